@@ -1,0 +1,1 @@
+"""Reproductions of the three studies of the KF-OPC paper: `python -m comparisons`."""

@@ -1,0 +1,1 @@
+"""Kalman filter with output power constraint (KF-OPC) for active noise control."""

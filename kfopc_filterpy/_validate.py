@@ -1,0 +1,107 @@
+"""Checks of arguments, shared by every module: each error names what was wrong, what was expected, how to mend it."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+
+def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None = None) -> np.ndarray:
+    """Return `value` as a contiguous, finite, one-dimensional float64 array, or raise a clear error."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}") from error
+    if array.ndim != 1:
+        raise ValueError(
+            f"{name} must be one-dimensional, (n,), got shape {array.shape}; "
+            f"pass one channel, e.g. {name}[:, 0] or {name}.ravel()"
+        )
+    if length is not None and array.size != length:
+        raise ValueError(f"{name} must have {length} values, got {array.size}")
+    if array.size < min_length:
+        raise ValueError(f"{name} must have at least {min_length} value(s), got {array.size}")
+    require_finite(array, name)
+    return np.ascontiguousarray(array)
+
+
+def require_finite(array: Any, name: str) -> None:
+    """Raise ValueError where `array` holds NaN or Inf, saying where the first one stands."""
+    finite = np.isfinite(array)
+    if not np.all(finite):
+        where = tuple(int(i) for i in np.argwhere(~np.atleast_1d(finite))[0])
+        at = where[0] if len(where) == 1 else where
+        raise ValueError(f"{name} must be finite, but holds NaN or Inf (first at index {at})")
+
+
+def as_number(value: Any, name: str, *, unit: str = "") -> float:
+    """Return `value` as a finite float."""
+    unit = f" {unit}" if unit else ""
+    if isinstance(value, str | bytes) or np.ndim(value) != 0 and np.size(value) != 1:
+        raise TypeError(f"{name} must be a single number{unit}, got {value!r}")
+    try:
+        number = float(np.asarray(value).reshape(()))
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name} must be a single number{unit}, got {value!r}") from error
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be finite, got {number}")
+    return number
+
+
+def as_positive(value: Any, name: str, *, unit: str = "") -> float:
+    """Return `value` as a finite float above zero."""
+    number = as_number(value, name, unit=unit)
+    if number <= 0:
+        raise ValueError(f"{name} must be greater than 0{' ' + unit if unit else ''}, got {number:g}")
+    return number
+
+
+def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:
+    """Return `value` as a finite float, zero or above."""
+    number = as_number(value, name, unit=unit)
+    if number < 0:
+        raise ValueError(f"{name} must not be negative, got {number:g}{' ' + unit if unit else ''}")
+    return number
+
+
+def as_count(value: Any, name: str, *, minimum: int = 1) -> int:
+    """Return `value` as an int of at least `minimum`."""
+    try:
+        count = operator.index(value)
+    except TypeError as error:
+        raise TypeError(f"{name} must be a whole number, got {value!r}") from error
+    if count < minimum:
+        raise ValueError(f"{name} must be at least {minimum}, got {count}")
+    return count
+
+
+def as_choice(value: Any, name: str, choices: Iterable[str]) -> str:
+    """Return `value` if it is one of `choices`."""
+    known = tuple(choices)
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(map(repr, known))}, got {value!r}")
+    return value
+
+
+def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
+    """Return `band` as (low, high) in Hz with 0 <= low < high <= fs/2."""
+    try:
+        low, high = (as_number(edge, name, unit="Hz") for edge in band)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a pair (low, high) in Hz, got {band!r}") from error
+    if not 0 <= low < high <= fs / 2:
+        raise ValueError(
+            f"{name} must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz"
+        )
+    return low, high
+
+
+def as_generator(rng: Any) -> np.random.Generator:
+    """Return a numpy Generator from a seed or a Generator; never the global random state."""
+    if rng is None:
+        raise TypeError("rng must be a seed or a numpy.random.Generator, so that a run can be repeated; got None")
+    return np.random.default_rng(rng)

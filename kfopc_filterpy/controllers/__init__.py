@@ -1,0 +1,1 @@
+"""Adaptive controllers for active noise control, one family a file."""
