@@ -1,0 +1,276 @@
+"""Eq. 10-13: from the rated power and running power estimates to the constraint factor."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ._validate import as_choice, as_nonnegative, as_number, as_positive
+
+DEFAULT_FS = 16000.0
+DEFAULT_MEMORY_S = 0.5
+
+# Below the smallest normal number a ratio of powers has no digits left: such a reference counts as silent.
+SILENCE = float(np.finfo(np.float64).tiny)
+
+# Rows of the three running powers, and of what is supplied or last used.
+DISTURBANCE, FILTERED_REFERENCE, REFERENCE = 0, 1, 2
+FACTOR, POWER, GAIN = 0, 1, 2
+
+
+class ConstraintState(NamedTuple):
+    """What the compiled functions below read and advance."""
+
+    mean: np.ndarray  # (3,) mean squares of disturbance, filtered reference and reference
+    lap: np.ndarray  # (3,) sums of squares since the sliding window last wrapped
+    window: np.ndarray  # (3, m) squares in the sliding window; m = 0: exponential
+    count: np.ndarray  # (3,) samples taken
+    settings: np.ndarray  # (2,) rated power, 1 - forgetting factor
+    supplied: np.ndarray  # (3,) factor, disturbance power, gain set by the caller; NaN: estimated
+    last: np.ndarray  # (3,) factor, disturbance power, gain last used
+
+
+@njit(cache=True)
+def _next_mean(state, row, square):
+    """Mean square with one more sample, unbiased from the first sample on."""
+    n, m, mean = state.count[row], state.window.shape[1], state.mean[row]
+    if m == 0:
+        return mean + max(state.settings[1], 1.0 / (n + 1)) * (square - mean)
+    if n < m:
+        return mean + (square - mean) / (n + 1)
+    position = n % m
+    if position == m - 1:  # a lap of plain sums ends: start from it, so that rounding never accumulates
+        return (state.lap[row] + square) / m
+    return max(mean + (square - state.window[row, position]) / m, 0.0)
+
+
+@njit(cache=True)
+def _gain(state, filtered_power, reference_power):
+    """Eq. 11, or the gain supplied, or the last one while the reference is silent."""
+    if not np.isnan(state.supplied[GAIN]):
+        return state.supplied[GAIN]
+    if reference_power > SILENCE:
+        return filtered_power / reference_power
+    return state.last[GAIN]
+
+
+@njit(cache=True)
+def _factor(state, disturbance_power, gain):
+    """Eq. 13; 1 where there is nothing to constrain (no disturbance, or no gain known yet)."""
+    if not np.isnan(state.supplied[FACTOR]):
+        return state.supplied[FACTOR]
+    if disturbance_power <= SILENCE or np.isnan(gain):
+        return 1.0
+    return min(math.sqrt(state.settings[0] * gain / disturbance_power), 1.0)
+
+
+@njit(cache=True)
+def preview_constraint(state, disturbance, filtered_reference, reference):
+    """Constraint factor with this sample included; nothing is changed.
+
+    Returns the factor, the disturbance power and the gain it follows from, and the three mean squares. A NaN
+    `reference` (none given) leaves the powers of the reference and the filtered reference as they are.
+    """
+    mean_d = _next_mean(state, DISTURBANCE, disturbance * disturbance)
+    mean_xf, mean_x = state.mean[FILTERED_REFERENCE], state.mean[REFERENCE]
+    if not np.isnan(reference):
+        mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference * filtered_reference)
+        mean_x = _next_mean(state, REFERENCE, reference * reference)
+    gain = _gain(state, mean_xf, mean_x)
+    power = mean_d if np.isnan(state.supplied[POWER]) else state.supplied[POWER]
+    return _factor(state, power, gain), power, gain, mean_d, mean_xf, mean_x
+
+
+@njit(cache=True)
+def advance_constraint(state, disturbance, filtered_reference, reference):
+    """Take this sample into the running powers and return the constraint factor."""
+    factor, power, gain, mean_d, mean_xf, mean_x = preview_constraint(
+        state, disturbance, filtered_reference, reference
+    )
+    _take(state, DISTURBANCE, disturbance, mean_d)
+    if not np.isnan(reference):
+        _take(state, FILTERED_REFERENCE, filtered_reference, mean_xf)
+        _take(state, REFERENCE, reference, mean_x)
+    state.last[FACTOR], state.last[POWER], state.last[GAIN] = factor, power, gain
+    return factor
+
+
+@njit(cache=True)
+def _take(state, row, value, mean):
+    """Record one sample of one running power, whose new mean square is `mean`."""
+    state.mean[row] = mean
+    m = state.window.shape[1]
+    if m > 0:
+        position = state.count[row] % m
+        if position == 0:
+            state.lap[row] = 0.0
+        state.lap[row] += value * value
+        state.window[row, position] = value * value
+    state.count[row] += 1
+
+
+class OutputPowerConstraint:
+    r"""Constraint factor of KF-OPC, kept sample by sample (eq. 10-13).
+
+    .. math:: \alpha = \min\{\sqrt{\rho_o G_s / \delta_d^2},\ 1\}
+
+    Parameters
+    ----------
+    rated_power : float
+        Rated output power :math:`\rho_o` of the amplifier, the mean square of the control signal.
+    secondary_path_gain : float, optional
+        Power gain :math:`G_s`; by default estimated as E[x'^2]/E[x^2] (eq. 11).
+    fs : float, default 16000
+        Sample rate in Hz.
+    memory : float, default 0.5
+        Memory of the power estimates in seconds: the time constant of the exponential window, or the length
+        of the sliding one.
+    window : {"exponential", "sliding"}, default "exponential"
+        The estimates start bias-free: until the window is full they are plain means.
+
+    Raises
+    ------
+    ValueError
+        A power, gain, rate or memory that is not positive and finite, or another window.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import OutputPowerConstraint
+    >>> constraint = OutputPowerConstraint(rated_power=1.0, secondary_path_gain=1.0)
+    >>> constraint.advance(2.0)  # a disturbance of power 4, a rated power of 1
+    0.5
+    >>> constraint.disturbance_power
+    4.0
+    """
+
+    def __init__(
+        self,
+        rated_power: float,
+        *,
+        secondary_path_gain: float | None = None,
+        fs: float = DEFAULT_FS,
+        memory: float = DEFAULT_MEMORY_S,
+        window: str = "exponential",
+    ) -> None:
+        rated_power = as_positive(rated_power, "rated_power")
+        self.fs = as_positive(fs, "fs", unit="Hz")
+        self.memory = as_positive(memory, "memory", unit="s")
+        self.window = as_choice(window, "window", ("exponential", "sliding"))
+        samples = self.memory * self.fs
+        length = max(round(samples), 1) if window == "sliding" else 0
+        self._state = ConstraintState(
+            mean=np.zeros(3),
+            lap=np.zeros(3),
+            window=np.zeros((3, length)),
+            count=np.zeros(3, dtype=np.int64),
+            settings=np.array([rated_power, -math.expm1(-1.0 / samples)]),
+            supplied=np.full(3, np.nan),
+            last=np.array([1.0, 0.0, np.nan]),
+        )
+        self.secondary_path_gain = secondary_path_gain
+
+    @property
+    def state(self) -> ConstraintState:
+        """Arrays that the compiled loop advances."""
+        return self._state
+
+    @property
+    def rated_power(self) -> float:
+        """Rated output power; can be assigned."""
+        return float(self._state.settings[0])
+
+    @rated_power.setter
+    def rated_power(self, value: float) -> None:
+        self._state.settings[0] = as_positive(value, "rated_power")
+
+    @property
+    def factor(self) -> float:
+        """Constraint factor last used; assign a value to hold it there, None to estimate it again."""
+        return self._read(FACTOR)
+
+    @factor.setter
+    def factor(self, value: float | None) -> None:
+        self._supply(FACTOR, None if value is None else as_nonnegative(value, "constraint_factor"))
+
+    @property
+    def disturbance_power(self) -> float:
+        """Disturbance power last used (eq. 10); assign a value to supply it, None to estimate it again."""
+        return self._read(POWER)
+
+    @disturbance_power.setter
+    def disturbance_power(self, value: float | None) -> None:
+        self._supply(POWER, None if value is None else as_nonnegative(value, "disturbance_power"))
+
+    @property
+    def secondary_path_gain(self) -> float | None:
+        """Power gain last used (eq. 11), None before any; assign to supply it, None to estimate it again."""
+        gain = self._read(GAIN)
+        return None if math.isnan(gain) else gain
+
+    @secondary_path_gain.setter
+    def secondary_path_gain(self, value: float | None) -> None:
+        self._supply(GAIN, None if value is None else as_positive(value, "secondary_path_gain"))
+
+    @property
+    def needs_reference(self) -> bool:
+        """Whether the gain has to come from the reference: neither it nor the factor was supplied."""
+        return bool(np.isnan(self._state.supplied[GAIN]) and np.isnan(self._state.supplied[FACTOR]))
+
+    def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
+        """Constraint factor that `advance` would return for this sample; nothing is changed."""
+        return float(preview_constraint(self._state, *self._sample(disturbance, filtered_reference, reference))[0])
+
+    def advance(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
+        """Take one sample into the powers and return the constraint factor.
+
+        Parameters
+        ----------
+        disturbance : float
+            Disturbance (measurement) d(n).
+        filtered_reference : float, default 0
+            Newest filtered reference x'(n).
+        reference : float, optional
+            Newest reference x(n); without it the gain must have been supplied.
+
+        Returns
+        -------
+        float
+            Constraint factor, 0 to 1.
+
+        Raises
+        ------
+        ValueError
+            NaN, Inf or a value whose square overflows; no reference and no gain.
+        """
+        return float(advance_constraint(self._state, *self._sample(disturbance, filtered_reference, reference)))
+
+    def _sample(self, disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float]:
+        if reference is None and self.needs_reference:
+            raise ValueError(
+                "the secondary-path gain is unknown: pass reference=, the newest reference sample x(n), "
+                "or set secondary_path_gain"
+            )
+        values = (
+            _squarable(disturbance, "the measurement"),
+            _squarable(filtered, "the newest filtered reference"),
+            math.nan if reference is None else _squarable(reference, "reference"),
+        )
+        return values
+
+    def _read(self, row: int) -> float:
+        supplied = self._state.supplied[row]
+        return float(self._state.last[row] if math.isnan(supplied) else supplied)
+
+    def _supply(self, row: int, value: float | None) -> None:
+        self._state.supplied[row] = math.nan if value is None else value
+
+
+def _squarable(value: Any, name: str) -> float:
+    """A finite number whose square is finite too: an infinite power would never be forgotten."""
+    number = as_number(value, name)
+    if math.isinf(number * number):
+        raise ValueError(f"{name} must have a finite square, got {number:g}")
+    return number

@@ -1,0 +1,151 @@
+"""Compiled arithmetic of the Kalman filter, pure functions of arrays; nothing here knows of paths or controllers.
+
+The covariance is kept as the lower triangle of a square array, with what the last step still owes it::
+
+    P = scale (T - g g' / S) + diagonal I
+
+``T`` is the stored triangle, ``g`` and ``S`` the last gain direction and innovation variance (eq. 8), ``scale``
+filterpy's fading memory squared and ``diagonal`` the state noise of eq. 4. The debt is paid in the same pass that
+forms ``P x'`` for the next sample, so each element of the triangle is read and written once a sample, and P is
+symmetric because there is only one of each element.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+# No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
+FAST = {"reassoc", "contract", "nsz"}
+
+SCALE, DIAGONAL, INVERSE_S = 0, 1, 2
+
+
+class Covariance(NamedTuple):
+    """State covariance: P = scale (T - g g' inverse_s) + diagonal I."""
+
+    triangle: np.ndarray  # (n, n), lower triangle T valid
+    gain_direction: np.ndarray  # (n,), g = P x' of the last update
+    product: np.ndarray  # (n,), P x' of the pass under way
+    owed: np.ndarray  # (3,): scale, diagonal, 1/S
+
+
+def new_covariance(P: np.ndarray) -> Covariance:
+    """Covariance state from a full symmetric array (n, n); the upper triangle is not read."""
+    n = P.shape[0]
+    return Covariance(np.array(P, dtype=np.float64, order="C"), np.zeros(n), np.zeros(n), np.array([1.0, 0.0, 0.0]))
+
+
+@njit(cache=True)
+def predict_covariance(cov, alpha_sq, state_noise):
+    """Eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
+    cov.owed[SCALE] *= alpha_sq
+    cov.owed[DIAGONAL] = alpha_sq * cov.owed[DIAGONAL] + state_noise
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def project_covariance(cov, h):
+    """Pay what is owed to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
+
+    The value of P does not change. Four rows go together so that each load of ``g``, ``h`` and the running
+    product serves four elements.
+    """
+    T, g, Ph = cov.triangle, cov.gain_direction, cov.product
+    scale, diagonal = cov.owed[SCALE], cov.owed[DIAGONAL]
+    weight = scale * cov.owed[INVERSE_S]
+    n = h.size
+    for i in range(n):
+        Ph[i] = 0.0
+    whole = n - n % 4
+    for i in range(0, whole, 4):
+        T0, T1, T2, T3 = T[i], T[i + 1], T[i + 2], T[i + 3]
+        g0, g1, g2, g3 = weight * g[i], weight * g[i + 1], weight * g[i + 2], weight * g[i + 3]
+        h0, h1, h2, h3 = h[i], h[i + 1], h[i + 2], h[i + 3]
+        a0 = a1 = a2 = a3 = 0.0
+        for j in range(i):
+            p0 = scale * T0[j] - g0 * g[j]
+            p1 = scale * T1[j] - g1 * g[j]
+            p2 = scale * T2[j] - g2 * g[j]
+            p3 = scale * T3[j] - g3 * g[j]
+            T0[j], T1[j], T2[j], T3[j] = p0, p1, p2, p3
+            a0 += p0 * h[j]
+            a1 += p1 * h[j]
+            a2 += p2 * h[j]
+            a3 += p3 * h[j]
+            Ph[j] += p0 * h0 + p1 * h1 + p2 * h2 + p3 * h3
+        Ph[i] += a0
+        Ph[i + 1] += a1
+        Ph[i + 2] += a2
+        Ph[i + 3] += a3
+        for k in range(i, i + 4):  # the block on the diagonal
+            gk, hk = weight * g[k], h[k]
+            for j in range(i, k):
+                p = scale * T[k, j] - gk * g[j]
+                T[k, j] = p
+                Ph[k] += p * h[j]
+                Ph[j] += p * hk
+            T[k, k] = scale * T[k, k] - gk * g[k] + diagonal
+            Ph[k] += T[k, k] * hk
+    for k in range(whole, n):  # the last n % 4 rows
+        gk, hk = weight * g[k], h[k]
+        for j in range(k):
+            p = scale * T[k, j] - gk * g[j]
+            T[k, j] = p
+            Ph[k] += p * h[j]
+            Ph[j] += p * hk
+        T[k, k] = scale * T[k, k] - gk * g[k] + diagonal
+        Ph[k] += T[k, k] * hk
+    cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = 1.0, 0.0, 0.0
+    return dot(h, Ph)
+
+
+@njit(cache=True)
+def downdate_covariance(cov, S):
+    """Eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
+    cov.gain_direction[:] = cov.product
+    cov.owed[INVERSE_S] = 1.0 / S
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def full_covariance(T, g, scale, diagonal, weight):
+    """Full symmetric array scale T + weight g g' + diagonal I."""
+    n = g.size
+    P = np.empty((n, n))
+    for i in range(n):
+        gi = weight * g[i]
+        for j in range(i + 1):
+            P[i, j] = scale * T[i, j] + gi * g[j]
+            P[j, i] = P[i, j]
+        P[i, i] += diagonal
+    return P
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def dot(a, b):
+    """Inner product of two vectors of the length of the first."""
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def correct_weights(w, gain_direction, innovation_over_S):
+    """Eq. 5, w(n|n) = w(n|n-1) + K (d - x'w), with K = g/S."""
+    for i in range(w.size):
+        w[i] += gain_direction[i] * innovation_over_S
+
+
+@njit(cache=True)
+def update_weights(cov, w, h, scaled_measurement, S):
+    """Eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
+
+    A non-finite innovation is returned with nothing changed.
+    """
+    y = scaled_measurement - dot(h, w)
+    if np.isfinite(y):
+        correct_weights(w, cov.product, y / S)
+        downdate_covariance(cov, S)
+    return y

@@ -1,0 +1,54 @@
+"""A read-only array whose refusal to be written into names the assignment to use instead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class ReadOnlyMatrix(np.ndarray):
+    """View of an array that raises on any in-place write, naming the attribute to assign.
+
+    Results of arithmetic with it are plain arrays.
+    """
+
+    attribute = ""
+
+    @classmethod
+    def of(cls, array: np.ndarray, attribute: str) -> ReadOnlyMatrix:
+        """Freeze `array` and view it as the value of the filter's `attribute`."""
+        array.flags.writeable = False
+        view = array.view(cls)
+        view.attribute = attribute
+        return view
+
+    def __array_finalize__(self, source: Any) -> None:
+        self.attribute = getattr(source, "attribute", "")
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if method == "at" or any(out is self for out in kwargs.get("out", ())):
+            raise self._refusal()
+        plain = [np.asarray(value) if isinstance(value, ReadOnlyMatrix) else value for value in inputs]
+        return getattr(ufunc, method)(*plain, **kwargs)
+
+    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        try:
+            return super().__array_function__(function, types, args, kwargs)
+        except ValueError as error:  # np.fill_diagonal, np.copyto, ...
+            raise (self._refusal() if "read-only" in str(error) else error) from error
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        raise self._refusal()
+
+    def fill(self, value: Any) -> None:
+        """Refused, as any in-place write."""
+        raise self._refusal()
+
+    def _refusal(self) -> ValueError:
+        name = self.attribute
+        return ValueError(
+            f"{name} of a random-walk filter is read-only, so that its steps can stay O(L^2): "
+            f"assign instead, kf.{name} = value"
+            + (" (a full array hands the steps to filterpy's equations)" if name in ("F", "Q") else "")
+        )
