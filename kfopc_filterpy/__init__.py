@@ -12,18 +12,32 @@ from typing import TYPE_CHECKING, Any
 from .estimator import KFOPC
 
 if TYPE_CHECKING:
+    from .amplifiers import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier
     from .constraint import OutputPowerConstraint
+    from .controllers import Controller, FxLMS, KalmanController, MOVFxLMS, kf_anc, kf_opc
     from .random_walk import RandomWalkKFOPC
+    from .simulation import SimulationResult, simulate
 
 __version__ = "0.1.0"
 
 # Public names and the module each lives in.
 _LAZY = {
+    "Controller": "controllers",
+    "FxLMS": "controllers",
+    "HardClipAmplifier": "amplifiers",
+    "KalmanController": "controllers",
+    "LinearAmplifier": "amplifiers",
+    "MOVFxLMS": "controllers",
     "OutputPowerConstraint": "constraint",
     "RandomWalkKFOPC": "random_walk",
+    "SimulationResult": "simulation",
+    "SoftSaturationAmplifier": "amplifiers",
+    "kf_anc": "controllers",
+    "kf_opc": "controllers",
+    "simulate": "simulation",
 }
 
-__all__ = ["KFOPC", "OutputPowerConstraint", "RandomWalkKFOPC"]
+__all__ = ["KFOPC", *sorted(_LAZY)]
 
 
 def __getattr__(name: str) -> Any:

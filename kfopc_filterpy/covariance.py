@@ -99,6 +99,13 @@ class RandomWalkCovariance:
         """An update is over, or its sample was missed: P is P_post."""
         self.posterior = self.now
 
+    def after_compiled(self) -> float:
+        """After the compiled loop advanced `arrays`: what is owed is one downdate; return its S."""
+        self._shown = None
+        self.prior = TRIANGLE
+        self.settle()
+        return 1.0 / float(self.arrays.owed[INVERSE_S])
+
 
 def require_covariance(P: np.ndarray) -> None:
     """Raise ValueError unless P is symmetric, to rounding, with no negative variance."""

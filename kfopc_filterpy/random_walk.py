@@ -11,7 +11,7 @@ import numpy as np
 from ._validate import as_count, as_nonnegative, require_finite
 from .covariance import RandomWalkCovariance, require_covariance
 from .estimator import KFOPC
-from .kernels import update_weights
+from .kernels import Covariance, update_weights
 from .read_only import ReadOnlyMatrix
 
 
@@ -284,3 +284,22 @@ class RandomWalkKFOPC(KFOPC):
         self.x, self.y = x, y
         self.x_post = self.x.copy()
         self._covariance.settle()
+
+    # A whole signal at compiled speed: the arrays go out, and come back advanced.
+
+    def compiled_state(self) -> tuple[Covariance, tuple[float, float, float]] | None:
+        """The covariance arrays and (r, q, fading alpha squared); None where steps take filterpy's equations."""
+        if self._F is not None or self._Q is not None:
+            return None
+        self._take_in_edits()
+        return self._covariance.arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
+
+    def after_compiled(self, weights: np.ndarray, z: float, y: float) -> None:
+        """Take back the arrays after at least one sample: `weights`, the last measurement and its residual."""
+        S = self._covariance.after_compiled()
+        self._K = None
+        self.S, self.SI = np.array([[S]]), np.array([[1.0 / S]])
+        shape = np.shape(self.x)
+        self._record(weights.reshape(shape).copy(), np.full((1,) * len(shape), y))
+        self.x_prior = self.x - (self.K * y).reshape(shape)
+        self.z = np.full((1,) * len(shape), z)

@@ -1,0 +1,126 @@
+"""What a controller is, and what the built-in ones share."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from .._validate import as_count, as_number
+from ..amplifiers import Amplifier, compiled_parameters
+from ..constraint import FACTOR, GAIN, POWER, ConstraintState, OutputPowerConstraint
+from ..kernels import new_covariance
+from ..loop import ControllerState, adapt, control_signal, delay_line
+from ..paths import path_taps
+
+NO_SOLUTION = (
+    "the update has no solution: S = x' P x' + q is not positive; a silent reference with measurement_noise = 0 tells "
+    "nothing: give measurement_noise > 0"
+)
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """What `simulate` drives: two calls a sample. A user's own needs nothing else.
+
+    An optional attribute `constraint_factor` is recorded where there is one, and `weights`, (L,), where they are
+    asked for.
+    """
+
+    def control_signal(self, reference: float) -> float:
+        """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        ...
+
+    def update(self, error: float) -> None:
+        """Adapt to the error e(n) = d(n) - (s * y_amp)(n) that this control signal left."""
+        ...
+
+
+def unconstrained() -> ConstraintState:
+    """Constraint of a controller that has none: the factor is supplied, 1; the powers are still followed."""
+    constraint = OutputPowerConstraint(1.0)
+    constraint.factor = 1.0
+    return constraint.state
+
+
+class FilteredReferenceController:
+    """Delay lines and filtered reference that the built-in controllers share.
+
+    Parameters
+    ----------
+    kind : int
+        Family, `loop.KALMAN` or `loop.LMS`.
+    n_taps : int
+        Taps L of the control filter.
+    secondary_path : array_like or control.TransferFunction
+        Estimated secondary path s^, taps or an FIR system.
+    amplifier : callable, optional
+        Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
+    """
+
+    name = "controller"
+
+    def __init__(
+        self, kind: int, n_taps: int, secondary_path: Any, settings: list[float], amplifier: Amplifier | None = None
+    ) -> None:
+        n_taps = as_count(n_taps, "n_taps")
+        secondary = path_taps(secondary_path, name="secondary_path")
+        parameters = compiled_parameters(amplifier)
+        if parameters is None:
+            raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
+        self._state = ControllerState(
+            kind=kind,
+            weights=np.zeros(n_taps),
+            secondary_estimate=secondary,
+            reference=delay_line(max(n_taps, secondary.size)),
+            filtered=delay_line(n_taps),
+            output=delay_line(secondary.size),
+            amplifier=parameters,
+            settings=np.array(settings, dtype=np.float64),
+            covariance=new_covariance(np.zeros((1, 1))),
+            constraint=unconstrained(),
+            last=np.zeros(2),
+        )
+        self._y = 0.0
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Control filter w, (L,), newest-sample tap first; a copy."""
+        return self._state.weights.copy()
+
+    @property
+    def rated_power(self) -> float | None:
+        """Rated output power that the controller keeps to; None where it has no constraint."""
+        return None
+
+    @property
+    def constraint_factor(self) -> float:
+        """Constraint factor of the last sample."""
+        return float(self._state.constraint.last[FACTOR])
+
+    @property
+    def disturbance_power(self) -> float:
+        """Running power of the disturbance estimate (eq. 10)."""
+        return float(self._state.constraint.last[POWER])
+
+    @property
+    def secondary_path_gain(self) -> float:
+        """Running secondary-path gain (eq. 11); NaN before any reference energy."""
+        return float(self._state.constraint.last[GAIN])
+
+    def control_signal(self, reference: float) -> float:
+        """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        self._y = float(control_signal(self._state, as_number(reference, "reference")))
+        return self._y
+
+    def update(self, error: float) -> None:
+        """Adapt to the error e(n) that the last control signal left."""
+        if not adapt(self._state, as_number(error, "error"), self._y):
+            raise ValueError(NO_SOLUTION)
+
+    def compiled_state(self) -> ControllerState | None:
+        """State for the compiled loop, which advances it; None where only the steps above can run."""
+        return self._state
+
+    def after_compiled(self, state: ControllerState) -> None:
+        """Take back what the compiled loop advanced."""

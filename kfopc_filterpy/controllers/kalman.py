@@ -1,0 +1,213 @@
+"""KF-ANC (eq. 2-8) and KF-OPC (eq. 9-13): a Kalman filter as the adaptation of the control filter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from .._validate import as_number
+from ..amplifiers import Amplifier
+from ..constraint import FACTOR
+from ..estimator import KFOPC
+from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate, newest
+from ..random_walk import RandomWalkKFOPC
+from .base import FilteredReferenceController, unconstrained
+
+
+class KalmanController(FilteredReferenceController):
+    """The modified ANC structure around a Kalman filter: any filterpy `KalmanFilter` of one measurement.
+
+    Each sample the estimator is given the disturbance estimate as z and the filtered reference as H. With a rated
+    power the estimator is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` make the estimator too.
+
+    Parameters
+    ----------
+    estimator : filterpy.kalman.KalmanFilter
+        Filter whose state is the control filter, ``dim_z = 1``; a `KFOPC`, or filterpy's own. One from
+        `KFOPC.random_walk` runs whole signals at compiled speed.
+    secondary_path : array_like or control.TransferFunction
+        Estimated secondary path, taps or an FIR system.
+    amplifier : callable, optional
+        Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
+    name : str, optional
+        Name in results and legends; by default KF-OPC with a rated power, KF-ANC without.
+
+    Raises
+    ------
+    TypeError
+        An estimator that is no filterpy KalmanFilter.
+    ValueError
+        An estimator of several measurements.
+
+    Examples
+    --------
+    >>> from filterpy.kalman import KalmanFilter
+    >>> from kfopc_filterpy import KalmanController
+    >>> controller = KalmanController(KalmanFilter(dim_x=4, dim_z=1), secondary_path=[1.0])
+    >>> controller.control_signal(1.0)
+    0.0
+    >>> controller.update(2.0)
+    >>> float(controller.weights[0])  # K z = P / (P + R) z with P = I + Q = 2, R = 1
+    1.3333333333333333
+    """
+
+    def __init__(
+        self, estimator: KalmanFilter, secondary_path: Any, *, amplifier: Amplifier | None = None, name: str | None = None
+    ) -> None:
+        if not isinstance(estimator, KalmanFilter):
+            raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
+        if estimator.dim_z != 1:
+            raise ValueError(f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}")
+        super().__init__(KALMAN, estimator.dim_x, secondary_path, [0.0, 0.0, 1.0], amplifier)
+        self.estimator = estimator
+        self.name = name or ("KF-ANC" if self.rated_power is None else "KF-OPC")
+
+    @property
+    def rated_power(self) -> float | None:
+        """Rated output power of the estimator; None for KF-ANC."""
+        return getattr(self.estimator, "rated_power", None)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Control filter w, (L,), the estimator's state; a copy."""
+        return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
+
+    @property
+    def constraint_factor(self) -> float:
+        """Constraint factor of the last sample."""
+        return getattr(self.estimator, "constraint_factor", 1.0)
+
+    @property
+    def disturbance_power(self) -> float:
+        """Running power of the disturbance estimate (eq. 10); NaN where it is not followed."""
+        power = getattr(self.estimator, "disturbance_power", None)
+        return np.nan if power is None else power
+
+    @property
+    def secondary_path_gain(self) -> float:
+        """Running secondary-path gain (eq. 11); NaN where it is not known."""
+        gain = getattr(self.estimator, "secondary_path_gain", None)
+        return np.nan if gain is None else gain
+
+    def control_signal(self, reference: float) -> float:
+        """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        reference = as_number(reference, "reference")
+        self._state.weights[:] = self.weights
+        return float(control_signal(self._state, reference))
+
+    def update(self, error: float) -> None:
+        """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
+        d = disturbance_estimate(self._state, as_number(error, "error"))
+        h = newest(self._state.filtered, self.estimator.dim_x).reshape(1, -1).copy()
+        self.estimator.predict()
+        if isinstance(self.estimator, KFOPC):
+            self.estimator.update(d, H=h, reference=newest(self._state.reference, 1)[0])
+        else:
+            self.estimator.update(np.full((1,) * np.ndim(self.estimator.x), d), H=h)
+
+    def compiled_state(self) -> ControllerState | None:
+        """State for the compiled loop; None where the estimator takes filterpy's own equations."""
+        estimator = self.estimator
+        if type(estimator) is not RandomWalkKFOPC:
+            return None
+        compiled = estimator.compiled_state()
+        if compiled is None:
+            return None
+        covariance, settings = compiled
+        if estimator.constraint is not None:
+            constraint = estimator.constraint.state
+        else:
+            constraint = unconstrained()
+            constraint.supplied[FACTOR] = estimator.constraint_factor
+        self._state.settings[:] = settings
+        self._state.weights[:] = self.weights
+        return self._state._replace(covariance=covariance, constraint=constraint)
+
+    def after_compiled(self, state: ControllerState) -> None:
+        """Give the estimator the weights, residual and gain of the last sample."""
+        self.estimator.after_compiled(state.weights, *state.last)
+
+
+def kf_anc(
+    n_taps: int,
+    secondary_path: Any,
+    *,
+    state_noise: float,
+    measurement_noise: float,
+    initial_variance: float = 1.0,
+    amplifier: Amplifier | None = None,
+) -> KalmanController:
+    """KF-ANC: the Kalman filter of eq. 2-8 without a constraint.
+
+    Parameters
+    ----------
+    n_taps : int
+        Taps L of the control filter.
+    secondary_path : array_like or control.TransferFunction
+        Estimated secondary path.
+    state_noise, measurement_noise, initial_variance
+        r, q and P(0|0), see `KFOPC.random_walk`.
+    amplifier : callable, optional
+        See `KalmanController`.
+
+    Returns
+    -------
+    KalmanController
+        A controller named KF-ANC.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import kf_anc
+    >>> kf_anc(8, [1.0], state_noise=1e-6, measurement_noise=0.1).name
+    'KF-ANC'
+    """
+    estimator = KFOPC.random_walk(
+        n_taps, state_noise=state_noise, measurement_noise=measurement_noise, initial_variance=initial_variance
+    )
+    return KalmanController(estimator, secondary_path, amplifier=amplifier)
+
+
+def kf_opc(
+    n_taps: int,
+    secondary_path: Any,
+    *,
+    rated_power: float,
+    state_noise: float,
+    measurement_noise: float,
+    initial_variance: float = 1.0,
+    amplifier: Amplifier | None = None,
+    **constraint: Any,
+) -> KalmanController:
+    """KF-OPC: the Kalman filter with output power constraint, eq. 9-13.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier
+        As for `kf_anc`.
+    rated_power : float
+        Rated output power rho_o.
+    **constraint
+        `fs`, `power_memory`, `power_window`, `secondary_path_gain`, see `KFOPC`.
+
+    Returns
+    -------
+    KalmanController
+        A controller named KF-OPC.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import kf_opc
+    >>> kf_opc(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).rated_power
+    0.5
+    """
+    estimator = KFOPC.random_walk(
+        n_taps,
+        state_noise=state_noise,
+        measurement_noise=measurement_noise,
+        initial_variance=initial_variance,
+        rated_power=rated_power,
+        **constraint,
+    )
+    return KalmanController(estimator, secondary_path, amplifier=amplifier)

@@ -1,0 +1,193 @@
+"""The compiled sample: what a controller and the plant do at one n, and the loop over a whole signal.
+
+Sample-by-sample use (`controllers`, `simulation`) calls the same functions one at a time, so each equation stands
+here once. A delay line keeps the newest sample first and contiguous: it is written downwards, and its taps are moved
+to the end once every few lengths, so no sample is shifted on the way.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from .amplifiers import amplify
+from .constraint import FACTOR, GAIN, POWER, ConstraintState, advance_constraint
+from .kernels import FAST, Covariance, dot, predict_covariance, project_covariance, update_weights
+
+KALMAN, LMS = 0, 1
+RUNNING, DIVERGED, SINGULAR = 0, 1, 2
+
+
+class DelayLine(NamedTuple):
+    """Newest `taps` samples, newest first, at buffer[start[0] : start[0] + taps]."""
+
+    buffer: np.ndarray
+    start: np.ndarray
+    taps: int
+
+
+def delay_line(taps: int) -> DelayLine:
+    """A silent delay line of `taps` samples."""
+    size = 4 * taps + 64
+    return DelayLine(np.zeros(size), np.array([size - taps]), taps)
+
+
+@njit(cache=True)
+def push(line, sample):
+    """Make `sample` the newest one."""
+    start = line.start[0]
+    if start == 0:
+        start = line.buffer.size - line.taps + 1
+        line.buffer[start:] = line.buffer[: line.taps - 1]
+    line.buffer[start - 1] = sample
+    line.start[0] = start - 1
+
+
+@njit(cache=True)
+def newest(line, taps):
+    """The newest `taps` samples, newest first, as a view."""
+    start = line.start[0]
+    return line.buffer[start : start + taps]
+
+
+class ControllerState(NamedTuple):
+    """What every controller here keeps."""
+
+    kind: int  # KALMAN or LMS
+    weights: np.ndarray  # (L,) control filter w
+    secondary_estimate: np.ndarray  # taps of s^
+    reference: DelayLine  # x
+    filtered: DelayLine  # x' = s^ * x
+    output: DelayLine  # y, through the amplifier model where one is known
+    amplifier: np.ndarray  # (3,) parameters of that model; linear: d^ = e + s^ * y as published
+    settings: np.ndarray  # Kalman: r, q, fading alpha squared; LMS: step size
+    covariance: Covariance  # Kalman
+    constraint: ConstraintState  # powers, gain, factor
+    last: np.ndarray  # (2,) disturbance estimate and residual of the last Kalman update
+
+
+@njit(cache=True)
+def control_signal(controller, x):
+    """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
+    push(controller.reference, x)
+    s = controller.secondary_estimate
+    push(controller.filtered, dot(s, newest(controller.reference, s.size)))
+    w = controller.weights
+    y = dot(w, newest(controller.reference, w.size))
+    kind, limit, sharpness = controller.amplifier
+    push(controller.output, amplify(kind, limit, sharpness, y))
+    return y
+
+
+@njit(cache=True)
+def disturbance_estimate(controller, error):
+    """d^(n) = e(n) + (s^ * y)(n)."""
+    s = controller.secondary_estimate
+    return error + dot(s, newest(controller.output, s.size))
+
+
+@njit(cache=True)
+def adapt_kalman(controller, error):
+    """Eq. 2-9 with the factor of eq. 10-13; returns False where S is not positive, with the weights unchanged."""
+    d = disturbance_estimate(controller, error)
+    w = controller.weights
+    h = newest(controller.filtered, w.size)
+    r, q, alpha_sq = controller.settings
+    predict_covariance(controller.covariance, alpha_sq, r)
+    S = project_covariance(controller.covariance, h) + q
+    if not 0.0 < S < np.inf:
+        return False
+    factor = advance_constraint(controller.constraint, d, h[0], newest(controller.reference, 1)[0])
+    controller.last[0], controller.last[1] = d, update_weights(controller.covariance, w, h, factor * d, S)
+    return True
+
+
+@njit(cache=True, fastmath=FAST, error_model="numpy")
+def adapt_lms(controller, error, y):
+    """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS)."""
+    d = disturbance_estimate(controller, error)
+    w = controller.weights
+    xf = newest(controller.filtered, w.size)
+    x = newest(controller.reference, w.size)
+    factor = advance_constraint(controller.constraint, d, xf[0], x[0])
+    gamma = controller.constraint.last[GAIN] * (1.0 / factor - 1.0) if factor < 1.0 else 0.0
+    mu = controller.settings[0]
+    correction, penalty = mu * error, mu * gamma * y
+    for i in range(w.size):
+        w[i] += correction * xf[i] - penalty * x[i]
+
+
+@njit(cache=True)
+def adapt(controller, error, y):
+    """Adapt the weights of either family; False: the step has no solution."""
+    if controller.kind == KALMAN:
+        return adapt_kalman(controller, error)
+    adapt_lms(controller, error, y)
+    return True
+
+
+class Plant(NamedTuple):
+    """The true amplifier and paths."""
+
+    secondary: np.ndarray  # taps of s
+    feedback: np.ndarray  # taps from the amplifier to the reference microphone; size 0: none
+    output: DelayLine  # y after the amplifier
+    amplifier: np.ndarray  # (3,)
+
+
+@njit(cache=True)
+def measured_reference(plant, x):
+    """Reference microphone: the noise, and what comes back from the loudspeaker (one sample late at the least)."""
+    taps = plant.feedback.size
+    return x if taps < 2 else x + dot(plant.feedback[1:], newest(plant.output, taps - 1))
+
+
+@njit(cache=True)
+def anti_noise(plant, y_amplified):
+    """(s * y_amp)(n)."""
+    push(plant.output, y_amplified)
+    return dot(plant.secondary, newest(plant.output, plant.secondary.size))
+
+
+class Record(NamedTuple):
+    """Rows of a run, one a sample, except `weights`, one every so many samples."""
+
+    error: np.ndarray
+    control_signal: np.ndarray
+    amplifier_output: np.ndarray
+    anti_noise: np.ndarray
+    constraint_factor: np.ndarray
+    powers: np.ndarray  # (n or 0, 2) disturbance power, gain
+    weights: np.ndarray  # (n_rows or 0, L)
+
+
+@njit(cache=True)
+def note_weights(record, weights, every, n):
+    """Keep the weights of sample n where it is one of the recorded."""
+    if record.weights.shape[0] > 0 and n % every == 0:
+        record.weights[n // every] = weights
+
+
+@njit(cache=True)
+def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last):
+    """Samples `first` to `last` of the loop; returns the status and the sample after the last one run."""
+    kind, clip, sharpness = plant.amplifier
+    for n in range(first, last):
+        y = control_signal(controller, measured_reference(plant, x[n]))
+        if not abs(y) <= limit:
+            return DIVERGED, n
+        y_amplified = amplify(kind, clip, sharpness, y)
+        a = anti_noise(plant, y_amplified)
+        e = d[n] - a + sensor_noise[n]
+        if not adapt(controller, e, y):
+            return SINGULAR, n
+        record.error[n], record.control_signal[n] = e, y
+        record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
+        powers = controller.constraint.last
+        record.constraint_factor[n] = powers[FACTOR]
+        if record.powers.shape[0] > 0:
+            record.powers[n, 0], record.powers[n, 1] = powers[POWER], powers[GAIN]
+        note_weights(record, controller.weights, every, n)
+    return RUNNING, last

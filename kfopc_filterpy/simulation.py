@@ -1,0 +1,296 @@
+"""The modified ANC structure of the paper's block diagrams: controller + amplifier + paths -> a frozen result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ._validate import as_count, as_generator, as_nonnegative, as_positive, as_signal
+from .amplifiers import Amplifier, compiled_parameters
+from .constraint import DEFAULT_FS
+from .controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
+from .loop import (
+    DIVERGED,
+    RUNNING,
+    SINGULAR,
+    Plant,
+    Record,
+    anti_noise,
+    delay_line,
+    measured_reference,
+    note_weights,
+    run,
+)
+from .paths import path_taps
+
+DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """What a run left. Signals are (n_samples,); after a divergence they are NaN.
+
+    Attributes
+    ----------
+    algorithm : str
+        Name of the controller.
+    fs : float
+        Sample rate in Hz.
+    rated_power : float or None
+        Rated output power of the controller, or the one given to `simulate`.
+    reference, disturbance : ndarray
+        Reference x and disturbance d of the run.
+    error : ndarray
+        Error e = d - s*y_amp at the error microphone, sensor noise included.
+    control_signal, amplifier_output : ndarray
+        Control signal y before, and y_amp after the amplifier.
+    anti_noise : ndarray
+        Anti-noise s*y_amp at the error microphone.
+    constraint_factor : ndarray
+        Constraint factor; 1 for a controller without a constraint, NaN for one that does not say.
+    weights : ndarray or None
+        (n_rows, L) weights after samples 0, k, 2k, ..., where they were asked for.
+    weights_time_s : ndarray or None
+        (n_rows,) their times in seconds.
+    disturbance_power, secondary_path_gain : ndarray or None
+        Power histories (eq. 10, 11), where they were asked for.
+    diverged_at_s : float or None
+        Time at which the control signal passed 1e6 sqrt(rated power); None: it did not.
+    """
+
+    algorithm: str
+    fs: float
+    rated_power: float | None
+    reference: np.ndarray
+    disturbance: np.ndarray
+    error: np.ndarray
+    control_signal: np.ndarray
+    amplifier_output: np.ndarray
+    anti_noise: np.ndarray
+    constraint_factor: np.ndarray
+    weights: np.ndarray | None = None
+    weights_time_s: np.ndarray | None = None
+    disturbance_power: np.ndarray | None = None
+    secondary_path_gain: np.ndarray | None = None
+    diverged_at_s: float | None = None
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(n_samples,) time in seconds."""
+        return np.arange(self.error.size) / self.fs
+
+
+def simulate(
+    controller: Controller,
+    reference: Any,
+    *,
+    secondary_path: Any,
+    primary_path: Any = None,
+    disturbance: Any = None,
+    fs: float = DEFAULT_FS,
+    amplifier: Amplifier | None = None,
+    rated_power: float | None = None,
+    sensor_noise_std: float = 0.0,
+    rng: Any = None,
+    feedback_path: Any = None,
+    record_weights_every: int | None = None,
+    record_powers: bool = False,
+    progress: Callable[[int], Any] | None = None,
+    compiled: bool = True,
+) -> SimulationResult:
+    """Run a controller in the modified ANC structure.
+
+    Each sample: the control signal from the last weights, the amplifier, the error e = d - s*y_amp, the controller's
+    update. Single channel. The built-in controllers run at compiled speed; a user's own is called sample by sample.
+
+    Parameters
+    ----------
+    controller : Controller
+        Goes on from the state it is in; make a new one for a fresh run.
+    reference : array_like
+        (n_samples,) reference x.
+    secondary_path : array_like or control.TransferFunction
+        True secondary path s, loudspeaker amplifier to error microphone.
+    primary_path : array_like or control.TransferFunction, optional
+        Path from the reference to the error microphone, which makes the disturbance p*x.
+    disturbance : array_like, optional
+        (n_samples,) disturbance d, in place of `primary_path`.
+    fs : float, default 16000
+        Sample rate in Hz; systems given must have it.
+    amplifier : callable, optional
+        Amplifier model, by default linear; any function of a sample.
+    rated_power : float, optional
+        Rated power, by default the controller's; it sets the scale of the divergence limit (1 where neither says).
+    sensor_noise_std : float, default 0
+        Standard deviation of white noise at the error microphone.
+    rng : int or numpy.random.Generator, optional
+        Seed of the sensor noise, needed where there is any.
+    feedback_path : array_like or control.TransferFunction, optional
+        Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
+    record_weights_every : int, optional
+        Record the weights every so many samples.
+    record_powers : bool, default False
+        Record the disturbance power and the secondary-path gain.
+    progress : callable, optional
+        Called with the number of samples done since its last call, such as `tqdm.update`.
+    compiled : bool, default True
+        False: call the controller sample by sample even where a compiled loop exists, with equal results.
+
+    Returns
+    -------
+    SimulationResult
+        Divergence is a result: past ``1e6 sqrt(rated_power)`` the run stops and `diverged_at_s` says when.
+
+    Raises
+    ------
+    ValueError
+        Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
+        `primary_path` and `disturbance`; a feedback path without delay.
+    TypeError
+        A controller without `control_signal` and `update`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import kf_opc, simulate
+    >>> x = np.random.default_rng(0).standard_normal(16000)
+    >>> controller = kf_opc(16, [0.0, 1.0], rated_power=0.25, state_noise=1e-9, measurement_noise=1e-3)
+    >>> result = simulate(controller, x, secondary_path=[0.0, 1.0], primary_path=[0.0, 0.0, 0.0, 1.0])
+    >>> bool(np.mean(result.control_signal[8000:] ** 2) < 1.02 * 0.25)  # unconstrained it would be 1
+    True
+    """
+    if not isinstance(controller, Controller):
+        raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    fs = as_positive(fs, "fs", unit="Hz")
+    x = as_signal(reference, "reference")
+    d = _disturbance(x, primary_path, disturbance, fs)
+    sensor_noise = _sensor_noise(x.size, as_nonnegative(sensor_noise_std, "sensor_noise_std"), rng)
+    if rated_power is None:
+        rated_power = getattr(controller, "rated_power", None)
+    else:
+        rated_power = as_positive(rated_power, "rated_power")
+    limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
+    every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
+    plant = _plant(secondary_path, feedback_path, amplifier, fs)
+    record = _new_record(x.size, controller, every, record_powers)
+
+    state = None
+    if compiled and isinstance(controller, FilteredReferenceController) and compiled_parameters(amplifier) is not None:
+        state = controller.compiled_state()
+    if state is not None:
+        status, end = RUNNING, 0
+        step = max(int(fs), 1) if progress else x.size
+        for first in range(0, x.size, step):
+            last = min(first + step, x.size)
+            status, end = run(state, plant, x, d, sensor_noise, limit, record, every or 1, first, last)
+            if progress:
+                progress(end - first)
+            if status != RUNNING:
+                break
+        if end > 0:
+            controller.after_compiled(state)
+        if status == SINGULAR:
+            raise ValueError(f"sample {end}: {NO_SOLUTION}")
+    else:
+        status, end = _run_steps(controller, plant, amplifier, x, d, sensor_noise, limit, record, every or 1, progress)
+    _blank(record, end, every or 1)
+    kept = {"weights": record.weights if every else None, "disturbance_power": None, "secondary_path_gain": None}
+    if record_powers:
+        kept["disturbance_power"], kept["secondary_path_gain"] = record.powers.T
+    return SimulationResult(
+        algorithm=str(getattr(controller, "name", type(controller).__name__)),
+        fs=fs,
+        rated_power=rated_power,
+        reference=x,
+        disturbance=d,
+        error=record.error,
+        control_signal=record.control_signal,
+        amplifier_output=record.amplifier_output,
+        anti_noise=record.anti_noise,
+        constraint_factor=record.constraint_factor,
+        weights_time_s=np.arange(len(record.weights)) * every / fs if every else None,
+        diverged_at_s=end / fs if status == DIVERGED else None,
+        **kept,
+    )
+
+
+def _run_steps(
+    controller: Controller,
+    plant: Plant,
+    amplifier: Amplifier | None,
+    x: np.ndarray,
+    d: np.ndarray,
+    sensor_noise: np.ndarray,
+    limit: float,
+    record: Record,
+    every: int,
+    progress: Callable[[int], Any] | None,
+) -> tuple[int, int]:
+    """The loop of `loop.run`, one call of the controller at a time."""
+    for n in range(x.size):
+        y = float(controller.control_signal(float(measured_reference(plant, x[n]))))
+        if not abs(y) <= limit:
+            return DIVERGED, n
+        y_amplified = y if amplifier is None else float(amplifier(y))
+        a = anti_noise(plant, y_amplified)
+        e = d[n] - a + sensor_noise[n]
+        controller.update(float(e))
+        record.error[n], record.control_signal[n] = e, y
+        record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
+        record.constraint_factor[n] = getattr(controller, "constraint_factor", np.nan)
+        if record.powers.shape[0] > 0:
+            record.powers[n, 0] = getattr(controller, "disturbance_power", np.nan)
+            record.powers[n, 1] = getattr(controller, "secondary_path_gain", np.nan)
+        if record.weights.shape[0] > 0:
+            note_weights(record, np.asarray(controller.weights, dtype=np.float64), every, n)  # type: ignore[attr-defined]
+        if progress:
+            progress(1)
+    return RUNNING, x.size
+
+
+def _disturbance(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
+    if (primary_path is None) == (disturbance is None):
+        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+    if disturbance is not None:
+        return as_signal(disturbance, "disturbance", length=x.size)
+    from scipy.signal import oaconvolve
+
+    return oaconvolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+
+
+def _sensor_noise(n_samples: int, std: float, rng: Any) -> np.ndarray:
+    return std * as_generator(rng).standard_normal(n_samples) if std > 0 else np.zeros(n_samples)
+
+
+def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None, fs: float) -> Plant:
+    secondary = path_taps(secondary_path, fs=fs, name="secondary_path")
+    feedback = np.zeros(0)
+    if feedback_path is not None:
+        feedback = path_taps(feedback_path, fs=fs, name="feedback_path")
+        if feedback[0] != 0:
+            raise ValueError(f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0")
+    parameters = compiled_parameters(amplifier)
+    if parameters is None:  # a user's own: applied in the loop of steps
+        parameters = compiled_parameters(None)
+    assert parameters is not None
+    return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), parameters)
+
+
+def _new_record(n_samples: int, controller: Controller, every: int | None, powers: bool) -> Record:
+    rows = columns = 0
+    if every:
+        if not hasattr(controller, "weights"):
+            raise ValueError("record_weights_every needs a controller with an attribute weights, (L,)")
+        rows, columns = -(-n_samples // every), np.size(controller.weights)
+    signals = (np.empty(n_samples) for _ in range(5))
+    return Record(*signals, powers=np.empty((n_samples if powers else 0, 2)), weights=np.empty((rows, columns)))
+
+
+def _blank(record: Record, end: int, every: int) -> None:
+    """NaN in all that a run which stopped at sample `end` did not reach."""
+    for rows in record[:-1]:
+        rows[end:] = np.nan
+    record.weights[-(-end // every) :] = np.nan
