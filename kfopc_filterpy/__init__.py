@@ -13,28 +13,110 @@ from .estimator import KFOPC
 
 if TYPE_CHECKING:
     from .amplifiers import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier
+    from .causality import CausalityMargin, causality_margin
     from .constraint import OutputPowerConstraint
     from .controllers import Controller, FxLMS, KalmanController, MOVFxLMS, kf_anc, kf_opc
+    from .datasets import DataUnavailableError, MeasuredDuct, load_measured_duct
+    from .duct import DuctPaths, duct_paths
+    from .identification import (
+        IdentificationResult,
+        PathEstimate,
+        estimate_path,
+        identify_secondary_path,
+        misalignment_db,
+        modelling_error_db,
+    )
+    from .measurement_noise import measurement_noise_from_residual, measurement_noise_from_run
+    from .metrics import (
+        clipped_fraction,
+        convergence_time_s,
+        noise_reduction_db,
+        nse_db,
+        output_power,
+        overshoot,
+        peak_control_signal,
+    )
+    from .path_analysis import (
+        achieved_band,
+        frequency_response,
+        group_delay,
+        phase_error,
+        secondary_path_gain,
+    )
+    from .paths import bandpass_path, fir_path, path_taps, perturbed_path
     from .random_walk import RandomWalkKFOPC
+    from .rated_power import RatedPower, required_rated_power
+    from .recordings import read_mat_vector, read_wav, write_wav
+    from .signals import band_limited_noise, compressor_noise, level_jump, scaled_to_power, tone
     from .simulation import SimulationResult, simulate
+    from .spectra import coherence_and_gain, harmonics_db, power_spectrum_db
+    from .wiener import WienerSolution, coherence_bound, power_constrained_solution, wiener_solution
 
 __version__ = "0.1.0"
 
 # Public names and the module each lives in.
 _LAZY = {
+    "CausalityMargin": "causality",
     "Controller": "controllers",
+    "DataUnavailableError": "datasets",
+    "DuctPaths": "duct",
     "FxLMS": "controllers",
     "HardClipAmplifier": "amplifiers",
+    "IdentificationResult": "identification",
     "KalmanController": "controllers",
     "LinearAmplifier": "amplifiers",
     "MOVFxLMS": "controllers",
+    "MeasuredDuct": "datasets",
     "OutputPowerConstraint": "constraint",
+    "PathEstimate": "identification",
     "RandomWalkKFOPC": "random_walk",
+    "RatedPower": "rated_power",
     "SimulationResult": "simulation",
     "SoftSaturationAmplifier": "amplifiers",
+    "WienerSolution": "wiener",
+    "achieved_band": "path_analysis",
+    "band_limited_noise": "signals",
+    "bandpass_path": "paths",
+    "causality_margin": "causality",
+    "clipped_fraction": "metrics",
+    "coherence_and_gain": "spectra",
+    "coherence_bound": "wiener",
+    "compressor_noise": "signals",
+    "convergence_time_s": "metrics",
+    "duct_paths": "duct",
+    "estimate_path": "identification",
+    "fir_path": "paths",
+    "frequency_response": "path_analysis",
+    "group_delay": "path_analysis",
+    "harmonics_db": "spectra",
+    "identify_secondary_path": "identification",
     "kf_anc": "controllers",
     "kf_opc": "controllers",
+    "level_jump": "signals",
+    "load_measured_duct": "datasets",
+    "measurement_noise_from_residual": "measurement_noise",
+    "measurement_noise_from_run": "measurement_noise",
+    "misalignment_db": "identification",
+    "modelling_error_db": "identification",
+    "noise_reduction_db": "metrics",
+    "nse_db": "metrics",
+    "output_power": "metrics",
+    "overshoot": "metrics",
+    "path_taps": "paths",
+    "peak_control_signal": "metrics",
+    "perturbed_path": "paths",
+    "phase_error": "path_analysis",
+    "power_constrained_solution": "wiener",
+    "power_spectrum_db": "spectra",
+    "read_mat_vector": "recordings",
+    "read_wav": "recordings",
+    "required_rated_power": "rated_power",
+    "scaled_to_power": "signals",
+    "secondary_path_gain": "path_analysis",
     "simulate": "simulation",
+    "tone": "signals",
+    "wiener_solution": "wiener",
+    "write_wav": "recordings",
 }
 
 __all__ = ["KFOPC", *sorted(_LAZY)]

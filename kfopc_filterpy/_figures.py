@@ -28,9 +28,7 @@ def new_axes(ax: Any, rows: int = 1) -> Any:
 
         return plt.subplots(rows, 1, figsize=(6.4, 2.4 + 1.6 * rows), sharex=True, layout="constrained")[1]
     if rows > 1 and np.size(ax) != rows:
-        raise ValueError(
-            f"ax must be {rows} axes, one above the other, got {np.size(ax)}; leave it out for new"
-        )
+        raise ValueError(f"ax must be {rows} axes, one above the other, got {np.size(ax)}; leave it out for new")
     return ax
 
 

@@ -30,9 +30,7 @@ def as_pair(first: Any, first_name: str, second: Any, second_name: str) -> tuple
     """Two signals of one run, of the same shape."""
     one, two = as_runs(first, first_name), as_runs(second, second_name)
     if one.shape != two.shape:
-        raise ValueError(
-            f"{first_name} and {second_name} must have one shape, got {one.shape} and {two.shape}"
-        )
+        raise ValueError(f"{first_name} and {second_name} must have one shape, got {one.shape} and {two.shape}")
     return one, two
 
 

@@ -41,7 +41,7 @@ def require_finite(array: Any, name: str) -> None:
 def as_number(value: Any, name: str, *, unit: str = "") -> float:
     """Return `value` as a finite float."""
     unit = f" {unit}" if unit else ""
-    if isinstance(value, str | bytes) or np.ndim(value) != 0 and np.size(value) != 1:
+    if isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}")
     try:
         number = float(np.asarray(value).reshape(()))
@@ -94,9 +94,7 @@ def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a pair (low, high) in Hz, got {band!r}") from error
     if not 0 <= low < high <= fs / 2:
-        raise ValueError(
-            f"{name} must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz"
-        )
+        raise ValueError(f"{name} must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz")
     return low, high
 
 

@@ -51,7 +51,8 @@ class _Amplifier:
         """Output for `signal`, a number or an array of any shape."""
         array = np.asarray(signal, dtype=np.float64)
         out = np.empty(array.size)
-        _amplify_all(*self.parameters, array.reshape(-1), out)
+        kind, limit, sharpness = self.parameters
+        _amplify_all(kind, limit, sharpness, array.reshape(-1), out)
         return out.reshape(array.shape) if array.ndim else float(out[0])
 
 

@@ -26,8 +26,8 @@ class ConstraintState(NamedTuple):
 
     mean: np.ndarray  # (3,) mean squares of disturbance, filtered reference and reference
     lap: np.ndarray  # (3,) sums of squares since the sliding window last wrapped
-    window: np.ndarray  # (3, m) squares in the sliding window; m = 0: exponential
-    count: np.ndarray  # (3,) samples taken
+    window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential
+    taken: np.ndarray  # (3,) samples taken
     settings: np.ndarray  # (2,) rated power, 1 - forgetting factor
     supplied: np.ndarray  # (3,) factor, disturbance power, gain set by the caller; NaN: estimated
     last: np.ndarray  # (3,) factor, disturbance power, gain last used
@@ -36,15 +36,12 @@ class ConstraintState(NamedTuple):
 @njit(cache=True)
 def _next_mean(state, row, square):
     """Mean square with one more sample, unbiased from the first sample on."""
-    n, m, mean = state.count[row], state.window.shape[1], state.mean[row]
+    n, m, mean = state.taken[row], state.window.shape[1], state.mean[row]
     if m == 0:
         return mean + max(state.settings[1], 1.0 / (n + 1)) * (square - mean)
-    if n < m:
-        return mean + (square - mean) / (n + 1)
     position = n % m
-    if position == m - 1:  # a lap of plain sums ends: start from it, so that rounding never accumulates
-        return (state.lap[row] + square) / m
-    return max(mean + (square - state.window[row, position]) / m, 0.0)
+    rest = state.window[row, position + 1] if position + 1 < m else 0.0
+    return (state.lap[row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
 
 
 @njit(cache=True)
@@ -87,9 +84,7 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
 @njit(cache=True)
 def advance_constraint(state, disturbance, filtered_reference, reference):
     """Take this sample into the running powers and return the constraint factor."""
-    factor, power, gain, mean_d, mean_xf, mean_x = preview_constraint(
-        state, disturbance, filtered_reference, reference
-    )
+    factor, power, gain, mean_d, mean_xf, mean_x = preview_constraint(state, disturbance, filtered_reference, reference)
     _take(state, DISTURBANCE, disturbance, mean_d)
     if not np.isnan(reference):
         _take(state, FILTERED_REFERENCE, filtered_reference, mean_xf)
@@ -104,12 +99,14 @@ def _take(state, row, value, mean):
     state.mean[row] = mean
     m = state.window.shape[1]
     if m > 0:
-        position = state.count[row] % m
-        if position == 0:
-            state.lap[row] = 0.0
+        position = state.taken[row] % m
         state.lap[row] += value * value
         state.window[row, position] = value * value
-    state.count[row] += 1
+        if position == m - 1:
+            state.lap[row] = 0.0
+            for i in range(m - 2, -1, -1):
+                state.window[row, i] += state.window[row, i + 1]
+    state.taken[row] += 1
 
 
 class OutputPowerConstraint:
@@ -165,7 +162,7 @@ class OutputPowerConstraint:
             mean=np.zeros(3),
             lap=np.zeros(3),
             window=np.zeros((3, length)),
-            count=np.zeros(3, dtype=np.int64),
+            taken=np.zeros(3, dtype=np.int64),
             settings=np.array([rated_power, -math.expm1(-1.0 / samples)]),
             supplied=np.full(3, np.nan),
             last=np.array([1.0, 0.0, np.nan]),

@@ -33,8 +33,8 @@ TRIANGLE = "triangle"  # P(n|n-1) of the last update: the pass wrote it, only th
 class RandomWalkCovariance:
     """P, P_prior, P_post and the gain of a random-walk filter, each made full when read.
 
-    `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and P_post from
-    it: an `Owed` moment, `TRIANGLE`, or an array where that is no longer possible.
+    `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and
+    P_post from it: an `Owed` moment, `TRIANGLE`, or an array where that is no longer possible.
     """
 
     def __init__(self, P: np.ndarray) -> None:
@@ -77,6 +77,8 @@ class RandomWalkCovariance:
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Eq. 4."""
+        if not np.isfinite(alpha_sq * max(self.now) + state_noise):
+            raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
         self._shown = None
         predict_covariance(self.arrays, alpha_sq, state_noise)
         self.prior = self.now

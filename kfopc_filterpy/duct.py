@@ -13,9 +13,11 @@ from .paths import fir_path
 if TYPE_CHECKING:
     import control
 
-# Share of a synthesised response's energy that may be cut off: -40 dB, which lies below the residual
-# that an active control system of some hundred taps leaves.
-_CUT = 1e-4
+# Share of a response's energy that is cut off where the number of taps is chosen here (-50 dB), and that
+# may be cut off by a given number (-40 dB).
+_CHOSEN_CUT, _ALLOWED_CUT = 1e-5, 1e-4
+# Length of the synthesis. A response that has not decayed by half of it is refused, so it does not alias.
+_N_FFT = 2**16
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,8 @@ def duct_paths(
     loudspeaker_q: float = 0.8,
     electronics_delay_s: float = 0.25e-3,
     speed_of_sound: float = 343.0,
-    primary_taps: int = 1024,
-    secondary_taps: int = 512,
+    primary_taps: int | None = None,
+    secondary_taps: int | None = None,
 ) -> DuctPaths:
     r"""Model a duct with reflecting ends in which plane waves travel, and return its two paths.
 
@@ -81,8 +83,7 @@ def duct_paths(
     resonances cancel, and those of the section beyond the reference microphone stay. The responses are
     sampled with a band limit from 0.4 fs to 0.5 fs.
 
-    With the defaults the cut-off tails hold -62 dB (primary) and -43 dB (secondary) of the energy. Not
-    modelled: cross modes (above ``0.586 c / diameter``) and feedback to the reference microphone.
+    Not modelled: cross modes (above ``0.586 c / diameter``) and feedback to the reference microphone.
 
     Parameters
     ----------
@@ -105,8 +106,9 @@ def duct_paths(
         Delay of converters and filters in the secondary path in s.
     speed_of_sound : float
         Speed of sound c in m/s.
-    primary_taps, secondary_taps : int
-        Lengths of the impulse responses.
+    primary_taps, secondary_taps : int, optional
+        Lengths of the impulse responses; by default the least multiples of 64 that leave out no more than
+        -50 dB of their energy: 832 and 640 for the default duct. Given lengths may leave out -40 dB.
 
     Returns
     -------
@@ -128,7 +130,7 @@ def duct_paths(
     >>> from kfopc_filterpy.paths import path_taps
     >>> duct = duct_paths()
     >>> path_taps(duct.primary).size, path_taps(duct.secondary).size
-    (1024, 512)
+    (832, 640)
     >>> duct.resonances_hz[:3].round(1)
     array([ 39. , 116.9, 194.9])
     """
@@ -139,10 +141,7 @@ def duct_paths(
     speed = as_positive(speed_of_sound, "speed_of_sound", unit="m/s")
     loss = as_nonnegative(attenuation_db_per_m, "attenuation_db_per_m", unit="dB/m") / (20 * np.log10(np.e))
     latency = as_nonnegative(electronics_delay_s, "electronics_delay_s", unit="s")
-    counts = as_count(primary_taps, "primary_taps"), as_count(secondary_taps, "secondary_taps")
-
-    n_fft = 1 << (8 * max(counts)).bit_length()
-    f = np.fft.rfftfreq(n_fft, 1 / fs)
+    f = np.fft.rfftfreq(_N_FFT, 1 / fs)
 
     def travel(distance: float) -> np.ndarray:
         return np.exp(-2j * np.pi * f * distance / speed - (1 + 1j) * loss * distance * np.sqrt(f / 1000))
@@ -159,13 +158,11 @@ def duct_paths(
     secondary = pressure(error_m, loudspeaker_m) * np.exp(-2j * np.pi * f * latency)
     if loudspeaker_resonance_hz is not None:
         relative = f / as_positive(loudspeaker_resonance_hz, "loudspeaker_resonance_hz", unit="Hz")
-        secondary *= -(relative**2) / (
-            1 - relative**2 + 1j * relative / as_positive(loudspeaker_q, "loudspeaker_q")
-        )
+        secondary *= -(relative**2) / (1 - relative**2 + 1j * relative / as_positive(loudspeaker_q, "loudspeaker_q"))
 
     return DuctPaths(
-        primary=fir_path(_sampled(primary, n_fft, counts[0], "primary_taps"), fs, "primary"),
-        secondary=fir_path(_sampled(secondary, n_fft, counts[1], "secondary_taps"), fs, "secondary"),
+        primary=fir_path(_sampled(primary, primary_taps, "primary_taps"), fs, "primary"),
+        secondary=fir_path(_sampled(secondary, secondary_taps, "secondary_taps"), fs, "secondary"),
         fs=fs,
         length_m=length,
         source_m=source_m,
@@ -176,9 +173,7 @@ def duct_paths(
     )
 
 
-def _check_positions(
-    length: float, source: float, reference: float | None, loudspeaker: float, error: float
-) -> None:
+def _check_positions(length: float, source: float, reference: float | None, loudspeaker: float, error: float) -> None:
     """Check that source, reference, loudspeaker and error microphone follow each other along the duct."""
     positions = {"source_m": source, "reference_m": reference, "loudspeaker_m": loudspeaker, "error_m": error}
     placed = {name: as_number(x, name, unit="m") for name, x in positions.items() if x is not None}
@@ -206,20 +201,29 @@ def _check_reflection(reflection: tuple[float, float]) -> tuple[float, float]:
     return near, far
 
 
-def _sampled(response: np.ndarray, n_fft: int, n_taps: int, name: str) -> np.ndarray:
+def _sampled(response: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
     """Impulse response of a frequency response on the grid of `rfft`, band-limited and cut to `n_taps`."""
     position = np.linspace(0.0, 1.0, response.size)
     # Half a cosine from 0.4 fs to 0.5 fs: fractional delays then ring only briefly.
     band_limit = np.where(position < 0.8, 1.0, 0.5 + 0.5 * np.cos(np.pi * (position - 0.8) / 0.2))
-    taps = np.fft.irfft(response * band_limit, n_fft)
-    # What rings before time zero stands, by the circularity of the FFT, at the end of `taps`.
-    lost = np.sum(taps[n_taps:] ** 2) / np.sum(taps**2)
-    if lost > _CUT:
+    taps = np.fft.irfft(response * band_limit, _N_FFT)
+    # Share of the energy from each sample on. What rings before time zero stands, by the circularity of
+    # the FFT, at the end of `taps`, and so counts as left out.
+    left_out = np.cumsum(taps[::-1] ** 2)[::-1] / np.sum(taps**2)
+    enough = 64 * -(-int(np.count_nonzero(left_out > _CHOSEN_CUT)) // 64)
+    chosen = enough if n_taps is None else as_count(n_taps, name)
+    if chosen > _N_FFT // 2:
         raise ValueError(
-            f"{name} = {n_taps} leaves out {10 * np.log10(lost):.1f} dB of the response's energy, more than "
-            f"{10 * np.log10(_CUT):.0f} dB; use more taps, more loss, less reflection or a longer delay"
+            f"{name} must not exceed {_N_FFT // 2}, but {chosen} are needed: the response rings too long, or "
+            "its wave arrives at once and rings before time zero; reflect less, attenuate more or delay more"
         )
-    return taps[:n_taps]
+    if left_out[chosen] > _ALLOWED_CUT:
+        lost_db, allowed_db = 10 * np.log10(left_out[chosen]), 10 * np.log10(_ALLOWED_CUT)
+        raise ValueError(
+            f"{name} = {chosen} leaves out {lost_db:.1f} dB of the response's energy, more than "
+            f"{allowed_db:.0f} dB; leave it to the default, which takes {enough}"
+        )
+    return taps[:chosen]
 
 
 def _resonances(round_trip: float, spacing_hz: float, fs: float) -> np.ndarray:

@@ -2,30 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from copy import deepcopy
 from math import sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from ._validate import as_nonnegative, as_signal, require_finite
+from ._constrained import BatchReferences, ConstraintAttributes
+from ._guards import (
+    all_or_nothing,
+    checked_measurement,
+    require_matrix,
+    require_measurement,
+    require_variance,
+)
+from ._validate import as_number, as_signal, require_finite
 
 if TYPE_CHECKING:
-    from .constraint import OutputPowerConstraint
     from .random_walk import RandomWalkKFOPC
 
 
-class KFOPC(KalmanFilter):
+class KFOPC(KalmanFilter, ConstraintAttributes):
     r"""Kalman filter with output power constraint, a drop-in `filterpy.kalman.KalmanFilter`.
 
     The measurement is scaled by the constraint factor before it corrects the state (eq. 9),
 
     .. math:: \hat w(n|n) = \hat w(n|n-1) + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
 
-    With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
-    what would poison or break that filter (NaN, Inf, a wrong shape, a negative variance) raises before any change.
+    With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except
+    that what would poison or break that filter (NaN, Inf, a wrong shape, a negative variance) raises before
+    any change.
 
     Parameters
     ----------
@@ -69,8 +78,8 @@ class KFOPC(KalmanFilter):
 
     References
     ----------
-    J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo, W.-S. Gan, "Preventing output saturation in active noise control: An
-    output-constrained Kalman filter approach", eq. 1-13.
+    J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo, W.-S. Gan, "Preventing output saturation in active noise control:
+    An output-constrained Kalman filter approach", eq. 1-13.
 
     Examples
     --------
@@ -85,6 +94,12 @@ class KFOPC(KalmanFilter):
     array([[1.]])
     """
 
+    x: Any  # assigned by filterpy, as the rest is
+    y: Any
+    z: Any
+    K: Any
+    _mahalanobis: Any
+
     def __init__(
         self,
         dim_x: int,
@@ -97,9 +112,8 @@ class KFOPC(KalmanFilter):
         power_memory: float | None = None,
         power_window: str = "exponential",
     ) -> None:
-        self._constraint: OutputPowerConstraint | None = None
-        self._unconstrained_factor = 1.0
-        self._batch_references: Iterator[float] | None = None
+        self._constraint, self._unconstrained_factor = None, 1.0
+        self._batch_references: BatchReferences | None = None
         settings = {"fs": fs, "memory": power_memory, "secondary_path_gain": secondary_path_gain}
         self._constraint_settings = {k: v for k, v in settings.items() if v is not None} | {"window": power_window}
         super().__init__(dim_x, dim_z, dim_u)
@@ -116,7 +130,7 @@ class KFOPC(KalmanFilter):
         rated_power: float | None = None,
         **constraint: Any,
     ) -> RandomWalkKFOPC:
-        """Filter of eq. 1-8 for a control filter that is a random walk: F = I, Q = r I, R = q, O(L^2) a sample.
+        """Filter of eq. 1-8 for a control filter that walks at random: F = I, Q = r I, R = q, in O(L^2).
 
         Parameters
         ----------
@@ -164,78 +178,20 @@ class KFOPC(KalmanFilter):
             **constraint,
         )
 
-    # The constraint: what can be read, and supplied by the caller instead.
-
-    @property
-    def rated_power(self) -> float | None:
-        """Rated output power; assign another, or None to lift the constraint."""
-        return None if self._constraint is None else self._constraint.rated_power
-
-    @rated_power.setter
-    def rated_power(self, value: float | None) -> None:
-        if value is None:
-            self._constraint = None
-        elif self._constraint is not None:
-            self._constraint.rated_power = value
-        else:
-            if self.dim_z != 1:
-                raise ValueError(f"a rated power needs one measurement, dim_z = 1, got dim_z = {self.dim_z}")
-            from .constraint import OutputPowerConstraint
-
-            self._constraint = OutputPowerConstraint(value, **self._constraint_settings)
-
-    @property
-    def constraint(self) -> OutputPowerConstraint | None:
-        """The object that keeps the powers and the factor; None without a rated power."""
-        return self._constraint
-
-    @property
-    def constraint_factor(self) -> float:
-        """Factor that scales the measurement; assign a value to hold it, None to follow eq. 13 again."""
-        return self._unconstrained_factor if self._constraint is None else self._constraint.factor
-
-    @constraint_factor.setter
-    def constraint_factor(self, value: float | None) -> None:
-        if self._constraint is not None:
-            self._constraint.factor = value  # type: ignore[assignment]
-        else:
-            self._unconstrained_factor = 1.0 if value is None else as_nonnegative(value, "constraint_factor")
-
-    @property
-    def disturbance_power(self) -> float | None:
-        """Disturbance power delta_d^2 last used (eq. 10), None without a rated power; can be supplied."""
-        return None if self._constraint is None else self._constraint.disturbance_power
-
-    @disturbance_power.setter
-    def disturbance_power(self, value: float | None) -> None:
-        self._require_constraint("disturbance_power").disturbance_power = value  # type: ignore[assignment]
-
-    @property
-    def secondary_path_gain(self) -> float | None:
-        """Secondary-path power gain G_s last used (eq. 11), None before any is known; can be supplied."""
-        return None if self._constraint is None else self._constraint.secondary_path_gain
-
-    @secondary_path_gain.setter
-    def secondary_path_gain(self, value: float | None) -> None:
-        self._require_constraint("secondary_path_gain").secondary_path_gain = value
-
-    def _require_constraint(self, name: str) -> OutputPowerConstraint:
-        if self._constraint is None:
-            raise ValueError(f"{name} takes part only in a constraint: set rated_power first")
-        return self._constraint
-
     # filterpy's steps.
 
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
         """filterpy's `predict`; arguments that would poison the filter raise before any change."""
         n = self.dim_x
-        _require_matrix(self.F if F is None else F, (n, n), "F")
-        _require_variance(self.Q if Q is None else Q, n, "Q")
-        with self._all_or_nothing("predict", u=u, B=self.B if B is None else B):
+        transition = self.F if F is None else F
+        require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
+        require_variance(self.Q if Q is None else Q, n, "Q")
+        used_B = None if u is None else self.B if B is None else B
+        with self._all_or_nothing("predict", u=u, B=used_B):
             super().predict(u, B, F, Q)
 
     def predict_steadystate(self, u: Any = 0, B: Any = None) -> None:
-        """filterpy's `predict_steadystate`; arguments that would poison the filter raise before any change."""
+        """filterpy's `predict_steadystate`; what would poison the filter raises before any change."""
         with self._all_or_nothing("predict_steadystate", u=u, B=self.B if B is None else B):
             super().predict_steadystate(u, B)
 
@@ -245,8 +201,8 @@ class KFOPC(KalmanFilter):
         Parameters
         ----------
         z : float, array_like or None
-            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and no
-            power estimate advances.
+            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
+            no power estimate advances.
         R : float or array_like, optional
             Measurement noise variance of this step; by default `self.R`.
         H : array_like, optional
@@ -258,14 +214,14 @@ class KFOPC(KalmanFilter):
         Raises
         ------
         ValueError
-            NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power with
-            neither a reference nor a secondary-path gain. The filter is as it was and can go on.
+            NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power
+            with neither a reference nor a secondary-path gain. The filter is as it was and can go on.
         """
         reference = self._next_reference(reference)
         if z is None:
             super().update(None)
             return
-        z, R, H = self._checked_measurement(z, R, H)
+        z, R, H = checked_measurement(self, z, R, H)
         self._scaled_step("update", lambda scaled: KalmanFilter.update(self, scaled, R, H), z, H, reference)
 
     def update_steadystate(self, z: Any, *, reference: float | None = None) -> None:
@@ -273,7 +229,7 @@ class KFOPC(KalmanFilter):
         if z is None:
             super().update_steadystate(None)
             return
-        z, _, _ = self._checked_measurement(z, None, None)
+        z, _, _ = checked_measurement(self, z, None, None)
         step = super().update_steadystate
         self._scaled_step("update_steadystate", step, z, None, reference)
 
@@ -282,7 +238,7 @@ class KFOPC(KalmanFilter):
         if z is None:
             super().update_correlated(None)
             return
-        z, R, H = self._checked_measurement(z, R, H)
+        z, R, H = checked_measurement(self, z, R, H)
         step = super().update_correlated
         self._scaled_step("update_correlated", lambda scaled: step(scaled, R, H), z, H, reference)
 
@@ -292,18 +248,20 @@ class KFOPC(KalmanFilter):
         """filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
         if not hasattr(KalmanFilter, "update_sequential"):
             raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
-        require_finite(np.asarray(z_i, dtype=np.float64), "z_i")
-        if H_i is not None:
-            require_finite(np.asarray(H_i, dtype=np.float64), "H_i")
         length = np.size(z_i)
-        _require_variance(self.R[start : start + length, start : start + length] if R_i is None else R_i, length, "R_i")
+        if not 0 <= start <= self.dim_z - length:
+            raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
+        require_measurement(z_i, length)
+        rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
+        require_finite(rows, "H_i")
+        require_variance(self.R[start : start + length, start : start + length] if R_i is None else R_i, length, "R_i")
 
         def step(scaled: Any) -> None:
             # filterpy writes into these four in place: let it write into copies, so that all can be undone
-            self.x, self.y, self.K, self.z = self.x.copy(), self.y.copy(), self.K.copy(), self.z.copy()
+            self.x, self.y, self.K = self.x.copy(), self.y.copy(), self.K.copy()
+            self.z = np.array(self.z).reshape(self.dim_z, 1)
             KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
 
-        rows = (self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x)))
         self._scaled_step("update_sequential", step, z_i, rows, reference, start)
 
     def batch_filter(
@@ -333,25 +291,46 @@ class KFOPC(KalmanFilter):
         -------
         means, covariances, means_predictions, covariances_predictions : ndarray
             As in filterpy.
+
+        Raises
+        ------
+        ValueError
+            As `predict` and `update` do; the filter is then as it was before the batch.
         """
         if references is not None:
-            self._batch_references = iter(as_signal(references, "references", length=len(zs)).tolist())
+            references = BatchReferences(as_signal(references, "references", length=len(zs)))
+        before = self.__getstate__()
+        self._batch_references = references
         try:
-            return super().batch_filter(zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
-        finally:
-            self._batch_references = None
+            result = super().batch_filter(zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
+        except BaseException:
+            self.__dict__.clear()
+            self.__dict__.update(before)
+            raise
+        self._batch_references = None
+        return result
 
     def get_update(self, z: Any = None) -> tuple[np.ndarray, np.ndarray]:
         """filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
-        return super().get_update(None if z is None else self._scaled(z, self.constraint_factor))
+        return super().get_update(None if z is None else self._presently_scaled(z))
 
     def residual_of(self, z: Any) -> np.ndarray:
         """Residual of the measurement scaled by the present factor; nothing changes."""
-        return super().residual_of(self._scaled(z, self.constraint_factor))
+        return super().residual_of(self._presently_scaled(z))
 
     def log_likelihood_of(self, z: Any) -> float:
         """Log-likelihood of the measurement scaled by the present factor; nothing changes."""
-        return super().log_likelihood_of(None if z is None else self._scaled(z, self.constraint_factor))
+        return super().log_likelihood_of(None if z is None else self._presently_scaled(z))
+
+    @property
+    def alpha(self) -> float:
+        """filterpy's fading memory, 1 or above; not the constraint factor."""
+        return super().alpha
+
+    @alpha.setter
+    def alpha(self, value: float) -> None:
+        as_number(as_number(value, "alpha") ** 2, "alpha squared")
+        KalmanFilter.alpha.fset(self, value)
 
     @property
     def mahalanobis(self) -> float:
@@ -360,19 +339,29 @@ class KFOPC(KalmanFilter):
             self._mahalanobis = sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
         return self._mahalanobis
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy starts from; the powers advance in place, so that even a shallow copy needs its own."""
+        return self.__dict__ | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
+
     def __repr__(self) -> str:
         constraint = [
             f"{name} = {getattr(self, name)}"
             for name in ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
         ]
-        return "\n".join([super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint])
+        return "\n".join(
+            [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint]
+        )
 
     # All or nothing: what a step needs checked, and how it is undone.
 
     def _next_reference(self, reference: float | None) -> float | None:
         if reference is None and self._batch_references is not None:
-            return next(self._batch_references)
+            return self._batch_references.next()
         return reference
+
+    def _presently_scaled(self, z: Any) -> Any:
+        require_measurement(z, self.dim_z)
+        return self._scaled(z, self.constraint_factor)
 
     @staticmethod
     def _scaled(z: Any, factor: float) -> Any:
@@ -387,11 +376,13 @@ class KFOPC(KalmanFilter):
         reference: float | None,
         start: int | None = None,
     ) -> None:
-        """Run `step` on the scaled measurement, then let the powers advance; an error leaves all as it was."""
+        """Run `step` on the scaled measurement, then advance the powers; an error leaves all as it was."""
         sample, factor = None, self.constraint_factor
         if self._constraint is not None:
-            newest = np.asarray(self.H if H is None else H).flat[0]
-            sample = (np.asarray(z).reshape(()), newest, reference)
+            row = np.asarray(self.H if H is None else H)
+            if row.size != self.dim_x:
+                raise ValueError(f"a rated power needs one measurement, one row of H, got {row.shape[0]} rows")
+            sample = (np.asarray(z).item(), row.flat[0], reference)
             factor = self._constraint.preview(*sample)
         with self._all_or_nothing(name):
             step(self._scaled(z, factor))
@@ -403,79 +394,5 @@ class KFOPC(KalmanFilter):
         if sample is not None and self._constraint is not None:
             self._constraint.advance(*sample)
 
-    @contextmanager
-    def _all_or_nothing(self, name: str, **arguments: Any) -> Iterator[None]:
-        for argument, value in arguments.items():
-            if value is not None:
-                require_finite(np.asarray(value, dtype=np.float64), argument)
-        before = dict(self.__dict__)
-        try:
-            yield
-            self._require_sound(name)
-        except (ValueError, TypeError) as error:
-            self.__dict__.clear()
-            self.__dict__.update(before)
-            if isinstance(error, np.linalg.LinAlgError):
-                raise ValueError(
-                    f"{name}: S = H P H' + R cannot be inverted ({error}); a silent reference (H = 0) with R = 0 "
-                    "tells nothing: give R > 0, or z=None for a missed sample. Nothing was changed"
-                ) from error
-            shapes = {key: np.shape(value) for key, value in {"x": self.x, "P": self.P, **arguments}.items()}
-            raise type(error)(f"{name}: {error} (shapes: {shapes}). Nothing was changed") from error
-
-    def _require_sound(self, name: str) -> None:
-        """A step must leave x and P of their size, and finite."""
-        n = self.dim_x
-        if np.size(self.x) != n or np.shape(self.P) != (n, n):
-            raise ValueError(f"x would become {np.shape(self.x)} and P {np.shape(self.P)}, for dim_x = {n}")
-        for key in ("x", "P"):
-            if not np.all(np.isfinite(getattr(self, key))):
-                raise ValueError(f"{key} would hold NaN or Inf: look for them in x, P, F, Q, R, H, K before this step")
-
-    def _checked_measurement(self, z: Any, R: Any, H: Any) -> tuple[Any, Any, np.ndarray | None]:
-        """z, R and H as filterpy handles them, or a clear error."""
-        n = self.dim_x
-        given = self.H if H is None else H
-        if H is not None or np.ndim(given) == 1:
-            H = np.asarray(given)
-            H = H.reshape(1, -1) if H.ndim == 1 else H
-            given = H
-        if np.ndim(given) != 2 or np.shape(given)[1] != n:
-            raise ValueError(f"H must have shape ({n},) or (dim_z, {n}), got {np.shape(given)}")
-        require_finite(given, "H")
-        rows = np.shape(given)[0]
-        noise = self.R if R is None else R
-        _require_variance(noise, rows, "R")
-        if np.shape(noise) == (1,):
-            R = np.reshape(noise, (1, 1))
-        return self._checked_z(z, rows, given_row=H is not None), R, H
-
-    def _checked_z(self, z: Any, rows: int, *, given_row: bool) -> Any:
-        values = np.asarray(z)
-        if values.dtype.kind not in "biufc":
-            raise TypeError(f"z must be a number or an array of numbers, or None for a missed sample, got {z!r}")
-        shape = values.shape
-        if values.size != rows or shape not in ((), (rows,), (rows, 1), (1, rows)):
-            raise ValueError(f"z must have {rows} value(s), shape ({rows}, 1) or what converts to it, got shape {shape}")
-        require_finite(values, "z")
-        if not given_row or not shape:
-            return z  # filterpy brings it into shape
-        # filterpy 2.0.0 takes z as it comes where H is given: (rows,) against a column would broadcast
-        wanted = (rows, 1) if np.ndim(self.x) == 2 else (rows,)
-        return z if shape == wanted or (rows == 1 and len(wanted) == 2) else values.reshape(wanted)
-
-
-def _require_matrix(value: Any, shape: tuple[int, int], name: str) -> None:
-    if np.shape(value) != shape:
-        raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
-    require_finite(value, name)
-
-
-def _require_variance(value: Any, size: int, name: str) -> None:
-    """A variance: a number, or (size, size) with no negative value on its diagonal; finite."""
-    if np.ndim(value) > 0 and np.size(value) > 1:
-        _require_matrix(value, (size, size), name)
-    else:
-        require_finite(np.asarray(value, dtype=np.float64), name)
-    if np.min(np.diagonal(value) if np.ndim(value) == 2 else value) < 0:
-        raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")
+    def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
+        return all_or_nothing(self, name, **arguments)

@@ -228,9 +228,7 @@ def _through(sent: np.ndarray, amplifier: Amplifier | None, taps: np.ndarray) ->
     return lfilter(taps, 1.0, amplified)
 
 
-def modelling_error_db(
-    path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None
-) -> np.ndarray:
+def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
     """Modelling error of an estimate over frequency, ``20 log10(|S_est - S| / |S|)``.
 
     Parameters

@@ -1,13 +1,13 @@
-"""Compiled arithmetic of the Kalman filter, pure functions of arrays; nothing here knows of paths or controllers.
+"""Compiled arithmetic of the Kalman filter: pure functions of arrays that know no paths or controllers.
 
 The covariance is kept as the lower triangle of a square array, with what the last step still owes it::
 
     P = scale (T - g g' / S) + diagonal I
 
-``T`` is the stored triangle, ``g`` and ``S`` the last gain direction and innovation variance (eq. 8), ``scale``
-filterpy's fading memory squared and ``diagonal`` the state noise of eq. 4. The debt is paid in the same pass that
-forms ``P x'`` for the next sample, so each element of the triangle is read and written once a sample, and P is
-symmetric because there is only one of each element.
+``T`` is the stored triangle, ``g`` and ``S`` the last gain direction and innovation variance (eq. 8),
+``scale`` filterpy's fading memory squared and ``diagonal`` the state noise of eq. 4. The debt is paid in the
+same pass that forms ``P x'`` for the next sample, so each element of the triangle is read and written once a
+sample, and P is symmetric because there is only one of each element.
 """
 
 from __future__ import annotations
@@ -138,14 +138,24 @@ def correct_weights(w, gain_direction, innovation_over_S):
         w[i] += gain_direction[i] * innovation_over_S
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def correction_is_finite(w, gain_direction, innovation_over_S):
+    """Whether `correct_weights` would leave finite weights."""
+    total = 0.0
+    for i in range(w.size):
+        total += abs(w[i] + gain_direction[i] * innovation_over_S)
+    return np.isfinite(total)
+
+
+@njit(cache=True, error_model="numpy")
 def update_weights(cov, w, h, scaled_measurement, S):
     """Eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
 
-    A non-finite innovation is returned with nothing changed.
+    Where the innovation or a weight would not be finite, NaN is returned with nothing changed.
     """
     y = scaled_measurement - dot(h, w)
-    if np.isfinite(y):
-        correct_weights(w, cov.product, y / S)
-        downdate_covariance(cov, S)
+    if not correction_is_finite(w, cov.product, y / S):
+        return np.nan
+    correct_weights(w, cov.product, y / S)
+    downdate_covariance(cov, S)
     return y

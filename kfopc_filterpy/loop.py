@@ -128,6 +128,18 @@ def adapt(controller, error, y):
     return True
 
 
+@njit(cache=True, nogil=True)
+def listen(controller, references, errors):
+    """Follow the noise with the loudspeaker silent: delay lines and powers advance, the weights stay."""
+    s = controller.secondary_estimate
+    for n in range(references.size):
+        push(controller.reference, references[n])
+        push(controller.filtered, dot(s, newest(controller.reference, s.size)))
+        push(controller.output, 0.0)
+        d = disturbance_estimate(controller, errors[n])
+        advance_constraint(controller.constraint, d, newest(controller.filtered, 1)[0], references[n])
+
+
 class Plant(NamedTuple):
     """The true amplifier and paths."""
 
@@ -170,7 +182,7 @@ def note_weights(record, weights, every, n):
         record.weights[n // every] = weights
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last):
     """Samples `first` to `last` of the loop; returns the status and the sample after the last one run."""
     kind, clip, sharpness = plant.amplifier

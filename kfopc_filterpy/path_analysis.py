@@ -308,9 +308,7 @@ def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None)
     )
 
 
-def _crossing(
-    frequencies: np.ndarray, magnitude: np.ndarray, level: float, inside: int, outside: int
-) -> float:
+def _crossing(frequencies: np.ndarray, magnitude: np.ndarray, level: float, inside: int, outside: int) -> float:
     """Frequency between two grid points at which the magnitude crosses a level."""
     if not 0 <= outside < frequencies.size:
         return float(frequencies[inside])

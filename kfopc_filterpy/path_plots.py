@@ -53,9 +53,7 @@ def _grid(frequencies_hz: Any, paths: Mapping[str, Any], fs: float | None) -> np
     if frequencies_hz is not None:
         return as_signal(frequencies_hz, "frequencies_hz", min_length=2)
     if len(rates) > 1:
-        raise ValueError(
-            f"frequencies_hz must be given for paths of differing sampling rates {sorted(rates)} Hz"
-        )
+        raise ValueError(f"frequencies_hz must be given for paths of differing sampling rates {sorted(rates)} Hz")
     nyquist = rates.pop() / 2
     return np.geomspace(min(20.0, nyquist / 400), 0.999 * nyquist, 2000)
 
@@ -184,9 +182,7 @@ def plot_group_delay(
     return ax
 
 
-def plot_causality_margin(
-    primary: Any, secondary: Any, *, fs: float | None = None, ax: Axes | None = None
-) -> Axes:
+def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = None, ax: Axes | None = None) -> Axes:
     """Impulse responses of both paths with their energy onsets and the margin between them.
 
     Parameters
@@ -213,9 +209,7 @@ def plot_causality_margin(
     ax = new_axes(ax)
     for i, (label, path) in enumerate((("Primary path P", primary), ("Secondary path S", secondary))):
         taps = path_taps(path)
-        ax.plot(
-            1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **line_style(i)
-        )
+        ax.plot(1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **line_style(i))
         ax.axvline(onsets[i], color=line_style(i)["color"], linewidth=0.8)
     ax.annotate("", (onsets[0], -1.2), (onsets[1], -1.2), arrowprops={"arrowstyle": "<->", "color": MARK})
     ax.text(
@@ -409,9 +403,7 @@ def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
     ax = new_axes(ax)
     for i, (label, result) in enumerate(_named(named).items()):
         if not isinstance(result, IdentificationResult):
-            raise TypeError(
-                f"results must hold IdentificationResult, got {type(result).__name__} for {label!r}"
-            )
+            raise TypeError(f"results must hold IdentificationResult, got {type(result).__name__} for {label!r}")
         text = f"{label}: {result.misalignment_db:.1f} dB overall"
         ax.plot(result.frequencies_hz, result.modelling_error_db, label=text, **line_style(i))
     ax.set_ylabel("Modelling error (dB)")

@@ -182,9 +182,7 @@ def finite_taps(system: Any) -> np.ndarray | None:
     return np.concatenate([np.zeros(denominator.size - numerator.size), numerator / denominator[0]])
 
 
-def path_taps(
-    path: Any, *, fs: float | None = None, n_taps: int | None = None, name: str = "path"
-) -> np.ndarray:
+def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, name: str = "path") -> np.ndarray:
     """Return the impulse response of a path as an array, for running it sample by sample.
 
     Parameters

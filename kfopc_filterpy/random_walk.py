@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
+from ._guards import checked_measurement
 from ._validate import as_count, as_nonnegative, require_finite
 from .covariance import RandomWalkCovariance, require_covariance
 from .estimator import KFOPC
@@ -61,13 +63,11 @@ class RandomWalkKFOPC(KFOPC):
         super().__init__(n_taps, 1, rated_power=rated_power, **constraint)
         self.state_noise = state_noise
         self.measurement_noise = measurement_noise
-        self._covariance = RandomWalkCovariance(
-            as_nonnegative(initial_variance, "initial_variance") * np.eye(n_taps)
-        )
+        self._covariance = RandomWalkCovariance(as_nonnegative(initial_variance, "initial_variance") * np.eye(n_taps))
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy makes its own read-only views: copied arrays would be writeable."""
-        return self.__dict__ | {"_views": {}}
+        """A copy makes its own read-only views (copied arrays are writeable) and steps its own covariance."""
+        return super().__getstate__() | {"_views": {}, "_covariance": deepcopy(self._covariance)}
 
     # F, Q, R: numbers, read as matrices.
 
@@ -104,7 +104,7 @@ class RandomWalkKFOPC(KFOPC):
 
     @property
     def Q(self) -> np.ndarray:
-        """State noise covariance r I (read-only) unless a full one was assigned; assign a number to change r."""
+        """State noise covariance r I, read-only unless a full one was assigned; assign a number for r."""
         return self._view("Q", self._state_noise) if self._Q is None else self._Q
 
     @Q.setter
@@ -161,7 +161,8 @@ class RandomWalkKFOPC(KFOPC):
 
     @P.setter
     def P(self, value: Any) -> None:
-        P = self._matrix(value, "P")
+        # to filterpy's equations a number is that variance for every state
+        P = self._matrix(value * np.eye(self.dim_x) if np.ndim(value) == 0 else value, "P")
         if not self._delegating:  # filterpy's own equations leave rounding, which need not be small beside P
             require_covariance(P)
         self._replace_covariance(P)
@@ -211,17 +212,14 @@ class RandomWalkKFOPC(KFOPC):
     def _all_or_nothing(self, name: str, **arguments: Any) -> Iterator[None]:
         """Around filterpy's own equations, which see P, F, Q as full arrays."""
         self._take_in_edits()
-        covariance = self._covariance
-        self._replace_covariance(covariance.show())
-        self._delegating = True
-        try:
-            with super()._all_or_nothing(name, **arguments):
-                yield
-        finally:
+        with super()._all_or_nothing(name, **arguments):
+            self._replace_covariance(self._covariance.show())
+            self._delegating = True
+            yield
             self._delegating = False
 
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
-        """Eq. 2 and 4; a full F or Q, or B with u, goes through filterpy's own equations. See `KFOPC.predict`."""
+        """Eq. 2 and 4; a full F or Q, or B with u, takes filterpy's own equations. See `KFOPC.predict`."""
         # batch_filter passes F and Q as they are read
         F = self._F if F is None or F is self._views.get("F") else F
         Q = self._Q if Q is None or Q is self._views.get("Q") else Q
@@ -250,17 +248,20 @@ class RandomWalkKFOPC(KFOPC):
             self.z = np.array([[None]])
             return
         R = None if R is self._views.get("R") else R
-        z_checked, _, _ = self._checked_measurement(z, R, row)
+        z_checked, _, _ = checked_measurement(self, z, R, row)
         noise = self._measurement_noise if R is None else as_nonnegative(R, "R")
         weights, y, S = self._corrected(
-            float(np.asarray(z_checked).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1), reference
+            float(np.asarray(z_checked).reshape(())),
+            noise,
+            np.array(row, dtype=np.float64).reshape(-1),
+            reference,
         )
         self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
         self._record(weights.reshape(np.shape(self.x)), np.full((1,) * np.ndim(self.x), y))
         self.z = np.array(z).reshape(self.y.shape)
 
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> tuple[Any, float, float]:
-        """Eq. 5-9 on the arrays; returns the new weights, the residual and S. Refusals come before any change."""
+        """Eq. 5-9 on the arrays: the new weights, the residual and S. Refusals come before any change."""
         constraint = self._constraint
         factor = self.constraint_factor if constraint is None else constraint.preview(z, h[0], reference)
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
@@ -268,15 +269,19 @@ class RandomWalkKFOPC(KFOPC):
             raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
         if noise == 0 and not h.any():
             raise ValueError(
-                "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
-                "Nothing was changed"
+                "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed "
+                "sample. Nothing was changed"
             )
         S = self._covariance.project(h) + noise
         if not 0 < S < np.inf:
-            raise ValueError(f"S = H P H' + R must be positive, got {S:g}: P is not positive definite on H. Nothing was changed")
+            raise ValueError(
+                f"S = H P H' + R must be positive, got {S:g}: P is not positive definite on H. Nothing was changed"
+            )
+        y = float(update_weights(self._covariance.arrays, weights, h, factor * z, S))
+        if not np.isfinite(y):
+            raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
         if constraint is not None:
             constraint.advance(z, h[0], reference)
-        y = float(update_weights(self._covariance.arrays, weights, h, factor * z, S))
         return weights, y, S
 
     def _record(self, x: np.ndarray, y: np.ndarray) -> None:
@@ -288,14 +293,14 @@ class RandomWalkKFOPC(KFOPC):
     # A whole signal at compiled speed: the arrays go out, and come back advanced.
 
     def compiled_state(self) -> tuple[Covariance, tuple[float, float, float]] | None:
-        """The covariance arrays and (r, q, fading alpha squared); None where steps take filterpy's equations."""
+        """The covariance arrays and (r, q, fading alpha squared); None where filterpy's equations step."""
         if self._F is not None or self._Q is not None:
             return None
         self._take_in_edits()
         return self._covariance.arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
 
     def after_compiled(self, weights: np.ndarray, z: float, y: float) -> None:
-        """Take back the arrays after at least one sample: `weights`, the last measurement and its residual."""
+        """Take back the arrays after one sample or more: `weights`, the last measurement, its residual."""
         S = self._covariance.after_compiled()
         self._K = None
         self.S, self.SI = np.array([[S]]), np.array([[1.0 / S]])

@@ -27,23 +27,31 @@ class ReadOnlyMatrix(np.ndarray):
         self.attribute = getattr(source, "attribute", "")
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        if method == "at" or any(out is self for out in kwargs.get("out", ())):
-            raise self._refusal()
-        plain = [np.asarray(value) if isinstance(value, ReadOnlyMatrix) else value for value in inputs]
-        return getattr(ufunc, method)(*plain, **kwargs)
+        written = inputs[:1] if method == "at" else kwargs.get("out", ())
+        for array in written:
+            _require_writeable(array)
+        if "out" in kwargs:
+            kwargs["out"] = tuple(_plain(array) for array in written)
+        return getattr(ufunc, method)(*map(_plain, inputs), **kwargs)
 
     def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
         try:
-            return super().__array_function__(function, types, args, kwargs)
+            return _plain(super().__array_function__(function, types, args, kwargs))
         except ValueError as error:  # np.fill_diagonal, np.copyto, ...
             raise (self._refusal() if "read-only" in str(error) else error) from error
 
     def __setitem__(self, key: Any, value: Any) -> None:
-        raise self._refusal()
+        _require_writeable(self)
+        super().__setitem__(key, value)
 
     def fill(self, value: Any) -> None:
         """Refused, as any in-place write."""
-        raise self._refusal()
+        _require_writeable(self)
+        super().fill(value)
+
+    def copy(self, order: Any = "C") -> np.ndarray:  # type: ignore[override]
+        """A plain array, which can be written into and then assigned."""
+        return np.array(self, order=order)
 
     def _refusal(self) -> ValueError:
         name = self.attribute
@@ -52,3 +60,13 @@ class ReadOnlyMatrix(np.ndarray):
             f"assign instead, kf.{name} = value"
             + (" (a full array hands the steps to filterpy's equations)" if name in ("F", "Q") else "")
         )
+
+
+def _plain(value: Any) -> Any:
+    """A `ReadOnlyMatrix` as a plain view, anything else as it is."""
+    return value.view(np.ndarray) if isinstance(value, ReadOnlyMatrix) else value
+
+
+def _require_writeable(array: Any) -> None:
+    if isinstance(array, ReadOnlyMatrix) and not array.flags.writeable:
+        raise array._refusal()

@@ -119,12 +119,9 @@ def read_wav(
         raise ValueError(f"{path} cannot be read as a WAV file: {error}") from error
     if fs is not None and file_fs != as_positive(fs, "fs", unit="Hz"):
         raise ValueError(
-            f"{path} is sampled at {file_fs} Hz, expected fs = {fs:g} Hz; "
-            "resample it (scipy.signal.resample_poly)"
+            f"{path} is sampled at {file_fs} Hz, expected fs = {fs:g} Hz; resample it (scipy.signal.resample_poly)"
         )
-    return as_signal(_full_scale(_one_channel(samples, channel, path)), f"the signal of {path}"), float(
-        file_fs
-    )
+    return as_signal(_full_scale(_one_channel(samples, channel, path)), f"the signal of {path}"), float(file_fs)
 
 
 def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: float | None = None) -> None:
@@ -173,8 +170,7 @@ def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: flo
     largest = np.max(np.abs(samples))
     if largest > full_scale:
         raise ValueError(
-            f"signal reaches {largest:g}, beyond peak = {full_scale:g}; "
-            "raise peak, or limit the signal with np.clip"
+            f"signal reaches {largest:g}, beyond peak = {full_scale:g}; raise peak, or limit the signal with np.clip"
         )
     wavfile.write(path, round(rate), np.round(samples / full_scale * 32767).astype(np.int16))
 

@@ -30,6 +30,7 @@ _LOBE_GAIN_DB = 10.0
 _LINE_SPREAD_DB = 3.0
 # Load and speed of a machine wander over about half a second.
 _FLUCTUATION_TIME_S = 0.5
+_BROADBAND_FROM_HZ = 20.0
 
 
 def tone(
@@ -70,9 +71,7 @@ def tone(
     n_samples = _sample_count(duration_s, fs)
     frequency = as_positive(frequency_hz, "frequency_hz", unit="Hz")
     if frequency >= fs / 2:
-        raise ValueError(
-            f"frequency_hz must be below fs/2 = {fs / 2:g} Hz, got {frequency:g} Hz; raise fs or lower it"
-        )
+        raise ValueError(f"frequency_hz must be below fs/2 = {fs / 2:g} Hz, got {frequency:g} Hz; raise fs or lower it")
     peak = as_nonnegative(amplitude, "amplitude")
     phase = as_number(phase_rad, "phase_rad", unit="rad")
     return peak * np.sin(2 * np.pi * frequency / fs * np.arange(n_samples) + phase)
@@ -206,7 +205,11 @@ def compressor_noise(
         raise ValueError(
             f"broadband_ratio must be below 1, got {share:g}; band_limited_noise makes noise without lines"
         )
-    band = as_band((20.0, bandwidth_hz), fs, "bandwidth_hz as (20, bandwidth_hz)")
+    upper = as_positive(bandwidth_hz, "bandwidth_hz", unit="Hz")
+    if not _BROADBAND_FROM_HZ < upper <= fs / 2:
+        raise ValueError(
+            f"bandwidth_hz must be above {_BROADBAND_FROM_HZ:g} Hz and at most fs/2 = {fs / 2:g} Hz, got {upper:g} Hz"
+        )
 
     orders = np.arange(1, as_count(n_harmonics, "n_harmonics") + 1)
     shaft = as_positive(shaft_hz, "shaft_hz", unit="Hz")
@@ -224,7 +227,7 @@ def compressor_noise(
     lines = _modulated_lines(orders, levels, speed, level_std, fs, generator)
     signal = scaled_to_power(lines, 1 - share)
     if share > 0:
-        signal = signal + scaled_to_power(_broadband(band, n_samples, fs, generator), share)
+        signal = signal + scaled_to_power(_broadband(upper, n_samples, fs, generator), share)
     return scaled_to_power(signal, power)
 
 
@@ -262,8 +265,7 @@ def level_jump(signal: Any, at_s: float, gain_db: float, *, fs: float) -> np.nda
     first = round(as_nonnegative(at_s, "at_s", unit="s") * rate)
     if first >= jumped.size:
         raise ValueError(
-            f"at_s must lie within the signal of {jumped.size / rate:g} s, got {at_s:g} s; "
-            "make the signal longer"
+            f"at_s must lie within the signal of {jumped.size / rate:g} s, got {at_s:g} s; make the signal longer"
         )
     jumped[first:] *= 10 ** (as_number(gain_db, "gain_db", unit="dB") / 20)
     return jumped
@@ -326,9 +328,7 @@ def _envelope(frequencies: np.ndarray) -> np.ndarray:
     return 2 * relative / (1 + relative**2)
 
 
-def _line_amplitudes(
-    orders: np.ndarray, shaft: float, lobes: int, generator: np.random.Generator
-) -> np.ndarray:
+def _line_amplitudes(orders: np.ndarray, shaft: float, lobes: int, generator: np.random.Generator) -> np.ndarray:
     """Mean amplitude of each shaft harmonic."""
     gain_db = _LOBE_GAIN_DB * (orders % lobes == 0) + _LINE_SPREAD_DB * generator.standard_normal(orders.size)
     return _envelope(orders * shaft) * 10 ** (gain_db / 20)
@@ -363,18 +363,16 @@ def _slow_process(n_samples: int, fs: float, generator: np.random.Generator) -> 
     return lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], white, zi=state)[0]
 
 
-def _broadband(
-    band: tuple[float, float], n_samples: int, fs: float, generator: np.random.Generator
-) -> np.ndarray:
-    """Noise inside `band` with the compressor's envelope."""
+def _broadband(upper: float, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
+    """Noise from 20 Hz to `upper` with the compressor's envelope."""
 
     def gain(frequencies: np.ndarray) -> np.ndarray:
-        return _envelope(frequencies) * ((frequencies >= band[0]) & (frequencies <= band[1]))
+        return _envelope(frequencies) * ((frequencies >= _BROADBAND_FROM_HZ) & (frequencies <= upper))
 
     noise = _shaped_noise(gain, n_samples, fs, generator)
     if not np.any(noise):
         raise ValueError(
             f"duration_s = {n_samples / fs:g} s is too short for the broadband part, "
-            f"{band[0]:g} to {band[1]:g} Hz: take at least {1 / (band[1] - band[0]):g} s"
+            f"{_BROADBAND_FROM_HZ:g} to {upper:g} Hz: take at least {1 / (upper - _BROADBAND_FROM_HZ):g} s"
         )
     return noise

@@ -16,6 +16,7 @@ from .loop import (
     DIVERGED,
     RUNNING,
     SINGULAR,
+    ControllerState,
     Plant,
     Record,
     anti_noise,
@@ -27,6 +28,7 @@ from .loop import (
 from .paths import path_taps
 
 DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
+PROGRESS_STEP = 16000  # samples between two reports of progress
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,7 @@ def simulate(
     rated_power: float | None = None,
     sensor_noise_std: float = 0.0,
     rng: Any = None,
+    switch_on_s: float = 0.0,
     feedback_path: Any = None,
     record_weights_every: int | None = None,
     record_powers: bool = False,
@@ -128,6 +131,9 @@ def simulate(
         Standard deviation of white noise at the error microphone.
     rng : int or numpy.random.Generator, optional
         Seed of the sensor noise, needed where there is any.
+    switch_on_s : float, default 0
+        Time at which the control is switched on. Until then the loudspeaker is silent and the controller listens
+        (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts there.
     feedback_path : array_like or control.TransferFunction, optional
         Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
     record_weights_every : int, optional
@@ -174,32 +180,24 @@ def simulate(
         rated_power = as_positive(rated_power, "rated_power")
     limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
+    on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     plant = _plant(secondary_path, feedback_path, amplifier, fs)
-    record = _new_record(x.size, controller, every, record_powers)
+    record = _new_record(x.size - on, controller, every, record_powers)
+    if on:
+        _listen(controller, x[:on], (d + sensor_noise)[:on])
+        x, d, sensor_noise = x[on:], d[on:], sensor_noise[on:]
 
-    state = None
+    signals = (x, d, sensor_noise)
     if compiled and isinstance(controller, FilteredReferenceController) and compiled_parameters(amplifier) is not None:
         state = controller.compiled_state()
-    if state is not None:
-        status, end = RUNNING, 0
-        step = max(int(fs), 1) if progress else x.size
-        for first in range(0, x.size, step):
-            last = min(first + step, x.size)
-            status, end = run(state, plant, x, d, sensor_noise, limit, record, every or 1, first, last)
-            if progress:
-                progress(end - first)
-            if status != RUNNING:
-                break
-        if end > 0:
-            controller.after_compiled(state)
-        if status == SINGULAR:
-            raise ValueError(f"sample {end}: {NO_SOLUTION}")
     else:
-        status, end = _run_steps(controller, plant, amplifier, x, d, sensor_noise, limit, record, every or 1, progress)
+        state = None
+    if isinstance(controller, FilteredReferenceController) and state is not None:
+        status, end = _run_compiled(controller, state, plant, signals, limit, record, every or 1, progress)
+    else:
+        status, end = _run_steps(controller, plant, amplifier, signals, limit, record, every or 1, progress)
     _blank(record, end, every or 1)
-    kept = {"weights": record.weights if every else None, "disturbance_power": None, "secondary_path_gain": None}
-    if record_powers:
-        kept["disturbance_power"], kept["secondary_path_gain"] = record.powers.T
+    powers = record.powers.T if record_powers else (None, None)
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,
@@ -211,25 +209,59 @@ def simulate(
         amplifier_output=record.amplifier_output,
         anti_noise=record.anti_noise,
         constraint_factor=record.constraint_factor,
+        weights=record.weights if every else None,
         weights_time_s=np.arange(len(record.weights)) * every / fs if every else None,
+        disturbance_power=powers[0],
+        secondary_path_gain=powers[1],
         diverged_at_s=end / fs if status == DIVERGED else None,
-        **kept,
     )
+
+
+def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
+    if not hasattr(controller, "listen"):
+        raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+    controller.listen(x, errors)
+
+
+def _run_compiled(
+    controller: FilteredReferenceController,
+    state: ControllerState,
+    plant: Plant,
+    signals: tuple[np.ndarray, np.ndarray, np.ndarray],
+    limit: float,
+    record: Record,
+    every: int,
+    progress: Callable[[int], Any] | None,
+) -> tuple[int, int]:
+    """`loop.run`, some samples at a time where progress is shown."""
+    n_samples = signals[0].size
+    step = PROGRESS_STEP if progress else n_samples
+    status, end = RUNNING, 0
+    for first in range(0, n_samples, step):
+        status, end = run(state, plant, *signals, limit, record, every, first, min(first + step, n_samples))
+        if progress:
+            progress(end - first)
+        if status != RUNNING:
+            break
+    if end > 0:
+        controller.after_compiled(state)
+    if status == SINGULAR:
+        raise ValueError(f"sample {end}: {NO_SOLUTION}")
+    return status, end
 
 
 def _run_steps(
     controller: Controller,
     plant: Plant,
     amplifier: Amplifier | None,
-    x: np.ndarray,
-    d: np.ndarray,
-    sensor_noise: np.ndarray,
+    signals: tuple[np.ndarray, np.ndarray, np.ndarray],
     limit: float,
     record: Record,
     every: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
     """The loop of `loop.run`, one call of the controller at a time."""
+    x, d, sensor_noise = signals
     for n in range(x.size):
         y = float(controller.control_signal(float(measured_reference(plant, x[n]))))
         if not abs(y) <= limit:
@@ -271,7 +303,9 @@ def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None,
     if feedback_path is not None:
         feedback = path_taps(feedback_path, fs=fs, name="feedback_path")
         if feedback[0] != 0:
-            raise ValueError(f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0")
+            raise ValueError(
+                f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0"
+            )
     parameters = compiled_parameters(amplifier)
     if parameters is None:  # a user's own: applied in the loop of steps
         parameters = compiled_parameters(None)
@@ -280,13 +314,15 @@ def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None,
 
 
 def _new_record(n_samples: int, controller: Controller, every: int | None, powers: bool) -> Record:
+    if n_samples < 1:
+        raise ValueError("switch_on_s must leave samples to control: it takes the whole signal")
     rows = columns = 0
     if every:
         if not hasattr(controller, "weights"):
             raise ValueError("record_weights_every needs a controller with an attribute weights, (L,)")
         rows, columns = -(-n_samples // every), np.size(controller.weights)
-    signals = (np.empty(n_samples) for _ in range(5))
-    return Record(*signals, powers=np.empty((n_samples if powers else 0, 2)), weights=np.empty((rows, columns)))
+    e, y, y_amplified, a, factor = np.empty((5, n_samples))
+    return Record(e, y, y_amplified, a, factor, np.empty((n_samples if powers else 0, 2)), np.empty((rows, columns)))
 
 
 def _blank(record: Record, end: int, every: int) -> None:

@@ -26,9 +26,7 @@ class CoherenceAndGain(NamedTuple):
     gain: float
 
 
-def harmonics_db(
-    error: Any, disturbance: Any, fundamental_hz: float, fs: float, *, steady: float = 0.5
-) -> float:
+def harmonics_db(error: Any, disturbance: Any, fundamental_hz: float, fs: float, *, steady: float = 0.5) -> float:
     """Power of the error at 2 to 10 times the fundamental, over the disturbance's power at the fundamental.
 
     A line's power is the sum over the main lobe (4 bins to each side) of a Blackman-Harris-windowed Fourier
@@ -84,8 +82,7 @@ def harmonics_db(
     centres = centres[centres + _LOBE_BINS <= (e.shape[1] - 1) // 2]
     if centres.size == 0:
         raise ValueError(
-            f"fundamental_hz must leave its second harmonic below fs/2 = {rate / 2:g} Hz, "
-            f"got {fundamental_hz:g} Hz"
+            f"fundamental_hz must leave its second harmonic below fs/2 = {rate / 2:g} Hz, got {fundamental_hz:g} Hz"
         )
     harmonics = np.sum(_line_powers(e, centres))
     fundamental = _line_powers(d, np.array([round(bins_per_harmonic)]))[0]

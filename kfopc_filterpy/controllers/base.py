@@ -6,11 +6,11 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from .._validate import as_count, as_number
+from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, compiled_parameters
 from ..constraint import FACTOR, GAIN, POWER, ConstraintState, OutputPowerConstraint
 from ..kernels import new_covariance
-from ..loop import ControllerState, adapt, control_signal, delay_line
+from ..loop import ControllerState, adapt, control_signal, delay_line, listen
 from ..paths import path_taps
 
 NO_SOLUTION = (
@@ -23,8 +23,9 @@ NO_SOLUTION = (
 class Controller(Protocol):
     """What `simulate` drives: two calls a sample. A user's own needs nothing else.
 
-    An optional attribute `constraint_factor` is recorded where there is one, and `weights`, (L,), where they are
-    asked for.
+    Optional: `constraint_factor`, `disturbance_power` and `secondary_path_gain` are recorded where there are such
+    attributes, `weights`, (L,), where they are asked for; `name` names the result; `listen(references, errors)` follows
+    the noise before the control is switched on.
     """
 
     def control_signal(self, reference: float) -> float:
@@ -61,7 +62,12 @@ class FilteredReferenceController:
     name = "controller"
 
     def __init__(
-        self, kind: int, n_taps: int, secondary_path: Any, settings: list[float], amplifier: Amplifier | None = None
+        self,
+        kind: int,
+        n_taps: int,
+        secondary_path: Any,
+        settings: list[float],
+        amplifier: Amplifier | None = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         secondary = path_taps(secondary_path, name="secondary_path")
@@ -117,6 +123,20 @@ class FilteredReferenceController:
         """Adapt to the error e(n) that the last control signal left."""
         if not adapt(self._state, as_number(error, "error"), self._y):
             raise ValueError(NO_SOLUTION)
+
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+        """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
+
+        Parameters
+        ----------
+        references, errors : ndarray
+            (n_samples,) reference, and the error microphone's signal while the loudspeaker is silent.
+        """
+        listen(
+            self._state,
+            as_signal(references, "references"),
+            as_signal(errors, "errors", length=len(references)),
+        )
 
     def compiled_state(self) -> ControllerState | None:
         """State for the compiled loop, which advances it; None where only the steps above can run."""

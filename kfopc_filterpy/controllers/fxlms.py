@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from .._validate import as_positive
-from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
 from ..loop import LMS
 from .base import FilteredReferenceController
@@ -102,7 +101,11 @@ class MOVFxLMS(FxLMS):
     ) -> None:
         super().__init__(n_taps, secondary_path, step_size=step_size)
         self.constraint = OutputPowerConstraint(
-            rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
+            rated_power,
+            secondary_path_gain=secondary_path_gain,
+            fs=fs,
+            memory=power_memory,
+            window=power_window,
         )
         self._state = self._state._replace(constraint=self.constraint.state)
 

@@ -9,7 +9,7 @@ from filterpy.kalman import KalmanFilter
 
 from .._validate import as_number
 from ..amplifiers import Amplifier
-from ..constraint import FACTOR
+from ..constraint import FACTOR, ConstraintState
 from ..estimator import KFOPC
 from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate, newest
 from ..random_walk import RandomWalkKFOPC
@@ -54,7 +54,12 @@ class KalmanController(FilteredReferenceController):
     """
 
     def __init__(
-        self, estimator: KalmanFilter, secondary_path: Any, *, amplifier: Amplifier | None = None, name: str | None = None
+        self,
+        estimator: KalmanFilter,
+        secondary_path: Any,
+        *,
+        amplifier: Amplifier | None = None,
+        name: str | None = None,
     ) -> None:
         if not isinstance(estimator, KalmanFilter):
             raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
@@ -116,14 +121,22 @@ class KalmanController(FilteredReferenceController):
         if compiled is None:
             return None
         covariance, settings = compiled
-        if estimator.constraint is not None:
-            constraint = estimator.constraint.state
-        else:
-            constraint = unconstrained()
-            constraint.supplied[FACTOR] = estimator.constraint_factor
         self._state.settings[:] = settings
         self._state.weights[:] = self.weights
-        return self._state._replace(covariance=covariance, constraint=constraint)
+        return self._state._replace(covariance=covariance, constraint=self._constraint_state())
+
+    def _constraint_state(self) -> ConstraintState:
+        constraint = getattr(self.estimator, "constraint", None)
+        if constraint is not None:
+            return constraint.state
+        state = unconstrained()
+        state.supplied[FACTOR] = self.constraint_factor
+        return state
+
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+        """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
+        self._state = self._state._replace(constraint=self._constraint_state())
+        super().listen(references, errors)
 
     def after_compiled(self, state: ControllerState) -> None:
         """Give the estimator the weights, residual and gain of the last sample."""
@@ -164,7 +177,10 @@ def kf_anc(
     'KF-ANC'
     """
     estimator = KFOPC.random_walk(
-        n_taps, state_noise=state_noise, measurement_noise=measurement_noise, initial_variance=initial_variance
+        n_taps,
+        state_noise=state_noise,
+        measurement_noise=measurement_noise,
+        initial_variance=initial_variance,
     )
     return KalmanController(estimator, secondary_path, amplifier=amplifier)
 

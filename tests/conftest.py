@@ -1,0 +1,44 @@
+"""Fixtures that any test may ask for, and the settings all tests run with."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+
+# Figures are drawn without a display, in subprocesses too; set here, before anything imports matplotlib.
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+# The same examples on every run, and no deadline, since a first call may compile.
+# For new random examples: `pytest --hypothesis-profile default`.
+settings.register_profile(
+    "ci",
+    derandomize=True,
+    deadline=None,
+    database=None,
+    print_blob=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.load_profile("ci")
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A random generator with the same seed in every test."""
+    return np.random.default_rng(20241225)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of measured paths and noise: `KFOPC_DATA`, else `../shared/data` beside the checkout."""
+    named = os.environ.get("KFOPC_DATA")
+    folder = Path(named) if named else ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        setting = f"KFOPC_DATA={named}" if named else "KFOPC_DATA is not set"
+        pytest.skip(f"no measured data: {setting}, and {folder} is not a folder")
+    return folder

@@ -1,0 +1,272 @@
+"""Eq. 10-13: running powers and the constraint factor, against sums taken afresh at every sample.
+
+The tolerances are relative and a few thousand roundings (1e-12): a window holds up to some hundred squares,
+summed in another order here.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kfopc_filterpy import OutputPowerConstraint
+
+FS = 1000.0
+CLOSE = 1e-12
+
+values = st.floats(-1e3, 1e3, allow_subnormal=False).map(lambda v: 0.0 if abs(v) < 1e-6 else v)
+
+
+def constraint(samples: float, window: str = "exponential", **kwargs: float) -> OutputPowerConstraint:
+    """A constraint whose memory is `samples` samples."""
+    return OutputPowerConstraint(kwargs.pop("rated_power", 1.0), fs=FS, memory=samples / FS, window=window, **kwargs)
+
+
+def direct_power(x: np.ndarray, n: int, samples: float, window: str) -> float:
+    """Mean square after sample n, from the definition."""
+    if window == "sliding":
+        return float(np.mean(x[max(n + 1 - round(samples), 0) : n + 1] ** 2))
+    forgetting, mean = math.exp(-1.0 / samples), 0.0
+    for k in range(n + 1):
+        gain = max(1.0 - forgetting, 1.0 / (k + 1))
+        mean = (1.0 - gain) * mean + gain * float(x[k]) ** 2
+    return mean
+
+
+def signals(n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Disturbance, filtered reference, reference."""
+    rng = np.random.default_rng(seed)
+    return 3.0 * rng.normal(size=n), 0.5 * rng.normal(size=n), rng.normal(size=n)
+
+
+@pytest.mark.parametrize("window", ["exponential", "sliding"])
+@pytest.mark.parametrize("samples", [1, 2, 7, 50])
+def test_powers_gain_and_factor_follow_eq_10_to_13(window: str, samples: int) -> None:
+    ours = constraint(samples, window, rated_power=0.8)
+    d, xf, x = signals(160)
+    for n in range(d.size):
+        factor = ours.advance(d[n], xf[n], x[n])
+        power, filtered, reference = (direct_power(s, n, samples, window) for s in (d, xf, x))
+        assert ours.disturbance_power == pytest.approx(power, rel=CLOSE)
+        assert ours.secondary_path_gain == pytest.approx(filtered / reference, rel=CLOSE)
+        assert factor == pytest.approx(min(math.sqrt(0.8 * filtered / reference / power), 1.0), rel=CLOSE)
+        assert ours.factor == factor
+
+
+@given(x=st.lists(values, min_size=1, max_size=60), samples=st.integers(1, 12), sliding=st.booleans())
+def test_any_signal_any_memory(x: list[float], samples: int, sliding: bool) -> None:
+    window = "sliding" if sliding else "exponential"
+    ours = constraint(samples, window, secondary_path_gain=1.0)
+    for n, value in enumerate(x):
+        ours.advance(value)
+        assert ours.disturbance_power == pytest.approx(direct_power(np.array(x), n, samples, window), rel=CLOSE)
+
+
+@given(x=st.lists(values, min_size=1, max_size=40))
+def test_the_start_is_a_plain_mean(x: list[float]) -> None:
+    """While 1/(n+1) > 1-λ, whatever the window."""
+    for window in ("exponential", "sliding"):
+        ours = constraint(50, window, secondary_path_gain=1.0)
+        for n, value in enumerate(x):
+            ours.advance(value)
+            assert ours.disturbance_power == pytest.approx(np.mean(np.square(x[: n + 1])), rel=CLOSE)
+
+
+def test_the_exponential_window_forgets_with_its_time_constant() -> None:
+    ours = constraint(100, secondary_path_gain=1.0)
+    for _ in range(1000):
+        ours.advance(2.0)
+    for _ in range(100):
+        ours.advance(0.0)
+    assert ours.disturbance_power == pytest.approx(4.0 * math.exp(-1.0), rel=CLOSE)
+
+
+@pytest.mark.parametrize("switch", [1000, 1037, 1099])
+def test_the_sliding_window_keeps_no_rounding(switch: int) -> None:
+    """Loud, then 300 dB softer: once the loud part has left the window nothing of it remains.
+
+    A running sum with the oldest square taken off it would keep 1e30 * 1e-16.
+    """
+    samples = 100
+    x = np.random.default_rng(1).normal(size=switch + 3 * samples)
+    x[:switch] *= 1e15
+    ours = constraint(samples, "sliding", secondary_path_gain=1.0)
+    for n in range(x.size):
+        ours.advance(x[n])
+        if n >= switch:
+            assert ours.disturbance_power == pytest.approx(direct_power(x, n, samples, "sliding"), rel=CLOSE)
+
+
+def test_the_sliding_window_does_not_drift_in_a_long_run() -> None:
+    x = np.random.default_rng(2).normal(size=200_000)
+    ours = constraint(333, "sliding", secondary_path_gain=1.0)
+    for n in range(x.size):
+        ours.advance(x[n])
+        if n % 1117 == 0:
+            assert ours.disturbance_power == pytest.approx(direct_power(x, n, 333, "sliding"), rel=1e-13)
+
+
+@pytest.mark.parametrize("window", ["exponential", "sliding"])
+def test_preview_is_advance_without_the_change(window: str) -> None:
+    ours = constraint(5, window)
+    for d, xf, x in zip(*signals(30), strict=True):
+        before = pickle.dumps(ours)
+        expected = ours.preview(d, xf, x)
+        assert pickle.dumps(ours) == before
+        assert ours.advance(d, xf, x) == expected
+    assert pickle.dumps(ours) != before
+
+
+def test_no_disturbance_gives_1() -> None:
+    ours = constraint(10, secondary_path_gain=1e-6)
+    assert ours.advance(0.0) == 1.0
+    assert ours.disturbance_power == 0.0
+    assert ours.advance(1e-200) == 1.0  # its square is no normal number
+    assert ours.advance(1.0) == pytest.approx(math.sqrt(1e-6 * 3), rel=CLOSE)
+    ours.disturbance_power = 0.0
+    assert ours.advance(1.0) == 1.0
+
+
+def test_a_silent_reference_gives_the_last_gain_or_1() -> None:
+    ours = constraint(3, "sliding")
+    assert ours.secondary_path_gain is None
+    assert ours.advance(10.0, 0.0, 0.0) == 1.0  # no gain known yet
+    ours.advance(10.0, 2.0, 4.0)
+    assert ours.secondary_path_gain == 0.25
+    for _ in range(5):  # the reference leaves the window
+        factor = ours.advance(10.0, 0.0, 0.0)
+    assert ours.secondary_path_gain == 0.25
+    assert factor == pytest.approx(math.sqrt(0.25 / 100.0), rel=CLOSE)
+    ours.advance(10.0, 3.0, 1.0)
+    assert ours.secondary_path_gain == 9.0
+
+
+def test_a_sample_without_reference_leaves_the_powers_of_the_reference() -> None:
+    ours, other = constraint(4), constraint(4)
+    for c in (ours, other):
+        c.advance(1.0, 2.0, 4.0)
+    ours.secondary_path_gain = 7.0
+    ours.advance(5.0, 9.0)
+    ours.secondary_path_gain = None
+    other.advance(5.0, 0.5, 1.0)
+    ours.advance(1.0, 0.5, 1.0)
+    assert ours.secondary_path_gain == other.secondary_path_gain
+
+
+def test_what_is_supplied_takes_part_until_it_is_taken_back() -> None:
+    ours, untouched = constraint(10), constraint(10)
+    d, xf, x = signals(30)
+    for n in range(10):
+        ours.advance(d[n], xf[n], x[n])
+        untouched.advance(d[n], xf[n], x[n])
+    ours.disturbance_power, ours.secondary_path_gain = 16.0, 4.0
+    assert ours.advance(d[10], xf[10], x[10]) == 0.5
+    assert (ours.disturbance_power, ours.secondary_path_gain) == (16.0, 4.0)
+    ours.factor = 0.125
+    assert ours.factor == ours.advance(d[11], xf[11], x[11]) == 0.125
+    ours.factor = ours.disturbance_power = ours.secondary_path_gain = None
+    for n in (10, 11, 12):
+        untouched.advance(d[n], xf[n], x[n])
+    assert ours.advance(d[12], xf[12], x[12]) == untouched.factor  # the powers went on all the while
+    assert ours.disturbance_power == untouched.disturbance_power
+    assert ours.secondary_path_gain == untouched.secondary_path_gain
+
+
+def test_a_reference_is_needed_unless_the_gain_or_the_factor_is_supplied() -> None:
+    ours = constraint(10)
+    for method in (ours.advance, ours.preview):
+        with pytest.raises(ValueError, match=r"reference=.*secondary_path_gain"):
+            method(1.0, 1.0)
+    ours.factor = 0.5
+    assert ours.advance(1.0) == 0.5
+    ours.factor, ours.secondary_path_gain = None, 1.0
+    ours.advance(1.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e200, "loud", [1.0, 2.0], None])
+@pytest.mark.parametrize("position", [0, 1, 2])
+def test_a_bad_sample_changes_nothing(bad: object, position: int) -> None:
+    ours = constraint(10)
+    ours.advance(1.0, 2.0, 3.0)
+    before = pickle.dumps(ours)
+    sample: list = [1.0, 2.0, 3.0]
+    sample[position] = bad
+    with pytest.raises((ValueError, TypeError), match=r"measurement|reference"):
+        ours.advance(*sample)
+    assert pickle.dumps(ours) == before
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"rated_power": 0.0}, {"rated_power": -1.0}, {"rated_power": math.nan}, {"rated_power": math.inf},
+        {"secondary_path_gain": 0.0}, {"secondary_path_gain": -1.0}, {"fs": 0.0}, {"memory": 0.0},
+        {"memory": math.inf}, {"window": "hann"},
+    ],
+)  # fmt: skip
+def test_settings_out_of_range(kwargs: dict) -> None:
+    with pytest.raises(ValueError, match=next(iter(kwargs))):
+        OutputPowerConstraint(**{"rated_power": 1.0} | kwargs)
+
+
+@pytest.mark.parametrize(
+    ("name", "bad"),
+    [
+        ("factor", -0.1),
+        ("factor", math.nan),
+        ("disturbance_power", -1.0),
+        ("secondary_path_gain", 0.0),
+        ("rated_power", -2.0),
+    ],
+)
+def test_assignments_out_of_range(name: str, bad: float) -> None:
+    ours = constraint(10, secondary_path_gain=1.0)
+    before = pickle.dumps(ours)
+    with pytest.raises(ValueError, match=name):
+        setattr(ours, name, bad)
+    assert pickle.dumps(ours) == before
+
+
+def test_the_memory_is_in_seconds() -> None:
+    """The same signal, held twice as long at twice the rate, leaves the same power."""
+    powers = []
+    for fs in (8000.0, 16000.0):
+        ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory=0.01)
+        for level, seconds in ((2.0, 0.2), (1.0, 0.01)):
+            for _ in range(round(seconds * fs)):
+                ours.advance(level)
+        powers.append(ours.disturbance_power)
+    assert powers[0] == pytest.approx(powers[1], rel=CLOSE)
+    assert powers[0] == pytest.approx(1.0 + 3.0 * math.exp(-1.0), rel=CLOSE)
+
+
+def test_a_bias_free_start_scales_a_steady_tone_right_at_once() -> None:
+    """A start from zero underestimates the power: the factor is far too large for long."""
+    fs, memory, samples = 16000.0, 0.5, 800
+    tone = 4.0 * np.sin(2 * np.pi * 400 / fs * np.arange(samples) + 0.3)
+    ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory=memory)
+    right = math.sqrt(1.0 / 8.0)
+    from_zero, forgetting = 0.0, math.exp(-1 / (fs * memory))
+    for value in tone:
+        factor = ours.advance(value)
+        from_zero = forgetting * from_zero + (1 - forgetting) * value**2
+    assert factor == pytest.approx(right, rel=0.01)  # 20 periods, of which the last is whole
+    assert min(math.sqrt(1.0 / from_zero), 1.0) > 2 * right
+
+
+@pytest.mark.parametrize("window", ["exponential", "sliding"])
+def test_a_copy_goes_on_by_itself(window: str) -> None:
+    ours = constraint(5, window)
+    d, xf, x = signals(20)
+    for n in range(8):
+        ours.advance(d[n], xf[n], x[n])
+    clones = [copy.deepcopy(ours), pickle.loads(pickle.dumps(ours))]
+    expected = [ours.advance(d[n], xf[n], x[n]) for n in range(8, 20)]
+    for clone in clones:
+        assert [clone.advance(d[n], xf[n], x[n]) for n in range(8, 20)] == expected

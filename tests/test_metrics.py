@@ -1,0 +1,371 @@
+"""Figures of merit against direct sums and closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy import metrics
+from kfopc_filterpy.metrics import (
+    clipped_fraction,
+    coherence_and_gain,
+    convergence_time_s,
+    harmonics_db,
+    noise_reduction_db,
+    nse_db,
+    output_power,
+    overshoot,
+    peak_control_signal,
+    power_spectrum_db,
+)
+
+FS = 16000
+
+
+def noise(n, seed=0):
+    return np.random.default_rng(seed).standard_normal(n)
+
+
+def sine(frequency, n, amplitude=1.0, phase=0.0):
+    return amplitude * np.sin(2 * np.pi * frequency / FS * np.arange(n) + phase)
+
+
+# ---- NSE
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 7, 80, 100, 101, 500])
+def test_nse_is_the_direct_sum_over_the_window_that_ends_with_the_sample(window):
+    e, d = noise(101, 1), noise(101, 2)
+    expected = [
+        10
+        * np.log10(
+            np.sum(e[max(0, n - window + 1) : n + 1] ** 2) / np.sum(d[max(0, n - window + 1) : n + 1] ** 2)
+        )
+        for n in range(101)
+    ]
+    # Two orders of summation of up to 101 positive terms: rounding below 1e-13 relative, 1e-12 dB.
+    np.testing.assert_allclose(nse_db(e, d, FS, window / FS), expected, rtol=0, atol=1e-11)
+
+
+def test_nse_default_window_is_5_ms():
+    e, d = noise(400, 1), noise(400, 2)
+    np.testing.assert_array_equal(nse_db(e, d, FS), nse_db(e, d, FS, 80 / FS))
+
+
+def test_nse_keeps_a_small_residual_after_a_huge_transient():
+    # Differences of running sums would leave rounding of 1e16 * 1e-16 = 1 here, over a residual of 1e-12.
+    e = np.concatenate([np.full(500, 1e8), np.full(500, 1e-6)])
+    np.testing.assert_allclose(nse_db(e, np.ones(1000), FS)[580:], -120.0, rtol=0, atol=1e-9)
+
+
+def test_nse_of_several_runs_sums_over_runs():
+    e, d = noise((3, 200), 1), noise((3, 200), 2)
+    pooled_e, pooled_d = np.sqrt(np.sum(e**2, axis=0)), np.sqrt(np.sum(d**2, axis=0))
+    np.testing.assert_allclose(nse_db(e, d, FS), nse_db(pooled_e, pooled_d, FS), rtol=0, atol=1e-10)
+
+
+def test_nse_is_nan_exactly_where_its_window_sees_nan_or_silence():
+    e, d = np.ones(40), np.ones(40)
+    e[20] = np.nan
+    curve = nse_db(e, d, 1000, 0.005)
+    assert np.flatnonzero(np.isnan(curve)).tolist() == [20, 21, 22, 23, 24]
+    d[:10] = 0.0
+    assert np.flatnonzero(np.isnan(nse_db(np.ones(40), d, 1000, 0.005))).tolist() == list(range(10))
+
+
+def test_perfect_cancellation_is_minus_infinity_without_a_warning():
+    assert np.all(nse_db(np.zeros(10), np.ones(10), FS) == -np.inf)
+    assert noise_reduction_db(np.zeros(10), np.ones(10)) == np.inf
+
+
+@given(st.floats(1e-3, 1e3), st.integers(1, 60), st.integers(1, 200), st.integers(0, 2**32 - 1))
+@settings(max_examples=60, deadline=None)
+def test_nse_does_not_change_when_both_signals_are_scaled(scale, window, n, seed):
+    e, d = noise(n, seed), noise(n, seed + 1)
+    curve = nse_db(e, d, FS, window / FS)
+    np.testing.assert_allclose(nse_db(scale * e, scale * d, FS, window / FS), curve, rtol=0, atol=1e-9)
+    # Scaling the error alone moves the curve by the scale's level.
+    np.testing.assert_allclose(
+        nse_db(scale * e, d, FS, window / FS), curve + 20 * np.log10(scale), rtol=0, atol=1e-9
+    )
+
+
+# ---- noise reduction, power, peaks
+
+
+def test_noise_reduction_is_of_the_second_half():
+    e, d = noise(1001, 1), noise(1001, 2)
+    assert noise_reduction_db(e, d) == pytest.approx(
+        -10 * math.log10(sum(e[500:] ** 2) / sum(d[500:] ** 2)), abs=1e-10
+    )
+    assert noise_reduction_db(e, d, steady=1.0) == pytest.approx(-nse_db(e, d, FS, 1.0)[-1], abs=1e-10)
+
+
+@given(st.floats(-60.0, 60.0))
+def test_noise_reduction_of_a_scaled_disturbance_is_the_scale(level):
+    d = noise(200)
+    assert noise_reduction_db(d * 10 ** (-level / 20), d) == pytest.approx(level, abs=1e-10)
+
+
+def test_output_power_is_the_mean_square_of_the_steady_portion():
+    y = noise(1000)
+    assert output_power(y) == pytest.approx(math.fsum(y[500:] ** 2) / 500, rel=1e-13)
+    assert output_power(y, steady=0.25) == pytest.approx(math.fsum(y[750:] ** 2) / 250, rel=1e-13)
+    runs = np.array([y, 2 * y])
+    assert output_power(runs) == pytest.approx(2.5 * output_power(y), rel=1e-13)
+
+
+def test_a_single_sample_is_its_own_steady_portion():
+    assert output_power([3.0]) == 9.0
+    assert peak_control_signal([1.0, -2.0], steady=1e-9) == 2.0
+
+
+def test_overshoot_is_the_highest_full_window():
+    y = np.concatenate([sine(400, 1600, 2.0), sine(400, 14400, 1.0)])
+    # Whole periods fill the window, so its power is 2.0 at the start, 0.5 after.
+    assert overshoot(y, 0.5, FS) == pytest.approx(4.0, rel=1e-12)
+    assert overshoot(np.array([y, 3 * y]), 0.5, FS) == pytest.approx(36.0, rel=1e-12)
+    # One sample of a burst at the very start must not count as a window of its own.
+    burst = np.concatenate([[10.0], np.zeros(1599)])
+    assert overshoot(burst, 1.0, FS, window_s=0.05) == pytest.approx(100 / 800, rel=1e-12)
+
+
+def test_overshoot_window_longer_than_the_run_is_the_run():
+    y = noise(100)
+    assert overshoot(y, 1.0, FS, window_s=10.0) == pytest.approx(np.mean(y**2), rel=1e-12)
+
+
+def test_clipped_fraction_of_a_sine_is_the_arc_cosine():
+    y = sine(37.0, 160000, 2.0)
+    # abs(2 sin) > 1 for 2/3 of a period; 185 periods of steady portion, an edge of 4 samples in each.
+    assert clipped_fraction(y, 1.0) == pytest.approx(2 / 3, abs=1e-3)
+    assert clipped_fraction(np.clip(y, -1.0, 1.0), 1.0) == 0.0
+
+
+def test_peak_is_of_the_steady_portion_unless_told_otherwise():
+    y = [5.0, 0.0, -3.0, 1.0]
+    assert peak_control_signal(y) == 3.0
+    assert peak_control_signal(y, steady=1.0) == 5.0
+
+
+# ---- harmonics
+
+
+@pytest.mark.parametrize("fundamental", [400.0, 397.3, 123.45])
+def test_harmonics_of_known_lines_also_between_bins(fundamental):
+    n = 32000
+    d = sine(fundamental, n, 2.0)
+    e = sine(fundamental, n, 1.0, 0.4)
+    for order, amplitude in ((2, 0.02), (3, 0.1), (10, 0.05)):
+        e = e + sine(order * fundamental, n, amplitude, order)
+    e = e + sine(11 * fundamental, n, 0.5)
+    expected = 10 * math.log10((0.02**2 + 0.1**2 + 0.05**2) / 2.0**2)
+    # The power beyond the four bins of the main lobe, and leakage, are below 1e-6.
+    assert harmonics_db(e, d, fundamental, FS) == pytest.approx(expected, abs=1e-4)
+
+
+def test_harmonics_of_a_hard_clip_are_the_fourier_series():
+    # 40 samples a period; the sampled clip's series is the discrete Fourier series of one period.
+    d = sine(400, 16000, 1.5)
+    clipped = np.clip(d, -1.0, 1.0)
+    series = 2 * np.abs(np.fft.fft(clipped[:40]) / 40) ** 2
+    expected = 10 * math.log10(np.sum(series[2:11]) / (1.5**2 / 2))
+    assert harmonics_db(d - clipped, d, 400.0, FS) == pytest.approx(expected, abs=1e-9)
+
+
+def test_harmonics_leak_floor_is_below_minus_100_db():
+    for frequency in np.linspace(16, 25, 20):
+        angle = 2 * np.pi * frequency / 640 * np.arange(640)
+        # The hardest case: the fewest periods that are accepted.
+        assert harmonics_db(np.sin(angle + 1.0), np.sin(angle), frequency, 640, steady=1.0) < -100
+
+
+def test_harmonics_above_half_the_sampling_rate_are_left_out():
+    d = sine(3000, 16000)
+    assert harmonics_db(d + sine(6000, 16000, 0.1), d, 3000.0, FS) == pytest.approx(-20.0, abs=1e-6)
+
+
+def test_harmonics_average_power_over_runs():
+    d = sine(400, 16000)
+    e = np.array([sine(800, 16000, 0.1), sine(800, 16000, 0.3)])
+    expected = 10 * math.log10((0.1**2 + 0.3**2) / 2)
+    assert harmonics_db(e, np.array([d, d]), 400.0, FS) == pytest.approx(expected, abs=1e-6)
+
+
+# ---- convergence time
+
+
+def test_convergence_time_of_an_exponential_decay_is_the_closed_form():
+    fs, n = 1000, 4000
+    t = np.arange(n) / fs
+    # NSE falls by 20 dB a second down to a floor of -40 dB.
+    e = np.maximum(10 ** (-t), 10**-2.0)
+    # Within 3 dB of -40 dB from (40 - 3) / 20 = 1.85 s on; one sample of rounding.
+    assert convergence_time_s(e, np.ones(n), fs, window_s=0.001) == pytest.approx(1.85, abs=0.0011)
+
+
+def test_convergence_counts_from_the_last_excursion():
+    e = np.where(np.arange(2000) < 100, 1.0, 0.1)
+    e[500:510] = 1.0
+    assert convergence_time_s(e, np.ones(2000), 1000, window_s=0.001) == 0.51
+    # Going below the steady value by more than the tolerance is an excursion as well.
+    e[700:710] = 0.01
+    assert convergence_time_s(e, np.ones(2000), 1000, window_s=0.001) == 0.71
+
+
+def test_convergence_is_zero_where_nothing_happens_and_nan_where_it_never_settles():
+    d = noise(1000)
+    assert convergence_time_s(0.5 * d, d, FS) == 0.0
+    e = np.ones(1000)
+    e[-1] = 10.0
+    assert math.isnan(convergence_time_s(e, np.ones(1000), 1000, window_s=0.001))
+    assert convergence_time_s(np.r_[np.ones(10), np.zeros(90)], np.ones(100), 1000, window_s=0.001) == 0.01
+
+
+def test_convergence_of_noise_needs_runs_or_a_window():
+    n, tau = 5 * FS, 0.1
+    decay = np.exp(-np.arange(n) / FS / tau)
+    d, floor = noise((8, n), 1), noise((8, n), 2)
+    e = decay * d + 0.1 * floor
+    # exp(-2 t / tau) + 0.01 is 3 dB above 0.01.
+    true_time = -tau / 2 * math.log(0.01 * (10**0.3 - 1))
+    # A window delays by at most its length; eight runs leave a spread of about 0.02 s.
+    measured = convergence_time_s(e, d, FS, window_s=0.02)
+    assert true_time - 0.02 < measured < true_time + 0.04
+    measured = convergence_time_s(e[0], d[0], FS, window_s=0.1)
+    assert true_time - 0.05 < measured < true_time + 0.15
+
+
+# ---- coherence and spectra
+
+
+def test_coherence_of_signal_and_noise_is_the_power_ratio():
+    n = 40 * FS
+    d, other = noise(n, 1), noise(n, 2)
+    coherence, gain = coherence_and_gain(d, 0.5 * d + 0.25 * other, FS, (200.0, 2000.0), steady=1.0)
+    # Signal power 0.25 over 0.25 + 0.0625; 1200 half-overlapping segments bias it by less than 1e-3.
+    assert coherence == pytest.approx(0.8, abs=3e-3)
+    # Relative error 0.5 / sqrt(72000 independent values in the band), five of them.
+    assert gain == pytest.approx(0.5, abs=0.005)
+
+
+def test_coherence_gain_is_that_of_the_band_only():
+    n = 2 * FS
+    low, high = sine(500, n), sine(5000, n)
+    _, gain = coherence_and_gain(low + high, 0.5 * low + 9.0 * high, FS, (300.0, 700.0))
+    # Leakage of the Hann window over 70 bins: below 1e-10 of the power.
+    assert gain == pytest.approx(0.5, abs=1e-6)
+
+
+def test_coherence_of_unrelated_signals_is_near_zero():
+    d, a = noise((2, 10 * FS), 1), noise((2, 10 * FS), 2)
+    coherence, gain = coherence_and_gain(d, a, FS, (200.0, 2000.0))
+    assert coherence < 0.01
+    assert abs(gain) < 0.02
+
+
+def test_density_integrates_to_the_power():
+    x = noise(20 * FS)
+    f, level = power_spectrum_db(x, FS, steady=1.0)
+    assert f[0] == 0
+    assert f[-1] == FS / 2
+    # 2e5 independent values: the windowed estimate of the power is within 1 %.
+    assert np.sum(10 ** (level / 10)) * (f[1] - f[0]) == pytest.approx(np.mean(x**2), rel=0.02)
+
+
+def test_spectrum_of_silence_and_of_short_signals():
+    assert np.all(power_spectrum_db(np.zeros(4000), FS)[1] == -np.inf)
+    f, level = power_spectrum_db(noise(60), FS)
+    assert f.shape == level.shape == (16,)
+
+
+# ---- divergence, silence, refusals
+
+
+def test_a_diverged_run_gives_nan_everywhere_without_a_warning():
+    d = sine(400, 16000)
+    e = np.where(np.arange(16000) < 9000, d, np.nan)
+    assert np.isnan(nse_db(e, d, FS)[9000:]).all()
+    figures = [
+        noise_reduction_db(e, d),
+        output_power(e),
+        overshoot(e, 1.0, FS),
+        clipped_fraction(e, 1.0),
+        peak_control_signal(e),
+        harmonics_db(e, d, 400.0, FS),
+        convergence_time_s(e, d, FS),
+        *coherence_and_gain(d, e, FS, (200.0, 2000.0), segment_s=0.01),
+        power_spectrum_db(e, FS)[1][5],
+    ]
+    assert np.isnan(figures).all()
+    assert all(type(figure) is float for figure in figures[:-1])
+
+
+def test_silent_disturbance_gives_nan_without_a_warning():
+    e, silence = sine(400, 2 * FS), np.zeros(2 * FS)
+    figures = [
+        noise_reduction_db(e, silence),
+        harmonics_db(e, silence, 400.0, FS),
+        convergence_time_s(e, silence, FS),
+        *coherence_and_gain(silence, e, FS, (200.0, 2000.0)),
+    ]
+    assert np.isnan(figures).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: nse_db([], [], FS), ValueError, r"error must have at least one sample"),
+        (lambda: nse_db([1.0], [1.0, 2.0], FS), ValueError, r"error and disturbance must have one shape"),
+        (lambda: nse_db([1.0], [1.0], FS, 1e-6), ValueError, r"window_s must be at least one sample"),
+        (lambda: nse_db([1.0], [1.0], 0.0), ValueError, r"fs must be greater than 0"),
+        (lambda: nse_db([np.inf], [1.0], FS), ValueError, r"error must hold finite numbers"),
+        (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be an array of real numbers, got list"),
+        (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be an array of real numbers, got complex"),
+        (lambda: nse_db(np.ones((1, 1, 1)), [1.0], FS), ValueError, r"error must be \(n_samples,\) or"),
+        (
+            lambda: noise_reduction_db([1.0], [1.0], steady=0.0),
+            ValueError,
+            r"steady must be a portion above 0",
+        ),
+        (
+            lambda: noise_reduction_db([1.0], [1.0], steady=1.5),
+            ValueError,
+            r"steady must be a portion above 0",
+        ),
+        (lambda: output_power([]), ValueError, r"control_signal must have at least one sample"),
+        (lambda: overshoot([1.0], 0.0, FS), ValueError, r"rated_power must be greater than 0"),
+        (lambda: clipped_fraction([1.0], -1.0), ValueError, r"limit must be greater than 0"),
+        (lambda: harmonics_db(np.ones(80), np.ones(80), 400.0, FS), ValueError, r"at least 16 periods"),
+        (
+            lambda: harmonics_db(np.ones(999), np.ones(999), 5e3, FS),
+            ValueError,
+            r"second harmonic below fs/2",
+        ),
+        (
+            lambda: convergence_time_s([1.0], [1.0], FS, tolerance_db=0),
+            ValueError,
+            r"tolerance_db must be greater",
+        ),
+        (
+            lambda: coherence_and_gain(np.ones(999), np.ones(999), FS, (200, 2000)),
+            ValueError,
+            r"at least 8 segments",
+        ),
+        (
+            lambda: coherence_and_gain(np.ones(FS), np.ones(FS), FS, (201, 202), segment_s=0.01),
+            ValueError,
+            r"holds no frequency bin",
+        ),
+        (lambda: power_spectrum_db([1.0], FS, scaling="power"), ValueError, r"scaling must be one of"),
+    ],
+)
+def test_refusals_say_what_was_wrong(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
+
+
+def test_every_public_name_exists():
+    assert all(hasattr(metrics, name) for name in metrics.__all__)

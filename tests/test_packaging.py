@@ -1,0 +1,115 @@
+"""What a user meets before any filter runs: metadata, import cost, pinned versions, the README's commands."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.resources
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+import kfopc_filterpy
+
+ROOT = Path(__file__).resolve().parents[1]
+DISTRIBUTION = "kfopc-filterpy"
+SET_UP = "python3 -m venv .venv && .venv/bin/python -m pip install -q -c constraints.txt -e"
+README_COMMANDS = [
+    f'{SET_UP} ".[test]" && .venv/bin/python -m pytest',
+    f'{SET_UP} ".[studies]" && .venv/bin/python -m comparisons',
+]
+LOADED_WHEN_FIRST_USED = ("control", "matplotlib", "numba", "pooch", "tqdm")
+
+
+def read(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def pins() -> dict[str, str]:
+    """Return the version of each package that constraints.txt pins, by normalised name."""
+    lines = [line for line in read("constraints.txt").splitlines() if line and not line.startswith("#")]
+    pairs = [line.split("==") for line in lines]
+    assert all(len(pair) == 2 for pair in pairs), "every line of constraints.txt is name==version"
+    versions = {str(canonicalize_name(name)): version for name, version in pairs}
+    assert len(versions) == len(lines), "constraints.txt names a package twice"
+    return versions
+
+
+def requirements() -> list[Requirement]:
+    """Return what pyproject.toml asks for, extras included, the package itself left out."""
+    project = tomllib.loads(read("pyproject.toml"))["project"]
+    groups = [project["dependencies"], *project["optional-dependencies"].values()]
+    parsed = [Requirement(line) for group in groups for line in group]
+    return [requirement for requirement in parsed if requirement.name != DISTRIBUTION]
+
+
+@pytest.mark.parametrize("statement", ["import kfopc_filterpy", "from kfopc_filterpy import KFOPC"])
+def test_import_leaves_heavy_modules_for_later_and_warns_of_nothing(statement):
+    code = f"import sys; {statement}; print(*sorted(set(sys.modules) & set({LOADED_WHEN_FIRST_USED})))"
+    command = [sys.executable, "-W", "error", "-c", code]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.split() == [], f"{statement} loads {run.stdout.strip()}"
+
+
+@pytest.mark.parametrize("name", kfopc_filterpy.__all__)
+def test_public_names_resolve_and_are_listed(name):
+    assert getattr(kfopc_filterpy, name) is not None
+    assert name in dir(kfopc_filterpy)
+
+
+def test_public_names_are_listed_once():
+    assert len(set(kfopc_filterpy.__all__)) == len(kfopc_filterpy.__all__)
+
+
+def test_unknown_name_raises_attribute_error():
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = kfopc_filterpy.no_such_name
+
+
+def test_package_is_typed():
+    assert (importlib.resources.files("kfopc_filterpy") / "py.typed").is_file()
+
+
+def test_version_is_the_same_everywhere():
+    version = kfopc_filterpy.__version__
+    cited = re.search(r"^version: *[\"']?([^\"'\s]+)", read("CITATION.cff"), flags=re.MULTILINE)
+    assert importlib.metadata.version(DISTRIBUTION) == version
+    assert tomllib.loads(read("pyproject.toml"))["project"]["version"] == version
+    assert cited is not None
+    assert cited[1] == version
+    assert version in read("CHANGELOG.md")
+
+
+def test_every_requirement_is_pinned_within_its_range():
+    versions = pins()
+    for requirement in requirements():
+        name = str(canonicalize_name(requirement.name))
+        assert name in versions, f"constraints.txt does not pin {name}"
+        assert versions[name] in requirement.specifier, f"{name}=={versions[name]} is not {requirement}"
+
+
+def test_everything_an_install_brings_is_pinned():
+    """Follow the requirements of what is installed, from this package's own down to the last."""
+    versions = pins()
+    waiting, seen = [str(canonicalize_name(requirement.name)) for requirement in requirements()], set()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        for line in importlib.metadata.requires(name) or []:
+            requirement = Requirement(line)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                waiting.append(str(canonicalize_name(requirement.name)))
+    assert seen <= set(versions), f"constraints.txt does not pin {sorted(seen - set(versions))}"
+
+
+@pytest.mark.parametrize("command", README_COMMANDS)
+def test_readme_states_the_command_on_a_line_of_its_own(command):
+    assert command in [line.strip() for line in read("README.md").splitlines()]
