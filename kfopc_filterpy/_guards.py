@@ -11,6 +11,11 @@ from filterpy.kalman import KalmanFilter
 
 from ._validate import require_finite
 
+SILENT_REFERENCE = (
+    "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
+    "Nothing was changed"
+)
+
 
 @contextmanager
 def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[None]:
@@ -30,10 +35,7 @@ def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[No
         kf.__dict__.clear()
         kf.__dict__.update(before)
         if isinstance(error, np.linalg.LinAlgError):
-            raise ValueError(
-                f"{name}: S = H P H' + R cannot be inverted ({error}); a silent reference (H = 0) with R = 0 "
-                "tells nothing: give R > 0, or z=None for a missed sample. Nothing was changed"
-            ) from error
+            raise ValueError(f"{name}: S = H P H' + R cannot be inverted ({error}); {SILENT_REFERENCE}") from error
         if not isinstance(error, ValueError | TypeError):
             raise
         shapes = {key: np.shape(value) for key, value in {"x": kf.x, "P": kf.P, **arguments}.items()}
@@ -50,7 +52,7 @@ def _require_sound(kf: KalmanFilter) -> None:
         if not np.all(np.isfinite(getattr(kf, key))):
             raise ValueError(
                 f"{key} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, "
-                "H, M, K before this step, or for a silent reference (H = 0) with R = 0"
+                "H, M, K before this step"
             )
 
 

@@ -26,7 +26,10 @@ def amplify(kind, limit, sharpness, y):
     if kind == HARD_CLIP:
         return min(max(y, -limit), limit)
     if kind == SOFT_SATURATION:
-        return y / (1.0 + (abs(y) / limit) ** (2.0 * sharpness)) ** (0.5 / sharpness)
+        ratio = abs(y) / limit
+        if ratio <= 1.0:
+            return y / (1.0 + ratio ** (2.0 * sharpness)) ** (0.5 / sharpness)
+        return math.copysign(limit, y) / (1.0 + ratio ** (-2.0 * sharpness)) ** (0.5 / sharpness)  # no power overflows
     return y
 
 
@@ -88,7 +91,7 @@ class HardClipAmplifier(_Amplifier):
     kind: ClassVar[int] = HARD_CLIP
 
     def __post_init__(self) -> None:
-        as_positive(self.limit, "limit")
+        object.__setattr__(self, "limit", as_positive(self.limit, "limit"))
 
 
 @dataclass(frozen=True)
@@ -118,15 +121,16 @@ class SoftSaturationAmplifier(_Amplifier):
     kind: ClassVar[int] = SOFT_SATURATION
 
     def __post_init__(self) -> None:
-        as_positive(self.limit, "limit")
-        as_positive(self.sharpness, "sharpness")
+        object.__setattr__(self, "limit", as_positive(self.limit, "limit"))
+        object.__setattr__(self, "sharpness", as_positive(self.sharpness, "sharpness"))
 
 
 Amplifier = Callable[[Any], Any]  # a user's own may be any function of a sample
 
 
 def compiled_parameters(amplifier: Amplifier | None) -> np.ndarray | None:
-    """Parameters for the compiled loop (None stands for linear); None for a user's own function."""
+    """Parameters for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
     if amplifier is None:
         return LinearAmplifier().parameters
-    return amplifier.parameters if isinstance(amplifier, _Amplifier) else None
+    models = (LinearAmplifier, HardClipAmplifier, SoftSaturationAmplifier)
+    return amplifier.parameters if isinstance(amplifier, models) and type(amplifier) in models else None

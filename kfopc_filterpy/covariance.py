@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from copy import deepcopy
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .kernels import (
-    DIAGONAL,
     INVERSE_S,
-    SCALE,
+    LAST_INVERSE_S,
     Covariance,
     full_covariance,
     new_covariance,
@@ -20,54 +20,59 @@ from .kernels import (
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: what rounding leaves; more is a mistake
 
 
-class Owed(NamedTuple):
-    """P at a moment since the last pass over the triangle: the scale and diagonal owed then."""
+class Moment(NamedTuple):
+    """P at a moment since the last pass over the triangle T: scale T + weight g g' + diagonal I."""
 
     scale: float
     diagonal: float
-
-
-TRIANGLE = "triangle"  # P(n|n-1) of the last update: the pass wrote it, only the downdate is owed
+    weight: float = 0.0
 
 
 class RandomWalkCovariance:
     """P, P_prior, P_post and the gain of a random-walk filter, each made full when read.
 
-    `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and
-    P_post from it: an `Owed` moment, `TRIANGLE`, or an array where that is no longer possible.
+    `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and P_post from it,
+    or are arrays where that is no longer possible.
     """
 
     def __init__(self, P: np.ndarray) -> None:
         self.arrays: Covariance = new_covariance((P + P.T) / 2)
-        self.prior: Owed | np.ndarray | str = Owed(1.0, 0.0)
-        self.posterior: Owed | np.ndarray | str = Owed(1.0, 0.0)
-        self._shown: np.ndarray | None = None
+        self.prior: Moment | np.ndarray = Moment(1.0, 0.0)
+        self.posterior: Moment | np.ndarray = Moment(1.0, 0.0)
+        self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
 
     @property
-    def now(self) -> Owed:
-        """What is owed at present."""
-        return Owed(float(self.arrays.owed[SCALE]), float(self.arrays.owed[DIAGONAL]))
+    def now(self) -> Moment:
+        """P at present."""
+        scale, diagonal, inverse_S, _ = self.arrays.owed.tolist()
+        return Moment(scale, diagonal, -scale * inverse_S)
 
-    def full(self, moment: Owed | np.ndarray | str) -> np.ndarray:
+    def full(self, moment: Moment | np.ndarray) -> np.ndarray:
         """P at a moment, as a full symmetric array of its own."""
         if isinstance(moment, np.ndarray):
             return moment.copy()
-        T, g, owed = self.arrays.triangle, self.arrays.gain_direction, self.arrays.owed
-        if isinstance(moment, str):
-            return full_covariance(T, g, 1.0, 0.0, 0.0)
-        return full_covariance(T, g, moment.scale, moment.diagonal, -moment.scale * owed[INVERSE_S])
+        return full_covariance(self.arrays.triangle, self.arrays.gain_direction, *moment)
 
     def show(self) -> np.ndarray:
         """P as a full array; what is written into it counts at the next step (`edited`)."""
-        if self._shown is None:
-            self._shown = self.full(self.now)
-        return self._shown
+        if not self._shown:
+            self._shown.append(self.full(self.now))
+        return self._shown[-1]
 
     def edited(self) -> np.ndarray | None:
-        """The shown array if it was written into, None otherwise."""
-        if self._shown is None or np.array_equal(self._shown, self.full(self.now)):
+        """The shown array that was written into, None where none was."""
+        if not self._shown:
             return None
-        return self._shown
+        now = self.full(self.now)
+        return next((array for array in reversed(self._shown) if not np.array_equal(array, now)), None)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
+        """filterpy's `Saver` keeps the P it reads and deep-copies the rest: later edits go into another array."""
+        if self._shown:
+            self._shown.append(self._shown[-1].copy())
+        other = memo[id(self)] = object.__new__(type(self))
+        other.__dict__.update(deepcopy(self.__dict__, memo))
+        return other
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:
         """A covariance that goes on from another P and remembers P_prior and P_post."""
@@ -77,36 +82,43 @@ class RandomWalkCovariance:
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Eq. 4."""
-        if not np.isfinite(alpha_sq * max(self.now) + state_noise):
+        if not np.isfinite(alpha_sq * max(self.now[:2]) + state_noise):
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
-        self._shown = None
+        self._shown = []
         predict_covariance(self.arrays, alpha_sq, state_noise)
         self.prior = self.now
 
     def project(self, h: np.ndarray) -> float:
         """h' P h, with P h left in the arrays for the update; the value of P does not change."""
-        self._shown = None
-        if isinstance(self.prior, str):  # a second update since the last prediction
+        self._shown = []
+        if not isinstance(self.prior, np.ndarray) and self.prior != self.now:  # a second update since the prediction
             self.prior = self.full(self.prior)
         now = self.now
         hPh = float(project_covariance(self.arrays, h))
-        if isinstance(self.prior, Owed):
-            self.prior = TRIANGLE
-        if isinstance(self.posterior, Owed):  # the same P_post, seen from the triangle as it is now
+        if isinstance(self.prior, Moment):
+            self.prior = Moment(1.0, 0.0)
+        if isinstance(self.posterior, Moment):  # the same P_post, seen from the triangle as it is now
             ratio = self.posterior.scale / now.scale
-            self.posterior = Owed(ratio, self.posterior.diagonal - ratio * now.diagonal)
+            self.posterior = Moment(ratio, self.posterior.diagonal - ratio * now.diagonal)
         return hPh
+
+    def updated(self) -> None:
+        """The arrays took an update after `project`: P_prior, where it was the triangle, is P + g g'/S now."""
+        if isinstance(self.prior, Moment):
+            inverse_S, last_inverse_S = self.arrays.owed[[INVERSE_S, LAST_INVERSE_S]].tolist()
+            self.prior = Moment(1.0, 0.0, last_inverse_S - inverse_S)
+        self.settle()
 
     def settle(self) -> None:
         """An update is over, or its sample was missed: P is P_post."""
         self.posterior = self.now
 
     def after_compiled(self) -> float:
-        """After the compiled loop advanced `arrays`: what is owed is one downdate; return its S."""
-        self._shown = None
-        self.prior = TRIANGLE
-        self.settle()
-        return 1.0 / float(self.arrays.owed[INVERSE_S])
+        """After the compiled loop advanced `arrays`: what is owed is one downdate at most; return its S."""
+        self._shown = []
+        self.prior = Moment(1.0, 0.0)
+        self.updated()
+        return 1.0 / float(self.arrays.owed[LAST_INVERSE_S])
 
 
 def require_covariance(P: np.ndarray) -> None:

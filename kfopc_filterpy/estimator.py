@@ -13,6 +13,7 @@ from filterpy.kalman import KalmanFilter
 
 from ._constrained import BatchReferences, ConstraintAttributes
 from ._guards import (
+    SILENT_REFERENCE,
     all_or_nothing,
     checked_measurement,
     require_matrix,
@@ -217,7 +218,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
             NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power
             with neither a reference nor a secondary-path gain. The filter is as it was and can go on.
         """
-        reference = self._next_reference(reference)
+        reference = self._next_reference(z, reference)
         if z is None:
             super().update(None)
             return
@@ -229,6 +230,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         if z is None:
             super().update_steadystate(None)
             return
+        reference = self._next_reference(z, reference)
         z, _, _ = checked_measurement(self, z, None, None)
         step = super().update_steadystate
         self._scaled_step("update_steadystate", step, z, None, reference)
@@ -238,6 +240,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         if z is None:
             super().update_correlated(None)
             return
+        reference = self._next_reference(z, reference)
         z, R, H = checked_measurement(self, z, R, H)
         step = super().update_correlated
         self._scaled_step("update_correlated", lambda scaled: step(scaled, R, H), z, H, reference)
@@ -248,13 +251,17 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         """filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
         if not hasattr(KalmanFilter, "update_sequential"):
             raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
+        reference = self._next_reference(z_i, reference)
         length = np.size(z_i)
         if not 0 <= start <= self.dim_z - length:
             raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
         require_measurement(z_i, length)
         rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
         require_finite(rows, "H_i")
-        require_variance(self.R[start : start + length, start : start + length] if R_i is None else R_i, length, "R_i")
+        noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
+        require_variance(noise, length, "R_i")
+        if not np.any(rows) and not np.any(noise):
+            raise ValueError(SILENT_REFERENCE)
 
         def step(scaled: Any) -> None:
             # filterpy writes into these four in place: let it write into copies, so that all can be undone
@@ -329,7 +336,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
 
     @alpha.setter
     def alpha(self, value: float) -> None:
-        as_number(as_number(value, "alpha") ** 2, "alpha squared")
+        as_number(as_number(value, "alpha") * value, "the square of alpha")
         KalmanFilter.alpha.fset(self, value)
 
     @property
@@ -354,10 +361,10 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
 
     # All or nothing: what a step needs checked, and how it is undone.
 
-    def _next_reference(self, reference: float | None) -> float | None:
+    def _next_reference(self, z: Any, reference: float | None) -> float | None:
         if reference is None and self._batch_references is not None:
-            return self._batch_references.next()
-        return reference
+            reference = self._batch_references.next()
+        return None if z is None or reference is None else as_number(reference, "reference")
 
     def _presently_scaled(self, z: Any) -> Any:
         require_measurement(z, self.dim_z)

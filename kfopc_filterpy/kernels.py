@@ -20,7 +20,12 @@ from numba import njit
 # No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
 FAST = {"reassoc", "contract", "nsz"}
 
-SCALE, DIAGONAL, INVERSE_S = 0, 1, 2
+SCALE, DIAGONAL, INVERSE_S, LAST_INVERSE_S = 0, 1, 2, 3
+
+# Where S exceeds the measurement noise by this much, the downdate cancels so many digits of P that it is done in
+# twice the precision: the first samples after a large initial variance.
+CANCELLATION = 1e3
+SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
 
 class Covariance(NamedTuple):
@@ -29,13 +34,15 @@ class Covariance(NamedTuple):
     triangle: np.ndarray  # (n, n), lower triangle T valid
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the pass under way
-    owed: np.ndarray  # (3,): scale, diagonal, 1/S
+    owed: np.ndarray  # (4,): scale, diagonal, 1/S or 0 where the downdate was done at once; 1/S of the last update
 
 
 def new_covariance(P: np.ndarray) -> Covariance:
     """Covariance state from a full symmetric array (n, n); the upper triangle is not read."""
     n = P.shape[0]
-    return Covariance(np.array(P, dtype=np.float64, order="C"), np.zeros(n), np.zeros(n), np.array([1.0, 0.0, 0.0]))
+    return Covariance(
+        np.array(P, dtype=np.float64, order="C"), np.zeros(n), np.zeros(n), np.array([1.0, 0.0, 0.0, 0.0])
+    )
 
 
 @njit(cache=True)
@@ -105,7 +112,67 @@ def project_covariance(cov, h):
 def downdate_covariance(cov, S):
     """Eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
     cov.gain_direction[:] = cov.product
-    cov.owed[INVERSE_S] = 1.0 / S
+    cov.owed[INVERSE_S] = cov.owed[LAST_INVERSE_S] = 1.0 / S
+
+
+@njit(cache=True)
+def two_sum(a, b):
+    """a + b as the rounded sum and what rounding left (Knuth)."""
+    total = a + b
+    rest = total - a
+    return total, (a - (total - rest)) + (b - rest)
+
+
+@njit(cache=True)
+def two_product(a, b):
+    """a b as the rounded product and what rounding left (Dekker)."""
+    product = a * b
+    cut = SPLIT * a
+    a_high = cut - (cut - a)
+    cut = SPLIT * b
+    b_high = cut - (cut - b)
+    a_low, b_low = a - a_high, b - b_high
+    return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
+
+
+@njit(cache=True)
+def add_product(total, rest, a, b):
+    """(total + rest) + a b in twice the precision (Ogita, Rump and Oishi's Dot2)."""
+    product, product_rest = two_product(a, b)
+    total, sum_rest = two_sum(total, product)
+    return total, rest + (product_rest + sum_rest)
+
+
+@njit(cache=True)
+def downdate_carefully(cov, h, noise):
+    """Eq. 8 in twice the precision and at once, after `project_covariance`; False, undone, where it would overflow."""
+    T, n = cov.triangle, h.size
+    g, g_low = np.zeros(n), np.zeros(n)
+    for i in range(n):
+        for j in range(i):
+            g[i], g_low[i] = add_product(g[i], g_low[i], T[i, j], h[j])
+            g[j], g_low[j] = add_product(g[j], g_low[j], T[i, j], h[i])
+        g[i], g_low[i] = add_product(g[i], g_low[i], T[i, i], h[i])
+    S, S_low = noise, 0.0
+    for i in range(n):
+        S, S_low = add_product(S, S_low + h[i] * g_low[i], h[i], g[i])
+    S, S_low = two_sum(S, S_low)
+    k, k_low = np.empty(n), np.empty(n)  # the gain g/S
+    size = S
+    for i in range(n):
+        k[i] = g[i] / S
+        product, rest = two_product(k[i], S)
+        k_low[i] = (((g[i] - product) - rest) + g_low[i] - k[i] * S_low) / S
+        size += abs(g[i]) + abs(g_low[i]) + abs(k[i]) + abs(k_low[i])
+    if not (S > 0.0 and size < 1e100):
+        return False
+    for i in range(n):
+        for j in range(i + 1):
+            product, rest = two_product(g[i], k[j])
+            T[i, j] = (T[i, j] - product) - (rest + (g[i] * k_low[j] + g_low[i] * k[j]))
+    cov.gain_direction[:] = g
+    cov.owed[INVERSE_S], cov.owed[LAST_INVERSE_S] = 0.0, 1.0 / S
+    return True
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -148,14 +215,16 @@ def correction_is_finite(w, gain_direction, innovation_over_S):
 
 
 @njit(cache=True, error_model="numpy")
-def update_weights(cov, w, h, scaled_measurement, S):
+def update_weights(cov, w, h, scaled_measurement, S, noise):
     """Eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
 
+    `noise` is the measurement noise in S: where S is far larger, the downdate is done in twice the precision.
     Where the innovation or a weight would not be finite, NaN is returned with nothing changed.
     """
     y = scaled_measurement - dot(h, w)
     if not correction_is_finite(w, cov.product, y / S):
         return np.nan
-    correct_weights(w, cov.product, y / S)
-    downdate_covariance(cov, S)
+    if not (S / noise > CANCELLATION and downdate_carefully(cov, h, noise)):
+        downdate_covariance(cov, S)
+    correct_weights(w, cov.gain_direction, y / S)
     return y

@@ -13,11 +13,21 @@ import numpy as np
 from numba import njit
 
 from .amplifiers import amplify
-from .constraint import FACTOR, GAIN, POWER, ConstraintState, advance_constraint
-from .kernels import FAST, Covariance, dot, predict_covariance, project_covariance, update_weights
+from .constraint import FACTOR, GAIN, POWER, ConstraintState, advance_constraint, preview_constraint
+from .kernels import (
+    DIAGONAL,
+    FAST,
+    INVERSE_S,
+    SCALE,
+    Covariance,
+    dot,
+    predict_covariance,
+    project_covariance,
+    update_weights,
+)
 
 KALMAN, LMS = 0, 1
-RUNNING, DIVERGED, SINGULAR = 0, 1, 2
+RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
 class DelayLine(NamedTuple):
@@ -65,7 +75,7 @@ class ControllerState(NamedTuple):
     settings: np.ndarray  # Kalman: r, q, fading alpha squared; LMS: step size
     covariance: Covariance  # Kalman
     constraint: ConstraintState  # powers, gain, factor
-    last: np.ndarray  # (2,) disturbance estimate and residual of the last Kalman update
+    last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
 
 
 @njit(cache=True)
@@ -90,29 +100,59 @@ def disturbance_estimate(controller, error):
 
 @njit(cache=True)
 def adapt_kalman(controller, error):
-    """Eq. 2-9 with the factor of eq. 10-13; returns False where S is not positive, with the weights unchanged."""
+    """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step."""
     d = disturbance_estimate(controller, error)
-    w = controller.weights
+    w, x = controller.weights, newest(controller.reference, 1)[0]
     h = newest(controller.filtered, w.size)
+    if not squares_are_finite(d, h[0], x):
+        return False
+    factor = preview_constraint(controller.constraint, d, h[0], x)[0]
     r, q, alpha_sq = controller.settings
+    owed = controller.covariance.owed
+    scale, diagonal, inverse_S = owed[SCALE], owed[DIAGONAL], owed[INVERSE_S]
     predict_covariance(controller.covariance, alpha_sq, r)
     S = project_covariance(controller.covariance, h) + q
-    if not 0.0 < S < np.inf:
+    y = np.nan
+    if 0.0 < S < np.inf:
+        y = update_weights(controller.covariance, w, h, factor * d, S, q)
+    if not np.isfinite(y):
+        take_back(controller.covariance, scale, diagonal, inverse_S, alpha_sq, r)
         return False
-    factor = advance_constraint(controller.constraint, d, h[0], newest(controller.reference, 1)[0])
-    controller.last[0], controller.last[1] = d, update_weights(controller.covariance, w, h, factor * d, S)
+    advance_constraint(controller.constraint, d, h[0], x)
+    controller.last[0], controller.last[1], controller.last[2] = d, y, S
     return True
+
+
+@njit(cache=True)
+def squares_are_finite(d, filtered, x):
+    """Whether the running powers can take this sample: an infinite power would never be forgotten."""
+    return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
+
+
+@njit(cache=True)
+def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
+    """Undo, to rounding, the prediction and projection of a step that cannot be completed."""
+    T, g = cov.triangle, cov.gain_direction
+    for i in range(g.size):
+        T[i, i] -= alpha_sq * diagonal + r
+        for j in range(i + 1):
+            T[i, j] = T[i, j] / (alpha_sq * scale) + inverse_S * g[i] * g[j]
+    cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
 @njit(cache=True, fastmath=FAST, error_model="numpy")
 def adapt_lms(controller, error, y):
-    """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS)."""
+    """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS).
+
+    While nothing has come through the estimated path, G_s = 0 and gamma = sqrt(G_s delta_d^2 / rho_o) - G_s is 0 too.
+    """
     d = disturbance_estimate(controller, error)
     w = controller.weights
     xf = newest(controller.filtered, w.size)
     x = newest(controller.reference, w.size)
     factor = advance_constraint(controller.constraint, d, xf[0], x[0])
-    gamma = controller.constraint.last[GAIN] * (1.0 / factor - 1.0) if factor < 1.0 else 0.0
+    gain = controller.constraint.last[GAIN]
+    gamma = gain * (1.0 / factor - 1.0) if factor < 1.0 and gain > 0.0 else 0.0
     mu = controller.settings[0]
     correction, penalty = mu * error, mu * gamma * y
     for i in range(w.size):
@@ -121,7 +161,7 @@ def adapt_lms(controller, error, y):
 
 @njit(cache=True)
 def adapt(controller, error, y):
-    """Adapt the weights of either family; False: the step has no solution."""
+    """Adapt the weights of either family; False: the step was refused."""
     if controller.kind == KALMAN:
         return adapt_kalman(controller, error)
     adapt_lms(controller, error, y)
@@ -130,14 +170,20 @@ def adapt(controller, error, y):
 
 @njit(cache=True, nogil=True)
 def listen(controller, references, errors):
-    """Follow the noise with the loudspeaker silent: delay lines and powers advance, the weights stay."""
+    """Follow the noise with the loudspeaker silent: delay lines and powers advance, the weights stay.
+
+    Returns the samples taken: all, or those before one whose square overflows.
+    """
     s = controller.secondary_estimate
     for n in range(references.size):
         push(controller.reference, references[n])
         push(controller.filtered, dot(s, newest(controller.reference, s.size)))
         push(controller.output, 0.0)
-        d = disturbance_estimate(controller, errors[n])
-        advance_constraint(controller.constraint, d, newest(controller.filtered, 1)[0], references[n])
+        d, filtered = disturbance_estimate(controller, errors[n]), newest(controller.filtered, 1)[0]
+        if not squares_are_finite(d, filtered, references[n]):
+            return n
+        advance_constraint(controller.constraint, d, filtered, references[n])
+    return references.size
 
 
 class Plant(NamedTuple):
@@ -193,9 +239,9 @@ def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last
         y_amplified = amplify(kind, clip, sharpness, y)
         a = anti_noise(plant, y_amplified)
         e = d[n] - a + sensor_noise[n]
-        if not adapt(controller, e, y):
-            return SINGULAR, n
         record.error[n], record.control_signal[n] = e, y
+        if not adapt(controller, e, y):
+            return REFUSED, n
         record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
         powers = controller.constraint.last
         record.constraint_factor[n] = powers[FACTOR]

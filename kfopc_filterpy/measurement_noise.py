@@ -86,8 +86,8 @@ def measurement_noise_from_residual(residual: Any, *, n_fitted: int = 0) -> floa
     Examples
     --------
     >>> from kfopc_filterpy import measurement_noise_from_residual
-    >>> measurement_noise_from_residual([0.1, -0.1, 0.1, -0.1], n_fitted=2)
-    0.02
+    >>> measurement_noise_from_residual([0.5, -0.5, 0.5, -0.5], n_fitted=2)  # 4 squares of 0.25, 2 degrees of freedom
+    0.5
     """
     n_fitted = as_count(n_fitted, "n_fitted", minimum=0)
     e = as_signal(residual, "residual", min_length=n_fitted + 1)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ._guards import checked_measurement
+from ._guards import SILENT_REFERENCE, checked_measurement
 from ._validate import as_count, as_nonnegative, require_finite
 from .covariance import RandomWalkCovariance, require_covariance
 from .estimator import KFOPC
@@ -110,7 +110,7 @@ class RandomWalkKFOPC(KFOPC):
     @Q.setter
     def Q(self, value: Any) -> None:
         if np.ndim(value) == 0:
-            self.state_noise = value
+            self.state_noise = as_nonnegative(value, "Q")
             return
         Q = self._matrix(value, "Q")
         if np.diagonal(Q).min() < 0:
@@ -129,7 +129,7 @@ class RandomWalkKFOPC(KFOPC):
     def R(self, value: Any) -> None:
         if np.size(value) != 1:
             raise ValueError(f"R must be one variance, got shape {np.shape(value)}")
-        self.measurement_noise = value
+        self.measurement_noise = as_nonnegative(value, "R")
 
     def _view(self, name: str, value: float, size: int | None = None) -> np.ndarray:
         if name not in self._views:
@@ -213,7 +213,7 @@ class RandomWalkKFOPC(KFOPC):
         """Around filterpy's own equations, which see P, F, Q as full arrays."""
         self._take_in_edits()
         with super()._all_or_nothing(name, **arguments):
-            self._replace_covariance(self._covariance.show())
+            self._replace_covariance(self._covariance.full(self._covariance.now))
             self._delegating = True
             yield
             self._delegating = False
@@ -241,7 +241,7 @@ class RandomWalkKFOPC(KFOPC):
         if z is not None and np.size(row) != self.dim_x:
             super().update(z, R, H, reference=reference)
             return
-        reference = self._next_reference(reference)
+        reference = self._next_reference(z, reference)
         self._take_in_edits()
         if z is None:
             self._record(self.x, np.zeros((1, 1)))
@@ -268,18 +268,16 @@ class RandomWalkKFOPC(KFOPC):
         if weights.size != self.dim_x or not np.isfinite(h @ weights):
             raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
         if noise == 0 and not h.any():
-            raise ValueError(
-                "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed "
-                "sample. Nothing was changed"
-            )
+            raise ValueError(SILENT_REFERENCE)
         S = self._covariance.project(h) + noise
         if not 0 < S < np.inf:
             raise ValueError(
                 f"S = H P H' + R must be positive, got {S:g}: P is not positive definite on H. Nothing was changed"
             )
-        y = float(update_weights(self._covariance.arrays, weights, h, factor * z, S))
+        y = float(update_weights(self._covariance.arrays, weights, h, factor * z, S, noise))
         if not np.isfinite(y):
             raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
+        self._covariance.updated()
         if constraint is not None:
             constraint.advance(z, h[0], reference)
         return weights, y, S

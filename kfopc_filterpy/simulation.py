@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +15,8 @@ from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
 from .loop import (
     DIVERGED,
+    REFUSED,
     RUNNING,
-    SINGULAR,
     ControllerState,
     Plant,
     Record,
@@ -28,7 +29,7 @@ from .loop import (
 from .paths import path_taps
 
 DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
-PROGRESS_STEP = 16000  # samples between two reports of progress
+STEP = 16000  # samples that the compiled loop runs between two reports of progress, or chances to interrupt it
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ def simulate(
     Parameters
     ----------
     controller : Controller
-        Goes on from the state it is in; make a new one for a fresh run.
+        Goes on from the state it is in, with paths that start silent; make a new one for a fresh run.
     reference : array_like
         (n_samples,) reference x.
     secondary_path : array_like or control.TransferFunction
@@ -124,7 +125,7 @@ def simulate(
     fs : float, default 16000
         Sample rate in Hz; systems given must have it.
     amplifier : callable, optional
-        Amplifier model, by default linear; any function of a sample.
+        Amplifier model, by default linear; any function of a sample that returns a finite number.
     rated_power : float, optional
         Rated power, by default the controller's; it sets the scale of the divergence limit (1 where neither says).
     sensor_noise_std : float, default 0
@@ -154,9 +155,10 @@ def simulate(
     ------
     ValueError
         Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
-        `primary_path` and `disturbance`; a feedback path without delay.
+        `primary_path` and `disturbance`; a feedback path without delay. Nothing was changed. In the midst of a run: an
+        amplifier that returns NaN, or an update without a solution (a silent reference with q = 0).
     TypeError
-        A controller without `control_signal` and `update`.
+        A controller without `control_signal` and `update`, an amplifier that is no function.
 
     Examples
     --------
@@ -168,20 +170,23 @@ def simulate(
     >>> bool(np.mean(result.control_signal[8000:] ** 2) < 1.02 * 0.25)  # unconstrained it would be 1
     True
     """
-    if not isinstance(controller, Controller):
+    if isinstance(controller, type) or not isinstance(controller, Controller):
         raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    if amplifier is not None and not callable(amplifier):
+        raise TypeError(f"amplifier must be a function of a sample, or None, got {amplifier!r}")
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference")
     d = _disturbance(x, primary_path, disturbance, fs)
     sensor_noise = _sensor_noise(x.size, as_nonnegative(sensor_noise_std, "sensor_noise_std"), rng)
     if rated_power is None:
         rated_power = getattr(controller, "rated_power", None)
-    else:
-        rated_power = as_positive(rated_power, "rated_power")
+    rated_power = None if rated_power is None else as_positive(rated_power, "rated_power")
     limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     plant = _plant(secondary_path, feedback_path, amplifier, fs)
+    if isinstance(controller, FilteredReferenceController):
+        controller.require_sample_rate(fs)
     record = _new_record(x.size - on, controller, every, record_powers)
     if on:
         _listen(controller, x[:on], (d + sensor_noise)[:on])
@@ -202,8 +207,8 @@ def simulate(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,
         rated_power=rated_power,
-        reference=x,
-        disturbance=d,
+        reference=x.copy(),
+        disturbance=d.copy(),
         error=record.error,
         control_signal=record.control_signal,
         amplifier_output=record.amplifier_output,
@@ -233,20 +238,22 @@ def _run_compiled(
     every: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
-    """`loop.run`, some samples at a time where progress is shown."""
+    """`loop.run`, some samples at a time."""
     n_samples = signals[0].size
-    step = PROGRESS_STEP if progress else n_samples
     status, end = RUNNING, 0
-    for first in range(0, n_samples, step):
-        status, end = run(state, plant, *signals, limit, record, every, first, min(first + step, n_samples))
-        if progress:
-            progress(end - first)
-        if status != RUNNING:
-            break
-    if end > 0:
+    try:
+        for first in range(0, n_samples, STEP):
+            status, end = run(state, plant, *signals, limit, record, every, first, min(first + STEP, n_samples))
+            if progress:
+                progress(end - first)
+            if status != RUNNING:
+                break
+    finally:  # interrupted or not, the controller is as its last sample left it
         controller.after_compiled(state)
-    if status == SINGULAR:
-        raise ValueError(f"sample {end}: {NO_SOLUTION}")
+    if status == REFUSED:
+        with _naming_sample(end):
+            controller.update(record.error[end])  # refused again, with the reason
+            raise ValueError(NO_SOLUTION)
     return status, end
 
 
@@ -263,13 +270,16 @@ def _run_steps(
     """The loop of `loop.run`, one call of the controller at a time."""
     x, d, sensor_noise = signals
     for n in range(x.size):
-        y = float(controller.control_signal(float(measured_reference(plant, x[n]))))
-        if not abs(y) <= limit:
-            return DIVERGED, n
-        y_amplified = y if amplifier is None else float(amplifier(y))
-        a = anti_noise(plant, y_amplified)
-        e = d[n] - a + sensor_noise[n]
-        controller.update(float(e))
+        with _naming_sample(n):
+            y = _as_sample(controller.control_signal(float(measured_reference(plant, x[n]))), "control_signal")
+            if not abs(y) <= limit:
+                return DIVERGED, n
+            y_amplified = y if amplifier is None else _as_sample(amplifier(y), "amplifier")
+            if not np.isfinite(y_amplified):
+                raise ValueError(f"amplifier must return a finite number, got {y_amplified} for {y}")
+            a = anti_noise(plant, y_amplified)
+            e = d[n] - a + sensor_noise[n]
+            controller.update(float(e))
         record.error[n], record.control_signal[n] = e, y
         record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
         record.constraint_factor[n] = getattr(controller, "constraint_factor", np.nan)
@@ -277,10 +287,29 @@ def _run_steps(
             record.powers[n, 0] = getattr(controller, "disturbance_power", np.nan)
             record.powers[n, 1] = getattr(controller, "secondary_path_gain", np.nan)
         if record.weights.shape[0] > 0:
-            note_weights(record, np.asarray(controller.weights, dtype=np.float64), every, n)  # type: ignore[attr-defined]
+            weights = np.array(controller.weights, dtype=np.float64)  # type: ignore[attr-defined]
+            note_weights(record, weights.reshape(-1), every, n)
         if progress:
             progress(1)
     return RUNNING, x.size
+
+
+@contextmanager
+def _naming_sample(n: int) -> Iterator[None]:
+    """Tell of an error in which sample of the run it came."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in sample {n} of the run")
+        raise
+
+
+def _as_sample(value: Any, source: str) -> float:
+    """What a user's function returned, NaN included, as a float."""
+    try:
+        return float(np.asarray(value).reshape(()))
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{source} must return one number, got {value!r}") from error
 
 
 def _disturbance(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
@@ -288,9 +317,7 @@ def _disturbance(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) 
         raise ValueError("give either primary_path= or disturbance=, not both and not neither")
     if disturbance is not None:
         return as_signal(disturbance, "disturbance", length=x.size)
-    from scipy.signal import oaconvolve
-
-    return oaconvolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+    return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
 
 
 def _sensor_noise(n_samples: int, std: float, rng: Any) -> np.ndarray:

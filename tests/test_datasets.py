@@ -90,9 +90,7 @@ def test_folder_argument_comes_before_the_environment(own_files, monkeypatch, tm
 @pytest.mark.usefixtures("no_folder")
 def test_without_folder_or_permission_the_error_names_every_way(monkeypatch):
     monkeypatch.setitem(sys.modules, "pooch", None)
-    with pytest.raises(
-        DataUnavailableError, match=r"pass folder, set KFOPC_DATA, or pass allow_download=True"
-    ):
+    with pytest.raises(DataUnavailableError, match=r"pass folder, set KFOPC_DATA, or pass allow_download=True"):
         load_measured_duct()
     with pytest.raises(FileNotFoundError):
         load_measured_duct()
@@ -108,9 +106,7 @@ def test_changed_file_is_refused_with_both_hashes(own_files):
     path = own_files / "duct" / "Sz.mat"
     path.write_bytes(path.read_bytes() + b"\0")
     found = hashlib.sha256(path.read_bytes()).hexdigest()
-    with pytest.raises(
-        DataUnavailableError, match=rf"Sz\.mat is not the published file, its SHA-256 is {found}"
-    ):
+    with pytest.raises(DataUnavailableError, match=rf"Sz\.mat is not the published file, its SHA-256 is {found}"):
         load_measured_duct(own_files)
 
 
@@ -125,12 +121,8 @@ def test_download_asks_pooch_once_for_each_pinned_and_hashed_file(own_files, mon
     monkeypatch.setitem(sys.modules, "pooch", fake_pooch(retrieve, own_files))
     assert load_measured_duct(allow_download=True, timeout_s=2.5).secondary.tolist() == [1.0, 2.0, 3.0]
     root = "https://raw.githubusercontent.com"
-    duct = (
-        f"{root}/Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
-    )
-    motor = (
-        f"{root}/Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst"
-    )
+    duct = f"{root}/Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
+    motor = f"{root}/Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst"
     expected = [f"{duct}/Pz1.mat", f"{duct}/Sz.mat", f"{motor}/Noise_data/Motor.mat"]
     assert [url for url, *_ in asked] == expected
     for (_, known_hash, path, downloader), name in zip(asked, FILES, strict=True):
@@ -149,9 +141,7 @@ def test_failed_download_stops_at_the_first_file(failure, tmp_path, monkeypatch)
         raise failure
 
     monkeypatch.setitem(sys.modules, "pooch", fake_pooch(retrieve, tmp_path))
-    with pytest.raises(
-        DataUnavailableError, match=rf"Pz1\.mat could not be fetched \({failure}\): set KFOPC_DATA"
-    ):
+    with pytest.raises(DataUnavailableError, match=rf"Pz1\.mat could not be fetched \({failure}\): set KFOPC_DATA"):
         load_measured_duct(allow_download=True)
     assert len(calls) == 1
 

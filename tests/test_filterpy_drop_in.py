@@ -236,9 +236,7 @@ def batch_of_lists(cls: type, update_first: bool) -> list:
     Rs = [5.0 + i for i in range(n)]
     us = [np.array([[i]]) for i in range(n)]
     zs: list[float | None] = [*noisy_line(n - 1), None]
-    return list(
-        kf.batch_filter(zs, Fs=Fs, Qs=Qs, Hs=Hs, Rs=Rs, Bs=[kf.B] * n, us=us, update_first=update_first)
-    )
+    return list(kf.batch_filter(zs, Fs=Fs, Qs=Qs, Hs=Hs, Rs=Rs, Bs=[kf.B] * n, us=us, update_first=update_first))
 
 
 def smoothed(cls: type, x_ndim: int) -> list:
@@ -486,9 +484,7 @@ def dimension_cases() -> list[tuple[dict, dict]]:
 
 
 @pytest.mark.parametrize("case", range(len(dimension_cases())))
-@pytest.mark.parametrize(
-    "make", [KFOPC, lambda n, m: KFOPC.random_walk(n, state_noise=1.0, measurement_noise=1.0)]
-)
+@pytest.mark.parametrize("make", [KFOPC, lambda n, m: KFOPC.random_walk(n, state_noise=1.0, measurement_noise=1.0)])
 def test_test_matrix_dimensions(case: int, make: Callable) -> None:
     attributes, arguments = dimension_cases()[case]
     outcomes = []

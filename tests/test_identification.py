@@ -19,9 +19,7 @@ PATH = bandpass_path(32)
 
 @pytest.mark.parametrize("excitation", ["white", "sweep"])
 def test_noiseless_identification_is_exact(excitation):
-    result = identify_secondary_path(
-        PATH, n_taps=40, duration_s=1.0, rng=0, excitation=excitation, regularization=0.0
-    )
+    result = identify_secondary_path(PATH, n_taps=40, duration_s=1.0, rng=0, excitation=excitation, regularization=0.0)
     # The sweep excites the lowest frequencies 500 times as much as the highest: digits lost.
     assert result.misalignment_db < (-250 if excitation == "white" else -150)
     assert np.all(result.modelling_error_db < -100)
@@ -39,9 +37,7 @@ def test_noise_gives_the_error_of_least_squares():
     # Variance of each tap: noise power / (samples * excitation power).
     taps, noise, level = path_taps(PATH), 0.1, 2.0
     results = [
-        identify_secondary_path(
-            taps, fs=FS, n_taps=32, duration_s=1.0, rng=seed, level=level, sensor_noise_std=noise
-        )
+        identify_secondary_path(taps, fs=FS, n_taps=32, duration_s=1.0, rng=seed, level=level, sensor_noise_std=noise)
         for seed in range(20)
     ]
     error = np.mean([10 ** (result.misalignment_db / 10) for result in results])
@@ -89,8 +85,7 @@ def test_ridge_keeps_what_the_excitation_lacks_from_noise():
 
 def test_runs_repeat_with_their_seed():
     first, second = (
-        identify_secondary_path(PATH, n_taps=32, duration_s=0.2, rng=7, sensor_noise_std=0.1)
-        for _ in range(2)
+        identify_secondary_path(PATH, n_taps=32, duration_s=0.2, rng=7, sensor_noise_std=0.1) for _ in range(2)
     )
     np.testing.assert_array_equal(first.taps, second.taps)
 
@@ -162,9 +157,7 @@ def test_level_is_the_root_mean_square_of_the_excitation(excitation, peak):
         sent.append(u)
         return u
 
-    identify_secondary_path(
-        PATH, n_taps=32, duration_s=2.0, rng=0, excitation=excitation, level=2.0, amplifier=record
-    )
+    identify_secondary_path(PATH, n_taps=32, duration_s=2.0, rng=0, excitation=excitation, level=2.0, amplifier=record)
     # 32000 samples: noise within 1 %; a sweep's first, partial period weighs about as much.
     assert np.sqrt(np.mean(sent[0] ** 2)) == pytest.approx(2.0, rel=0.02)
     assert np.abs(sent[0]).max() <= peak * (1 + 1e-12)

@@ -39,10 +39,7 @@ def sine(frequency, n, amplitude=1.0, phase=0.0):
 def test_nse_is_the_direct_sum_over_the_window_that_ends_with_the_sample(window):
     e, d = noise(101, 1), noise(101, 2)
     expected = [
-        10
-        * np.log10(
-            np.sum(e[max(0, n - window + 1) : n + 1] ** 2) / np.sum(d[max(0, n - window + 1) : n + 1] ** 2)
-        )
+        10 * np.log10(np.sum(e[max(0, n - window + 1) : n + 1] ** 2) / np.sum(d[max(0, n - window + 1) : n + 1] ** 2))
         for n in range(101)
     ]
     # Two orders of summation of up to 101 positive terms: rounding below 1e-13 relative, 1e-12 dB.
@@ -87,9 +84,7 @@ def test_nse_does_not_change_when_both_signals_are_scaled(scale, window, n, seed
     curve = nse_db(e, d, FS, window / FS)
     np.testing.assert_allclose(nse_db(scale * e, scale * d, FS, window / FS), curve, rtol=0, atol=1e-9)
     # Scaling the error alone moves the curve by the scale's level.
-    np.testing.assert_allclose(
-        nse_db(scale * e, d, FS, window / FS), curve + 20 * np.log10(scale), rtol=0, atol=1e-9
-    )
+    np.testing.assert_allclose(nse_db(scale * e, d, FS, window / FS), curve + 20 * np.log10(scale), rtol=0, atol=1e-9)
 
 
 # ---- noise reduction, power, peaks
@@ -97,9 +92,7 @@ def test_nse_does_not_change_when_both_signals_are_scaled(scale, window, n, seed
 
 def test_noise_reduction_is_of_the_second_half():
     e, d = noise(1001, 1), noise(1001, 2)
-    assert noise_reduction_db(e, d) == pytest.approx(
-        -10 * math.log10(sum(e[500:] ** 2) / sum(d[500:] ** 2)), abs=1e-10
-    )
+    assert noise_reduction_db(e, d) == pytest.approx(-10 * math.log10(sum(e[500:] ** 2) / sum(d[500:] ** 2)), abs=1e-10)
     assert noise_reduction_db(e, d, steady=1.0) == pytest.approx(-nse_db(e, d, FS, 1.0)[-1], abs=1e-10)
 
 

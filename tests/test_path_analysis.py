@@ -130,9 +130,7 @@ def test_gain_over_a_band_is_the_mean_of_the_squared_response(taps, low, width):
 
 def test_gain_for_a_reference_is_equation_11():
     path = bandpass_path(32)
-    assert secondary_path_gain(path) == pytest.approx(
-        secondary_path_gain(path, band=(0.0, FS / 2)), rel=1e-12
-    )
+    assert secondary_path_gain(path) == pytest.approx(secondary_path_gain(path, band=(0.0, FS / 2)), rel=1e-12)
     # A tone of whole periods: |S|² at its frequency.
     tone = np.sin(2 * np.pi * 400 * np.arange(4000 + 31) / FS)
     expected = np.abs(frequency_response(path, [400.0])[0]) ** 2

@@ -35,9 +35,7 @@ def test_scaled_filter_reaches_the_reduction_at_that_power():
         control_power=best.control_power,
     )
     start = 16 + 3 - 2
-    for wanted, factor, power in zip(
-        [3.0, 6.0, 10.0], needed.constraint_factor, needed.rated_power, strict=True
-    ):
+    for wanted, factor, power in zip([3.0, 6.0, 10.0], needed.constraint_factor, needed.rated_power, strict=True):
         y = scipy.signal.lfilter(factor * best.weights, 1.0, x)
         e = d - scipy.signal.lfilter(s, 1.0, y)
         assert np.mean(y[start:] ** 2) == pytest.approx(power, rel=1e-9)

@@ -40,9 +40,7 @@ def test_tone_at_rated_power_peaks_at_the_root_of_twice_the_power():
     assert np.max(np.abs(x)) == pytest.approx(np.sqrt(1.6), rel=EXACT)
 
 
-@pytest.mark.parametrize(
-    ("duration", "samples"), [(1.0, 16000), (0.00006, 1), (0.99997, 16000), (10.1, 161600)]
-)
+@pytest.mark.parametrize(("duration", "samples"), [(1.0, 16000), (0.00006, 1), (0.99997, 16000), (10.1, 161600)])
 def test_durations_round_to_the_nearest_sample(duration, samples):
     assert tone(100.0, duration, fs=FS).shape == (samples,)
 
@@ -126,9 +124,7 @@ def test_compressor_lobe_lines_stand_out():
         )
         energy = np.abs(np.fft.rfft(x)) ** 2
         # Orders 9 and 11 surround order 10, the peak of the envelope; 8 and 12 are lobe lines.
-        ratios.append(
-            10 * np.log10(energy[50 * 12] * energy[50 * 8] / (energy[50 * 9] * energy[50 * 11])) / 2
-        )
+        ratios.append(10 * np.log10(energy[50 * 12] * energy[50 * 8] / (energy[50 * 9] * energy[50 * 11])) / 2)
     # 10 dB apart; four independent spreads of 3 dB, halved, over 40 seeds: standard error 0.5 dB.
     assert np.mean(ratios) == pytest.approx(10.0, abs=2.0)
 
@@ -181,9 +177,7 @@ def test_level_jump_scales_the_rest_and_leaves_its_input():
 def test_scaled_signal_has_the_power_and_the_shape(values, power):
     scaled = scaled_to_power(values, power)
     assert np.mean(scaled**2) == pytest.approx(power, rel=1e-12)
-    np.testing.assert_array_equal(
-        np.sign(scaled[np.abs(scaled) > 0]), np.sign(np.array(values))[np.abs(scaled) > 0]
-    )
+    np.testing.assert_array_equal(np.sign(scaled[np.abs(scaled) > 0]), np.sign(np.array(values))[np.abs(scaled) > 0])
     # Scaling again to the same power changes nothing but rounding.
     np.testing.assert_allclose(scaled_to_power(scaled, power), scaled, rtol=1e-12, atol=0)
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, compiled_parameters
-from ..constraint import FACTOR, GAIN, POWER, ConstraintState, OutputPowerConstraint
+from ..constraint import FACTOR, GAIN, POWER, OutputPowerConstraint
 from ..kernels import new_covariance
 from ..loop import ControllerState, adapt, control_signal, delay_line, listen
-from ..paths import path_taps
+from ..paths import is_system, path_taps, sampling_rate
 
 NO_SOLUTION = (
-    "the update has no solution: S = x' P x' + q is not positive; a silent reference with measurement_noise = 0 tells "
-    "nothing: give measurement_noise > 0"
+    "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
+    "measurement_noise = 0 tells nothing: give measurement_noise > 0"
 )
 
 
@@ -37,11 +37,11 @@ class Controller(Protocol):
         ...
 
 
-def unconstrained() -> ConstraintState:
-    """Constraint of a controller that has none: the factor is supplied, 1; the powers are still followed."""
+def unconstrained() -> OutputPowerConstraint:
+    """Constraint of a controller that has none: the factor is held at 1; the powers are still followed."""
     constraint = OutputPowerConstraint(1.0)
     constraint.factor = 1.0
-    return constraint.state
+    return constraint
 
 
 class FilteredReferenceController:
@@ -57,6 +57,8 @@ class FilteredReferenceController:
         Estimated secondary path s^, taps or an FIR system.
     amplifier : callable, optional
         Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
+    constraint : OutputPowerConstraint, optional
+        What keeps the powers and the factor; by default the powers are followed with the factor held at 1.
     """
 
     name = "controller"
@@ -68,12 +70,15 @@ class FilteredReferenceController:
         secondary_path: Any,
         settings: list[float],
         amplifier: Amplifier | None = None,
+        constraint: OutputPowerConstraint | None = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         secondary = path_taps(secondary_path, name="secondary_path")
         parameters = compiled_parameters(amplifier)
         if parameters is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
+        self._path_fs = sampling_rate(secondary_path, name="secondary_path") if is_system(secondary_path) else None
+        self._own_constraint = constraint or unconstrained()
         self._state = ControllerState(
             kind=kind,
             weights=np.zeros(n_taps),
@@ -84,8 +89,8 @@ class FilteredReferenceController:
             amplifier=parameters,
             settings=np.array(settings, dtype=np.float64),
             covariance=new_covariance(np.zeros((1, 1))),
-            constraint=unconstrained(),
-            last=np.zeros(2),
+            constraint=self._own_constraint.state,
+            last=np.zeros(3),
         )
         self._y = 0.0
 
@@ -98,6 +103,11 @@ class FilteredReferenceController:
     def rated_power(self) -> float | None:
         """Rated output power that the controller keeps to; None where it has no constraint."""
         return None
+
+    @property
+    def constraint(self) -> OutputPowerConstraint:
+        """What keeps the powers and the factor; without a rated power it follows the powers, the factor held."""
+        return self._own_constraint
 
     @property
     def constraint_factor(self) -> float:
@@ -132,15 +142,28 @@ class FilteredReferenceController:
         references, errors : ndarray
             (n_samples,) reference, and the error microphone's signal while the loudspeaker is silent.
         """
-        listen(
-            self._state,
-            as_signal(references, "references"),
-            as_signal(errors, "errors", length=len(references)),
-        )
+        x = as_signal(references, "references")
+        taken = listen(self._state, x, as_signal(errors, "errors", length=x.size))
+        if taken < x.size:
+            raise ValueError(f"references and errors must have finite squares: those of sample {taken} overflow")
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError where the secondary path or the memory of the powers is of another sample rate."""
+        rates = {"secondary path": self._path_fs, "power memory": self.constraint.fs if self.rated_power else None}
+        for name, rate in rates.items():
+            if rate is not None and abs(rate - fs) > 1e-9 * fs:
+                raise ValueError(
+                    f"fs is {fs:g} Hz but the controller's {name} is for {rate:g} Hz: make it with the fs of the run"
+                )
+
+    def steps_of(self, family: type) -> bool:
+        """Whether the two calls a sample are those of `family`, which the compiled loop knows, and not a subclass's."""
+        mine = type(self)
+        return mine.control_signal is family.control_signal and mine.update is family.update  # type: ignore[attr-defined]
 
     def compiled_state(self) -> ControllerState | None:
         """State for the compiled loop, which advances it; None where only the steps above can run."""
-        return self._state
+        return self._state if self.steps_of(FilteredReferenceController) else None
 
     def after_compiled(self, state: ControllerState) -> None:
-        """Take back what the compiled loop advanced."""
+        """Take back what the compiled loop advanced, however many samples it ran."""

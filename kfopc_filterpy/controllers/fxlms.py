@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .._validate import as_positive
+from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
 from ..loop import LMS
 from .base import FilteredReferenceController
@@ -54,7 +55,7 @@ class FxLMS(FilteredReferenceController):
         return float(self._state.settings[0])
 
 
-class MOVFxLMS(FxLMS):
+class MOVFxLMS(FilteredReferenceController):
     r"""Minimum-output-variance FxLMS: the leak of FxLMS that keeps the control signal to its rated power.
 
     .. math:: w(n+1) = w(n) + \mu [e(n) x'(n) - \gamma y(n) x(n)], \qquad
@@ -71,6 +72,16 @@ class MOVFxLMS(FxLMS):
         Rated output power rho_o.
     fs, power_memory, power_window, secondary_path_gain
         As `fs`, `memory`, `window`, `secondary_path_gain` of `OutputPowerConstraint`.
+    amplifier : callable, optional
+        Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
+
+    Raises
+    ------
+    ValueError
+        A step size, rated power, rate, memory or gain that is not positive and finite, another window, fewer than
+        one tap, a path that is no FIR path.
+    TypeError
+        An amplifier that is none of the amplifier models.
 
     References
     ----------
@@ -98,16 +109,21 @@ class MOVFxLMS(FxLMS):
         power_memory: float = DEFAULT_MEMORY_S,
         power_window: str = "exponential",
         secondary_path_gain: float | None = None,
+        amplifier: Amplifier | None = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, step_size=step_size)
-        self.constraint = OutputPowerConstraint(
+        constraint = OutputPowerConstraint(
             rated_power,
             secondary_path_gain=secondary_path_gain,
             fs=fs,
             memory=power_memory,
             window=power_window,
         )
-        self._state = self._state._replace(constraint=self.constraint.state)
+        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], amplifier, constraint)
+
+    @property
+    def step_size(self) -> float:
+        """Step size mu."""
+        return float(self._state.settings[0])
 
     @property
     def rated_power(self) -> float:

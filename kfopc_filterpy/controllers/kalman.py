@@ -9,11 +9,11 @@ from filterpy.kalman import KalmanFilter
 
 from .._validate import as_number
 from ..amplifiers import Amplifier
-from ..constraint import FACTOR, ConstraintState
+from ..constraint import OutputPowerConstraint
 from ..estimator import KFOPC
 from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate, newest
 from ..random_walk import RandomWalkKFOPC
-from .base import FilteredReferenceController, unconstrained
+from .base import FilteredReferenceController
 
 
 class KalmanController(FilteredReferenceController):
@@ -80,20 +80,28 @@ class KalmanController(FilteredReferenceController):
         return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
 
     @property
+    def constraint(self) -> OutputPowerConstraint:
+        """What keeps the powers: the estimator's constraint, or one of our own with the estimator's factor held."""
+        theirs = self.estimator.constraint if isinstance(self.estimator, KFOPC) else None
+        if theirs is not None:
+            return theirs
+        self._own_constraint.factor = self.constraint_factor
+        return self._own_constraint
+
+    @property
     def constraint_factor(self) -> float:
         """Constraint factor of the last sample."""
         return getattr(self.estimator, "constraint_factor", 1.0)
 
     @property
     def disturbance_power(self) -> float:
-        """Running power of the disturbance estimate (eq. 10); NaN where it is not followed."""
-        power = getattr(self.estimator, "disturbance_power", None)
-        return np.nan if power is None else power
+        """Running power of the disturbance estimate (eq. 10)."""
+        return self.constraint.disturbance_power
 
     @property
     def secondary_path_gain(self) -> float:
-        """Running secondary-path gain (eq. 11); NaN where it is not known."""
-        gain = getattr(self.estimator, "secondary_path_gain", None)
+        """Running secondary-path gain (eq. 11); NaN before any reference energy."""
+        gain = self.constraint.secondary_path_gain
         return np.nan if gain is None else gain
 
     def control_signal(self, reference: float) -> float:
@@ -106,16 +114,20 @@ class KalmanController(FilteredReferenceController):
         """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
         d = disturbance_estimate(self._state, as_number(error, "error"))
         h = newest(self._state.filtered, self.estimator.dim_x).reshape(1, -1).copy()
+        x, powers = newest(self._state.reference, 1)[0], self.constraint
+        powers.preview(d, h[0, 0], x)  # refuses what would overflow before anything changes
         self.estimator.predict()
         if isinstance(self.estimator, KFOPC):
-            self.estimator.update(d, H=h, reference=newest(self._state.reference, 1)[0])
+            self.estimator.update(d, H=h, reference=x)
         else:
             self.estimator.update(np.full((1,) * np.ndim(self.estimator.x), d), H=h)
+        if powers is self._own_constraint:
+            powers.advance(d, h[0, 0], x)
 
     def compiled_state(self) -> ControllerState | None:
         """State for the compiled loop; None where the estimator takes filterpy's own equations."""
         estimator = self.estimator
-        if type(estimator) is not RandomWalkKFOPC:
+        if type(estimator) is not RandomWalkKFOPC or not self.steps_of(KalmanController):
             return None
         compiled = estimator.compiled_state()
         if compiled is None:
@@ -123,24 +135,23 @@ class KalmanController(FilteredReferenceController):
         covariance, settings = compiled
         self._state.settings[:] = settings
         self._state.weights[:] = self.weights
-        return self._state._replace(covariance=covariance, constraint=self._constraint_state())
-
-    def _constraint_state(self) -> ConstraintState:
-        constraint = getattr(self.estimator, "constraint", None)
-        if constraint is not None:
-            return constraint.state
-        state = unconstrained()
-        state.supplied[FACTOR] = self.constraint_factor
-        return state
+        self._state.last[:] = np.nan
+        return self._state._replace(covariance=covariance, constraint=self.constraint.state)
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
-        self._state = self._state._replace(constraint=self._constraint_state())
+        self._state = self._state._replace(constraint=self.constraint.state)
         super().listen(references, errors)
 
     def after_compiled(self, state: ControllerState) -> None:
-        """Give the estimator the weights, residual and gain of the last sample."""
-        self.estimator.after_compiled(state.weights, *state.last)
+        """Give the estimator the weights, residual, S and gain of the last sample run."""
+        d, y, S = state.last.tolist()
+        if np.isnan(S):
+            return
+        estimator = self.estimator
+        estimator.after_compiled(state.weights, d, y)
+        estimator.S, estimator.SI = np.array([[S]]), np.array([[1.0 / S]])  # to the last digit
+        estimator.K = (state.covariance.gain_direction / S).reshape(-1, 1)
 
 
 def kf_anc(

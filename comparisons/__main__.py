@@ -1,0 +1,68 @@
+"""`python -m comparisons`: run the studies and write the report."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from textwrap import fill
+
+from . import broadband, duct, tonal
+from .report import StudyReport, prepare_folder, results_table, write_report
+from .scene import Runs
+
+STUDIES: dict[str, Callable[[Runs], StudyReport | str]] = {
+    "tonal": tonal.main,
+    "broadband": broadband.main,
+    "duct": duct.main,
+    "duct-measured": duct.main_measured,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the studies named, all by default; write report.html, results.json, figures and audio into a folder."""
+    parser = argparse.ArgumentParser(
+        prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
+    )
+    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"{', '.join(STUDIES)}; by default all")
+    parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.studies if name not in STUDIES]
+    if unknown:
+        parser.error(f"no study called {', '.join(unknown)}; there are {', '.join(STUDIES)}")
+
+    import matplotlib
+    from tqdm import tqdm
+
+    matplotlib.use("Agg")
+    prepare_folder(options.output)
+    began = time.perf_counter()
+    reports: list[StudyReport] = []
+    with tqdm(total=0, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
+        runs = Runs(bar)
+        for name in options.studies or STUDIES:
+            bar.set_description(name)
+            report = STUDIES[name](runs)
+            if isinstance(report, str):
+                tqdm.write(report)
+            else:
+                reports.append(report)
+    if not reports:
+        return 1
+    page = write_report(reports, options.output)
+    print(results_table(reports))
+    for report in reports:
+        print(
+            f"\n{report.name}: notes",
+            *(fill(note, 110, initial_indent="- ", subsequent_indent="  ") for note in report.notes),
+            sep="\n",
+        )
+    print(f"\n{page} and results.json written in {time.perf_counter() - began:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,241 @@
+"""What a study hands over to the report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FIGURES_OF_MERIT = (
+    "noise_reduction_db",
+    "output_power",
+    "peak_control_signal",
+    "clipped_fraction",
+    "harmonics_db",
+    "convergence_time_s",
+    "diverged_at_s",
+)
+HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond which it is clipped
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One claim of the paper, and what was measured, as a sentence."""
+
+    claim: str
+    reproduced: bool
+    figure: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter's value, and how it was chosen."""
+
+    value: Any
+    chosen: str
+
+
+@dataclass(frozen=True)
+class FigureItem:
+    """A figure, the end of its files' name, and its caption. pyplot is made to forget it: a report holds many."""
+
+    stem: str
+    caption: str
+    figure: Figure
+
+    def __post_init__(self) -> None:
+        import matplotlib.pyplot as plt
+
+        _require_stem(self.stem, "stem")
+        plt.close(self.figure)
+
+
+@dataclass(frozen=True)
+class Sound:
+    """A sound, (n_samples,), NaN at its end where the run diverged; the end of its file's name and its label."""
+
+    stem: str
+    label: str
+    signal: np.ndarray
+
+    def __post_init__(self) -> None:
+        _require_stem(self.stem, "stem")
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """All that the report says of one study.
+
+    Parameters
+    ----------
+    name : str
+        "tonal", "broadband", "duct" or "duct-measured": lower-case letters, digits and "-".
+    title, summary : str
+        Heading, and a few sentences.
+    fs : float
+        Sampling frequency in Hz.
+    rated_power : float
+        Rated output power, a mean square.
+    parameters : dict of str to Parameter
+        Every parameter by name.
+    algorithms : dict of str to dict
+        Figures of merit by algorithm: keys out of `FIGURES_OF_MERIT`; None, NaN or left out where undefined.
+    extra : dict of str to Any
+        Further figures for results.json: numbers, text, arrays, lists and mappings of them.
+    verdicts : list of Verdict
+        One for each claim of the paper.
+    figures : list of FigureItem
+        Figures in their order.
+    sounds : list of Sound
+        Sounds; the first one, the disturbance, sets the level.
+    notes : list of str
+        Further remarks.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An unknown figure of merit, two figures or sounds of one stem, or an argument not as described.
+    """
+
+    name: str
+    title: str
+    summary: str
+    fs: float
+    rated_power: float
+    parameters: dict[str, Parameter]
+    algorithms: dict[str, dict[str, float | None]]
+    extra: dict[str, Any] = field(default_factory=dict)
+    verdicts: list[Verdict] = field(default_factory=list)
+    figures: list[FigureItem] = field(default_factory=list)
+    sounds: list[Sound] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        _require_stem(self.name, "name")
+        for algorithm, figures in self.algorithms.items():
+            if unknown := set(figures) - set(FIGURES_OF_MERIT):
+                raise ValueError(
+                    f"algorithms[{algorithm!r}] holds unknown figures of merit {sorted(unknown)}; "
+                    f"known are {', '.join(FIGURES_OF_MERIT)}; further ones belong into extra"
+                )
+        for items, kind in ((self.figures, "figures"), (self.sounds, "sounds")):
+            require_different((item.stem for item in items), f"{kind} of study {self.name!r}")
+
+    @property
+    def result(self) -> dict[str, Any]:
+        """The study's part of results.json: strict JSON values only, None where undefined."""
+        values = {
+            "rated_power": self.rated_power,
+            "parameters": {name: parameter.value for name, parameter in self.parameters.items()},
+            "algorithms": {
+                name: {key: figures.get(key) for key in FIGURES_OF_MERIT} for name, figures in self.algorithms.items()
+            },
+            "verdicts": [
+                {"claim": verdict.claim, "reproduced": verdict.reproduced, "figure": verdict.figure}
+                for verdict in self.verdicts
+            ],
+            "extra": self.extra,
+        }
+        return jsonable(values, f"study {self.name!r}")
+
+
+def jsonable(value: Any, where: str = "value") -> Any:
+    """`value` in strict JSON's types: arrays as lists, numpy's scalars as numbers, NaN and Inf as None.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> jsonable({"power": np.float64(0.8), "taps": np.array([1.0, np.nan])})
+    {'power': 0.8, 'taps': [1.0, None]}
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if np.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item, f"{where}, {key!r}") for key, item in value.items()}
+    if isinstance(value, list | tuple | range):
+        return [jsonable(item, where) for item in value]
+    raise TypeError(f"{where} must hold numbers, text, arrays, lists or mappings, got {type(value).__name__}")
+
+
+# Headings and units of the table of figures of merit.
+COLUMNS = [
+    ("noise reduction", "dB"),
+    ("output power", ""),
+    ("of rated power", "times"),
+    ("peak control signal", ""),
+    ("clipped", "%"),
+    ("harmonics", "dB"),
+    ("converged", "s"),
+    ("diverged", "s"),
+]
+
+
+def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
+    """Figures of merit as the table's cells, "-" where there is none."""
+
+    def cell(key: str, form: str, scale: float = 1.0) -> str:
+        value = jsonable(figures.get(key))
+        return "-" if value is None else f"{value * scale:{form}}"
+
+    return [
+        cell("noise_reduction_db", ".1f"),
+        cell("output_power", ".5g"),
+        cell("output_power", ".4g", 1 / rated_power),
+        cell("peak_control_signal", ".4g"),
+        cell("clipped_fraction", ".2f", 100.0),
+        cell("harmonics_db", ".1f"),
+        cell("convergence_time_s", ".4g"),
+        cell("diverged_at_s", ".4g"),
+    ]
+
+
+def count_of_claims(studies: Sequence[StudyReport]) -> str:
+    """How many claims were reproduced, as a phrase."""
+    verdicts = [verdict.reproduced for study in studies for verdict in study.verdicts]
+    return f"{sum(verdicts)} of {len(verdicts)} claims reproduced"
+
+
+def figure_file(folder: Path, study: StudyReport, item: FigureItem) -> Path:
+    """Path of a figure, without its suffix."""
+    return folder / "figures" / f"{study.name}-{item.stem}"
+
+
+def sound_file(folder: Path, study: StudyReport, sound: Sound) -> Path:
+    """Path of a sound."""
+    return folder / "audio" / f"{study.name}-{sound.stem}.wav"
+
+
+def loudness(study: StudyReport) -> list[tuple[np.ndarray, float]]:
+    """Each sound, clipped where it must be, and the one peak that is full scale in all of the study.
+
+    Full scale is the loudest sound's peak, at most 4 times the first's: a run that diverges would silence the rest.
+    """
+    signals = [np.asarray(sound.signal, dtype=np.float64) for sound in study.sounds]
+    peaks = [float(np.max(np.abs(signal), initial=0.0, where=~np.isnan(signal))) for signal in signals]
+    if not peaks or max(peaks) == 0:
+        return [(signal, 1.0) for signal in signals]
+    full_scale = min(max(peaks), HEADROOM * peaks[0]) if peaks[0] > 0 else max(peaks)
+    return [(np.clip(signal, -full_scale, full_scale), full_scale) for signal in signals]
+
+
+def _require_stem(name: str, argument: str) -> None:
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name):
+        raise ValueError(f"{argument} must be lower-case letters, digits and '-', for it names files, got {name!r}")
+
+
+def require_different(names: Iterable[str], what: str) -> None:
+    names = list(names)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{what} must have different names, got {', '.join(twice)} twice")

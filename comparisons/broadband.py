@@ -1,0 +1,234 @@
+"""Study 2: noise from 200 to 2000 Hz (the paper's Fig. 6)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    KalmanController,
+    SimulationResult,
+    band_limited_noise,
+    bandpass_path,
+    coherence_and_gain,
+    output_power,
+)
+from kfopc_filterpy.plotting import (
+    plot_disturbance_and_anti_noise,
+    plot_error_spectra,
+    plot_nse,
+    plot_output_power,
+)
+
+from .report import FigureItem, Parameter, StudyReport, Verdict
+from .scene import ALGORITHMS, Runs, Scene, Tuned, figures_of_merit, make_controller, make_scene, tune
+from .study import common_parameters, draw, sounds, tuning_note
+
+FS = 16000.0
+BAND = (200.0, 2000.0)
+DURATION_S = 10.5
+RATED_POWER = 0.8
+POWER_MULTIPLE = 4.0
+N_TAPS = 128
+OTHER_N_TAPS = 256
+SEEDS = tuple(range(1, 9))
+TUNING_SEEDS = 2
+
+Results = dict[str, list[SimulationResult]]
+
+
+def main(runs: Runs) -> StudyReport:
+    """Run the study."""
+    scene = _scene(N_TAPS)
+    tuned = tune(runs, scene, seeds=TUNING_SEEDS)
+    results = _run_all(runs, scene, tuned)
+    algorithms = {name: figures_of_merit(rows, scene) for name, rows in results.items()}
+    clipped_scene = dataclasses.replace(scene, amplifier=HardClipAmplifier(scene.amplitude_limit))
+    clipped = _run_all(runs, clipped_scene, tuned, seeds=1)
+    clipped["KF-OPC, known amplifier"] = [_knowing_the_amplifier(clipped_scene, tuned["KF-OPC"])]
+    clipped_figures = {name: figures_of_merit(rows, clipped_scene) for name, rows in clipped.items()}
+    other = _other_length(runs)
+    opc = results["KF-OPC"]
+    coherence = coherence_and_gain(opc[0].disturbance, opc[0].anti_noise, FS, BAND)
+    return StudyReport(
+        name="broadband",
+        title="Broadband noise and a linear amplifier",
+        summary=(
+            f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of "
+            f"{RATED_POWER:g}. The amplifier is linear, as the paper's must be for its KF-ANC to have the best noise "
+            "reduction; a run with a clipping amplifier stands beside it."
+        ),
+        fs=FS,
+        rated_power=RATED_POWER,
+        parameters=common_parameters(scene, tuned)
+        | {
+            "noise": Parameter(f"Gaussian, {BAND[0]:g}-{BAND[1]:g} Hz", "the paper's band"),
+            "duration_s": Parameter(DURATION_S - scene.switch_on_s, "10 s"),
+            "tuning_seeds": Parameter(scene.seeds[:TUNING_SEEDS], "the settings are tuned on these"),
+            "amplifier": Parameter("linear", "see the summary"),
+            "primary_path": Parameter("band-pass FIR, 20-5000 Hz, 128 taps", "the paper's; Hamming window"),
+            "secondary_path": Parameter("band-pass FIR, 20-5000 Hz, 32 taps", "the paper's; Hamming window"),
+        },
+        algorithms=algorithms,
+        extra={
+            "output_power_of_each_seed": {
+                n: [output_power(r.control_signal) for r in rows] for n, rows in results.items()
+            },
+            "anti_noise_coherence": coherence.coherence,
+            "anti_noise_gain": coherence.gain,
+            "with_clipping_amplifier": clipped_figures,
+            f"convergence_time_s_at_{OTHER_N_TAPS}_taps": other,
+        },
+        verdicts=_verdicts(results, algorithms, coherence),
+        figures=_figures_of(results, clipped, clipped_scene),
+        sounds=sounds({name: rows[0] for name, rows in results.items()}),
+        notes=[*tuning_note(tuned), *_notes(algorithms, clipped_figures, other)],
+    )
+
+
+def _scene(n_taps: int) -> Scene:
+    noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
+    return make_scene(
+        noises,
+        bandpass_path(128, fs=FS),
+        bandpass_path(32, fs=FS),
+        fs=FS,
+        rated_power=RATED_POWER,
+        power_multiple=POWER_MULTIPLE,
+        n_taps=n_taps,
+    )
+
+
+def _run_all(runs: Runs, scene: Scene, tuned: dict[str, Tuned], seeds: int = len(SEEDS)) -> Results:
+    jobs = [(name, k) for name in tuned for k in range(seeds)]
+
+    def run(job: tuple[str, int]) -> SimulationResult:
+        name, k = job
+        return scene.run(make_controller(scene, name, tuned[name].setting), k)
+
+    outcomes = runs.map(run, jobs)
+    return {name: [r for (n, _), r in zip(jobs, outcomes, strict=True) if n == name] for name in tuned}
+
+
+def _knowing_the_amplifier(scene: Scene, tuned: Tuned) -> SimulationResult:
+    """KF-OPC whose disturbance estimate is e + s^ * amplifier(y)."""
+    estimator = make_controller(scene, "KF-OPC", tuned.setting)
+    assert isinstance(estimator, KalmanController)
+    return scene.run(
+        KalmanController(
+            estimator.estimator, scene.secondary, amplifier=scene.amplifier, name="KF-OPC, known amplifier"
+        )
+    )
+
+
+def _other_length(runs: Runs) -> dict[str, float | None]:
+    """Convergence times with a control filter of another length, tuned again by the same rule."""
+    scene = _scene(OTHER_N_TAPS)
+    tuned = tune(runs, scene, seeds=TUNING_SEEDS)
+    results = _run_all(runs, scene, tuned)
+    return {name: figures_of_merit(rows, scene)["convergence_time_s"] for name, rows in results.items()}
+
+
+def _verdicts(results: Results, algorithms: dict[str, dict[str, Any]], coherence: Any) -> list[Verdict]:
+    powers = np.array([output_power(r.control_signal) for r in results["KF-OPC"]]) / RATED_POWER
+    anc, opc, mov = (algorithms[name] for name in ("KF-ANC", "KF-OPC", "MOV-FxLMS"))
+    times = {name: algorithms[name]["convergence_time_s"] for name in ALGORITHMS}
+    best = max(ALGORITHMS, key=lambda name: algorithms[name]["noise_reduction_db"])
+    return [
+        Verdict(
+            "KF-OPC keeps its output power to the rated power (the paper: 0.79971 of 0.8)",
+            bool(abs(powers.mean() - 1) <= 0.005 and np.all(np.abs(powers - 1) <= 0.015)),
+            f"mean over {len(powers)} seeds {powers.mean() * RATED_POWER:.5f}, each within "
+            f"{100 * np.abs(powers - 1).max():.2f} % of {RATED_POWER:g}",
+        ),
+        Verdict(
+            "KF-ANC has the best noise reduction, at an output power far over the rated one",
+            bool(best == "KF-ANC" and anc["output_power"] > 1.5 * RATED_POWER),
+            f"{anc['noise_reduction_db']:.1f} dB at {anc['output_power'] / RATED_POWER:.2f} times the rated power; "
+            f"KF-OPC {opc['noise_reduction_db']:.2f} dB at {opc['output_power'] / RATED_POWER:.3f} times",
+        ),
+        Verdict(
+            "The constraint factor does not slow KF-ANC's convergence",
+            bool(times["KF-OPC"] <= times["KF-ANC"]),
+            f"convergence after {1e3 * times['KF-OPC']:.1f} ms, KF-ANC {1e3 * times['KF-ANC']:.1f} ms",
+        ),
+        Verdict(
+            "KF-OPC converges faster than MOV-FxLMS, at least twice as fast",
+            bool(2 * times["KF-OPC"] <= times["MOV-FxLMS"]),
+            f"convergence after {1e3 * times['KF-OPC']:.1f} ms, MOV-FxLMS {1e3 * times['MOV-FxLMS']:.1f} ms, "
+            f"{times['MOV-FxLMS'] / times['KF-OPC']:.2f} times as long",
+        ),
+        Verdict(
+            "KF-OPC's anti-noise is highly linear with the disturbance",
+            bool(coherence.coherence > 0.99),
+            f"coherence {coherence.coherence:.4f}, gain {coherence.gain:.3f} (1/2 is eq. 13's factor here); "
+            f"MOV-FxLMS reduces by {mov['noise_reduction_db']:.2f} dB",
+        ),
+    ]
+
+
+def _notes(
+    algorithms: dict[str, dict[str, Any]], clipped: dict[str, dict[str, Any]], other: dict[str, float | None]
+) -> list[str]:
+    rows = "; ".join(
+        f"{name} {_decibels(figures)}, output power {_power(figures)}" for name, figures in clipped.items()
+    )
+    times = "; ".join(f"{name} {_milliseconds(t)}" for name, t in other.items())
+    here = "; ".join(f"{name} {_milliseconds(f['convergence_time_s'])}" for name, f in algorithms.items())
+    return [
+        f"With an amplifier that clips at sqrt(2 rated power), first seed, same settings: {rows}.",
+        f"Convergence depends on the length of the control filter. {N_TAPS} taps: {here}. {OTHER_N_TAPS} taps, tuned "
+        f"again: {times}.",
+    ]
+
+
+def _decibels(figures: dict[str, Any]) -> str:
+    if figures["diverged_at_s"] is not None:
+        return f"diverged after {figures['diverged_at_s']:.2f} s"
+    return f"{figures['noise_reduction_db']:.1f} dB"
+
+
+def _power(figures: dict[str, Any]) -> str:
+    return "undefined" if not np.isfinite(figures["output_power"]) else f"{figures['output_power']:.3g}"
+
+
+def _milliseconds(time_s: float | None) -> str:
+    return "does not settle" if time_s is None or np.isnan(time_s) else f"{1e3 * time_s:.1f} ms"
+
+
+def _figures_of(results: Results, clipped: Results, clipped_scene: Scene) -> list[FigureItem]:
+    def firsts(group: Results) -> Sequence[SimulationResult]:
+        return [rows[0] for rows in group.values()]
+
+    return [
+        draw(
+            "a-nse",
+            f"Normalised squared error over 5 ms, pooled over {len(SEEDS)} seeds, first 0.25 s (Fig. 6 a).",
+            lambda ax: plot_nse(results, ax=ax).set_xlim(0, 0.25),
+        ),
+        draw(
+            "b-error-spectra",
+            "Power spectra of disturbance and error signals over the steady half (Fig. 6 b).",
+            lambda ax: plot_error_spectra(firsts(results), band=(0, 4000), ax=ax),
+        ),
+        draw(
+            "c-waveform",
+            "Disturbance and KF-OPC's anti-noise, with their coherence and gain (Fig. 6 c).",
+            lambda ax: plot_disturbance_and_anti_noise(results["KF-OPC"][0], span_s=(9.0, 9.02), band=BAND, ax=ax),
+        ),
+        draw(
+            "output-power",
+            "Output power over 0.25 s, first seed.",
+            lambda ax: plot_output_power(firsts(results), rated_power=RATED_POWER, ax=ax),
+        ),
+        draw(
+            "clipped-nse",
+            f"Normalised squared error over 50 ms with an amplifier that clips at {clipped_scene.amplitude_limit:.3f}, "
+            "first seed.",
+            lambda ax: plot_nse(firsts(clipped), window_s=0.05, ax=ax),
+        ),
+    ]

@@ -1,0 +1,569 @@
+"""KFOPC beyond filterpy's filter: the scaled measurement, eq. 9-13, and what it refuses.
+
+Each test of the constraint and of faults runs with the general filter and with the random-walk one. Where the two
+must give what filterpy gives for the scaled measurement, the comparison is exact; against the plain-Python filter
+below it is 1e-10 relative, the rounding of some hundred steps in another order of sums.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kfopc_filterpy import KFOPC
+
+TAPS, STATE_NOISE, NOISE = 5, 1e-4, 0.3
+NAN, INF = math.nan, math.inf
+HAS_SEQUENTIAL = hasattr(KalmanFilter, "update_sequential")  # not in filterpy 1.4.5
+KINDS = ["general", "random walk"]
+UPDATES = ["update", "update_steadystate", "update_correlated"] + ["update_sequential"] * HAS_SEQUENTIAL
+
+both_kinds = pytest.mark.parametrize("kind", KINDS)
+rated_or_not = pytest.mark.parametrize("rated_power", [None, 0.5])
+
+
+def make(kind: str, rated_power: float | None = None, **kwargs: Any) -> KFOPC:
+    if kind == "random walk":
+        kf = KFOPC.random_walk(
+            TAPS, state_noise=STATE_NOISE, measurement_noise=NOISE, rated_power=rated_power, **kwargs
+        )
+    else:
+        kf = KFOPC(TAPS, rated_power=rated_power, **kwargs)
+        kf.Q, kf.R = STATE_NOISE * np.eye(TAPS), np.array([[NOISE]])
+    kf.M = np.zeros((TAPS, 1))  # 1.4.5 makes it (1, 1), which its own update_correlated cannot use
+    return kf
+
+
+def correct(kf: KalmanFilter, method: str, z: Any, **kwargs: Any) -> None:
+    """Any method that corrects the state; update_sequential from the first row on."""
+    getattr(kf, method)(*([0, z] if method == "update_sequential" else [z]), **kwargs)
+
+
+def scene(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reference, rows of the filtered reference (newest first), disturbance."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=n + TAPS)
+    filtered = np.convolve(x, [0.2, 0.7, -0.3])[: x.size]
+    rows = np.array([filtered[k + TAPS - 1 :: -1][:TAPS] for k in range(n)])
+    return x[TAPS - 1 : TAPS - 1 + n], rows, rows @ [3.0, -2.0, 1.0, 0.5, 0.0] + 0.5 * rng.normal(size=n)
+
+
+def plain_kf_opc(x: Any, rows: Any, d: Any, rated_power: float, forgetting: float) -> list[tuple]:
+    """Eq. 2-13 in plain Python: the weights, P, S and factor after each sample."""
+    n = TAPS
+    w, P = [0.0] * n, [[float(i == j) for j in range(n)] for i in range(n)]
+    powers, history = [0.0, 0.0, 0.0], []
+    for k in range(len(d)):
+        h, gain = [float(v) for v in rows[k]], max(1.0 - forgetting, 1.0 / (k + 1))
+        for i in range(n):
+            P[i][i] += STATE_NOISE  # eq. 4
+        for i, value in enumerate((d[k], h[0], x[k])):
+            powers[i] += gain * (float(value) ** 2 - powers[i])
+        factor = min(math.sqrt(rated_power * (powers[1] / powers[2]) / powers[0]), 1.0)  # eq. 11, 13
+        g = [sum(P[i][j] * h[j] for j in range(n)) for i in range(n)]
+        S = sum(h[i] * g[i] for i in range(n)) + NOISE
+        y = factor * float(d[k]) - sum(h[i] * w[i] for i in range(n))
+        w = [w[i] + g[i] / S * y for i in range(n)]  # eq. 9
+        P = [[P[i][j] - g[i] * g[j] / S for j in range(n)] for i in range(n)]  # eq. 8
+        history.append((w, copy.deepcopy(P), S, factor))
+    return history
+
+
+@both_kinds
+def test_eq_2_to_13_against_plain_python(kind: str) -> None:
+    x, rows, d = scene(400)
+    kf = make(kind, 0.5, fs=1000.0, power_memory=0.1)
+    factors = []
+    for k, (w, P, S, factor) in enumerate(plain_kf_opc(x, rows, d, 0.5, math.exp(-1 / 100))):
+        kf.predict()
+        kf.update(d[k], H=rows[k], reference=x[k])
+        assert kf.constraint_factor == pytest.approx(factor, rel=1e-10)
+        np.testing.assert_allclose(kf.x[:, 0], w, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(kf.P, P, rtol=1e-10, atol=1e-12)
+        assert kf.S[0, 0] == pytest.approx(S, rel=1e-10)
+        factors.append(factor)
+    assert min(factors) < 0.5, "the constraint never acted"
+
+
+# The scaled measurement.
+
+
+@pytest.mark.parametrize("method", UPDATES)
+@pytest.mark.parametrize("dim_z", [1, 2])
+@given(factor=st.floats(0.0, 1.0), z=st.floats(-100, 100), x_ndim=st.integers(1, 2))
+def test_every_update_scales_its_measurement(method: str, dim_z: int, factor: float, z: float, x_ndim: int) -> None:
+    """filterpy's filter with the scaled measurement is the oracle: x, P, y, S, K, likelihoods; z stays as given."""
+    if method == "update_sequential" and x_ndim == 1:
+        return  # filterpy's own has no 1-D state
+    measured = np.array([z, -z][:dim_z]).reshape((dim_z, 1)[:x_ndim])
+    filters = []
+    for cls in (KalmanFilter, KFOPC):
+        kf = cls(3, dim_z)
+        kf.x = np.ones((3, 1)[:x_ndim])
+        kf.H, kf.F, kf.M = np.arange(1.0, 1 + 3 * dim_z).reshape(dim_z, 3), 0.9 * np.eye(3), np.full((3, dim_z), 0.01)
+        kf.K = np.full((3, dim_z), 0.1)
+        kf.predict()
+        filters.append(kf)
+    kf, ours = filters
+    ours.constraint_factor = factor
+    assert np.array_equal(ours.residual_of(measured), kf.residual_of(factor * measured))
+    assert np.array_equal(ours.get_update(measured)[0], kf.get_update(factor * measured)[0])
+    correct(kf, method, factor * measured)
+    correct(ours, method, measured)
+    for name in ("x", "P", "y", "S", "K", "x_post", "P_post"):
+        assert np.array_equal(getattr(kf, name), getattr(ours, name)), name
+    if method != "update_steadystate":  # S is 0 there
+        assert kf.log_likelihood == ours.log_likelihood
+        assert kf.likelihood == ours.likelihood
+        assert ours.log_likelihood_of(measured) == kf.log_likelihood_of(factor * measured)
+    assert np.array_equal(ours.z, measured)
+    assert ours.z.shape == kf.z.shape
+
+
+@both_kinds
+@pytest.mark.parametrize("z", [4, 4.0, [4.0], (4,), np.array(4.0), np.array([4.0]), np.array([[4.0]])])
+@pytest.mark.parametrize("H", [None, np.arange(1.0, 1 + TAPS), np.arange(1.0, 1 + TAPS).reshape(1, TAPS)])
+@pytest.mark.parametrize("x_ndim", [1, 2])
+def test_forms_of_z_and_H(kind: str, z: Any, H: Any, x_ndim: int) -> None:
+    kf = make(kind)
+    kf.H, kf.x = np.arange(1.0, 1 + TAPS).reshape(1, TAPS), np.ones((TAPS, 1)[:x_ndim])
+    kf.constraint_factor = 0.25
+    kf.predict()
+    kf.update(z, H=H)
+    assert np.asarray(kf.z).item() == 4.0
+    assert kf.y.item() == 0.25 * 4.0 - 15.0
+    assert kf.x.shape == (TAPS, 1)[:x_ndim]
+    if H is not None:
+        assert H.shape in ((TAPS,), (1, TAPS)), "the caller's array is left alone"
+
+
+@both_kinds
+def test_batch_filter_scales_and_takes_references(kind: str) -> None:
+    x, rows, d = scene(60)
+    batch, steps = make(kind, 0.5), make(kind, 0.5)
+    zs: list[float | None] = d.tolist()
+    zs[7] = zs[20] = None
+    means, covariances, _, _ = batch.batch_filter(zs, Hs=list(rows), references=x)
+    for k, z in enumerate(zs):
+        steps.predict()
+        steps.update(z, H=rows[k], reference=x[k])
+        assert np.array_equal(means[k], steps.x)
+        assert np.array_equal(covariances[k], steps.P)
+    assert require_equal_state(batch, steps)
+    assert steps.constraint_factor < 1.0
+    with pytest.raises(ValueError, match="reference"):
+        batch.batch_filter(zs, Hs=list(rows))  # the references were those of the batch only
+    with pytest.raises(ValueError, match=r"references must have 60 values, got 59"):
+        batch.batch_filter(zs, Hs=list(rows), references=x[1:])
+
+
+# Power estimates: which methods advance them, and what can be supplied.
+
+
+def powers(kf: KFOPC) -> Any:
+    return copy.deepcopy(kf.constraint.state)
+
+
+@both_kinds
+@pytest.mark.parametrize("method", UPDATES)
+def test_what_changes_the_state_advances_the_powers_once(kind: str, method: str) -> None:
+    kf = make(kind, 0.5)
+    kf.H = np.full((1, TAPS), 3.0)
+    kf.predict()
+    kf.update(2.0, reference=1.0)
+    correct(kf, method, 4.0, reference=2.0)
+    assert kf.disturbance_power == pytest.approx((2.0**2 + 4.0**2) / 2)
+    assert kf.secondary_path_gain == pytest.approx(9.0 / ((1.0 + 4.0) / 2))
+    assert kf.constraint_factor == pytest.approx(math.sqrt(0.5 * 3.6 / 10.0))
+
+
+@both_kinds
+def test_what_leaves_the_state_leaves_the_powers(kind: str) -> None:
+    kf = make(kind, 0.5)
+    kf.H = np.full((1, TAPS), 3.0)
+    kf.predict()
+    kf.update(2.0, reference=1.0)
+    before = powers(kf)
+    kf.get_update(9.0), kf.residual_of(9.0), kf.log_likelihood_of(9.0), kf.measurement_of_state(kf.x)
+    kf.predict()
+    kf.predict_steadystate()
+    for method in ("update", "update_steadystate", "update_correlated"):  # missed samples
+        getattr(kf, method)(None, reference=5.0)
+        assert kf.z.tolist() == [[None]]
+        assert kf.y.tolist() == [[0.0]]
+    assert deep_equal(before, powers(kf))
+
+
+@both_kinds
+def test_a_missed_sample_is_a_prediction_only(kind: str) -> None:
+    kf, other = make(kind, 0.5, secondary_path_gain=1.0), make(kind, 0.5, secondary_path_gain=1.0)
+    row = np.ones(TAPS)
+    for f in (kf, other):
+        f.predict()
+        f.update(3.0, H=row)
+        f.predict()
+    kf.update(None, R=-1.0, H="unused", reference=NAN)
+    assert np.array_equal(kf.x_post, kf.x)
+    assert np.array_equal(kf.P_post, kf.P)
+    for f in (kf, other):
+        f.predict()
+        f.update(1.0, H=row)
+    np.testing.assert_array_equal(kf.x, other.x)
+    np.testing.assert_array_equal(kf.P, other.P)
+    assert deep_equal(powers(kf), powers(other))
+
+
+@both_kinds
+def test_the_gain_may_be_fixed_instead_of_estimated(kind: str) -> None:
+    kf = make(kind, 0.5, secondary_path_gain=2.0)
+    kf.predict()
+    kf.update(4.0, H=np.ones(TAPS))
+    assert kf.constraint_factor == math.sqrt(0.5 * 2.0 / 16.0)
+    kf.update(4.0, H=np.ones(TAPS), reference=100.0)  # the fixed one holds
+    assert (kf.constraint_factor, kf.secondary_path_gain, kf.disturbance_power) == (0.25, 2.0, 16.0)
+
+
+@both_kinds
+@pytest.mark.parametrize("method", UPDATES)
+def test_neither_reference_nor_gain(kind: str, method: str) -> None:
+    kf = make(kind, 0.5)
+    kf.H = np.ones((1, TAPS))
+    kf.predict()
+    before = copy.deepcopy(kf)
+    with pytest.raises(ValueError, match=r"reference=.*secondary_path_gain"):
+        correct(kf, method, 1.0)
+    assert require_equal_state(kf, before)
+
+
+@both_kinds
+def test_factor_power_and_gain_supplied_and_taken_back(kind: str) -> None:
+    x, rows, d = scene(40)
+    kf, untouched = make(kind, 0.5), make(kind, 0.5)
+
+    def step(k: int) -> None:
+        for f in (kf, untouched):
+            f.predict()
+            f.update(d[k], H=rows[k], reference=x[k])
+
+    for k in range(10):
+        step(k)
+    kf.constraint_factor = 0.125
+    step(10)
+    assert kf.constraint_factor == 0.125
+    assert kf.y.item() == pytest.approx(0.125 * d[10] - rows[10] @ kf.x_prior.reshape(-1), rel=1e-12)
+    kf.constraint_factor = None
+    kf.disturbance_power, kf.secondary_path_gain = 50.0, 4.0
+    step(11)
+    assert (kf.constraint_factor, kf.disturbance_power, kf.secondary_path_gain) == (0.2, 50.0, 4.0)
+    kf.disturbance_power = kf.secondary_path_gain = None
+    step(12)
+    assert kf.constraint_factor == untouched.constraint_factor  # the estimates went on all the while
+    assert kf.disturbance_power == untouched.disturbance_power
+    assert kf.secondary_path_gain == untouched.secondary_path_gain
+
+
+def test_without_a_rated_power() -> None:
+    kf = make("general")
+    assert (kf.rated_power, kf.constraint, kf.constraint_factor) == (None, None, 1.0)
+    assert (kf.disturbance_power, kf.secondary_path_gain) == (None, None)
+    for name in ("disturbance_power", "secondary_path_gain"):
+        with pytest.raises(ValueError, match=rf"{name}.*rated_power"):
+            setattr(kf, name, 1.0)
+    kf.constraint_factor = 0.5
+    kf.predict()
+    kf.update(2.0, H=np.ones(TAPS))
+    assert kf.y.item() == 1.0
+    kf.constraint_factor = None
+    assert kf.constraint_factor == 1.0
+
+
+def test_the_rated_power_may_come_and_go() -> None:
+    kf = make("general", secondary_path_gain=1.0)
+    kf.rated_power = 1.0
+    kf.update(4.0, H=np.ones(TAPS))
+    assert kf.constraint_factor == 0.25
+    kf.rated_power = 4.0  # the powers stay
+    kf.update(4.0, H=np.ones(TAPS))
+    assert kf.constraint_factor == 0.5
+    kf.rated_power = None
+    kf.update(4.0, H=np.ones(TAPS))
+    assert kf.constraint_factor == 1.0
+
+
+def test_a_rated_power_is_for_one_measurement() -> None:
+    with pytest.raises(ValueError, match=r"dim_z = 1, got dim_z = 2"):
+        KFOPC(4, 2, rated_power=1.0)
+    kf = KFOPC(4, 2)
+    with pytest.raises(ValueError, match="dim_z = 1"):
+        kf.rated_power = 1.0
+    for bad in (0.0, -1.0, NAN):
+        with pytest.raises(ValueError, match="rated_power"):
+            KFOPC(4, rated_power=bad)
+
+
+@both_kinds
+def test_repr_shows_the_constraint(kind: str) -> None:
+    kf = make(kind, 0.5, secondary_path_gain=1.0)
+    kf.predict()
+    kf.update(4.0, H=np.ones(TAPS))
+    for text in (type(kf).__name__, "rated_power = 0.5", "disturbance_power = 16.0", "secondary_path_gain = 1.0"):
+        assert text in repr(kf)
+
+
+# Faults: a clear error, nothing changed, and the filter goes on as one that never saw them.
+
+
+def deep_equal(a: Any, b: Any) -> bool:
+    """Equal to the last bit, through dicts, tuples and objects; NaN equals NaN."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and a.shape == b.shape and repr(a.tolist()) == repr(b.tolist())
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(deep_equal(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(map(deep_equal, a, b))
+    if hasattr(a, "__dict__") and not callable(a):
+        held = [{key: value for key, value in vars(o).items() if key != "_shown"} for o in (a, b)]
+        return deep_equal(*held)  # _shown: P as last read
+    return a is b or a == b or repr(a) == repr(b) == "nan"
+
+
+def state(kf: KFOPC) -> dict:
+    """All that a filter holds; the random-walk filter's read-only views are made when read."""
+    return {key: value for key, value in vars(kf).items() if key != "_views"}
+
+
+def require_equal_state(kf: KFOPC, other: KFOPC) -> bool:
+    differing = [key for key in state(kf) if not deep_equal(state(kf)[key], state(other)[key])]
+    assert state(kf).keys() == state(other).keys()
+    assert not differing, differing
+    return True
+
+
+ROW = np.linspace(1.0, 2.0, TAPS)
+Fault = tuple[Callable[[KFOPC], Any], str]
+
+
+def row_with(value: float) -> np.ndarray:
+    row = ROW.copy()
+    row[2] = value
+    return row
+
+
+def faults_of_updates() -> dict[str, Fault]:
+    bad_z = {"NaN": NAN, "Inf": INF, "two": [1.0, 2.0], "3-D": np.ones((1, 1, 1)), "text": "loud", "[None]": [None]}
+    found: dict[str, Fault] = {}
+    for method in UPDATES:
+        for name, z in bad_z.items():
+            if (method, name) != ("update_sequential", "two"):
+                found[f"{method}: z {name}"] = lambda f, m=method, z=z: correct(f, m, z, reference=1.0), r"\bz\b"
+        for name, x in {"NaN": NAN, "Inf": -INF, "two": [1.0, 2.0], "text": "x"}.items():
+            found[f"{method}: reference {name}"] = lambda f, m=method, x=x: correct(f, m, 1.0, reference=x), "reference"
+    suffixes = {"update": "", "update_correlated": "", "update_sequential": "_i"}
+    for method in [m for m in UPDATES if m in suffixes]:
+        H, R = "H" + suffixes[method], "R" + suffixes[method]
+        bad_H = {"NaN": row_with(NAN), "Inf": row_with(INF), "long": np.ones(TAPS + 1), "short": np.ones((1, TAPS - 1))}
+        if method != "update_sequential":
+            bad_H |= {"column": np.ones((TAPS, 1)), "number": 2.0, "3-D": np.ones((1, 1, TAPS))}
+        for name, value in bad_H.items():
+            match = "H" if name not in ("long", "short") or H == "H" else "reshape"
+            found[f"{method}: H {name}"] = (
+                lambda f, m=method, H=H, v=value: correct(f, m, 1.0, reference=1.0, **{H: v}), match
+            )  # fmt: skip
+        bad_R = {"negative": -1.0, "NaN": NAN, "Inf": INF, "[[-1]]": [[-1.0]], "too large": np.eye(2)}
+        for name, value in bad_R.items():
+            found[f"{method}: R {name}"] = (
+                lambda f, m=method, R=R, v=value: correct(f, m, 1.0, reference=1.0, **{R: v}), "R"
+            )  # fmt: skip
+        found[f"{method}: silent reference"] = (
+            lambda f, m=method, H=H, R=R: correct(f, m, 1.0, reference=1.0, **{H: np.zeros(TAPS), R: 0.0}), "silent"
+        )  # fmt: skip
+    found["update: two rows for one measurement"] = (
+        lambda f: f.update([1.0, 2.0, 3.0], H=np.ones((2, TAPS)), reference=1.0), "z"
+    )  # fmt: skip
+    return found
+
+
+def faults_of_other_steps() -> dict[str, Fault]:
+    zs, rows = [1.0, 2.0, 3.0, 4.0], [ROW] * 4
+
+    def batch(f: KFOPC, **kwargs: Any) -> None:
+        f.batch_filter(**{"zs": zs, "Hs": rows, "references": [1.0, 1.0, 0.5, 2.0]} | kwargs)
+
+    return {
+        "predict: F NaN": (lambda f: f.predict(F=NAN * np.eye(TAPS)), "F"),
+        "predict: F of another size": (lambda f: f.predict(F=np.eye(TAPS + 1)), "F"),
+        "predict: Q negative": (lambda f: f.predict(Q=-1.0), "Q"),
+        "predict: Q NaN": (lambda f: f.predict(Q=NAN), "Q"),
+        "predict: Q Inf": (lambda f: f.predict(Q=np.full((TAPS, TAPS), INF)), "Q"),
+        "predict: Q of another size": (lambda f: f.predict(Q=np.eye(2)), "Q"),
+        "predict: Q with a negative variance": (lambda f: f.predict(Q=np.diag([1.0, 1, -1, 1, 1])), "Q"),
+        "predict: u NaN": (lambda f: f.predict(u=NAN, B=np.ones((TAPS, 1))), "u"),
+        "predict: B Inf": (lambda f: f.predict(u=1.0, B=np.full((TAPS, 1), INF)), "B"),
+        "predict: B of another size": (lambda f: f.predict(u=np.ones((1, 1)), B=np.ones((TAPS + 1, 1))), "shape"),
+        "predict: u of another size": (lambda f: f.predict(u=np.ones((2, 1)), B=np.ones((TAPS, 1))), "shape"),
+        "predict: x broadcast": (lambda f: f.predict(u=np.ones((1, 3)), B=np.ones((TAPS, 1))), "x would become"),
+        "predict: F as a list": (lambda f: f.predict(F=np.eye(TAPS).tolist()), "list"),
+        "predict: overflow": (lambda f: f.predict(F=1e200 * np.eye(TAPS)), "NaN or Inf"),
+        "predict_steadystate: u NaN": (lambda f: f.predict_steadystate(u=NAN, B=np.ones((TAPS, 1))), "u"),
+        "batch_filter: z NaN": (lambda f: batch(f, zs=[1.0, 2.0, NAN, 4.0]), "z"),
+        "batch_filter: z of another size": (lambda f: batch(f, zs=[[1.0], [2.0], [3.0, 1.0], [4.0]]), "z|shape"),
+        "batch_filter: H Inf": (lambda f: batch(f, Hs=[ROW, ROW, ROW, row_with(INF)]), "H"),
+        "batch_filter: R negative": (lambda f: batch(f, Rs=[1.0, 1.0, -1.0, 1.0]), "R"),
+        "batch_filter: F NaN": (lambda f: batch(f, Fs=[np.eye(TAPS)] * 3 + [NAN * np.eye(TAPS)]), "F"),
+        "batch_filter: reference NaN": (lambda f: batch(f, references=[1.0, NAN, 1.0, 1.0]), "references"),
+        "batch_filter: silent": (lambda f: batch(f, Hs=[ROW, ROW, 0 * ROW, ROW], Rs=[1.0, 1.0, 0.0, 1.0]), "silent"),
+        "get_update: z NaN": (lambda f: f.get_update(NAN), "z"),
+        "residual_of: z Inf": (lambda f: f.residual_of(INF), "z"),
+        "residual_of: z of another size": (lambda f: f.residual_of([1.0, 2.0]), "z"),
+        "log_likelihood_of: z NaN": (lambda f: f.log_likelihood_of(NAN), "z"),
+        "alpha NaN": (lambda f: setattr(f, "alpha", NAN), "alpha"),
+        "alpha Inf": (lambda f: setattr(f, "alpha", INF), "alpha"),
+        "alpha whose square overflows": (lambda f: setattr(f, "alpha", 1e200), "alpha"),
+        "alpha below 1": (lambda f: setattr(f, "alpha", 0.5), "alpha"),
+        "constraint_factor negative": (lambda f: setattr(f, "constraint_factor", -0.5), "constraint_factor"),
+        "constraint_factor NaN": (lambda f: setattr(f, "constraint_factor", NAN), "constraint_factor"),
+        "rated_power negative": (lambda f: setattr(f, "rated_power", -1.0), "rated_power"),
+    }
+
+
+def faults_of_random_walk_assignments() -> dict[str, Fault]:
+    asymmetric = np.eye(TAPS)
+    asymmetric[0, 1] = 0.5
+    bad = {
+        "F": {"NaN": NAN * np.eye(TAPS), "of another size": np.eye(2)},
+        "Q": {"negative": -1.0, "NaN": NAN, "[[NaN]]": NAN * np.eye(TAPS), "-I": -np.eye(TAPS), "small": np.eye(2)},
+        "R": {"negative": -1.0, "NaN": NAN, "[[Inf]]": [[INF]], "of another size": np.eye(2)},
+        "P": {"NaN": NAN * np.eye(TAPS), "-I": -np.eye(TAPS), "asymmetric": asymmetric, "small": np.eye(2), "-1": -1.0},
+        "state_noise": {"negative": -1.0, "NaN": NAN, "two": [1.0, 2.0], "None": None},
+        "measurement_noise": {"negative": -1.0, "Inf": INF, "text": "quiet"},
+    }
+    return {
+        f"{name} {what}": (lambda f, name=name, value=value: setattr(f, name, value), name)
+        for name, values in bad.items()
+        for what, value in values.items()
+    }
+
+
+STEP_FAULTS = faults_of_updates() | faults_of_other_steps()
+FAULTS = [(kind, name) for kind in KINDS for name in STEP_FAULTS]
+FAULTS += [("random walk", name) for name in faults_of_random_walk_assignments()]
+
+
+def healthy_run(kf: KFOPC, steps: int, start: int = 0) -> None:
+    x, rows, d = scene(30)
+    for k in range(start, start + steps):
+        kf.predict()
+        kf.update(d[k], H=rows[k], reference=x[k])
+
+
+@rated_or_not
+@pytest.mark.parametrize(("kind", "name"), FAULTS)
+def test_a_fault_changes_nothing(kind: str, name: str, rated_power: float | None) -> None:
+    fault, match = (STEP_FAULTS | faults_of_random_walk_assignments())[name]
+    kf = make(kind, rated_power)
+    kf.H = ROW.reshape(1, -1)
+    healthy_run(kf, 8)
+    twin = copy.deepcopy(kf)
+    with pytest.raises((ValueError, TypeError, AttributeError), match=match) as caught:
+        fault(kf)
+    assert str(caught.value), "an error says what is wrong"
+    require_equal_state(kf, twin)
+    for f in (kf, twin):
+        healthy_run(f, 8, start=8)
+    require_equal_state(kf, twin)
+
+
+@rated_or_not
+@both_kinds
+@pytest.mark.parametrize("name", ["x", "P", "H"])
+def test_a_poison_written_into_an_attribute_is_found_and_can_be_taken_out(
+    kind: str, name: str, rated_power: float | None
+) -> None:
+    kf = make(kind, rated_power)
+    kf.H = ROW.reshape(1, -1).copy()
+    healthy_run(kf, 5)
+    twin = copy.deepcopy(kf)
+    good = getattr(kf, name)[0, 0]
+    getattr(kf, name)[0, 0] = NAN
+    with pytest.raises(ValueError, match=rf"NaN.* {name},|{name} must be finite|{name} .*finite|{name} would hold NaN"):
+        kf.update(1.0, reference=1.0)
+    getattr(kf, name)[0, 0] = good
+    for f in (kf, twin):
+        healthy_run(f, 5, start=5)
+    np.testing.assert_array_equal(kf.x, twin.x)
+    np.testing.assert_allclose(kf.P, twin.P, rtol=1e-13)  # taken in as edited, at another moment
+
+
+@pytest.mark.parametrize(
+    ("kind", "rated_power", "z", "R", "H"),
+    [
+        *[(kind, rated_power, 1.0, 1e-310, 1e-160) for kind in KINDS for rated_power in (None, 0.5)],
+        *[(kind, None, 1e308, 1e-12, 1e-3) for kind in KINDS],
+        ("random walk", None, 1.0, 1.0, 1e160),  # S = Inf, by which filterpy divides
+    ],
+)
+def test_a_step_that_would_overflow_is_refused(
+    kind: str, rated_power: float | None, z: float, R: float, H: float
+) -> None:
+    """S is known only after a pass over P, which the random-walk filter makes while it pays what it owes to P.
+
+    So P is the same to rounding there, not to the bit.
+    """
+    kf = make(kind, rated_power)
+    healthy_run(kf, 8)
+    twin = copy.deepcopy(kf)
+    with pytest.raises(ValueError, match=r"NaN or Inf|positive|overflow"):
+        kf.update(z, R=R, H=H * ROW, reference=1.0)
+    for steps in (0, 8):
+        for f in (kf, twin):
+            healthy_run(f, steps, start=8)
+        for name in ("x", "P", "P_prior", "P_post", "K", "S", "y", "z", "x_prior", "x_post", "log_likelihood"):
+            np.testing.assert_allclose(getattr(kf, name), getattr(twin, name), rtol=1e-12, atol=1e-14)
+        assert kf.constraint is None or deep_equal(powers(kf), powers(twin))
+
+
+@both_kinds
+def test_an_interrupted_step_changes_nothing(kind: str) -> None:
+    """Whatever breaks off a step of filterpy's own equations, an inverse of the user's among them."""
+    kf = make(kind)
+    healthy_run(kf, 3)
+    twin = copy.deepcopy(kf)
+
+    def interrupted(_: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt
+
+    kf.inv = twin.inv = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        kf.update_correlated(1.0, H=ROW)
+    require_equal_state(kf, twin)
+
+
+@pytest.mark.skipif(not HAS_SEQUENTIAL, reason="filterpy 1.4.5 has no update_sequential")
+def test_update_sequential_stays_within_the_measurements() -> None:
+    kf = KFOPC(3, 2)
+    for start, z in ((-1, 1.0), (2, 1.0), (1, [1.0, 2.0])):
+        with pytest.raises(ValueError, match="start"):
+            kf.update_sequential(start, z, R_i=1.0, H_i=np.ones((np.size(z), 3)))
+    kf.update(np.array([1.0, 2.0]), H=np.eye(2, 3))
+    kf.update_sequential(1, 1.0)
+    assert kf.z.tolist() == [[1.0], [1.0]]
+
+
+@pytest.mark.skipif(HAS_SEQUENTIAL, reason="filterpy 2.0.0 has update_sequential")
+def test_update_sequential_needs_filterpy_2() -> None:
+    with pytest.raises(AttributeError, match=r"2\.0\.0"):
+        KFOPC(2).update_sequential(0, 1.0)
+
+
+def test_two_measurements_and_a_rated_power_do_not_go_together() -> None:
+    kf = make("general", 0.5, secondary_path_gain=1.0)
+    with pytest.raises(ValueError, match="one measurement"):
+        kf.update([1.0, 2.0], R=np.eye(2), H=np.ones((2, TAPS)))
