@@ -38,7 +38,7 @@ BUDGET = 1.02  # a constrained method keeps its budget with up to this share of 
 # noise is no random walk any more but recursive least squares that never forgets, which a stationary noise would always
 # favour; the tonal study shows what it changes.
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
-STEP_SIZE_GRID = tuple((2.0 ** -np.arange(0, 17)).tolist())
+STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 POWER_MEMORY_S = 0.5
 
 Item = TypeVar("Item")

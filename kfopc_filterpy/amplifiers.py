@@ -20,7 +20,7 @@ from ._validate import as_positive
 LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def amplify(kind, limit, sharpness, y):
     """Output of one amplifier model for one sample."""
     if kind == HARD_CLIP:

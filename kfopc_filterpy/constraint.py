@@ -16,55 +16,58 @@ DEFAULT_MEMORY_S = 0.5
 # Below the smallest normal number a ratio of powers has no digits left: such a reference counts as silent.
 SILENCE = float(np.finfo(np.float64).tiny)
 
-# Rows of the three running powers, and of what is supplied or last used.
-DISTURBANCE, FILTERED_REFERENCE, REFERENCE = 0, 1, 2
-FACTOR, POWER, GAIN = 0, 1, 2
+# Rows of the state's table, and what their three columns are.
+MEAN, LAP, TAKEN, SUPPLIED, LAST, SETTINGS = range(6)
+DISTURBANCE, FILTERED_REFERENCE, REFERENCE = range(3)  # of MEAN, LAP, TAKEN
+FACTOR, POWER, GAIN = range(3)  # of SUPPLIED, LAST
+RATED_POWER, FORGETTING = range(2)  # of SETTINGS
 
 
 class ConstraintState(NamedTuple):
-    """What the compiled functions below read and advance."""
+    """What the compiled functions below read and advance.
 
-    mean: np.ndarray  # (3,) mean squares of disturbance, filtered reference and reference
-    lap: np.ndarray  # (3,) sums of squares since the sliding window last wrapped
+    Few arrays, since the compiled loop counts references to each at every call. The table's rows: MEAN, mean squares
+    of disturbance, filtered reference and reference; LAP, their sums of squares since the sliding window last wrapped;
+    TAKEN, samples taken; SUPPLIED, factor, disturbance power and gain set by the caller, NaN where estimated; LAST, the
+    same as last used; SETTINGS, rated power and 1 - forgetting factor.
+    """
+
+    table: np.ndarray  # (6, 3)
     window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential
-    taken: np.ndarray  # (3,) samples taken
-    settings: np.ndarray  # (2,) rated power, 1 - forgetting factor
-    supplied: np.ndarray  # (3,) factor, disturbance power, gain set by the caller; NaN: estimated
-    last: np.ndarray  # (3,) factor, disturbance power, gain last used
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _next_mean(state, row, square):
     """Mean square with one more sample, unbiased from the first sample on."""
-    n, m, mean = state.taken[row], state.window.shape[1], state.mean[row]
+    n, m, mean = state.table[TAKEN, row], state.window.shape[1], state.table[MEAN, row]
     if m == 0:
-        return mean + max(state.settings[1], 1.0 / (n + 1)) * (square - mean)
-    position = n % m
+        return mean + max(state.table[SETTINGS, FORGETTING], 1.0 / (n + 1)) * (square - mean)
+    position = int(n) % m
     rest = state.window[row, position + 1] if position + 1 < m else 0.0
-    return (state.lap[row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
+    return (state.table[LAP, row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _gain(state, filtered_power, reference_power):
     """Eq. 11, or the gain supplied, or the last one while the reference is silent."""
-    if not np.isnan(state.supplied[GAIN]):
-        return state.supplied[GAIN]
+    if not np.isnan(state.table[SUPPLIED, GAIN]):
+        return state.table[SUPPLIED, GAIN]
     if reference_power > SILENCE:
         return filtered_power / reference_power
-    return state.last[GAIN]
+    return state.table[LAST, GAIN]
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _factor(state, disturbance_power, gain):
     """Eq. 13; 1 where there is nothing to constrain (no disturbance, or no gain known yet)."""
-    if not np.isnan(state.supplied[FACTOR]):
-        return state.supplied[FACTOR]
+    if not np.isnan(state.table[SUPPLIED, FACTOR]):
+        return state.table[SUPPLIED, FACTOR]
     if disturbance_power <= SILENCE or np.isnan(gain):
         return 1.0
-    return min(math.sqrt(state.settings[0] * gain / disturbance_power), 1.0)
+    return min(math.sqrt(state.table[SETTINGS, RATED_POWER] * gain / disturbance_power), 1.0)
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def preview_constraint(state, disturbance, filtered_reference, reference):
     """Constraint factor with this sample included; nothing is changed.
 
@@ -72,41 +75,49 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     `reference` (none given) leaves the powers of the reference and the filtered reference as they are.
     """
     mean_d = _next_mean(state, DISTURBANCE, disturbance * disturbance)
-    mean_xf, mean_x = state.mean[FILTERED_REFERENCE], state.mean[REFERENCE]
+    mean_xf, mean_x = state.table[MEAN, FILTERED_REFERENCE], state.table[MEAN, REFERENCE]
     if not np.isnan(reference):
         mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference * filtered_reference)
         mean_x = _next_mean(state, REFERENCE, reference * reference)
     gain = _gain(state, mean_xf, mean_x)
-    power = mean_d if np.isnan(state.supplied[POWER]) else state.supplied[POWER]
+    power = mean_d if np.isnan(state.table[SUPPLIED, POWER]) else state.table[SUPPLIED, POWER]
     return _factor(state, power, gain), power, gain, mean_d, mean_xf, mean_x
 
 
-@njit(cache=True)
-def advance_constraint(state, disturbance, filtered_reference, reference):
-    """Take this sample into the running powers and return the constraint factor."""
-    factor, power, gain, mean_d, mean_xf, mean_x = preview_constraint(state, disturbance, filtered_reference, reference)
+@njit(cache=True, forceinline=True)
+def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
+    """Take the sample that `previewed` was made of into the running powers."""
+    factor, power, gain, mean_d, mean_xf, mean_x = previewed
     _take(state, DISTURBANCE, disturbance, mean_d)
     if not np.isnan(reference):
         _take(state, FILTERED_REFERENCE, filtered_reference, mean_xf)
         _take(state, REFERENCE, reference, mean_x)
-    state.last[FACTOR], state.last[POWER], state.last[GAIN] = factor, power, gain
-    return factor
+    table = state.table
+    table[LAST, FACTOR], table[LAST, POWER], table[LAST, GAIN] = factor, power, gain
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
+def advance_constraint(state, disturbance, filtered_reference, reference):
+    """Take this sample into the running powers and return the constraint factor."""
+    previewed = preview_constraint(state, disturbance, filtered_reference, reference)
+    commit_constraint(state, previewed, disturbance, filtered_reference, reference)
+    return previewed[0]
+
+
+@njit(cache=True, forceinline=True)
 def _take(state, row, value, mean):
     """Record one sample of one running power, whose new mean square is `mean`."""
-    state.mean[row] = mean
+    state.table[MEAN, row] = mean
     m = state.window.shape[1]
     if m > 0:
-        position = state.taken[row] % m
-        state.lap[row] += value * value
+        position = int(state.table[TAKEN, row]) % m
+        state.table[LAP, row] += value * value
         state.window[row, position] = value * value
         if position == m - 1:
-            state.lap[row] = 0.0
+            state.table[LAP, row] = 0.0
             for i in range(m - 2, -1, -1):
                 state.window[row, i] += state.window[row, i + 1]
-    state.taken[row] += 1
+    state.table[TAKEN, row] += 1
 
 
 class OutputPowerConstraint:
@@ -158,15 +169,11 @@ class OutputPowerConstraint:
         self.window = as_choice(window, "window", ("exponential", "sliding"))
         samples = self.memory * self.fs
         length = max(round(samples), 1) if window == "sliding" else 0
-        self._state = ConstraintState(
-            mean=np.zeros(3),
-            lap=np.zeros(3),
-            window=np.zeros((3, length)),
-            taken=np.zeros(3, dtype=np.int64),
-            settings=np.array([rated_power, -math.expm1(-1.0 / samples)]),
-            supplied=np.full(3, np.nan),
-            last=np.array([1.0, 0.0, np.nan]),
-        )
+        table = np.zeros((6, 3))
+        table[SUPPLIED] = np.nan
+        table[LAST] = 1.0, 0.0, np.nan
+        table[SETTINGS, :2] = rated_power, -math.expm1(-1.0 / samples)
+        self._state = ConstraintState(table, np.zeros((3, length)))
         self.secondary_path_gain = secondary_path_gain
 
     @property
@@ -177,11 +184,11 @@ class OutputPowerConstraint:
     @property
     def rated_power(self) -> float:
         """Rated output power; can be assigned."""
-        return float(self._state.settings[0])
+        return float(self._state.table[SETTINGS, RATED_POWER])
 
     @rated_power.setter
     def rated_power(self, value: float) -> None:
-        self._state.settings[0] = as_positive(value, "rated_power")
+        self._state.table[SETTINGS, RATED_POWER] = as_positive(value, "rated_power")
 
     @property
     def factor(self) -> float:
@@ -214,7 +221,7 @@ class OutputPowerConstraint:
     @property
     def needs_reference(self) -> bool:
         """Whether the gain has to come from the reference: neither it nor the factor was supplied."""
-        return bool(np.isnan(self._state.supplied[GAIN]) and np.isnan(self._state.supplied[FACTOR]))
+        return bool(np.isnan(self._state.table[SUPPLIED, GAIN]) and np.isnan(self._state.table[SUPPLIED, FACTOR]))
 
     def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Constraint factor that `advance` would return for this sample; nothing is changed."""
@@ -258,11 +265,11 @@ class OutputPowerConstraint:
         return values
 
     def _read(self, row: int) -> float:
-        supplied = self._state.supplied[row]
-        return float(self._state.last[row] if math.isnan(supplied) else supplied)
+        supplied = self._state.table[SUPPLIED, row]
+        return float(self._state.table[LAST, row] if math.isnan(supplied) else supplied)
 
     def _supply(self, row: int, value: float | None) -> None:
-        self._state.supplied[row] = math.nan if value is None else value
+        self._state.table[SUPPLIED, row] = math.nan if value is None else value
 
 
 def _squarable(value: Any, name: str) -> float:

@@ -45,7 +45,7 @@ def new_covariance(P: np.ndarray) -> Covariance:
     )
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def predict_covariance(cov, alpha_sq, state_noise):
     """Eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
     cov.owed[SCALE] *= alpha_sq
@@ -108,7 +108,7 @@ def project_covariance(cov, h):
     return dot(h, Ph)
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def downdate_covariance(cov, S):
     """Eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
     cov.gain_direction[:] = cov.product
@@ -189,7 +189,7 @@ def full_covariance(T, g, scale, diagonal, weight):
     return P
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def dot(a, b):
     """Inner product of two vectors of the length of the first."""
     total = 0.0
@@ -198,14 +198,14 @@ def dot(a, b):
     return total
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def correct_weights(w, gain_direction, innovation_over_S):
     """Eq. 5, w(n|n) = w(n|n-1) + K (d - x'w), with K = g/S."""
     for i in range(w.size):
         w[i] += gain_direction[i] * innovation_over_S
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", forceinline=True)
 def correction_is_finite(w, gain_direction, innovation_over_S):
     """Whether `correct_weights` would leave finite weights."""
     total = 0.0

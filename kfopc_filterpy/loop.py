@@ -3,6 +3,9 @@
 Sample-by-sample use (`controllers`, `simulation`) calls the same functions one at a time, so each equation stands
 here once. A delay line keeps the newest sample first and contiguous: it is written downwards, and its taps are moved
 to the end once every few lengths, so no sample is shifted on the way.
+
+Small functions are inlined by force: called, each would count references to every array of its arguments, which for
+a short control filter takes longer than the arithmetic.
 """
 
 from __future__ import annotations
@@ -13,7 +16,16 @@ import numpy as np
 from numba import njit
 
 from .amplifiers import amplify
-from .constraint import FACTOR, GAIN, POWER, ConstraintState, advance_constraint, preview_constraint
+from .constraint import (
+    FACTOR,
+    GAIN,
+    LAST,
+    POWER,
+    ConstraintState,
+    advance_constraint,
+    commit_constraint,
+    preview_constraint,
+)
 from .kernels import (
     DIAGONAL,
     FAST,
@@ -30,36 +42,34 @@ KALMAN, LMS = 0, 1
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
-class DelayLine(NamedTuple):
-    """Newest `taps` samples, newest first, at buffer[start[0] : start[0] + taps]."""
-
-    buffer: np.ndarray
-    start: np.ndarray
-    taps: int
+START, TAPS, HEAD = 0, 1, 2  # a delay line's first two values, and where its samples begin
 
 
-def delay_line(taps: int) -> DelayLine:
-    """A silent delay line of `taps` samples."""
-    size = 4 * taps + 64
-    return DelayLine(np.zeros(size), np.array([size - taps]), taps)
+def delay_line(taps: int) -> np.ndarray:
+    """A silent delay line of `taps` samples: the newest is at index line[START], where that of line[TAPS] follow."""
+    line = np.zeros(HEAD + 4 * taps + 64)
+    line[START], line[TAPS] = line.size - taps, taps
+    return line
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def push(line, sample):
     """Make `sample` the newest one."""
-    start = line.start[0]
-    if start == 0:
-        start = line.buffer.size - line.taps + 1
-        line.buffer[start:] = line.buffer[: line.taps - 1]
-    line.buffer[start - 1] = sample
-    line.start[0] = start - 1
+    start = int(line[START]) - 1
+    if start < HEAD:
+        kept = int(line[TAPS]) - 1
+        start = line.size - kept - 1
+        for i in range(kept):
+            line[start + 1 + i] = line[HEAD + i]
+    line[start] = sample
+    line[START] = start
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def newest(line, taps):
     """The newest `taps` samples, newest first, as a view."""
-    start = line.start[0]
-    return line.buffer[start : start + taps]
+    start = int(line[START])
+    return line[start : start + taps]
 
 
 class ControllerState(NamedTuple):
@@ -68,9 +78,9 @@ class ControllerState(NamedTuple):
     kind: int  # KALMAN or LMS
     weights: np.ndarray  # (L,) control filter w
     secondary_estimate: np.ndarray  # taps of s^
-    reference: DelayLine  # x
-    filtered: DelayLine  # x' = s^ * x
-    output: DelayLine  # y, through the amplifier model where one is known
+    reference: np.ndarray  # delay line of x
+    filtered: np.ndarray  # delay line of x' = s^ * x
+    output: np.ndarray  # delay line of y, through the amplifier model where one is known
     amplifier: np.ndarray  # (3,) parameters of that model; linear: d^ = e + s^ * y as published
     settings: np.ndarray  # Kalman: r, q, fading alpha squared; LMS: step size
     covariance: Covariance  # Kalman
@@ -78,7 +88,7 @@ class ControllerState(NamedTuple):
     last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def control_signal(controller, x):
     """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
     push(controller.reference, x)
@@ -91,7 +101,7 @@ def control_signal(controller, x):
     return y
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def disturbance_estimate(controller, error):
     """d^(n) = e(n) + (s^ * y)(n)."""
     s = controller.secondary_estimate
@@ -106,7 +116,7 @@ def adapt_kalman(controller, error):
     h = newest(controller.filtered, w.size)
     if not squares_are_finite(d, h[0], x):
         return False
-    factor = preview_constraint(controller.constraint, d, h[0], x)[0]
+    previewed = preview_constraint(controller.constraint, d, h[0], x)
     r, q, alpha_sq = controller.settings
     owed = controller.covariance.owed
     scale, diagonal, inverse_S = owed[SCALE], owed[DIAGONAL], owed[INVERSE_S]
@@ -114,16 +124,16 @@ def adapt_kalman(controller, error):
     S = project_covariance(controller.covariance, h) + q
     y = np.nan
     if 0.0 < S < np.inf:
-        y = update_weights(controller.covariance, w, h, factor * d, S, q)
+        y = update_weights(controller.covariance, w, h, previewed[0] * d, S, q)
     if not np.isfinite(y):
         take_back(controller.covariance, scale, diagonal, inverse_S, alpha_sq, r)
         return False
-    advance_constraint(controller.constraint, d, h[0], x)
+    commit_constraint(controller.constraint, previewed, d, h[0], x)
     controller.last[0], controller.last[1], controller.last[2] = d, y, S
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def squares_are_finite(d, filtered, x):
     """Whether the running powers can take this sample: an infinite power would never be forgotten."""
     return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
@@ -151,7 +161,7 @@ def adapt_lms(controller, error, y):
     xf = newest(controller.filtered, w.size)
     x = newest(controller.reference, w.size)
     factor = advance_constraint(controller.constraint, d, xf[0], x[0])
-    gain = controller.constraint.last[GAIN]
+    gain = controller.constraint.table[LAST, GAIN]
     gamma = gain * (1.0 / factor - 1.0) if factor < 1.0 and gain > 0.0 else 0.0
     mu = controller.settings[0]
     correction, penalty = mu * error, mu * gamma * y
@@ -159,7 +169,7 @@ def adapt_lms(controller, error, y):
         w[i] += correction * xf[i] - penalty * x[i]
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def adapt(controller, error, y):
     """Adapt the weights of either family; False: the step was refused."""
     if controller.kind == KALMAN:
@@ -191,18 +201,18 @@ class Plant(NamedTuple):
 
     secondary: np.ndarray  # taps of s
     feedback: np.ndarray  # taps from the amplifier to the reference microphone; size 0: none
-    output: DelayLine  # y after the amplifier
+    output: np.ndarray  # delay line of y after the amplifier
     amplifier: np.ndarray  # (3,)
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def measured_reference(plant, x):
     """Reference microphone: the noise, and what comes back from the loudspeaker (one sample late at the least)."""
     taps = plant.feedback.size
     return x if taps < 2 else x + dot(plant.feedback[1:], newest(plant.output, taps - 1))
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def anti_noise(plant, y_amplified):
     """(s * y_amp)(n)."""
     push(plant.output, y_amplified)
@@ -221,7 +231,7 @@ class Record(NamedTuple):
     weights: np.ndarray  # (n_rows or 0, L)
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def note_weights(record, weights, every, n):
     """Keep the weights of sample n where it is one of the recorded."""
     if record.weights.shape[0] > 0 and n % every == 0:
@@ -243,7 +253,7 @@ def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last
         if not adapt(controller, e, y):
             return REFUSED, n
         record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
-        powers = controller.constraint.last
+        powers = controller.constraint.table[LAST]
         record.constraint_factor[n] = powers[FACTOR]
         if record.powers.shape[0] > 0:
             record.powers[n, 0], record.powers[n, 1] = powers[POWER], powers[GAIN]

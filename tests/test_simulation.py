@@ -1,15 +1,10 @@
-"""`simulate`: its arguments and refusals, users' own controllers and amplifiers, divergence, going on, interruptions."""
+"""`simulate`: what it records, users' own controllers and amplifiers, divergence as a result."""
 
-import copy
 import dataclasses
 import math
-import pickle
 
-import control
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
-from oracles import modified_anc as oracle
 
 from kfopc_filterpy import (
     FxLMS,
@@ -234,39 +229,31 @@ def test_divergence_is_a_result(name, compiled):
     x, d = noises(3000)
     options = {"step_size": 1.0} if "LMS" in name else {"state_noise": 1e-2}
     made = MAKERS[name](-S, **options)  # the wrong sign: the loop feeds back positively
-    result = (
-        simulate(
-            made,
-            x,
-            disturbance=d,
-            secondary_path=S,
-            fs=8000,
-            rated_power=0.25,
-            record_weights_every=10,
-            record_powers=True,
-            compiled=compiled,
-            **({} if "OPC" not in name and "MOV" not in name else {}),
-        )
-        if name in ("KF-ANC", "FxLMS")
-        else simulate(
-            made, x, disturbance=d, secondary_path=S, record_weights_every=10, record_powers=True, compiled=compiled
-        )
-    )
+    if name == "KF-OPC":
+        made.estimator.constraint_factor = 1.0  # left to eq. 13 it does not diverge, see test_controllers
+    run = {"disturbance": d, "secondary_path": S, "fs": 16000, "rated_power": 0.25, "compiled": compiled}
+    result = simulate(made, x, record_weights_every=10, record_powers=True, **run)
     assert result.diverged_at_s is not None
-    end = round(result.diverged_at_s * result.fs)
+    end = round(result.diverged_at_s * 16000)
     assert 0 < end < 3000
-    assert result.diverged_at_s == end / result.fs
-    limit = 1e6 * math.sqrt(result.rated_power)
-    for signal in ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor"):
-        assert np.all(np.isfinite(getattr(result, signal)[:end]))
-        assert np.all(np.isnan(getattr(result, signal)[end:]))
-    assert np.all(np.isnan(result.disturbance_power[end:]))
-    assert np.all(np.isnan(result.weights[-(-end // 10) :]))
-    assert np.all(np.isfinite(result.weights[: -(-end // 10)]))
-    assert np.max(np.abs(result.control_signal[:end])) <= limit
-    assert np.all(np.isfinite(result.disturbance))  # what was given stays
-    again = simulate(made, x, disturbance=d, secondary_path=S, fs=result.fs, rated_power=result.rated_power)
-    assert again.diverged_at_s is not None  # it goes on from where it is: no exception either
+    assert result.diverged_at_s == end / 16000
+    for signal in (
+        "error",
+        "control_signal",
+        "amplifier_output",
+        "anti_noise",
+        "constraint_factor",
+        "disturbance_power",
+        "secondary_path_gain",
+    ):
+        assert np.all(np.isfinite(getattr(result, signal)[:end])), signal
+        assert np.all(np.isnan(getattr(result, signal)[end:])), signal
+    rows = -(-end // 10)
+    assert np.all(np.isfinite(result.weights[:rows]))
+    assert np.all(np.isnan(result.weights[rows:]))
+    assert np.max(np.abs(result.control_signal[:end])) <= 0.5e6
+    np.testing.assert_array_equal(result.disturbance, d)  # what was given stays
+    assert simulate(made, x, **run).diverged_at_s is not None  # it goes on from where it is: no exception either
 
 
 def test_divergence_comes_past_1e6_of_the_rated_amplitude():
@@ -315,87 +302,3 @@ def test_divergence_at_the_first_sample(name):
         result = simulate(made, X, disturbance=D, secondary_path=S, record_weights_every=50)
         assert result.diverged_at_s == 0.0
         assert np.all(np.isnan(result.weights))
-
-
-# ---- Silence, and updates without a solution
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("name", MAKERS)
-def test_a_silent_reference_leaves_everything_alone(name, compiled):
-    silent = np.zeros(100)
-    result = simulate(
-        MAKERS[name](), silent, disturbance=D[:100], secondary_path=S, record_powers=True, compiled=compiled
-    )
-    np.testing.assert_array_equal(result.control_signal, 0.0)
-    np.testing.assert_array_equal(result.error, D[:100])
-    np.testing.assert_array_equal(result.constraint_factor, 1.0)  # no gain known: alpha = 1
-    assert np.all(np.isnan(result.secondary_path_gain))
-    made = MAKERS[name]()
-    quiet = simulate(made, silent, disturbance=silent, secondary_path=S, compiled=compiled)
-    np.testing.assert_array_equal(quiet.constraint_factor, 1.0)  # no disturbance: alpha = 1
-    np.testing.assert_array_equal(made.weights, 0.0)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_noise_that_has_not_come_through_the_path_yet_does_no_harm(compiled):
-    """Disturbance and reference from the first sample on, filtered reference zero: G_s = 0 and alpha = 0."""
-    late = np.concatenate([np.zeros(5), [1.0]])
-    for name in ("KF-OPC", "MOV-FxLMS"):
-        result = simulate(
-            MAKERS[name](late), X, disturbance=D + 1.0, secondary_path=late, record_powers=True, compiled=compiled
-        )
-        assert result.diverged_at_s is None
-        np.testing.assert_array_equal(result.secondary_path_gain[:5], 0.0)
-        np.testing.assert_array_equal(result.constraint_factor[:5], 0.0)
-        assert np.all(np.isfinite(result.error))
-
-
-@pytest.mark.parametrize("first", [0, 40])
-@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
-def test_silent_reference_without_measurement_noise_is_a_clear_error(name, first):
-    x = np.where(np.arange(X.size) < first, X, 0.0)
-    silent_from = 0 if first == 0 else first + S.size + 6 - 2
-    direct = np.concatenate([[0.5], S]) if first else S  # x'(0) must not be silent in turn
-    left = []
-    for compiled in (True, False):
-        made = MAKERS[name](direct, measurement_noise=0.0)
-        with pytest.raises(ValueError, match=r"silent reference .* tells nothing: give R > 0") as caught:
-            simulate(made, x, disturbance=D, secondary_path=S, compiled=compiled)
-        assert caught.value.__notes__ == [f"in sample {silent_from + (1 if first else 0)} of the run"]
-        left.append(made.estimator)
-        made.estimator.R = 0.01  # and with the cure it goes on
-        assert np.all(np.isfinite(simulate(made, X, disturbance=D, secondary_path=S).error))
-    np.testing.assert_allclose(left[0].x, left[1].x, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(left[0].P, left[1].P, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-def test_an_update_without_a_solution_leaves_the_samples_before_it(compiled):
-    """r = q = 0: after the first samples of a tone P is singular on x', S is rounding, and in the end not positive."""
-    x = np.cos(0.3 * np.arange(400))
-    made = MAKERS["KF-ANC"]([1.0], state_noise=0.0, measurement_noise=0.0)
-    with pytest.raises(ValueError, match=r"S = H P H' \+ R must be positive|update has no solution") as caught:
-        simulate(made, x, disturbance=x, secondary_path=[1.0], compiled=compiled)
-    refused = int(caught.value.__notes__[0].split()[2])
-    assert refused > 0
-    before = MAKERS["KF-ANC"]([1.0], state_noise=0.0, measurement_noise=0.0)
-    simulate(before, x[:refused], disturbance=x[:refused], secondary_path=[1.0], compiled=compiled)
-    for name in ("x", "K", "S", "y", "z"):
-        np.testing.assert_array_equal(getattr(made.estimator, name), getattr(before.estimator, name))
-    np.testing.assert_allclose(made.estimator.P_post, before.estimator.P_post, rtol=0, atol=1e-14)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
-def test_a_sample_whose_square_overflows_is_refused(name, compiled):
-    d = D.copy()
-    d[50] = 1e200
-    made, before = MAKERS[name](), MAKERS[name]()
-    with pytest.raises(ValueError, match="measurement must have a finite square"):
-        simulate(made, X, disturbance=d, secondary_path=S, compiled=compiled)
-    simulate(before, X[:50], disturbance=D[:50], secondary_path=S)
-    np.testing.assert_array_equal(made.weights, before.weights)
-    assert made.disturbance_power == before.disturbance_power
-    with pytest.raises(ValueError, match="finite squares: those of sample 50 overflow"):
-        MAKERS[name]().listen(X, d)

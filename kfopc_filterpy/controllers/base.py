@@ -8,7 +8,7 @@ import numpy as np
 
 from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, compiled_parameters
-from ..constraint import FACTOR, GAIN, POWER, OutputPowerConstraint
+from ..constraint import FACTOR, GAIN, LAST, POWER, OutputPowerConstraint
 from ..kernels import new_covariance
 from ..loop import ControllerState, adapt, control_signal, delay_line, listen
 from ..paths import is_system, path_taps, sampling_rate
@@ -112,17 +112,17 @@ class FilteredReferenceController:
     @property
     def constraint_factor(self) -> float:
         """Constraint factor of the last sample."""
-        return float(self._state.constraint.last[FACTOR])
+        return float(self._state.constraint.table[LAST, FACTOR])
 
     @property
     def disturbance_power(self) -> float:
         """Running power of the disturbance estimate (eq. 10)."""
-        return float(self._state.constraint.last[POWER])
+        return float(self._state.constraint.table[LAST, POWER])
 
     @property
     def secondary_path_gain(self) -> float:
         """Running secondary-path gain (eq. 11); NaN before any reference energy."""
-        return float(self._state.constraint.last[GAIN])
+        return float(self._state.constraint.table[LAST, GAIN])
 
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
