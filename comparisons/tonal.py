@@ -55,7 +55,7 @@ def main(runs: Runs) -> StudyReport:
 
     results = dict(zip(tuned, runs.map(run, tuned), strict=True))
     algorithms = {name: _figures(result, scene) for name, result in results.items()}
-    sweep = _overdrive_sweep(runs, primary, secondary, tuned)
+    sweep = _overdrive_sweep(runs, scene, tuned)
     crossings = crossings_db(OVERDRIVES_DB, sweep["KF-OPC"] - sweep["KF-ANC"])
     unforgetting = _without_forgetting(runs, scene)
     theirs = _by_filterpy(scene, tuned["KF-ANC"].setting)
@@ -130,14 +130,14 @@ def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
     return figures_of_merit([result], scene) | {"harmonics_db": harmonics}
 
 
-def _overdrive_sweep(runs: Runs, primary: Any, secondary: Any, tuned: dict[str, Tuned]) -> dict[str, np.ndarray]:
+def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[str, np.ndarray]:
     """Noise reduction of both Kalman filters over the overdrive, at the settings tuned for the study."""
     jobs = [(name, level) for name in KALMAN for level in OVERDRIVES_DB]
 
     def reduction(job: tuple[str, float]) -> float:
         name, level = job
-        scene = _scene(primary, secondary, 10 ** (level / 10))
-        result = scene.run(make_controller(scene, name, tuned[name].setting))
+        louder = scene.scaled(10 ** (level / 10) * RATED_POWER)
+        result = louder.run(make_controller(louder, name, tuned[name].setting))
         return noise_reduction_db(result.error, result.disturbance)
 
     values = np.reshape(runs.map(reduction, jobs), (len(KALMAN), -1))

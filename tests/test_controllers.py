@@ -23,6 +23,7 @@ from kfopc_filterpy import (
     noise_reduction_db,
     output_power,
     simulate,
+    simulation,
     wiener_solution,
 )
 
@@ -87,16 +88,23 @@ def test_a_copy_goes_on_alone(name, clone):
     assert made.disturbance_power == twin.disturbance_power
 
 
+@pytest.mark.parametrize("place", ["progress", "run"])
 @pytest.mark.parametrize("name", MAKERS)
-def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, monkeypatch):
-    monkeypatch.setattr("kfopc_filterpy.simulation.STEP", 100)
+def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, place, monkeypatch):
+    monkeypatch.setattr(simulation, "STEP", 100)
     made, reference = MAKERS[name](), MAKERS[name]()
+    run = simulation.run
 
-    def interrupt(done):
+    def interrupt(*arguments):
+        if place == "run":
+            run(*arguments)
         raise KeyboardInterrupt
 
+    if place == "run":  # control-C comes through when the compiled loop returns, before its answer is kept
+        monkeypatch.setattr(simulation, "run", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        simulate(made, X, disturbance=D, secondary_path=S, progress=interrupt)
+        simulate(made, X, disturbance=D, secondary_path=S, progress=interrupt if place == "progress" else None)
+    monkeypatch.setattr(simulation, "run", run)
     simulate(reference, X[:100], disturbance=D[:100], secondary_path=S)
     np.testing.assert_array_equal(made.weights, reference.weights)
     if isinstance(made, KalmanController):
@@ -106,6 +114,16 @@ def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, monkeypatch):
             )
     one, other = (simulate(c, X, disturbance=D, secondary_path=S) for c in (made, reference))
     assert_same_run(one, other)
+
+
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
+def test_listening_after_a_run_hears_the_loudspeaker_fall_silent(name):
+    """Three samples of y are still in s^ * y; then the disturbance is what the microphone hears."""
+    made = MAKERS[name](power_memory=4 / FS, power_window="sliding")
+    simulate(made, X, disturbance=D, secondary_path=S)
+    made.listen(X[:7], D[:7])
+    assert made.disturbance_power == pytest.approx(np.mean(D[3:7] ** 2), rel=1e-14)
+    assert made.disturbance_power != 0.0
 
 
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])

@@ -256,6 +256,16 @@ def test_divergence_is_a_result(name, compiled):
     assert simulate(made, x, **run).diverged_at_s is not None  # it goes on from where it is: no exception either
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", ["FxLMS", "MOV-FxLMS"])
+def test_weights_that_overflow_at_once_are_a_divergence_too(name, compiled):
+    d = np.where(np.arange(X.size) < 20, 0.0, D)  # the first step adapts every weight, to inf and -inf: y is NaN
+    made = MAKERS[name](step_size=1e308)
+    result = simulate(made, 100 * X, disturbance=100 * d, secondary_path=S, compiled=compiled)
+    assert result.diverged_at_s == 21 / 16000
+    assert np.isnan(made.control_signal(1.0))
+
+
 def test_divergence_comes_past_1e6_of_the_rated_amplitude():
     class Ramp:
         def __init__(self):

@@ -211,6 +211,32 @@ def test_an_update_without_a_solution_leaves_the_samples_before_it(compiled):
     np.testing.assert_allclose(made.estimator.P_post, before.estimator.P_post, rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("fading", [1.0, 1.01])
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+def test_a_refused_step_is_taken_back(name, fading):
+    """S overflows at sample 50, with a downdate owed: what the estimator has is what 50 samples left."""
+    x = X.copy()
+    x[50] = 1e153
+    quiet = np.zeros(X.size)  # the weights stay 0, or the control signal would diverge before S does
+    kalman = {"state_noise": 1e3, "measurement_noise": 1e6, "initial_variance": 1e4}
+    made, stepped, before = (MAKERS[name]([1.0, 0.5], **kalman) for _ in range(3))
+    for controller in (made, stepped, before):
+        controller.estimator.alpha = fading
+    for controller, compiled in ((made, True), (stepped, False)):
+        with pytest.raises(ValueError, match=r"S = H P H' \+ R must be positive, got inf") as caught:
+            simulate(controller, x, disturbance=quiet, secondary_path=[1.0, 0.5], compiled=compiled)
+        assert caught.value.__notes__ == ["in sample 50 of the run"]
+    simulate(before, x[:50], disturbance=quiet[:50], secondary_path=[1.0, 0.5])
+    kf, expected = made.estimator, before.estimator
+    for attribute in ("x", "K", "S", "y", "z", "log_likelihood", "disturbance_power", "secondary_path_gain"):
+        np.testing.assert_array_equal(getattr(kf, attribute), getattr(expected, attribute), err_msg=attribute)
+    np.testing.assert_allclose(kf.P_post, expected.P_post, rtol=0, atol=1e-14 * np.max(expected.P_post))
+    # as after any refused update, the prediction before it stands
+    np.testing.assert_allclose(kf.P, stepped.estimator.P, rtol=0, atol=1e-14 * np.max(kf.P))
+    expected.predict()
+    np.testing.assert_allclose(kf.P, expected.P, rtol=0, atol=1e-14 * np.max(kf.P))
+
+
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
 def test_a_sample_whose_square_overflows_is_refused(name, compiled):

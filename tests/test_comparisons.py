@@ -1,0 +1,141 @@
+"""The studies' own parts: the scene, the rule that tunes, the command; the figures they give are their own output."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from comparisons import duct, tonal
+from comparisons.__main__ import STUDIES, main
+from comparisons.scene import (
+    ALGORITHMS,
+    Runs,
+    Trial,
+    _best,
+    figures_of_merit,
+    grid,
+    make_controller,
+    make_scene,
+    tune,
+)
+from kfopc_filterpy import bandpass_path, output_power, path_taps, tone, wiener_solution
+
+
+@pytest.fixture(scope="module")
+def scene():
+    noise = np.random.default_rng(0).standard_normal(12000)
+    return make_scene(
+        {3: noise, 4: noise[::-1].copy()},
+        bandpass_path(64),
+        bandpass_path(16),
+        fs=16000.0,
+        rated_power=0.5,
+        power_multiple=4.0,
+        n_taps=64,
+        switch_on_s=0.1,
+    )
+
+
+def test_scene_needs_the_stated_multiple_of_the_rated_power(scene):
+    x, d = scene.references[0][1600:], scene.disturbances[0][1600:]
+    solution = wiener_solution(x, d, scene.secondary, scene.n_taps)
+    assert solution.control_power == pytest.approx(4.0 * 0.5, rel=1e-9)  # the same least squares, scaled
+    np.testing.assert_allclose(d, np.convolve(scene.references[0], path_taps(bandpass_path(64)))[1600 : 1600 + d.size])
+
+
+def test_scene_knows_its_measurement_noise(scene):
+    # What 64 taps leave of the disturbance, sensor noise included: never less than the sensor noise, to 3 of its
+    # standard errors, sqrt(2/n).
+    floor = scene.sensor_noise_std**2 * (1 - 3 * np.sqrt(2 / 10400))
+    assert scene.measurement_noise > floor
+
+
+def test_scaling_a_scene_scales_the_unconstrained_control_signal(scene):
+    quiet, loud = scene, scene.scaled(4 * scene.wiener_control_power)
+    assert loud.amplitude_limit == quiet.amplitude_limit
+    results = [s.run(make_controller(s, "KF-ANC", 1e-6)) for s in (quiet, loud)]
+    # Every quantity of the filter scales by a power of two: equal but for the sensor noise's rounding.
+    np.testing.assert_allclose(results[1].control_signal, 2 * results[0].control_signal, rtol=1e-6, atol=1e-9)
+
+
+def test_every_algorithm_runs_from_every_end_of_its_grid(scene):
+    for name in ALGORITHMS:
+        for setting in (grid(name)[0], grid(name)[-1]):
+            result = scene.run(make_controller(scene, name, setting))
+            assert result.algorithm == name
+            assert result.error.size == 12000 - 1600
+
+
+def test_tuning_takes_the_lowest_error_that_keeps_the_budget():
+    trials = [
+        Trial(1.0, -9.0, 9.0, True),  # diverged
+        Trial(2.0, -8.0, 0.52, False),  # over the budget
+        Trial(3.0, -7.0, 0.505, False),
+        Trial(4.0, -6.0, 0.5, False),
+    ]
+    assert _best(trials, 0.5, "KF-OPC").setting == 3.0
+    assert _best(trials, np.inf, "KF-ANC").setting == 2.0
+    over = _best(trials[:2], 0.5, "KF-OPC")
+    assert (over.setting, over.within_budget) == (2.0, False)
+    with pytest.raises(RuntimeError, match="KF-OPC diverged at every setting"):
+        _best(trials[:1], 0.5, "KF-OPC")
+
+
+def test_tuned_setting_is_the_best_of_its_trials(scene):
+    tuned = tune(Runs(), scene, ["KF-OPC", "MOV-FxLMS"], seeds=2)
+    for name, best in tuned.items():
+        assert [t.setting for t in best.trials] == list(grid(name))
+        kept = [t for t in best.trials if not t.diverged and t.output_power <= 1.02 * scene.rated_power]
+        assert best.within_budget == bool(kept)
+        if kept:
+            assert best.setting == min(kept, key=lambda t: t.mean_nse_db).setting
+        result = scene.run(make_controller(scene, name, best.setting))
+        figures = figures_of_merit([result], scene)
+        assert figures["output_power"] == output_power(result.control_signal)
+
+
+def test_overdrives_where_the_order_flips():
+    levels = np.array([0.0, 1.0, 2.0, 3.0])
+    assert tonal.crossings_db(levels, np.array([-1.0, 1.0, 3.0, -1.0])) == [0.5, 2.75]
+    assert tonal.crossings_db(levels, np.ones(4)) == []
+
+
+def test_wiener_multiple_of_a_tone_is_its_overdrive():
+    scene = tonal._scene(bandpass_path(128), bandpass_path(32), 2.0)
+    x = scene.references[0]
+    gain = abs(np.exp(-2j * np.pi * 400 / 16000 * np.arange(32)) @ path_taps(bandpass_path(32))) ** 2
+    d = scene.disturbances[0][8000:]
+    # A tone is cancelled by a control signal of power E[d^2] over the path's power gain at its frequency.
+    assert np.mean(d**2) / gain == pytest.approx(2.0, rel=1e-3)
+    np.testing.assert_allclose(x / np.abs(x).max(), tone(400, 10.5, fs=16000.0), atol=1e-9)
+
+
+def test_measured_study_says_in_a_line_why_it_is_left_out(monkeypatch, tmp_path):
+    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
+    line = duct.main_measured(Runs())
+    assert isinstance(line, str)
+    assert line.startswith("duct-measured is left out: ")
+    assert "\n" not in line
+
+
+def test_command_refuses_an_unknown_study(capsys):
+    with pytest.raises(SystemExit):
+        main(["tonal", "tidal"])
+    assert "no study called tidal" in capsys.readouterr().err
+
+
+def test_command_writes_report_and_results(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tonal, "DURATION_S", 1.5)
+    monkeypatch.setattr(tonal, "OVERDRIVES_DB", np.array([0.0, 3.0, 10.0]))
+    monkeypatch.setattr(tonal, "FILTERPY_SAMPLES", 320)
+    assert list(STUDIES) == ["tonal", "broadband", "duct", "duct-measured"]
+    assert main(["tonal", "--quiet", "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "KF-ANC run by filterpy's own KalmanFilter over the first 320 samples" in printed.replace("\n  ", " ")
+    study = json.loads((tmp_path / "out" / "results.json").read_text())["studies"]["tonal"]
+    assert set(study["algorithms"]) == set(ALGORITHMS)
+    assert study["extra"]["filterpy_largest_difference"]["weights"] < 1e-5  # S/R starts at 1e6: 1e-16 times that
+    assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
+    assert sorted(p.name for p in (tmp_path / "out" / "audio").iterdir())[0] == "tonal-disturbance.wav"
