@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 
+from ._compile import compiled
 from ._validate import as_positive
 
 LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def amplify(kind, limit, sharpness, y):
     """Output of one amplifier model for one sample."""
     if kind == HARD_CLIP:
@@ -33,7 +33,7 @@ def amplify(kind, limit, sharpness, y):
     return y
 
 
-@njit(cache=True)
+@compiled()
 def _amplify_all(kind, limit, sharpness, signal, out):
     for n in range(signal.size):
         out[n] = amplify(kind, limit, sharpness, signal[n])

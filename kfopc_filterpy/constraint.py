@@ -6,8 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ._compile import compiled
 from ._validate import as_choice, as_nonnegative, as_number, as_positive
 
 DEFAULT_FS = 16000.0
@@ -36,7 +36,7 @@ class ConstraintState(NamedTuple):
     window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def _next_mean(state, row, square):
     """Mean square with one more sample, unbiased from the first sample on."""
     n, m, mean = state.table[TAKEN, row], state.window.shape[1], state.table[MEAN, row]
@@ -47,7 +47,7 @@ def _next_mean(state, row, square):
     return (state.table[LAP, row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def _gain(state, filtered_power, reference_power):
     """Eq. 11, or the gain supplied, or the last one while the reference is silent."""
     if not np.isnan(state.table[SUPPLIED, GAIN]):
@@ -57,7 +57,7 @@ def _gain(state, filtered_power, reference_power):
     return state.table[LAST, GAIN]
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def _factor(state, disturbance_power, gain):
     """Eq. 13; 1 where there is nothing to constrain (no disturbance, or no gain known yet)."""
     if not np.isnan(state.table[SUPPLIED, FACTOR]):
@@ -67,7 +67,7 @@ def _factor(state, disturbance_power, gain):
     return min(math.sqrt(state.table[SETTINGS, RATED_POWER] * gain / disturbance_power), 1.0)
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def preview_constraint(state, disturbance, filtered_reference, reference):
     """Constraint factor with this sample included; nothing is changed.
 
@@ -84,7 +84,7 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     return _factor(state, power, gain), power, gain, mean_d, mean_xf, mean_x
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
     """Take the sample that `previewed` was made of into the running powers."""
     factor, power, gain, mean_d, mean_xf, mean_x = previewed
@@ -96,7 +96,7 @@ def commit_constraint(state, previewed, disturbance, filtered_reference, referen
     table[LAST, FACTOR], table[LAST, POWER], table[LAST, GAIN] = factor, power, gain
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def advance_constraint(state, disturbance, filtered_reference, reference):
     """Take this sample into the running powers and return the constraint factor."""
     previewed = preview_constraint(state, disturbance, filtered_reference, reference)
@@ -104,7 +104,7 @@ def advance_constraint(state, disturbance, filtered_reference, reference):
     return previewed[0]
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def _take(state, row, value, mean):
     """Record one sample of one running power, whose new mean square is `mean`."""
     state.table[MEAN, row] = mean

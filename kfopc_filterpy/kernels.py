@@ -15,7 +15,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from ._compile import compiled
 
 # No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
 FAST = {"reassoc", "contract", "nsz"}
@@ -45,14 +46,14 @@ def new_covariance(P: np.ndarray) -> Covariance:
     )
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def predict_covariance(cov, alpha_sq, state_noise):
     """Eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
     cov.owed[SCALE] *= alpha_sq
     cov.owed[DIAGONAL] = alpha_sq * cov.owed[DIAGONAL] + state_noise
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def project_covariance(cov, h):
     """Pay what is owed to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
 
@@ -108,14 +109,14 @@ def project_covariance(cov, h):
     return dot(h, Ph)
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def downdate_covariance(cov, S):
     """Eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
     cov.gain_direction[:] = cov.product
     cov.owed[INVERSE_S] = cov.owed[LAST_INVERSE_S] = 1.0 / S
 
 
-@njit(cache=True)
+@compiled()
 def two_sum(a, b):
     """a + b as the rounded sum and what rounding left (Knuth)."""
     total = a + b
@@ -123,7 +124,7 @@ def two_sum(a, b):
     return total, (a - (total - rest)) + (b - rest)
 
 
-@njit(cache=True)
+@compiled()
 def two_product(a, b):
     """a b as the rounded product and what rounding left (Dekker)."""
     product = a * b
@@ -135,7 +136,7 @@ def two_product(a, b):
     return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
-@njit(cache=True)
+@compiled()
 def add_product(total, rest, a, b):
     """(total + rest) + a b in twice the precision (Ogita, Rump and Oishi's Dot2)."""
     product, product_rest = two_product(a, b)
@@ -143,7 +144,7 @@ def add_product(total, rest, a, b):
     return total, rest + (product_rest + sum_rest)
 
 
-@njit(cache=True)
+@compiled()
 def downdate_carefully(cov, h, noise):
     """Eq. 8 in twice the precision and at once, after `project_covariance`; False, undone, where it would overflow."""
     T, n = cov.triangle, h.size
@@ -175,7 +176,7 @@ def downdate_carefully(cov, h, noise):
     return True
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def full_covariance(T, g, scale, diagonal, weight):
     """Full symmetric array scale T + weight g g' + diagonal I."""
     n = g.size
@@ -189,7 +190,7 @@ def full_covariance(T, g, scale, diagonal, weight):
     return P
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
+@compiled(fastmath=FAST, error_model="numpy", forceinline=True)
 def dot(a, b):
     """Inner product of two vectors of the length of the first."""
     total = 0.0
@@ -198,14 +199,14 @@ def dot(a, b):
     return total
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
+@compiled(fastmath=FAST, error_model="numpy", forceinline=True)
 def correct_weights(w, gain_direction, innovation_over_S):
     """Eq. 5, w(n|n) = w(n|n-1) + K (d - x'w), with K = g/S."""
     for i in range(w.size):
         w[i] += gain_direction[i] * innovation_over_S
 
 
-@njit(cache=True, error_model="numpy", forceinline=True)
+@compiled(error_model="numpy", forceinline=True)
 def correction_is_finite(w, gain_direction, innovation_over_S):
     """Whether `correct_weights` would leave finite weights."""
     total = 0.0
@@ -214,7 +215,7 @@ def correction_is_finite(w, gain_direction, innovation_over_S):
     return np.isfinite(total)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def update_weights(cov, w, h, scaled_measurement, S, noise):
     """Eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from ._compile import compiled
 from .amplifiers import amplify
 from .constraint import (
     FACTOR,
@@ -52,7 +52,7 @@ def delay_line(taps: int) -> np.ndarray:
     return line
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def push(line, sample):
     """Make `sample` the newest one."""
     start = int(line[START]) - 1
@@ -65,7 +65,7 @@ def push(line, sample):
     line[START] = start
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def newest(line, taps):
     """The newest `taps` samples, newest first, as a view."""
     start = int(line[START])
@@ -88,7 +88,7 @@ class ControllerState(NamedTuple):
     last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def control_signal(controller, x):
     """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
     push(controller.reference, x)
@@ -101,14 +101,14 @@ def control_signal(controller, x):
     return y
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def disturbance_estimate(controller, error):
     """d^(n) = e(n) + (s^ * y)(n)."""
     s = controller.secondary_estimate
     return error + dot(s, newest(controller.output, s.size))
 
 
-@njit(cache=True)
+@compiled()
 def adapt_kalman(controller, error):
     """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step."""
     d = disturbance_estimate(controller, error)
@@ -133,13 +133,13 @@ def adapt_kalman(controller, error):
     return True
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def squares_are_finite(d, filtered, x):
     """Whether the running powers can take this sample: an infinite power would never be forgotten."""
     return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
 
 
-@njit(cache=True)
+@compiled()
 def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     """Undo, to rounding, the prediction and projection of a step that cannot be completed."""
     T, g = cov.triangle, cov.gain_direction
@@ -150,7 +150,7 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
-@njit(cache=True, fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST, error_model="numpy")
 def adapt_lms(controller, error, y):
     """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS).
 
@@ -169,7 +169,7 @@ def adapt_lms(controller, error, y):
         w[i] += correction * xf[i] - penalty * x[i]
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def adapt(controller, error, y):
     """Adapt the weights of either family; False: the step was refused."""
     if controller.kind == KALMAN:
@@ -178,7 +178,7 @@ def adapt(controller, error, y):
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def listen(controller, references, errors):
     """Follow the noise with the loudspeaker silent: delay lines and powers advance, the weights stay.
 
@@ -205,14 +205,14 @@ class Plant(NamedTuple):
     amplifier: np.ndarray  # (3,)
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def measured_reference(plant, x):
     """Reference microphone: the noise, and what comes back from the loudspeaker (one sample late at the least)."""
     taps = plant.feedback.size
     return x if taps < 2 else x + dot(plant.feedback[1:], newest(plant.output, taps - 1))
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def anti_noise(plant, y_amplified):
     """(s * y_amp)(n)."""
     push(plant.output, y_amplified)
@@ -231,14 +231,14 @@ class Record(NamedTuple):
     weights: np.ndarray  # (n_rows or 0, L)
 
 
-@njit(cache=True, forceinline=True)
+@compiled(forceinline=True)
 def note_weights(record, weights, every, n):
     """Keep the weights of sample n where it is one of the recorded."""
     if record.weights.shape[0] > 0 and n % every == 0:
         record.weights[n // every] = weights
 
 
-@njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last):
     """Samples `first` to `last` of the loop; returns the status and the sample after the last one run."""
     kind, clip, sharpness = plant.amplifier
