@@ -12,6 +12,7 @@ from kfopc_filterpy import (
     compressor_noise,
     duct_paths,
     fir_path,
+    identify_secondary_path,
     load_measured_duct,
     nse_db,
     overshoot,
@@ -19,7 +20,15 @@ from kfopc_filterpy import (
     secondary_path_gain,
     wiener_solution,
 )
-from kfopc_filterpy.path_plots import plot_required_rated_power
+from kfopc_filterpy.path_plots import (
+    plot_causality_margin,
+    plot_group_delay,
+    plot_impulse_responses,
+    plot_modelling_error,
+    plot_phase_error,
+    plot_required_rated_power,
+    plot_secondary_path_gain,
+)
 from kfopc_filterpy.plotting import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 
 from .report import FigureItem, Parameter, StudyReport, Verdict
@@ -246,5 +255,38 @@ def _figures_of(scene: Scene, results: dict[str, SimulationResult], primary: Any
             "Rated power needed for a noise reduction, by scaling the Wiener control filter.",
             lambda ax: plot_required_rated_power(solution, rated_power=RATED_POWER, ax=ax),
         ),
-        draw_paths("Primary and secondary path.", {"primary path": primary, "secondary path": secondary}),
+        *_path_figures(scene, primary, secondary),
+    ]
+
+
+def _path_figures(scene: Scene, primary: Any, secondary: Any) -> list[FigureItem]:
+    """What a practitioner looks at before any control: the paths, and an identification of the secondary one."""
+    both = {"primary path": primary, "secondary path": secondary}
+    identified = {
+        f"{n_taps} taps": identify_secondary_path(
+            secondary, n_taps=n_taps, duration_s=5.0, rng=SEED, level=0.5, sensor_noise_std=scene.sensor_noise_std
+        )
+        for n_taps in (scene.secondary.size // 4, scene.secondary.size)
+    }
+    estimates = {name: result.estimate for name, result in identified.items()}
+    return [
+        draw_paths("Primary and secondary path.", both),
+        draw(
+            "impulse-responses",
+            "Impulse responses, and the delay of the primary path over the secondary one: the causality margin.",
+            lambda ax: plot_impulse_responses(both, ax=ax),
+            lambda ax: plot_causality_margin(primary, secondary, ax=ax),
+        ),
+        draw(
+            "delay-and-gain",
+            "Group delay, and the secondary path's gain, for white noise and for the reference (eq. 11).",
+            lambda ax: plot_group_delay(both, frequencies_hz=np.geomspace(50, 4000, 400), ax=ax),
+            lambda ax: plot_secondary_path_gain(secondary, reference=scene.references[0], ax=ax),
+        ),
+        draw(
+            "identification",
+            "Secondary path identified with 5 s of white noise: phase error with its 90-degree bound, modelling error.",
+            lambda ax: plot_phase_error(secondary, estimates, ax=ax),
+            lambda ax: plot_modelling_error(identified, ax=ax),
+        ),
     ]

@@ -32,6 +32,7 @@ from kfopc_filterpy.amplifiers import Amplifier
 from kfopc_filterpy.controllers.base import FilteredReferenceController
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
+KALMAN = ("KF-ANC", "KF-OPC")
 CONSTRAINED = ("KF-OPC", "MOV-FxLMS")
 BUDGET = 1.02  # a constrained method keeps its budget with up to this share of the rated power
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
@@ -184,9 +185,10 @@ def make_scene(
 
 def make_controller(scene: Scene, algorithm: str, setting: float) -> FilteredReferenceController:
     """A fresh controller. `setting` is r E[x'^2] / q for the Kalman filters, mu L E[x'^2] for the LMS family."""
-    if algorithm in ("KF-ANC", "KF-OPC"):
+    scaled = setting_value(scene, algorithm, setting)
+    if algorithm in KALMAN:
         kalman: dict[str, Any] = {
-            "state_noise": setting * scene.measurement_noise / scene.filtered_power,
+            "state_noise": scaled,
             "measurement_noise": scene.measurement_noise,
             "initial_variance": scene.initial_variance,
         }
@@ -194,22 +196,28 @@ def make_controller(scene: Scene, algorithm: str, setting: float) -> FilteredRef
             return kf_anc(scene.n_taps, scene.secondary, **kalman)
         kalman |= {"rated_power": scene.rated_power, "fs": scene.fs, "power_memory": POWER_MEMORY_S}
         return kf_opc(scene.n_taps, scene.secondary, **kalman)
-    step_size = setting / (scene.n_taps * scene.filtered_power)
     if algorithm == "FxLMS":
-        return FxLMS(scene.n_taps, scene.secondary, step_size=step_size)
+        return FxLMS(scene.n_taps, scene.secondary, step_size=scaled)
     return MOVFxLMS(
         scene.n_taps,
         scene.secondary,
-        step_size=step_size,
+        step_size=scaled,
         rated_power=scene.rated_power,
         fs=scene.fs,
         power_memory=POWER_MEMORY_S,
     )
 
 
+def setting_value(scene: Scene, algorithm: str, setting: float) -> float:
+    """State noise r or step size mu of a setting, in the scene's units."""
+    if algorithm in KALMAN:
+        return setting * scene.measurement_noise / scene.filtered_power
+    return setting / (scene.n_taps * scene.filtered_power)
+
+
 def grid(algorithm: str) -> tuple[float, ...]:
     """Settings that are tried for an algorithm."""
-    return STATE_NOISE_GRID if algorithm in ("KF-ANC", "KF-OPC") else STEP_SIZE_GRID
+    return STATE_NOISE_GRID if algorithm in KALMAN else STEP_SIZE_GRID
 
 
 @dataclass(frozen=True)

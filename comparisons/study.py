@@ -11,7 +11,7 @@ from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.path_plots import plot_bode
 
 from .report import FigureItem, Parameter, Sound
-from .scene import BUDGET, POWER_MEMORY_S, Scene, Tuned
+from .scene import BUDGET, KALMAN, POWER_MEMORY_S, Scene, Tuned, setting_value
 
 RULE = (
     "lowest mean NSE over the whole run, start included, among settings that do not diverge and, for constrained "
@@ -64,7 +64,10 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
         "seeds": Parameter(scene.seeds, "of noise and sensor noise"),
     }
     for name, best in tuned.items():
-        kind = "state noise r E[x'^2]/q" if name.startswith("KF") else "step size mu L E[x'^2]"
+        symbol, kind = ("r", "r E[x'^2]/q") if name in KALMAN else ("mu", "mu L E[x'^2]")
+        parameters[f"{name} {symbol}"] = Parameter(
+            setting_value(scene, name, best.setting), "follows from the next line"
+        )
         parameters[f"{name} {kind}"] = Parameter(best.setting, f"tuned: {RULE}")
         parameters[f"{name} settings tried"] = Parameter(
             [

@@ -27,7 +27,7 @@ from kfopc_filterpy.plotting import (
 )
 
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import Runs, Scene, Tuned, figures_of_merit, make_controller, make_scene, tune
+from .scene import KALMAN, Runs, Scene, Tuned, figures_of_merit, make_controller, make_scene, tune
 from .study import common_parameters, draw, draw_paths, sounds, tuning_note
 
 FS = 16000.0
@@ -40,7 +40,6 @@ OVERDRIVES_DB = np.arange(0.0, 10.5, 1.0)
 UNFORGETTING = (1e-10, 1e-12)
 FILTERPY_SAMPLES = 4000
 WEIGHTS_EVERY = 160
-KALMAN = ("KF-ANC", "KF-OPC")
 
 
 def main(runs: Runs) -> StudyReport:
