@@ -38,12 +38,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from tqdm import tqdm
 
     matplotlib.use("Agg")
-    prepare_folder(options.output)
+    try:
+        prepare_folder(options.output)
+    except OSError as error:
+        parser.error(str(error))
     began = time.perf_counter()
     reports: list[StudyReport] = []
     with tqdm(total=0, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
         runs = Runs(bar)
-        for name in options.studies or STUDIES:
+        for name in dict.fromkeys(options.studies or STUDIES):
             bar.set_description(name)
             report = STUDIES[name](runs)
             if isinstance(report, str):

@@ -41,6 +41,7 @@ BUDGET = 1.02  # a constrained method keeps its budget with up to this share of 
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 POWER_MEMORY_S = 0.5
+SENSOR_NOISE_SEED = 1000  # plus the seed of the noise
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -127,7 +128,7 @@ class Scene:
             amplifier=self.amplifier,
             rated_power=self.rated_power,
             sensor_noise_std=self.sensor_noise_std,
-            rng=1000 + self.seeds[seed_index],
+            rng=SENSOR_NOISE_SEED + self.seeds[seed_index],
             switch_on_s=self.switch_on_s,
             **options,
         )
@@ -236,6 +237,7 @@ class Tuned:
 
     setting: float
     within_budget: bool
+    at_edge: bool
     trials: list[Trial]
 
 
@@ -244,7 +246,7 @@ def tune(runs: Runs, scene: Scene, algorithms: Sequence[str] = ALGORITHMS, seeds
 
     The lowest mean NSE over the whole run, start included, among settings that do not diverge and, for constrained
     methods, keep the budget to 2 % over the steady half. Where no setting keeps it, the lowest mean NSE, and
-    `within_budget` is False.
+    `within_budget` is False. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
     """
     jobs = [(name, setting, k) for name in algorithms for setting in grid(name) for k in range(seeds)]
 
@@ -273,8 +275,9 @@ def _best(trials: list[Trial], rated_power: float, name: str) -> Tuned:
     if not stable:
         raise RuntimeError(f"{name} diverged at every setting tried: {[t.setting for t in trials]}")
     kept = [t for t in stable if t.output_power <= BUDGET * rated_power]
-    best = min(kept or stable, key=lambda t: t.mean_nse_db)
-    return Tuned(best.setting, bool(kept), trials)
+    best = min(kept or stable, key=lambda t: (round(t.mean_nse_db, 2), t.setting))  # a tie: the smaller setting
+    edges = (min(t.setting for t in trials), max(t.setting for t in trials))
+    return Tuned(best.setting, bool(kept), best.setting in edges, trials)
 
 
 def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[str, float | None]:

@@ -24,8 +24,8 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(cache=True, **options)(function)
-        cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if cache_file is not None:  # there is none where numba's compiler is switched off
+        cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if hasattr(cache_file, "_source_stamp"):  # not where numba's compiler is switched off
             cache_file._source_stamp = (cache_file._source_stamp, SOURCES)
         return dispatcher
 
