@@ -13,11 +13,12 @@ from . import broadband, duct, tonal
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
-STUDIES: dict[str, Callable[[Runs], StudyReport | str]] = {
-    "tonal": tonal.main,
-    "broadband": broadband.main,
-    "duct": duct.main,
-    "duct-measured": duct.main_measured,
+Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
+STUDIES: dict[str, Study] = {
+    "tonal": (tonal.main, tonal.planned_runs),
+    "broadband": (broadband.main, broadband.planned_runs),
+    "duct": (duct.main, duct.planned_runs),
+    "duct-measured": (duct.main_measured, duct.planned_runs),
 }
 
 
@@ -44,12 +45,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(str(error))
     began = time.perf_counter()
     reports: list[StudyReport] = []
-    with tqdm(total=0, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
+    chosen = {name: STUDIES[name] for name in options.studies or STUDIES}
+    planned = sum(planned_runs() for _, planned_runs in chosen.values())
+    with tqdm(total=planned, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
         runs = Runs(bar)
-        for name in dict.fromkeys(options.studies or STUDIES):
+        for name, (study, planned_runs) in chosen.items():
             bar.set_description(name)
-            report = STUDIES[name](runs)
+            report = study(runs)
             if isinstance(report, str):
+                bar.total -= planned_runs()
                 tqdm.write(report)
             else:
                 reports.append(report)

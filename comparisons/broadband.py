@@ -27,7 +27,18 @@ from kfopc_filterpy.plotting import (
 )
 
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import ALGORITHMS, CONSTRAINED, Runs, Scene, Tuned, figures_of_merit, make_controller, make_scene, tune
+from .scene import (
+    ALGORITHMS,
+    CONSTRAINED,
+    Runs,
+    Scene,
+    Tuned,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    tune,
+    tuning_runs,
+)
 from .study import BANDPASS_PATHS, common_parameters, draw, first_second_db, milliseconds, sounds, tuning_note
 
 FS = 16000.0
@@ -41,6 +52,12 @@ SEEDS = tuple(range(1, 9))
 TUNING_SEEDS = 2
 
 Results = dict[str, list[SimulationResult]]
+
+
+def planned_runs() -> int:
+    """Runs of the study."""
+    tuning = tuning_runs(seeds=TUNING_SEEDS) + tuning_runs(CONSTRAINED)
+    return tuning + len(ALGORITHMS) * (len(SEEDS) + 1) + len(CONSTRAINED) * len(SEEDS)
 
 
 def main(runs: Runs) -> StudyReport:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textwrap import shorten
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ from kfopc_filterpy.path_plots import (
 from kfopc_filterpy.plotting import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import Runs, Scene, figures_of_merit, make_controller, make_scene, tune
+from .scene import ALGORITHMS, Runs, Scene, figures_of_merit, make_controller, make_scene, tune, tuning_runs
 from .study import common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
 
 FS = 16000.0
@@ -42,6 +43,11 @@ POWER_MULTIPLE = 4.0
 N_TAPS = 256
 NSE_WINDOW_S = 0.05
 SEED = 1
+
+
+def planned_runs() -> int:
+    """Runs of the study, of either duct."""
+    return tuning_runs() + len(ALGORITHMS)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -69,7 +75,7 @@ def main_measured(runs: Runs) -> StudyReport | str:
     try:
         data = load_measured_duct(allow_download=True)
     except DataUnavailableError as error:
-        return f"duct-measured is left out: {str(error).splitlines()[0]}"
+        return shorten(f"duct-measured is left out: {error}", 200, placeholder=" ...")
     parameters = {
         "noise": Parameter("recorded motor noise, mean removed", "stands in for the paper's recording"),
         "primary_path": Parameter(f"measured duct, {data.primary.size} taps", "as published, scale arbitrary"),

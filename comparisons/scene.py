@@ -52,22 +52,18 @@ class Runs:
 
     def __init__(self, bar: Any = None) -> None:
         self.bar = bar
+        self.done = 0
         self._pool = ThreadPoolExecutor(max_workers=os.cpu_count())
 
     def map(self, job: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
         """Outcomes of `job` in the order of `items`."""
-        items = list(items)
-        if self.bar is not None:
-            self.bar.total = (self.bar.total or 0) + len(items)
-            self.bar.refresh()
-
-        def counted(item: Item) -> Outcome:
-            outcome = job(item)
+        outcomes = []
+        for outcome in self._pool.map(job, items):
+            outcomes.append(outcome)
+            self.done += 1
             if self.bar is not None:
                 self.bar.update(1)
-            return outcome
-
-        return list(self._pool.map(counted, items))
+        return outcomes
 
 
 @dataclass(frozen=True)
@@ -219,6 +215,11 @@ def setting_value(scene: Scene, algorithm: str, setting: float) -> float:
 def grid(algorithm: str) -> tuple[float, ...]:
     """Settings that are tried for an algorithm."""
     return STATE_NOISE_GRID if algorithm in KALMAN else STEP_SIZE_GRID
+
+
+def tuning_runs(algorithms: Sequence[str] = ALGORITHMS, seeds: int = 1) -> int:
+    """Runs that `tune` takes."""
+    return seeds * sum(len(grid(name)) for name in algorithms)
 
 
 @dataclass(frozen=True)

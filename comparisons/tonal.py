@@ -27,7 +27,18 @@ from kfopc_filterpy.plotting import (
 )
 
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import KALMAN, Runs, Scene, Tuned, figures_of_merit, make_controller, make_scene, tune
+from .scene import (
+    ALGORITHMS,
+    KALMAN,
+    Runs,
+    Scene,
+    Tuned,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    tune,
+    tuning_runs,
+)
 from .study import BANDPASS_PATHS, common_parameters, draw, draw_paths, sounds, tuning_note
 
 FS = 16000.0
@@ -40,6 +51,11 @@ OVERDRIVES_DB = np.arange(0.0, 10.5, 1.0)
 UNFORGETTING = (1e-10, 1e-12)
 FILTERPY_SAMPLES = 4000
 WEIGHTS_EVERY = 160
+
+
+def planned_runs() -> int:
+    """Runs of the study."""
+    return tuning_runs() + len(ALGORITHMS) + len(KALMAN) * (len(OVERDRIVES_DB) + len(UNFORGETTING))
 
 
 def main(runs: Runs) -> StudyReport:

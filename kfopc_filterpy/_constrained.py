@@ -6,10 +6,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._validate import as_nonnegative
+from ._validate import as_choice, as_nonnegative, as_positive
 
 if TYPE_CHECKING:
     from .constraint import OutputPowerConstraint
+
+
+def constraint_settings(
+    fs: float | None, memory: float | None, window: str, secondary_path_gain: float | None
+) -> dict[str, Any]:
+    """Keywords of an `OutputPowerConstraint`, checked now although it may be made later; None: its default."""
+    numbers = {"fs": fs, "memory": memory, "secondary_path_gain": secondary_path_gain}
+    settings: dict[str, Any] = {k: as_positive(v, k) for k, v in numbers.items() if v is not None}
+    return settings | {"window": as_choice(window, "power_window", ("exponential", "sliding"))}
 
 
 class ConstraintAttributes:

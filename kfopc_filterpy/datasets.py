@@ -209,6 +209,7 @@ def _fetched_file(item: _PublicFile, timeout_s: float) -> Path:
             f"{_FOLDER_VARIABLE} to a folder with the files"
         ) from error
     local = Path(item.local)
+    pooch.get_logger().setLevel("WARNING")  # its announcements would run into a progress bar
     try:
         fetched = pooch.retrieve(
             item.url,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from ._constrained import BatchReferences, ConstraintAttributes
+from ._constrained import BatchReferences, ConstraintAttributes, constraint_settings
 from ._guards import (
     SILENT_REFERENCE,
     all_or_nothing,
@@ -115,8 +115,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
     ) -> None:
         self._constraint, self._unconstrained_factor = None, 1.0
         self._batch_references: BatchReferences | None = None
-        settings = {"fs": fs, "memory": power_memory, "secondary_path_gain": secondary_path_gain}
-        self._constraint_settings = {k: v for k, v in settings.items() if v is not None} | {"window": power_window}
+        self._constraint_settings = constraint_settings(fs, power_memory, power_window, secondary_path_gain)
         super().__init__(dim_x, dim_z, dim_u)
         self.rated_power = rated_power
 
@@ -306,6 +305,9 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         """
         if references is not None:
             references = BatchReferences(as_signal(references, "references", length=len(zs)))
+        for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
+            if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
+                raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
         before = self.__getstate__()
         self._batch_references = references
         try:

@@ -225,7 +225,10 @@ def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, 
     taps = finite_taps(path)
     if taps is None:
         if n_taps is None:
-            raise ValueError(f"n_taps must be given: {name} has an infinite impulse response")
+            raise ValueError(
+                f"n_taps must be given: {name} has an infinite impulse response; pass path_taps(system, n_taps=...) "
+                "where only taps or FIR systems are taken"
+            )
         taps = _infinite_response(path, 2 * n_taps, name)
     if not np.all(np.isfinite(taps)):
         raise ValueError(f"{name} must have finite coefficients, but its response holds NaN or Inf")

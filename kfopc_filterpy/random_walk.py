@@ -231,8 +231,9 @@ class RandomWalkKFOPC(KFOPC):
             return
         state_noise = as_nonnegative(Q, "Q")
         self._take_in_edits()
+        x = self._weights().reshape(np.shape(self.x))
         self._covariance.predict(self._alpha_sq, state_noise)
-        self.x = np.array(self.x, dtype=np.float64)
+        self.x = x
         self.x_prior = self.x.copy()
 
     def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
@@ -264,9 +265,7 @@ class RandomWalkKFOPC(KFOPC):
         """Eq. 5-9 on the arrays: the new weights, the residual and S. Refusals come before any change."""
         constraint = self._constraint
         factor = self.constraint_factor if constraint is None else constraint.preview(z, h[0], reference)
-        weights = np.array(self.x, dtype=np.float64).reshape(-1)
-        if weights.size != self.dim_x or not np.isfinite(h @ weights):
-            raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
+        weights = self._weights()
         if noise == 0 and not h.any():
             raise ValueError(SILENT_REFERENCE)
         S = self._covariance.project(h) + noise
@@ -281,6 +280,13 @@ class RandomWalkKFOPC(KFOPC):
         if constraint is not None:
             constraint.advance(z, h[0], reference)
         return weights, y, S
+
+    def _weights(self) -> np.ndarray:
+        """x as an array of its own, (n,)."""
+        weights = np.array(self.x, dtype=np.float64).reshape(-1)
+        if weights.size != self.dim_x or not np.isfinite(weights).all():
+            raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
+        return weights
 
     def _record(self, x: np.ndarray, y: np.ndarray) -> None:
         self._log_likelihood = self._likelihood = self._mahalanobis = None

@@ -34,7 +34,7 @@ STEP = 16000  # samples that the compiled loop runs between two reports of progr
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """What a run left. Signals are (n_samples,); after a divergence they are NaN.
+    """What a run left. Signals are (n_samples,), read-only; after a divergence they are NaN.
 
     Attributes
     ----------
@@ -79,6 +79,11 @@ class SimulationResult:
     disturbance_power: np.ndarray | None = None
     secondary_path_gain: np.ndarray | None = None
     diverged_at_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
 
     @property
     def time_s(self) -> np.ndarray:

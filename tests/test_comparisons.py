@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from comparisons import duct, tonal
+from comparisons import broadband, duct, tonal
 from comparisons.__main__ import STUDIES, main
 from comparisons.scene import (
     ALGORITHMS,
@@ -118,6 +118,27 @@ def test_measured_study_says_in_a_line_why_it_is_left_out(monkeypatch, tmp_path)
     assert isinstance(line, str)
     assert line.startswith("duct-measured is left out: ")
     assert "\n" not in line
+
+
+def test_studies_plan_the_runs_they_take(monkeypatch):
+    monkeypatch.setattr(broadband, "DURATION_S", 1.7)
+    monkeypatch.setattr(duct, "DURATION_S", 1.7)
+    monkeypatch.setattr(tonal, "DURATION_S", 0.7)
+    monkeypatch.setattr(tonal, "FILTERPY_SAMPLES", 160)
+    monkeypatch.setattr(tonal, "_figures_of", lambda *_: [])
+    monkeypatch.setattr(broadband, "_figures_of", lambda *_: [])
+    monkeypatch.setattr(duct, "_figures_of", lambda *_: [])
+    for study in (tonal, broadband, duct):
+        runs = Runs()
+        study.main(runs)
+        assert runs.done == study.planned_runs()
+
+
+def test_command_refuses_a_folder_it_cannot_write(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit):
+        main(["tonal", "--output", str(tmp_path / "file")])
+    assert str(tmp_path / "file") in capsys.readouterr().err
 
 
 def test_command_refuses_an_unknown_study(capsys):

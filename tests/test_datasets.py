@@ -1,6 +1,7 @@
 """Readers and writers of recordings, and the measured duct; no test reaches for the network."""
 
 import hashlib
+import logging
 import os
 import struct
 import sys
@@ -60,7 +61,10 @@ def own_files(tmp_path, monkeypatch):
 def fake_pooch(retrieve, cache):
     """Module with the part of pooch's interface that is used."""
     return types.SimpleNamespace(
-        retrieve=retrieve, os_cache=lambda name: cache / name, HTTPDownloader=lambda **kwargs: kwargs
+        get_logger=lambda: logging.getLogger("pooch"),
+        retrieve=retrieve,
+        os_cache=lambda name: cache / name,
+        HTTPDownloader=lambda **kwargs: kwargs,
     )
 
 
