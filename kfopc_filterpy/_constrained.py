@@ -16,9 +16,14 @@ def constraint_settings(
     fs: float | None, memory: float | None, window: str, secondary_path_gain: float | None
 ) -> dict[str, Any]:
     """Keywords of an `OutputPowerConstraint`, checked now although it may be made later; None: its default."""
-    numbers = {"fs": fs, "memory": memory, "secondary_path_gain": secondary_path_gain}
-    settings: dict[str, Any] = {k: as_positive(v, k) for k, v in numbers.items() if v is not None}
-    return settings | {"window": as_choice(window, "power_window", ("exponential", "sliding"))}
+    settings: dict[str, Any] = {"window": as_choice(window, "power_window", ("exponential", "sliding"))}
+    if fs is not None:
+        settings["fs"] = as_positive(fs, "fs", unit="Hz")
+    if memory is not None:
+        settings["memory"] = as_positive(memory, "power_memory", unit="s")
+    if secondary_path_gain is not None:
+        settings["secondary_path_gain"] = as_positive(secondary_path_gain, "secondary_path_gain")
+    return settings
 
 
 class ConstraintAttributes:

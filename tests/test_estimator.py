@@ -567,3 +567,29 @@ def test_two_measurements_and_a_rated_power_do_not_go_together() -> None:
     kf = make("general", 0.5, secondary_path_gain=1.0)
     with pytest.raises(ValueError, match="one measurement"):
         kf.update([1.0, 2.0], R=np.eye(2), H=np.ones((2, TAPS)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"fs": -1.0}, "fs must be greater than 0"),
+        ({"power_memory": 0.0}, "power_memory must be greater than 0"),
+        ({"power_window": "hann"}, "power_window must be one of 'exponential', 'sliding'"),
+        ({"secondary_path_gain": np.nan}, "secondary_path_gain must be finite"),
+    ],
+)
+@pytest.mark.parametrize("rated_power", [None, 1.0])
+def test_settings_of_the_constraint_are_checked_at_once(
+    settings: dict, message: str, rated_power: float | None
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        KFOPC(3, rated_power=rated_power, **settings)
+
+
+@pytest.mark.parametrize("name", ["Fs", "Qs", "Hs", "Rs", "us"])
+def test_batch_refuses_a_list_that_ends_early(name: str) -> None:
+    kf = KFOPC(2)
+    values = {"Fs": np.eye(2), "Qs": np.eye(2), "Hs": np.ones((1, 2)), "Rs": np.eye(1), "us": 0.0}
+    with pytest.raises(ValueError, match=f"{name} must have one value for each of the 3 of zs, got 2"):
+        kf.batch_filter([1.0, 2.0, 3.0], **{name: [values[name]] * 2})
+    assert not kf.x.any()

@@ -78,6 +78,7 @@ def both(filters: tuple[KalmanFilter, KFOPC], action: Callable[[Any], Any]) -> N
         (9, "line", 1e3, 1.0, 2),
         (16, "low-passed line", 1.0, 1.0, 2),
         (7, "line", 10.0, 1.001, 2),
+        (66, "line", 1e3, 1.0, 2),
     ],
 )
 def test_ten_thousand_steps_as_filterpy(n: int, kind: str, P0: float, alpha: float, x_ndim: int) -> None:
@@ -595,3 +596,16 @@ def test_a_silent_filter_of_no_variance_is_refused() -> None:
     ours.predict()
     ours.update(1.0, H=np.ones(3))
     np.testing.assert_allclose(ours.x[:, 0], np.full(3, 1 / 3))
+
+
+@pytest.mark.parametrize("x", [[np.nan, 0.0, 0.0], [0.0, 0.0]])
+def test_weights_that_are_no_weights_are_refused_by_both_steps(x: list[float]) -> None:
+    kf = KFOPC.random_walk(3, state_noise=1e-3, measurement_noise=1.0)
+    kf.predict()
+    kf.x = np.array(x)
+    P = kf.P.copy()
+    with pytest.raises(ValueError, match="x must have 3 finite values"):
+        kf.predict()
+    with pytest.raises(ValueError, match="x must have 3 finite values"):
+        kf.update(1.0, H=np.ones(3))
+    assert np.array_equal(kf.P, P)
