@@ -116,7 +116,7 @@ _TERMS = """<section id="terms">
 <li>Noise reduction: −10 log<sub>10</sub>(Σe²/Σd²), with the error e and the disturbance d.</li>
 <li>Output power: mean square of the control signal before the amplifier; the rated power ρ<sub>o</sub> is its
 limit.</li>
-<li>Clipped: share of the samples of the control signal beyond the amplifier's limit.</li>
+<li>Clipped: share of the samples of the control signal beyond sqrt(2 rated power), the limit of the clipping amplifiers; with a linear one, what a clipping one would cut.</li>
 <li>Harmonics: power at 2 to 10 times the tone's frequency in e, over the power of d at the tone.</li>
 <li>Converged: first time from which the normalised squared error stays within 3 dB of its steady value.</li>
 <li>Diverged: time at which the control signal passed 10<sup>6</sup> √ρ<sub>o</sub>, and the run was stopped.</li>

@@ -132,5 +132,9 @@ def compiled_parameters(amplifier: Amplifier | None) -> np.ndarray | None:
     """Parameters for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
     if amplifier is None:
         return LinearAmplifier().parameters
+    if isinstance(amplifier, type):
+        raise TypeError(
+            f"amplifier must be an object, such as HardClipAmplifier(limit=1.0), got the class {amplifier!r}"
+        )
     models = (LinearAmplifier, HardClipAmplifier, SoftSaturationAmplifier)
     return amplifier.parameters if isinstance(amplifier, models) and type(amplifier) in models else None

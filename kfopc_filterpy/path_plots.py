@@ -100,7 +100,7 @@ def plot_bode(paths: Any, *, frequencies_hz: Any = None, fs: float | None = None
         angle[~audible(response)] = np.nan
         phase.plot(frequencies, angle, label=f"{label}, less {1e3 * delay:.2f} ms", **line_style(i))
     level_axis(magnitude, powers, "Magnitude (dB)")
-    phase.set_ylabel("Phase (degrees)")
+    phase.set_ylabel("Phase less onset delay (degrees)")
     frequency_axis(magnitude, frequencies, label=False)
     frequency_axis(phase, frequencies)
     legend_above(magnitude)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -229,7 +230,7 @@ class RandomWalkKFOPC(KFOPC):
         if moved or F is not None or np.ndim(Q) != 0:
             super().predict(u, B, F, Q)
             return
-        state_noise = as_nonnegative(Q, "Q")
+        state_noise = Q if Q is self._state_noise else as_nonnegative(Q, "Q")
         self._take_in_edits()
         x = self._weights().reshape(np.shape(self.x))
         self._covariance.predict(self._alpha_sq, state_noise)
@@ -249,17 +250,20 @@ class RandomWalkKFOPC(KFOPC):
             self.z = np.array([[None]])
             return
         R = None if R is self._views.get("R") else R
-        z_checked, _, _ = checked_measurement(self, z, R, row)
-        noise = self._measurement_noise if R is None else as_nonnegative(R, "R")
-        weights, y, S = self._corrected(
-            float(np.asarray(z_checked).reshape(())),
-            noise,
-            np.array(row, dtype=np.float64).reshape(-1),
-            reference,
-        )
+        weights, y, S = self._corrected(*self._checked(z, R, row), reference)
         self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
         self._record(weights.reshape(np.shape(self.x)), np.full((1,) * np.ndim(self.x), y))
         self.z = np.array(z).reshape(self.y.shape)
+
+    def _checked(self, z: Any, R: Any, row: Any) -> tuple[float, float, np.ndarray]:
+        """z, R and H as numbers and (n,), or a clear error. The plain case, of every sample, goes first."""
+        if R is None and isinstance(z, float) and isinstance(row, np.ndarray) and row.dtype == np.float64:
+            h = np.ascontiguousarray(row).reshape(-1)
+            if row.shape in ((self.dim_x,), (1, self.dim_x)) and isfinite(z) and isfinite(h @ h):
+                return float(z), self._measurement_noise, h
+        z, _, _ = checked_measurement(self, z, R, row)
+        noise = self._measurement_noise if R is None else as_nonnegative(R, "R")
+        return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> tuple[Any, float, float]:
         """Eq. 5-9 on the arrays: the new weights, the residual and S. Refusals come before any change."""

@@ -149,3 +149,10 @@ def test_a_subclass_is_called_not_replaced_by_its_parents_equation():
     x = np.random.default_rng(0).standard_normal(50)
     result = simulate(FxLMS(4, [1.0], step_size=0.1), x, disturbance=x, secondary_path=[1.0], amplifier=Weak(1.0))
     np.testing.assert_array_equal(result.amplifier_output, 0.5 * np.clip(result.control_signal, -1, 1))
+
+
+def test_a_class_is_no_amplifier() -> None:
+    with pytest.raises(
+        TypeError, match=r"amplifier must be an object, such as HardClipAmplifier\(limit=1\.0\), got the"
+    ):
+        compiled_parameters(HardClipAmplifier)

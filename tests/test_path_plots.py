@@ -46,7 +46,7 @@ def _labels(ax):
 def test_bode_draws_magnitude_and_phase_in_hz():
     magnitude, phase = plot_bode({"P": P, "S": S})
     magnitude.figure.canvas.draw()
-    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("Magnitude (dB)", "Phase (degrees)")
+    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("Magnitude (dB)", "Phase less onset delay (degrees)")
     assert phase.get_xlabel() == "Frequency (Hz)"
     assert phase.get_xscale() == "log"
     assert _labels(magnitude) == ["P", "S"]
