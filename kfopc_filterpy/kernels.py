@@ -47,6 +47,13 @@ def new_covariance(P: np.ndarray) -> Covariance:
 
 
 @compiled(forceinline=True)
+def copy_into(target, source):
+    """target[:] = source, in a loop: numba compiles two seconds of error messages for the slice."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@compiled(forceinline=True)
 def predict_covariance(cov, alpha_sq, state_noise):
     """Eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
     cov.owed[SCALE] *= alpha_sq
@@ -112,7 +119,7 @@ def project_covariance(cov, h):
 @compiled(forceinline=True)
 def downdate_covariance(cov, S):
     """Eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
-    cov.gain_direction[:] = cov.product
+    copy_into(cov.gain_direction, cov.product)
     cov.owed[INVERSE_S] = cov.owed[LAST_INVERSE_S] = 1.0 / S
 
 
@@ -171,7 +178,7 @@ def downdate_carefully(cov, h, noise):
         for j in range(i + 1):
             product, rest = two_product(g[i], k[j])
             T[i, j] = (T[i, j] - product) - (rest + (g[i] * k_low[j] + g_low[i] * k[j]))
-    cov.gain_direction[:] = g
+    copy_into(cov.gain_direction, g)
     cov.owed[INVERSE_S], cov.owed[LAST_INVERSE_S] = 0.0, 1.0 / S
     return True
 

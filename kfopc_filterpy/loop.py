@@ -32,6 +32,7 @@ from .kernels import (
     INVERSE_S,
     SCALE,
     Covariance,
+    copy_into,
     dot,
     predict_covariance,
     project_covariance,
@@ -235,7 +236,7 @@ class Record(NamedTuple):
 def note_weights(record, weights, every, n):
     """Keep the weights of sample n where it is one of the recorded."""
     if record.weights.shape[0] > 0 and n % every == 0:
-        record.weights[n // every] = weights
+        copy_into(record.weights[n // every], weights)
 
 
 @compiled(nogil=True)
