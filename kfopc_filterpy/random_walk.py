@@ -238,9 +238,10 @@ class RandomWalkKFOPC(KFOPC):
         self.x_prior = self.x.copy()
 
     def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
-        """Eq. 5-9; an H of several rows goes through filterpy's own equations. See `KFOPC.update`."""
+        """Eq. 5-9; an H of several rows, or another `inv`, takes filterpy's own equations. See `KFOPC.update`."""
         row = self.H if H is None else H
-        if z is not None and np.size(row) != self.dim_x:
+        own_inverse = self.inv is not np.linalg.inv
+        if z is not None and (own_inverse or np.size(row) != self.dim_x):
             super().update(z, R, H, reference=reference)
             return
         reference = self._next_reference(z, reference)
@@ -302,7 +303,7 @@ class RandomWalkKFOPC(KFOPC):
 
     def compiled_state(self) -> tuple[Covariance, tuple[float, float, float]] | None:
         """The covariance arrays and (r, q, fading alpha squared); None where filterpy's equations step."""
-        if self._F is not None or self._Q is not None:
+        if self._F is not None or self._Q is not None or self.inv is not np.linalg.inv:
             return None
         self._take_in_edits()
         return self._covariance.arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)

@@ -49,6 +49,26 @@ class ReadOnlyMatrix(np.ndarray):
         _require_writeable(self)
         super().fill(value)
 
+    def sort(self, *args: Any, **kwargs: Any) -> None:
+        """Refused, as any in-place write."""
+        _require_writeable(self)
+        super().sort(*args, **kwargs)
+
+    def partition(self, *args: Any, **kwargs: Any) -> None:
+        """Refused, as any in-place write."""
+        _require_writeable(self)
+        super().partition(*args, **kwargs)
+
+    def put(self, *args: Any, **kwargs: Any) -> None:
+        """Refused, as any in-place write."""
+        _require_writeable(self)
+        super().put(*args, **kwargs)
+
+    @property
+    def flat(self) -> Any:
+        """The elements in a row, (size,), to read; writing into them is refused."""
+        return self.reshape(-1)
+
     def copy(self, order: Any = "C") -> np.ndarray:  # type: ignore[override]
         """A plain array, which can be written into and then assigned."""
         return np.array(self, order=order)

@@ -609,3 +609,35 @@ def test_weights_that_are_no_weights_are_refused_by_both_steps(x: list[float]) -
     with pytest.raises(ValueError, match="x must have 3 finite values"):
         kf.update(1.0, H=np.ones(3))
     assert np.array_equal(kf.P, P)
+
+
+@pytest.mark.parametrize("name", ["F", "Q", "R"])
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda a: a.sort(),
+        lambda a: a.partition(0),
+        lambda a: a.put(0, 2.0),
+        lambda a: a.flat.__setitem__(0, 2.0),
+    ],
+)
+def test_writes_through_methods_name_the_assignment(name: str, write: Callable[[Any], Any]) -> None:
+    kf = KFOPC.random_walk(3, state_noise=0.5, measurement_noise=2.0)
+    before = np.array(getattr(kf, name))
+    with pytest.raises(ValueError, match=rf"assign instead, kf\.{name} = value"):
+        write(getattr(kf, name))
+    assert np.array_equal(getattr(kf, name), before)
+    assert list(getattr(kf, name).flat) == before.ravel().tolist()
+
+
+def test_an_inverse_of_ones_own_is_used() -> None:
+    """A silent reference with R = 0 and the pseudo-inverse: filterpy's filter goes on, its gain is 0."""
+    ours, theirs = KFOPC.random_walk(2, state_noise=0.5, measurement_noise=0.0), KalmanFilter(2, 1)
+    theirs.Q, theirs.R = 0.5 * np.eye(2), np.zeros((1, 1))
+    for kf in (ours, theirs):
+        kf.inv = np.linalg.pinv
+        kf.predict()
+        kf.update(1.0, H=np.zeros((1, 2)))
+        kf.update(1.0, H=np.array([[1.0, 2.0]]))
+    np.testing.assert_allclose(ours.x, theirs.x, atol=1e-15)
+    np.testing.assert_allclose(ours.P, theirs.P, atol=1e-15)
