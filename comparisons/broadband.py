@@ -187,7 +187,7 @@ def _verdicts(results: Results, algorithms: dict[str, dict[str, Any]], coherence
         Verdict(
             "KF-OPC's anti-noise is highly linear with the disturbance",
             bool(coherence.coherence > 0.99),
-            f"coherence {coherence.coherence:.4f}, gain {coherence.gain:.3f} (1/2 is eq. 13's factor here); "
+            f"coherence {coherence.coherence:.4f}, gain {coherence.gain:.3f} ({POWER_MULTIPLE**-0.5:g} is eq. 13's factor for a flat path); "
             f"MOV-FxLMS reduces by {mov['noise_reduction_db']:.2f} dB",
         ),
     ]
@@ -216,8 +216,8 @@ def _clipped_verdict(clipped: dict[str, dict[str, Any]], scene: Scene) -> Verdic
         bool(opc[start] >= opc["noise_reduction_db"] - 1.0),
         f"steady half: {opc['noise_reduction_db']:.1f} dB, output power {opc['output_power']:.3f}. From switch-on: "
         f"noise reduction over the first second {opc[start]:.1f} dB (MOV-FxLMS {mov[start]:.1f}), control signal up to "
-        f"{opc[peak]:.0f} against a limit of {scene.amplitude_limit:.2f} (MOV-FxLMS {mov[peak]:.1f}). The clipped part of the first samples is taken for disturbance; with the amplifier known to the estimate it "
-        f"is {known[start]:.1f} dB and {known[peak]:.1f}",
+        f"{opc[peak]:.0f} against a limit of {scene.amplitude_limit:.2f} (MOV-FxLMS {mov[peak]:.1f}). The clipped "
+        f"part of the first samples is taken for disturbance; with the amplifier known to the estimate it is {known[start]:.1f} dB and {known[peak]:.1f}",
     )
 
 

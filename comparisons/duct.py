@@ -10,6 +10,7 @@ import numpy as np
 from kfopc_filterpy import (
     DataUnavailableError,
     SimulationResult,
+    WienerSolution,
     compressor_noise,
     duct_paths,
     fir_path,
@@ -33,7 +34,17 @@ from kfopc_filterpy.path_plots import (
 from kfopc_filterpy.plotting import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import ALGORITHMS, Runs, Scene, figures_of_merit, make_controller, make_scene, tune, tuning_runs
+from .scene import (
+    ALGORITHMS,
+    POWER_MEMORY_S,
+    Runs,
+    Scene,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    tune,
+    tuning_runs,
+)
 from .study import common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
 
 FS = 16000.0
@@ -128,7 +139,8 @@ def _study(
 
     results = dict(zip(tuned, runs.map(run, tuned), strict=True))
     algorithms = {algorithm: figures_of_merit([result], scene) for algorithm, result in results.items()}
-    extra = _why(scene, results)
+    wiener = wiener_solution(*scene.settled, scene.secondary, scene.n_taps)
+    extra = _why(scene, wiener, results)
     return StudyReport(
         name=name,
         title=title,
@@ -144,17 +156,15 @@ def _study(
         algorithms=algorithms,
         extra=extra,
         verdicts=_verdicts(algorithms, results, extra),
-        figures=_figures_of(scene, results, primary, secondary),
+        figures=_figures_of(scene, wiener, results, primary, secondary),
         sounds=sounds(results),
         notes=[*tuning_note(tuned), _power_note(algorithms, extra)],
     )
 
 
-def _why(scene: Scene, results: dict[str, SimulationResult]) -> dict[str, Any]:
+def _why(scene: Scene, wiener: WienerSolution, results: dict[str, SimulationResult]) -> dict[str, Any]:
     """Why the output power is what it is: the gain eq. 11 sees, and the one the control signal sees."""
-    settled = slice(int(scene.switch_on_s * FS), None)
-    x, d = scene.references[0][settled], scene.disturbances[0][settled]
-    wiener = wiener_solution(x, d, scene.secondary, scene.n_taps)
+    x, d = scene.settled
     bound = power_constrained_solution(x, d, scene.secondary, scene.n_taps, RATED_POWER)
     d2 = np.convolve(d**2, np.full(int(FS), 1 / FS), mode="valid")
     return {
@@ -185,7 +195,7 @@ def _power_note(algorithms: dict[str, dict[str, Any]], extra: dict[str, Any]) ->
         f"these two the power of a steady noise would be {assumed / seen * share:.2f} times the rated one. The rest is "
         "the noise's level, whose power over 1 s varies "
         f"{extra['disturbance_power_over_1_s_largest_over_smallest']:.1f} times here while the power estimates remember "
-        "0.5 s, and its spectrum, which varies with it."
+        f"{POWER_MEMORY_S:g} s, and its spectrum, which varies with it."
     )
 
 
@@ -217,8 +227,8 @@ def _verdicts(
             bool(early["KF-OPC"] > early["MOV-FxLMS"]),
             f"noise reduction over the first second {early['KF-OPC']:.2f} against {early['MOV-FxLMS']:.2f} dB; "
             f"convergence (NSE over 50 ms) {milliseconds(opc['convergence_time_s'])} against "
-            f"{milliseconds(mov['convergence_time_s'])}. KF-OPC draws {opc['output_power'] / mov['output_power']:.1f} times "
-            "the power of MOV-FxLMS meanwhile",
+            f"{milliseconds(mov['convergence_time_s'])}. Over the steady half KF-OPC draws "
+            f"{opc['output_power'] / mov['output_power']:.1f} times the power of MOV-FxLMS",
         ),
         Verdict(
             "KF-OPC's output power is closer to the rated power than MOV-FxLMS's, and its noise reduction better",
@@ -230,10 +240,10 @@ def _verdicts(
     ]
 
 
-def _figures_of(scene: Scene, results: dict[str, SimulationResult], primary: Any, secondary: Any) -> list[FigureItem]:
+def _figures_of(
+    scene: Scene, wiener: WienerSolution, results: dict[str, SimulationResult], primary: Any, secondary: Any
+) -> list[FigureItem]:
     group = list(results.values())
-    settled = slice(int(scene.switch_on_s * FS), None)
-    solution = wiener_solution(scene.references[0][settled], scene.disturbances[0][settled], scene.secondary, N_TAPS)
     return [
         draw(
             "a-nse",
@@ -258,7 +268,7 @@ def _figures_of(scene: Scene, results: dict[str, SimulationResult], primary: Any
         draw(
             "required-power",
             "Rated power needed for a noise reduction, by scaling the Wiener control filter.",
-            lambda ax: plot_required_rated_power(solution, rated_power=RATED_POWER, ax=ax),
+            lambda ax: plot_required_rated_power(wiener, rated_power=RATED_POWER, ax=ax),
         ),
         *_path_figures(scene, primary, secondary),
     ]

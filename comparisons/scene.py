@@ -95,6 +95,12 @@ class Scene:
         return float(np.sqrt(2 * self.rated_power))
 
     @property
+    def settled(self) -> tuple[np.ndarray, np.ndarray]:
+        """First reference and disturbance from switch-on on, where the primary path's start-up is over."""
+        start = int(self.switch_on_s * self.fs)
+        return self.references[0][start:], self.disturbances[0][start:]
+
+    @property
     def filtered_power(self) -> float:
         """Power of the filtered reference, which makes step sizes and state noises comparable."""
         x = self.references[0]

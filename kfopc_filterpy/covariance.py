@@ -113,12 +113,11 @@ class RandomWalkCovariance:
         """An update is over, or its sample was missed: P is P_post."""
         self.posterior = self.now
 
-    def after_compiled(self) -> float:
-        """After the compiled loop advanced `arrays`: what is owed is one downdate at most; return its S."""
+    def after_compiled(self) -> None:
+        """After the compiled loop advanced `arrays`: what is owed is one downdate at most."""
         self._shown = []
         self.prior = Moment(1.0, 0.0)
         self.updated()
-        return 1.0 / float(self.arrays.owed[LAST_INVERSE_S])
 
 
 def require_covariance(P: np.ndarray) -> None:

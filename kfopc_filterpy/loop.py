@@ -90,11 +90,17 @@ class ControllerState(NamedTuple):
 
 
 @compiled(forceinline=True)
-def control_signal(controller, x):
-    """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
+def take_reference(controller, x):
+    """x(n) into its delay line, and x'(n) = (s^ * x)(n) into the filtered one."""
     push(controller.reference, x)
     s = controller.secondary_estimate
     push(controller.filtered, dot(s, newest(controller.reference, s.size)))
+
+
+@compiled(forceinline=True)
+def control_signal(controller, x):
+    """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
+    take_reference(controller, x)
     w = controller.weights
     y = dot(w, newest(controller.reference, w.size))
     kind, limit, sharpness = controller.amplifier
@@ -185,10 +191,8 @@ def listen(controller, references, errors):
 
     Returns the samples taken: all, or those before one whose square overflows.
     """
-    s = controller.secondary_estimate
     for n in range(references.size):
-        push(controller.reference, references[n])
-        push(controller.filtered, dot(s, newest(controller.reference, s.size)))
+        take_reference(controller, references[n])
         push(controller.output, 0.0)
         d, filtered = disturbance_estimate(controller, errors[n]), newest(controller.filtered, 1)[0]
         if not squares_are_finite(d, filtered, references[n]):

@@ -308,9 +308,9 @@ class RandomWalkKFOPC(KFOPC):
         self._take_in_edits()
         return self._covariance.arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
 
-    def after_compiled(self, weights: np.ndarray, z: float, y: float) -> None:
-        """Take back the arrays after one sample or more: `weights`, the last measurement, its residual."""
-        S = self._covariance.after_compiled()
+    def after_compiled(self, weights: np.ndarray, z: float, y: float, S: float) -> None:
+        """Take back the arrays after one sample or more: `weights`, the last measurement, its residual and S."""
+        self._covariance.after_compiled()
         self._K = None
         self.S, self.SI = np.array([[S]]), np.array([[1.0 / S]])
         shape = np.shape(self.x)

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, compiled_parameters
-from ..constraint import FACTOR, GAIN, LAST, POWER, OutputPowerConstraint
+from ..constraint import OutputPowerConstraint
 from ..kernels import new_covariance
 from ..loop import ControllerState, adapt, control_signal, delay_line, listen
 from ..paths import is_system, path_taps, sampling_rate
@@ -112,17 +112,18 @@ class FilteredReferenceController:
     @property
     def constraint_factor(self) -> float:
         """Constraint factor of the last sample."""
-        return float(self._state.constraint.table[LAST, FACTOR])
+        return self.constraint.factor
 
     @property
     def disturbance_power(self) -> float:
         """Running power of the disturbance estimate (eq. 10)."""
-        return float(self._state.constraint.table[LAST, POWER])
+        return self.constraint.disturbance_power
 
     @property
     def secondary_path_gain(self) -> float:
         """Running secondary-path gain (eq. 11); NaN before any reference energy."""
-        return float(self._state.constraint.table[LAST, GAIN])
+        gain = self.constraint.secondary_path_gain
+        return np.nan if gain is None else gain
 
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""

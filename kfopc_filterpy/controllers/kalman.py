@@ -93,17 +93,6 @@ class KalmanController(FilteredReferenceController):
         """Constraint factor of the last sample."""
         return getattr(self.estimator, "constraint_factor", 1.0)
 
-    @property
-    def disturbance_power(self) -> float:
-        """Running power of the disturbance estimate (eq. 10)."""
-        return self.constraint.disturbance_power
-
-    @property
-    def secondary_path_gain(self) -> float:
-        """Running secondary-path gain (eq. 11); NaN before any reference energy."""
-        gain = self.constraint.secondary_path_gain
-        return np.nan if gain is None else gain
-
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         reference = as_number(reference, "reference")
@@ -146,12 +135,8 @@ class KalmanController(FilteredReferenceController):
     def after_compiled(self, state: ControllerState) -> None:
         """Give the estimator the weights, residual, S and gain of the last sample run."""
         d, y, S = state.last.tolist()
-        if np.isnan(S):
-            return
-        estimator = self.estimator
-        estimator.after_compiled(state.weights, d, y)
-        estimator.S, estimator.SI = np.array([[S]]), np.array([[1.0 / S]])  # to the last digit
-        estimator.K = (state.covariance.gain_direction / S).reshape(-1, 1)
+        if not np.isnan(S):
+            self.estimator.after_compiled(state.weights, d, y, S)
 
 
 def kf_anc(
