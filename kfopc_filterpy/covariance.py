@@ -11,6 +11,7 @@ from .kernels import (
     INVERSE_S,
     LAST_INVERSE_S,
     Covariance,
+    copy_covariance,
     full_covariance,
     new_covariance,
     predict_covariance,
@@ -71,7 +72,8 @@ class RandomWalkCovariance:
         if self._shown:
             self._shown.append(self._shown[-1].copy())
         other = memo[id(self)] = object.__new__(type(self))
-        other.__dict__.update(deepcopy(self.__dict__, memo))
+        other.__dict__.update(deepcopy({k: v for k, v in vars(self).items() if k != "arrays"}, memo))
+        other.arrays = copy_covariance(self.arrays)
         return other
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:

@@ -26,24 +26,42 @@ SCALE, DIAGONAL, INVERSE_S, LAST_INVERSE_S = 0, 1, 2, 3
 # Where S exceeds the measurement noise by this much, the downdate cancels so many digits of P that it is done in
 # twice the precision: the first samples after a large initial variance.
 CANCELLATION = 1e3
+LINE = 8  # float64 values in a cache line
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
 
 class Covariance(NamedTuple):
     """State covariance: P = scale (T - g g' inverse_s) + diagonal I."""
 
-    triangle: np.ndarray  # (n, n), lower triangle T valid
+    triangle: np.ndarray  # (n, n or more), lower triangle T valid; rows begin at cache lines
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the pass under way
     owed: np.ndarray  # (4,): scale, diagonal, 1/S or 0 where the downdate was done at once; 1/S of the last update
 
 
+def aligned_zeros(*shape: int) -> np.ndarray:
+    """Zeros whose rows begin at cache lines, the last dimension rounded up to that: a quarter faster from 128 taps on."""
+    *rows, columns = shape
+    padded = (*rows, -(-columns // LINE) * LINE)
+    memory = np.zeros(int(np.prod(padded)) + LINE)
+    start = -(memory.ctypes.data // memory.itemsize) % LINE
+    return memory[start : memory.size - LINE + start].reshape(padded)
+
+
 def new_covariance(P: np.ndarray) -> Covariance:
     """Covariance state from a full symmetric array (n, n); the upper triangle is not read."""
     n = P.shape[0]
-    return Covariance(
-        np.array(P, dtype=np.float64, order="C"), np.zeros(n), np.zeros(n), np.array([1.0, 0.0, 0.0, 0.0])
-    )
+    cov = Covariance(aligned_zeros(n, n), aligned_zeros(n)[:n], aligned_zeros(n)[:n], np.array([1.0, 0.0, 0.0, 0.0]))
+    cov.triangle[:, :n] = P
+    return cov
+
+
+def copy_covariance(cov: Covariance) -> Covariance:
+    """A covariance state of its own (a plain copy of an array need not begin at a cache line)."""
+    other = new_covariance(cov.triangle[:, : cov.product.size])
+    for mine, theirs in zip(other[1:], cov[1:], strict=True):
+        mine[:] = theirs
+    return other
 
 
 @compiled(forceinline=True)
@@ -60,7 +78,7 @@ def predict_covariance(cov, alpha_sq, state_noise):
     cov.owed[DIAGONAL] = alpha_sq * cov.owed[DIAGONAL] + state_noise
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def project_covariance(cov, h):
     """Pay what is owed to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
 
@@ -76,7 +94,8 @@ def project_covariance(cov, h):
     whole = n - n % 4
     for i in range(0, whole, 4):
         T0, T1, T2, T3 = T[i], T[i + 1], T[i + 2], T[i + 3]
-        g0, g1, g2, g3 = weight * g[i], weight * g[i + 1], weight * g[i + 2], weight * g[i + 3]
+        G0, G1, G2, G3 = g[i], g[i + 1], g[i + 2], g[i + 3]
+        g0, g1, g2, g3 = weight * G0, weight * G1, weight * G2, weight * G3
         h0, h1, h2, h3 = h[i], h[i + 1], h[i + 2], h[i + 3]
         a0 = a1 = a2 = a3 = 0.0
         for j in range(i):
@@ -90,19 +109,25 @@ def project_covariance(cov, h):
             a2 += p2 * h[j]
             a3 += p3 * h[j]
             Ph[j] += p0 * h0 + p1 * h1 + p2 * h2 + p3 * h3
-        Ph[i] += a0
-        Ph[i + 1] += a1
-        Ph[i + 2] += a2
-        Ph[i + 3] += a3
-        for k in range(i, i + 4):  # the block on the diagonal
-            gk, hk = weight * g[k], h[k]
-            for j in range(i, k):
-                p = scale * T[k, j] - gk * g[j]
-                T[k, j] = p
-                Ph[k] += p * h[j]
-                Ph[j] += p * hk
-            T[k, k] = scale * T[k, k] - gk * g[k] + diagonal
-            Ph[k] += T[k, k] * hk
+        # The 4 x 4 block on the diagonal, written out: as loops it costs a fifth of the whole pass at 64 taps.
+        p00 = scale * T0[i] - g0 * G0 + diagonal
+        p10 = scale * T1[i] - g1 * G0
+        p20 = scale * T2[i] - g2 * G0
+        p30 = scale * T3[i] - g3 * G0
+        p11 = scale * T1[i + 1] - g1 * G1 + diagonal
+        p21 = scale * T2[i + 1] - g2 * G1
+        p31 = scale * T3[i + 1] - g3 * G1
+        p22 = scale * T2[i + 2] - g2 * G2 + diagonal
+        p32 = scale * T3[i + 2] - g3 * G2
+        p33 = scale * T3[i + 3] - g3 * G3 + diagonal
+        T0[i] = p00
+        T1[i], T1[i + 1] = p10, p11
+        T2[i], T2[i + 1], T2[i + 2] = p20, p21, p22
+        T3[i], T3[i + 1], T3[i + 2], T3[i + 3] = p30, p31, p32, p33
+        Ph[i] += a0 + p00 * h0 + p10 * h1 + p20 * h2 + p30 * h3
+        Ph[i + 1] += a1 + p10 * h0 + p11 * h1 + p21 * h2 + p31 * h3
+        Ph[i + 2] += a2 + p20 * h0 + p21 * h1 + p22 * h2 + p32 * h3
+        Ph[i + 3] += a3 + p30 * h0 + p31 * h1 + p32 * h2 + p33 * h3
     for k in range(whole, n):  # the last n % 4 rows
         gk, hk = weight * g[k], h[k]
         for j in range(k):
@@ -183,7 +208,7 @@ def downdate_carefully(cov, h, noise):
     return True
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def full_covariance(T, g, scale, diagonal, weight):
     """Full symmetric array scale T + weight g g' + diagonal I."""
     n = g.size
@@ -197,7 +222,7 @@ def full_covariance(T, g, scale, diagonal, weight):
     return P
 
 
-@compiled(fastmath=FAST, error_model="numpy", forceinline=True)
+@compiled(fastmath=FAST, forceinline=True)
 def dot(a, b):
     """Inner product of two vectors of the length of the first."""
     total = 0.0
@@ -206,14 +231,14 @@ def dot(a, b):
     return total
 
 
-@compiled(fastmath=FAST, error_model="numpy", forceinline=True)
+@compiled(fastmath=FAST, forceinline=True)
 def correct_weights(w, gain_direction, innovation_over_S):
     """Eq. 5, w(n|n) = w(n|n-1) + K (d - x'w), with K = g/S."""
     for i in range(w.size):
         w[i] += gain_direction[i] * innovation_over_S
 
 
-@compiled(error_model="numpy", forceinline=True)
+@compiled(fastmath=FAST, forceinline=True)
 def correction_is_finite(w, gain_direction, innovation_over_S):
     """Whether `correct_weights` would leave finite weights."""
     total = 0.0
@@ -222,7 +247,7 @@ def correction_is_finite(w, gain_direction, innovation_over_S):
     return np.isfinite(total)
 
 
-@compiled(error_model="numpy")
+@compiled(forceinline=True)
 def update_weights(cov, w, h, scaled_measurement, S, noise):
     """Eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
 

@@ -103,8 +103,8 @@ def control_signal(controller, x):
     take_reference(controller, x)
     w = controller.weights
     y = dot(w, newest(controller.reference, w.size))
-    kind, limit, sharpness = controller.amplifier
-    push(controller.output, amplify(kind, limit, sharpness, y))
+    model = controller.amplifier
+    push(controller.output, amplify(model[0], model[1], model[2], y))
     return y
 
 
@@ -124,7 +124,7 @@ def adapt_kalman(controller, error):
     if not squares_are_finite(d, h[0], x):
         return False
     previewed = preview_constraint(controller.constraint, d, h[0], x)
-    r, q, alpha_sq = controller.settings
+    r, q, alpha_sq = controller.settings[0], controller.settings[1], controller.settings[2]
     owed = controller.covariance.owed
     scale, diagonal, inverse_S = owed[SCALE], owed[DIAGONAL], owed[INVERSE_S]
     predict_covariance(controller.covariance, alpha_sq, r)
@@ -157,7 +157,7 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
-@compiled(fastmath=FAST, error_model="numpy")
+@compiled(fastmath=FAST)
 def adapt_lms(controller, error, y):
     """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS).
 
@@ -246,12 +246,12 @@ def note_weights(record, weights, every, n):
 @compiled(nogil=True)
 def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last):
     """Samples `first` to `last` of the loop; returns the status and the sample after the last one run."""
-    kind, clip, sharpness = plant.amplifier
+    model = plant.amplifier
     for n in range(first, last):
         y = control_signal(controller, measured_reference(plant, x[n]))
         if not abs(y) <= limit:
             return DIVERGED, n
-        y_amplified = amplify(kind, clip, sharpness, y)
+        y_amplified = amplify(model[0], model[1], model[2], y)
         a = anti_noise(plant, y_amplified)
         e = d[n] - a + sensor_noise[n]
         record.error[n], record.control_signal[n] = e, y
