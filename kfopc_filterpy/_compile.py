@@ -11,26 +11,80 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+import numba
+from numba import njit, types
+from numba.core.registry import CPUDispatcher
+from numba.extending import intrinsic
 
-COMPILED_MODULES = ("amplifiers", "constraint", "kernels", "loop")
+COMPILED_MODULES = ("_compile", "amplifiers", "constraint", "kernels", "loop")
+# All said for every function: what is not said, numba takes from the caller that happens to compile a function first,
+# and leaves it on disk for all the others. Division is numpy's (Inf or NaN, which the callers look for): a test for
+# zero at each would make a way out of every function, at which references to all its arrays are counted.
+OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "error_model": "numpy",
+    "fastmath": False,
+    "forceinline": False,
+    "no_cfunc_wrapper": True,
+}
 SOURCES = hashlib.sha256(
     b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in COMPILED_MODULES)
 ).hexdigest()
+SWITCHED_OFF: bool = vars(numba)["config"].DISABLE_JIT  # numba's own switch: everything is called as plain Python
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: `numba.njit(cache=True, error_model="numpy", **options)`.
-
-    Division is numpy's (Inf or NaN, which the callers look for): a test for zero at each would make a way out of every
-    function, at which references to all its arrays are counted; the loop took three times as long for it.
-    """
+    """Decorator: `numba.njit(**OPTIONS)`, with what is given here in place of them."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(cache=True, error_model="numpy", **options)(function)
+        dispatcher = njit(**(OPTIONS | options))(function)
         cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if hasattr(cache_file, "_source_stamp"):  # not where numba's compiler is switched off
             cache_file._source_stamp = (cache_file._source_stamp, SOURCES)
         return dispatcher
 
     return decorate
+
+
+class Part(CPUDispatcher):
+    """A function compiled into others only: it has no entry from Python, which for small ones takes longest to make."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        raise TypeError(f"{self.py_func.__name__} is a part of compiled functions and cannot be called from Python")
+
+
+def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: as `compiled`, for functions that only compiled functions call."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = compiled(no_cpython_wrapper=True, **options)(function)
+        if not SWITCHED_OFF:
+            dispatcher.__class__ = Part
+        return dispatcher
+
+    return decorate
+
+
+def _borrowed(typingctx: Any, value: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _without_count(context, builder, value, args[0])
+
+    return value(value), codegen
+
+
+def _without_count(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    if isinstance(kind, types.Array):
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo, array.parent = array.meminfo.type(None), array.parent.type(None)
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        for i, item in enumerate(tuple(kind)):  # type: ignore[var-annotated,arg-type]
+            part = _without_count(context, builder, item, builder.extract_value(value, i))
+            value = builder.insert_value(value, part, i)
+    return value
+
+
+# The same array, or tuple of arrays, without reference counts: for the time of a call whose caller holds it. numba
+# counts the references to each array that passes through a call or a tuple, one locked instruction each: in a loop
+# over samples more work than the arithmetic of a short control filter.
+borrowed: Any = (lambda value: value) if SWITCHED_OFF else intrinsic(_borrowed)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import compiled
+from ._compile import compiled, part
 from ._validate import as_choice, as_nonnegative, as_number, as_positive
 
 DEFAULT_FS = 16000.0
@@ -18,7 +18,8 @@ SILENCE = float(np.finfo(np.float64).tiny)
 
 # Rows of the state's table, and what their three columns are.
 MEAN, LAP, TAKEN, SUPPLIED, LAST, SETTINGS = range(6)
-DISTURBANCE, FILTERED_REFERENCE, REFERENCE = range(3)  # of MEAN, LAP, TAKEN
+# of MEAN, LAP, TAKEN; numpy's integers, since numba compiles a function anew for each plain one it is called with
+DISTURBANCE, FILTERED_REFERENCE, REFERENCE = np.arange(3)
 FACTOR, POWER, GAIN = range(3)  # of SUPPLIED, LAST
 RATED_POWER, FORGETTING = range(2)  # of SETTINGS
 
@@ -36,7 +37,7 @@ class ConstraintState(NamedTuple):
     window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def _next_mean(state, row, square):
     """Mean square with one more sample, unbiased from the first sample on."""
     n, m, mean = state.table[TAKEN, row], state.window.shape[1], state.table[MEAN, row]
@@ -47,7 +48,7 @@ def _next_mean(state, row, square):
     return (state.table[LAP, row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def _gain(state, filtered_power, reference_power):
     """Eq. 11, or the gain supplied, or the last one while the reference is silent."""
     if not np.isnan(state.table[SUPPLIED, GAIN]):
@@ -57,7 +58,7 @@ def _gain(state, filtered_power, reference_power):
     return state.table[LAST, GAIN]
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def _factor(state, disturbance_power, gain):
     """Eq. 13; 1 where there is nothing to constrain (no disturbance, or no gain known yet)."""
     if not np.isnan(state.table[SUPPLIED, FACTOR]):
@@ -84,7 +85,7 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     return _factor(state, power, gain), power, gain, mean_d, mean_xf, mean_x
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
     """Take the sample that `previewed` was made of into the running powers."""
     factor, power, gain, mean_d, mean_xf, mean_x = previewed
@@ -104,7 +105,7 @@ def advance_constraint(state, disturbance, filtered_reference, reference):
     return previewed[0]
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def _take(state, row, value, mean):
     """Record one sample of one running power, whose new mean square is `mean`."""
     state.table[MEAN, row] = mean

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._compile import compiled
+from ._compile import compiled, part
 
 # No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
 FAST = {"reassoc", "contract", "nsz"}
@@ -64,7 +64,7 @@ def copy_covariance(cov: Covariance) -> Covariance:
     return other
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def copy_into(target, source):
     """target[:] = source, in a loop: numba compiles two seconds of error messages for the slice."""
     for i in range(source.size):
@@ -141,14 +141,14 @@ def project_covariance(cov, h):
     return dot(h, Ph)
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def downdate_covariance(cov, S):
     """Eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
     copy_into(cov.gain_direction, cov.product)
     cov.owed[INVERSE_S] = cov.owed[LAST_INVERSE_S] = 1.0 / S
 
 
-@compiled()
+@part()
 def two_sum(a, b):
     """a + b as the rounded sum and what rounding left (Knuth)."""
     total = a + b
@@ -156,7 +156,7 @@ def two_sum(a, b):
     return total, (a - (total - rest)) + (b - rest)
 
 
-@compiled()
+@part()
 def two_product(a, b):
     """a b as the rounded product and what rounding left (Dekker)."""
     product = a * b
@@ -168,7 +168,7 @@ def two_product(a, b):
     return product, ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low
 
 
-@compiled()
+@part()
 def add_product(total, rest, a, b):
     """(total + rest) + a b in twice the precision (Ogita, Rump and Oishi's Dot2)."""
     product, product_rest = two_product(a, b)
@@ -176,7 +176,7 @@ def add_product(total, rest, a, b):
     return total, rest + (product_rest + sum_rest)
 
 
-@compiled()
+@part()
 def downdate_carefully(cov, h, noise):
     """Eq. 8 in twice the precision and at once, after `project_covariance`; False, undone, where it would overflow."""
     T, n = cov.triangle, h.size
@@ -231,14 +231,14 @@ def dot(a, b):
     return total
 
 
-@compiled(fastmath=FAST, forceinline=True)
+@part(fastmath=FAST, forceinline=True)
 def correct_weights(w, gain_direction, innovation_over_S):
     """Eq. 5, w(n|n) = w(n|n-1) + K (d - x'w), with K = g/S."""
     for i in range(w.size):
         w[i] += gain_direction[i] * innovation_over_S
 
 
-@compiled(fastmath=FAST, forceinline=True)
+@part(fastmath=FAST, forceinline=True)
 def correction_is_finite(w, gain_direction, innovation_over_S):
     """Whether `correct_weights` would leave finite weights."""
     total = 0.0

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._compile import compiled
+from ._compile import borrowed, compiled, part
 from .amplifiers import amplify
 from .constraint import (
     FACTOR,
@@ -73,6 +73,12 @@ def newest(line, taps):
     return line[start : start + taps]
 
 
+@compiled(forceinline=True)
+def latest(line):
+    """The newest sample."""
+    return line[int(line[START])]
+
+
 class ControllerState(NamedTuple):
     """What every controller here keeps."""
 
@@ -89,7 +95,7 @@ class ControllerState(NamedTuple):
     last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def take_reference(controller, x):
     """x(n) into its delay line, and x'(n) = (s^ * x)(n) into the filtered one."""
     push(controller.reference, x)
@@ -115,11 +121,11 @@ def disturbance_estimate(controller, error):
     return error + dot(s, newest(controller.output, s.size))
 
 
-@compiled()
+@part(forceinline=True)
 def adapt_kalman(controller, error):
     """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step."""
     d = disturbance_estimate(controller, error)
-    w, x = controller.weights, newest(controller.reference, 1)[0]
+    w, x = controller.weights, latest(controller.reference)
     h = newest(controller.filtered, w.size)
     if not squares_are_finite(d, h[0], x):
         return False
@@ -140,13 +146,13 @@ def adapt_kalman(controller, error):
     return True
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def squares_are_finite(d, filtered, x):
     """Whether the running powers can take this sample: an infinite power would never be forgotten."""
     return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
 
 
-@compiled()
+@part()
 def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     """Undo, to rounding, the prediction and projection of a step that cannot be completed."""
     T, g = cov.triangle, cov.gain_direction
@@ -157,7 +163,7 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
-@compiled(fastmath=FAST)
+@compiled(fastmath=FAST, forceinline=True)
 def adapt_lms(controller, error, y):
     """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS).
 
@@ -176,25 +182,17 @@ def adapt_lms(controller, error, y):
         w[i] += correction * xf[i] - penalty * x[i]
 
 
-@compiled(forceinline=True)
-def adapt(controller, error, y):
-    """Adapt the weights of either family; False: the step was refused."""
-    if controller.kind == KALMAN:
-        return adapt_kalman(controller, error)
-    adapt_lms(controller, error, y)
-    return True
-
-
 @compiled(nogil=True)
 def listen(controller, references, errors):
     """Follow the noise with the loudspeaker silent: delay lines and powers advance, the weights stay.
 
     Returns the samples taken: all, or those before one whose square overflows.
     """
+    controller = borrowed(controller)
     for n in range(references.size):
         take_reference(controller, references[n])
         push(controller.output, 0.0)
-        d, filtered = disturbance_estimate(controller, errors[n]), newest(controller.filtered, 1)[0]
+        d, filtered = disturbance_estimate(controller, errors[n]), latest(controller.filtered)
         if not squares_are_finite(d, filtered, references[n]):
             return n
         advance_constraint(controller.constraint, d, filtered, references[n])
@@ -246,6 +244,8 @@ def note_weights(record, weights, every, n):
 @compiled(nogil=True)
 def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last):
     """Samples `first` to `last` of the loop; returns the status and the sample after the last one run."""
+    controller, plant, record = borrowed(controller), borrowed(plant), borrowed(record)
+    x, d, sensor_noise = borrowed(x), borrowed(d), borrowed(sensor_noise)
     model = plant.amplifier
     for n in range(first, last):
         y = control_signal(controller, measured_reference(plant, x[n]))
@@ -255,7 +255,9 @@ def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last
         a = anti_noise(plant, y_amplified)
         e = d[n] - a + sensor_noise[n]
         record.error[n], record.control_signal[n] = e, y
-        if not adapt(controller, e, y):
+        if controller.kind == LMS:
+            adapt_lms(controller, e, y)
+        elif not adapt_kalman(controller, e):
             return REFUSED, n
         record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
         powers = controller.constraint.table[LAST]

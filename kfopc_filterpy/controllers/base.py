@@ -10,7 +10,7 @@ from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, compiled_parameters
 from ..constraint import OutputPowerConstraint
 from ..kernels import new_covariance
-from ..loop import ControllerState, adapt, control_signal, delay_line, listen
+from ..loop import ControllerState, adapt_lms, control_signal, delay_line, listen
 from ..paths import is_system, path_taps, sampling_rate
 
 NO_SOLUTION = (
@@ -132,8 +132,7 @@ class FilteredReferenceController:
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""
-        if not adapt(self._state, as_number(error, "error"), self._y):
-            raise ValueError(NO_SOLUTION)
+        adapt_lms(self._state, as_number(error, "error"), self._y)
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.

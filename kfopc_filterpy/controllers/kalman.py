@@ -11,7 +11,7 @@ from .._validate import as_number
 from ..amplifiers import Amplifier
 from ..constraint import OutputPowerConstraint
 from ..estimator import KFOPC
-from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate, newest
+from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate, latest, newest
 from ..random_walk import RandomWalkKFOPC
 from .base import FilteredReferenceController
 
@@ -103,7 +103,7 @@ class KalmanController(FilteredReferenceController):
         """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
         d = disturbance_estimate(self._state, as_number(error, "error"))
         h = newest(self._state.filtered, self.estimator.dim_x).reshape(1, -1).copy()
-        x, powers = newest(self._state.reference, 1)[0], self.constraint
+        x, powers = latest(self._state.reference), self.constraint
         powers.preview(d, h[0, 0], x)  # refuses what would overflow before anything changes
         self.estimator.predict()
         if isinstance(self.estimator, KFOPC):
