@@ -222,47 +222,47 @@ def anti_noise(plant, y_amplified):
     return dot(plant.secondary, newest(plant.output, plant.secondary.size))
 
 
-class Record(NamedTuple):
-    """Rows of a run, one a sample, except `weights`, one every so many samples."""
-
-    error: np.ndarray
-    control_signal: np.ndarray
-    amplifier_output: np.ndarray
-    anti_noise: np.ndarray
-    constraint_factor: np.ndarray
-    powers: np.ndarray  # (n or 0, 2) disturbance power, gain
-    weights: np.ndarray  # (n_rows or 0, L)
+# Rows of a stretch of signals: what goes in, and what the loop leaves.
+(
+    REFERENCE_IN,
+    DISTURBANCE_IN,
+    SENSOR_NOISE,
+    ERROR,
+    CONTROL,
+    AMPLIFIED,
+    ANTI_NOISE,
+    USED_FACTOR,
+    USED_POWER,
+    USED_GAIN,
+) = range(10)
 
 
 @compiled(forceinline=True)
-def note_weights(record, weights, every, n):
-    """Keep the weights of sample n where it is one of the recorded."""
-    if record.weights.shape[0] > 0 and n % every == 0:
-        copy_into(record.weights[n // every], weights)
+def note_weights(rows, weights, every, n):
+    """Keep the weights of sample n where it is one of the recorded; without rows none is."""
+    if rows.shape[0] > 0 and n % every == 0:
+        copy_into(rows[n // every], weights)
 
 
 @compiled(nogil=True)
-def run(controller, plant, x, d, sensor_noise, limit, record, every, first, last):
-    """Samples `first` to `last` of the loop; returns the status and the sample after the last one run."""
-    controller, plant, record = borrowed(controller), borrowed(plant), borrowed(record)
-    x, d, sensor_noise = borrowed(x), borrowed(d), borrowed(sensor_noise)
+def run(controller, plant, signals, weights, limit, every, first):
+    """A stretch of the loop, `signals` (10, k) from sample `first` on; returns the status and the samples done."""
+    controller, plant, signals, weights = borrowed(controller), borrowed(plant), borrowed(signals), borrowed(weights)
     model = plant.amplifier
-    for n in range(first, last):
-        y = control_signal(controller, measured_reference(plant, x[n]))
+    for k in range(signals.shape[1]):
+        y = control_signal(controller, measured_reference(plant, signals[REFERENCE_IN, k]))
         if not abs(y) <= limit:
-            return DIVERGED, n
+            return DIVERGED, k
         y_amplified = amplify(model[0], model[1], model[2], y)
         a = anti_noise(plant, y_amplified)
-        e = d[n] - a + sensor_noise[n]
-        record.error[n], record.control_signal[n] = e, y
+        e = signals[DISTURBANCE_IN, k] - a + signals[SENSOR_NOISE, k]
+        signals[ERROR, k], signals[CONTROL, k] = e, y
         if controller.kind == LMS:
             adapt_lms(controller, e, y)
         elif not adapt_kalman(controller, e):
-            return REFUSED, n
-        record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
-        powers = controller.constraint.table[LAST]
-        record.constraint_factor[n] = powers[FACTOR]
-        if record.powers.shape[0] > 0:
-            record.powers[n, 0], record.powers[n, 1] = powers[POWER], powers[GAIN]
-        note_weights(record, controller.weights, every, n)
-    return RUNNING, last
+            return REFUSED, k
+        signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a
+        used = controller.constraint.table[LAST]
+        signals[USED_FACTOR, k], signals[USED_POWER, k], signals[USED_GAIN, k] = used[FACTOR], used[POWER], used[GAIN]
+        note_weights(weights, controller.weights, every, first + k)
+    return RUNNING, signals.shape[1]

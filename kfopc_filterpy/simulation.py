@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,21 @@ from .amplifiers import Amplifier, compiled_parameters
 from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
 from .loop import (
+    AMPLIFIED,
+    ANTI_NOISE,
+    CONTROL,
+    DISTURBANCE_IN,
     DIVERGED,
+    ERROR,
+    REFERENCE_IN,
     REFUSED,
     RUNNING,
+    SENSOR_NOISE,
+    USED_FACTOR,
+    USED_GAIN,
+    USED_POWER,
     ControllerState,
     Plant,
-    Record,
     anti_noise,
     delay_line,
     measured_reference,
@@ -29,7 +39,8 @@ from .loop import (
 from .paths import path_taps
 
 DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
-STEP = 16000  # samples that the compiled loop runs between two reports of progress, or chances to interrupt it
+STEP = 16000  # samples between two reports of progress, or chances to interrupt a run
+RECORDED = (ERROR, CONTROL, AMPLIFIED, ANTI_NOISE, USED_FACTOR)  # always; the powers where they are asked for
 
 
 @dataclass(frozen=True)
@@ -182,49 +193,65 @@ def simulate(
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference")
     d = _disturbance(x, primary_path, disturbance, fs)
-    sensor_noise = _sensor_noise(x.size, as_nonnegative(sensor_noise_std, "sensor_noise_std"), rng)
+    noise = _SensorNoise(sensor_noise_std, rng)
     if rated_power is None:
         rated_power = getattr(controller, "rated_power", None)
     rated_power = None if rated_power is None else as_positive(rated_power, "rated_power")
     limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
-    on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
+    on = _switch_on_sample(switch_on_s, fs, x.size)
     plant = _plant(secondary_path, feedback_path, amplifier, fs)
     if isinstance(controller, FilteredReferenceController):
         controller.require_sample_rate(fs)
-    record = _new_record(x.size - on, controller, every, record_powers)
+    weights = _weight_rows(x.size - on, controller, every)
     if on:
-        _listen(controller, x[:on], (d + sensor_noise)[:on])
-        x, d, sensor_noise = x[on:], d[on:], sensor_noise[on:]
+        _listen(controller, x[:on], d[:on] + noise.take(on))
+        x, d = x[on:], d[on:]
 
-    signals = (x, d, sensor_noise)
+    run_stretch = partial(_run_steps, controller, plant, amplifier)
     if compiled and isinstance(controller, FilteredReferenceController) and compiled_parameters(amplifier) is not None:
         state = controller.compiled_state()
-    else:
-        state = None
-    if isinstance(controller, FilteredReferenceController) and state is not None:
-        status, end = _run_compiled(controller, state, plant, signals, limit, record, every or 1, progress)
-    else:
-        status, end = _run_steps(controller, plant, amplifier, signals, limit, record, every or 1, progress)
-    _blank(record, end, every or 1)
-    powers = record.powers.T if record_powers else (None, None)
+        if state is not None:
+            run_stretch = partial(_run_compiled, controller, state, plant)
+    rows = (*RECORDED, USED_POWER, USED_GAIN) if record_powers else RECORDED
+    recorded = np.full((len(rows), x.size), np.nan)
+    status, end = RUNNING, 0
+    for first in range(0, x.size, STEP):
+        stretch = np.empty((10, min(STEP, x.size - first)))
+        stretch[REFERENCE_IN] = x[first : first + STEP]
+        stretch[DISTURBANCE_IN] = d[first : first + STEP]
+        stretch[SENSOR_NOISE] = noise.take(stretch.shape[1])
+        status, done = run_stretch(stretch, weights, limit, every or 1, first, progress)
+        end = first + done
+        recorded[:, first:end] = stretch[rows, :done]
+        if status != RUNNING:
+            break
+    weights[-(-end // (every or 1)) :] = np.nan
+    e, y, y_amplified, a, factor, *powers = recorded
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,
         rated_power=rated_power,
         reference=x.copy(),
         disturbance=d.copy(),
-        error=record.error,
-        control_signal=record.control_signal,
-        amplifier_output=record.amplifier_output,
-        anti_noise=record.anti_noise,
-        constraint_factor=record.constraint_factor,
-        weights=record.weights if every else None,
-        weights_time_s=np.arange(len(record.weights)) * every / fs if every else None,
-        disturbance_power=powers[0],
-        secondary_path_gain=powers[1],
+        error=e,
+        control_signal=y,
+        amplifier_output=y_amplified,
+        anti_noise=a,
+        constraint_factor=factor,
+        weights=weights if every else None,
+        weights_time_s=np.arange(len(weights)) * every / fs if every else None,
+        disturbance_power=powers[0] if powers else None,
+        secondary_path_gain=powers[1] if powers else None,
         diverged_at_s=end / fs if status == DIVERGED else None,
     )
+
+
+def _switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
+    on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
+    if on >= n_samples:
+        raise ValueError("switch_on_s must leave samples to control: it takes the whole signal")
+    return on
 
 
 def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
@@ -237,66 +264,62 @@ def _run_compiled(
     controller: FilteredReferenceController,
     state: ControllerState,
     plant: Plant,
-    signals: tuple[np.ndarray, np.ndarray, np.ndarray],
+    stretch: np.ndarray,
+    weights: np.ndarray,
     limit: float,
-    record: Record,
     every: int,
+    first: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
-    """`loop.run`, some samples at a time."""
-    n_samples = signals[0].size
-    status, end = RUNNING, 0
+    """`loop.run`."""
     try:
-        for first in range(0, n_samples, STEP):
-            status, end = run(state, plant, *signals, limit, record, every, first, min(first + STEP, n_samples))
-            if progress:
-                progress(end - first)
-            if status != RUNNING:
-                break
+        status, done = run(state, plant, stretch, weights, limit, every, first)
     finally:  # interrupted or not, the controller is as its last sample left it
         controller.after_compiled(state)
+    if progress:
+        progress(done)
     if status == REFUSED:
-        with _naming_sample(end):
-            controller.update(record.error[end])  # refused again, with the reason
+        with _naming_sample(first + done):
+            controller.update(stretch[ERROR, done])  # refused again, with the reason
             raise ValueError(NO_SOLUTION)
-    return status, end
+    return status, done
 
 
 def _run_steps(
     controller: Controller,
     plant: Plant,
     amplifier: Amplifier | None,
-    signals: tuple[np.ndarray, np.ndarray, np.ndarray],
+    stretch: np.ndarray,
+    weights: np.ndarray,
     limit: float,
-    record: Record,
     every: int,
+    first: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
     """The loop of `loop.run`, one call of the controller at a time."""
-    x, d, sensor_noise = signals
-    for n in range(x.size):
-        with _naming_sample(n):
-            y = _as_sample(controller.control_signal(float(measured_reference(plant, x[n]))), "control_signal")
+    for k in range(stretch.shape[1]):
+        with _naming_sample(first + k):
+            x = measured_reference(plant, stretch[REFERENCE_IN, k])
+            y = _as_sample(controller.control_signal(float(x)), "control_signal")
             if not abs(y) <= limit:
-                return DIVERGED, n
+                return DIVERGED, k
             y_amplified = y if amplifier is None else _as_sample(amplifier(y), "amplifier")
             if not np.isfinite(y_amplified):
                 raise ValueError(f"amplifier must return a finite number, got {y_amplified} for {y}")
             a = anti_noise(plant, y_amplified)
-            e = d[n] - a + sensor_noise[n]
+            e = stretch[DISTURBANCE_IN, k] - a + stretch[SENSOR_NOISE, k]
             controller.update(float(e))
-        record.error[n], record.control_signal[n] = e, y
-        record.amplifier_output[n], record.anti_noise[n] = y_amplified, a
-        record.constraint_factor[n] = getattr(controller, "constraint_factor", np.nan)
-        if record.powers.shape[0] > 0:
-            record.powers[n, 0] = getattr(controller, "disturbance_power", np.nan)
-            record.powers[n, 1] = getattr(controller, "secondary_path_gain", np.nan)
-        if record.weights.shape[0] > 0:
-            weights = np.array(controller.weights, dtype=np.float64)  # type: ignore[attr-defined]
-            note_weights(record, weights.reshape(-1), every, n)
+        stretch[ERROR, k], stretch[CONTROL, k] = e, y
+        stretch[AMPLIFIED, k], stretch[ANTI_NOISE, k] = y_amplified, a
+        stretch[USED_FACTOR, k] = getattr(controller, "constraint_factor", np.nan)
+        stretch[USED_POWER, k] = getattr(controller, "disturbance_power", np.nan)
+        stretch[USED_GAIN, k] = getattr(controller, "secondary_path_gain", np.nan)
+        if weights.shape[0] > 0:
+            now = np.array(controller.weights, dtype=np.float64)  # type: ignore[attr-defined]
+            note_weights(weights, now.reshape(-1), every, first + k)
         if progress:
             progress(1)
-    return RUNNING, x.size
+    return RUNNING, stretch.shape[1]
 
 
 @contextmanager
@@ -325,8 +348,15 @@ def _disturbance(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) 
     return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
 
 
-def _sensor_noise(n_samples: int, std: float, rng: Any) -> np.ndarray:
-    return std * as_generator(rng).standard_normal(n_samples) if std > 0 else np.zeros(n_samples)
+class _SensorNoise:
+    """White noise, made a stretch at a time."""
+
+    def __init__(self, std: float, rng: Any) -> None:
+        self.std = as_nonnegative(std, "sensor_noise_std")
+        self.rng = as_generator(rng) if self.std > 0 else None
+
+    def take(self, n_samples: int) -> np.ndarray | float:
+        return 0.0 if self.rng is None else self.std * self.rng.standard_normal(n_samples)
 
 
 def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None, fs: float) -> Plant:
@@ -345,20 +375,9 @@ def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None,
     return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), parameters)
 
 
-def _new_record(n_samples: int, controller: Controller, every: int | None, powers: bool) -> Record:
-    if n_samples < 1:
-        raise ValueError("switch_on_s must leave samples to control: it takes the whole signal")
-    rows = columns = 0
-    if every:
-        if not hasattr(controller, "weights"):
-            raise ValueError("record_weights_every needs a controller with an attribute weights, (L,)")
-        rows, columns = -(-n_samples // every), np.size(controller.weights)
-    e, y, y_amplified, a, factor = np.empty((5, n_samples))
-    return Record(e, y, y_amplified, a, factor, np.empty((n_samples if powers else 0, 2)), np.empty((rows, columns)))
-
-
-def _blank(record: Record, end: int, every: int) -> None:
-    """NaN in all that a run which stopped at sample `end` did not reach."""
-    for rows in record[:-1]:
-        rows[end:] = np.nan
-    record.weights[-(-end // every) :] = np.nan
+def _weight_rows(n_samples: int, controller: Controller, every: int | None) -> np.ndarray:
+    if every is None:
+        return np.empty((0, 0))
+    if not hasattr(controller, "weights"):
+        raise ValueError("record_weights_every needs a controller with an attribute weights, (L,)")
+    return np.empty((-(-n_samples // every), np.size(controller.weights)))
