@@ -33,7 +33,7 @@ SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products a
 class Covariance(NamedTuple):
     """State covariance: P = scale (T - g g' inverse_s) + diagonal I."""
 
-    triangle: np.ndarray  # (n, n or more), lower triangle T valid; rows begin at cache lines
+    triangle: np.ndarray  # (n or more, n or more), lower triangle T valid; rows begin at cache lines
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the pass under way
     owed: np.ndarray  # (4,): scale, diagonal, 1/S or 0 where the downdate was done at once; 1/S of the last update
@@ -51,14 +51,15 @@ def aligned_zeros(*shape: int) -> np.ndarray:
 def new_covariance(P: np.ndarray) -> Covariance:
     """Covariance state from a full symmetric array (n, n); the upper triangle is not read."""
     n = P.shape[0]
-    cov = Covariance(aligned_zeros(n, n), aligned_zeros(n)[:n], aligned_zeros(n)[:n], np.array([1.0, 0.0, 0.0, 0.0]))
-    cov.triangle[:, :n] = P
-    return cov
+    triangle = aligned_zeros(-(-n // LINE) * LINE, n)  # square for BLAS, zero past n
+    triangle[:n, :n] = P
+    return Covariance(triangle, aligned_zeros(n)[:n], aligned_zeros(n)[:n], np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def copy_covariance(cov: Covariance) -> Covariance:
     """A covariance state of its own (a plain copy of an array need not begin at a cache line)."""
-    other = new_covariance(cov.triangle[:, : cov.product.size])
+    n = cov.product.size
+    other = new_covariance(cov.triangle[:n, :n])
     for mine, theirs in zip(other[1:], cov[1:], strict=True):
         mine[:] = theirs
     return other

@@ -16,6 +16,7 @@ import numpy as np
 
 from ._compile import borrowed, compiled, part
 from .amplifiers import amplify
+from .block import leave_block, project_in_block, update_in_block
 from .constraint import (
     FACTOR,
     GAIN,
@@ -27,6 +28,7 @@ from .constraint import (
     preview_constraint,
 )
 from .kernels import (
+    CANCELLATION,
     DIAGONAL,
     FAST,
     INVERSE_S,
@@ -122,8 +124,11 @@ def disturbance_estimate(controller, error):
 
 
 @part(forceinline=True)
-def adapt_kalman(controller, error):
-    """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step."""
+def adapt_kalman(controller, error, block):
+    """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step.
+
+    `block` is None, or open for the samples to come (see `block`).
+    """
     d = disturbance_estimate(controller, error)
     w, x = controller.weights, latest(controller.reference)
     h = newest(controller.filtered, w.size)
@@ -131,16 +136,25 @@ def adapt_kalman(controller, error):
         return False
     previewed = preview_constraint(controller.constraint, d, h[0], x)
     r, q, alpha_sq = controller.settings[0], controller.settings[1], controller.settings[2]
-    owed = controller.covariance.owed
-    scale, diagonal, inverse_S = owed[SCALE], owed[DIAGONAL], owed[INVERSE_S]
-    predict_covariance(controller.covariance, alpha_sq, r)
-    S = project_covariance(controller.covariance, h) + q
-    y = np.nan
-    if 0.0 < S < np.inf:
-        y = update_weights(controller.covariance, w, h, previewed[0] * d, S, q)
-    if not np.isfinite(y):
-        take_back(controller.covariance, scale, diagonal, inverse_S, alpha_sq, r)
-        return False
+    cov = controller.covariance
+    S, y = np.nan, np.nan
+    if block is not None and block.taken[1] > 0:
+        S = project_in_block(cov, block, h, r) + q
+        if 0.0 < S <= CANCELLATION * q:
+            y = update_in_block(cov, block, w, h, previewed[0] * d, S)
+            if not np.isfinite(y):
+                return False
+        else:
+            leave_block(cov, block, r)
+    if np.isnan(y):
+        scale, diagonal, inverse_S = cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S]
+        predict_covariance(cov, alpha_sq, r)
+        S = project_covariance(cov, h) + q
+        if 0.0 < S < np.inf:
+            y = update_weights(cov, w, h, previewed[0] * d, S, q)
+        if not np.isfinite(y):
+            take_back(cov, scale, diagonal, inverse_S, alpha_sq, r)
+            return False
     commit_constraint(controller.constraint, previewed, d, h[0], x)
     controller.last[0], controller.last[1], controller.last[2] = d, y, S
     return True
@@ -245,11 +259,15 @@ def note_weights(rows, weights, every, n):
 
 
 @compiled(nogil=True)
-def run(controller, plant, signals, weights, limit, every, first):
-    """A stretch of the loop, `signals` (10, k) from sample `first` on; returns the status and the samples done."""
-    controller, plant, signals, weights = borrowed(controller), borrowed(plant), borrowed(signals), borrowed(weights)
+def run(controller, block, plant, signals, weights, limit, every, first, begin, end):
+    """Columns `begin` to `end` of a stretch of signals (10, k), whose first is sample `first` of the run.
+
+    Returns the status and the column after the last one done.
+    """
+    controller, block, plant = borrowed(controller), borrowed(block), borrowed(plant)
+    signals, weights = borrowed(signals), borrowed(weights)
     model = plant.amplifier
-    for k in range(signals.shape[1]):
+    for k in range(begin, end):
         y = control_signal(controller, measured_reference(plant, signals[REFERENCE_IN, k]))
         if not abs(y) <= limit:
             return DIVERGED, k
@@ -259,10 +277,10 @@ def run(controller, plant, signals, weights, limit, every, first):
         signals[ERROR, k], signals[CONTROL, k] = e, y
         if controller.kind == LMS:
             adapt_lms(controller, e, y)
-        elif not adapt_kalman(controller, e):
+        elif not adapt_kalman(controller, e, block):
             return REFUSED, k
         signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a
         used = controller.constraint.table[LAST]
         signals[USED_FACTOR, k], signals[USED_POWER, k], signals[USED_GAIN, k] = used[FACTOR], used[POWER], used[GAIN]
         note_weights(weights, controller.weights, every, first + k)
-    return RUNNING, signals.shape[1]
+    return RUNNING, end

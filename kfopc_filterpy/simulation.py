@@ -272,8 +272,13 @@ def _run_compiled(
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
     """`loop.run`."""
+    status, done = RUNNING, 0
     try:
-        status, done = run(state, plant, stretch, weights, limit, every, first)
+        for begin, end in controller.blocks(state, stretch.shape[1]):
+            block = controller.open_block
+            status, done = run(state, block, plant, stretch, weights, limit, every, first, begin, end)
+            if status != RUNNING:
+                break
     finally:  # interrupted or not, the controller is as its last sample left it
         controller.after_compiled(state)
     if progress:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, compiled_parameters
+from ..block import OpenBlock
 from ..constraint import OutputPowerConstraint
 from ..kernels import new_covariance
 from ..loop import ControllerState, adapt_lms, control_signal, delay_line, listen
@@ -164,6 +166,15 @@ class FilteredReferenceController:
     def compiled_state(self) -> ControllerState | None:
         """State for the compiled loop, which advances it; None where only the steps above can run."""
         return self._state if self.steps_of(FilteredReferenceController) else None
+
+    @property
+    def open_block(self) -> OpenBlock | None:
+        """Block under way, for the compiled loop; None for a controller that takes samples one by one."""
+        return None
+
+    def blocks(self, state: ControllerState, n_samples: int) -> Iterator[tuple[int, int]]:
+        """Begin and end of the blocks that the compiled loop may run without a pause; here all samples."""
+        yield 0, n_samples
 
     def after_compiled(self, state: ControllerState) -> None:
         """Take back what the compiled loop advanced, however many samples it ran."""
