@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from .random_walk import RandomWalkKFOPC
     from .rated_power import RatedPower, required_rated_power
     from .recordings import read_mat_vector, read_wav, write_wav
+    from .scenarios import simulate_scenarios
     from .signals import band_limited_noise, compressor_noise, level_jump, scaled_to_power, tone
     from .simulation import SimulationResult, simulate
     from .spectra import coherence_and_gain, harmonics_db, power_spectrum_db
@@ -114,6 +115,7 @@ _LAZY = {
     "scaled_to_power": "signals",
     "secondary_path_gain": "path_analysis",
     "simulate": "simulation",
+    "simulate_scenarios": "scenarios",
     "tone": "signals",
     "wiener_solution": "wiener",
     "write_wav": "recordings",

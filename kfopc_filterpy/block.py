@@ -58,17 +58,18 @@ def settle(cov: Covariance) -> None:
 class Block:
     """A block of samples whose rows are all known.
 
-    `rows` (m, n or more) takes the filtered-reference rows and is zero past their n taps; `gains` is left in its shape.
+    `rows` (m, n or more) takes the filtered-reference rows and is zero past their n taps; `directions`, of its shape,
+    is where the gain directions g_k = S_k K_k are left.
     """
 
     def __init__(self, n_taps: int, size: int) -> None:
-        self.rows, self.gains = aligned_zeros(2, size, n_taps)
+        self.rows, self.directions = aligned_zeros(2, size, n_taps)
         self._covariance = np.zeros((size, size), order="F")
 
     def advance(
         self, cov: Covariance, state_noise: float, measurement_noise: float, alpha_sq: float = 1.0
     ) -> np.ndarray:
-        """Take `cov` past the block: K_k in `gains`; returns S_k (m,), NaN from a sample on that has no solution."""
+        """Take `cov` past the block; returns S_k (m,), NaN from a sample on that has no solution."""
         settle(cov)
         S = self._in_products(cov, state_noise, measurement_noise) if alpha_sq == 1.0 else None
         return self.advance_by_steps(cov, state_noise, measurement_noise, alpha_sq) if S is None else S
@@ -78,14 +79,14 @@ class Block:
     ) -> np.ndarray:
         """`advance`, sample by sample."""
         S = np.full(len(self.rows), np.nan)
-        _steps(cov, self.rows, state_noise, measurement_noise, alpha_sq, self.gains, S)
+        _steps(cov, self.rows, state_noise, measurement_noise, alpha_sq, self.directions, S)
         return S
 
     def _in_products(self, cov: Covariance, state_noise: float, measurement_noise: float) -> np.ndarray | None:
         """None, with nothing changed, where Sigma has no Cholesky factor or S exceeds q too far."""
-        P, H, C = cov.triangle.T, self.rows.T, self.gains.T  # BLAS counts by columns
+        P, H, C = cov.triangle.T, self.rows.T, self.directions.T  # BLAS counts by columns
         C = dsymm(1.0, P, H, c=C, overwrite_c=1)
-        _add_random_walk(self.gains, self.rows, state_noise)
+        _add_random_walk(self.directions, self.rows, state_noise)
         covariance = dgemm(1.0, H, C, trans_a=1, c=self._covariance, overwrite_c=1)
         np.fill_diagonal(covariance, covariance.diagonal() + measurement_noise)
         L, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
@@ -95,8 +96,8 @@ class Block:
             return None
         G = dtrsm(1.0, L, C, side=1, lower=1, trans_a=1, overwrite_b=1)
         downdate_by_columns(cov, G, len(S) * state_noise)
-        self.gains /= root[:, None]
-        cov.gain_direction[:] = S[-1] * self.gains[-1, : cov.product.size]
+        self.directions *= root[:, None]
+        cov.gain_direction[:] = self.directions[-1, : cov.product.size]
         cov.owed[LAST_INVERSE_S] = 1.0 / S[-1]
         return S
 
@@ -108,10 +109,10 @@ def _add_random_walk(products, rows, state_noise):
 
 
 @compiled(nogil=True)
-def _steps(cov, rows, state_noise, measurement_noise, alpha_sq, gains, S):
-    cov, n = borrowed(cov), cov.product.size
+def _steps(cov, rows, state_noise, measurement_noise, alpha_sq, directions, S):
+    cov, rows, n = borrowed(cov), borrowed(rows), cov.product.size
     for k in range(len(rows)):
-        h = borrowed(rows[k, :n])
+        h = rows[k, :n]
         predict_covariance(cov, alpha_sq, state_noise)
         variance = project_covariance(cov, h) + measurement_noise
         if not 0.0 < variance < np.inf:
@@ -121,8 +122,7 @@ def _steps(cov, rows, state_noise, measurement_noise, alpha_sq, gains, S):
             S[k] = 1.0 / cov.owed[LAST_INVERSE_S]
         else:
             downdate_covariance(cov, variance)
-        for i in range(n):
-            gains[k, i] = cov.gain_direction[i] / S[k]
+        copy_into(directions[k], cov.gain_direction)
 
 
 def downdate_by_columns(cov: Covariance, G: np.ndarray, diagonal: float) -> None:

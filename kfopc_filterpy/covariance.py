@@ -41,6 +41,17 @@ class RandomWalkCovariance:
         self.prior: Moment | np.ndarray = Moment(1.0, 0.0)
         self.posterior: Moment | np.ndarray = Moment(1.0, 0.0)
         self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
+        self._others_read = False  # the arrays are another's too
+
+    def share(self, arrays: Covariance) -> None:
+        """Go on from arrays that others go on from too: whoever steps first takes a copy."""
+        self.arrays, self._others_read = arrays, True
+
+    def own(self) -> Covariance:
+        """The arrays, which nobody else reads."""
+        if self._others_read:
+            self.arrays, self._others_read = copy_covariance(self.arrays), False
+        return self.arrays
 
     @property
     def now(self) -> Moment:
@@ -87,7 +98,7 @@ class RandomWalkCovariance:
         if not np.isfinite(alpha_sq * max(self.now[:2]) + state_noise):
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
         self._shown = []
-        predict_covariance(self.arrays, alpha_sq, state_noise)
+        predict_covariance(self.own(), alpha_sq, state_noise)
         self.prior = self.now
 
     def project(self, h: np.ndarray) -> float:
@@ -96,7 +107,7 @@ class RandomWalkCovariance:
         if not isinstance(self.prior, np.ndarray) and self.prior != self.now:  # a second update since the prediction
             self.prior = self.full(self.prior)
         now = self.now
-        hPh = float(project_covariance(self.arrays, h))
+        hPh = float(project_covariance(self.own(), h))
         if isinstance(self.prior, Moment):
             self.prior = Moment(1.0, 0.0)
         if isinstance(self.posterior, Moment):  # the same P_post, seen from the triangle as it is now

@@ -223,6 +223,12 @@ def full_covariance(T, g, scale, diagonal, weight):
     return P
 
 
+def covariance_matrix(cov: Covariance) -> np.ndarray:
+    """P as a full symmetric array (n, n) of its own."""
+    scale, diagonal, inverse_S, _ = cov.owed.tolist()
+    return full_covariance(cov.triangle, cov.gain_direction, scale, diagonal, -scale * inverse_S)
+
+
 @compiled(fastmath=FAST, forceinline=True)
 def dot(a, b):
     """Inner product of two vectors of the length of the first."""

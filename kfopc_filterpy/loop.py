@@ -55,6 +55,13 @@ def delay_line(taps: int) -> np.ndarray:
     return line
 
 
+def refill(line: np.ndarray, samples: np.ndarray) -> None:
+    """Make `samples` (TAPS or more,), newest first, what the line holds."""
+    taps = int(line[TAPS])
+    line[START] = line.size - taps
+    line[line.size - taps :] = samples[:taps]
+
+
 @compiled(forceinline=True)
 def push(line, sample):
     """Make `sample` the newest one."""

@@ -301,15 +301,23 @@ class RandomWalkKFOPC(KFOPC):
 
     # A whole signal at compiled speed: the arrays go out, and come back advanced.
 
-    def compiled_state(self) -> tuple[Covariance, tuple[float, float, float]] | None:
+    def compiled_state(self, to_step: bool = True) -> tuple[Covariance, tuple[float, float, float]] | None:
         """The covariance arrays and (r, q, fading alpha squared); None where filterpy's equations step."""
         if self._F is not None or self._Q is not None or self.inv is not np.linalg.inv:
             return None
         self._take_in_edits()
-        return self._covariance.arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
+        arrays = self._covariance.own() if to_step else self._covariance.arrays
+        return arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
 
-    def after_compiled(self, weights: np.ndarray, z: float, y: float, S: float) -> None:
-        """Take back the arrays after one sample or more: `weights`, the last measurement, its residual and S."""
+    def after_compiled(
+        self, weights: np.ndarray, z: float, y: float, S: float, shared: Covariance | None = None
+    ) -> None:
+        """Take back the arrays after one sample or more: `weights`, the last measurement, its residual and S.
+
+        `shared` are the arrays where other filters go on from them too.
+        """
+        if shared is not None:
+            self._covariance.share(shared)
         self._covariance.after_compiled()
         self._K = None
         self.S, self.SI = np.array([[S]]), np.array([[1.0 / S]])

@@ -192,14 +192,14 @@ def simulate(
         raise TypeError(f"amplifier must be a function of a sample, or None, got {amplifier!r}")
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference")
-    d = _disturbance(x, primary_path, disturbance, fs)
-    noise = _SensorNoise(sensor_noise_std, rng)
+    d = disturbance_at_microphone(x, primary_path, disturbance, fs)
+    noise = SensorNoise(sensor_noise_std, rng)
     if rated_power is None:
         rated_power = getattr(controller, "rated_power", None)
     rated_power = None if rated_power is None else as_positive(rated_power, "rated_power")
     limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
-    on = _switch_on_sample(switch_on_s, fs, x.size)
+    on = switch_on_sample(switch_on_s, fs, x.size)
     plant = _plant(secondary_path, feedback_path, amplifier, fs)
     if isinstance(controller, FilteredReferenceController):
         controller.require_sample_rate(fs)
@@ -247,7 +247,8 @@ def simulate(
     )
 
 
-def _switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
+def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
+    """Samples before the control is switched on."""
     on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     if on >= n_samples:
         raise ValueError("switch_on_s must leave samples to control: it takes the whole signal")
@@ -345,7 +346,8 @@ def _as_sample(value: Any, source: str) -> float:
         raise TypeError(f"{source} must return one number, got {value!r}") from error
 
 
-def _disturbance(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
+def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
+    """(n_samples,) d, as given or p*x."""
     if (primary_path is None) == (disturbance is None):
         raise ValueError("give either primary_path= or disturbance=, not both and not neither")
     if disturbance is not None:
@@ -353,7 +355,7 @@ def _disturbance(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) 
     return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
 
 
-class _SensorNoise:
+class SensorNoise:
     """White noise, made a stretch at a time."""
 
     def __init__(self, std: float, rng: Any) -> None:
@@ -361,6 +363,7 @@ class _SensorNoise:
         self.rng = as_generator(rng) if self.std > 0 else None
 
     def take(self, n_samples: int) -> np.ndarray | float:
+        """The next samples; 0 where there is no noise."""
         return 0.0 if self.rng is None else self.std * self.rng.standard_normal(n_samples)
 
 

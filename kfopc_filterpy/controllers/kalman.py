@@ -123,12 +123,12 @@ class KalmanController(FilteredReferenceController):
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
 
-    def compiled_state(self) -> ControllerState | None:
-        """State for the compiled loop; None where the estimator takes filterpy's own equations."""
+    def compiled_state(self, to_step: bool = True) -> ControllerState | None:
+        """State for the compiled loop, to step it or to read only; None where filterpy's own equations step."""
         estimator = self.estimator
         if type(estimator) is not RandomWalkKFOPC or not self.steps_of(KalmanController):
             return None
-        compiled = estimator.compiled_state()
+        compiled = estimator.compiled_state(to_step)
         if compiled is None:
             return None
         covariance, settings = compiled
@@ -158,13 +158,13 @@ class KalmanController(FilteredReferenceController):
             yield begin, min(begin + self._block.size, n_samples)
             self._block.close(state.covariance, state.settings[0])
 
-    def after_compiled(self, state: ControllerState) -> None:
-        """Give the estimator the weights, residual, S and gain of the last sample run."""
+    def after_compiled(self, state: ControllerState, shared: bool = False) -> None:
+        """Give the estimator the weights, residual, S and gain of the last sample run, and a covariance it shares."""
         if self._block is not None:
             self._block.close(state.covariance, state.settings[0])
         d, y, S = state.last.tolist()
         if not np.isnan(S):
-            self.estimator.after_compiled(state.weights, d, y, S)
+            self.estimator.after_compiled(state.weights, d, y, S, state.covariance if shared else None)
 
 
 def kf_anc(

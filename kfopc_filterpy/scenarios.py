@@ -1,0 +1,333 @@
+"""Many runs at the price of one filter: scenarios of one reference, whose Kalman gains are the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from ._validate import as_choice, as_positive, as_signal
+from .amplifiers import Amplifier, compiled_parameters
+from .block import Block
+from .constraint import DEFAULT_FS
+from .controllers.base import NO_SOLUTION
+from .controllers.kalman import KalmanController
+from .kernels import INVERSE_S, aligned_zeros, covariance_matrix
+from .lockstep import Scenarios, SharedBlock, run_block
+from .loop import DIVERGED, REFUSED, TAPS, ControllerState, delay_line, newest, refill
+from .paths import path_taps
+from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
+
+BLOCK = 256
+
+
+def simulate_scenarios(
+    controllers: Sequence[KalmanController],
+    reference: Any,
+    *,
+    secondary_path: Any,
+    primary_path: Any = None,
+    disturbance: Any = None,
+    fs: float = DEFAULT_FS,
+    amplifier: Amplifier | Sequence[Amplifier | None] | None = None,
+    rated_power: float | None = None,
+    sensor_noise_std: float | Sequence[float] = 0.0,
+    rng: Any = None,
+    switch_on_s: float = 0.0,
+    record_powers: bool = False,
+    progress: Callable[[int], Any] | None = None,
+    kernel: str = "streaming",
+) -> list[SimulationResult]:
+    """Run Kalman controllers that share one gain sequence, as `simulate` would run each, to rounding.
+
+    The gain (eq. 6) follows from the reference and the filter's r, q and P(0|0), not from what is measured. Scenarios
+    that differ in rated power, amplifier, disturbance, true secondary path or sensor noise therefore need the filter's
+    O(L^2) once, and O(L) each. The scenarios go on side by side and the gains are kept for one block only.
+
+    What breaks the sharing: another reference (acoustic feedback makes one for each scenario: there is no
+    `feedback_path` here), estimated secondary path, r, q or P(0|0), and any observation beside the disturbance that
+    depends on the control signal, since its row would be each scenario's own.
+
+    Parameters
+    ----------
+    controllers : sequence of KalmanController
+        Of `kf_anc` and `kf_opc` filters, each its own object, that agree in taps, estimated secondary path, state and
+        measurement noise, fading memory, covariance and the signals they have heard so far.
+    reference : array_like
+        (n_samples,) reference x of all.
+    secondary_path : array_like, control.TransferFunction or list of them
+        True secondary path, one for all or a list with one each.
+    primary_path : array_like or control.TransferFunction, optional
+        Path that makes the disturbance of all.
+    disturbance : array_like, optional
+        (n_samples,) disturbance of all, or (n_scenarios, n_samples), in place of `primary_path`.
+    fs : float, default 16000
+        Sample rate in Hz.
+    amplifier : callable or sequence, optional
+        One of the package's amplifier models for all, or one each; by default linear.
+    rated_power : float, optional
+        See `simulate`; by default each controller's.
+    sensor_noise_std : float or sequence of float, default 0
+        Standard deviation of the sensor noise, one for all or one each.
+    rng : int, numpy.random.Generator or sequence, optional
+        Seed of the sensor noise: one (each scenario then hears the same noise, as runs with that seed would) or one
+        each; Generators only one each.
+    switch_on_s : float, default 0
+        See `simulate`.
+    record_powers : bool, default False
+        See `simulate`.
+    progress : callable, optional
+        Called with the number of samples done since its last call.
+    kernel : {"streaming", "block"}, default "streaming"
+        How the gains are made: sample by sample, or in matrix products. Equal to rounding; which is faster is the
+        machine's matter (``python -m comparisons speed``).
+
+    Returns
+    -------
+    list of SimulationResult
+        One for each controller. Each controller goes on from where its run ended; one that diverged, with the
+        covariance of the end of the run.
+
+    Raises
+    ------
+    ValueError
+        Controllers that do not share, saying which and in what; lists of another length; what `simulate` refuses.
+    TypeError
+        Something that is no `KalmanController`, or an amplifier that is none of the models.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import kf_opc, output_power, simulate_scenarios
+    >>> x = np.random.default_rng(0).standard_normal(16000)
+    >>> budgets = [0.1, 0.2, 0.4]
+    >>> filters = [
+    ...     kf_opc(16, [0.0, 1.0], rated_power=p, state_noise=1e-9, measurement_noise=1e-3) for p in budgets
+    ... ]
+    >>> results = simulate_scenarios(filters, x, secondary_path=[0.0, 1.0], primary_path=[0.0, 0.0, 0.0, 1.0])
+    >>> [round(output_power(r.control_signal), 1) for r in results]
+    [0.1, 0.2, 0.4]
+    """
+    as_choice(kernel, "kernel", ("streaming", "block"))
+    fs = as_positive(fs, "fs", unit="Hz")
+    x = as_signal(reference, "reference").copy()  # the results keep it, read-only
+    controllers = list(controllers)
+    states = _states_that_share(controllers, fs)
+    count = len(controllers)
+    d = _disturbances(x, primary_path, disturbance, fs, count)
+    noises = [
+        SensorNoise(std, seed)
+        for std, seed in zip(_each(sensor_noise_std, count, "sensor_noise_std"), _each(rng, count, "rng"), strict=True)
+    ]
+    rated = [c.rated_power if rated_power is None else as_positive(rated_power, "rated_power") for c in controllers]
+    paths = _stacked_paths(secondary_path, fs, count)
+    amplifiers = np.array([_parameters(a) for a in _each(amplifier, count, "amplifier")])
+    on = switch_on_sample(switch_on_s, fs, x.size)
+    if on:
+        for i, (controller, noise) in enumerate(zip(controllers, noises, strict=True)):
+            controller.listen(x[:on], d[i if len(d) > 1 else 0, :on] + noise.take(on))
+        x, d = x[on:], np.ascontiguousarray(d[:, on:])
+
+    scenarios = _stacked(states, paths, amplifiers, [1.0 if p is None else p for p in rated])
+    gains = _SharedGains(states[0], x, kernel)
+    recorded = np.full((count, 7 if record_powers else 5, x.size), np.nan)
+    done = 0
+    try:
+        for first, shared in gains.blocks():
+            length = len(shared.variances)
+            sensed = np.array([n.take(length) for n in noises]) if any(n.std for n in noises) else np.empty((0, 0))
+            solved = length if np.isfinite(shared.variances[-1]) else int(np.isnan(shared.variances).argmax())
+            run_block(scenarios, shared, d, sensed, recorded, first, solved)
+            done = first + solved
+            if progress:
+                progress(count * solved)
+            _raise_where_refused(scenarios, done if solved < length else None)
+    finally:  # interrupted or not, the controllers are as their last sample left them
+        gains.hand_back(controllers, states, scenarios, done)
+    results = []
+    for i, controller in enumerate(controllers):
+        end = int(scenarios.done[i])
+        recorded[i, :, end:] = np.nan
+        e, y, y_amplified, a, factor, *powers = recorded[i]
+        results.append(
+            SimulationResult(
+                algorithm=controller.name,
+                fs=fs,
+                rated_power=rated[i],
+                reference=x,
+                disturbance=d[i if len(d) > 1 else 0],
+                error=e,
+                control_signal=y,
+                amplifier_output=y_amplified,
+                anti_noise=a,
+                constraint_factor=factor,
+                disturbance_power=powers[0] if powers else None,
+                secondary_path_gain=powers[1] if powers else None,
+                diverged_at_s=end / fs if scenarios.status[i] == DIVERGED else None,
+            )
+        )
+    return results
+
+
+def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerState]:
+    """States of the controllers for the compiled loop, or an error that says which one differs in what."""
+    if not controllers:
+        raise ValueError("controllers must hold one controller at least")
+    states = []
+    for i, controller in enumerate(controllers):
+        if not isinstance(controller, KalmanController):
+            raise TypeError(f"controllers[{i}] must be a KalmanController, got {controller!r}")
+        if any(controller is other or controller.estimator is other.estimator for other in controllers[:i]):
+            raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs a controller of its own")
+        controller.require_sample_rate(fs)
+        state = controller.compiled_state(to_step=i == 0)
+        if state is None:
+            raise ValueError(
+                f"controllers[{i}] takes filterpy's own equations; scenarios share the gains of filters from "
+                "kf_anc, kf_opc or KFOPC.random_walk"
+            )
+        states.append(state)
+    for i, state in enumerate(states[1:], 1):
+        difference = _difference(states[0], state)
+        if difference:
+            raise ValueError(f"controllers[0] and controllers[{i}] must agree in {difference} to share gains")
+    return states
+
+
+def _difference(one: ControllerState, other: ControllerState) -> str | None:
+    """In what two states do not share, in words."""
+    n = one.weights.size
+    if n != other.weights.size:
+        return "n_taps"
+    if not np.array_equal(one.secondary_estimate, other.secondary_estimate):
+        return "their estimated secondary path"
+    if not np.array_equal(one.settings, other.settings):
+        return "state noise, measurement noise and fading memory"
+    if one.constraint.window.shape != other.constraint.window.shape:
+        return "the window and memory of their powers"
+    for mine, theirs in ((one.reference, other.reference), (one.filtered, other.filtered)):
+        if not np.array_equal(newest(mine, int(mine[TAPS])), newest(theirs, int(theirs[TAPS]))):
+            return "the reference heard so far"
+    a, b = one.covariance, other.covariance
+    if a.triangle is b.triangle or (
+        np.array_equal(a.triangle, b.triangle) and not (a.owed[INVERSE_S] or b.owed[INVERSE_S])
+    ):
+        same = np.array_equal(a.owed[:3], b.owed[:3])
+    else:
+        same = np.array_equal(covariance_matrix(a), covariance_matrix(b))
+    return None if same else "their covariance P"
+
+
+def _each(value: Any, count: int, name: str) -> list[Any]:
+    """One for each scenario: a list or tuple as it is, anything else for all."""
+    if not isinstance(value, list | tuple | np.ndarray) or np.ndim(value) == 0:
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{name} must be one value or {count}, one for each controller, got {len(value)}")
+    return list(value)
+
+
+def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, count: int) -> np.ndarray:
+    """(count, n_samples), one row where one serves all; an array of its own."""
+    if disturbance is None or np.ndim(disturbance) != 2:
+        return disturbance_at_microphone(x, primary_path, disturbance, fs)[None].copy()
+    each = _each(np.asarray(disturbance, dtype=np.float64), count, "disturbance")
+    return np.array([disturbance_at_microphone(x, primary_path, own, fs) for own in each])
+
+
+def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
+    """(count, taps), shorter ones with zeros at the end."""
+    several = isinstance(secondary_path, list | tuple) and np.ndim(secondary_path[0]) == 1
+    several = several or (isinstance(secondary_path, list | tuple) and not np.isscalar(secondary_path[0]))
+    paths = _each(secondary_path, count, "secondary_path") if several else [secondary_path] * count
+    taps = [path_taps(path, fs=fs, name="secondary_path") for path in paths]
+    stacked = np.zeros((count, max(t.size for t in taps)))
+    for row, own in zip(stacked, taps, strict=True):
+        row[: own.size] = own
+    return stacked
+
+
+def _parameters(amplifier: Amplifier | None) -> np.ndarray:
+    parameters = compiled_parameters(amplifier)
+    if parameters is None:
+        raise TypeError(
+            f"amplifier must be one of the package's models or None, got {amplifier!r}; use simulate for it"
+        )
+    return parameters
+
+
+def _stacked(states: list[ControllerState], paths: np.ndarray, amplifiers: np.ndarray, rated: list[float]) -> Scenarios:
+    count, n = len(states), states[0].weights.size
+    weights = aligned_zeros(count, n)
+    for row, state in zip(weights, states, strict=True):
+        row[:n] = state.weights
+    return Scenarios(
+        weights=weights,
+        output=np.array([s.output for s in states]),
+        model=np.array([s.amplifier for s in states]),
+        emitted=np.array([delay_line(paths.shape[1]) for _ in states]),
+        amplifier=amplifiers,
+        secondary=paths,
+        table=np.array([s.constraint.table for s in states]),
+        window=np.array([s.constraint.window for s in states]),
+        last=np.full((count, 3), np.nan),
+        limit=DIVERGENCE_LIMIT * np.sqrt(rated),
+        done=np.zeros(count, dtype=np.int64),
+        status=np.zeros(count, dtype=np.int64),
+    )
+
+
+class _SharedGains:
+    """The gains of a run, a block at a time in the same arrays; `state`'s covariance is advanced with them."""
+
+    def __init__(self, state: ControllerState, x: np.ndarray, kernel: str) -> None:
+        n, s = state.weights.size, state.secondary_estimate
+        self.state, self.kernel = state, kernel
+        heard = newest(state.reference, int(state.reference[TAPS]))[::-1]
+        self.heard, self.n_samples = heard.size, x.size
+        self.reference = np.concatenate((heard, x))
+        self.filtered = np.convolve(self.reference, s)[: self.reference.size]
+        self.filtered[self.heard - n : self.heard] = newest(state.filtered, n)[::-1]
+
+    def blocks(self) -> Iterator[tuple[int, SharedBlock]]:
+        """First sample and gains of each block."""
+        n, s = self.state.weights.size, self.state.secondary_estimate
+        for first in range(0, self.n_samples, BLOCK):
+            size = min(BLOCK, self.n_samples - first)
+            if size < BLOCK or first == 0:
+                block, references = Block(n, size), aligned_zeros(size, n)
+            references[:, :n] = self._rows(self.reference, first, size)
+            block.rows[:, :n] = self._rows(self.filtered, first, size)
+            advance = block.advance if self.kernel == "block" else block.advance_by_steps
+            variances = advance(self.state.covariance, *self.state.settings.tolist())
+            largest = np.abs(block.directions).max(axis=1)
+            yield first, SharedBlock(references, block.rows, block.directions, largest, variances, s)
+
+    def _rows(self, signal: np.ndarray, first: int, size: int) -> np.ndarray:
+        n, now = self.state.weights.size, self.heard + first
+        return sliding_window_view(signal[now + 1 - n : now + size], n)[:, ::-1]
+
+    def hand_back(
+        self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios, done: int
+    ) -> None:
+        """Leave each controller as its scenario left it after so many samples; all read one covariance."""
+        reference, filtered = (signal[self.heard + done - 1 :: -1] for signal in (self.reference, self.filtered))
+        for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
+            refill(state.reference, reference)
+            refill(state.filtered, filtered)
+            state.output[:], state.weights[:] = scenarios.output[i], scenarios.weights[i, : state.weights.size]
+            state.constraint.table[:], state.constraint.window[:] = scenarios.table[i], scenarios.window[i]
+            state.last[:] = scenarios.last[i]
+            controller.after_compiled(state._replace(covariance=self.state.covariance), shared=True)
+
+
+def _raise_where_refused(scenarios: Scenarios, unsolved: int | None) -> None:
+    for i in np.flatnonzero(scenarios.status == REFUSED):
+        raise ValueError(
+            f"the weights of controllers[{i}] would overflow in sample {scenarios.done[i]} of the run: its disturbance "
+            "estimate or residual is too large"
+        )
+    if unsolved is not None:
+        raise ValueError(f"{NO_SOLUTION} (sample {unsolved} of the run)")
