@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
@@ -14,6 +15,7 @@ from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
+SPEED = "speed"
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -27,13 +29,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
-    parser.add_argument("studies", nargs="*", metavar="STUDY", help=f"{', '.join(STUDIES)}; by default all")
+    parser.add_argument(
+        "studies",
+        nargs="*",
+        metavar="STUDY",
+        help=f"{', '.join(STUDIES)}, by default all of these; or speed, which times the filter against others",
+    )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    unknown = [name for name in options.studies if name not in STUDIES]
+    unknown = [name for name in options.studies if name not in (*STUDIES, SPEED)]
     if unknown:
-        parser.error(f"no study called {', '.join(unknown)}; there are {', '.join(STUDIES)}")
+        parser.error(f"no study called {', '.join(unknown)}; there are {', '.join((*STUDIES, SPEED))}")
+    if SPEED in options.studies and len(options.studies) > 1:
+        parser.error(f"{SPEED} runs alone: other work beside it would be timed too")
 
     import matplotlib
     from tqdm import tqdm
@@ -43,6 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prepare_folder(options.output)
     except OSError as error:
         parser.error(str(error))
+    if SPEED in options.studies:
+        return _speed(parser, options)
     began = time.perf_counter()
     reports: list[StudyReport] = []
     chosen = {name: STUDIES[name] for name in options.studies or STUDIES}
@@ -69,6 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     print(f"\n{page} and results.json written in {time.perf_counter() - began:.0f} s")
     return 0
+
+
+def _speed(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
+    if find_spec("threadpoolctl") is None:
+        parser.error('speed needs the extra bench: python -m pip install -c constraints.txt -e ".[bench]"')
+    from . import speed
+
+    return speed.main(options.output, options.quiet)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from .scene import (
     figures_of_merit,
     make_controller,
     make_scene,
+    run_settings,
     tune,
     tuning_runs,
 )
@@ -124,14 +125,9 @@ def _scene(n_taps: int) -> Scene:
 
 
 def _run_all(runs: Runs, scene: Scene, tuned: dict[str, Tuned], seeds: int = len(SEEDS)) -> Results:
-    jobs = [(name, k) for name in tuned for k in range(seeds)]
-
-    def run(job: tuple[str, int]) -> SimulationResult:
-        name, k = job
-        return scene.run(make_controller(scene, name, tuned[name].setting), k)
-
-    outcomes = runs.map(run, jobs)
-    return {name: [r for (n, _), r in zip(jobs, outcomes, strict=True) if n == name] for name in tuned}
+    jobs = [(name, tuned[name].setting, k) for name in tuned for k in range(seeds)]
+    outcomes = run_settings(runs, scene, jobs, lambda result: result)
+    return {name: [r for job, r in zip(jobs, outcomes, strict=True) if job[0] == name] for name in tuned}
 
 
 def _knowing_the_amplifier(scene: Scene, tuned: Tuned) -> SimulationResult:

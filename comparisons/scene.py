@@ -12,6 +12,7 @@ import numpy as np
 
 from kfopc_filterpy import (
     FxLMS,
+    KalmanController,
     MOVFxLMS,
     SimulationResult,
     clipped_fraction,
@@ -26,6 +27,7 @@ from kfopc_filterpy import (
     peak_control_signal,
     scaled_to_power,
     simulate,
+    simulate_scenarios,
     wiener_solution,
 )
 from kfopc_filterpy.amplifiers import Amplifier
@@ -55,14 +57,16 @@ class Runs:
         self.done = 0
         self._pool = ThreadPoolExecutor(max_workers=os.cpu_count())
 
-    def map(self, job: Callable[[Item], Outcome], items: Iterable[Item]) -> list[Outcome]:
-        """Outcomes of `job` in the order of `items`."""
-        outcomes = []
-        for outcome in self._pool.map(job, items):
+    def map(
+        self, job: Callable[[Item], Outcome], items: Iterable[Item], worth: Callable[[Item], int] = lambda item: 1
+    ) -> list[Outcome]:
+        """Outcomes of `job` in the order of `items`, each of which is worth some runs of those planned."""
+        items, outcomes = list(items), []
+        for item, outcome in zip(items, self._pool.map(job, items), strict=True):
             outcomes.append(outcome)
-            self.done += 1
+            self.done += worth(item)
             if self.bar is not None:
-                self.bar.update(1)
+                self.bar.update(worth(item))
         return outcomes
 
 
@@ -122,18 +126,26 @@ class Scene:
     def run(self, controller: Any, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a controller on the noise of one seed."""
         return simulate(
-            controller,
-            self.references[seed_index],
-            disturbance=self.disturbances[seed_index],
-            secondary_path=self.secondary,
-            fs=self.fs,
-            amplifier=self.amplifier,
-            rated_power=self.rated_power,
-            sensor_noise_std=self.sensor_noise_std,
-            rng=SENSOR_NOISE_SEED + self.seeds[seed_index],
-            switch_on_s=self.switch_on_s,
-            **options,
+            controller, self.references[seed_index], amplifier=self.amplifier, **self._options(seed_index), **options
         )
+
+    def run_together(
+        self, controllers: Sequence[KalmanController], seed_index: int = 0, **options: Any
+    ) -> list[SimulationResult]:
+        """Run Kalman controllers that share their gains on the noise of one seed."""
+        options = {"amplifier": self.amplifier} | self._options(seed_index) | options
+        return simulate_scenarios(controllers, self.references[seed_index], **options)
+
+    def _options(self, seed_index: int) -> dict[str, Any]:
+        return {
+            "disturbance": self.disturbances[seed_index],
+            "secondary_path": self.secondary,
+            "fs": self.fs,
+            "rated_power": self.rated_power,
+            "sensor_noise_std": self.sensor_noise_std,
+            "rng": SENSOR_NOISE_SEED + self.seeds[seed_index],
+            "switch_on_s": self.switch_on_s,
+        }
 
 
 def make_scene(
@@ -218,6 +230,34 @@ def setting_value(scene: Scene, algorithm: str, setting: float) -> float:
     return setting / (scene.n_taps * scene.filtered_power)
 
 
+def run_settings(
+    runs: Runs,
+    scene: Scene,
+    jobs: Sequence[tuple[str, float, int]],
+    measure: Callable[[SimulationResult], Outcome],
+) -> list[Outcome]:
+    """What `measure` makes of a run of each (algorithm, setting, index of the seed).
+
+    Kalman filters of one setting on one noise differ in the constraint only: they share their gains.
+    """
+    groups: dict[Any, list[tuple[str, float, int]]] = {}
+    for job in jobs:
+        groups.setdefault(("Kalman", *job[1:]) if job[0] in KALMAN else job, []).append(job)
+
+    def run(group: list[tuple[str, float, int]]) -> list[Outcome]:
+        controllers = [make_controller(scene, name, setting) for name, setting, _ in group]
+        kalman = [c for c in controllers if isinstance(c, KalmanController)]
+        if len(kalman) > 1:
+            return [measure(result) for result in scene.run_together(kalman, group[0][2])]
+        return [measure(scene.run(controllers[0], group[0][2]))]
+
+    outcomes = runs.map(run, groups.values(), worth=len)
+    by_job = {
+        job: o for group, own in zip(groups.values(), outcomes, strict=True) for job, o in zip(group, own, strict=True)
+    }
+    return [by_job[job] for job in jobs]
+
+
 def grid(algorithm: str) -> tuple[float, ...]:
     """Settings that are tried for an algorithm."""
     return STATE_NOISE_GRID if algorithm in KALMAN else STEP_SIZE_GRID
@@ -257,15 +297,13 @@ def tune(runs: Runs, scene: Scene, algorithms: Sequence[str] = ALGORITHMS, seeds
     """
     jobs = [(name, setting, k) for name in algorithms for setting in grid(name) for k in range(seeds)]
 
-    def trial(job: tuple[str, float, int]) -> tuple[float, float, bool]:
-        name, setting, k = job
-        result = scene.run(make_controller(scene, name, setting), k)
+    def trial(result: SimulationResult) -> tuple[float, float, bool]:
         if result.diverged_at_s is not None:
             return np.inf, np.inf, True
         nse = nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s)
         return float(np.mean(nse)), output_power(result.control_signal), False
 
-    outcomes = dict(zip(jobs, runs.map(trial, jobs), strict=True))
+    outcomes = dict(zip(jobs, run_settings(runs, scene, jobs, trial), strict=True))
     tuned = {}
     for name in algorithms:
         trials = []

@@ -147,17 +147,22 @@ def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
 
 
 def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[str, np.ndarray]:
-    """Noise reduction of both Kalman filters over the overdrive, at the settings tuned for the study."""
-    jobs = [(name, level) for name in KALMAN for level in OVERDRIVES_DB]
+    """Noise reduction of both Kalman filters over the overdrive, at the settings tuned for the study.
 
-    def reduction(job: tuple[str, float]) -> float:
-        name, level = job
-        louder = scene.scaled(10 ** (level / 10) * RATED_POWER)
-        result = louder.run(make_controller(louder, name, tuned[name].setting))
-        return noise_reduction_db(result.error, result.disturbance)
+    In decibels a louder noise is the same as a smaller amplifier, and so all levels share the gains of one reference.
+    """
+    powers = scene.wiener_control_power / 10 ** (np.array(OVERDRIVES_DB) / 10)
+    amplifiers = [HardClipAmplifier(float(np.sqrt(2 * power))) for power in powers]
 
-    values = np.reshape(runs.map(reduction, jobs), (len(KALMAN), -1))
-    return dict(zip(KALMAN, values, strict=True))
+    def reductions(name: str) -> list[float]:
+        smaller = [dataclasses.replace(scene, rated_power=float(power)) for power in powers]
+        controllers = [make_controller(budget, name, tuned[name].setting) for budget in smaller]
+        kalman = [c for c in controllers if isinstance(c, KalmanController)]
+        results = scene.run_together(kalman, amplifier=amplifiers)
+        return [noise_reduction_db(result.error, result.disturbance) for result in results]
+
+    values = runs.map(reductions, KALMAN, worth=lambda name: len(OVERDRIVES_DB))
+    return dict(zip(KALMAN, np.array(values), strict=True))
 
 
 def crossings_db(levels: np.ndarray, lead: np.ndarray) -> list[float]:

@@ -47,19 +47,27 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 class Part(CPUDispatcher):
-    """A function compiled into others only: it has no entry from Python, which for small ones takes longest to make."""
+    """A function compiled into others, without the entry from Python that for small ones takes longest to make.
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        raise TypeError(f"{self.py_func.__name__} is a part of compiled functions and cannot be called from Python")
+    One is made where Python does call it.
+    """
+
+    _entry: Any = None
+    _own_options: dict[str, Any]
+
+    def __call__(self, *args: Any) -> Any:
+        if self._entry is None:
+            self._entry = compiled(**self._own_options)(self.py_func)
+        return self._entry(*args)
 
 
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: as `compiled`, for functions that only compiled functions call."""
+    """Decorator: as `compiled`, for functions that mostly other compiled functions call."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = compiled(no_cpython_wrapper=True, **options)(function)
+        dispatcher = compiled(no_cpython_wrapper=True, cache=False, **options)(function)
         if not SWITCHED_OFF:
-            dispatcher.__class__ = Part
+            dispatcher.__class__, dispatcher._own_options = Part, options
         return dispatcher
 
     return decorate

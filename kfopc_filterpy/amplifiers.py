@@ -14,13 +14,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ._compile import compiled
+from ._compile import compiled, part
 from ._validate import as_positive
 
 LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def amplify(kind, limit, sharpness, y):
     """Output of one amplifier model for one sample."""
     if kind == HARD_CLIP:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import compiled, part
+from ._compile import part
 from ._validate import as_choice, as_nonnegative, as_number, as_positive
 
 DEFAULT_FS = 16000.0
@@ -68,7 +68,7 @@ def _factor(state, disturbance_power, gain):
     return min(math.sqrt(state.table[SETTINGS, RATED_POWER] * gain / disturbance_power), 1.0)
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def preview_constraint(state, disturbance, filtered_reference, reference):
     """Constraint factor with this sample included; nothing is changed.
 
@@ -97,7 +97,7 @@ def commit_constraint(state, previewed, disturbance, filtered_reference, referen
     table[LAST, FACTOR], table[LAST, POWER], table[LAST, GAIN] = factor, power, gain
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def advance_constraint(state, disturbance, filtered_reference, reference):
     """Take this sample into the running powers and return the constraint factor."""
     previewed = preview_constraint(state, disturbance, filtered_reference, reference)

@@ -229,7 +229,7 @@ def covariance_matrix(cov: Covariance) -> np.ndarray:
     return full_covariance(cov.triangle, cov.gain_direction, scale, diagonal, -scale * inverse_S)
 
 
-@compiled(fastmath=FAST, forceinline=True)
+@part(fastmath=FAST, forceinline=True)
 def dot(a, b):
     """Inner product of two vectors of the length of the first."""
     total = 0.0

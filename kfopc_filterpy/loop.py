@@ -41,7 +41,7 @@ from .kernels import (
     update_weights,
 )
 
-KALMAN, LMS = 0, 1
+KALMAN, LMS, LISTENING = 0, 1, 2  # what a controller does with an error
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
@@ -62,7 +62,7 @@ def refill(line: np.ndarray, samples: np.ndarray) -> None:
     line[line.size - taps :] = samples[:taps]
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def push(line, sample):
     """Make `sample` the newest one."""
     start = int(line[START]) - 1
@@ -75,14 +75,14 @@ def push(line, sample):
     line[START] = start
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def newest(line, taps):
     """The newest `taps` samples, newest first, as a view."""
     start = int(line[START])
     return line[start : start + taps]
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def latest(line):
     """The newest sample."""
     return line[int(line[START])]
@@ -91,7 +91,7 @@ def latest(line):
 class ControllerState(NamedTuple):
     """What every controller here keeps."""
 
-    kind: int  # KALMAN or LMS
+    kind: int  # KALMAN or LMS; LISTENING, with zero weights, while the loudspeaker is silent
     weights: np.ndarray  # (L,) control filter w
     secondary_estimate: np.ndarray  # taps of s^
     reference: np.ndarray  # delay line of x
@@ -112,7 +112,7 @@ def take_reference(controller, x):
     push(controller.filtered, dot(s, newest(controller.reference, s.size)))
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def control_signal(controller, x):
     """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
     take_reference(controller, x)
@@ -123,7 +123,7 @@ def control_signal(controller, x):
     return y
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def disturbance_estimate(controller, error):
     """d^(n) = e(n) + (s^ * y)(n)."""
     s = controller.secondary_estimate
@@ -184,7 +184,7 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
-@compiled(fastmath=FAST, forceinline=True)
+@part(fastmath=FAST, forceinline=True)
 def adapt_lms(controller, error, y):
     """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS).
 
@@ -203,21 +203,14 @@ def adapt_lms(controller, error, y):
         w[i] += correction * xf[i] - penalty * x[i]
 
 
-@compiled(nogil=True)
-def listen(controller, references, errors):
-    """Follow the noise with the loudspeaker silent: delay lines and powers advance, the weights stay.
-
-    Returns the samples taken: all, or those before one whose square overflows.
-    """
-    controller = borrowed(controller)
-    for n in range(references.size):
-        take_reference(controller, references[n])
-        push(controller.output, 0.0)
-        d, filtered = disturbance_estimate(controller, errors[n]), latest(controller.filtered)
-        if not squares_are_finite(d, filtered, references[n]):
-            return n
-        advance_constraint(controller.constraint, d, filtered, references[n])
-    return references.size
+@part(forceinline=True)
+def follow(controller, error):
+    """What a controller learns while the loudspeaker is silent: the powers; False where a square would overflow."""
+    d, x, filtered = disturbance_estimate(controller, error), latest(controller.reference), latest(controller.filtered)
+    if not squares_are_finite(d, filtered, x):
+        return False
+    advance_constraint(controller.constraint, d, filtered, x)
+    return True
 
 
 class Plant(NamedTuple):
@@ -229,14 +222,14 @@ class Plant(NamedTuple):
     amplifier: np.ndarray  # (3,)
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def measured_reference(plant, x):
     """Reference microphone: the noise, and what comes back from the loudspeaker (one sample late at the least)."""
     taps = plant.feedback.size
     return x if taps < 2 else x + dot(plant.feedback[1:], newest(plant.output, taps - 1))
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def anti_noise(plant, y_amplified):
     """(s * y_amp)(n)."""
     push(plant.output, y_amplified)
@@ -258,7 +251,7 @@ def anti_noise(plant, y_amplified):
 ) = range(10)
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def note_weights(rows, weights, every, n):
     """Keep the weights of sample n where it is one of the recorded; without rows none is."""
     if rows.shape[0] > 0 and n % every == 0:
@@ -284,7 +277,7 @@ def run(controller, block, plant, signals, weights, limit, every, first, begin, 
         signals[ERROR, k], signals[CONTROL, k] = e, y
         if controller.kind == LMS:
             adapt_lms(controller, e, y)
-        elif not adapt_kalman(controller, e, block):
+        elif not (follow(controller, e) if controller.kind == LISTENING else adapt_kalman(controller, e, block)):
             return REFUSED, k
         signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a
         used = controller.constraint.table[LAST]

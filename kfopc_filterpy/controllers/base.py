@@ -8,13 +8,24 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .._validate import as_count, as_number, as_signal
-from ..amplifiers import Amplifier, compiled_parameters
+from ..amplifiers import Amplifier, LinearAmplifier, compiled_parameters
 from ..block import OpenBlock
 from ..constraint import OutputPowerConstraint
 from ..kernels import new_covariance
-from ..loop import ControllerState, adapt_lms, control_signal, delay_line, listen
+from ..loop import (
+    DISTURBANCE_IN,
+    LISTENING,
+    REFERENCE_IN,
+    ControllerState,
+    Plant,
+    adapt_lms,
+    control_signal,
+    delay_line,
+    run,
+)
 from ..paths import is_system, path_taps, sampling_rate
 
+STRETCH = 16000  # samples that the compiled loop takes at a time
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
     "measurement_noise = 0 tells nothing: give measurement_noise > 0"
@@ -145,9 +156,21 @@ class FilteredReferenceController:
             (n_samples,) reference, and the error microphone's signal while the loudspeaker is silent.
         """
         x = as_signal(references, "references")
-        taken = listen(self._state, x, as_signal(errors, "errors", length=x.size))
-        if taken < x.size:
-            raise ValueError(f"references and errors must have finite squares: those of sample {taken} overflow")
+        e = as_signal(errors, "errors", length=x.size)
+        for first in range(0, x.size, STRETCH):
+            taken = self._listen(x[first : first + STRETCH], e[first : first + STRETCH])
+            if taken < min(STRETCH, x.size - first):
+                raise ValueError(
+                    f"references and errors must have finite squares: those of sample {first + taken} overflow"
+                )
+
+    def _listen(self, x: np.ndarray, errors: np.ndarray) -> int:
+        """`loop.run` with the loudspeaker silent; the samples taken."""
+        silent = self._state._replace(kind=LISTENING, weights=np.zeros(self._state.weights.size))
+        signals = np.zeros((10, x.size))
+        signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x, errors
+        nothing = Plant(np.zeros(1), np.zeros(0), delay_line(1), LinearAmplifier().parameters)
+        return run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, x.size)[1]
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError where the secondary path or the memory of the powers is of another sample rate."""
