@@ -29,7 +29,7 @@ R, Q, P0 = 1e-8, 1.0, 1e-3
 BLOCK = 48
 SCENARIOS = 64
 PATH = np.random.default_rng(0).standard_normal(32) / 8  # secondary path of the closed loops
-TARGET_FLOPS = 2e7  # a timing takes about this much work of ours, and a few samples of the slow ones
+TARGET_FLOPS = 1e8  # a timing takes about this much work of ours, and a few samples of the slow ones
 
 
 def samples_for(taps: int, most: int = 20000, least: int = 192) -> int:
@@ -73,9 +73,13 @@ def streaming(taps: int) -> Work:
     return lambda: _stream(cov, w, x, d, R, Q), samples
 
 
+def _block_samples(taps: int) -> int:
+    return samples_for(taps, most=20 * BLOCK, least=8 * BLOCK) // BLOCK * BLOCK
+
+
 def block(taps: int) -> Work:
     """All rows of a block known, weights as `simulate_scenarios` has them (two products with the gains)."""
-    samples = 4 * BLOCK
+    samples = _block_samples(taps)
     x, (cov, w) = signal(taps, samples), filter_state(taps)
     d, work = x[:samples].copy(), Block(taps, BLOCK)
 
@@ -101,9 +105,9 @@ def _correct_in_turn(w, rows, directions, S, d):
 
 def block_causal(taps: int) -> Work:
     """Each row only when its sample comes."""
-    samples = 4 * BLOCK
+    samples = _block_samples(taps)
     x, (cov, w) = signal(taps, samples), filter_state(taps)
-    rows = sliding_window_view(x[::-1].copy(), taps)[::-1]  # newest first, as a delay line has them
+    rows = sliding_window_view(x[::-1], taps)[::-1].copy()  # newest first, as a delay line has them
     d, work = x[:samples].copy(), CausalBlock(taps, BLOCK)
 
     def run() -> None:
@@ -155,7 +159,7 @@ def _kf_opc(taps: int, i: int) -> Any:
 
 def scenarios(taps: int) -> Work:
     """One of 64 scenarios in `simulate_scenarios`: samples of all are counted."""
-    samples = samples_for(taps, most=2000, least=2000)
+    samples = 8000 if taps <= 256 else 4000
     x = signal(0, samples)
     d = np.random.default_rng(2).standard_normal(samples)
     controllers = [_kf_opc(taps, i) for i in range(SCENARIOS)]

@@ -41,7 +41,7 @@ from .kernels import (
     update_weights,
 )
 
-KALMAN, LMS, LISTENING = 0, 1, 2  # what a controller does with an error
+KALMAN, LMS = 0, 1
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
@@ -91,7 +91,7 @@ def latest(line):
 class ControllerState(NamedTuple):
     """What every controller here keeps."""
 
-    kind: int  # KALMAN or LMS; LISTENING, with zero weights, while the loudspeaker is silent
+    kind: int  # KALMAN or LMS
     weights: np.ndarray  # (L,) control filter w
     secondary_estimate: np.ndarray  # taps of s^
     reference: np.ndarray  # delay line of x
@@ -203,16 +203,6 @@ def adapt_lms(controller, error, y):
         w[i] += correction * xf[i] - penalty * x[i]
 
 
-@part(forceinline=True)
-def follow(controller, error):
-    """What a controller learns while the loudspeaker is silent: the powers; False where a square would overflow."""
-    d, x, filtered = disturbance_estimate(controller, error), latest(controller.reference), latest(controller.filtered)
-    if not squares_are_finite(d, filtered, x):
-        return False
-    advance_constraint(controller.constraint, d, filtered, x)
-    return True
-
-
 class Plant(NamedTuple):
     """The true amplifier and paths."""
 
@@ -277,7 +267,7 @@ def run(controller, block, plant, signals, weights, limit, every, first, begin, 
         signals[ERROR, k], signals[CONTROL, k] = e, y
         if controller.kind == LMS:
             adapt_lms(controller, e, y)
-        elif not (follow(controller, e) if controller.kind == LISTENING else adapt_kalman(controller, e, block)):
+        elif not adapt_kalman(controller, e, block):
             return REFUSED, k
         signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a
         used = controller.constraint.table[LAST]

@@ -132,7 +132,7 @@ def simulate_scenarios(
 
     scenarios = _stacked(states, paths, amplifiers, [1.0 if p is None else p for p in rated])
     gains = _SharedGains(states[0], x, kernel)
-    recorded = np.full((count, 7 if record_powers else 5, x.size), np.nan)
+    recorded = np.empty((count, 7 if record_powers else 5, x.size))
     done = 0
     try:
         for first, shared in gains.blocks():
@@ -182,7 +182,7 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerStat
         if any(controller is other or controller.estimator is other.estimator for other in controllers[:i]):
             raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs a controller of its own")
         controller.require_sample_rate(fs)
-        state = controller.compiled_state(to_step=i == 0)
+        state = controller.compiled_state(to_step=False)
         if state is None:
             raise ValueError(
                 f"controllers[{i}] takes filterpy's own equations; scenarios share the gains of filters from "
@@ -193,7 +193,9 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerStat
         difference = _difference(states[0], state)
         if difference:
             raise ValueError(f"controllers[0] and controllers[{i}] must agree in {difference} to share gains")
-    return states
+    own = controllers[0].compiled_state()
+    assert own is not None
+    return [own, *states[1:]]
 
 
 def _difference(one: ControllerState, other: ControllerState) -> str | None:
@@ -211,10 +213,10 @@ def _difference(one: ControllerState, other: ControllerState) -> str | None:
         if not np.array_equal(newest(mine, int(mine[TAPS])), newest(theirs, int(theirs[TAPS]))):
             return "the reference heard so far"
     a, b = one.covariance, other.covariance
-    if a.triangle is b.triangle or (
-        np.array_equal(a.triangle, b.triangle) and not (a.owed[INVERSE_S] or b.owed[INVERSE_S])
-    ):
-        same = np.array_equal(a.owed[:3], b.owed[:3])
+    if a.triangle is b.triangle:  # they ran together
+        return None
+    if a.owed[INVERSE_S] == b.owed[INVERSE_S] == 0.0:
+        same = np.array_equal(a.owed[:2], b.owed[:2]) and np.array_equal(a.triangle, b.triangle)
     else:
         same = np.array_equal(covariance_matrix(a), covariance_matrix(b))
     return None if same else "their covariance P"

@@ -214,7 +214,7 @@ def simulate(
         if state is not None:
             run_stretch = partial(_run_compiled, controller, state, plant)
     rows = (*RECORDED, USED_POWER, USED_GAIN) if record_powers else RECORDED
-    recorded = np.full((len(rows), x.size), np.nan)
+    recorded = np.empty((len(rows), x.size))
     status, end = RUNNING, 0
     for first in range(0, x.size, STEP):
         stretch = np.empty((10, min(STEP, x.size - first)))
@@ -226,6 +226,7 @@ def simulate(
         recorded[:, first:end] = stretch[rows, :done]
         if status != RUNNING:
             break
+    recorded[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
     e, y, y_amplified, a, factor, *powers = recorded
     return SimulationResult(

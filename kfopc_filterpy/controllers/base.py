@@ -14,13 +14,14 @@ from ..constraint import OutputPowerConstraint
 from ..kernels import new_covariance
 from ..loop import (
     DISTURBANCE_IN,
-    LISTENING,
+    LMS,
     REFERENCE_IN,
     ControllerState,
     Plant,
     adapt_lms,
     control_signal,
     delay_line,
+    newest,
     run,
 )
 from ..paths import is_system, path_taps, sampling_rate
@@ -157,20 +158,27 @@ class FilteredReferenceController:
         """
         x = as_signal(references, "references")
         e = as_signal(errors, "errors", length=x.size)
-        for first in range(0, x.size, STRETCH):
-            taken = self._listen(x[first : first + STRETCH], e[first : first + STRETCH])
-            if taken < min(STRETCH, x.size - first):
-                raise ValueError(
-                    f"references and errors must have finite squares: those of sample {first + taken} overflow"
-                )
-
-    def _listen(self, x: np.ndarray, errors: np.ndarray) -> int:
-        """`loop.run` with the loudspeaker silent; the samples taken."""
-        silent = self._state._replace(kind=LISTENING, weights=np.zeros(self._state.weights.size))
-        signals = np.zeros((10, x.size))
-        signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x, errors
+        self._require_finite_squares(x, e)
+        # Weights of zero and a step size of zero: what is left of FxLMS are the delay lines and the powers.
+        silent = self._state._replace(
+            kind=LMS, weights=np.zeros(self._state.weights.size), settings=np.zeros(self._state.settings.size)
+        )
         nothing = Plant(np.zeros(1), np.zeros(0), delay_line(1), LinearAmplifier().parameters)
-        return run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, x.size)[1]
+        for first in range(0, x.size, STRETCH):
+            signals = np.zeros((10, min(STRETCH, x.size - first)))
+            signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STRETCH], e[first : first + STRETCH]
+            run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, signals.shape[1])
+
+    def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:
+        s, heard = self._state.secondary_estimate, self._state.reference
+        before = newest(heard, s.size - 1)[::-1]
+        with np.errstate(over="ignore", invalid="ignore"):
+            filtered = np.convolve(np.concatenate((before, x)), s, mode="valid")
+            fine = np.isfinite(x**2) & np.isfinite(e**2) & np.isfinite(filtered**2)
+        if not fine.all():
+            raise ValueError(
+                f"references and errors must have finite squares: those of sample {int(fine.argmin())} overflow"
+            )
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError where the secondary path or the memory of the powers is of another sample rate."""
