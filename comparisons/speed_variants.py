@@ -55,7 +55,7 @@ def _stream(cov, w, x, d, state_noise, measurement_noise):
 def _stream_in_block(cov, block, w, rows, d, state_noise, measurement_noise):
     for k in range(d.size):
         h = rows[k, : w.size]
-        S = project_in_block(cov, block, h, state_noise) + measurement_noise
+        S = project_in_block(cov, block, h, state_noise)[0] + measurement_noise
         update_in_block(cov, block, w, h, d[k], S)
 
 

@@ -13,8 +13,8 @@ sample as sample by sample, but each element of P is read and written once a blo
 `Block` takes all rows at once: where the reference is known ahead. `CausalBlock` needs each row only
 when its sample comes: what it can multiply before it does at the block's beginning, and downdates P at its end, so that
 a sample within costs 3 L m flops on average and the change of blocks a burst of 3 L^2 m.
-Fading memory is left to the steps of `kernels`; so are the samples whose S exceeds q so far that the downdate has to be
-done in twice the precision, and a block whose Sigma has no Cholesky factor.
+Fading memory is left to the steps of `kernels`; so are the samples whose variance before the block exceeds q so far that
+the downdate would cost digits of P, and a block whose Sigma has no Cholesky factor.
 """
 
 from __future__ import annotations
@@ -83,17 +83,20 @@ class Block:
         return S
 
     def _in_products(self, cov: Covariance, state_noise: float, measurement_noise: float) -> np.ndarray | None:
-        """None, with nothing changed, where Sigma has no Cholesky factor or S exceeds q too far."""
+        """None, with nothing changed, where Sigma has no Cholesky factor or its variances exceed q too far."""
         P, H, C = cov.triangle.T, self.rows.T, self.directions.T  # BLAS counts by columns
         C = dsymm(1.0, P, H, c=C, overwrite_c=1)
         _add_random_walk(self.directions, self.rows, state_noise)
         covariance = dgemm(1.0, H, C, trans_a=1, c=self._covariance, overwrite_c=1)
         np.fill_diagonal(covariance, covariance.diagonal() + measurement_noise)
+        # What the whole block takes from a variance, not only what its last sample does, costs digits.
+        if not covariance.diagonal().max() <= CANCELLATION * measurement_noise:
+            return None
         L, failed = dpotrf(covariance, lower=1, clean=0, overwrite_a=1)
+        if failed:
+            return None
         root = L.diagonal().copy()
         S = root**2
-        if failed or not S.max() <= CANCELLATION * measurement_noise:
-            return None
         G = dtrsm(1.0, L, C, side=1, lower=1, trans_a=1, overwrite_b=1)
         downdate_by_columns(cov, G, len(S) * state_noise)
         self.directions *= root[:, None]
@@ -175,16 +178,17 @@ class CausalBlock:
 
 @part(fastmath=FAST)
 def project_in_block(cov, block, h, state_noise):
-    """`kernels.project_covariance` of the block's next row, after its prediction."""
+    """`kernels.project_covariance` of the block's next row, after its prediction; and h'P h before the block."""
     c, n, k = cov.product, h.size, block.taken[0]
     ahead, columns, scaled = block.arrays[AHEAD, k], block.arrays[COLUMNS], block.arrays[SCALED]
     for i in range(n):
         c[i] = ahead[i] + (k + 1) * state_noise * h[i]
     for j in range(min(k + 1, n)):
         correct_weights(c, columns[j], h[j])
+    before = dot(h, c)
     for j in range(k):
         correct_weights(c, scaled[j], -dot(h, scaled[j]))
-    return dot(h, c)
+    return dot(h, c), before
 
 
 @part()

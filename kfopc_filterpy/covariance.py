@@ -36,8 +36,8 @@ class RandomWalkCovariance:
     or are arrays where that is no longer possible.
     """
 
-    def __init__(self, P: np.ndarray) -> None:
-        self.arrays: Covariance = new_covariance((P + P.T) / 2)
+    def __init__(self, P: np.ndarray, dtype: Any = np.float64) -> None:
+        self.arrays: Covariance = new_covariance(0.5 * (P + P.T), dtype)
         self.prior: Moment | np.ndarray = Moment(1.0, 0.0)
         self.posterior: Moment | np.ndarray = Moment(1.0, 0.0)
         self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
@@ -89,7 +89,7 @@ class RandomWalkCovariance:
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:
         """A covariance that goes on from another P and remembers P_prior and P_post."""
-        other = RandomWalkCovariance(P)
+        other = RandomWalkCovariance(P, self.arrays.triangle.dtype)
         other.prior, other.posterior = self.full(self.prior), self.full(self.posterior)
         return other
 

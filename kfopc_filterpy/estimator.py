@@ -128,6 +128,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
+        dtype: Any = np.float64,
         **constraint: Any,
     ) -> RandomWalkKFOPC:
         """Filter of eq. 1-8 for a control filter that walks at random: F = I, Q = r I, R = q, in O(L^2).
@@ -144,6 +145,10 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
             Variance of each tap before the first sample: P(0|0) = initial_variance I.
         rated_power : float, optional
             Rated output power; None: the unconstrained filter, KF-ANC.
+        dtype : {numpy.float64, numpy.float32}, default numpy.float64
+            Precision that P is kept and stepped in; the weights stay float64. float32 halves the memory, and is
+            faster from about 512 taps on. It needs state noise: without, rounding makes P indefinite within some
+            thousand samples of a band-limited reference, and `update` then refuses.
         **constraint
             `secondary_path_gain`, `fs`, `power_memory`, `power_window`, as for `KFOPC`.
 
@@ -155,7 +160,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         Raises
         ------
         ValueError
-            A negative variance, fewer than one tap, or a constraint argument out of range.
+            A negative variance, fewer than one tap, another dtype, or a constraint argument out of range.
 
         Examples
         --------
@@ -175,6 +180,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
             measurement_noise=measurement_noise,
             initial_variance=initial_variance,
             rated_power=rated_power,
+            dtype=dtype,
             **constraint,
         )
 

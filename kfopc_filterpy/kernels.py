@@ -12,7 +12,7 @@ sample, and P is symmetric because there is only one of each element.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,7 +26,7 @@ SCALE, DIAGONAL, INVERSE_S, LAST_INVERSE_S = 0, 1, 2, 3
 # Where S exceeds the measurement noise by this much, the downdate cancels so many digits of P that it is done in
 # twice the precision: the first samples after a large initial variance.
 CANCELLATION = 1e3
-LINE = 8  # float64 values in a cache line
+LINE = 64  # bytes in a cache line
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
 
@@ -34,32 +34,35 @@ class Covariance(NamedTuple):
     """State covariance: P = scale (T - g g' inverse_s) + diagonal I."""
 
     triangle: np.ndarray  # (n or more, n or more), lower triangle T valid; rows begin at cache lines
+    row: np.ndarray  # (n,) x' of the pass under way, in T's precision
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the pass under way
     owed: np.ndarray  # (4,): scale, diagonal, 1/S or 0 where the downdate was done at once; 1/S of the last update
 
 
-def aligned_zeros(*shape: int) -> np.ndarray:
+def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
     """Zeros whose rows begin at cache lines, the last dimension rounded up to that: a quarter faster from 128 taps on."""
     *rows, columns = shape
-    padded = (*rows, -(-columns // LINE) * LINE)
-    memory = np.zeros(int(np.prod(padded)) + LINE)
-    start = -(memory.ctypes.data // memory.itemsize) % LINE
-    return memory[start : memory.size - LINE + start].reshape(padded)
+    line = LINE // np.dtype(dtype).itemsize
+    padded = (*rows, -(-columns // line) * line)
+    memory = np.zeros(int(np.prod(padded)) + line, dtype)
+    start = -(memory.ctypes.data // memory.itemsize) % line
+    return memory[start : memory.size - line + start].reshape(padded)
 
 
-def new_covariance(P: np.ndarray) -> Covariance:
+def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     """Covariance state from a full symmetric array (n, n); the upper triangle is not read."""
-    n = P.shape[0]
-    triangle = aligned_zeros(-(-n // LINE) * LINE, n)  # square for BLAS, zero past n
+    n, line = P.shape[0], LINE // np.dtype(dtype).itemsize
+    triangle = aligned_zeros(-(-n // line) * line, n, dtype=dtype)  # square for BLAS, zero past n
     triangle[:n, :n] = P
-    return Covariance(triangle, aligned_zeros(n)[:n], aligned_zeros(n)[:n], np.array([1.0, 0.0, 0.0, 0.0]))
+    row, gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(3))
+    return Covariance(triangle, row, gain_direction, product, np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def copy_covariance(cov: Covariance) -> Covariance:
     """A covariance state of its own (a plain copy of an array need not begin at a cache line)."""
     n = cov.product.size
-    other = new_covariance(cov.triangle[:n, :n])
+    other = new_covariance(cov.triangle[:n, :n], cov.triangle.dtype)
     for mine, theirs in zip(other[1:], cov[1:], strict=True):
         mine[:] = theirs
     return other
@@ -86,10 +89,12 @@ def project_covariance(cov, h):
     The value of P does not change. Four rows go together so that each load of ``g``, ``h`` and the running
     product serves four elements.
     """
-    T, g, Ph = cov.triangle, cov.gain_direction, cov.product
-    scale, diagonal = cov.owed[SCALE], cov.owed[DIAGONAL]
-    weight = scale * cov.owed[INVERSE_S]
-    n = h.size
+    T, g, Ph, n = cov.triangle, cov.gain_direction, cov.product, h.size
+    number = T.dtype.type  # a float64 factor would make float32 arithmetic float64
+    scale, diagonal = number(cov.owed[SCALE]), number(cov.owed[DIAGONAL])
+    weight = number(cov.owed[SCALE] * cov.owed[INVERSE_S])
+    copy_into(cov.row, h)
+    h = cov.row
     for i in range(n):
         Ph[i] = 0.0
     whole = n - n % 4
@@ -98,7 +103,7 @@ def project_covariance(cov, h):
         G0, G1, G2, G3 = g[i], g[i + 1], g[i + 2], g[i + 3]
         g0, g1, g2, g3 = weight * G0, weight * G1, weight * G2, weight * G3
         h0, h1, h2, h3 = h[i], h[i + 1], h[i + 2], h[i + 3]
-        a0 = a1 = a2 = a3 = 0.0
+        a0 = a1 = a2 = a3 = number(0.0)
         for j in range(i):
             p0 = scale * T0[j] - g0 * g[j]
             p1 = scale * T1[j] - g1 * g[j]

@@ -53,7 +53,7 @@ class Scenarios(NamedTuple):
 def run_block(scenarios, shared, disturbance, sensor_noise, recorded, first, count):
     """The first `count` samples of a block for all scenarios, from sample `first` of the run on.
 
-    `disturbance` (N or 1, n_samples), `sensor_noise` (N, m or more; or 0 rows), `recorded` (N, 5 or 7, n_samples).
+    `disturbance` (N or 1, n_samples), `sensor_noise` (N, m), `recorded` (N, 5 or 7, n_samples).
     """
     scenarios, shared, recorded = borrowed(scenarios), borrowed(shared), borrowed(recorded)
     disturbance, sensor_noise = borrowed(disturbance), borrowed(sensor_noise)
@@ -63,8 +63,7 @@ def run_block(scenarios, shared, disturbance, sensor_noise, recorded, first, cou
             emit(scenarios, shared, recorded, begin, end, k, first + k)
             for i in range(begin, end):
                 d = disturbance[i if len(disturbance) > 1 else 0, first + k]
-                noise = sensor_noise[i, k] if len(sensor_noise) > 0 else 0.0
-                receive(scenarios, recorded, d, noise, i, first + k)
+                receive(scenarios, recorded, d, sensor_noise[i, k], i, first + k)
             correct(scenarios, shared, recorded, begin, end, k, first + k)
 
 

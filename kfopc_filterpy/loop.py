@@ -146,8 +146,9 @@ def adapt_kalman(controller, error, block):
     cov = controller.covariance
     S, y = np.nan, np.nan
     if block is not None and block.taken[1] > 0:
-        S = project_in_block(cov, block, h, r) + q
-        if 0.0 < S <= CANCELLATION * q:
+        projected, before = project_in_block(cov, block, h, r)
+        S = projected + q
+        if S > 0.0 and before + q <= CANCELLATION * q:
             y = update_in_block(cov, block, w, h, previewed[0] * d, S)
             if not np.isfinite(y):
                 return False

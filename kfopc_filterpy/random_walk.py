@@ -29,6 +29,7 @@ class RandomWalkKFOPC(KFOPC):
     - Another F or a full Q, assigned or passed, `B` with `u`, and an H of several rows hand the step to
       filterpy's own equations, at their O(L^3).
     - filterpy's fading memory ``alpha`` stays fast.
+    - `dtype` is the precision that P is kept in, float64 unless float32 was asked for (see `KFOPC.random_walk`).
 
     Examples
     --------
@@ -52,9 +53,11 @@ class RandomWalkKFOPC(KFOPC):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
+        dtype: Any = np.float64,
         **constraint: Any,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
+        self.dtype = _precision(dtype)
         self._F: np.ndarray | None = None  # None: the identity
         self._Q: np.ndarray | None = None  # None: state_noise I
         self._views: dict[str, np.ndarray] = {}  # read-only F, Q, R, made when read
@@ -64,7 +67,8 @@ class RandomWalkKFOPC(KFOPC):
         super().__init__(n_taps, 1, rated_power=rated_power, **constraint)
         self.state_noise = state_noise
         self.measurement_noise = measurement_noise
-        self._covariance = RandomWalkCovariance(as_nonnegative(initial_variance, "initial_variance") * np.eye(n_taps))
+        variance = as_nonnegative(initial_variance, "initial_variance")
+        self._covariance = RandomWalkCovariance(variance * np.eye(n_taps), self.dtype)
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy makes its own read-only views (copied arrays are writeable) and steps its own covariance."""
@@ -309,6 +313,18 @@ class RandomWalkKFOPC(KFOPC):
         arrays = self._covariance.own() if to_step else self._covariance.arrays
         return arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
 
+    def settle_covariance(self) -> None:
+        """Make P the triangle, for a block; what `P_prior` and `P_post` show stays."""
+        self._K = self.K  # it may still be derived from the last update
+        self._covariance.project(np.zeros(self.dim_x))
+
+    def go_on_from(self, shared: Covariance) -> None:
+        """Take the covariance of other filters without an update of one's own."""
+        self._K, prior = self.K, self.P_prior
+        self._covariance.share(shared)
+        self._covariance.prior = prior
+        self._covariance.settle()
+
     def after_compiled(
         self, weights: np.ndarray, z: float, y: float, S: float, shared: Covariance | None = None
     ) -> None:
@@ -325,3 +341,13 @@ class RandomWalkKFOPC(KFOPC):
         self._record(weights.reshape(shape).copy(), np.full((1,) * len(shape), y))
         self.x_prior = self.x - (self.K * y).reshape(shape)
         self.z = np.full((1,) * len(shape), z)
+
+
+def _precision(dtype: Any) -> np.dtype:
+    try:
+        precision = np.dtype(dtype)
+    except TypeError as error:
+        raise TypeError(f"dtype must be numpy.float64 or numpy.float32, got {dtype!r}") from error
+    if precision not in (np.float64, np.float32):
+        raise ValueError(f"dtype must be numpy.float64 or numpy.float32, got {precision}")
+    return precision

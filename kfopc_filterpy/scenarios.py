@@ -14,7 +14,7 @@ from .block import Block
 from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION
 from .controllers.kalman import KalmanController
-from .kernels import INVERSE_S, aligned_zeros, covariance_matrix
+from .kernels import INVERSE_S, aligned_zeros, copy_covariance, covariance_matrix
 from .lockstep import Scenarios, SharedBlock, run_block
 from .loop import DIVERGED, REFUSED, TAPS, ControllerState, delay_line, newest, refill
 from .paths import path_taps
@@ -93,7 +93,9 @@ def simulate_scenarios(
     Raises
     ------
     ValueError
-        Controllers that do not share, saying which and in what; lists of another length; what `simulate` refuses.
+        Controllers that do not share, saying which and in what; lists of another length; what `simulate` refuses. In
+        the midst of a run: weights that would overflow, an update without a solution. The controllers are then as they
+        were, but for what they heard before they were switched on; so are they after an interruption.
     TypeError
         Something that is no `KalmanController`, or an amplifier that is none of the models.
 
@@ -115,11 +117,13 @@ def simulate_scenarios(
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
     controllers = list(controllers)
     states = _states_that_share(controllers, fs)
+    if kernel == "block" and states[0].covariance.triangle.dtype != np.float64:
+        raise ValueError('kernel="block" needs filters of dtype float64: its products cancel too much in float32')
     count = len(controllers)
     d = _disturbances(x, primary_path, disturbance, fs, count)
     noises = [
         SensorNoise(std, seed)
-        for std, seed in zip(_each(sensor_noise_std, count, "sensor_noise_std"), _each(rng, count, "rng"), strict=True)
+        for std, seed in zip(_each(sensor_noise_std, count, "sensor_noise_std"), _seeds(rng, count), strict=True)
     ]
     rated = [c.rated_power if rated_power is None else as_positive(rated_power, "rated_power") for c in controllers]
     paths = _stacked_paths(secondary_path, fs, count)
@@ -133,42 +137,51 @@ def simulate_scenarios(
     scenarios = _stacked(states, paths, amplifiers, [1.0 if p is None else p for p in rated])
     gains = _SharedGains(states[0], x, kernel)
     recorded = np.empty((count, 7 if record_powers else 5, x.size))
-    done = 0
-    try:
-        for first, shared in gains.blocks():
-            length = len(shared.variances)
-            sensed = np.array([n.take(length) for n in noises]) if any(n.std for n in noises) else np.empty((0, 0))
-            solved = length if np.isfinite(shared.variances[-1]) else int(np.isnan(shared.variances).argmax())
-            run_block(scenarios, shared, d, sensed, recorded, first, solved)
-            done = first + solved
-            if progress:
-                progress(count * solved)
-            _raise_where_refused(scenarios, done if solved < length else None)
-    finally:  # interrupted or not, the controllers are as their last sample left them
-        gains.hand_back(controllers, states, scenarios, done)
-    results = []
-    for i, controller in enumerate(controllers):
-        end = int(scenarios.done[i])
-        recorded[i, :, end:] = np.nan
-        e, y, y_amplified, a, factor, *powers = recorded[i]
-        results.append(
-            SimulationResult(
-                algorithm=controller.name,
-                fs=fs,
-                rated_power=rated[i],
-                reference=x,
-                disturbance=d[i if len(d) > 1 else 0],
-                error=e,
-                control_signal=y,
-                amplifier_output=y_amplified,
-                anti_noise=a,
-                constraint_factor=factor,
-                disturbance_power=powers[0] if powers else None,
-                secondary_path_gain=powers[1] if powers else None,
-                diverged_at_s=end / fs if scenarios.status[i] == DIVERGED else None,
-            )
-        )
-    return results
+    for first, shared in gains.blocks():
+        length = len(shared.variances)
+        sensed = np.zeros((count, length))
+        for row, noise in zip(sensed, noises, strict=True):
+            row[:] = noise.take(length)
+        solved = length if np.isfinite(shared.variances[-1]) else int(np.isnan(shared.variances).argmax())
+        run_block(scenarios, shared, d, sensed, recorded, first, solved)
+        _raise_where_refused(scenarios, first + solved if solved < length else None)
+        if progress:
+            progress(count * length)
+    gains.hand_back(controllers, states, scenarios)
+    return [
+        _result(controller, fs, rated[i], x, d[i if len(d) > 1 else 0], recorded[i], scenarios, i)
+        for i, controller in enumerate(controllers)
+    ]
+
+
+def _result(
+    controller: KalmanController,
+    fs: float,
+    rated_power: float | None,
+    x: np.ndarray,
+    d: np.ndarray,
+    recorded: np.ndarray,
+    scenarios: Scenarios,
+    i: int,
+) -> SimulationResult:
+    end = int(scenarios.done[i])
+    recorded[:, end:] = np.nan
+    e, y, y_amplified, a, factor, *powers = recorded
+    return SimulationResult(
+        algorithm=controller.name,
+        fs=fs,
+        rated_power=rated_power,
+        reference=x,
+        disturbance=d,
+        error=e,
+        control_signal=y,
+        amplifier_output=y_amplified,
+        anti_noise=a,
+        constraint_factor=factor,
+        disturbance_power=powers[0] if powers else None,
+        secondary_path_gain=powers[1] if powers else None,
+        diverged_at_s=end / fs if scenarios.status[i] == DIVERGED else None,
+    )
 
 
 def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerState]:
@@ -185,24 +198,23 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerStat
         state = controller.compiled_state(to_step=False)
         if state is None:
             raise ValueError(
-                f"controllers[{i}] takes filterpy's own equations; scenarios share the gains of filters from "
-                "kf_anc, kf_opc or KFOPC.random_walk"
+                f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
+                "KalmanControllers of filters from KFOPC.random_walk"
             )
         states.append(state)
     for i, state in enumerate(states[1:], 1):
         difference = _difference(states[0], state)
         if difference:
             raise ValueError(f"controllers[0] and controllers[{i}] must agree in {difference} to share gains")
-    own = controllers[0].compiled_state()
-    assert own is not None
-    return [own, *states[1:]]
+    return states
 
 
 def _difference(one: ControllerState, other: ControllerState) -> str | None:
     """In what two states do not share, in words."""
-    n = one.weights.size
-    if n != other.weights.size:
+    if one.weights.size != other.weights.size:
         return "n_taps"
+    if one.covariance.triangle.dtype != other.covariance.triangle.dtype:
+        return "dtype"
     if not np.array_equal(one.secondary_estimate, other.secondary_estimate):
         return "their estimated secondary path"
     if not np.array_equal(one.settings, other.settings):
@@ -223,12 +235,21 @@ def _difference(one: ControllerState, other: ControllerState) -> str | None:
 
 
 def _each(value: Any, count: int, name: str) -> list[Any]:
-    """One for each scenario: a list or tuple as it is, anything else for all."""
-    if not isinstance(value, list | tuple | np.ndarray) or np.ndim(value) == 0:
+    """One for each scenario: a list, tuple or array as it is, anything else for all."""
+    if not isinstance(value, list | tuple) and np.ndim(value) == 0:
         return [value] * count
     if len(value) != count:
         raise ValueError(f"{name} must be one value or {count}, one for each controller, got {len(value)}")
     return list(value)
+
+
+def _seeds(rng: Any, count: int) -> list[Any]:
+    """Seeds or generators; a generator serves one scenario, or they would draw from it in turns."""
+    each = _each(rng, count, "rng")
+    generators = [id(one) for one in each if isinstance(one, np.random.Generator)]
+    if len(set(generators)) < len(generators):
+        raise ValueError("rng holds one Generator for several controllers: give each its own, or seeds")
+    return each
 
 
 def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, count: int) -> np.ndarray:
@@ -241,8 +262,9 @@ def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float,
 
 def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
     """(count, taps), shorter ones with zeros at the end."""
-    several = isinstance(secondary_path, list | tuple) and np.ndim(secondary_path[0]) == 1
-    several = several or (isinstance(secondary_path, list | tuple) and not np.isscalar(secondary_path[0]))
+    several = isinstance(secondary_path, list | tuple | np.ndarray) and any(
+        not np.isscalar(one) for one in secondary_path
+    )
     paths = _each(secondary_path, count, "secondary_path") if several else [secondary_path] * count
     taps = [path_taps(path, fs=fs, name="secondary_path") for path in paths]
     stacked = np.zeros((count, max(t.size for t in taps)))
@@ -282,11 +304,11 @@ def _stacked(states: list[ControllerState], paths: np.ndarray, amplifiers: np.nd
 
 
 class _SharedGains:
-    """The gains of a run, a block at a time in the same arrays; `state`'s covariance is advanced with them."""
+    """The gains of a run, a block at a time in the same arrays, from a copy of the covariance."""
 
     def __init__(self, state: ControllerState, x: np.ndarray, kernel: str) -> None:
         n, s = state.weights.size, state.secondary_estimate
-        self.state, self.kernel = state, kernel
+        self.state, self.kernel = state._replace(covariance=copy_covariance(state.covariance)), kernel
         heard = newest(state.reference, int(state.reference[TAPS]))[::-1]
         self.heard, self.n_samples = heard.size, x.size
         self.reference = np.concatenate((heard, x))
@@ -312,13 +334,12 @@ class _SharedGains:
         return sliding_window_view(signal[now + 1 - n : now + size], n)[:, ::-1]
 
     def hand_back(
-        self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios, done: int
+        self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios
     ) -> None:
-        """Leave each controller as its scenario left it after so many samples; all read one covariance."""
-        reference, filtered = (signal[self.heard + done - 1 :: -1] for signal in (self.reference, self.filtered))
+        """Leave each controller as its scenario left it; all read one covariance until they step."""
         for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
-            refill(state.reference, reference)
-            refill(state.filtered, filtered)
+            refill(state.reference, self.reference[::-1])
+            refill(state.filtered, self.filtered[::-1])
             state.output[:], state.weights[:] = scenarios.output[i], scenarios.weights[i, : state.weights.size]
             state.constraint.table[:], state.constraint.window[:] = scenarios.table[i], scenarios.window[i]
             state.last[:] = scenarios.last[i]

@@ -20,7 +20,7 @@ from filterpy.kalman import IMMEstimator, KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import KFOPC
+from kfopc_filterpy import KFOPC, band_limited_noise
 
 HAS_SEQUENTIAL = hasattr(KalmanFilter, "update_sequential")  # not in filterpy 1.4.5
 READ = ("x", "P", "x_prior", "P_prior", "x_post", "P_post", "K", "S", "SI", "y", "F", "Q", "R", "log_likelihood")
@@ -641,3 +641,49 @@ def test_an_inverse_of_ones_own_is_used() -> None:
         kf.update(1.0, H=np.array([[1.0, 2.0]]))
     np.testing.assert_allclose(ours.x, theirs.x, atol=1e-15)
     np.testing.assert_allclose(ours.P, theirs.P, atol=1e-15)
+
+
+# ---- Single precision, on request
+
+
+def band_limited_rows(n_taps, samples):
+    x = band_limited_noise((200, 2000), 1.5, fs=16000.0, rng=0)
+    return np.lib.stride_tricks.sliding_window_view(x, n_taps)[:samples, ::-1]
+
+
+def stepped(dtype, state_noise, samples=6000):
+    kf = KFOPC.random_walk(32, state_noise=state_noise, measurement_noise=1e-3, dtype=dtype)
+    for h in band_limited_rows(32, samples):
+        kf.predict()
+        kf.update(2.0 * h[5], H=h)
+    return kf
+
+
+def test_float32_without_state_noise_loses_definiteness_and_says_so():
+    """Noise of 200-2000 Hz leaves directions that only rounding moves: P is indefinite within some thousand samples."""
+    with pytest.raises(ValueError, match="P is not positive definite"):
+        stepped(np.float32, 0.0)
+    assert np.linalg.eigvalsh(stepped(np.float64, 0.0).P).min() > 0
+
+
+def test_float32_with_state_noise_stays_definite_and_near_float64():
+    """float32 rounds the largest variance, 1, by 6e-8; measured with q = 1e-3 that is some hundredths of P and x."""
+    single, double = stepped(np.float32, 1e-8), stepped(np.float64, 1e-8)
+    assert np.linalg.eigvalsh(single.P).min() > 0
+    np.testing.assert_allclose(single.P, double.P, rtol=0, atol=0.02 * np.abs(double.P).max())
+    np.testing.assert_allclose(single.x, double.x, rtol=0, atol=0.02 * np.abs(double.x).max())
+    assert abs(single.y[0, 0]) < 0.01  # of a measurement of power 4
+
+
+def test_float32_is_kept_where_it_was_asked_for():
+    kf = KFOPC.random_walk(5, state_noise=1e-6, measurement_noise=1e-3, dtype="float32")
+    kf.P = 2 * np.eye(5)
+    assert copy.deepcopy(kf)._covariance.arrays.triangle.dtype == np.float32
+    assert kf.P.dtype == kf.x.dtype == np.float64
+    assert KFOPC.random_walk(5, state_noise=1e-6, measurement_noise=1e-3).dtype == np.float64
+
+
+@pytest.mark.parametrize(("dtype", "error"), [("float16", ValueError), (int, ValueError), ("exact", TypeError)])
+def test_another_dtype_is_refused(dtype, error):
+    with pytest.raises(error, match=r"dtype must be numpy\.float64 or numpy\.float32, got"):
+        KFOPC.random_walk(5, state_noise=1e-6, measurement_noise=1e-3, dtype=dtype)

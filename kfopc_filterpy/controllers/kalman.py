@@ -46,7 +46,7 @@ class KalmanController(FilteredReferenceController):
     TypeError
         An estimator that is no filterpy KalmanFilter.
     ValueError
-        An estimator of several measurements, a block size below 1.
+        An estimator of several measurements; a block size below 1, or one with a float32 estimator.
 
     Examples
     --------
@@ -77,6 +77,8 @@ class KalmanController(FilteredReferenceController):
         self.estimator = estimator
         self.name = name or ("KF-ANC" if self.rated_power is None else "KF-OPC")
         size = None if block_size is None else as_count(block_size, "block_size")
+        if size is not None and getattr(estimator, "dtype", np.float64) != np.float64:
+            raise ValueError("block_size needs an estimator of dtype float64: its products cancel too much in float32")
         self._block = None if size is None else CausalBlock(estimator.dim_x, size)
 
     @property
@@ -153,6 +155,7 @@ class KalmanController(FilteredReferenceController):
         if self._block is None or alpha_sq != 1.0:
             yield from super().blocks(state, n_samples)
             return
+        self.estimator.settle_covariance()
         for begin in range(0, n_samples, self._block.size):
             self._block.open(state.covariance, newest(state.filtered, state.weights.size))
             yield begin, min(begin + self._block.size, n_samples)
@@ -163,8 +166,11 @@ class KalmanController(FilteredReferenceController):
         if self._block is not None:
             self._block.close(state.covariance, state.settings[0])
         d, y, S = state.last.tolist()
+        arrays = state.covariance if shared else None
         if not np.isnan(S):
-            self.estimator.after_compiled(state.weights, d, y, S, state.covariance if shared else None)
+            self.estimator.after_compiled(state.weights, d, y, S, arrays)
+        elif arrays is not None:  # it diverged before its first update
+            self.estimator.go_on_from(arrays)
 
 
 def kf_anc(
@@ -232,7 +238,7 @@ def kf_opc(
     rated_power : float
         Rated output power rho_o.
     **constraint
-        `fs`, `power_memory`, `power_window`, `secondary_path_gain`, see `KFOPC`.
+        `fs`, `power_memory`, `power_window`, `secondary_path_gain`, see `KFOPC`; `dtype`, see `KFOPC.random_walk`.
 
     Returns
     -------
