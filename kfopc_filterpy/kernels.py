@@ -15,8 +15,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba.extending import overload
 
-from ._compile import compiled, part
+from ._compile import OPTIONS, compiled, part
 
 # No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
 FAST = {"reassoc", "contract", "nsz"}
@@ -34,7 +35,7 @@ class Covariance(NamedTuple):
     """State covariance: P = scale (T - g g' inverse_s) + diagonal I."""
 
     triangle: np.ndarray  # (n or more, n or more), lower triangle T valid; rows begin at cache lines
-    row: np.ndarray  # (n,) x' of the pass under way, in T's precision
+    row: np.ndarray  # (n,) where x' is put into T's precision, if it is of another
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the pass under way
     owed: np.ndarray  # (4,): scale, diagonal, 1/S or 0 where the downdate was done at once; 1/S of the last update
@@ -75,6 +76,26 @@ def copy_into(target, source):
         target[i] = source[i]
 
 
+def in_precision(row, h):
+    """`h`, or where P is kept in another precision, a copy of it in `row`."""
+    if row.dtype == h.dtype:
+        return h
+    row[:] = h
+    return row
+
+
+@overload(in_precision, jit_options=OPTIONS | {"cache": False})  # type: ignore[arg-type]
+def _in_precision(row, h):
+    if row.dtype == h.dtype:  # types: decided when it is compiled
+        return lambda row, h: h
+
+    def copied(row, h):
+        copy_into(row, h)
+        return row
+
+    return copied
+
+
 @compiled(forceinline=True)
 def predict_covariance(cov, alpha_sq, state_noise):
     """Eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
@@ -93,8 +114,7 @@ def project_covariance(cov, h):
     number = T.dtype.type  # a float64 factor would make float32 arithmetic float64
     scale, diagonal = number(cov.owed[SCALE]), number(cov.owed[DIAGONAL])
     weight = number(cov.owed[SCALE] * cov.owed[INVERSE_S])
-    copy_into(cov.row, h)
-    h = cov.row
+    h = in_precision(cov.row, h)
     for i in range(n):
         Ph[i] = 0.0
     whole = n - n % 4
