@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 TAPS = (32, 64, 128, 256, 512, 1024)
 ROUNDS = 8
 PROBE_SIZE, PROBE_TIMES = 384, 20
+TURN_S = 0.05  # a variant's turn, about as long as the probe's
 REAL_TIME_FS = (16000.0, 48000.0)
 WORST_TAPS = (128, 256, 512)
 WORST_SAMPLES = 1_000_000
@@ -65,6 +66,15 @@ def seconds(work: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
+def shortest(work: Callable[[], Any]) -> float:
+    """Best time of a turn: as many calls as the probe has where they are short, one where they are long."""
+    best, spent, calls = np.inf, 0.0, 0
+    while calls == 0 or (spent < TURN_S and calls < PROBE_TIMES):
+        took = seconds(work)
+        best, spent, calls = min(best, took), spent + took, calls + 1
+    return best
+
+
 def dgemm_probe() -> Callable[[], float]:
     """A function that gives the rate of a matrix product in GFLOP/s, the best of some."""
     from scipy.linalg.blas import dgemm
@@ -90,7 +100,7 @@ def measure(taps: int, rounds: int = ROUNDS, tick: Callable[[], Any] = lambda: N
     rate, best = 0.0, dict.fromkeys(works, np.inf)
     for _ in range(rounds):
         for name, (work, samples) in works.items():
-            best[name] = min(best[name], seconds(work) / samples * 1e6)
+            best[name] = min(best[name], shortest(work) / samples * 1e6)
         rate = max(rate, probe())
         tick()
     return rate, best
@@ -205,8 +215,8 @@ def remarks(result: dict[str, Any]) -> list[str]:
     return [
         f"dgemm, one thread: {result['dgemm_gflops']:.1f} GFLOP/s.",
         f"Most taps timed that run in real time, {'; '.join(real_time)}.",
-        f"The closed loop at 128 taps takes {us['closed loop, KF-OPC', 128] / us['streaming kernel', 128] - 1:.0%} more "
-        "than its filter's update.",
+        f"The closed loop at 128 taps costs {us['closed loop, KF-OPC', 128] / us['streaming kernel', 128]:.2f} times its "
+        "filter's update.",
         f"{variants.SCENARIOS} scenarios that share gains, at 256 taps: "
         f"{us['closed loop, KF-OPC', 256] / us[shared, 256]:.1f} times cheaper than as many runs.",
         f"The causal block kernel puts its work off to the change of blocks ({variants.BLOCK} samples): a burst of "
