@@ -27,7 +27,7 @@ from kfopc_filterpy.kernels import (
 
 Work = tuple[Callable[[], Any], int]
 R, Q, P0 = 1e-8, 1.0, 1e-3
-BLOCK = 48
+BLOCK_SIZE = 48
 SCENARIOS = 64
 PATH = np.random.default_rng(0).standard_normal(32) / 8  # secondary path of the closed loops
 TARGET_FLOPS = 1e8  # a timing takes about this much work of ours, and a few samples of the slow ones
@@ -77,20 +77,20 @@ def streaming(taps: int) -> Work:
 
 
 def _block_samples(taps: int) -> int:
-    return samples_for(taps, most=20 * BLOCK, least=8 * BLOCK) // BLOCK * BLOCK
+    return samples_for(taps, most=20 * BLOCK_SIZE, least=8 * BLOCK_SIZE) // BLOCK_SIZE * BLOCK_SIZE
 
 
 def block(taps: int) -> Work:
     """All rows of a block known, weights as `simulate_scenarios` has them (two products with the gains)."""
     samples = _block_samples(taps)
     x, (cov, w) = signal(taps, samples), filter_state(taps)
-    d, work = x[:samples].copy(), Block(taps, BLOCK)
+    d, work = x[:samples].copy(), Block(taps, BLOCK_SIZE)
 
     def run() -> None:
-        for first in range(0, samples, BLOCK):
-            work.rows[:, :taps] = sliding_window_view(x[first : first + BLOCK + taps - 1], taps)
+        for first in range(0, samples, BLOCK_SIZE):
+            work.rows[:, :taps] = sliding_window_view(x[first : first + BLOCK_SIZE + taps - 1], taps)
             S = work.advance(cov, R, Q)
-            _correct_in_turn(w, work.rows, work.directions, S, d[first : first + BLOCK])
+            _correct_in_turn(w, work.rows, work.directions, S, d[first : first + BLOCK_SIZE])
 
     run()
     return run, samples
@@ -111,12 +111,14 @@ def block_causal(taps: int) -> Work:
     samples = _block_samples(taps)
     x, (cov, w) = signal(taps, samples), filter_state(taps)
     rows = sliding_window_view(x[::-1], taps)[::-1].copy()  # newest first, as a delay line has them
-    d, work = x[:samples].copy(), CausalBlock(taps, BLOCK)
+    d, work = x[:samples].copy(), CausalBlock(taps, BLOCK_SIZE)
 
     def run() -> None:
-        for first in range(1, samples + 1, BLOCK):
+        for first in range(1, samples + 1, BLOCK_SIZE):
             work.open(cov, rows[first - 1])
-            _stream_in_block(cov, work.state, w, rows[first : first + BLOCK], d[first - 1 : first - 1 + BLOCK], R, Q)
+            _stream_in_block(
+                cov, work.state, w, rows[first : first + BLOCK_SIZE], d[first - 1 : first - 1 + BLOCK_SIZE], R, Q
+            )
             work.close(cov, R)
 
     run()

@@ -41,11 +41,12 @@ class RandomWalkCovariance:
         self.prior: Moment | np.ndarray = Moment(1.0, 0.0)
         self.posterior: Moment | np.ndarray = Moment(1.0, 0.0)
         self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
+        self._largest = float(np.finfo(dtype).max)
         self._others_read = False  # the arrays are another's too
 
     def share(self, arrays: Covariance) -> None:
         """Go on from arrays that others go on from too: whoever steps first takes a copy."""
-        self.arrays, self._others_read = arrays, True
+        self.arrays, self._others_read, self._shown = arrays, True, []
 
     def own(self) -> Covariance:
         """The arrays, which nobody else reads."""
@@ -95,7 +96,8 @@ class RandomWalkCovariance:
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Eq. 4."""
-        if not np.isfinite(alpha_sq * max(self.now[:2]) + state_noise):
+        scale, diagonal, _ = self.now
+        if not alpha_sq * max(scale, diagonal) + state_noise < self._largest:
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
         self._shown = []
         predict_covariance(self.own(), alpha_sq, state_noise)
@@ -104,9 +106,9 @@ class RandomWalkCovariance:
     def project(self, h: np.ndarray) -> float:
         """h' P h, with P h left in the arrays for the update; the value of P does not change."""
         self._shown = []
-        if not isinstance(self.prior, np.ndarray) and self.prior != self.now:  # a second update since the prediction
-            self.prior = self.full(self.prior)
         now = self.now
+        if not isinstance(self.prior, np.ndarray) and self.prior != now:  # a second update since the prediction
+            self.prior = self.full(self.prior)
         hPh = float(project_covariance(self.own(), h))
         if isinstance(self.prior, Moment):
             self.prior = Moment(1.0, 0.0)
@@ -116,11 +118,10 @@ class RandomWalkCovariance:
         return hPh
 
     def updated(self) -> None:
-        """The arrays took an update after `project`: P_prior, where it was the triangle, is P + g g'/S now."""
+        """The arrays took an update after `project`: P_prior, where it was the triangle, is P + g g'/S; `settle` next."""
         if isinstance(self.prior, Moment):
             inverse_S, last_inverse_S = self.arrays.owed[[INVERSE_S, LAST_INVERSE_S]].tolist()
             self.prior = Moment(1.0, 0.0, last_inverse_S - inverse_S)
-        self.settle()
 
     def settle(self) -> None:
         """An update is over, or its sample was missed: P is P_post."""

@@ -146,9 +146,9 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         rated_power : float, optional
             Rated output power; None: the unconstrained filter, KF-ANC.
         dtype : {numpy.float64, numpy.float32}, default numpy.float64
-            Precision that P is kept and stepped in; the weights stay float64. float32 halves the memory, and is
-            faster from about 512 taps on. It needs state noise: without, rounding makes P indefinite within some
-            thousand samples of a band-limited reference, and `update` then refuses.
+            Precision that P is kept and stepped in; the weights stay float64. float32 halves the memory and, at many
+            taps, the time. It needs a state noise well above 6e-8 of the largest variance in P: below, rounding makes P
+            indefinite within some thousand samples of a band-limited reference, and `update` then refuses.
         **constraint
             `secondary_path_gain`, `fs`, `power_memory`, `power_window`, as for `KFOPC`.
 

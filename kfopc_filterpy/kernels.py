@@ -54,6 +54,8 @@ def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
 def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     """Covariance state from a full symmetric array (n, n); the upper triangle is not read."""
     n, line = P.shape[0], LINE // np.dtype(dtype).itemsize
+    if not np.abs(P).max() < float(np.finfo(dtype).max):
+        raise ValueError(f"P must be below {np.finfo(dtype).max:.2g}, the largest {np.dtype(dtype).name}")
     triangle = aligned_zeros(-(-n // line) * line, n, dtype=dtype)  # square for BLAS, zero past n
     triangle[:n, :n] = P
     row, gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(3))

@@ -17,7 +17,9 @@ from .kernels import FAST, correct_weights, dot
 from .loop import DIVERGED, REFUSED, RUNNING, newest, push, squares_are_finite
 
 GROUP = 8  # scenarios that take turns: their weights stay in the first cache
-ERROR, CONTROL, AMPLIFIED, ANTI_NOISE, USED_FACTOR, USED_POWER, USED_GAIN = range(7)  # rows of what is recorded
+KEPT_ERROR, KEPT_CONTROL, KEPT_AMPLIFIED, KEPT_ANTI_NOISE, KEPT_FACTOR, KEPT_POWER, KEPT_GAIN = range(
+    7
+)  # rows of what is recorded
 SAFE = 1e290  # a correction below does not overflow weights that are finite
 
 
@@ -79,7 +81,7 @@ def emit(scenarios, shared, recorded, begin, end, k, n):
         push(scenarios.output[i], amplify(model[0], model[1], model[2], y))
         y_amplified = amplify(amplifier[0], amplifier[1], amplifier[2], y)
         push(scenarios.emitted[i], y_amplified)
-        recorded[i, CONTROL, n], recorded[i, AMPLIFIED, n] = y, y_amplified
+        recorded[i, KEPT_CONTROL, n], recorded[i, KEPT_AMPLIFIED, n] = y, y_amplified
 
 
 @part(fastmath=FAST, forceinline=True)
@@ -96,7 +98,7 @@ def two_dots(w, x, h):
 def receive(scenarios, recorded, d, noise, i, n):
     """e = d - s * y_amp, and the sensor's noise."""
     a = dot(scenarios.secondary[i], newest(scenarios.emitted[i], scenarios.secondary.shape[1]))
-    recorded[i, ANTI_NOISE, n], recorded[i, ERROR, n] = a, d - a + noise
+    recorded[i, KEPT_ANTI_NOISE, n], recorded[i, KEPT_ERROR, n] = a, d - a + noise
 
 
 @part(forceinline=True)
@@ -108,7 +110,7 @@ def correct(scenarios, shared, recorded, begin, end, k, n):
         if scenarios.status[i] != RUNNING:
             continue
         constraint = ConstraintState(scenarios.table[i], scenarios.window[i])
-        d = recorded[i, ERROR, n] + dot(shared.secondary_estimate, newest(scenarios.output[i], taps))
+        d = recorded[i, KEPT_ERROR, n] + dot(shared.secondary_estimate, newest(scenarios.output[i], taps))
         previewed = preview_constraint(constraint, d, h, x)
         y = previewed[0] * d - scenarios.last[i, 1]
         if not (squares_are_finite(d, h, x) and abs(y / S) * shared.largest[k] < SAFE):
@@ -118,7 +120,7 @@ def correct(scenarios, shared, recorded, begin, end, k, n):
         commit_constraint(constraint, previewed, d, h, x)
         scenarios.last[i, 0], scenarios.last[i, 1], scenarios.last[i, 2] = d, y, S
         used = constraint.table[LAST]
-        recorded[i, USED_FACTOR, n] = used[FACTOR]
-        if recorded.shape[1] > USED_POWER:
-            recorded[i, USED_POWER, n], recorded[i, USED_GAIN, n] = used[POWER], used[GAIN]
+        recorded[i, KEPT_FACTOR, n] = used[FACTOR]
+        if recorded.shape[1] > KEPT_POWER:
+            recorded[i, KEPT_POWER, n], recorded[i, KEPT_GAIN, n] = used[POWER], used[GAIN]
         scenarios.done[i] += 1

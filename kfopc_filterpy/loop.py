@@ -41,7 +41,8 @@ from .kernels import (
     update_weights,
 )
 
-KALMAN, LMS = 0, 1
+KALMAN, LMS, LISTENING = 0, 1, 2  # what a controller does with an error
+STEP = 16000  # samples between two reports of progress, or chances to interrupt a run
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
@@ -91,7 +92,7 @@ def latest(line):
 class ControllerState(NamedTuple):
     """What every controller here keeps."""
 
-    kind: int  # KALMAN or LMS
+    kind: int  # KALMAN or LMS; LISTENING, with zero weights, while the loudspeaker is silent
     weights: np.ndarray  # (L,) control filter w
     secondary_estimate: np.ndarray  # taps of s^
     reference: np.ndarray  # delay line of x
@@ -204,6 +205,13 @@ def adapt_lms(controller, error, y):
         w[i] += correction * xf[i] - penalty * x[i]
 
 
+@part(forceinline=True)
+def follow(controller, error):
+    """Take the sample into the powers only."""
+    d, filtered, x = disturbance_estimate(controller, error), latest(controller.filtered), latest(controller.reference)
+    advance_constraint(controller.constraint, d, filtered, x)
+
+
 class Plant(NamedTuple):
     """The true amplifier and paths."""
 
@@ -268,6 +276,8 @@ def run(controller, block, plant, signals, weights, limit, every, first, begin, 
         signals[ERROR, k], signals[CONTROL, k] = e, y
         if controller.kind == LMS:
             adapt_lms(controller, e, y)
+        elif controller.kind == LISTENING:
+            follow(controller, e)
         elif not adapt_kalman(controller, e, block):
             return REFUSED, k
         signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a

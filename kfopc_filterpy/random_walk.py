@@ -279,9 +279,8 @@ class RandomWalkKFOPC(KFOPC):
             raise ValueError(SILENT_REFERENCE)
         S = self._covariance.project(h) + noise
         if not 0 < S < np.inf:
-            raise ValueError(
-                f"S = H P H' + R must be positive, got {S:g}: P is not positive definite on H. Nothing was changed"
-            )
+            cause = "P is not positive definite on H" if S <= 0 else f"it overflows {self.dtype.name}"
+            raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
         y = float(update_weights(self._covariance.arrays, weights, h, factor * z, S, noise))
         if not np.isfinite(y):
             raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")

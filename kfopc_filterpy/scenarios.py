@@ -17,7 +17,7 @@ from .controllers.kalman import KalmanController
 from .kernels import INVERSE_S, aligned_zeros, copy_covariance, covariance_matrix
 from .lockstep import Scenarios, SharedBlock, run_block
 from .loop import DIVERGED, REFUSED, TAPS, ControllerState, delay_line, newest, refill
-from .paths import path_taps
+from .paths import is_system, path_taps
 from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
 
 BLOCK = 256
@@ -68,7 +68,7 @@ def simulate_scenarios(
     amplifier : callable or sequence, optional
         One of the package's amplifier models for all, or one each; by default linear.
     rated_power : float, optional
-        See `simulate`; by default each controller's.
+        One for all, which sets the scale of the divergence limit only; by default each controller's own.
     sensor_noise_std : float or sequence of float, default 0
         Standard deviation of the sensor noise, one for all or one each.
     rng : int, numpy.random.Generator or sequence, optional
@@ -87,8 +87,8 @@ def simulate_scenarios(
     Returns
     -------
     list of SimulationResult
-        One for each controller. Each controller goes on from where its run ended; one that diverged, with the
-        covariance of the end of the run.
+        One for each controller. Their signals lie in one array, which any of them keeps: copy what is to be kept alone.
+        Each controller goes on from where its run ended; one that diverged, with the covariance of the end of the run.
 
     Raises
     ------
@@ -115,6 +115,8 @@ def simulate_scenarios(
     as_choice(kernel, "kernel", ("streaming", "block"))
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
+    if isinstance(controllers, KalmanController):
+        raise TypeError("controllers must be a sequence of controllers: [controller] for one")
     controllers = list(controllers)
     states = _states_that_share(controllers, fs)
     if kernel == "block" and states[0].covariance.triangle.dtype != np.float64:
@@ -220,7 +222,7 @@ def _difference(one: ControllerState, other: ControllerState) -> str | None:
     if not np.array_equal(one.settings, other.settings):
         return "state noise, measurement noise and fading memory"
     if one.constraint.window.shape != other.constraint.window.shape:
-        return "the window and memory of their powers"
+        return "the length of the sliding windows of their powers"
     for mine, theirs in ((one.reference, other.reference), (one.filtered, other.filtered)):
         if not np.array_equal(newest(mine, int(mine[TAPS])), newest(theirs, int(theirs[TAPS]))):
             return "the reference heard so far"
@@ -243,6 +245,13 @@ def _each(value: Any, count: int, name: str) -> list[Any]:
     return list(value)
 
 
+def _several(value: Any) -> bool:
+    """Whether it is a list of signals or paths, and not one of them."""
+    if isinstance(value, np.ndarray):
+        return value.ndim > 1
+    return isinstance(value, list | tuple) and len(value) > 0 and (is_system(value[0]) or np.ndim(value[0]) > 0)
+
+
 def _seeds(rng: Any, count: int) -> list[Any]:
     """Seeds or generators; a generator serves one scenario, or they would draw from it in turns."""
     each = _each(rng, count, "rng")
@@ -254,18 +263,15 @@ def _seeds(rng: Any, count: int) -> list[Any]:
 
 def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, count: int) -> np.ndarray:
     """(count, n_samples), one row where one serves all; an array of its own."""
-    if disturbance is None or np.ndim(disturbance) != 2:
+    if not _several(disturbance):
         return disturbance_at_microphone(x, primary_path, disturbance, fs)[None].copy()
-    each = _each(np.asarray(disturbance, dtype=np.float64), count, "disturbance")
+    each = _each(disturbance, count, "disturbance")
     return np.array([disturbance_at_microphone(x, primary_path, own, fs) for own in each])
 
 
 def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
     """(count, taps), shorter ones with zeros at the end."""
-    several = isinstance(secondary_path, list | tuple | np.ndarray) and any(
-        not np.isscalar(one) for one in secondary_path
-    )
-    paths = _each(secondary_path, count, "secondary_path") if several else [secondary_path] * count
+    paths = _each(secondary_path, count, "secondary_path") if _several(secondary_path) else [secondary_path] * count
     taps = [path_taps(path, fs=fs, name="secondary_path") for path in paths]
     stacked = np.zeros((count, max(t.size for t in taps)))
     for row, own in zip(stacked, taps, strict=True):

@@ -25,6 +25,7 @@ from .loop import (
     REFUSED,
     RUNNING,
     SENSOR_NOISE,
+    STEP,
     USED_FACTOR,
     USED_GAIN,
     USED_POWER,
@@ -39,7 +40,6 @@ from .loop import (
 from .paths import path_taps
 
 DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
-STEP = 16000  # samples between two reports of progress, or chances to interrupt a run
 RECORDED = (ERROR, CONTROL, AMPLIFIED, ANTI_NOISE, USED_FACTOR)  # always; the powers where they are asked for
 
 

@@ -289,3 +289,16 @@ def test_clipping_drives_kf_anc_apart_and_not_kf_opc():
     assert output_power(anc.control_signal) > 4.0
     assert output_power(opc.control_signal) == pytest.approx(1.0, rel=0.01)
     assert np.max(np.abs(opc.control_signal[FS:])) <= 1.01 * math.sqrt(2)
+
+
+def test_listening_goes_on_where_nothing_may_be_put_out():
+    """A constraint factor of 0, held or from a rated power that underflows: the powers are followed all the same."""
+    x = np.random.default_rng(0).standard_normal(4000)
+    held = kf_opc(8, [0.0, 0.8, 0.3], rated_power=1.0, state_noise=1e-6, measurement_noise=1e-3)
+    held.estimator.constraint_factor = 0.0
+    tiny = MOVFxLMS(8, [0.0, 0.8, 0.3], rated_power=1e-200, step_size=0.1)
+    for controller, scale in ((held, 1.0), (tiny, 1e150)):
+        controller.listen(scale * x, scale * x)
+        # half a second's memory over a quarter of one: nearly the plain mean
+        assert controller.disturbance_power == pytest.approx(scale**2 * np.mean(x**2), rel=0.1)
+        assert controller.constraint_factor == 0.0

@@ -687,3 +687,26 @@ def test_float32_is_kept_where_it_was_asked_for():
 def test_another_dtype_is_refused(dtype, error):
     with pytest.raises(error, match=r"dtype must be numpy\.float64 or numpy\.float32, got"):
         KFOPC.random_walk(5, state_noise=1e-6, measurement_noise=1e-3, dtype=dtype)
+
+
+def test_float32_that_would_overflow_is_refused_with_nothing_changed():
+    options = {"state_noise": 1.0, "measurement_noise": 1e-3, "dtype": np.float32}
+    with pytest.raises(ValueError, match=r"P must be below 3\.4e\+38, the largest float32"):
+        KFOPC.random_walk(4, initial_variance=1e39, **options)
+    kf = KFOPC.random_walk(4, **options)
+    with pytest.raises(ValueError, match="P would overflow"):
+        kf.predict(Q=1e39)
+    np.testing.assert_array_equal(kf.P, np.eye(4))
+    kf.predict()
+    with pytest.raises(ValueError, match="must be positive, got inf: it overflows float32"):
+        kf.update(1.0, H=[1e30, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(kf.P, 2 * np.eye(4))
+
+
+def test_float32_below_its_rounding_of_state_noise_is_as_good_as_none():
+    """r = 1e-9 beside a variance of 1: float32 leaves it out, as docs/speed.md says."""
+    kf = KFOPC.random_walk(4, state_noise=1e-9, measurement_noise=1.0, dtype=np.float32)
+    for _ in range(100):
+        kf.predict()
+        kf.update(0.0, H=[0.0, 0.0, 0.0, 1e-6])
+    assert kf.P[0, 0] == 1.0

@@ -338,6 +338,7 @@ def test_the_first_scenario_may_diverge_in_its_first_sample():
     x, own = differing(3, 200)
     made = filters(3)
     made[0].estimator.x[0] = 1e9
+    assert made[0].estimator.P[0, 0] == 0.5  # reading it is no edit
     assert run_scenarios(made, x, fs=FS, **own)[0].diverged_at_s == 0.0
     np.testing.assert_array_equal(made[0].estimator.P, made[0].estimator.P_post)
     np.testing.assert_array_equal(made[0].estimator.P, made[1].estimator.P)
@@ -374,6 +375,14 @@ def test_one_generator_for_several_scenarios_is_refused(several):
     x, own = differing(3, 50)
     with pytest.raises(ValueError, match="rng holds one Generator for several controllers"):
         run_scenarios(filters(3), x, fs=FS, **own | {"rng": several(np.random.default_rng(0))})
+
+
+def test_one_controller_that_is_no_list_and_signals_of_different_lengths_are_refused():
+    x, own = differing(3, 50)
+    with pytest.raises(TypeError, match=r"controllers must be a sequence of controllers: \[controller\] for one"):
+        run_scenarios(filters(1)[0], x, fs=FS, **own)
+    with pytest.raises(ValueError, match="disturbance must have 50 values, got 49"):
+        run_scenarios(filters(3), x, fs=FS, **own | {"disturbance": [x, x[:-1], x]})
 
 
 @pytest.mark.parametrize("empty", [[], ()])
@@ -417,7 +426,7 @@ REFUSED = [
     (lambda: one_of_three(initial_variance=1.0), ValueError, AGREE + "their covariance P"),
     (lambda: one_of_three(secondary=0.9 * S_HAT), ValueError, AGREE + "their estimated secondary path"),
     (lambda: one_of_three(secondary=S), ValueError, AGREE + "their estimated secondary path"),
-    (lambda: one_of_three(window="sliding"), ValueError, AGREE + "the window .* of their powers"),
+    (lambda: one_of_three(window="sliding"), ValueError, AGREE + "the length of the sliding windows of their powers"),
     (lambda: one_of_three(heard=[1]), ValueError, HEARD),
     (lambda: one_of_three(heard=[-1, 1, 1]), ValueError, HEARD),  # with the same covariance
     (lambda: one_of_three(Q=np.diag(np.arange(7.0))), ValueError, r"controllers\[1\] takes filterpy's own equations"),

@@ -14,8 +14,9 @@ from ..constraint import OutputPowerConstraint
 from ..kernels import new_covariance
 from ..loop import (
     DISTURBANCE_IN,
-    LMS,
+    LISTENING,
     REFERENCE_IN,
+    STEP,
     ControllerState,
     Plant,
     adapt_lms,
@@ -26,7 +27,6 @@ from ..loop import (
 )
 from ..paths import is_system, path_taps, sampling_rate
 
-STRETCH = 16000  # samples that the compiled loop takes at a time
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
     "measurement_noise = 0 tells nothing: give measurement_noise > 0"
@@ -159,14 +159,11 @@ class FilteredReferenceController:
         x = as_signal(references, "references")
         e = as_signal(errors, "errors", length=x.size)
         self._require_finite_squares(x, e)
-        # Weights of zero and a step size of zero: what is left of FxLMS are the delay lines and the powers.
-        silent = self._state._replace(
-            kind=LMS, weights=np.zeros(self._state.weights.size), settings=np.zeros(self._state.settings.size)
-        )
+        silent = self._state._replace(kind=LISTENING, weights=np.zeros(self._state.weights.size))
         nothing = Plant(np.zeros(1), np.zeros(0), delay_line(1), LinearAmplifier().parameters)
-        for first in range(0, x.size, STRETCH):
-            signals = np.zeros((10, min(STRETCH, x.size - first)))
-            signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STRETCH], e[first : first + STRETCH]
+        for first in range(0, x.size, STEP):
+            signals = np.zeros((10, min(STEP, x.size - first)))
+            signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STEP], e[first : first + STEP]
             run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, signals.shape[1])
 
     def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:

@@ -182,6 +182,7 @@ def kf_anc(
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     block_size: int | None = None,
+    dtype: Any = np.float64,
 ) -> KalmanController:
     """KF-ANC: the Kalman filter of eq. 2-8 without a constraint.
 
@@ -196,6 +197,8 @@ def kf_anc(
     amplifier : callable, optional
     block_size : int, optional
         See `KalmanController`.
+    dtype : {numpy.float64, numpy.float32}, default numpy.float64
+        See `KFOPC.random_walk`.
 
     Returns
     -------
@@ -213,6 +216,7 @@ def kf_anc(
         state_noise=state_noise,
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
+        dtype=dtype,
     )
     return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)
 
@@ -227,18 +231,19 @@ def kf_opc(
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     block_size: int | None = None,
+    dtype: Any = np.float64,
     **constraint: Any,
 ) -> KalmanController:
     """KF-OPC: the Kalman filter with output power constraint, eq. 9-13.
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, dtype
         As for `kf_anc`.
     rated_power : float
         Rated output power rho_o.
     **constraint
-        `fs`, `power_memory`, `power_window`, `secondary_path_gain`, see `KFOPC`; `dtype`, see `KFOPC.random_walk`.
+        `fs`, `power_memory`, `power_window`, `secondary_path_gain`, see `KFOPC`.
 
     Returns
     -------
@@ -257,6 +262,7 @@ def kf_opc(
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
         rated_power=rated_power,
+        dtype=dtype,
         **constraint,
     )
     return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)
