@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -109,19 +109,6 @@ class Scene:
         """Power of the filtered reference, which makes step sizes and state noises comparable."""
         x = self.references[0]
         return float(np.mean(np.convolve(x, self.secondary)[: x.size] ** 2))
-
-    def scaled(self, wiener_control_power: float) -> Scene:
-        """The scene with all signals louder or softer, and another Wiener control power with them; same amplifier."""
-        ratio = wiener_control_power / self.wiener_control_power
-        gain = float(np.sqrt(ratio))
-        return replace(
-            self,
-            references=[gain * x for x in self.references],
-            disturbances=[gain * d for d in self.disturbances],
-            sensor_noise_std=gain * self.sensor_noise_std,
-            measurement_noise=ratio * self.measurement_noise,
-            wiener_control_power=wiener_control_power,
-        )
 
     def run(self, controller: Any, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a controller on the noise of one seed."""

@@ -17,9 +17,8 @@ from .kernels import FAST, correct_weights, dot
 from .loop import DIVERGED, REFUSED, RUNNING, newest, push, squares_are_finite
 
 GROUP = 8  # scenarios that take turns: their weights stay in the first cache
-KEPT_ERROR, KEPT_CONTROL, KEPT_AMPLIFIED, KEPT_ANTI_NOISE, KEPT_FACTOR, KEPT_POWER, KEPT_GAIN = range(
-    7
-)  # rows of what is recorded
+# Rows of what is recorded.
+KEPT_ERROR, KEPT_CONTROL, KEPT_AMPLIFIED, KEPT_ANTI_NOISE, KEPT_FACTOR, KEPT_POWER, KEPT_GAIN = range(7)
 SAFE = 1e290  # a correction below does not overflow weights that are finite
 
 

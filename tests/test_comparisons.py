@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,8 +53,22 @@ def test_scene_knows_its_measurement_noise(scene):
     assert scene.measurement_noise > floor
 
 
+def scaled(scene, wiener_control_power):
+    """The scene with all signals louder or softer, and another Wiener control power with them; same amplifier."""
+    ratio = wiener_control_power / scene.wiener_control_power
+    gain = float(np.sqrt(ratio))
+    return replace(
+        scene,
+        references=[gain * x for x in scene.references],
+        disturbances=[gain * d for d in scene.disturbances],
+        sensor_noise_std=gain * scene.sensor_noise_std,
+        measurement_noise=ratio * scene.measurement_noise,
+        wiener_control_power=wiener_control_power,
+    )
+
+
 def test_scaling_a_scene_scales_the_unconstrained_control_signal(scene):
-    quiet, loud = scene, scene.scaled(4 * scene.wiener_control_power)
+    quiet, loud = scene, scaled(scene, 4 * scene.wiener_control_power)
     assert loud.amplitude_limit == quiet.amplitude_limit
     results = [s.run(make_controller(s, "KF-ANC", 1e-6)) for s in (quiet, loud)]
     # Every quantity of the filter scales by a power of two: equal but for the sensor noise's rounding.
