@@ -16,7 +16,19 @@ from numba import njit, types
 from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
-COMPILED_MODULES = ("_compile", "amplifiers", "block", "constraint", "kernels", "lockstep", "loop")
+COMPILED_MODULES = (
+    "_compile",
+    "allocation",
+    "amplifiers",
+    "block",
+    "constraint",
+    "delay_lines",
+    "kernels",
+    "lockstep",
+    "loop",
+    "power_budget",
+    "repairs",
+)
 # All said for every function: what is not said, numba takes from the caller that happens to compile a function first,
 # and leaves it on disk for all the others. Division is numpy's (Inf or NaN, which the callers look for): a test for
 # zero at each would make a way out of every function, at which references to all its arrays are counted.

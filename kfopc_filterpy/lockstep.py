@@ -13,8 +13,9 @@ import numpy as np
 from ._compile import borrowed, compiled, part
 from .amplifiers import amplify
 from .constraint import FACTOR, GAIN, LAST, POWER, ConstraintState, commit_constraint, preview_constraint
+from .delay_lines import newest, push
 from .kernels import FAST, correct_weights, dot
-from .loop import DIVERGED, REFUSED, RUNNING, newest, push, squares_are_finite
+from .loop import DIVERGED, REFUSED, RUNNING, squares_are_finite
 
 GROUP = 8  # scenarios that take turns: their weights stay in the first cache
 # Rows of what is recorded.

@@ -1,8 +1,7 @@
 """The compiled sample: what a controller and the plant do at one n, and the loop over a whole signal.
 
 Sample-by-sample use (`controllers`, `simulation`) calls the same functions one at a time, so each equation stands
-here once. A delay line keeps the newest sample first and contiguous: it is written downwards, and its taps are moved
-to the end once every few lengths, so no sample is shifted on the way.
+here once.
 
 Small functions are inlined by force: called, each would count references to every array of its arguments, which for
 a short control filter takes longer than the arithmetic.
@@ -10,7 +9,7 @@ a short control filter takes longer than the arithmetic.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,6 +26,7 @@ from .constraint import (
     commit_constraint,
     preview_constraint,
 )
+from .delay_lines import latest, newest, push
 from .kernels import (
     CANCELLATION,
     DIAGONAL,
@@ -40,60 +40,20 @@ from .kernels import (
     project_covariance,
     update_weights,
 )
+from .power_budget import WEIGHT, BudgetState, advance_budget, take_correlations
+from .repairs import RepairState, advance_repair, gain_samples, measurement_factor, output_gain
 
 KALMAN, LMS, LISTENING = 0, 1, 2  # what a controller does with an error
 STEP = 16000  # samples between two reports of progress, or chances to interrupt a run
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
-START, TAPS, HEAD = 0, 1, 2  # a delay line's first two values, and where its samples begin
-
-
-def delay_line(taps: int) -> np.ndarray:
-    """A silent delay line of `taps` samples: the newest is at index line[START], where that of line[TAPS] follow."""
-    line = np.zeros(HEAD + 4 * taps + 64)
-    line[START], line[TAPS] = line.size - taps, taps
-    return line
-
-
-def refill(line: np.ndarray, samples: np.ndarray) -> None:
-    """Make `samples` (TAPS or more,), newest first, what the line holds."""
-    taps = int(line[TAPS])
-    line[START] = line.size - taps
-    line[line.size - taps :] = samples[:taps]
-
-
-@part(forceinline=True)
-def push(line, sample):
-    """Make `sample` the newest one."""
-    start = int(line[START]) - 1
-    if start < HEAD:
-        kept = int(line[TAPS]) - 1
-        start = line.size - kept - 1
-        for i in range(kept):
-            line[start + 1 + i] = line[HEAD + i]
-    line[start] = sample
-    line[START] = start
-
-
-@part(forceinline=True)
-def newest(line, taps):
-    """The newest `taps` samples, newest first, as a view."""
-    start = int(line[START])
-    return line[start : start + taps]
-
-
-@part(forceinline=True)
-def latest(line):
-    """The newest sample."""
-    return line[int(line[START])]
-
-
 class ControllerState(NamedTuple):
     """What every controller here keeps."""
 
     kind: int  # KALMAN or LMS; LISTENING, with zero weights, while the loudspeaker is silent
-    weights: np.ndarray  # (L,) control filter w
+    weights: np.ndarray  # (L,) what is adapted, w
+    control_filter: np.ndarray  # (L,) what makes y: the weights themselves, but for a power budget
     secondary_estimate: np.ndarray  # taps of s^
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x' = s^ * x
@@ -103,6 +63,9 @@ class ControllerState(NamedTuple):
     covariance: Covariance  # Kalman
     constraint: ConstraintState  # powers, gain, factor
     last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
+    budget: BudgetState | None = None  # of a power-budgeted filter
+    repair: RepairState | None = None  # of KF-OPC with its gain repaired
+    limiter: Any = None
 
 
 @part(forceinline=True)
@@ -115,13 +78,22 @@ def take_reference(controller, x):
 
 @part(forceinline=True)
 def control_signal(controller, x):
-    """y(n) = w(n-1)' x(n), with the filtered reference brought up to date."""
+    """y(n) = w(n-1)' x(n), limited where there is a limiter, with the filtered reference brought up to date."""
     take_reference(controller, x)
-    w = controller.weights
-    y = dot(w, newest(controller.reference, w.size))
+    w = controller.control_filter
+    y = output_gain(controller.repair) * dot(w, newest(controller.reference, w.size))
+    y = limited(controller.limiter, y)
     model = controller.amplifier
     push(controller.output, amplify(model[0], model[1], model[2], y))
     return y
+
+
+@part(forceinline=True)
+def limited(limiter, y):
+    """y after the limiter, if there is one."""
+    if limiter is None:
+        return y
+    return y  # TODO
 
 
 @part(forceinline=True)
@@ -132,17 +104,19 @@ def disturbance_estimate(controller, error):
 
 
 @part(forceinline=True)
-def adapt_kalman(controller, error, block):
+def adapt_kalman(controller, error, y_emitted, block):
     """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step.
 
-    `block` is None, or open for the samples to come (see `block`).
+    `y_emitted` is the control signal of the sample; `block` is None, or open for the samples to come (see `block`).
     """
     d = disturbance_estimate(controller, error)
     w, x = controller.weights, latest(controller.reference)
     h = newest(controller.filtered, w.size)
     if not squares_are_finite(d, h[0], x):
         return False
-    previewed = preview_constraint(controller.constraint, d, h[0], x)
+    seen = gain_samples(controller.repair, h[0], x, error, d, y_emitted)
+    previewed = preview_constraint(controller.constraint, d, seen[0], seen[1])
+    scaled = measurement_factor(controller.repair, previewed[0]) * d
     r, q, alpha_sq = controller.settings[0], controller.settings[1], controller.settings[2]
     cov = controller.covariance
     S, y = np.nan, np.nan
@@ -150,7 +124,7 @@ def adapt_kalman(controller, error, block):
         projected, before = project_in_block(cov, block, h, r)
         S = projected + q
         if S > 0.0 and before + q <= CANCELLATION * q:
-            y = update_in_block(cov, block, w, h, previewed[0] * d, S)
+            y = update_in_block(cov, block, w, h, scaled, S)
             if not np.isfinite(y):
                 return False
         else:
@@ -160,13 +134,29 @@ def adapt_kalman(controller, error, block):
         predict_covariance(cov, alpha_sq, r)
         S = project_covariance(cov, h) + q
         if 0.0 < S < np.inf:
-            y = update_weights(cov, w, h, previewed[0] * d, S, q)
+            y = update_weights(cov, w, h, scaled, S, q)
         if not np.isfinite(y):
             take_back(cov, scale, diagonal, inverse_S, alpha_sq, r)
             return False
-    commit_constraint(controller.constraint, previewed, d, h[0], x)
+    commit_constraint(controller.constraint, previewed, d, seen[0], seen[1])
+    advance_repair(controller.repair, controller.constraint, y_emitted)
+    spend(controller.budget, w, x, h[0], y_emitted)
     controller.last[0], controller.last[1], controller.last[2] = d, y, S
     return True
+
+
+@part(forceinline=True)
+def spend(budget, w, x, filtered, y):
+    """Let the power budget, if there is one, follow the sample."""
+    if budget is not None:
+        advance_budget(budget, w, x, filtered, y)
+
+
+@part(forceinline=True)
+def hear(budget, x, filtered):
+    """Let the power budget, if there is one, follow the signals only."""
+    if budget is not None:
+        take_correlations(budget, x, filtered)
 
 
 @part(forceinline=True)
@@ -210,6 +200,7 @@ def follow(controller, error):
     """Take the sample into the powers only."""
     d, filtered, x = disturbance_estimate(controller, error), latest(controller.filtered), latest(controller.reference)
     advance_constraint(controller.constraint, d, filtered, x)
+    hear(controller.budget, x, filtered)
 
 
 class Plant(NamedTuple):
@@ -247,7 +238,9 @@ def anti_noise(plant, y_amplified):
     USED_FACTOR,
     USED_POWER,
     USED_GAIN,
-) = range(10)
+    USED_WEIGHT,
+) = range(11)
+ROWS = 11
 
 
 @part(forceinline=True)
@@ -257,9 +250,16 @@ def note_weights(rows, weights, every, n):
         copy_into(rows[n // every], weights)
 
 
+@part(forceinline=True)
+def note_power_weight(budget, signals, k):
+    """Keep the lambda of a power budget."""
+    if budget is not None:
+        signals[USED_WEIGHT, k] = budget.table[WEIGHT]
+
+
 @compiled(nogil=True)
 def run(controller, block, plant, signals, weights, limit, every, first, begin, end):
-    """Columns `begin` to `end` of a stretch of signals (10, k), whose first is sample `first` of the run.
+    """Columns `begin` to `end` of a stretch of signals (ROWS, k), whose first is sample `first` of the run.
 
     Returns the status and the column after the last one done.
     """
@@ -278,10 +278,11 @@ def run(controller, block, plant, signals, weights, limit, every, first, begin, 
             adapt_lms(controller, e, y)
         elif controller.kind == LISTENING:
             follow(controller, e)
-        elif not adapt_kalman(controller, e, block):
+        elif not adapt_kalman(controller, e, y, block):
             return REFUSED, k
         signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a
         used = controller.constraint.table[LAST]
         signals[USED_FACTOR, k], signals[USED_POWER, k], signals[USED_GAIN, k] = used[FACTOR], used[POWER], used[GAIN]
-        note_weights(weights, controller.weights, every, first + k)
+        note_power_weight(controller.budget, signals, k)
+        note_weights(weights, controller.control_filter, every, first + k)
     return RUNNING, end

@@ -14,9 +14,10 @@ from .block import Block
 from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION
 from .controllers.kalman import KalmanController
+from .delay_lines import TAPS, delay_line, newest, refill
 from .kernels import INVERSE_S, aligned_zeros, copy_covariance, covariance_matrix
 from .lockstep import Scenarios, SharedBlock, run_block
-from .loop import DIVERGED, REFUSED, TAPS, ControllerState, delay_line, newest, refill
+from .loop import DIVERGED, REFUSED, ControllerState
 from .paths import is_system, path_taps
 from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
 
@@ -203,6 +204,10 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerStat
                 f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
                 "KalmanControllers of filters from KFOPC.random_walk"
             )
+        own = {"power budget": state.budget, "repaired gain": state.repair, "limiter": state.limiter}
+        for what, present in own.items():
+            if present is not None:
+                raise ValueError(f"controllers[{i}] has a {what}, which scenarios do not run: use simulate for it")
         states.append(state)
     for i, state in enumerate(states[1:], 1):
         difference = _difference(states[0], state)

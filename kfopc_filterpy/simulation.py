@@ -14,6 +14,7 @@ from ._validate import as_count, as_generator, as_nonnegative, as_positive, as_s
 from .amplifiers import Amplifier, compiled_parameters
 from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
+from .delay_lines import delay_line
 from .loop import (
     AMPLIFIED,
     ANTI_NOISE,
@@ -23,16 +24,17 @@ from .loop import (
     ERROR,
     REFERENCE_IN,
     REFUSED,
+    ROWS,
     RUNNING,
     SENSOR_NOISE,
     STEP,
     USED_FACTOR,
     USED_GAIN,
     USED_POWER,
+    USED_WEIGHT,
     ControllerState,
     Plant,
     anti_noise,
-    delay_line,
     measured_reference,
     note_weights,
     run,
@@ -71,6 +73,8 @@ class SimulationResult:
         (n_rows,) their times in seconds.
     disturbance_power, secondary_path_gain : ndarray or None
         Power histories (eq. 10, 11), where they were asked for.
+    power_weight : ndarray or None
+        Weight lambda of the control power of a power budget (NaN without one), where powers were asked for.
     diverged_at_s : float or None
         Time at which the control signal passed 1e6 sqrt(rated power); None: it did not.
     """
@@ -89,6 +93,7 @@ class SimulationResult:
     weights_time_s: np.ndarray | None = None
     disturbance_power: np.ndarray | None = None
     secondary_path_gain: np.ndarray | None = None
+    power_weight: np.ndarray | None = None
     diverged_at_s: float | None = None
 
     def __post_init__(self) -> None:
@@ -154,9 +159,9 @@ def simulate(
     feedback_path : array_like or control.TransferFunction, optional
         Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
     record_weights_every : int, optional
-        Record the weights every so many samples.
+        Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     record_powers : bool, default False
-        Record the disturbance power and the secondary-path gain.
+        Record the disturbance power, the secondary-path gain and the weight of a power budget.
     progress : callable, optional
         Called with the number of samples done since its last call, such as `tqdm.update`.
     compiled : bool, default True
@@ -213,14 +218,15 @@ def simulate(
         state = controller.compiled_state()
         if state is not None:
             run_stretch = partial(_run_compiled, controller, state, plant)
-    rows = (*RECORDED, USED_POWER, USED_GAIN) if record_powers else RECORDED
+    rows = (*RECORDED, USED_POWER, USED_GAIN, USED_WEIGHT) if record_powers else RECORDED
     recorded = np.empty((len(rows), x.size))
     status, end = RUNNING, 0
     for first in range(0, x.size, STEP):
-        stretch = np.empty((10, min(STEP, x.size - first)))
+        stretch = np.empty((ROWS, min(STEP, x.size - first)))
         stretch[REFERENCE_IN] = x[first : first + STEP]
         stretch[DISTURBANCE_IN] = d[first : first + STEP]
         stretch[SENSOR_NOISE] = noise.take(stretch.shape[1])
+        stretch[USED_WEIGHT] = np.nan
         status, done = run_stretch(stretch, weights, limit, every or 1, first, progress)
         end = first + done
         recorded[:, first:end] = stretch[rows, :done]
@@ -244,6 +250,7 @@ def simulate(
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
         disturbance_power=powers[0] if powers else None,
         secondary_path_gain=powers[1] if powers else None,
+        power_weight=powers[2] if powers and hasattr(controller, "power_weight") else None,
         diverged_at_s=end / fs if status == DIVERGED else None,
     )
 
@@ -321,8 +328,11 @@ def _run_steps(
         stretch[USED_FACTOR, k] = getattr(controller, "constraint_factor", np.nan)
         stretch[USED_POWER, k] = getattr(controller, "disturbance_power", np.nan)
         stretch[USED_GAIN, k] = getattr(controller, "secondary_path_gain", np.nan)
+        stretch[USED_WEIGHT, k] = getattr(controller, "power_weight", np.nan)
         if weights.shape[0] > 0:
-            now = np.array(controller.weights, dtype=np.float64)  # type: ignore[attr-defined]
+            now = np.array(
+                getattr(controller, "control_filter", getattr(controller, "weights", None)), dtype=np.float64
+            )
             note_weights(weights, now.reshape(-1), every, first + k)
         if progress:
             progress(1)

@@ -20,7 +20,7 @@ from kfopc_filterpy import (
     kf_opc,
     simulate,
 )
-from kfopc_filterpy.loop import delay_line, newest, push
+from kfopc_filterpy.delay_lines import delay_line, newest, push
 
 N_TAPS, N = 10, 500
 S = np.array([0.0, 0.9, -0.4, 0.2, 0.1])

@@ -2,6 +2,17 @@
 
 from .base import Controller
 from .fxlms import FxLMS, MOVFxLMS
-from .kalman import KalmanController, kf_anc, kf_opc
+from .kalman import KalmanController, kf_anc, kf_opc, kf_pb
+from .repaired import RepairedKFOPC, kf_opc_repaired
 
-__all__ = ["Controller", "FxLMS", "KalmanController", "MOVFxLMS", "kf_anc", "kf_opc"]
+__all__ = [
+    "Controller",
+    "FxLMS",
+    "KalmanController",
+    "MOVFxLMS",
+    "RepairedKFOPC",
+    "kf_anc",
+    "kf_opc",
+    "kf_opc_repaired",
+    "kf_pb",
+]

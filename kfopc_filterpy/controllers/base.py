@@ -11,18 +11,18 @@ from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, LinearAmplifier, compiled_parameters
 from ..block import OpenBlock
 from ..constraint import OutputPowerConstraint
+from ..delay_lines import delay_line, newest
 from ..kernels import new_covariance
 from ..loop import (
     DISTURBANCE_IN,
     LISTENING,
     REFERENCE_IN,
+    ROWS,
     STEP,
     ControllerState,
     Plant,
     adapt_lms,
     control_signal,
-    delay_line,
-    newest,
     run,
 )
 from ..paths import is_system, path_taps, sampling_rate
@@ -93,9 +93,11 @@ class FilteredReferenceController:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
         self._path_fs = sampling_rate(secondary_path, name="secondary_path") if is_system(secondary_path) else None
         self._own_constraint = constraint or unconstrained()
+        weights = np.zeros(n_taps)
         self._state = ControllerState(
             kind=kind,
-            weights=np.zeros(n_taps),
+            weights=weights,
+            control_filter=weights,
             secondary_estimate=secondary,
             reference=delay_line(max(n_taps, secondary.size)),
             filtered=delay_line(n_taps),
@@ -112,6 +114,11 @@ class FilteredReferenceController:
     def weights(self) -> np.ndarray:
         """Control filter w, (L,), newest-sample tap first; a copy."""
         return self._state.weights.copy()
+
+    @property
+    def control_filter(self) -> np.ndarray:
+        """Control filter that makes y, (L,); a copy."""
+        return self._state.control_filter.copy()
 
     @property
     def rated_power(self) -> float | None:
@@ -159,10 +166,11 @@ class FilteredReferenceController:
         x = as_signal(references, "references")
         e = as_signal(errors, "errors", length=x.size)
         self._require_finite_squares(x, e)
-        silent = self._state._replace(kind=LISTENING, weights=np.zeros(self._state.weights.size))
+        zeros = np.zeros(self._state.weights.size)
+        silent = self._state._replace(kind=LISTENING, weights=zeros, control_filter=zeros)
         nothing = Plant(np.zeros(1), np.zeros(0), delay_line(1), LinearAmplifier().parameters)
         for first in range(0, x.size, STEP):
-            signals = np.zeros((10, min(STEP, x.size - first)))
+            signals = np.zeros((ROWS, min(STEP, x.size - first)))
             signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STEP], e[first : first + STEP]
             run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, signals.shape[1])
 
@@ -177,9 +185,14 @@ class FilteredReferenceController:
                 f"references and errors must have finite squares: those of sample {int(fine.argmin())} overflow"
             )
 
+    @property
+    def _powers_fs(self) -> float:
+        """Sample rate in Hz that the memory of the powers was made for."""
+        return self.constraint.fs
+
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError where the secondary path or the memory of the powers is of another sample rate."""
-        rates = {"secondary path": self._path_fs, "power memory": self.constraint.fs if self.rated_power else None}
+        rates = {"secondary path": self._path_fs, "power memory": self._powers_fs if self.rated_power else None}
         for name, rate in rates.items():
             if rate is not None and abs(rate - fs) > 1e-9 * fs:
                 raise ValueError(

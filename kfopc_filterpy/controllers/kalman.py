@@ -12,8 +12,10 @@ from .._validate import as_count, as_number
 from ..amplifiers import Amplifier
 from ..block import CausalBlock, OpenBlock
 from ..constraint import OutputPowerConstraint
+from ..delay_lines import latest, newest
 from ..estimator import KFOPC
-from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate, latest, newest
+from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate
+from ..power_budget_filter import PowerBudgetKalmanFilter
 from ..random_walk import RandomWalkKFOPC
 from .base import FilteredReferenceController
 
@@ -75,11 +77,16 @@ class KalmanController(FilteredReferenceController):
             raise ValueError(f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}")
         super().__init__(KALMAN, estimator.dim_x, secondary_path, [0.0, 0.0, 1.0], amplifier)
         self.estimator = estimator
-        self.name = name or ("KF-ANC" if self.rated_power is None else "KF-OPC")
+        self.name = name or self._usual_name()
         size = None if block_size is None else as_count(block_size, "block_size")
         if size is not None and getattr(estimator, "dtype", np.float64) != np.float64:
             raise ValueError("block_size needs an estimator of dtype float64: its products cancel too much in float32")
         self._block = None if size is None else CausalBlock(estimator.dim_x, size)
+
+    def _usual_name(self) -> str:
+        if isinstance(self.estimator, PowerBudgetKalmanFilter):
+            return "KF-PB"
+        return "KF-ANC" if self.rated_power is None else "KF-OPC"
 
     @property
     def rated_power(self) -> float | None:
@@ -88,8 +95,24 @@ class KalmanController(FilteredReferenceController):
 
     @property
     def weights(self) -> np.ndarray:
-        """Control filter w, (L,), the estimator's state; a copy."""
+        """Estimator's state w, (L,), the control filter but for a power budget; a copy."""
         return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
+
+    @property
+    def control_filter(self) -> np.ndarray:
+        """Control filter that makes y, (L,); a copy."""
+        estimator = self.estimator
+        return estimator.control_filter if isinstance(estimator, PowerBudgetKalmanFilter) else self.weights
+
+    @property
+    def power_weight(self) -> float:
+        """Weight lambda of the control power in a power budget; NaN without one."""
+        return getattr(self.estimator, "power_weight", np.nan)
+
+    @property
+    def _powers_fs(self) -> float:
+        estimator = self.estimator
+        return estimator.budget.fs if isinstance(estimator, PowerBudgetKalmanFilter) else self.constraint.fs
 
     @property
     def constraint(self) -> OutputPowerConstraint:
@@ -108,8 +131,17 @@ class KalmanController(FilteredReferenceController):
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         reference = as_number(reference, "reference")
+        self._y = float(control_signal(self._state_with_estimator(), reference))
+        return self._y
+
+    def _state_with_estimator(self) -> ControllerState:
+        """State that sees what the estimator has now: its weights, and the arrays of its powers and budget."""
         self._state.weights[:] = self.weights
-        return float(control_signal(self._state, reference))
+        state = self._state._replace(constraint=self.constraint.state)
+        if isinstance(self.estimator, PowerBudgetKalmanFilter):
+            budget = self.estimator.budget.state
+            state = state._replace(budget=budget, control_filter=budget.control_filter)
+        return state
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
@@ -118,30 +150,35 @@ class KalmanController(FilteredReferenceController):
         x, powers = latest(self._state.reference), self.constraint
         powers.preview(d, h[0, 0], x)  # refuses what would overflow before anything changes
         self.estimator.predict()
-        if isinstance(self.estimator, KFOPC):
+        if isinstance(self.estimator, PowerBudgetKalmanFilter):
+            self.estimator.update(d, H=h, reference=x, control_signal=self._y)
+        elif isinstance(self.estimator, KFOPC):
             self.estimator.update(d, H=h, reference=x)
         else:
             self.estimator.update(np.full((1,) * np.ndim(self.estimator.x), d), H=h)
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
 
+    def _family(self) -> type:
+        """Class whose two calls a sample the compiled loop knows."""
+        return KalmanController
+
     def compiled_state(self, to_step: bool = True) -> ControllerState | None:
         """State for the compiled loop, to step it or to read only; None where filterpy's own equations step."""
         estimator = self.estimator
-        if type(estimator) is not RandomWalkKFOPC or not self.steps_of(KalmanController):
+        if type(estimator) not in (RandomWalkKFOPC, PowerBudgetKalmanFilter) or not self.steps_of(self._family()):
             return None
         compiled = estimator.compiled_state(to_step)
         if compiled is None:
             return None
         covariance, settings = compiled
         self._state.settings[:] = settings
-        self._state.weights[:] = self.weights
         self._state.last[:] = np.nan
-        return self._state._replace(covariance=covariance, constraint=self.constraint.state)
+        return self._state_with_estimator()._replace(covariance=covariance)
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
-        self._state = self._state._replace(constraint=self.constraint.state)
+        self._state = self._state_with_estimator()
         super().listen(references, errors)
 
     @property
@@ -264,5 +301,53 @@ def kf_opc(
         rated_power=rated_power,
         dtype=dtype,
         **constraint,
+    )
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)
+
+
+def kf_pb(
+    n_taps: int,
+    secondary_path: Any,
+    *,
+    rated_power: float,
+    state_noise: float,
+    measurement_noise: float,
+    initial_variance: float = 1.0,
+    amplifier: Amplifier | None = None,
+    block_size: int | None = None,
+    dtype: Any = np.float64,
+    **budget: Any,
+) -> KalmanController:
+    """KF-PB: the power-budgeted Kalman filter, the least error within the rated power.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, dtype
+        As for `kf_anc`.
+    rated_power : float
+        Rated output power.
+    **budget
+        `fs`, `window_s`, `credit_s`, see `PowerBudget`.
+
+    Returns
+    -------
+    KalmanController
+        A controller named KF-PB; its `control_filter` makes the control signal, its `weights` are the estimate of the
+        unconstrained one.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import kf_pb
+    >>> kf_pb(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).name
+    'KF-PB'
+    """
+    estimator = PowerBudgetKalmanFilter(
+        n_taps,
+        state_noise=state_noise,
+        measurement_noise=measurement_noise,
+        rated_power=rated_power,
+        initial_variance=initial_variance,
+        dtype=dtype,
+        **budget,
     )
     return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)

@@ -1,0 +1,364 @@
+"""The power budget: from the unconstrained control filter to the best one within the rated power, sample by sample.
+
+`allocation` solves for the control filter; here stand the three things it has to be told: the correlations of the
+recent signals, how loud they are becoming, and what the power spent so far has left to spend.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ._compile import compiled, part
+from ._validate import as_count, as_number, as_positive, as_signal
+from .allocation import WORK_ROWS, add_scaled, constrained_filter
+from .constraint import DEFAULT_FS, SILENCE
+from .delay_lines import delay_line, newest, push
+from .kernels import FAST
+
+DEFAULT_WINDOW_S = 0.75
+DEFAULT_CREDIT_S = 0.25
+SEGMENTS = 6  # whole ones in the window; one more is being filled
+DEBT_S = 1.0  # overspending beyond this much of the rated power is forgotten, so that no burst can wind the account up
+REPAYMENT = 1.0  # 1/s: what the account holds changes the target by this share of itself
+TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
+INTERVAL = 128  # samples between two solutions; fewer at the start
+STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its standard error
+FORECAST_MOST = 4.0  # largest change of power that a trend may foretell
+
+# Rows of `correlations`: products of samples of one segment, and with samples before it; of x and of x'.
+OWN_X, OWN_XF, ACROSS_X, ACROSS_XF = range(4)
+(
+    RATED_POWER,
+    FS,
+    CREDIT,
+    SEGMENT,  # samples
+    CURRENT,  # segment that is being filled
+    TAKEN,  # samples since the control was switched on
+    WAITED,  # of these, since the last solution
+    ACCOUNT,  # seconds of rated power spent beyond what was due
+    WEIGHT,  # lambda
+) = range(9)
+
+
+class BudgetState(NamedTuple):
+    """What the compiled functions below read and advance."""
+
+    control_filter: np.ndarray  # (L,) v, which makes the control signal
+    reference: np.ndarray  # delay line of x
+    filtered: np.ndarray  # delay line of x'
+    correlations: np.ndarray  # (SEGMENTS + 1, 4, L) sums of products at lags 0 ... L - 1
+    counts: np.ndarray  # (SEGMENTS + 1,) samples in each segment
+    table: np.ndarray  # (9,) numbers named above
+    work: np.ndarray  # (WORK_ROWS + 2, L)
+
+
+@part()
+def take_correlations(budget, x, xf):
+    """Products of the newest x and x' with those before.
+
+    Those that reach back before the segment are kept apart: for the oldest segment of the window they are left out,
+    so that the sum is the correlation of a stretch of signal with zeros around it.
+    """
+    push(budget.reference, x)
+    push(budget.filtered, xf)
+    L, table = budget.control_filter.size, budget.table
+    current = int(table[CURRENT])
+    if budget.counts[current] >= table[SEGMENT]:
+        current = (current + 1) % len(budget.counts)
+        table[CURRENT], budget.counts[current] = current, 0.0
+        oldest = budget.correlations[current]
+        for row in range(4):
+            for k in range(L):
+                oldest[row, k] = 0.0
+    budget.counts[current] += 1.0
+    own = min(int(budget.counts[current]), L)
+    rows = budget.correlations[current]
+    before, filtered_before = newest(budget.reference, L), newest(budget.filtered, L)
+    add_scaled(rows[OWN_X], x, before, 0, own)
+    add_scaled(rows[OWN_XF], xf, filtered_before, 0, own)
+    if own < L:
+        add_scaled(rows[ACROSS_X], x, before, own, L)
+        add_scaled(rows[ACROSS_XF], xf, filtered_before, own, L)
+
+
+@part()
+def sum_correlations(budget, of_x, of_xf):
+    """First rows of R_x and R_x' over the window, as means."""
+    count, kept, current = 0.0, len(budget.counts), int(budget.table[CURRENT])
+    for k in range(of_x.size):
+        of_x[k] = of_xf[k] = 0.0
+    for i in range(kept):
+        rows = budget.correlations[i]
+        add_scaled(of_x, 1.0, rows[OWN_X], 0, of_x.size)
+        add_scaled(of_xf, 1.0, rows[OWN_XF], 0, of_x.size)
+        if i != (current + 1) % kept:  # the oldest segment
+            add_scaled(of_x, 1.0, rows[ACROSS_X], 0, of_x.size)
+            add_scaled(of_xf, 1.0, rows[ACROSS_XF], 0, of_x.size)
+        count += budget.counts[i]
+    for k in range(of_x.size):
+        of_x[k] /= count
+        of_xf[k] /= count
+
+
+@part()
+def level_forecast(budget, mean_power):
+    """Power of x' now over its mean in the window, where a trend stands out.
+
+    A straight line through the logarithm of the segments' powers. Its slope is shrunk by what its scatter would make
+    of a steady noise (James and Stein), so that bursts, which scatter, are averaged and a swelling noise is followed.
+    """
+    kept, current, whole = len(budget.counts), int(budget.table[CURRENT]), budget.table[SEGMENT]
+    floor = 1e-12 * mean_power
+    weight = times = levels = 0.0
+    for j in range(kept):
+        count = budget.counts[(current - j) % kept]
+        weight += count
+        times += count * _age(budget, j)
+        levels += count * _level(budget, j, floor)
+    if not (weight > 3.0 * whole and floor > SILENCE):
+        return 1.0
+    times, levels = times / weight, levels / weight
+    spread = together = scatter = 0.0
+    for j in range(kept):
+        count = budget.counts[(current - j) % kept] / whole
+        t, level = _age(budget, j) - times, _level(budget, j, floor) - levels
+        spread += count * t * t
+        together += count * t * level
+        scatter += count * level * level
+    slope = together / spread
+    error = max(scatter - slope * together, 0.0) / (weight / whole - 2.0) / spread
+    if not slope * slope > STEADY * error:
+        return 1.0
+    change = slope * (1.0 - STEADY * error / (slope * slope)) * -times  # from the window's middle to now
+    return math.exp(min(max(change, -math.log(FORECAST_MOST)), math.log(FORECAST_MOST)))
+
+
+@part(forceinline=True)
+def _age(budget, j):
+    """Middle of the j-th newest segment, in segments from now (negative)."""
+    newest_part = budget.counts[int(budget.table[CURRENT])] / budget.table[SEGMENT]
+    return -0.5 * newest_part if j == 0 else -newest_part - j + 0.5
+
+
+@part(forceinline=True)
+def _level(budget, j, floor):
+    """Logarithm of the power of x' in the j-th newest segment."""
+    i = (int(budget.table[CURRENT]) - j) % len(budget.counts)
+    return math.log(budget.correlations[i, OWN_XF, 0] / budget.counts[i] + floor) if budget.counts[i] > 0.0 else 0.0
+
+
+@part()
+def target_power(budget, forecast):
+    """Power to solve for: the rated one, corrected by the account, over what the level is forecast to become."""
+    table = budget.table
+    share = math.exp(-REPAYMENT * table[ACCOUNT])
+    return table[RATED_POWER] * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
+
+
+@compiled()
+def allocate(budget, w):
+    """Set the control filter for the estimate w."""
+    of_x, of_xf, work = budget.work[WORK_ROWS], budget.work[WORK_ROWS + 1], budget.work[:WORK_ROWS]
+    sum_correlations(budget, of_x, of_xf)
+    if not of_x[0] > SILENCE:  # nothing was heard: nothing to go by
+        return
+    power = target_power(budget, level_forecast(budget, of_xf[0]))
+    budget.table[WEIGHT] = constrained_filter(of_x, of_xf, w, power, budget.table[WEIGHT], work, budget.control_filter)
+
+
+@part()
+def advance_budget(budget, w, x, xf, y):
+    """Take a sample: reference, filtered reference and emitted control signal; solve anew where it is time to."""
+    table = budget.table
+    take_correlations(budget, x, xf)
+    spent = table[ACCOUNT] + (y * y / table[RATED_POWER] - 1.0) / table[FS]
+    table[ACCOUNT] = min(max(spent, -table[CREDIT]), DEBT_S)
+    table[TAKEN] += 1.0
+    table[WAITED] += 1.0
+    # At the start, when the estimate grows fast, after every eighth part of the time so far.
+    if table[WAITED] >= min(float(INTERVAL), 1.0 + table[TAKEN] // 8.0):
+        table[WAITED] = 0.0
+        allocate(budget, w)
+
+
+@part(fastmath=FAST)
+def control_sample(budget, x):
+    """v' x(n) for a reference sample that the budget has not taken yet."""
+    v, before = budget.control_filter, newest(budget.reference, budget.control_filter.size)
+    total = v[0] * x
+    for k in range(1, v.size):
+        total += v[k] * before[k - 1]
+    return total
+
+
+class PowerBudget:
+    r"""Best use of a rated power: the control filter for an estimate of the unconstrained one.
+
+    An adaptive filter estimates the control filter w that would be best without a limit; every few milliseconds the
+    budget finds the one that is best within the power,
+
+    .. math:: (R_{x'} + \lambda R_x) v = R_{x'} \hat w, \qquad v^T R_x v = \rho
+
+    which minimises :math:`E[e^2]` subject to :math:`E[y^2] \le \rho`: for any :math:`v`,
+    :math:`E[e^2] = E[e^2]_{min} + (v - w)^T R_{x'} (v - w)`, so that w is all the disturbance has to say, and an
+    unbiased estimate of it may stand in its place (certainty equivalence: the error is quadratic in w). The
+    constraint never enters the estimate. What it would have to forget when the level changes, it never learnt.
+
+    Three things decide :math:`\lambda`:
+
+    - the correlations of reference and filtered reference over a sliding window that forgets completely;
+    - how loud the signal is becoming: where a straight line through the logarithm of the power stands out of its
+      scatter, the level it leads to now takes the place of the window's mean;
+    - an account of the power spent beyond what was due, in seconds of rated power, kept between -`credit_s` and 1 s:
+      the target is the rated power times ``exp(-account / 1 s)``. It makes the mean power exact, and repays what a
+      surprise has overspent.
+
+    Parameters
+    ----------
+    n_taps : int
+        Taps L of the control filter.
+    rated_power : float
+        Rated output power (mean square of the control signal).
+    fs : float, default 16000
+        Sample rate in Hz.
+    window_s : float, default 0.75
+        Length of the window of the correlations in seconds; at least 6 n_taps samples are taken.
+    credit_s : float, default 0.25
+        Seconds of rated power that may be saved up while the noise needs less.
+
+    Raises
+    ------
+    ValueError
+        A power, rate or time that is not positive and finite, fewer than one tap.
+
+    See Also
+    --------
+    PowerBudgetKalmanFilter : a filterpy filter with a budget.
+
+    References
+    ----------
+    M. D. Hebden, "An algorithm for minimization using exact second derivatives", AERE report TP515, 1973, and
+    J. J. More, D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4(3), 1983, for the search
+    for lambda. N. Levinson, "The Wiener RMS error criterion in filter design and prediction", J. Math. Phys. 25, 1947.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import PowerBudget
+    >>> budget = PowerBudget(n_taps=2, rated_power=0.25)
+    >>> for x in np.random.default_rng(0).standard_normal(16000):
+    ...     y = budget.control_signal(x)
+    ...     budget.advance(x, x, weights=[1.0, 0.0])  # the secondary path is a wire: x' = x
+    >>> budget.control_filter.round(1) + 0.0  # half the amplitude: a quarter of the power
+    array([0.5, 0. ])
+    """
+
+    def __init__(
+        self,
+        n_taps: int,
+        rated_power: float,
+        *,
+        fs: float = DEFAULT_FS,
+        window_s: float = DEFAULT_WINDOW_S,
+        credit_s: float = DEFAULT_CREDIT_S,
+    ) -> None:
+        n_taps = as_count(n_taps, "n_taps")
+        rated_power = as_positive(rated_power, "rated_power")
+        self.fs = as_positive(fs, "fs", unit="Hz")
+        self.window_s = as_positive(window_s, "window_s", unit="s")
+        self.credit_s = as_positive(credit_s, "credit_s", unit="s")
+        table = np.zeros(9)
+        table[RATED_POWER], table[FS], table[CREDIT] = rated_power, self.fs, self.credit_s
+        table[SEGMENT] = max(round(self.window_s * self.fs / SEGMENTS), n_taps)
+        self._state = BudgetState(
+            control_filter=np.zeros(n_taps),
+            reference=delay_line(n_taps),
+            filtered=delay_line(n_taps),
+            correlations=np.zeros((SEGMENTS + 1, 4, n_taps)),
+            counts=np.zeros(SEGMENTS + 1),
+            table=table,
+            work=np.zeros((WORK_ROWS + 2, n_taps)),
+        )
+
+    @property
+    def state(self) -> BudgetState:
+        """Arrays that the compiled loop advances."""
+        return self._state
+
+    @property
+    def n_taps(self) -> int:
+        """Taps of the control filter."""
+        return self._state.control_filter.size
+
+    @property
+    def rated_power(self) -> float:
+        """Rated output power; can be assigned."""
+        return float(self._state.table[RATED_POWER])
+
+    @rated_power.setter
+    def rated_power(self, value: float) -> None:
+        self._state.table[RATED_POWER] = as_positive(value, "rated_power")
+
+    @property
+    def control_filter(self) -> np.ndarray:
+        """Control filter v, (L,), newest-sample tap first, zero before the first sample; a copy."""
+        return self._state.control_filter.copy()
+
+    @property
+    def power_weight(self) -> float:
+        """Weight lambda of the control power; 0 where the estimate fits the budget as it is."""
+        return float(self._state.table[WEIGHT])
+
+    @property
+    def account_s(self) -> float:
+        """Power spent beyond what was due, in seconds of rated power; negative: credit."""
+        return float(self._state.table[ACCOUNT])
+
+    def control_signal(self, reference: float) -> float:
+        """Control signal y(n) for the reference x(n); call it before `advance` with the same x(n)."""
+        return float(control_sample(self._state, self._sample(reference, "reference")))
+
+    def advance(
+        self, reference: float, filtered_reference: float, weights: Any, control_signal: float | None = None
+    ) -> None:
+        """Take one sample, and solve for the control filter where it is time to.
+
+        Parameters
+        ----------
+        reference, filtered_reference : float
+            Newest reference x(n) and filtered reference x'(n).
+        weights : array_like
+            (L,) estimate of the unconstrained control filter.
+        control_signal : float, optional
+            What was emitted, where it is not `control_signal` of the same reference: after a limiter, say.
+
+        Raises
+        ------
+        ValueError
+            NaN, Inf, a sample whose square overflows, weights of another length. Nothing was changed.
+        """
+        w = as_signal(weights, "weights", length=self.n_taps)
+        y = self.checked_sample(reference, filtered_reference, control_signal)
+        advance_budget(self._state, w, float(reference), float(filtered_reference), y)
+
+    def checked_sample(self, reference: Any, filtered_reference: Any, control_signal: Any = None) -> float:
+        """Control signal of a sample that `advance` would take, or the error it would raise."""
+        self._sample(filtered_reference, "filtered_reference")
+        return (
+            self.control_signal(reference) if control_signal is None else self._sample(control_signal, "control_signal")
+        )
+
+    def listen(self, reference: float, filtered_reference: float) -> None:
+        """Take one sample into the correlations only, while the control is switched off."""
+        sample = self._sample(reference, "reference"), self._sample(filtered_reference, "filtered_reference")
+        take_correlations(self._state, *sample)
+
+    @staticmethod
+    def _sample(value: Any, name: str) -> float:
+        number = as_number(value, name)
+        if math.isinf(number * number):
+            raise ValueError(f"{name} must have a finite square, got {number:g}")
+        return number
