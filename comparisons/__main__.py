@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from . import broadband, duct, tonal
+from . import broadband, constraint, duct, tonal
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
@@ -22,6 +22,7 @@ STUDIES: dict[str, Study] = {
     "duct": (duct.main, duct.planned_runs),
     "duct-measured": (duct.main_measured, duct.planned_runs),
 }
+FURTHER: dict[str, Study] = {"constraint": (constraint.main, constraint.planned_runs)}  # beyond the paper
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,14 +34,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "studies",
         nargs="*",
         metavar="STUDY",
-        help=f"{', '.join(STUDIES)}, by default all of these; or speed, which times the filter against others",
+        help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
+        "or speed, which times the filter against others",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    unknown = [name for name in options.studies if name not in (*STUDIES, SPEED)]
+    known = (*STUDIES, *FURTHER, SPEED)
+    unknown = [name for name in options.studies if name not in known]
     if unknown:
-        parser.error(f"no study called {', '.join(unknown)}; there are {', '.join((*STUDIES, SPEED))}")
+        parser.error(f"no study called {', '.join(unknown)}; there are {', '.join(known)}")
     if SPEED in options.studies and len(options.studies) > 1:
         parser.error(f"{SPEED} runs alone: other work beside it would be timed too")
 
@@ -56,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _speed(parser, options)
     began = time.perf_counter()
     reports: list[StudyReport] = []
-    chosen = {name: STUDIES[name] for name in options.studies or STUDIES}
+    chosen = {name: (STUDIES | FURTHER)[name] for name in options.studies or STUDIES}
     planned = sum(planned_runs() for _, planned_runs in chosen.values())
     with tqdm(total=planned, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
         runs = Runs(bar)

@@ -43,6 +43,30 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Table:
+    """A table, the end of its file's name and its caption: cells are text or numbers, of which page and terminal show
+    four digits and the file all."""
+
+    stem: str
+    caption: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str | float]]
+
+    def __post_init__(self) -> None:
+        _require_stem(self.stem, "stem")
+
+    @property
+    def cells(self) -> list[list[str]]:
+        """The cells as they are shown."""
+        return [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in self.rows]
+
+    @property
+    def numbers(self) -> set[int]:
+        """Columns of numbers."""
+        return {i for row in self.rows for i, cell in enumerate(row) if not isinstance(cell, str)}
+
+
+@dataclass(frozen=True)
 class FigureItem:
     """A figure, the end of its files' name, and its caption. pyplot is made to forget it: a report holds many."""
 
@@ -97,6 +121,10 @@ class StudyReport:
         Sounds; the first one, the disturbance, sets the level.
     notes : list of str
         Further remarks.
+    tables : list of Table
+        Further tables in their order.
+    claims : str
+        Whose claims the verdicts are on.
 
     Raises
     ------
@@ -116,6 +144,8 @@ class StudyReport:
     figures: list[FigureItem] = field(default_factory=list)
     sounds: list[Sound] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    claims: str = "Claims of the paper"
 
     def __post_init__(self) -> None:
         _require_stem(self.name, "name")
@@ -125,7 +155,7 @@ class StudyReport:
                     f"algorithms[{algorithm!r}] holds unknown figures of merit {sorted(unknown)}; "
                     f"known are {', '.join(FIGURES_OF_MERIT)}; further ones belong into extra"
                 )
-        for items, kind in ((self.figures, "figures"), (self.sounds, "sounds")):
+        for items, kind in ((self.figures, "figures"), (self.sounds, "sounds"), (self.tables, "tables")):
             require_different((item.stem for item in items), f"{kind} of study {self.name!r}")
 
     @property
@@ -209,6 +239,11 @@ def count_of_claims(studies: Sequence[StudyReport]) -> str:
 def figure_file(folder: Path, study: StudyReport, item: FigureItem) -> Path:
     """Path of a figure, without its suffix."""
     return folder / "figures" / f"{study.name}-{item.stem}"
+
+
+def table_file(folder: Path, study: StudyReport, table: Table) -> Path:
+    """Path of a table."""
+    return folder / "tables" / f"{study.name}-{table.stem}.csv"
 
 
 def sound_file(folder: Path, study: StudyReport, sound: Sound) -> Path:

@@ -17,6 +17,7 @@ from ._items import (
     FigureItem,
     Sound,
     StudyReport,
+    Table,
     Verdict,
     cells,
     count_of_claims,
@@ -135,7 +136,7 @@ def _overview(studies: Sequence[StudyReport]) -> str:
         for study in studies
         for verdict in study.verdicts
     ]
-    table = _table(["Study", "Claim of the paper", "Verdict", "Measured"], rows, "stack")
+    table = _table(["Study", "Claim", "Verdict", "Measured"], rows, "stack")
     return (
         f'<section id="verdicts">\n<h2>Verdicts</h2>\n<p>{escape(count_of_claims(studies))}.</p>\n{table}</section>\n'
     )
@@ -158,7 +159,8 @@ def _study(study: StudyReport, folder: Path) -> str:
         f'<section id="{study.name}">\n<h2>{escape(study.title)}</h2>\n<p>{escape(study.summary)}</p>',
         f"<p>Rated power ρ<sub>o</sub> = {study.rated_power:g}, sampling frequency {study.fs:g} Hz.</p>",
         *_part("Results", _table(["Algorithm", *headings], merit, numbers=range(1, len(headings) + 1))),
-        *_part("Claims of the paper", _table(["Claim", "Verdict", "Measured"], verdicts, "stack")),
+        *_part(study.claims, _table(["Claim", "Verdict", "Measured"], verdicts, "stack")),
+        *(part for table in study.tables for part in _part(escape(table.caption), _shown(table))),
         *_part("Notes", _group(notes, "<ul>", "</ul>")),
         *_part("Figures", _group(figures, '<div class="figures">', "</div>")),
         *_part("Sounds", _group(_sounds(study, folder), f'{_ONE_SCALE}<div class="sounds">', "</div>"), "audio"),
@@ -170,6 +172,11 @@ def _study(study: StudyReport, folder: Path) -> str:
             f"<details><summary>Further figures, as in results.json</summary><pre>{escape(text)}</pre></details>"
         )
     return "\n".join([*parts, "</section>\n"])
+
+
+def _shown(table: Table) -> str:
+    rows = [[escape(cell) for cell in row] for row in table.cells]
+    return _table(table.headings, rows, numbers=table.numbers)
 
 
 def _part(heading: str, content: str, kind: str = "") -> list[str]:

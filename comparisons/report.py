@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
 import tempfile
@@ -19,6 +21,7 @@ from ._items import (
     Parameter,
     Sound,
     StudyReport,
+    Table,
     Verdict,
     cells,
     count_of_claims,
@@ -26,6 +29,7 @@ from ._items import (
     loudness,
     require_different,
     sound_file,
+    table_file,
 )
 from ._page import page
 
@@ -35,6 +39,7 @@ __all__ = [
     "Parameter",
     "Sound",
     "StudyReport",
+    "Table",
     "Verdict",
     "prepare_folder",
     "results_table",
@@ -61,7 +66,7 @@ def prepare_folder(folder: str | os.PathLike[str]) -> Path:
 
 
 def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str]) -> Path:
-    """Write report.html, results.json, figures/ and audio/ into a folder.
+    """Write report.html, results.json, figures/, audio/ and, where there are any, tables/ into a folder.
 
     Parameters
     ----------
@@ -96,6 +101,9 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
             save_figure(item.figure, figure_file(path, study, item))
         for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
             write_wav(sound_file(path, study, sound), clipped, study.fs, peak=peak)
+        for table in study.tables:
+            prepare_folder(path / "tables")
+            _write_csv(table_file(path, study, table), table)
     _replace(path / "results.json", results + "\n")
     _replace(path / "report.html", page(studies, path))
     return path / "report.html"
@@ -126,17 +134,41 @@ def results_table(studies: Sequence[StudyReport]) -> str:
         rows = [[heading for heading, _ in COLUMNS], [unit for _, unit in COLUMNS]]
         rows += [cells(figures, study.rated_power) for figures in study.algorithms.values()]
         names = ["", "", *study.algorithms]
-        widths = [max(len(row[i]) for row in rows) for i in range(len(COLUMNS))]
-        name_width = max(len(name) for name in names)
-        for name, row in zip(names, rows, strict=True):
-            columns = [name.ljust(name_width), *(cell.rjust(width) for cell, width in zip(row, widths, strict=True))]
-            lines.append("  ".join(columns).rstrip())
+        if study.algorithms:
+            lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})
         for verdict in study.verdicts:
             mark = "REPRODUCED" if verdict.reproduced else "NOT REPRODUCED"
             lines += textwrap.wrap(verdict.claim, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(verdict.figure, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
+        for table in study.tables:
+            lines += ["", table.caption, *_aligned(table)]
         lines.append("")
     return "\n".join([*lines, count_of_claims(studies)])
+
+
+def _aligned(table: Table) -> list[str]:
+    """A table's lines for a terminal."""
+    return _columns([list(table.headings), *table.cells], set(range(len(table.headings))) - table.numbers)
+
+
+def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+    """Lines of cells in columns, those of `left` aligned to the left."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _write_csv(path: Path, table: Table) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table.headings)
+    writer.writerows(table.rows)
+    _replace(path, text.getvalue())
 
 
 def _replace(path: Path, text: str) -> None:

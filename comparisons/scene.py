@@ -19,6 +19,8 @@ from kfopc_filterpy import (
     convergence_time_s,
     kf_anc,
     kf_opc,
+    kf_opc_repaired,
+    kf_pb,
     measurement_noise_from_run,
     noise_reduction_db,
     nse_db,
@@ -35,7 +37,8 @@ from kfopc_filterpy.controllers.base import FilteredReferenceController
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
 KALMAN = ("KF-ANC", "KF-OPC")
-CONSTRAINED = ("KF-OPC", "MOV-FxLMS")
+BUDGETED = ("KF-OPC repaired", "KF-PB")  # Kalman filters whose runs share no gains
+CONSTRAINED = ("KF-OPC", "MOV-FxLMS", *BUDGETED)
 BUDGET = 1.02  # a constrained method keeps its budget with up to this share of the rated power
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
 # noise is no random walk any more but recursive least squares that never forgets, which a stationary noise would always
@@ -185,19 +188,28 @@ def make_scene(
     )
 
 
-def make_controller(scene: Scene, algorithm: str, setting: float) -> FilteredReferenceController:
-    """A fresh controller. `setting` is r E[x'^2] / q for the Kalman filters, mu L E[x'^2] for the LMS family."""
+def make_controller(
+    scene: Scene, algorithm: str, setting: float, *, amplifier: Amplifier | None = None
+) -> FilteredReferenceController:
+    """A fresh controller. `setting` is r E[x'^2] / q for the Kalman filters, mu L E[x'^2] for the LMS family.
+
+    `amplifier` is the one that a Kalman filter's disturbance estimate knows.
+    """
     scaled = setting_value(scene, algorithm, setting)
-    if algorithm in KALMAN:
+    if algorithm in (*KALMAN, *BUDGETED):
         kalman: dict[str, Any] = {
             "state_noise": scaled,
             "measurement_noise": scene.measurement_noise,
             "initial_variance": scene.initial_variance,
+            "amplifier": amplifier,
         }
         if algorithm == "KF-ANC":
             return kf_anc(scene.n_taps, scene.secondary, **kalman)
-        kalman |= {"rated_power": scene.rated_power, "fs": scene.fs, "power_memory": POWER_MEMORY_S}
-        return kf_opc(scene.n_taps, scene.secondary, **kalman)
+        kalman |= {"rated_power": scene.rated_power, "fs": scene.fs}
+        if algorithm == "KF-PB":
+            return kf_pb(scene.n_taps, scene.secondary, **kalman)
+        make = kf_opc if algorithm == "KF-OPC" else kf_opc_repaired
+        return make(scene.n_taps, scene.secondary, power_memory=POWER_MEMORY_S, **kalman)
     if algorithm == "FxLMS":
         return FxLMS(scene.n_taps, scene.secondary, step_size=scaled)
     return MOVFxLMS(
@@ -212,7 +224,7 @@ def make_controller(scene: Scene, algorithm: str, setting: float) -> FilteredRef
 
 def setting_value(scene: Scene, algorithm: str, setting: float) -> float:
     """State noise r or step size mu of a setting, in the scene's units."""
-    if algorithm in KALMAN:
+    if algorithm in (*KALMAN, *BUDGETED):
         return setting * scene.measurement_noise / scene.filtered_power
     return setting / (scene.n_taps * scene.filtered_power)
 
@@ -247,7 +259,7 @@ def run_settings(
 
 def grid(algorithm: str) -> tuple[float, ...]:
     """Settings that are tried for an algorithm."""
-    return STATE_NOISE_GRID if algorithm in KALMAN else STEP_SIZE_GRID
+    return STATE_NOISE_GRID if algorithm in (*KALMAN, *BUDGETED) else STEP_SIZE_GRID
 
 
 def tuning_runs(algorithms: Sequence[str] = ALGORITHMS, seeds: int = 1) -> int:

@@ -15,7 +15,18 @@ if TYPE_CHECKING:
     from .amplifiers import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier
     from .causality import CausalityMargin, causality_margin
     from .constraint import OutputPowerConstraint
-    from .controllers import Controller, FxLMS, KalmanController, MOVFxLMS, kf_anc, kf_opc
+    from .controllers import (
+        Controller,
+        FxLMS,
+        KalmanController,
+        LimitedController,
+        MOVFxLMS,
+        RepairedKFOPC,
+        kf_anc,
+        kf_opc,
+        kf_opc_repaired,
+        kf_pb,
+    )
     from .datasets import DataUnavailableError, MeasuredDuct, load_measured_duct
     from .duct import DuctPaths, duct_paths
     from .identification import (
@@ -26,6 +37,7 @@ if TYPE_CHECKING:
         misalignment_db,
         modelling_error_db,
     )
+    from .limiter import OutputLimiter
     from .measurement_noise import measurement_noise_from_residual, measurement_noise_from_run
     from .metrics import (
         clipped_fraction,
@@ -44,6 +56,9 @@ if TYPE_CHECKING:
         secondary_path_gain,
     )
     from .paths import bandpass_path, fir_path, path_taps, perturbed_path
+    from .power_bound import PowerConstrainedWiener, power_constrained_solution, power_constrained_wiener
+    from .power_budget import PowerBudget
+    from .power_budget_filter import PowerBudgetKalmanFilter
     from .random_walk import RandomWalkKFOPC
     from .rated_power import RatedPower, required_rated_power
     from .recordings import read_mat_vector, read_wav, write_wav
@@ -51,7 +66,8 @@ if TYPE_CHECKING:
     from .signals import band_limited_noise, compressor_noise, level_jump, scaled_to_power, tone
     from .simulation import SimulationResult, simulate
     from .spectra import coherence_and_gain, harmonics_db, power_spectrum_db
-    from .wiener import WienerSolution, coherence_bound, power_constrained_solution, wiener_solution
+    from .varying_noise import bursty_noise, looped, swelling
+    from .wiener import WienerSolution, coherence_bound, wiener_solution
 
 __version__ = "0.1.0"
 
@@ -65,19 +81,26 @@ _LAZY = {
     "HardClipAmplifier": "amplifiers",
     "IdentificationResult": "identification",
     "KalmanController": "controllers",
+    "LimitedController": "controllers",
     "LinearAmplifier": "amplifiers",
     "MOVFxLMS": "controllers",
     "MeasuredDuct": "datasets",
+    "OutputLimiter": "limiter",
     "OutputPowerConstraint": "constraint",
     "PathEstimate": "identification",
+    "PowerBudget": "power_budget",
+    "PowerBudgetKalmanFilter": "power_budget_filter",
+    "PowerConstrainedWiener": "power_bound",
     "RandomWalkKFOPC": "random_walk",
     "RatedPower": "rated_power",
+    "RepairedKFOPC": "controllers",
     "SimulationResult": "simulation",
     "SoftSaturationAmplifier": "amplifiers",
     "WienerSolution": "wiener",
     "achieved_band": "path_analysis",
     "band_limited_noise": "signals",
     "bandpass_path": "paths",
+    "bursty_noise": "varying_noise",
     "causality_margin": "causality",
     "clipped_fraction": "metrics",
     "coherence_and_gain": "spectra",
@@ -93,8 +116,11 @@ _LAZY = {
     "identify_secondary_path": "identification",
     "kf_anc": "controllers",
     "kf_opc": "controllers",
+    "kf_opc_repaired": "controllers",
+    "kf_pb": "controllers",
     "level_jump": "signals",
     "load_measured_duct": "datasets",
+    "looped": "varying_noise",
     "measurement_noise_from_residual": "measurement_noise",
     "measurement_noise_from_run": "measurement_noise",
     "misalignment_db": "identification",
@@ -107,7 +133,8 @@ _LAZY = {
     "peak_control_signal": "metrics",
     "perturbed_path": "paths",
     "phase_error": "path_analysis",
-    "power_constrained_solution": "wiener",
+    "power_constrained_solution": "power_bound",
+    "power_constrained_wiener": "power_bound",
     "power_spectrum_db": "spectra",
     "read_mat_vector": "recordings",
     "read_wav": "recordings",
@@ -116,6 +143,7 @@ _LAZY = {
     "secondary_path_gain": "path_analysis",
     "simulate": "simulation",
     "simulate_scenarios": "scenarios",
+    "swelling": "varying_noise",
     "tone": "signals",
     "wiener_solution": "wiener",
     "write_wav": "recordings",

@@ -24,6 +24,7 @@ COMPILED_MODULES = (
     "constraint",
     "delay_lines",
     "kernels",
+    "limiter",
     "lockstep",
     "loop",
     "power_budget",

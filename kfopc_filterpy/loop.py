@@ -9,7 +9,7 @@ a short control filter takes longer than the arithmetic.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +40,7 @@ from .kernels import (
     project_covariance,
     update_weights,
 )
+from .limiter import LimiterState, limit_sample
 from .power_budget import WEIGHT, BudgetState, advance_budget, take_correlations
 from .repairs import RepairState, advance_repair, gain_samples, measurement_factor, output_gain
 
@@ -65,7 +66,7 @@ class ControllerState(NamedTuple):
     last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
     budget: BudgetState | None = None  # of a power-budgeted filter
     repair: RepairState | None = None  # of KF-OPC with its gain repaired
-    limiter: Any = None
+    limiter: LimiterState | None = None
 
 
 @part(forceinline=True)
@@ -93,7 +94,7 @@ def limited(limiter, y):
     """y after the limiter, if there is one."""
     if limiter is None:
         return y
-    return y  # TODO
+    return limit_sample(limiter, y)
 
 
 @part(forceinline=True)

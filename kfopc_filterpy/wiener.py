@@ -5,6 +5,7 @@ Sign convention: ``e = d - s*y``, ``y = w*x`` with the newest sample first, filt
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,14 +16,16 @@ from .paths import path_taps
 
 # Eigenvalues of the correlation matrix below this share of the largest count as zero: such directions of
 # the weights (every one but two for a tone) get no weight, which is the minimum-norm solution.
-_RANK_TOLERANCE = 1e-11
+RANK_TOLERANCE = 1e-11
+# A control power that exceeds the rated one by no more than this share of it keeps within it.
+BUDGET_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True)
 class WienerSolution:
     """A fixed control filter and what it does to the signals it was made of.
 
-    All powers are mean squares over the samples at which both delay lines are full.
+    All powers are mean squares over the samples the filter was fitted to.
 
     Attributes
     ----------
@@ -34,6 +37,8 @@ class WienerSolution:
         Mean square of the anti-noise s*y.
     disturbance_power : float
         Mean square of the disturbance d.
+    error_power : float
+        Mean square of the error e = d - s*y.
     noise_reduction_db : float
         ``-10 log10(E[e^2] / E[d^2])``, at most 300 dB.
     """
@@ -42,6 +47,7 @@ class WienerSolution:
     control_power: float
     antinoise_power: float
     disturbance_power: float
+    error_power: float
     noise_reduction_db: float
 
 
@@ -76,7 +82,7 @@ def wiener_solution(
         Ridge λ, relative to the power of the filtered reference.
     control_penalty : float
         Penalty γ on the control power, the optimum that MOV-FxLMS steers to. With the γ at which
-        `control_power` equals the rated power, it is the least error any linear filter reaches within it.
+        `control_power` equals the rated power, it is the least error any filter of the length reaches within it.
 
     Returns
     -------
@@ -90,7 +96,7 @@ def wiener_solution(
 
     See Also
     --------
-    power_constrained_solution : finds the γ for a rated power.
+    kfopc_filterpy.power_bound.power_constrained_solution : finds the γ for a rated power.
 
     References
     ----------
@@ -106,61 +112,10 @@ def wiener_solution(
     >>> solution.weights.round(6) + 0.0
     array([0. , 0. , 0.5, 0. ])
     """
-    problem = _Problem(reference, disturbance, secondary_path, n_taps)
-    ridge = as_nonnegative(regularization, "regularization")
-    return problem.solve(as_nonnegative(control_penalty, "control_penalty"), ridge)
-
-
-def power_constrained_solution(
-    reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, rated_power: float
-) -> WienerSolution:
-    """Least-squares control filter whose control power does not exceed the rated power.
-
-    Finds the penalty γ of `wiener_solution` at which the control power is `rated_power`, to 1e-6 of it; γ
-    is zero where the filter needs less. No linear filter of this length has a smaller error within the
-    power.
-
-    Parameters
-    ----------
-    reference, disturbance, secondary_path, n_taps
-        As in `wiener_solution`.
-    rated_power : float
-        Rated power (mean square of the control signal).
-
-    Returns
-    -------
-    WienerSolution
-        Weights, powers and noise reduction.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `wiener_solution`, or `rated_power` is not positive.
-
-    Examples
-    --------
-    >>> x = np.random.default_rng(0).standard_normal(2000)
-    >>> solution = power_constrained_solution(x, 2 * x, [1.0], n_taps=1, rated_power=1.0)
-    >>> round(solution.control_power, 4)
-    1.0
-    """
-    rated_power = as_positive(rated_power, "rated_power")
-    problem = _Problem(reference, disturbance, secondary_path, n_taps)
-    if problem.control_power(0.0) <= rated_power:
-        return problem.solve(0.0)
-    # The control power falls as the penalty grows: bracket it, then bisect on a logarithmic scale.
-    low = high = problem.filtered_power / problem.reference_power
-    while problem.control_power(high) > rated_power:
-        high *= 10
-    while problem.control_power(low) < rated_power:
-        low /= 10
-    while high > low * (1 + 1e-9):
-        middle = float(np.sqrt(low * high))
-        power = problem.control_power(middle)
-        if abs(power - rated_power) <= 1e-6 * rated_power:
-            return problem.solve(middle)
-        low, high = (middle, high) if power > rated_power else (low, middle)
-    return problem.solve(high)
+    stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
+    ridge = as_nonnegative(regularization, "regularization") * stretch.filtered_power
+    penalty = as_nonnegative(control_penalty, "control_penalty")
+    return stretch.solution(stretch.correlations().weights(penalty, ridge))
 
 
 @dataclass(frozen=True)
@@ -236,67 +191,110 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
     return CoherenceBound(frequencies, -10 * np.log10(remaining), float(-10 * np.log10(overall)))
 
 
-class _Problem:
-    """Correlations of one least-squares problem, from which it is solved for any penalty."""
+@dataclass(frozen=True)
+class Correlations:
+    """Correlations of a stretch of signals: R_x', R_x and r, from which it is solved for any penalty."""
 
-    def __init__(self, reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> None:
-        from scipy.signal import lfilter
+    filtered: np.ndarray
+    reference: np.ndarray
+    cross: np.ndarray
 
-        self.x = as_signal(reference, "reference")
-        self.d = as_signal(disturbance, "disturbance", length=self.x.size)
-        self.taps = path_taps(secondary_path, name="secondary_path")
-        self.n_taps = as_count(n_taps, "n_taps")
-        # From this sample on the delay lines of w and s are full.
-        self.start = self.n_taps + self.taps.size - 2
-        if self.x.size < self.start + self.n_taps:
-            raise ValueError(
-                f"reference must have at least {self.start + self.n_taps} samples for {self.n_taps} control "
-                f"and {self.taps.size} path taps, got {self.x.size}; use a longer signal or fewer taps"
-            )
-        filtered = lfilter(self.taps, 1.0, self.x)
-        self.reference_power = _power(self.x, self.start)
-        self.filtered_power = _power(filtered, self.start)
-        if self.filtered_power == 0 or _power(self.d, self.start) == 0:
-            silent = "disturbance" if self.filtered_power else "reference through secondary_path"
-            raise ValueError(f"{silent} must not be silent: there is nothing to solve for")
-        self.filtered_matrix = correlation_matrix(filtered, self.n_taps, self.start)
-        self.reference_matrix = correlation_matrix(self.x, self.n_taps, self.start)
-        self.cross = cross_correlation(self.d, filtered, self.n_taps, self.start)
-
-    def weights(self, penalty: float, ridge: float = 0.0) -> np.ndarray:
-        matrix = self.filtered_matrix + penalty * self.reference_matrix
-        matrix.flat[:: self.n_taps + 1] += ridge * self.filtered_power
+    def weights(self, penalty: float = 0.0, ridge: float = 0.0) -> np.ndarray:
+        """Minimum-norm solution of (R_x' + penalty R_x + ridge I) w = r."""
+        matrix = self.filtered + penalty * self.reference
+        matrix.flat[:: self.cross.size + 1] += ridge
         return minimum_norm_solve(matrix, self.cross)
 
-    def control_power(self, penalty: float) -> float:
-        weights = self.weights(penalty)
-        return float(weights @ self.reference_matrix @ weights)
 
-    def solve(self, penalty: float, ridge: float = 0.0) -> WienerSolution:
-        from scipy.signal import lfilter
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Samples that a control filter is fitted to. x and x' begin `n_taps` - 1 samples early: the delay line's past."""
 
-        weights = self.weights(penalty, ridge)
-        control = lfilter(weights, 1.0, self.x)
-        antinoise = lfilter(self.taps, 1.0, control)
-        disturbance_power = _power(self.d, self.start)
-        residual = max(_power(self.d - antinoise, self.start) / disturbance_power, 1e-30)
+    x: np.ndarray
+    filtered: np.ndarray
+    d: np.ndarray
+    n_taps: int
+
+    @property
+    def filtered_power(self) -> float:
+        """Power of the filtered reference."""
+        return mean_square(self.filtered[self.n_taps - 1 :])
+
+    def part(self, start: int, stop: int) -> Stretch:
+        """The samples from `start` to before `stop`, with the past they really have."""
+        with_past = slice(start, stop + self.n_taps - 1)
+        return Stretch(self.x[with_past], self.filtered[with_past], self.d[start:stop], self.n_taps)
+
+    def correlations(self) -> Correlations:
+        start = self.n_taps - 1
+        return Correlations(
+            correlation_matrix(self.filtered, self.n_taps, start),
+            correlation_matrix(self.x, self.n_taps, start),
+            cross_correlation(self.d, self.filtered),
+        )
+
+    def control_signal(self, weights: np.ndarray) -> np.ndarray:
+        return np.convolve(self.x, weights, mode="valid")
+
+    def antinoise(self, weights: np.ndarray) -> np.ndarray:
+        return np.convolve(self.filtered, weights, mode="valid")
+
+    def solution(self, weights: np.ndarray) -> WienerSolution:
+        """What the weights do. The powers are those of the signals, not of the matrices, which keep fewer digits."""
+        antinoise = self.antinoise(weights)
+        error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
         return WienerSolution(
             weights=weights,
-            control_power=_power(control, self.start),
-            antinoise_power=_power(antinoise, self.start),
+            control_power=mean_square(self.control_signal(weights)),
+            antinoise_power=mean_square(antinoise),
             disturbance_power=disturbance_power,
-            noise_reduction_db=float(-10 * np.log10(residual)),
+            error_power=error_power,
+            noise_reduction_db=reduction_db(error_power, disturbance_power),
         )
 
 
-def _power(signal: np.ndarray, start: int) -> float:
-    return float(np.mean(signal[start:] ** 2))
+def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> Stretch:
+    """Check the signals and take the samples at which the delay lines of w and s are full."""
+    from scipy.signal import lfilter
+
+    x = as_signal(reference, "reference")
+    d = as_signal(disturbance, "disturbance", length=x.size)
+    taps = path_taps(secondary_path, name="secondary_path")
+    n_taps = as_count(n_taps, "n_taps")
+    past = taps.size - 1
+    start = past + n_taps - 1
+    if x.size < start + n_taps:
+        raise ValueError(
+            f"reference must have at least {start + n_taps} samples for {n_taps} control "
+            f"and {taps.size} path taps, got {x.size}; use a longer signal or fewer taps"
+        )
+    return require_sound(Stretch(x[past:], lfilter(taps, 1.0, x)[past:], d[start:], n_taps))
 
 
-def cross_correlation(output: np.ndarray, regressor: np.ndarray, n_taps: int, start: int) -> np.ndarray:
-    """Mean of ``output[n] * regressor[n - j]`` over n >= start, for j = 0 ... n_taps - 1."""
-    n = output.size
-    return np.array([output[start:] @ regressor[start - j : n - j] for j in range(n_taps)]) / (n - start)
+def require_sound(stretch: Stretch) -> Stretch:
+    """Return the stretch, or raise ValueError where nothing is to be heard of x' or d."""
+    filtered_power = stretch.filtered_power
+    if filtered_power == 0 or mean_square(stretch.d) == 0:
+        silent = "disturbance" if filtered_power else "reference through secondary_path"
+        raise ValueError(f"{silent} must not be silent: there is nothing to solve for")
+    return stretch
+
+
+def mean_square(signal: np.ndarray) -> float:
+    """Power of a signal."""
+    return float(np.mean(signal**2))
+
+
+def reduction_db(error_power: float, disturbance_power: float) -> float:
+    """Noise reduction in dB, at most 300; NaN where there is no disturbance to reduce."""
+    if disturbance_power == 0:
+        return float("nan")
+    return float(-10 * np.log10(max(error_power / disturbance_power, 1e-30)))
+
+
+def cross_correlation(output: np.ndarray, regressor: np.ndarray) -> np.ndarray:
+    """Mean of the products of `output` and each delay of `regressor`, which begins that many samples early."""
+    return np.correlate(regressor, output, mode="valid")[::-1] / output.size
 
 
 def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarray:
@@ -306,7 +304,7 @@ def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarra
     """
     count = signal.size - start
     matrix = np.zeros((n_taps, n_taps))
-    matrix[0] = cross_correlation(signal, signal, n_taps, start)
+    matrix[0] = cross_correlation(signal[start:], signal[start - n_taps + 1 :])
     entering = signal[start - n_taps + 1 : start][::-1]  # signal[start - 1], signal[start - 2], ...
     leaving = signal[::-1][: n_taps - 1]  # signal[-1], signal[-2], ...
     for i in range(n_taps - 1):
@@ -318,5 +316,47 @@ def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarra
 def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric positive semidefinite system, leaving out directions without energy."""
     values, vectors = np.linalg.eigh(matrix)
-    kept = values > _RANK_TOLERANCE * values[-1]
+    kept = values > RANK_TOLERANCE * values[-1]
     return vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
+
+
+def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
+    """Weights of the least error within the power, and their λ."""
+    energies = float(np.trace(correlations.filtered)), float(np.trace(correlations.reference))
+    weights, penalty = np.zeros(stretch.n_taps), 0.0
+    if min(energies) > 0:
+        weights, penalty = _least_penalty(correlations, energies[0] / energies[1], rated_power)
+    if penalty == 0:
+        # Of the filters without a penalty, the one of least norm is `wiener_solution`'s. Where the path lets nothing
+        # through it may need more power than is needed, and more than there is.
+        free = correlations.weights()
+        if mean_square(stretch.control_signal(free)) <= rated_power:
+            weights = free
+    return weights, penalty
+
+
+def _least_penalty(correlations: Correlations, balance: float, rated_power: float) -> tuple[np.ndarray, float]:
+    """Weights that solve (R_x' + λ R_x) w = r, and the least λ >= 0 that brings their power down to the rated one.
+
+    In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), where both matrices may be
+    singular, each λ costs a sum over the taps instead of the solution of a system.
+    """
+    values, vectors = np.linalg.eigh(correlations.filtered + balance * correlations.reference)
+    kept = values > RANK_TOLERANCE * values[-1]
+    whitened = vectors[:, kept] / np.sqrt(values[kept])
+    share, turn = np.linalg.eigh(whitened.T @ correlations.filtered @ whitened)
+    heard = share > RANK_TOLERANCE  # of the others the path lets nothing through: they cost power for nothing
+    basis, share = whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
+    cross = basis.T @ correlations.cross
+
+    # Newton's method on 1/sqrt(power), which rises with λ, is concave and all but a straight line: from λ = 0 the steps
+    # approach the root from below, a dozen at most where the eigenvalues span twelve decades (Moré and Sorensen).
+    penalty = 0.0
+    while True:
+        stiffness = share + penalty * (1 - share)
+        parts = cross / stiffness
+        power = float((1 - share) @ parts**2) / balance
+        if power <= rated_power * (1 + BUDGET_TOLERANCE):
+            return basis @ parts, penalty * balance
+        slope = float((1 - share) ** 2 @ (parts**2 / stiffness)) / balance
+        penalty += power / slope * (math.sqrt(power / rated_power) - 1)

@@ -7,13 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy.paths import bandpass_path, path_taps
-from kfopc_filterpy.wiener import (
-    coherence_bound,
-    correlation_matrix,
-    minimum_norm_solve,
-    power_constrained_solution,
-    wiener_solution,
-)
+from kfopc_filterpy.power_bound import power_constrained_solution
+from kfopc_filterpy.wiener import coherence_bound, correlation_matrix, minimum_norm_solve, wiener_solution
 
 FS = 16000.0
 

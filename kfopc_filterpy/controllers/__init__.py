@@ -3,12 +3,14 @@
 from .base import Controller
 from .fxlms import FxLMS, MOVFxLMS
 from .kalman import KalmanController, kf_anc, kf_opc, kf_pb
+from .limited import LimitedController
 from .repaired import RepairedKFOPC, kf_opc_repaired
 
 __all__ = [
     "Controller",
     "FxLMS",
     "KalmanController",
+    "LimitedController",
     "MOVFxLMS",
     "RepairedKFOPC",
     "kf_anc",

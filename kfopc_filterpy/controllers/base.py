@@ -13,6 +13,7 @@ from ..block import OpenBlock
 from ..constraint import OutputPowerConstraint
 from ..delay_lines import delay_line, newest
 from ..kernels import new_covariance
+from ..limiter import OutputLimiter
 from ..loop import (
     DISTURBANCE_IN,
     LISTENING,
@@ -73,6 +74,8 @@ class FilteredReferenceController:
         Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
     constraint : OutputPowerConstraint, optional
         What keeps the powers and the factor; by default the powers are followed with the factor held at 1.
+    limiter : OutputLimiter, optional
+        What the control signal goes through, see `limiter`.
     """
 
     name = "controller"
@@ -85,6 +88,7 @@ class FilteredReferenceController:
         settings: list[float],
         amplifier: Amplifier | None = None,
         constraint: OutputPowerConstraint | None = None,
+        limiter: OutputLimiter | None = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         secondary = path_taps(secondary_path, name="secondary_path")
@@ -109,6 +113,22 @@ class FilteredReferenceController:
             last=np.zeros(3),
         )
         self._y = 0.0
+        self.limiter = limiter
+
+    @property
+    def limiter(self) -> OutputLimiter | None:
+        """Limiter that the control signal goes through, or None; can be assigned, an object of its own.
+
+        The disturbance is estimated from what the limiter puts out, so that the adaptation stays right.
+        """
+        return self._limiter
+
+    @limiter.setter
+    def limiter(self, value: OutputLimiter | None) -> None:
+        if value is not None and not isinstance(value, OutputLimiter):
+            raise TypeError(f"limiter must be an OutputLimiter or None, got {value!r}")
+        self._limiter = value
+        self._state = self._state._replace(limiter=None if value is None else value.state)
 
     @property
     def weights(self) -> np.ndarray:
@@ -193,6 +213,7 @@ class FilteredReferenceController:
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError where the secondary path or the memory of the powers is of another sample rate."""
         rates = {"secondary path": self._path_fs, "power memory": self._powers_fs if self.rated_power else None}
+        rates["limiter"] = None if self.limiter is None else self.limiter.fs
         for name, rate in rates.items():
             if rate is not None and abs(rate - fs) > 1e-9 * fs:
                 raise ValueError(

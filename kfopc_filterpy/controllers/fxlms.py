@@ -7,6 +7,7 @@ from typing import Any
 from .._validate import as_positive
 from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..limiter import OutputLimiter
 from ..loop import LMS
 from .base import FilteredReferenceController
 
@@ -22,6 +23,8 @@ class FxLMS(FilteredReferenceController):
         Estimated secondary path, taps or an FIR system.
     step_size : float
         Step size mu, above zero.
+    limiter : OutputLimiter, optional
+        Limiter of its own that the control signal goes through.
 
     Raises
     ------
@@ -46,8 +49,10 @@ class FxLMS(FilteredReferenceController):
 
     name = "FxLMS"
 
-    def __init__(self, n_taps: int, secondary_path: Any, *, step_size: float) -> None:
-        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")])
+    def __init__(
+        self, n_taps: int, secondary_path: Any, *, step_size: float, limiter: OutputLimiter | None = None
+    ) -> None:
+        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], limiter=limiter)
 
     @property
     def step_size(self) -> float:
@@ -74,6 +79,8 @@ class MOVFxLMS(FilteredReferenceController):
         As `fs`, `memory`, `window`, `secondary_path_gain` of `OutputPowerConstraint`.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
+    limiter : OutputLimiter, optional
+        As for `FxLMS`.
 
     Raises
     ------
@@ -110,6 +117,7 @@ class MOVFxLMS(FilteredReferenceController):
         power_window: str = "exponential",
         secondary_path_gain: float | None = None,
         amplifier: Amplifier | None = None,
+        limiter: OutputLimiter | None = None,
     ) -> None:
         constraint = OutputPowerConstraint(
             rated_power,
@@ -118,7 +126,7 @@ class MOVFxLMS(FilteredReferenceController):
             memory=power_memory,
             window=power_window,
         )
-        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], amplifier, constraint)
+        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], amplifier, constraint, limiter)
 
     @property
     def step_size(self) -> float:

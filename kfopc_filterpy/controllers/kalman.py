@@ -14,6 +14,7 @@ from ..block import CausalBlock, OpenBlock
 from ..constraint import OutputPowerConstraint
 from ..delay_lines import latest, newest
 from ..estimator import KFOPC
+from ..limiter import OutputLimiter
 from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate
 from ..power_budget_filter import PowerBudgetKalmanFilter
 from ..random_walk import RandomWalkKFOPC
@@ -42,6 +43,8 @@ class KalmanController(FilteredReferenceController):
         to the block's end, a burst of 3 L^2 block_size flops. By default sample by sample. It counts in compiled runs
         of a filter from `KFOPC.random_walk` without fading memory; whether it is faster is the machine's matter
         (``python -m comparisons speed``).
+    limiter : OutputLimiter, optional
+        Limiter of its own that the control signal goes through: no window of it passes the limiter's rated power.
 
     Raises
     ------
@@ -70,12 +73,13 @@ class KalmanController(FilteredReferenceController):
         amplifier: Amplifier | None = None,
         name: str | None = None,
         block_size: int | None = None,
+        limiter: OutputLimiter | None = None,
     ) -> None:
         if not isinstance(estimator, KalmanFilter):
             raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
         if estimator.dim_z != 1:
             raise ValueError(f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}")
-        super().__init__(KALMAN, estimator.dim_x, secondary_path, [0.0, 0.0, 1.0], amplifier)
+        super().__init__(KALMAN, estimator.dim_x, secondary_path, [0.0, 0.0, 1.0], amplifier, limiter=limiter)
         self.estimator = estimator
         self.name = name or self._usual_name()
         size = None if block_size is None else as_count(block_size, "block_size")
@@ -219,6 +223,7 @@ def kf_anc(
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     block_size: int | None = None,
+    limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
 ) -> KalmanController:
     """KF-ANC: the Kalman filter of eq. 2-8 without a constraint.
@@ -233,6 +238,7 @@ def kf_anc(
         r, q and P(0|0), see `KFOPC.random_walk`.
     amplifier : callable, optional
     block_size : int, optional
+    limiter : OutputLimiter, optional
         See `KalmanController`.
     dtype : {numpy.float64, numpy.float32}, default numpy.float64
         See `KFOPC.random_walk`.
@@ -255,7 +261,7 @@ def kf_anc(
         initial_variance=initial_variance,
         dtype=dtype,
     )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size, limiter=limiter)
 
 
 def kf_opc(
@@ -268,6 +274,7 @@ def kf_opc(
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     block_size: int | None = None,
+    limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
     **constraint: Any,
 ) -> KalmanController:
@@ -275,7 +282,7 @@ def kf_opc(
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, dtype
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, limiter, dtype
         As for `kf_anc`.
     rated_power : float
         Rated output power rho_o.
@@ -302,7 +309,7 @@ def kf_opc(
         dtype=dtype,
         **constraint,
     )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size, limiter=limiter)
 
 
 def kf_pb(
@@ -315,6 +322,7 @@ def kf_pb(
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     block_size: int | None = None,
+    limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
     **budget: Any,
 ) -> KalmanController:
@@ -322,7 +330,7 @@ def kf_pb(
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, dtype
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, limiter, dtype
         As for `kf_anc`.
     rated_power : float
         Rated output power.
@@ -350,4 +358,4 @@ def kf_pb(
         dtype=dtype,
         **budget,
     )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size)
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size, limiter=limiter)

@@ -8,6 +8,7 @@ from .._validate import as_choice, as_number, as_positive
 from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
 from ..estimator import KFOPC
+from ..limiter import OutputLimiter
 from ..loop import ControllerState, disturbance_estimate, latest, newest
 from ..random_walk import RandomWalkKFOPC
 from ..repairs import advance_repair, gain_samples, measurement_factor, new_repair
@@ -36,13 +37,14 @@ class RepairedKFOPC(KalmanController):
         factor_at: str = "output",
         amplifier: Amplifier | None = None,
         name: str | None = None,
+        limiter: OutputLimiter | None = None,
     ) -> None:
         if not isinstance(estimator, RandomWalkKFOPC) or estimator.rated_power is not None:
             raise ValueError("estimator must be a filter of KFOPC.random_walk without a rated power of its own")
         self.gain_of = as_choice(gain_of, "gain_of", ("reference", "control"))
         self.trim_s = None if trim_s is None else as_positive(trim_s, "trim_s", unit="s")
         self.factor_at = as_choice(factor_at, "factor_at", ("measurement", "output"))
-        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name)
+        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
         self._own_constraint = constraint
         rate = 0.0 if self.trim_s is None else 1.0 / (self.trim_s * constraint.fs)
         self._state = self._state._replace(
@@ -104,6 +106,7 @@ def kf_opc_repaired(
     power_memory: float = DEFAULT_MEMORY_S,
     power_window: str = "exponential",
     amplifier: Amplifier | None = None,
+    limiter: OutputLimiter | None = None,
 ) -> RepairedKFOPC:
     r"""KF-OPC with its gain repaired: eq. 13 made to hold on paths that are not flat.
 
@@ -113,7 +116,7 @@ def kf_opc_repaired(
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter
         As for `kf_anc`.
     rated_power : float
         Rated output power.
@@ -160,4 +163,5 @@ def kf_opc_repaired(
         trim_s=trim_s,
         factor_at=factor_at,
         amplifier=amplifier,
+        limiter=limiter,
     )

@@ -1,0 +1,161 @@
+"""Paths, noises and scenes of the study of the constraint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy import (
+    DataUnavailableError,
+    PowerConstrainedWiener,
+    band_limited_noise,
+    bandpass_path,
+    bursty_noise,
+    compressor_noise,
+    duct_paths,
+    load_measured_duct,
+    looped,
+    path_taps,
+    power_constrained_wiener,
+    swelling,
+    tone,
+    wiener_solution,
+)
+
+from .scene import Scene, make_scene
+
+FS = 16000.0
+N_TAPS = 160
+SWITCH_ON_S = 0.5
+SENSOR_NOISE_DB = -40.0
+TONE_HZ = 300.0
+BAND_HZ = (100.0, 1000.0)
+SWING_DB, PERIOD_S = 6.0, 4.0
+STATIONARY = ("tone", "compressor", "band noise")
+VARYING = ("motor", "bursts", "swelling band noise")
+
+Noise = Callable[[float, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Where a case is run: a pair of paths and a noise, by name."""
+
+    path: str
+    noise: str
+
+    @property
+    def stationary(self) -> bool:
+        """Whether the noise is as loud in one second as in another."""
+        return self.noise in STATIONARY
+
+
+def paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Primary and secondary taps by name; the measured duct where it is at hand."""
+    duct = duct_paths(fs=FS)
+    pairs = {
+        "band-pass": (path_taps(bandpass_path(128)), path_taps(bandpass_path(32))),
+        "duct": (path_taps(duct.primary), path_taps(duct.secondary)),
+    }
+    measured = measured_data()
+    if measured is not None:
+        scale = np.sqrt(np.sum(measured.secondary**2))  # its scale is arbitrary: unit gain for white noise
+        pairs["measured duct"] = (measured.primary / scale, measured.secondary / scale)
+    return pairs
+
+
+def noises() -> dict[str, Noise]:
+    """Noises by name, functions of duration and seed; the motor recording where it is at hand."""
+    made: dict[str, Noise] = {
+        "tone": lambda duration, seed: tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
+        "compressor": lambda duration, seed: compressor_noise(duration, fs=FS, rng=seed),
+        "band noise": lambda duration, seed: band_limited_noise(BAND_HZ, duration, fs=FS, rng=seed),
+        "bursts": lambda duration, seed: bursty_noise(duration, fs=FS, rng=seed),
+        "swelling band noise": lambda duration, seed: swelling(
+            band_limited_noise(BAND_HZ, duration, fs=FS, rng=seed),
+            fs=FS,
+            swing_db=SWING_DB,
+            period_s=PERIOD_S,
+            phase=float(seed),
+        ),
+    }
+    measured = measured_data()
+    if measured is not None:
+        recording = measured.noise - measured.noise.mean()
+        made["motor"] = lambda duration, seed: looped(recording, duration, fs=FS, start_s=2.5 * seed)
+    return made
+
+
+@cache
+def measured_data() -> Any:
+    """The measured duct and the motor recording, None where they are not to be had."""
+    try:
+        return load_measured_duct(allow_download=True)
+    except DataUnavailableError:
+        return None
+
+
+def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray) -> Scene:
+    """Scene of one noise whose unconstrained control power is 1.
+
+    That power is of the filter that a Kalman filter without state noise would end with, ``(R_x' + q/(N P0) I) w = r``
+    over the record: without the ridge, directions that the noise hardly excites could ask for any power.
+    """
+    scene = make_scene(
+        {0: noise},
+        *pair,
+        fs=FS,
+        rated_power=1.0,
+        power_multiple=1.0,
+        n_taps=N_TAPS,
+        switch_on_s=SWITCH_ON_S,
+        sensor_noise_db=SENSOR_NOISE_DB,
+        nse_window_s=0.05,
+    )
+    x, d = scene.settled
+    ridge = scene.measurement_noise / (x.size * scene.initial_variance)
+    solution = wiener_solution(x, d, scene.secondary, N_TAPS, regularization=ridge / scene.filtered_power)
+    return louder(scene, 1.0 / np.sqrt(solution.control_power))
+
+
+def louder(scene: Scene, gain: float) -> Scene:
+    """The scene with all signals times a gain, and the measurement noise with them."""
+    return replace(
+        scene,
+        references=[gain * x for x in scene.references],
+        disturbances=[gain * d for d in scene.disturbances],
+        sensor_noise_std=gain * scene.sensor_noise_std,
+        measurement_noise=gain**2 * scene.measurement_noise,
+        wiener_control_power=gain**2 * scene.wiener_control_power,
+    )
+
+
+def bound_of(scene: Scene) -> PowerConstrainedWiener:
+    """The power-constrained Wiener solutions of a case."""
+    ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
+    return power_constrained_wiener(
+        scene.references[0],
+        scene.disturbances[0],
+        scene.secondary,
+        N_TAPS,
+        scene.rated_power,
+        fs=FS,
+        switch_on_s=SWITCH_ON_S,
+        ridge=ridge,
+    )
+
+
+def with_jump(noise: np.ndarray, gain_db: float, begin_s: float, end_s: float) -> np.ndarray:
+    """The noise, louder or softer between two times."""
+    jumped = noise.copy()
+    jumped[round(begin_s * FS) : round(end_s * FS)] *= 10 ** (gain_db / 20)
+    return jumped
+
+
+def settings(pairs: Mapping[str, Any], made: Mapping[str, Noise]) -> list[Setting]:
+    """All combinations of paths and noises."""
+    return [Setting(path, noise) for path in pairs for noise in made]
