@@ -22,7 +22,8 @@ from .kernels import FAST, copy_into, dot
 
 RIDGE = 1e-7  # of R_x'[0], on v - w: decides what no signal excites
 POWER_TOLERANCE = 0.005  # of the power that the filter is solved for
-TRIES = 12
+TRIES = 20
+NEAR = 1e-6  # of E[x'^2]/E[x^2] to its inverse: where a search may start from
 # Rows of the work array: solution and right side; the predictors of Levinson's recursion, two rows each.
 RIGHT, TOTAL, REVERSED, FORWARD, BACKWARD = 0, 1, 2, 3, 4
 WORK_ROWS = 6
@@ -104,21 +105,25 @@ def constrained_filter(of_x, of_xf, w, power, weight, work, v):
 
     `of_x`, `of_xf` are the first rows of R_x and R_x'. 1/sqrt(v' R_x v) grows with lambda and is nearly straight (for
     a flat secondary path exactly): the secular equation of trust-region methods (Hebden; More and Sorensen), solved
-    here by secants within a bracket. Where a solve fails the estimate is scaled, which keeps the power in any case.
+    here by secants within a bracket (the Illinois rule). Where that fails the estimate is scaled, which keeps the
+    power in any case, and lambda is infinite.
     """
     free = toeplitz_power(of_x, w)
     if free <= power:
         copy_into(v, w)
         return 0.0
-    goal = 1.0 / math.sqrt(power)
-    at_low = 1.0 / math.sqrt(free)
-    if not (of_xf[0] > 0.0 and of_x[0] > 0.0 and math.isfinite(of_xf[0] / of_x[0]) and math.isfinite(free)):
-        return scaled_filter(w, at_low / goal, v)
+    if not free < np.inf:
+        return scaled_filter(w, 0.0, v)
+    goal, at_low = 1.0 / math.sqrt(power), 1.0 / math.sqrt(free)
+    scale = at_low / goal
+    gain = of_xf[0] / of_x[0]
+    if not (gain > 0.0 and gain < np.inf):
+        return scaled_filter(w, scale, v)
     toeplitz_times(of_xf, w, work[RIGHT])
     add_scaled(work[RIGHT], RIDGE * of_xf[0], w, 0, w.size)
-    low, high, at_high = 0.0, np.inf, np.inf
-    if not weight > 0.0:
-        weight = of_xf[0] / of_x[0] * (goal / at_low - 1.0)
+    low, high, at_high, moved = 0.0, np.inf, np.inf, 0
+    if not (weight > NEAR * gain and weight < gain / NEAR):
+        weight = gain * (1.0 / scale - 1.0)  # exact for a flat path
     for _ in range(TRIES):
         for k in range(w.size):
             work[TOTAL, k] = of_xf[k] + weight * of_x[k]
@@ -131,17 +136,22 @@ def constrained_filter(of_x, of_xf, w, power, weight, work, v):
         if abs(reached - power) <= POWER_TOLERANCE * power:
             return weight
         at_weight = 1.0 / math.sqrt(reached)
-        slope = (at_weight - at_low) / (weight - low)
         if at_weight < goal:
-            low, at_low = weight, at_weight
+            if high == np.inf:
+                slope = (at_weight - at_low) / (weight - low)
+            elif moved < 0:
+                at_high = 0.5 * (at_high + goal)  # Illinois: an end that stays twice is moved closer
+            low, at_low, moved = weight, at_weight, -1
         else:
-            high, at_high = weight, at_weight
+            if moved > 0:
+                at_low = 0.5 * (at_low + goal)
+            high, at_high, moved = weight, at_weight, 1
         if high < np.inf:
             slope = (at_high - at_low) / (high - low)
         weight = low + (goal - at_low) / slope if slope > 0.0 else 2.0 * low
-        if not low < weight < high:
+        if not (weight > low and weight < high):
             weight = 0.5 * (low + high) if high < np.inf else 2.0 * low
-    return scaled_filter(w, (1.0 / math.sqrt(free)) / goal, v)
+    return scaled_filter(w, scale, v)
 
 
 @part()

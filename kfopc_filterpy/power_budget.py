@@ -19,13 +19,14 @@ from .delay_lines import delay_line, newest, push
 from .kernels import FAST
 
 DEFAULT_WINDOW_S = 0.75
-DEFAULT_CREDIT_S = 0.25
+DEFAULT_CREDIT_S = 0.15
 SEGMENTS = 6  # whole ones in the window; one more is being filled
 DEBT_S = 1.0  # overspending beyond this much of the rated power is forgotten, so that no burst can wind the account up
 REPAYMENT = 1.0  # 1/s: what the account holds changes the target by this share of itself
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
 INTERVAL = 128  # samples between two solutions; fewer at the start
 STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its standard error
+SHORTEST_PART = 0.25  # of a segment, for its power to count
 FORECAST_MOST = 4.0  # largest change of power that a trend may foretell
 
 # Rows of `correlations`: products of samples of one segment, and with samples before it; of x and of x'.
@@ -110,30 +111,38 @@ def level_forecast(budget, mean_power):
     A straight line through the logarithm of the segments' powers. Its slope is shrunk by what its scatter would make
     of a steady noise (James and Stein), so that bursts, which scatter, are averaged and a swelling noise is followed.
     """
-    kept, current, whole = len(budget.counts), int(budget.table[CURRENT]), budget.table[SEGMENT]
     floor = 1e-12 * mean_power
     weight = times = levels = 0.0
-    for j in range(kept):
-        count = budget.counts[(current - j) % kept]
-        weight += count
-        times += count * _age(budget, j)
-        levels += count * _level(budget, j, floor)
-    if not (weight > 3.0 * whole and floor > SILENCE):
+    for j in range(len(budget.counts)):
+        share = _share(budget, j)
+        weight += share
+        times += share * _age(budget, j)
+        levels += share * _level(budget, j, floor)
+    if not (weight > 3.0 and floor > SILENCE):
         return 1.0
     times, levels = times / weight, levels / weight
     spread = together = scatter = 0.0
-    for j in range(kept):
-        count = budget.counts[(current - j) % kept] / whole
-        t, level = _age(budget, j) - times, _level(budget, j, floor) - levels
-        spread += count * t * t
-        together += count * t * level
-        scatter += count * level * level
+    for j in range(len(budget.counts)):
+        share, t, level = _share(budget, j), _age(budget, j) - times, _level(budget, j, floor) - levels
+        spread += share * t * t
+        together += share * t * level
+        scatter += share * level * level
     slope = together / spread
-    error = max(scatter - slope * together, 0.0) / (weight / whole - 2.0) / spread
+    error = max(scatter - slope * together, 0.0) / (weight - 2.0) / spread
     if not slope * slope > STEADY * error:
         return 1.0
-    change = slope * (1.0 - STEADY * error / (slope * slope)) * -times  # from the window's middle to now
-    return math.exp(min(max(change, -math.log(FORECAST_MOST)), math.log(FORECAST_MOST)))
+    slope *= 1.0 - STEADY * error / (slope * slope)
+    mean = 0.0  # of the power along the line, over that at its middle
+    for j in range(len(budget.counts)):
+        mean += _share(budget, j) / weight * math.exp(slope * (_age(budget, j) - times))
+    return min(max(math.exp(-slope * times) / mean, 1.0 / FORECAST_MOST), FORECAST_MOST)
+
+
+@part(forceinline=True)
+def _share(budget, j):
+    """How much of the j-th newest segment is there; the very beginning of one says too little to count."""
+    count = budget.counts[(int(budget.table[CURRENT]) - j) % len(budget.counts)] / budget.table[SEGMENT]
+    return count if count >= SHORTEST_PART else 0.0
 
 
 @part(forceinline=True)
@@ -147,7 +156,9 @@ def _age(budget, j):
 def _level(budget, j, floor):
     """Logarithm of the power of x' in the j-th newest segment."""
     i = (int(budget.table[CURRENT]) - j) % len(budget.counts)
-    return math.log(budget.correlations[i, OWN_XF, 0] / budget.counts[i] + floor) if budget.counts[i] > 0.0 else 0.0
+    if not (budget.counts[i] > 0.0 and floor > 0.0):
+        return 0.0
+    return math.log(budget.correlations[i, OWN_XF, 0] / budget.counts[i] + floor)
 
 
 @part()
@@ -214,7 +225,8 @@ class PowerBudget:
       scatter, the level it leads to now takes the place of the window's mean;
     - an account of the power spent beyond what was due, in seconds of rated power, kept between -`credit_s` and 1 s:
       the target is the rated power times ``exp(-account / 1 s)``. It makes the mean power exact, and repays what a
-      surprise has overspent.
+      surprise has overspent, up to a second of rated power: a burst of hundreds of times the power is not starved for
+      afterwards.
 
     Parameters
     ----------
@@ -226,7 +238,7 @@ class PowerBudget:
         Sample rate in Hz.
     window_s : float, default 0.75
         Length of the window of the correlations in seconds; at least 6 n_taps samples are taken.
-    credit_s : float, default 0.25
+    credit_s : float, default 0.15
         Seconds of rated power that may be saved up while the noise needs less.
 
     Raises

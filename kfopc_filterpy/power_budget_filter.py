@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
 import numpy as np
 
-from .constraint import DEFAULT_FS
+from .constraint import DEFAULT_FS, OutputPowerConstraint
 from .power_budget import DEFAULT_CREDIT_S, DEFAULT_WINDOW_S, PowerBudget
 from .random_walk import RandomWalkKFOPC
 
@@ -139,16 +140,64 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         ValueError
             As `KFOPC.update`, or no reference. The filter is as it was and can go on.
         """
+        self._spend(lambda: super(PowerBudgetKalmanFilter, self).update(z, R, H), z, H, reference, control_signal)
+
+    def update_steadystate(
+        self, z: Any, *, reference: float | None = None, control_signal: float | None = None
+    ) -> None:
+        """filterpy's `update_steadystate`; see `update`."""
+        step = super().update_steadystate
+        self._spend(lambda: step(z), z, None, reference, control_signal)
+
+    def update_correlated(
+        self,
+        z: Any,
+        R: Any = None,
+        H: Any = None,
+        *,
+        reference: float | None = None,
+        control_signal: float | None = None,
+    ) -> None:
+        """filterpy's `update_correlated`; see `update`."""
+        step = super().update_correlated
+        self._spend(lambda: step(z, R, H), z, H, reference, control_signal)
+
+    def update_sequential(
+        self,
+        start: int,
+        z_i: Any,
+        R_i: Any = None,
+        H_i: Any = None,
+        *,
+        reference: float | None = None,
+        control_signal: float | None = None,
+    ) -> None:
+        """filterpy's `update_sequential` (filterpy 2.0.0); see `update`."""
+        step = super().update_sequential
+        self._spend(lambda: step(start, z_i, R_i, H_i), z_i, H_i, reference, control_signal)
+
+    def _spend(
+        self, step: Callable[[], None], z: Any, H: Any, reference: float | None, control_signal: float | None
+    ) -> None:
+        """Run filterpy's step, and let the budget follow the sample; a missed one is only the step."""
         reference = self._next_reference(z, reference)
-        if z is None:
-            super().update(None)
-            return
-        if reference is None:
-            raise ValueError("reference is missing: pass reference=, the newest reference sample x(n)")
-        newest = np.asarray(self.H if H is None else H).reshape(-1)[0]
-        emitted = self.budget.checked_sample(reference, newest, control_signal)
-        super().update(z, R, H)
-        self.budget.advance(reference, newest, self._weights(), emitted)
+        references, self._batch_references = self._batch_references, None  # this sample's is taken
+        try:
+            if z is None:
+                step()
+                return
+            if reference is None:
+                raise ValueError("reference is missing: pass reference=, the newest reference sample x(n)")
+            row = np.asarray(self.H if H is None else H)
+            newest = row.flat[0] if row.size == self.dim_x else 0.0  # the step refuses any other size
+            emitted = self.budget.checked_sample(reference, newest, control_signal)
+            step()
+            self.budget.advance(reference, newest, self._weights(), emitted)
+        finally:
+            self._batch_references = references
+
+    def _require_constraint(self, name: str) -> OutputPowerConstraint:
+        raise ValueError(f"{name} has no part in a power budget, which goes by the signals' correlations")
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy has a budget of its own."""

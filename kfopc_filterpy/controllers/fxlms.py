@@ -126,7 +126,9 @@ class MOVFxLMS(FilteredReferenceController):
             memory=power_memory,
             window=power_window,
         )
-        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], amplifier, constraint, limiter)
+        super().__init__(
+            LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], amplifier, constraint, limiter
+        )
 
     @property
     def step_size(self) -> float:
