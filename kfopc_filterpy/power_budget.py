@@ -18,16 +18,19 @@ from .constraint import DEFAULT_FS, SILENCE
 from .delay_lines import delay_line, newest, push
 from .kernels import FAST
 
-DEFAULT_WINDOW_S = 0.75
-DEFAULT_CREDIT_S = 0.15
-SEGMENTS = 6  # whole ones in the window; one more is being filled
+DEFAULT_WINDOW_S = 1.25
+DEFAULT_CREDIT_S = 0.1
+SHORT, USUAL, LONG = 6, 10, 24  # whole segments that a window may have; one more is being filled
+AGREEMENT = 1.0  # of the variance that chance gives to the difference of two windows' levels: above, they differ
 DEBT_S = 1.0  # overspending beyond this much of the rated power is forgotten, so that no burst can wind the account up
-REPAYMENT = 1.0  # 1/s: what the account holds changes the target by this share of itself
+REPAYMENT = 3.0  # 1/s: what the account holds changes the target by this share of itself
+PATIENCE = 6.0  # 1/s: and by less, the more of the account chance makes
+LARGEST_CHANCE_S = 0.5
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
 INTERVAL = 128  # samples between two solutions; fewer at the start
 STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its standard error
 SHORTEST_PART = 0.25  # of a segment, for its power to count
-FORECAST_MOST = 4.0  # largest change of power that a trend may foretell
+FORECAST_LEAST, FORECAST_MOST = 0.5, 4.0  # change of power that a trend may foretell; see choose_span for the lower
 
 # Rows of `correlations`: products of samples of one segment, and with samples before it; of x and of x'.
 OWN_X, OWN_XF, ACROSS_X, ACROSS_XF = range(4)
@@ -41,7 +44,9 @@ OWN_X, OWN_XF, ACROSS_X, ACROSS_XF = range(4)
     WAITED,  # of these, since the last solution
     ACCOUNT,  # seconds of rated power spent beyond what was due
     WEIGHT,  # lambda
-) = range(9)
+    SPAN,  # segments in the window
+    CHANCE,  # seconds of rated power: standard deviation that the scatter of levels gives to the account in a second
+) = range(11)
 
 
 class BudgetState(NamedTuple):
@@ -50,9 +55,9 @@ class BudgetState(NamedTuple):
     control_filter: np.ndarray  # (L,) v, which makes the control signal
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x'
-    correlations: np.ndarray  # (SEGMENTS + 1, 4, L) sums of products at lags 0 ... L - 1
-    counts: np.ndarray  # (SEGMENTS + 1,) samples in each segment
-    table: np.ndarray  # (9,) numbers named above
+    correlations: np.ndarray  # (LONG + 1, 4, L) sums of products at lags 0 ... L - 1
+    counts: np.ndarray  # (LONG + 1,) samples in each segment
+    table: np.ndarray  # (11,) numbers named above
     work: np.ndarray  # (WORK_ROWS + 2, L)
 
 
@@ -86,16 +91,62 @@ def take_correlations(budget, x, xf):
 
 
 @part()
+def choose_span(budget):
+    """Set the window: long where the level is the same as of late but for chance, short where it has risen.
+
+    Chance is the scatter of neighbouring segments' powers (von Neumann): bursts, which come and go, are averaged over
+    long; of a swelling noise neighbours are alike, and any difference between the means of two windows counts. (A rule of
+    intersecting confidence intervals, after Goldenshluger and Nemirovski.) That the noise has become softer is believed
+    more slowly than that it has become louder: a pause between bursts is no reason to spend more on the next one.
+    """
+    table = budget.table
+    table[SPAN], table[CHANCE] = USUAL, 0.0
+    usual, variance, _ = _mean_level(budget, USUAL)
+    if not usual > SILENCE:
+        return
+    chance = math.sqrt(2.0 * SHORT * variance * table[SEGMENT] / table[FS])
+    table[CHANCE] = min(chance, LARGEST_CHANCE_S)
+    short, short_variance, _ = _mean_level(budget, SHORT)
+    long, long_variance, segments = _mean_level(budget, LONG)
+    if short > usual and math.log(short / usual) ** 2 > AGREEMENT * (short_variance + variance):
+        table[SPAN] = SHORT
+    elif segments >= 0.8 * LONG and math.log(long / usual) ** 2 <= AGREEMENT * (long_variance + variance):
+        table[SPAN] = LONG
+
+
+@part()
+def _mean_level(budget, span):
+    """Mean power of x' in the newest segments, its relative variance by chance, and how many they are."""
+    total = weight = differences = count = 0.0
+    last = -1.0
+    for j in range(span + 1):
+        share = _share(budget, j)
+        if share > 0.0:
+            power = _power(budget, j)
+            weight += share
+            total += share * power
+            if last >= 0.0:
+                differences += (power - last) ** 2
+                count += 1.0
+            last = power
+    if not total > 0.0:
+        return 0.0, 0.0, 0.0
+    mean = total / weight
+    return mean, 0.5 * (differences / mean) / mean / max(count, 1.0) / max(weight, 1.0), weight
+
+
+@part()
 def sum_correlations(budget, of_x, of_xf):
     """First rows of R_x and R_x' over the window, as means."""
-    count, kept, current = 0.0, len(budget.counts), int(budget.table[CURRENT])
+    count, kept, span, current = 0.0, len(budget.counts), int(budget.table[SPAN]), int(budget.table[CURRENT])
     for k in range(of_x.size):
         of_x[k] = of_xf[k] = 0.0
-    for i in range(kept):
+    for j in range(span + 1):
+        i = (current - j) % kept
         rows = budget.correlations[i]
         add_scaled(of_x, 1.0, rows[OWN_X], 0, of_x.size)
         add_scaled(of_xf, 1.0, rows[OWN_XF], 0, of_x.size)
-        if i != (current + 1) % kept:  # the oldest segment
+        if j < span:  # the oldest segment knows nothing before it
             add_scaled(of_x, 1.0, rows[ACROSS_X], 0, of_x.size)
             add_scaled(of_xf, 1.0, rows[ACROSS_XF], 0, of_x.size)
         count += budget.counts[i]
@@ -111,31 +162,34 @@ def level_forecast(budget, mean_power):
     A straight line through the logarithm of the segments' powers. Its slope is shrunk by what its scatter would make
     of a steady noise (James and Stein), so that bursts, which scatter, are averaged and a swelling noise is followed.
     """
-    floor = 1e-12 * mean_power
+    floor, segments = 1e-12 * mean_power, int(budget.table[SPAN]) + 1
     weight = times = levels = 0.0
-    for j in range(len(budget.counts)):
+    for j in range(segments):
         share = _share(budget, j)
-        weight += share
-        times += share * _age(budget, j)
-        levels += share * _level(budget, j, floor)
+        if share > 0.0:
+            weight += share
+            times += share * _age(budget, j)
+            levels += share * math.log(_power(budget, j) + floor)
     if not (weight > 3.0 and floor > SILENCE):
         return 1.0
     times, levels = times / weight, levels / weight
     spread = together = scatter = 0.0
-    for j in range(len(budget.counts)):
-        share, t, level = _share(budget, j), _age(budget, j) - times, _level(budget, j, floor) - levels
-        spread += share * t * t
-        together += share * t * level
-        scatter += share * level * level
+    for j in range(segments):
+        share = _share(budget, j)
+        if share > 0.0:
+            t, level = _age(budget, j) - times, math.log(_power(budget, j) + floor) - levels
+            spread += share * t * t
+            together += share * t * level
+            scatter += share * level * level
     slope = together / spread
     error = max(scatter - slope * together, 0.0) / (weight - 2.0) / spread
     if not slope * slope > STEADY * error:
         return 1.0
     slope *= 1.0 - STEADY * error / (slope * slope)
     mean = 0.0  # of the power along the line, over that at its middle
-    for j in range(len(budget.counts)):
+    for j in range(segments):
         mean += _share(budget, j) / weight * math.exp(slope * (_age(budget, j) - times))
-    return min(max(math.exp(-slope * times) / mean, 1.0 / FORECAST_MOST), FORECAST_MOST)
+    return min(max(math.exp(-slope * times) / mean, FORECAST_LEAST), FORECAST_MOST)
 
 
 @part(forceinline=True)
@@ -153,19 +207,23 @@ def _age(budget, j):
 
 
 @part(forceinline=True)
-def _level(budget, j, floor):
-    """Logarithm of the power of x' in the j-th newest segment."""
+def _power(budget, j):
+    """Power of x' in the j-th newest segment, of which some is there."""
     i = (int(budget.table[CURRENT]) - j) % len(budget.counts)
-    if not (budget.counts[i] > 0.0 and floor > 0.0):
-        return 0.0
-    return math.log(budget.correlations[i, OWN_XF, 0] / budget.counts[i] + floor)
+    return budget.correlations[i, OWN_XF, 0] / budget.counts[i]
 
 
 @part()
 def target_power(budget, forecast):
-    """Power to solve for: the rated one, corrected by the account, over what the level is forecast to become."""
+    """Power to solve for: the rated one, corrected by the account, over what the level is forecast to become.
+
+    Debt is repaid at once, the more patiently the more of it chance makes; of credit, half of what chance makes in a
+    second is left to even out by itself: to chase chance would cost noise reduction.
+    """
     table = budget.table
-    share = math.exp(-REPAYMENT * table[ACCOUNT])
+    account, chance = table[ACCOUNT], table[CHANCE]
+    excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
+    share = math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
     return table[RATED_POWER] * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
 
 
@@ -173,6 +231,7 @@ def target_power(budget, forecast):
 def allocate(budget, w):
     """Set the control filter for the estimate w."""
     of_x, of_xf, work = budget.work[WORK_ROWS], budget.work[WORK_ROWS + 1], budget.work[:WORK_ROWS]
+    choose_span(budget)
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # nothing was heard: nothing to go by
         return
@@ -186,7 +245,7 @@ def advance_budget(budget, w, x, xf, y):
     table = budget.table
     take_correlations(budget, x, xf)
     spent = table[ACCOUNT] + (y * y / table[RATED_POWER] - 1.0) / table[FS]
-    table[ACCOUNT] = min(max(spent, -table[CREDIT]), DEBT_S)
+    table[ACCOUNT] = min(max(spent, -table[CREDIT] - table[CHANCE]), DEBT_S)
     table[TAKEN] += 1.0
     table[WAITED] += 1.0
     # At the start, when the estimate grows fast, after every eighth part of the time so far.
@@ -220,13 +279,14 @@ class PowerBudget:
 
     Three things decide :math:`\lambda`:
 
-    - the correlations of reference and filtered reference over a sliding window that forgets completely;
+    - the correlations of reference and filtered reference over a sliding window that forgets completely: 1.25 s long,
+      0.75 s where the noise has become louder, 3 s where its level is the same but for chance;
     - how loud the signal is becoming: where a straight line through the logarithm of the power stands out of its
       scatter, the level it leads to now takes the place of the window's mean;
-    - an account of the power spent beyond what was due, in seconds of rated power, kept between -`credit_s` and 1 s:
-      the target is the rated power times ``exp(-account / 1 s)``. It makes the mean power exact, and repays what a
-      surprise has overspent, up to a second of rated power: a burst of hundreds of times the power is not starved for
-      afterwards.
+    - an account of the power spent beyond what was due, in seconds of rated power: the target is the rated power times
+      ``exp(-3 excess / (1 + 6 chance))``. It makes the mean power exact, and repays what a surprise has overspent, up to
+      a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
+      to the account within a second; it adds to the credit, and half of it does not count as excess.
 
     Parameters
     ----------
@@ -238,7 +298,7 @@ class PowerBudget:
         Sample rate in Hz.
     window_s : float, default 0.75
         Length of the window of the correlations in seconds; at least 6 n_taps samples are taken.
-    credit_s : float, default 0.15
+    credit_s : float, default 0.1
         Seconds of rated power that may be saved up while the noise needs less.
 
     Raises
@@ -252,7 +312,8 @@ class PowerBudget:
 
     References
     ----------
-    M. D. Hebden, "An algorithm for minimization using exact second derivatives", AERE report TP515, 1973, and
+    A. Goldenshluger, A. Nemirovski, "On spatially adaptive estimation of nonparametric regression", Math. Methods
+    Statist. 6, 1997, for the window. M. D. Hebden, "An algorithm for minimization using exact second derivatives", AERE report TP515, 1973, and
     J. J. More, D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4(3), 1983, for the search
     for lambda. N. Levinson, "The Wiener RMS error criterion in filter design and prediction", J. Math. Phys. 25, 1947.
 
@@ -282,15 +343,16 @@ class PowerBudget:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.window_s = as_positive(window_s, "window_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
-        table = np.zeros(9)
+        table = np.zeros(11)
         table[RATED_POWER], table[FS], table[CREDIT] = rated_power, self.fs, self.credit_s
-        table[SEGMENT] = max(round(self.window_s * self.fs / SEGMENTS), n_taps)
+        table[SEGMENT] = max(round(self.window_s * self.fs / USUAL), n_taps)
+        table[SPAN] = USUAL
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(n_taps),
             filtered=delay_line(n_taps),
-            correlations=np.zeros((SEGMENTS + 1, 4, n_taps)),
-            counts=np.zeros(SEGMENTS + 1),
+            correlations=np.zeros((LONG + 1, 4, n_taps)),
+            counts=np.zeros(LONG + 1),
             table=table,
             work=np.zeros((WORK_ROWS + 2, n_taps)),
         )
