@@ -42,6 +42,12 @@ class Parameter:
     chosen: str
 
 
+def _shown(cell: str | float) -> str:
+    if isinstance(cell, str):
+        return cell
+    return "–" if np.isnan(cell) else f"{cell:.4g}"
+
+
 @dataclass(frozen=True)
 class Table:
     """A table, the end of its file's name and its caption: cells are text or numbers, of which page and terminal show
@@ -54,11 +60,16 @@ class Table:
 
     def __post_init__(self) -> None:
         _require_stem(self.stem, "stem")
+        for row in self.rows:
+            if len(row) != len(self.headings):
+                raise ValueError(
+                    f"rows must have {len(self.headings)} cells, one for each heading, got {len(row)}: {row}"
+                )
 
     @property
     def cells(self) -> list[list[str]]:
         """The cells as they are shown."""
-        return [[cell if isinstance(cell, str) else f"{cell:.4g}" for cell in row] for row in self.rows]
+        return [[_shown(cell) for cell in row] for row in self.rows]
 
     @property
     def numbers(self) -> set[int]:

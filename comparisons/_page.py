@@ -159,7 +159,7 @@ def _study(study: StudyReport, folder: Path) -> str:
         f'<section id="{study.name}">\n<h2>{escape(study.title)}</h2>\n<p>{escape(study.summary)}</p>',
         f"<p>Rated power ρ<sub>o</sub> = {study.rated_power:g}, sampling frequency {study.fs:g} Hz.</p>",
         *_part("Results", _table(["Algorithm", *headings], merit, numbers=range(1, len(headings) + 1))),
-        *_part(study.claims, _table(["Claim", "Verdict", "Measured"], verdicts, "stack")),
+        *_part(escape(study.claims), _table(["Claim", "Verdict", "Measured"], verdicts, "stack")),
         *(part for table in study.tables for part in _part(escape(table.caption), _shown(table))),
         *_part("Notes", _group(notes, "<ul>", "</ul>")),
         *_part("Figures", _group(figures, '<div class="figures">', "</div>")),

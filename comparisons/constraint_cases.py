@@ -23,7 +23,6 @@ from kfopc_filterpy import (
     power_constrained_wiener,
     swelling,
     tone,
-    wiener_solution,
 )
 
 from .scene import Scene, make_scene
@@ -116,10 +115,7 @@ def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray) -> Scene:
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=0.05,
     )
-    x, d = scene.settled
-    ridge = scene.measurement_noise / (x.size * scene.initial_variance)
-    solution = wiener_solution(x, d, scene.secondary, N_TAPS, regularization=ridge / scene.filtered_power)
-    return louder(scene, 1.0 / np.sqrt(solution.control_power))
+    return louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
 
 
 def louder(scene: Scene, gain: float) -> Scene:

@@ -102,7 +102,7 @@ def convergence_times(
     kept: Sequence[dict[str, tuple[np.ndarray, np.ndarray]]],
 ) -> dict[str, float | None]:
     """Convergence times in seconds of the runs that `run_case` kept, the NSE over 50 ms pooled over seeds."""
-    times = {}
+    times: dict[str, float | None] = {}
     for name in ("KF-ANC", "KF-PB"):
         errors, disturbances = (np.array([one[name][i] for one in kept]) for i in (0, 1))
         times[name] = convergence_time_s(errors, disturbances, FS, window_s=0.05)

@@ -14,6 +14,7 @@ from ._validate import as_count, as_generator, as_nonnegative, as_positive, as_s
 from .amplifiers import Amplifier, compiled_parameters
 from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
+from .controllers.limited import LimitedController
 from .delay_lines import delay_line
 from .loop import (
     AMPLIFIED,
@@ -206,7 +207,7 @@ def simulate(
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.size)
     plant = _plant(secondary_path, feedback_path, amplifier, fs)
-    if isinstance(controller, FilteredReferenceController):
+    if isinstance(controller, FilteredReferenceController | LimitedController):
         controller.require_sample_rate(fs)
     weights = _weight_rows(x.size - on, controller, every)
     if on:

@@ -123,6 +123,8 @@ def swelling(signal: Any, *, fs: float, swing_db: float = 6.0, period_s: float =
     40.0
     """
     samples = as_signal(signal, "signal")
+    if not samples.any():
+        raise ValueError("signal must not be all zeros: silence has no level to swing")
     turn = 2 * np.pi / (as_positive(period_s, "period_s", unit="s") * as_positive(fs, "fs", unit="Hz"))
     level_db = as_nonnegative(swing_db, "swing_db", unit="dB") * np.sin(
         turn * np.arange(samples.size) + as_number(phase, "phase")
@@ -142,7 +144,7 @@ def looped(recording: Any, duration_s: float, *, fs: float, start_s: float = 0.0
     fs : float
         Sample rate in Hz.
     start_s : float, default 0
-        Where in the recording to begin, taken modulo its length.
+        Where in the recording to begin, taken modulo its length less the cross-fade.
 
     Returns
     -------

@@ -1,5 +1,6 @@
-"""The report: strict JSON, a page that needs no other file, sounds of one scale, refusals."""
+"""The report: strict JSON, a page that needs no other file, sounds of one scale, tables, refusals."""
 
+import csv
 import json
 import re
 from html.parser import HTMLParser
@@ -10,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from comparisons import report
-from comparisons.report import FigureItem, Parameter, Sound, StudyReport, Verdict, results_table, write_report
+from comparisons.report import FigureItem, Parameter, Sound, StudyReport, Table, Verdict, results_table, write_report
 from kfopc_filterpy.recordings import read_wav
 
 FS = 8000.0
@@ -189,6 +190,72 @@ def test_table_for_the_terminal():
     assert max(map(len, lines)) <= 120
 
 
+POWERS = Table(
+    "powers",
+    "Powers < 1 & more",
+    ["paths", "noise, of <kind>", "power"],
+    [["duct", 'tone "300"', 0.123456789], ["band-pass", "diverged", np.float64(1e6)], ["duct", 7.0, 3]],
+)
+EMPTY = Table("none", "Nothing to show", ["paths", "power"], [])
+
+
+def test_a_table_on_the_page(tmp_path):
+    study = _study(tables=[POWERS, EMPTY])
+    source = write_report([study, _study("duct")], tmp_path).read_text(encoding="utf-8")
+    assert "<kind>" not in source
+    part = source.split("Powers &lt; 1 &amp; more</h3>")
+    assert len(part) == 2  # one heading: the other study has no table
+    table = part[1].split("</table>")[0]
+    rows = [re.findall(r'<t[hd] class="(\w+)">(.*?)</t[hd]>', row) for row in table.split("<tr>")[1:]]
+    assert [[text for _, text in row] for row in rows] == [
+        ["paths", "noise, of &lt;kind&gt;", "power"],
+        ["duct", "tone &quot;300&quot;", "0.1235"],
+        ["band-pass", "diverged", "1e+06"],
+        ["duct", "7", "3"],
+    ]
+    assert all([kind for kind, _ in row] == ["value", "number", "number"] for row in rows)  # of numbers where one is
+    assert source.index("Claims of the paper</h3>") < source.index("Powers &lt; 1") < source.index("Notes</h3>")
+    assert "Nothing to show" not in source
+    assert "Powers < 1 & more" in _Links(source).text
+
+
+def test_a_table_for_the_terminal():
+    lines = results_table([_study(tables=[POWERS])]).splitlines()
+    begin = lines.index(POWERS.caption)
+    assert lines[begin - 1] == ""
+    assert lines[begin + 1 : begin + 5] == [  # text to the left, columns with a number in them to the right
+        "paths      noise, of <kind>   power",
+        'duct             tone "300"  0.1235',
+        "band-pass          diverged   1e+06",
+        "duct                      7       3",
+    ]
+    assert lines[-1] == "1 of 2 claims reproduced"
+
+
+def test_a_table_as_a_file_has_all_digits(tmp_path):
+    write_report([_study(tables=[POWERS, EMPTY]), _study("duct")], tmp_path)
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["tonal-none.csv", "tonal-powers.csv"]
+    with (tmp_path / "tables" / "tonal-powers.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["paths", "noise, of <kind>", "power"]
+    assert rows[1:] == [
+        ["duct", 'tone "300"', "0.123456789"],
+        ["band-pass", "diverged", "1000000.0"],
+        ["duct", "7.0", "3"],
+    ]
+    assert (tmp_path / "tables" / "tonal-none.csv").read_bytes() == b"paths,power\n"
+
+
+def test_without_tables_there_is_no_folder_of_tables(written):
+    assert sorted(path.name for path in written.iterdir()) == ["audio", "figures", "report.html", "results.json"]
+
+
+def test_whose_claims_the_verdicts_are_on(tmp_path):
+    source = write_report([_study(claims="Aims"), _study("duct")], tmp_path).read_text(encoding="utf-8")
+    headings = re.findall(r"<h3[^>]*>(Aims|Claims of the paper)</h3>", source)
+    assert headings == ["Aims", "Claims of the paper"]
+
+
 def test_figures_held_for_the_report_are_unknown_to_pyplot():
     for i in range(25):  # pyplot warns from 21 open figures on
         FigureItem(f"f{i}", "", plt.subplots()[0])
@@ -206,6 +273,10 @@ def test_refusals_say_what_was_wrong(tmp_path):
         Sound("a b", "", D)
     with pytest.raises(ValueError, match="figures of study 'tonal' must have different names, got a twice"):
         _study(figures=[FigureItem("a", "", _figure()), FigureItem("a", "", _figure())])
+    with pytest.raises(ValueError, match="tables of study 'tonal' must have different names, got powers twice"):
+        _study(tables=[POWERS, EMPTY, POWERS])
+    with pytest.raises(ValueError, match=r"stem must be lower-case letters.*got '../powers'"):
+        Table("../powers", "", [], [])
     with pytest.raises(ValueError, match=r"algorithms\['KF-ANC'\] holds unknown figures of merit \['loudness'\]"):
         _study(algorithms={"KF-ANC": {"loudness": 1.0}})
     with pytest.raises(TypeError, match=r"study 'tonal', 'extra', 'path' must hold numbers.*got PosixPath|WindowsPath"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ..limiter import OutputLimiter
 from .base import Controller, FilteredReferenceController
 
@@ -53,18 +55,35 @@ class LimitedController:
 
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) that the limiter lets through."""
-        y = self.limiter(self.controller.control_signal(reference))
+        y = self.controller.control_signal(reference)
+        if not np.isfinite(y):  # a divergence, for the loop to see
+            return y
+        y = self.limiter(y)
         emitted = getattr(self.controller, "emitted", None)
         if emitted is not None:
             emitted(y)
         return y
 
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError where the limiter is of another sample rate."""
+        if abs(self.limiter.fs - fs) > 1e-9 * fs:
+            raise ValueError(
+                f"fs is {fs:g} Hz but the controller's limiter is for {self.limiter.fs:g} Hz: make it with the fs of the run"
+            )
+
     def update(self, error: float) -> None:
         """Let the controller adapt to the error e(n)."""
         self.controller.update(error)
 
+    def listen(self, references: Any, errors: Any) -> None:
+        """Let the controller follow the noise before the control is switched on, the limiter silent."""
+        if not hasattr(self.controller, "listen"):
+            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+        self.controller.listen(references, errors)
+        self.limiter.process(np.zeros(len(references)))
+
     def __getattr__(self, name: str) -> Any:
-        """Everything else is the controller's."""
-        if name == "controller":  # not there yet: a copy in the making
+        """Everything else is the controller's, but for what Python itself asks for, as for copies."""
+        if name == "controller" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.controller, name)
