@@ -42,7 +42,7 @@ from .report import Parameter, StudyReport, Table, Verdict
 from .scene import STATE_NOISE_GRID, Runs, Scene, Tuned, tune
 from .study import RULE
 
-DURATIONS_S = (8.0, 60.0)
+DURATIONS_S = (8.0, 60.0)  # the first is short: it is tuned on, and convergence is measured on it
 SEEDS = (1, 2, 3, 4)
 TUNED = ("KF-OPC", "KF-OPC repaired", "KF-PB")
 CLIPPED_NOISES = ("tone", "band noise")

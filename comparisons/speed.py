@@ -225,6 +225,7 @@ def remarks(result: dict[str, Any]) -> list[str]:
         f"Most taps timed that run in real time, {'; '.join(real_time)}.",
         f"The closed loop at 128 taps costs {us['closed loop, KF-OPC', 128] / us['streaming kernel', 128]:.2f} times its "
         "filter's update.",
+        f"KF-PB costs {us['closed loop, KF-PB', 256] / us['closed loop, KF-OPC', 256]:.2f} times KF-OPC at 256 taps.",
         f"{variants.SCENARIOS} scenarios that share gains, at 256 taps: "
         f"{us['closed loop, KF-OPC', 256] / us[shared, 256]:.1f} times cheaper than as many runs.",
         f"The causal block kernel puts its work off to the change of blocks ({variants.BLOCK_SIZE} samples): a burst of "

@@ -14,7 +14,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.lib.stride_tricks import sliding_window_view
 
-from kfopc_filterpy import KFOPC, MOVFxLMS, kf_opc, simulate, simulate_scenarios
+from kfopc_filterpy import KFOPC, MOVFxLMS, kf_opc, kf_pb, simulate, simulate_scenarios
 from kfopc_filterpy._compile import borrowed
 from kfopc_filterpy.block import Block, CausalBlock, project_in_block, update_in_block
 from kfopc_filterpy.kernels import (
@@ -158,6 +158,11 @@ def closed_loop_lms(taps: int) -> Work:
     return _loop(MOVFxLMS(taps, PATH, step_size=1e-5, rated_power=0.1), taps)
 
 
+def closed_loop_budget(taps: int) -> Work:
+    """KF-PB in `simulate`, its rated power so low that lambda is always searched for."""
+    return _loop(kf_pb(taps, PATH, rated_power=1e-6, state_noise=R, measurement_noise=Q, initial_variance=P0), taps)
+
+
 def _kf_opc(taps: int, i: int) -> Any:
     return kf_opc(taps, PATH, rated_power=0.1 * (1 + i), state_noise=R, measurement_noise=Q, initial_variance=P0)
 
@@ -282,6 +287,7 @@ OURS: dict[str, Callable[[int], Work]] = {
     "block kernel, causal": block_causal,
     "filterpy API of KFOPC": filterpy_api,
     "closed loop, KF-OPC": closed_loop,
+    "closed loop, KF-PB": closed_loop_budget,
     "closed loop, MOV-FxLMS": closed_loop_lms,
     f"closed loop, each of {SCENARIOS} KF-OPC": scenarios,
 }
