@@ -95,8 +95,8 @@ def choose_span(budget):
     """Set the window: long where the level is the same as of late but for chance, short where it has risen.
 
     Chance is the scatter of neighbouring segments' powers (von Neumann): bursts, which come and go, are averaged over
-    long; of a swelling noise neighbours are alike, and any difference between the means of two windows counts. (A rule of
-    intersecting confidence intervals, after Goldenshluger and Nemirovski.) That the noise has become softer is believed
+    long; of a swelling noise neighbours are alike, and any difference between the means of two windows counts. (A rule
+    of intersecting confidence intervals, after Goldenshluger and Nemirovski.) That the noise has become softer is believed
     more slowly than that it has become louder: a pause between bursts is no reason to spend more on the next one.
     """
     table = budget.table
@@ -104,6 +104,7 @@ def choose_span(budget):
     usual, variance, _ = _mean_level(budget, USUAL)
     if not usual > SILENCE:
         return
+    # Of a segment it is a dozen times that of the mean; at the start, with fewer segments, this errs towards patience.
     chance = math.sqrt(2.0 * SHORT * variance * table[SEGMENT] / table[FS])
     table[CHANCE] = min(chance, LARGEST_CHANCE_S)
     short, short_variance, _ = _mean_level(budget, SHORT)
@@ -117,22 +118,25 @@ def choose_span(budget):
 @part()
 def _mean_level(budget, span):
     """Mean power of x' in the newest segments, its relative variance by chance, and how many they are."""
-    total = weight = differences = count = 0.0
-    last = -1.0
+    total = weight = 0.0
     for j in range(span + 1):
         share = _share(budget, j)
         if share > 0.0:
-            power = _power(budget, j)
             weight += share
-            total += share * power
-            if last >= 0.0:
-                differences += (power - last) ** 2
-                count += 1.0
-            last = power
-    if not total > 0.0:
+            total += share * _power(budget, j)
+    if not (total > 0.0 and total < np.inf):
         return 0.0, 0.0, 0.0
     mean = total / weight
-    return mean, 0.5 * (differences / mean) / mean / max(count, 1.0) / max(weight, 1.0), weight
+    differences = count = 0.0
+    last = -1.0
+    for j in range(span + 1):
+        if _share(budget, j) > 0.0:
+            level = _power(budget, j) / mean
+            if last >= 0.0:
+                differences += (level - last) ** 2
+                count += 1.0
+            last = level
+    return mean, 0.5 * differences / max(count, 1.0) / max(weight, 1.0), weight
 
 
 @part()
@@ -284,9 +288,9 @@ class PowerBudget:
     - how loud the signal is becoming: where a straight line through the logarithm of the power stands out of its
       scatter, the level it leads to now takes the place of the window's mean;
     - an account of the power spent beyond what was due, in seconds of rated power: the target is the rated power times
-      ``exp(-3 excess / (1 + 6 chance))``. It makes the mean power exact, and repays what a surprise has overspent, up to
-      a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
-      to the account within a second; it adds to the credit, and half of it does not count as excess.
+      ``exp(-3 excess / (1 + 6 chance))``. It makes the mean power exact, and repays what a surprise has overspent, up
+      to a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
+      to the account within a second; it adds to the credit, half of which it lets be.
 
     Parameters
     ----------
@@ -296,8 +300,8 @@ class PowerBudget:
         Rated output power (mean square of the control signal).
     fs : float, default 16000
         Sample rate in Hz.
-    window_s : float, default 0.75
-        Length of the window of the correlations in seconds; at least 6 n_taps samples are taken.
+    window_s : float, default 1.25
+        Usual length of the window of the correlations in seconds; at least 10 n_taps samples are taken.
     credit_s : float, default 0.1
         Seconds of rated power that may be saved up while the noise needs less.
 
@@ -312,10 +316,11 @@ class PowerBudget:
 
     References
     ----------
-    A. Goldenshluger, A. Nemirovski, "On spatially adaptive estimation of nonparametric regression", Math. Methods
-    Statist. 6, 1997, for the window. M. D. Hebden, "An algorithm for minimization using exact second derivatives", AERE report TP515, 1973, and
+    M. D. Hebden, "An algorithm for minimization using exact second derivatives", AERE report TP515, 1973, and
     J. J. More, D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4(3), 1983, for the search
     for lambda. N. Levinson, "The Wiener RMS error criterion in filter design and prediction", J. Math. Phys. 25, 1947.
+    A. Goldenshluger, A. Nemirovski, "On spatially adaptive estimation of nonparametric regression", Math. Methods
+    Statist. 6, 1997, for the window.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A filterpy filter with a power budget: the random-walk Kalman filter, and the best control filter within the power."""
+"""A filterpy filter with a power budget: the random-walk Kalman filter, and the best filter within the power."""
 
 from __future__ import annotations
 

@@ -107,13 +107,13 @@ def test_the_control_filter_is_the_state_of_filterpys_filter_that_observes_the_c
 
 
 def test_over_a_long_steady_noise_the_state_of_that_filter_is_where_the_control_filter_stays() -> None:
-    """The window's correlations scatter by 1/sqrt(samples); over 8 taps that is 0.02 of v where it has 18000."""
+    """The window's correlations scatter by 1/sqrt(samples); over 8 taps that is 0.02 of v where it has 17600."""
     x, rows, filtered, d = signals(24_000)
     kf = made(state_noise=1e-9, fs=16000.0, window_s=1.0)
     for n in range(x.size):
         step(kf, d[n], filtered[n], reference=x[n])
     state = two_observations(kf.power_weight, filtered, rows, d, P0=1.0, q=0.05, r=1e-9)
-    assert np.linalg.norm(kf.control_filter - state) < math.sqrt(8 / 18_000) * np.linalg.norm(state)
+    assert np.linalg.norm(kf.control_filter - state) < math.sqrt(8 / 17_600) * np.linalg.norm(state)
     assert np.linalg.norm(kf.x[:, 0] - state) > 0.3 * np.linalg.norm(state)
 
 
@@ -183,7 +183,7 @@ def test_a_rated_power_assigned_is_kept_from_there_on() -> None:
         spent.append((kf.control_filter @ rows[n]) ** 2)
         step(kf, d[n], filtered[n], reference=x[n])
     assert kf.rated_power == kf.budget.rated_power == 0.1
-    assert np.mean(spent[1000:2000]) == pytest.approx(0.3, rel=0.05)  # a window of 350 samples: 0.08, 3 of them
+    assert np.mean(spent[1000:2000]) == pytest.approx(0.3, rel=0.05)  # a window of 720 samples: 0.05
     assert np.mean(spent[3000:]) == pytest.approx(0.1, rel=0.05)
 
 
@@ -239,7 +239,7 @@ SETTINGS_IN_LOOP = {
 
 
 def controller(n_taps: int = 10, **options: Any) -> KalmanController:
-    """As those of `test_loop`; a window of 80 samples, or six times the taps."""
+    """As those of `test_loop`; a usual window of 80 samples, or ten times the taps."""
     return kf_pb(n_taps, S_HAT, **SETTINGS_IN_LOOP | options)
 
 
