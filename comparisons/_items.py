@@ -22,6 +22,7 @@ FIGURES_OF_MERIT = (
     "convergence_time_s",
     "diverged_at_s",
 )
+OF_THE_PAPER = "Claims of the paper"
 HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond which it is clipped
 
 
@@ -156,7 +157,7 @@ class StudyReport:
     sounds: list[Sound] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    claims: str = "Claims of the paper"
+    claims: str = OF_THE_PAPER
 
     def __post_init__(self) -> None:
         _require_stem(self.name, "name")
@@ -168,6 +169,11 @@ class StudyReport:
                 )
         for items, kind in ((self.figures, "figures"), (self.sounds, "sounds"), (self.tables, "tables")):
             require_different((item.stem for item in items), f"{kind} of study {self.name!r}")
+
+    @property
+    def marks(self) -> tuple[str, str]:
+        """What a verdict is called that holds, and one that does not."""
+        return ("reproduced", "not reproduced") if self.claims == OF_THE_PAPER else ("met", "not met")
 
     @property
     def result(self) -> dict[str, Any]:
@@ -244,7 +250,8 @@ def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
 def count_of_claims(studies: Sequence[StudyReport]) -> str:
     """How many claims were reproduced, as a phrase."""
     verdicts = [verdict.reproduced for study in studies for verdict in study.verdicts]
-    return f"{sum(verdicts)} of {len(verdicts)} claims reproduced"
+    what = "claims reproduced" if any(study.claims == OF_THE_PAPER for study in studies) else "aims met"
+    return f"{sum(verdicts)} of {len(verdicts)} {what}"
 
 
 def figure_file(folder: Path, study: StudyReport, item: FigureItem) -> Path:

@@ -130,7 +130,7 @@ def _overview(studies: Sequence[StudyReport]) -> str:
         [
             f'<a href="#{study.name}">{escape(study.title)}</a>',
             escape(verdict.claim),
-            _mark(verdict),
+            _mark(verdict, study),
             escape(verdict.figure),
         ]
         for study in studies
@@ -152,7 +152,7 @@ def _study(study: StudyReport, folder: Path) -> str:
         for name, figures in study.algorithms.items()
     ]
     headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in COLUMNS]
-    verdicts = [[escape(verdict.claim), _mark(verdict), escape(verdict.figure)] for verdict in study.verdicts]
+    verdicts = [[escape(verdict.claim), _mark(verdict, study), escape(verdict.figure)] for verdict in study.verdicts]
     notes = (f"<li>{escape(note)}</li>" for note in study.notes)
     figures = (_figure(study, item, folder) for item in study.figures)
     parts = [
@@ -206,10 +206,11 @@ def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], kind: str = "
     return f'<div class="wide"><table class="{kind}"><thead>{head}</thead>\n<tbody>{body}</tbody></table></div>\n'
 
 
-def _mark(verdict: Verdict) -> str:
+def _mark(verdict: Verdict, study: StudyReport) -> str:
+    held, not_held = study.marks
     if verdict.reproduced:
-        return '<span class="mark yes">✓ reproduced</span>'
-    return '<span class="mark no">✗ not reproduced</span>'
+        return f'<span class="mark yes">✓ {held}</span>'
+    return f'<span class="mark no">✗ {not_held}</span>'
 
 
 def _value(value: Any) -> str:

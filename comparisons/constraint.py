@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy.power_budget import DEFAULT_CREDIT_S, DEFAULT_WINDOW_S
+from kfopc_filterpy.power_budget import DEFAULT_CORRELATION_MEMORY_S, DEFAULT_CREDIT_S
 
 from .constraint_cases import (
     FS,
@@ -341,7 +341,9 @@ def _parameters(
         "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
         "seeds": Parameter(list(seeds), "of noise; of a tone, its phase; of the recording, where it begins"),
         "limiter_window_s": Parameter(WINDOW_S, "default of OutputLimiter"),
-        "KF-PB window_s, credit_s": Parameter([DEFAULT_WINDOW_S, DEFAULT_CREDIT_S], "defaults of PowerBudget"),
+        "KF-PB memory_s, credit_s": Parameter(
+            [DEFAULT_CORRELATION_MEMORY_S, DEFAULT_CREDIT_S], "defaults of PowerBudget"
+        ),
         "r E[x'^2]/q": Parameter(
             {f"{s.path}, {s.noise}": {name: own[name].setting for name in TUNED} for s, own in tuned.items()},
             f"tuned on the first seed, {durations_s[0]:g} s, 25 %: {RULE}",

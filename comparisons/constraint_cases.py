@@ -79,7 +79,7 @@ def noises() -> dict[str, Noise]:
             fs=FS,
             swing_db=SWING_DB,
             period_s=PERIOD_S,
-            phase=float(seed),
+            phase_rad=float(seed),
         ),
     }
     measured = measured_data()

@@ -138,7 +138,7 @@ def _course(course: Course) -> FigureItem:
         ax.grid(True, alpha=0.3)
     return FigureItem(
         "course",
-        f"{course.setting.noise.capitalize()}, {course.setting.path}: output power, disturbance and error, and λ, which "
+        f"{course.setting.noise.capitalize()}, {course.setting.path}: output power, disturbance (grey) and errors, and λ, which "
         "follows the noise's level.",
         figure,
     )

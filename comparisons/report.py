@@ -137,7 +137,7 @@ def results_table(studies: Sequence[StudyReport]) -> str:
         if study.algorithms:
             lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})
         for verdict in study.verdicts:
-            mark = "REPRODUCED" if verdict.reproduced else "NOT REPRODUCED"
+            mark = study.marks[0 if verdict.reproduced else 1].upper()
             lines += textwrap.wrap(verdict.claim, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(verdict.figure, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
         for table in study.tables:

@@ -56,7 +56,13 @@ if TYPE_CHECKING:
         secondary_path_gain,
     )
     from .paths import bandpass_path, fir_path, path_taps, perturbed_path
-    from .power_bound import PowerConstrainedWiener, power_constrained_solution, power_constrained_wiener
+    from .power_bound import (
+        ControlFilter,
+        ControlFilters,
+        PowerConstrainedWiener,
+        power_constrained_solution,
+        power_constrained_wiener,
+    )
     from .power_budget import PowerBudget
     from .power_budget_filter import PowerBudgetKalmanFilter
     from .random_walk import RandomWalkKFOPC
@@ -74,6 +80,8 @@ __version__ = "0.1.0"
 # Public names and the module each lives in.
 _LAZY = {
     "CausalityMargin": "causality",
+    "ControlFilter": "power_bound",
+    "ControlFilters": "power_bound",
     "Controller": "controllers",
     "DataUnavailableError": "datasets",
     "DuctPaths": "duct",

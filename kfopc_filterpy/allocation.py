@@ -24,7 +24,7 @@ RIDGE = 1e-7  # of R_x'[0], on v - w: decides what no signal excites
 POWER_TOLERANCE = 0.005  # of the power that the filter is solved for
 TRIES = 20
 NEAR = 1e-6  # of E[x'^2]/E[x^2] to its inverse: where a search may start from
-# Rows of the work array: solution and right side; the predictors of Levinson's recursion, two rows each.
+# Rows of the work array: solution and right side; the predictors of Levinson's recursion, the backward one in two rows.
 RIGHT, TOTAL, REVERSED, FORWARD, BACKWARD = 0, 1, 2, 3, 4
 WORK_ROWS = 6
 

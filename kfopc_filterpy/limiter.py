@@ -133,7 +133,7 @@ class OutputLimiter:
 
     .. math:: \frac{1}{N} \sum_{k=0}^{N-1} y^2(n-k) \le \rho_o, \qquad |y(n)| \le A.
 
-    What fits passes unchanged. What does not is scaled, before the budget of the window is used up, by a gain that
+    What plainly fits passes unchanged. What does not is scaled, before the budget of the window is used up, by a gain that
     keeps a tone a tone; only what even then does not fit is clipped. One sample in, one out, without delay: call it
     with a sample, or a compiled loop ``limit_sample(limiter.state, u)``.
 

@@ -18,10 +18,10 @@ from .constraint import DEFAULT_FS, SILENCE
 from .delay_lines import delay_line, newest, push
 from .kernels import FAST
 
-DEFAULT_WINDOW_S = 1.25
+DEFAULT_CORRELATION_MEMORY_S = 1.25
 DEFAULT_CREDIT_S = 0.1
 SHORT, USUAL, LONG = 6, 10, 24  # whole segments that a window may have; one more is being filled
-AGREEMENT = 1.0  # of the variance that chance gives to the difference of two windows' levels: above, they differ
+AGREEMENT = 1.0  # squared difference of two windows' levels over the sum of their variances, above which they differ
 DEBT_S = 1.0  # overspending beyond this much of the rated power is forgotten, so that no burst can wind the account up
 REPAYMENT = 3.0  # 1/s: what the account holds changes the target by this share of itself
 PATIENCE = 6.0  # 1/s: and by less, the more of the account chance makes
@@ -277,8 +277,8 @@ class PowerBudget:
     .. math:: (R_{x'} + \lambda R_x) v = R_{x'} \hat w, \qquad v^T R_x v = \rho
 
     which minimises :math:`E[e^2]` subject to :math:`E[y^2] \le \rho`: for any :math:`v`,
-    :math:`E[e^2] = E[e^2]_{min} + (v - w)^T R_{x'} (v - w)`, so that w is all the disturbance has to say, and an
-    unbiased estimate of it may stand in its place (certainty equivalence: the error is quadratic in w). The
+    :math:`E[e^2] = E[e^2]_{min} + (v - w)^T R_{x'} (v - w)`, so that w is all the disturbance has to say, and its
+    conditional mean may stand in its place (certainty equivalence: the error is quadratic in w). The
     constraint never enters the estimate. What it would have to forget when the level changes, it never learnt.
 
     Three things decide :math:`\lambda`:
@@ -288,8 +288,8 @@ class PowerBudget:
     - how loud the signal is becoming: where a straight line through the logarithm of the power stands out of its
       scatter, the level it leads to now takes the place of the window's mean;
     - an account of the power spent beyond what was due, in seconds of rated power: the target is the rated power times
-      ``exp(-3 excess / (1 + 6 chance))``. It makes the mean power exact, and repays what a surprise has overspent, up
-      to a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
+      ``exp(-3 excess / (1 + 6 chance))``. It steers the mean power to the rated one, and repays what a surprise has
+      overspent, up to a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
       to the account within a second; it adds to the credit, half of which it lets be.
 
     Parameters
@@ -300,8 +300,9 @@ class PowerBudget:
         Rated output power (mean square of the control signal).
     fs : float, default 16000
         Sample rate in Hz.
-    window_s : float, default 1.25
-        Usual length of the window of the correlations in seconds; at least 10 n_taps samples are taken.
+    memory_s : float, default 1.25
+        Usual length of the window of the correlations in seconds (0.6 and 2.4 times it where it is short or long); at
+        least 10 n_taps samples are taken.
     credit_s : float, default 0.1
         Seconds of rated power that may be saved up while the noise needs less.
 
@@ -340,17 +341,17 @@ class PowerBudget:
         rated_power: float,
         *,
         fs: float = DEFAULT_FS,
-        window_s: float = DEFAULT_WINDOW_S,
+        memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         credit_s: float = DEFAULT_CREDIT_S,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         rated_power = as_positive(rated_power, "rated_power")
         self.fs = as_positive(fs, "fs", unit="Hz")
-        self.window_s = as_positive(window_s, "window_s", unit="s")
+        self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
         table = np.zeros(11)
         table[RATED_POWER], table[FS], table[CREDIT] = rated_power, self.fs, self.credit_s
-        table[SEGMENT] = max(round(self.window_s * self.fs / USUAL), n_taps)
+        table[SEGMENT] = max(round(self.memory_s * self.fs / USUAL), n_taps)
         table[SPAN] = USUAL
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
@@ -388,7 +389,7 @@ class PowerBudget:
 
     @property
     def power_weight(self) -> float:
-        """Weight lambda of the control power; 0 where the estimate fits the budget as it is."""
+        """Weight lambda of the control power; 0: the estimate fits the budget as it is, Inf: it was scaled to fit."""
         return float(self._state.table[WEIGHT])
 
     @property

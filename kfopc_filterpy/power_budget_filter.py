@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .constraint import DEFAULT_FS, OutputPowerConstraint
-from .power_budget import DEFAULT_CREDIT_S, DEFAULT_WINDOW_S, PowerBudget
+from .power_budget import DEFAULT_CORRELATION_MEMORY_S, DEFAULT_CREDIT_S, PowerBudget
 from .random_walk import RandomWalkKFOPC
 
 
@@ -28,7 +28,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         r, q, P(0|0) = initial_variance I and the precision of P, see `KFOPC.random_walk`.
     rated_power : float
         Rated output power (mean square of the control signal).
-    fs, window_s, credit_s
+    fs, memory_s, credit_s
         See `PowerBudget`.
 
     Raises
@@ -54,6 +54,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     >>> row = np.zeros(2)
     >>> for x in np.random.default_rng(0).standard_normal(16000):
     ...     row = np.array([x, row[0]])  # the secondary path is a wire: the filtered reference is the reference
+    ...     y = kf.control_signal(x)
     ...     kf.predict()
     ...     kf.update(3.0 * row[0] + row[1], H=row, reference=x)
     >>> kf.x.ravel().round(2)  # without a limit: power 10
@@ -74,7 +75,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         initial_variance: float = 1.0,
         dtype: Any = np.float64,
         fs: float = DEFAULT_FS,
-        window_s: float = DEFAULT_WINDOW_S,
+        memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         credit_s: float = DEFAULT_CREDIT_S,
     ) -> None:
         super().__init__(
@@ -84,7 +85,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
             initial_variance=initial_variance,
             dtype=dtype,
         )
-        self._budget = PowerBudget(n_taps, rated_power, fs=fs, window_s=window_s, credit_s=credit_s)
+        self._budget = PowerBudget(n_taps, rated_power, fs=fs, memory_s=memory_s, credit_s=credit_s)
 
     @property
     def budget(self) -> PowerBudget:
@@ -111,8 +112,22 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
 
     @property
     def power_weight(self) -> float:
-        """Weight lambda of the control power; 0 where the estimate fits the budget as it is."""
+        """Weight lambda of the control power; 0: the estimate fits the budget as it is, Inf: it was scaled to fit."""
         return self.budget.power_weight
+
+    @property
+    def constraint_factor(self) -> float:
+        """1: the estimate is not scaled; what keeps the power is the control filter."""
+        return 1.0
+
+    @constraint_factor.setter
+    def constraint_factor(self, value: float | None) -> None:
+        if value not in (None, 1.0):
+            raise ValueError(f"constraint_factor is 1 in a power budget, got {value!r}: assign rated_power instead")
+
+    def control_signal(self, reference: float) -> float:
+        """Control signal y(n) for the reference x(n); call it before `update` with the same x(n)."""
+        return self.budget.control_signal(reference)
 
     def update(
         self,
@@ -129,7 +144,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         ----------
         z, R, H
             See `KFOPC.update`; H is the filtered reference x'(n), newest sample first. With z None, a missed sample,
-            nothing advances.
+            nothing advances: what was emitted meanwhile is not accounted for.
         reference : float
             Newest reference x(n).
         control_signal : float, optional

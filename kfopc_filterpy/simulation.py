@@ -69,7 +69,7 @@ class SimulationResult:
     constraint_factor : ndarray
         Constraint factor; 1 for a controller without a constraint, NaN for one that does not say.
     weights : ndarray or None
-        (n_rows, L) weights after samples 0, k, 2k, ..., where they were asked for.
+        (n_rows, L) control filter after samples 0, k, 2k, ..., where it was asked for.
     weights_time_s : ndarray or None
         (n_rows,) their times in seconds.
     disturbance_power, secondary_path_gain : ndarray or None

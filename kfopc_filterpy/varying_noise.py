@@ -41,7 +41,7 @@ def bursty_noise(
     decay_s : float, default 0.012
         Time constant of a burst's amplitude in seconds.
     band : (float, float), default (100, 1500)
-        Band in Hz of bursts and background (Butterworth, fourth order).
+        Band in Hz of bursts and background (Butterworth, four poles at either edge).
     level_spread_db : float, default 4
         Standard deviation of the bursts' levels in dB.
     background_db : float, default -20
@@ -88,7 +88,9 @@ def bursty_noise(
     return scaled_to_power(scaled_to_power(bursts, 1.0) + scaled_to_power(steady, 1.0) * background, power)
 
 
-def swelling(signal: Any, *, fs: float, swing_db: float = 6.0, period_s: float = 4.0, phase: float = 0.0) -> np.ndarray:
+def swelling(
+    signal: Any, *, fs: float, swing_db: float = 6.0, period_s: float = 4.0, phase_rad: float = 0.0
+) -> np.ndarray:
     """Copy of a signal whose level in dB swings up and down as a sine, its mean power kept.
 
     Parameters
@@ -101,7 +103,7 @@ def swelling(signal: Any, *, fs: float, swing_db: float = 6.0, period_s: float =
         Largest deviation of the level to either side in dB.
     period_s : float, default 4
         Period in seconds.
-    phase : float, default 0
+    phase_rad : float, default 0
         Phase at the first sample in radians.
 
     Returns
@@ -127,7 +129,7 @@ def swelling(signal: Any, *, fs: float, swing_db: float = 6.0, period_s: float =
         raise ValueError("signal must not be all zeros: silence has no level to swing")
     turn = 2 * np.pi / (as_positive(period_s, "period_s", unit="s") * as_positive(fs, "fs", unit="Hz"))
     level_db = as_nonnegative(swing_db, "swing_db", unit="dB") * np.sin(
-        turn * np.arange(samples.size) + as_number(phase, "phase")
+        turn * np.arange(samples.size) + as_number(phase_rad, "phase_rad")
     )
     return scaled_to_power(samples * 10 ** (level_db / 20), float(np.mean(samples**2)))
 

@@ -53,7 +53,7 @@ W = np.random.default_rng(0).standard_normal(16) / 4.0
 
 def made(n_taps: int = 3, rated_power: float = 1.0, segment: int = SEGMENT, **options: float) -> PowerBudget:
     """A budget at 1 kHz whose usual window has ten segments of `segment` samples, and the one that is being filled."""
-    return PowerBudget(n_taps, rated_power, fs=1000.0, window_s=10 * segment / 1000.0, **options)
+    return PowerBudget(n_taps, rated_power, fs=1000.0, memory_s=10 * segment / 1000.0, **options)
 
 
 def correlations(budget: PowerBudget, span: int | None = None) -> np.ndarray:
@@ -89,7 +89,7 @@ def test_the_windows_of_the_defaults() -> None:
         assert budget.state.counts[:2].tolist() == [fs / 8, 0.0]
         budget.listen(1.0, 1.0)
         assert budget.state.counts[:2].tolist() == [fs / 8, 1.0]
-    assert (budget.window_s, budget.credit_s, budget.state.table[SPAN]) == (1.25, 0.1, USUAL)
+    assert (budget.memory_s, budget.credit_s, budget.state.table[SPAN]) == (1.25, 0.1, USUAL)
 
 
 @pytest.mark.parametrize(("n_taps", "segment", "asked"), [(1, 7, 7), (4, 9, 9), (12, 30, 30), (12, 12, 3)])
@@ -713,7 +713,7 @@ def test_listening_and_playing_refuse_a_bad_sample(method: str, bad: object) -> 
     assert pickle.dumps(budget) == before
 
 
-@pytest.mark.parametrize("name", ["rated_power", "fs", "window_s", "credit_s"])
+@pytest.mark.parametrize("name", ["rated_power", "fs", "memory_s", "credit_s"])
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf, None])
 def test_settings_out_of_range(name: str, bad: object) -> None:
     with pytest.raises((ValueError, TypeError), match=name):

@@ -41,7 +41,7 @@ SECONDARY = np.array([0.0, 0.8, 0.3])
 
 
 def made(n_taps: int = N_TAPS, **options: Any) -> PowerBudgetKalmanFilter:
-    return PowerBudgetKalmanFilter(n_taps, **SETTINGS | {"rated_power": 0.3, "fs": 1000.0, "window_s": 0.3} | options)
+    return PowerBudgetKalmanFilter(n_taps, **SETTINGS | {"rated_power": 0.3, "fs": 1000.0, "memory_s": 0.3} | options)
 
 
 def signals(n: int, n_taps: int = N_TAPS, silent: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -94,7 +94,7 @@ def test_the_control_filter_is_the_state_of_filterpys_filter_that_observes_the_c
     But for the ridge of 1e-7 and the q/P0 of the start, 5e-5 beside 5000, at a condition of about 10.
     """
     x, rows, filtered, d = signals(5000, silent=200)
-    kf = made(state_noise=0.0, initial_variance=1e3, window_s=10.0)
+    kf = made(state_noise=0.0, initial_variance=1e3, memory_s=10.0)
     for n in range(x.size):
         step(kf, d[n], filtered[n], reference=x[n])
     weight = kf.power_weight
@@ -109,7 +109,7 @@ def test_the_control_filter_is_the_state_of_filterpys_filter_that_observes_the_c
 def test_over_a_long_steady_noise_the_state_of_that_filter_is_where_the_control_filter_stays() -> None:
     """The window's correlations scatter by 1/sqrt(samples); over 8 taps that is 0.02 of v where it has 17600."""
     x, rows, filtered, d = signals(24_000)
-    kf = made(state_noise=1e-9, fs=16000.0, window_s=1.0)
+    kf = made(state_noise=1e-9, fs=16000.0, memory_s=1.0)
     for n in range(x.size):
         step(kf, d[n], filtered[n], reference=x[n])
     state = two_observations(kf.power_weight, filtered, rows, d, P0=1.0, q=0.05, r=1e-9)
@@ -234,7 +234,7 @@ def test_a_rated_power_out_of_range_is_refused(bad: Any) -> None:
 
 
 SETTINGS_IN_LOOP = {
-    "rated_power": 0.2, "state_noise": 1e-5, "measurement_noise": 1e-2, "fs": FS, "window_s": MEMORY_S,
+    "rated_power": 0.2, "state_noise": 1e-5, "measurement_noise": 1e-2, "fs": FS, "memory_s": MEMORY_S,
 }  # fmt: skip
 
 

@@ -24,7 +24,8 @@ class FxLMS(FilteredReferenceController):
     step_size : float
         Step size mu, above zero.
     limiter : OutputLimiter, optional
-        Limiter of its own that the control signal goes through.
+        Limiter of its own that the control signal goes through. FxLMS adapts to the error alone: while the limiter acts
+        the error does not fall and the weights grow.
 
     Raises
     ------

@@ -25,7 +25,7 @@ class KalmanController(FilteredReferenceController):
     """The modified ANC structure around a Kalman filter: any filterpy `KalmanFilter` of one measurement.
 
     Each sample the estimator is given the disturbance estimate as z and the filtered reference as H. With a rated
-    power the estimator is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` make the estimator too.
+    power the estimator is KF-OPC or KF-PB, without one KF-ANC. `kf_anc`, `kf_opc` and `kf_pb` make the estimator too.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class KalmanController(FilteredReferenceController):
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     name : str, optional
-        Name in results and legends; by default KF-OPC with a rated power, KF-ANC without.
+        Name in results and legends; by default KF-PB with a power budget, KF-OPC with a rated power, else KF-ANC.
     block_size : int, optional
         Samples to a block of the block kernel: the same filter to rounding, causal, its work on the covariance put off
         to the block's end, a burst of 3 L^2 block_size flops. By default sample by sample. It counts in compiled runs
@@ -335,7 +335,7 @@ def kf_pb(
     rated_power : float
         Rated output power.
     **budget
-        `fs`, `window_s`, `credit_s`, see `PowerBudget`.
+        `fs`, `memory_s`, `credit_s`, see `PowerBudget`.
 
     Returns
     -------

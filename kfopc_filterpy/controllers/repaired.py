@@ -124,8 +124,8 @@ def kf_opc_repaired(
         Signal whose gain through the secondary path is G_s: the control signal's, :math:`E[(\hat s * y)^2] / E[y^2]`,
         or the reference's, :math:`E[x'^2] / E[x^2]` (eq. 11).
     trim_s : float or None, default 1
-        Time constant in seconds of a closed loop that trims the factor until the output power measured is the rated
-        one; None: no trim.
+        Integration time in seconds of a closed loop that trims the factor until the output power measured is the rated
+        one; it settles in half of it. None: no trim.
     factor_at : {"output", "measurement"}, default "output"
         Where the factor is applied: to the control signal, where it acts at once, or to the measurement (eq. 9),
         where it acts as fast as the filter adapts.
