@@ -40,7 +40,16 @@ from .scene import (
     tune,
     tuning_runs,
 )
-from .study import BANDPASS_PATHS, common_parameters, draw, first_second_db, milliseconds, sounds, tuning_note
+from .study import (
+    BANDPASS_PATHS,
+    ceiling_note,
+    common_parameters,
+    draw,
+    first_second_db,
+    milliseconds,
+    sounds,
+    tuning_note,
+)
 
 FS = 16000.0
 BAND = (200.0, 2000.0)
@@ -107,7 +116,7 @@ def main(runs: Runs) -> StudyReport:
         verdicts=[*_verdicts(results, algorithms, coherence), _clipped_verdict(clipped_figures, clipped_scene)],
         figures=_figures_of(results, clipped, clipped_scene),
         sounds=sounds({name: rows[0] for name, rows in results.items()}),
-        notes=[*tuning_note(tuned), *_notes(algorithms, clipped_figures, other)],
+        notes=[*tuning_note(tuned), ceiling_note(scene), *_notes(algorithms, clipped_figures, other)],
     )
 
 

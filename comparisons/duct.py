@@ -45,7 +45,7 @@ from .scene import (
     tune,
     tuning_runs,
 )
-from .study import common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
+from .study import ceiling_note, common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
 
 FS = 16000.0
 DURATION_S = 10.5
@@ -158,7 +158,7 @@ def _study(
         verdicts=_verdicts(algorithms, results, extra),
         figures=_figures_of(scene, wiener, results, primary, secondary),
         sounds=sounds(results),
-        notes=[*tuning_note(tuned), _power_note(algorithms, extra)],
+        notes=[*tuning_note(tuned), ceiling_note(scene), _power_note(algorithms, extra)],
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
+from kfopc_filterpy import SimulationResult, power_constrained_solution
 from kfopc_filterpy.path_plots import plot_bode
 
 from .report import FigureItem, Parameter, Sound
@@ -36,6 +36,15 @@ def draw(stem: str, caption: str, *panels: Callable[[Any], Any]) -> FigureItem:
 def draw_paths(caption: str, paths: Mapping[str, Any]) -> FigureItem:
     """Bode plot of the paths of a study."""
     return FigureItem("paths", caption, np.ravel(plot_bode(paths))[0].figure)
+
+
+def ceiling_note(scene: Scene) -> str:
+    """The ceiling of every constrained algorithm, as a sentence."""
+    bound = power_constrained_solution(*scene.settled, scene.secondary, scene.n_taps, scene.rated_power)
+    return (
+        f"The ceiling: within the rated power a fixed filter of {scene.n_taps} taps reaches {bound.noise_reduction_db:.2f} "
+        "dB with a linear amplifier (power-constrained Wiener solution)."
+    )
 
 
 def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Parameter]:

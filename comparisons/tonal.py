@@ -39,7 +39,7 @@ from .scene import (
     tune,
     tuning_runs,
 )
-from .study import BANDPASS_PATHS, common_parameters, draw, draw_paths, sounds, tuning_note
+from .study import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
 
 FS = 16000.0
 TONE_HZ = 400.0
@@ -106,6 +106,7 @@ def main(runs: Runs) -> StudyReport:
         sounds=sounds(results),
         notes=[
             *tuning_note(tuned),
+            ceiling_note(scene),
             f"KF-ANC run by filterpy's own KalmanFilter over the first {FILTERPY_SAMPLES} samples: the largest "
             f"difference from the O(L^2) filter is {oracle['error']:.1e} in the error signal and "
             f"{oracle['weights']:.1e} in the weights. That is rounding: S/R starts near "

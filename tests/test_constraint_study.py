@@ -150,7 +150,7 @@ def test_the_power_table_holds_the_rows(small: Any) -> None:
 def test_the_terminal_shows_verdicts_and_tables(small: Any) -> None:
     shown = results_table([small[0]])
     assert shown.startswith("constraint: The constraint that holds (rated power 0.25)\n")
-    assert f"{sum(v.reproduced for v in small[0].verdicts)} of 7 claims reproduced" in shown
+    assert f"{sum(v.reproduced for v in small[0].verdicts)} of 7 aims met" in shown
     for table in small[0].tables:
         assert table.caption in shown
 

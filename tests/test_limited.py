@@ -54,7 +54,7 @@ def controller(name: str, path: Any = S, **options: Any) -> FilteredReferenceCon
     if name == "KF-ANC":
         return kf_anc(N_TAPS, path, **kalman)
     if name == "KF-PB":
-        return kf_pb(N_TAPS, path, window_s=0.05, credit_s=0.05, **powers, **kalman)
+        return kf_pb(N_TAPS, path, memory_s=0.05, credit_s=0.05, **powers, **kalman)
     make = kf_opc if name == "KF-OPC" else kf_opc_repaired
     return make(N_TAPS, path, power_memory=MEMORY_S, **powers, **kalman)
 

@@ -134,7 +134,7 @@ def test_bursts_take_the_whole_band() -> None:
     values=st.lists(st.floats(-1e3, 1e3).filter(lambda v: abs(v) > 1e-3), min_size=1, max_size=50),
     swing=st.floats(0.0, 40.0),
     period=st.floats(0.01, 100.0),
-    phase_rad=st.floats(-10.0, 10.0),
+    phase=st.floats(-10.0, 10.0),
 )
 @settings(max_examples=60)
 def test_swelling_keeps_the_mean_power_and_its_input(
@@ -150,7 +150,7 @@ def test_swelling_keeps_the_mean_power_and_its_input(
         np.testing.assert_allclose(y, x, rtol=1e-14)
 
 
-@pytest.mark.parametrize("phase_rad", [0.0, 1.0, -2.5])
+@pytest.mark.parametrize("phase", [0.0, 1.0, -2.5])
 @pytest.mark.parametrize(("swing", "period"), [(6.0, 4.0), (3.0, 1.6), (12.0, 8.0)])
 def test_the_level_swings_as_a_sine_of_its_period(swing: float, period: float, phase: float) -> None:
     """Seen in the powers of noise over a 40th of a period, 0.04 s and more: some 80 degrees of freedom give 0.7 dB
@@ -193,7 +193,7 @@ def test_it_goes_round_and_begins_anywhere(turns: float, start: float) -> None:
 
 @given(
     frequency=st.floats(20.0, 400.0),
-    phase_rad=st.floats(0.0, 6.28),
+    phase=st.floats(0.0, 6.28),
     samples=st.integers(2001, 6000),
     start=st.floats(0.0, 1.0),
 )
@@ -258,7 +258,7 @@ BAD = [
     (lambda: swelling([1.0], fs=0.0), ValueError, r"fs must be greater than 0"),
     (lambda: swelling([1.0], fs=FS, swing_db=-1.0), ValueError, r"swing_db must not be negative"),
     (lambda: swelling([1.0], fs=FS, period_s=0.0), ValueError, r"period_s must be greater than 0"),
-    (lambda: swelling([1.0], fs=FS, phase_rad=np.inf), ValueError, r"phase must be finite"),
+    (lambda: swelling([1.0], fs=FS, phase_rad=np.inf), ValueError, r"phase_rad must be finite"),
     (lambda: looped(RECORDING, 0.0, fs=RATE), ValueError, r"duration_s must be greater than 0"),
     (lambda: looped(RECORDING, 1.0, fs=RATE, start_s=-1.0), ValueError, r"start_s must not be negative"),
     (lambda: looped([np.nan] * 600, 1.0, fs=RATE), ValueError, r"recording must be finite"),
