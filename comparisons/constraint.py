@@ -108,7 +108,13 @@ def constraint_study(runs: Runs, seeds: Sequence[int], durations_s: Sequence[flo
         verdicts=_claims(rows, jumps, clipped, settled),
         figures=constraint_figures(rows, jumps, course),
         notes=_notes(made, rows),
-        tables=[_power_table(rows), _limiter_table(rows), _jump_table(jumps), _amplifier_table(clipped)],
+        tables=[
+            _summary_table(rows),
+            _power_table(rows),
+            _limiter_table(rows),
+            _jump_table(jumps),
+            _amplifier_table(clipped),
+        ],
         claims="Aims",
     )
 
@@ -225,39 +231,54 @@ def _ratio(ours: float | None, theirs: float | None) -> float:
     return mine / other if other > 0.0 else (0.0 if mine == 0.0 else np.inf)
 
 
-def _power_table(rows: Sequence[Row]) -> Table:
-    headings = ["paths", "noise", "rated power", "duration", "bound dB", "scaled Wiener dB"]
-    for name in TUNED:
-        headings += [f"{name} dB", "power", "worst 100 ms"]
+def _summary_table(rows: Sequence[Row]) -> Table:
+    """What all runs together say of each algorithm."""
+    groups = {
+        f"{kind} noise": [row for row in rows if row.setting.stationary == stationary]
+        for kind, stationary in (("stationary", True), ("varying", False))
+    }
     return Table(
+        "summary",
+        "All runs: output power over the rated one, noise reduction below the bound in dB, and largest mean power over "
+        f"{1e3 * WINDOW_S:g} ms over the rated one",
+        ["algorithm", "noise", "runs", "power", "below, mean", "below, worst", "runs > 1 dB below", "worst window"],
+        [_summary_cells(name, kind, own) for name in TUNED for kind, own in groups.items() if own],
+    )
+
+
+def _summary_cells(algorithm: str, kind: str, rows: Sequence[Row]) -> list[str | float]:
+    own = [row for row in rows if row.algorithm == algorithm]
+    losses = np.array([row.loss_db for row in own])
+    worst = float(np.max([row.worst_window for row in own]))
+    below = [float(np.mean(losses)), float(np.max(losses)), int(np.sum(losses > 1.0))]
+    return [algorithm, kind, len(own), _range(own), *below, worst]
+
+
+def _power_table(rows: Sequence[Row]) -> Table:
+    return _case_table(
         "power",
         "Noise reduction over the steady half (mean over seeds), output power over the rated one (least and largest of the "
         "seeds) and largest mean power over 100 ms over the rated one. Bound: the power-constrained Wiener solution over "
         "the record (tone, compressor, band noise) or of each second (motor, bursts, swelling band noise)",
-        headings,
-        [
-            [*_case_cells(own), *(cell for name in TUNED for cell in _cells([r for r in own if r.algorithm == name]))]
-            for own in _cases(rows)
-        ],
+        rows,
+        {name: name for name in TUNED},
     )
 
 
 def _limiter_table(rows: Sequence[Row]) -> Table:
+    return _case_table("limiter", "The same behind the limiter", rows, {name: f"{name} limited" for name in LIMITED})
+
+
+def _case_table(stem: str, caption: str, rows: Sequence[Row], shown: Mapping[str, str]) -> Table:
+    """A line for each case; `shown` are algorithms by the name in the heading."""
     headings = ["paths", "noise", "rated power", "duration", "bound dB", "scaled Wiener dB"]
-    for name in LIMITED:
+    for name in shown:
         headings += [f"{name} dB", "power", "worst 100 ms"]
-    return Table(
-        "limiter",
-        "The same behind the limiter",
-        headings,
-        [
-            [
-                *_case_cells(own),
-                *(cell for name in LIMITED for cell in _cells([r for r in own if r.algorithm == f"{name} limited"])),
-            ]
-            for own in _cases(rows)
-        ],
-    )
+    lines = []
+    for own in _cases(rows):
+        figures = [_cells([row for row in own if row.algorithm == algorithm]) for algorithm in shown.values()]
+        lines.append([*_case_cells(own), *_joined(figures)])
+    return Table(stem, caption, headings, lines)
 
 
 def _cases(rows: Sequence[Row]) -> list[list[Row]]:
@@ -275,12 +296,14 @@ def _case_cells(rows: Sequence[Row]) -> list[str | float]:
 
 
 def _cells(rows: Sequence[Row]) -> list[str | float]:
+    reduction = float(np.mean([row.noise_reduction_db for row in rows]))
+    return [reduction, _range(rows), max(row.worst_window for row in rows)]
+
+
+def _range(rows: Sequence[Row]) -> str:
+    """Least and largest output power."""
     powers = [row.power for row in rows]
-    return [
-        float(np.mean([row.noise_reduction_db for row in rows])),
-        f"{np.min(powers):.2f}-{np.max(powers):.2f}",
-        max(row.worst_window for row in rows),
-    ]
+    return f"{np.min(powers):.2f}-{np.max(powers):.2f}"
 
 
 def _jump_table(jumps: Sequence[Jump]) -> Table:

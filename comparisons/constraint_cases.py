@@ -17,6 +17,7 @@ from kfopc_filterpy import (
     bursty_noise,
     compressor_noise,
     duct_paths,
+    level_jump,
     load_measured_duct,
     looped,
     path_taps,
@@ -35,7 +36,6 @@ TONE_HZ = 300.0
 BAND_HZ = (100.0, 1000.0)
 SWING_DB, PERIOD_S = 6.0, 4.0
 STATIONARY = ("tone", "compressor", "band noise")
-VARYING = ("motor", "bursts", "swelling band noise")
 
 Noise = Callable[[float, int], np.ndarray]
 
@@ -147,9 +147,7 @@ def bound_of(scene: Scene) -> PowerConstrainedWiener:
 
 def with_jump(noise: np.ndarray, gain_db: float, begin_s: float, end_s: float) -> np.ndarray:
     """The noise, louder or softer between two times."""
-    jumped = noise.copy()
-    jumped[round(begin_s * FS) : round(end_s * FS)] *= 10 ** (gain_db / 20)
-    return jumped
+    return level_jump(level_jump(noise, begin_s, gain_db, fs=FS), end_s, -gain_db, fs=FS)
 
 
 def settings(pairs: Mapping[str, Any], made: Mapping[str, Noise]) -> list[Setting]:

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy._figures import MARK, decibels, legend_above, line_style
+from kfopc_filterpy.plotting import _short_time_power
 
 from .constraint_cases import FS
 from .constraint_runs import JUMP_S, SHARES, WINDOW_S, Course, Jump, Row
 from .report import FigureItem
 
 SHOWN = ("KF-OPC", "KF-OPC repaired", "KF-PB")
-MARKERS = ("o", "s", "D")
+# One colour and marker for an algorithm in all figures.
+STYLES = {"KF-OPC": (0, "o"), "KF-OPC repaired": (1, "s"), "KF-PB": (2, "D"), "KF-PB limited": (3, "^")}
 
 
 def constraint_figures(rows: Sequence[Row], jumps: Sequence[Jump], course: Course) -> list[FigureItem]:
@@ -79,8 +81,9 @@ def _by_case(
             for row in rows
             if row.algorithm == name
         ]
-        color = line_style(k)["color"]
-        ax.plot(*zip(*points, strict=True), MARKERS[k], color=color, markersize=4, alpha=0.8, label=name)
+        style, marker = STYLES[name]
+        color = line_style(style)["color"]
+        ax.plot(*zip(*points, strict=True), marker, color=color, markersize=4, alpha=0.8, label=name)
     ax.axhline(mark, color=MARK, linewidth=1)
     for i in range(1, len(cases)):
         ax.axvline(i - 0.5, color=MARK, linewidth=0.4 if cases[i].path == cases[i - 1].path else 1.5, alpha=0.5)
@@ -102,11 +105,8 @@ def _by_case(
 
 
 def _mean_power(signal: np.ndarray, window_s: float) -> np.ndarray:
-    """Mean square over the window that ends at each sample, zeros before the first."""
-    total = np.concatenate([[0.0], np.cumsum(np.asarray(signal) ** 2)])
-    width = round(window_s * FS)
-    start = np.maximum(np.arange(1, total.size) - width, 0)
-    return (total[1:] - total[start]) / width
+    """Mean square over the window that ends at each sample."""
+    return _short_time_power(np.asarray(signal)[None], round(window_s * FS))
 
 
 def _course(course: Course) -> FigureItem:
@@ -150,10 +150,10 @@ def _limiter(course: Course) -> FigureItem:
     figure = Figure(figsize=(9.0, 4.0), layout="constrained")
     ax = figure.subplots()
     part = slice(round(10 * FS), round(14 * FS))
-    for k, (name, label) in enumerate({"KF-PB": "without limiter", "KF-PB limited": "with limiter"}.items()):
+    for name, label in {"KF-PB": "without limiter", "KF-PB limited": "with limiter"}.items():
         result = course.results[name]
         short = _mean_power(result.control_signal, WINDOW_S) / course.rated_power
-        ax.plot(result.time_s[part][::16], short[part][::16], label=f"KF-PB {label}", **line_style(k))
+        ax.plot(result.time_s[part][::16], short[part][::16], label=f"KF-PB {label}", **line_style(STYLES[name][0]))
     ax.axhline(1.0, color=MARK, linewidth=1)
     ax.set_xlabel("Time (s)")
     ax.set_ylabel(f"Power over {1e3 * WINDOW_S:g} ms / rated power")

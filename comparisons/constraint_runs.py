@@ -19,6 +19,7 @@ from kfopc_filterpy import (
     path_taps,
     perturbed_path,
 )
+from kfopc_filterpy._figures import decibels
 
 from .constraint_cases import FS, SWITCH_ON_S, Setting, bound_of, make_case, with_jump
 from .scene import BUDGETED, Scene, Tuned, make_controller
@@ -172,11 +173,11 @@ def _mean_weight(result: SimulationResult, part: slice) -> float:
 
 def _decibels(one: float, other: float) -> float:
     """Ratio in dB, 0 where both are 0."""
-    return 0.0 if one == other else float(10 * np.log10(max(one, 1e-30) / max(other, 1e-30)))
+    return float(decibels(one) - decibels(other))
 
 
 def _reduction(result: SimulationResult, part: slice) -> float:
-    return float(-10 * np.log10(np.sum(result.error[part] ** 2) / np.sum(result.disturbance[part] ** 2)))
+    return noise_reduction_db(result.error[part], result.disturbance[part], steady=1.0)
 
 
 @dataclass(frozen=True)

@@ -93,13 +93,23 @@ def test_rows_say_what_such_runs_must_give(small: Any) -> None:
             assert row["bound_db"] == pytest.approx(-20 * np.log10(1 - np.sqrt(row["share"])), abs=0.05)
 
 
-@pytest.mark.parametrize("stem", ["power", "limiter", "jumps", "amplifier"])
+@pytest.mark.parametrize("stem", ["summary", "power", "limiter", "jumps", "amplifier"])
 def test_tables_have_their_columns_and_files(small: Any, stem: str, tmp_path: Any) -> None:
     report: StudyReport = small[0]
-    assert [table.stem for table in report.tables] == ["power", "limiter", "jumps", "amplifier"]
+    assert [table.stem for table in report.tables] == ["summary", "power", "limiter", "jumps", "amplifier"]
     table = next(table for table in report.tables if table.stem == stem)
     filters = {"power": constraint.TUNED, "limiter": ("KF-OPC", "KF-PB")}.get(stem, ())
     headings = {
+        "summary": [
+            "algorithm",
+            "noise",
+            "runs",
+            "power",
+            "below, mean",
+            "below, worst",
+            "runs > 1 dB below",
+            "worst window",
+        ],
         "jumps": [
             "paths",
             "noise",
@@ -121,8 +131,8 @@ def test_tables_have_their_columns_and_files(small: Any, stem: str, tmp_path: An
         ],
     }.get(stem, COLUMNS_OF_ALL + [heading for name in filters for heading in (f"{name} dB", "power", "worst 100 ms")])
     assert list(table.headings) == headings
-    # both noises at both rated powers; the tone at both, louder and softer; 3 filters x 4 amplifiers and 2 wrong paths
-    assert len(table.rows) == {"power": 4, "limiter": 4, "jumps": 4, "amplifier": 14}[stem]
+    # 3 filters, stationary and varying; both noises at both rated powers; the tone at both, louder and softer; 3 filters x 4 amplifiers and 2 wrong paths
+    assert len(table.rows) == {"summary": 6, "power": 4, "limiter": 4, "jumps": 4, "amplifier": 14}[stem]
     assert all(len(row) == len(headings) for row in table.rows)
     write_report([replace(report, figures=[], tables=[table])], tmp_path)
     with (tmp_path / "tables" / f"constraint-{stem}.csv").open(newline="", encoding="utf-8") as file:
@@ -132,7 +142,7 @@ def test_tables_have_their_columns_and_files(small: Any, stem: str, tmp_path: An
 
 def test_the_power_table_holds_the_rows(small: Any) -> None:
     report: StudyReport = small[0]
-    for cells in report.tables[0].rows:
+    for cells in next(table for table in report.tables if table.stem == "power").rows:
         own = [
             r
             for r in report.extra["rows"]
@@ -145,6 +155,22 @@ def test_the_power_table_holds_the_rows(small: Any) -> None:
             assert cells[6 + 3 * k] == row["noise_reduction_db"]
             assert cells[7 + 3 * k] == f"{row['power']:.2f}-{row['power']:.2f}"
             assert cells[8 + 3 * k] == row["worst_window"]
+
+
+def test_the_summary_holds_what_the_rows_of_an_algorithm_say(small: Any) -> None:
+    report: StudyReport = small[0]
+    for algorithm, noise, runs, power, mean, worst, far, window in report.tables[0].rows:
+        own = [
+            r
+            for r in report.extra["rows"]
+            if r["algorithm"] == algorithm
+            and (r["setting"]["noise"] in constraint_cases.STATIONARY) == (noise == "stationary noise")
+        ]
+        losses = [r["bound_db"] - r["noise_reduction_db"] for r in own]
+        assert (runs, far) == (len(own), sum(loss > 1.0 for loss in losses))
+        assert (mean, worst) == pytest.approx((np.mean(losses), max(losses)), abs=1e-9)  # sums in another order
+        assert power == f"{min(r['power'] for r in own):.2f}-{max(r['power'] for r in own):.2f}"
+        assert window == max(r["worst_window"] for r in own)
 
 
 def test_the_terminal_shows_verdicts_and_tables(small: Any) -> None:

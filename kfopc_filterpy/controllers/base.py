@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -57,6 +57,15 @@ def unconstrained() -> OutputPowerConstraint:
     constraint = OutputPowerConstraint(1.0)
     constraint.factor = 1.0
     return constraint
+
+
+def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
+    """Raise ValueError where a part of a controller, by its name, is of another sample rate than the run's `fs` in Hz."""
+    for name, rate in rates.items():
+        if rate is not None and abs(rate - fs) > 1e-9 * fs:
+            raise ValueError(
+                f"fs is {fs:g} Hz but the controller's {name} is for {rate:g} Hz: make it with the fs of the run"
+            )
 
 
 class FilteredReferenceController:
@@ -211,14 +220,15 @@ class FilteredReferenceController:
         return self.constraint.fs
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError where the secondary path or the memory of the powers is of another sample rate."""
-        rates = {"secondary path": self._path_fs, "power memory": self._powers_fs if self.rated_power else None}
-        rates["limiter"] = None if self.limiter is None else self.limiter.fs
-        for name, rate in rates.items():
-            if rate is not None and abs(rate - fs) > 1e-9 * fs:
-                raise ValueError(
-                    f"fs is {fs:g} Hz but the controller's {name} is for {rate:g} Hz: make it with the fs of the run"
-                )
+        """Raise ValueError where the secondary path, the memory of the powers or the limiter is of another sample rate."""
+        require_rates(
+            fs,
+            {
+                "secondary path": self._path_fs,
+                "power memory": self._powers_fs if self.rated_power else None,
+                "limiter": None if self.limiter is None else self.limiter.fs,
+            },
+        )
 
     def steps_of(self, family: type) -> bool:
         """Whether the two calls a sample are those of `family`, which the compiled loop knows, and not a subclass's."""

@@ -16,6 +16,7 @@ from ..delay_lines import latest, newest
 from ..estimator import KFOPC
 from ..limiter import OutputLimiter
 from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate
+from ..power_budget import PowerBudget
 from ..power_budget_filter import PowerBudgetKalmanFilter
 from ..random_walk import RandomWalkKFOPC
 from .base import FilteredReferenceController
@@ -87,8 +88,13 @@ class KalmanController(FilteredReferenceController):
             raise ValueError("block_size needs an estimator of dtype float64: its products cancel too much in float32")
         self._block = None if size is None else CausalBlock(estimator.dim_x, size)
 
+    @property
+    def _budget(self) -> PowerBudget | None:
+        """The estimator's power budget, if it has one."""
+        return self.estimator.budget if isinstance(self.estimator, PowerBudgetKalmanFilter) else None
+
     def _usual_name(self) -> str:
-        if isinstance(self.estimator, PowerBudgetKalmanFilter):
+        if self._budget is not None:
             return "KF-PB"
         return "KF-ANC" if self.rated_power is None else "KF-OPC"
 
@@ -105,18 +111,16 @@ class KalmanController(FilteredReferenceController):
     @property
     def control_filter(self) -> np.ndarray:
         """Control filter that makes y, (L,); a copy."""
-        estimator = self.estimator
-        return estimator.control_filter if isinstance(estimator, PowerBudgetKalmanFilter) else self.weights
+        return self.weights if self._budget is None else self._budget.control_filter
 
     @property
     def power_weight(self) -> float:
         """Weight lambda of the control power in a power budget; NaN without one."""
-        return getattr(self.estimator, "power_weight", np.nan)
+        return np.nan if self._budget is None else self._budget.power_weight
 
     @property
     def _powers_fs(self) -> float:
-        estimator = self.estimator
-        return estimator.budget.fs if isinstance(estimator, PowerBudgetKalmanFilter) else self.constraint.fs
+        return self.constraint.fs if self._budget is None else self._budget.fs
 
     @property
     def constraint(self) -> OutputPowerConstraint:
@@ -142,8 +146,8 @@ class KalmanController(FilteredReferenceController):
         """State that sees what the estimator has now: its weights, and the arrays of its powers and budget."""
         self._state.weights[:] = self.weights
         state = self._state._replace(constraint=self.constraint.state)
-        if isinstance(self.estimator, PowerBudgetKalmanFilter):
-            budget = self.estimator.budget.state
+        if self._budget is not None:
+            budget = self._budget.state
             state = state._replace(budget=budget, control_filter=budget.control_filter)
         return state
 
@@ -154,7 +158,7 @@ class KalmanController(FilteredReferenceController):
         x, powers = latest(self._state.reference), self.constraint
         powers.preview(d, h[0, 0], x)  # refuses what would overflow before anything changes
         self.estimator.predict()
-        if isinstance(self.estimator, PowerBudgetKalmanFilter):
+        if self._budget is not None:
             self.estimator.update(d, H=h, reference=x, control_signal=self._y)
         elif isinstance(self.estimator, KFOPC):
             self.estimator.update(d, H=h, reference=x)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..limiter import OutputLimiter
-from .base import Controller, FilteredReferenceController
+from .base import Controller, FilteredReferenceController, require_rates
 
 
 class LimitedController:
@@ -66,10 +66,7 @@ class LimitedController:
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError where the limiter is of another sample rate."""
-        if abs(self.limiter.fs - fs) > 1e-9 * fs:
-            raise ValueError(
-                f"fs is {fs:g} Hz but the controller's limiter is for {self.limiter.fs:g} Hz: make it with the fs of the run"
-            )
+        require_rates(fs, {"limiter": self.limiter.fs})
 
     def update(self, error: float) -> None:
         """Let the controller adapt to the error e(n)."""

@@ -7,9 +7,10 @@ from typing import Any
 from .._validate import as_choice, as_number, as_positive
 from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..delay_lines import latest, newest
 from ..estimator import KFOPC
 from ..limiter import OutputLimiter
-from ..loop import ControllerState, disturbance_estimate, latest, newest
+from ..loop import ControllerState, disturbance_estimate
 from ..random_walk import RandomWalkKFOPC
 from ..repairs import advance_repair, gain_samples, measurement_factor, new_repair
 from .kalman import KalmanController
