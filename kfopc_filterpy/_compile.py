@@ -25,6 +25,7 @@ COMPILED_MODULES = (
     "delay_lines",
     "kernels",
     "limiter",
+    "lms_rules",
     "lockstep",
     "loop",
     "power_budget",

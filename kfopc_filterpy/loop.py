@@ -30,7 +30,6 @@ from .delay_lines import latest, newest, push
 from .kernels import (
     CANCELLATION,
     DIAGONAL,
-    FAST,
     INVERSE_S,
     SCALE,
     Covariance,
@@ -41,6 +40,7 @@ from .kernels import (
     update_weights,
 )
 from .limiter import LimiterState, limit_sample
+from .lms_rules import change_weights, hold_amplitude, lms_change
 from .power_budget import WEIGHT, BudgetState, advance_budget, take_correlations
 from .repairs import RepairState, advance_repair, gain_samples, measurement_factor, output_gain
 
@@ -60,7 +60,7 @@ class ControllerState(NamedTuple):
     filtered: np.ndarray  # delay line of x' = s^ * x
     output: np.ndarray  # delay line of y, through the amplifier model where one is known
     amplifier: np.ndarray  # (3,) parameters of that model; linear: d^ = e + s^ * y as published
-    settings: np.ndarray  # Kalman: r, q, fading alpha squared; LMS: step size
+    settings: np.ndarray  # Kalman: r, q, fading alpha squared; LMS: those of `lms_rules`
     covariance: Covariance  # Kalman
     constraint: ConstraintState  # powers, gain, factor
     last: np.ndarray  # (3,) disturbance estimate, residual and S of the last Kalman update; NaN: none in this run
@@ -83,6 +83,8 @@ def control_signal(controller, x):
     take_reference(controller, x)
     w = controller.control_filter
     y = output_gain(controller.repair) * dot(w, newest(controller.reference, w.size))
+    if controller.kind == LMS:
+        y = hold_amplitude(controller.settings, w, y)
     y = limited(controller.limiter, y)
     model = controller.amplifier
     push(controller.output, amplify(model[0], model[1], model[2], y))
@@ -177,23 +179,15 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
-@part(fastmath=FAST, forceinline=True)
+@part(forceinline=True)
 def adapt_lms(controller, error, y):
-    """w += mu (e x' - gamma y x), gamma = G_s (1/alpha - 1): zero where the rated power is enough (FxLMS).
-
-    While nothing has come through the estimated path, G_s = 0 and gamma = sqrt(G_s delta_d^2 / rho_o) - G_s is 0 too.
-    """
+    """One step of the filtered-reference LMS family (see `lms_rules`); `y` is the control signal that was emitted."""
     d = disturbance_estimate(controller, error)
     w = controller.weights
-    xf = newest(controller.filtered, w.size)
-    x = newest(controller.reference, w.size)
+    xf, x = newest(controller.filtered, w.size), newest(controller.reference, w.size)
     factor = advance_constraint(controller.constraint, d, xf[0], x[0])
-    gain = controller.constraint.table[LAST, GAIN]
-    gamma = gain * (1.0 / factor - 1.0) if factor < 1.0 and gain > 0.0 else 0.0
-    mu = controller.settings[0]
-    correction, penalty = mu * error, mu * gamma * y
-    for i in range(w.size):
-        w[i] += correction * xf[i] - penalty * x[i]
+    keep, correction, penalty = lms_change(controller, d, error, y, factor)
+    change_weights(w, x, xf, keep, correction, penalty)
 
 
 @part(forceinline=True)

@@ -1,4 +1,4 @@
-"""The filtered-reference LMS family: FxLMS and MOV-FxLMS."""
+"""The filtered-reference LMS without a constraint: FxLMS, and FxNLMS with a normalised step."""
 
 from __future__ import annotations
 
@@ -6,13 +6,42 @@ from typing import Any
 
 from .._validate import as_positive
 from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..constraint import OutputPowerConstraint
 from ..limiter import OutputLimiter
+from ..lms_rules import FACTOR, LIMIT, NORMALISED, PLAIN, STEP_SIZE, lms_settings
 from ..loop import LMS
 from .base import FilteredReferenceController
 
 
-class FxLMS(FilteredReferenceController):
+class LMSController(FilteredReferenceController):
+    """What the controllers of the LMS family share: the settings of their rule in `lms_rules`."""
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        settings: list[float],
+        amplifier: Amplifier | None = None,
+        constraint: OutputPowerConstraint | None = None,
+        limiter: OutputLimiter | None = None,
+    ) -> None:
+        super().__init__(LMS, n_taps, secondary_path, settings, amplifier, constraint, limiter)
+
+    @property
+    def step_size(self) -> float:
+        """Step size mu."""
+        return float(self._state.settings[STEP_SIZE])
+
+    @property
+    def _factor(self) -> float:
+        return float(self._state.settings[FACTOR])
+
+    @property
+    def _limit(self) -> float:
+        return float(self._state.settings[LIMIT])
+
+
+class FxLMS(LMSController):
     r"""Filtered-reference LMS, :math:`w(n+1) = w(n) + \mu e(n) x'(n)`, without a constraint.
 
     Parameters
@@ -53,58 +82,47 @@ class FxLMS(FilteredReferenceController):
     def __init__(
         self, n_taps: int, secondary_path: Any, *, step_size: float, limiter: OutputLimiter | None = None
     ) -> None:
-        super().__init__(LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], limiter=limiter)
-
-    @property
-    def step_size(self) -> float:
-        """Step size mu."""
-        return float(self._state.settings[0])
+        settings = lms_settings(PLAIN, as_positive(step_size, "step_size"))
+        super().__init__(n_taps, secondary_path, settings, limiter=limiter)
 
 
-class MOVFxLMS(FilteredReferenceController):
-    r"""Minimum-output-variance FxLMS: the leak of FxLMS that keeps the control signal to its rated power.
+class FxNLMS(LMSController):
+    r"""Normalised FxLMS: the step is measured by the energy of the filtered reference, without a constraint.
 
-    .. math:: w(n+1) = w(n) + \mu [e(n) x'(n) - \gamma y(n) x(n)], \qquad
-       \gamma = \max\{G_s (\sqrt{\delta_d^2 / (\rho_o G_s)} - 1), 0\}
+    .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
 
-    so that :math:`G_s / (G_s + \gamma)` is the constraint factor of eq. 13 for a flat path. The powers are estimated
-    as KF-OPC's are.
+    so that one step size serves soft and loud noise.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size
+    n_taps, secondary_path, limiter
         As for `FxLMS`.
-    rated_power : float
-        Rated output power rho_o.
-    fs, power_memory, power_window, secondary_path_gain
-        As `fs`, `memory`, `window`, `secondary_path_gain` of `OutputPowerConstraint`.
-    amplifier : callable, optional
-        Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
-    limiter : OutputLimiter, optional
-        As for `FxLMS`.
+    step_size : float
+        Step size mu, above zero; below 2 for a secondary path of no delay, and the less the longer the path.
+    regularization : float, default 1e-10
+        Energy epsilon that keeps the quotient finite while the reference is silent, above zero.
 
     Raises
     ------
     ValueError
-        A step size, rated power, rate, memory or gain that is not positive and finite, another window, fewer than
-        one tap, a path that is no FIR path.
-    TypeError
-        An amplifier that is none of the amplifier models.
+        A step size or regularization that is not positive and finite, fewer than one tap, a path that is no FIR path.
 
     References
     ----------
-    D. Shi, W.-S. Gan, B. Lam, S. Wen, X. Shen, "Optimal output-constrained active noise control based on inverse
-    adaptive modeling leak factor estimate", IEEE/ACM TASLP 29, 2021.
+    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999.
 
     Examples
     --------
-    >>> from kfopc_filterpy import MOVFxLMS
-    >>> controller = MOVFxLMS(4, secondary_path=[1.0], step_size=0.1, rated_power=0.5)
-    >>> controller.rated_power
-    0.5
+    >>> from kfopc_filterpy import FxNLMS
+    >>> controller = FxNLMS(4, secondary_path=[1.0], step_size=0.5)
+    >>> controller.control_signal(2.0)
+    0.0
+    >>> controller.update(4.0)
+    >>> round(float(controller.weights[0]), 9)  # 0.5 * 4 * 2 / 2^2
+    1.0
     """
 
-    name = "MOV-FxLMS"
+    name = "FxNLMS"
 
     def __init__(
         self,
@@ -112,31 +130,14 @@ class MOVFxLMS(FilteredReferenceController):
         secondary_path: Any,
         *,
         step_size: float,
-        rated_power: float,
-        fs: float = DEFAULT_FS,
-        power_memory: float = DEFAULT_MEMORY_S,
-        power_window: str = "exponential",
-        secondary_path_gain: float | None = None,
-        amplifier: Amplifier | None = None,
+        regularization: float = 1e-10,
         limiter: OutputLimiter | None = None,
     ) -> None:
-        constraint = OutputPowerConstraint(
-            rated_power,
-            secondary_path_gain=secondary_path_gain,
-            fs=fs,
-            memory=power_memory,
-            window=power_window,
-        )
-        super().__init__(
-            LMS, n_taps, secondary_path, [as_positive(step_size, "step_size")], amplifier, constraint, limiter
-        )
+        epsilon = as_positive(regularization, "regularization")
+        settings = lms_settings(NORMALISED, as_positive(step_size, "step_size"), factor=epsilon)
+        super().__init__(n_taps, secondary_path, settings, limiter=limiter)
 
     @property
-    def step_size(self) -> float:
-        """Step size mu."""
-        return float(self._state.settings[0])
-
-    @property
-    def rated_power(self) -> float:
-        """Rated output power."""
-        return self.constraint.rated_power
+    def regularization(self) -> float:
+        """Regularization epsilon."""
+        return self._factor

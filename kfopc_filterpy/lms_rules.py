@@ -1,0 +1,86 @@
+"""What the filtered-reference LMS family adds to the control filter at a sample, one rule an algorithm.
+
+All are of one form,
+
+.. math:: w(n+1) = k\\, w(n) + c\\, x'(n) - p\\, x(n)
+
+with numbers `keep` k, `correction` c and `penalty` p that `lms_change` gives; an amplitude limit acts on the control
+signal itself, in `hold_amplitude`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ._compile import part
+from .constraint import GAIN, LAST, MEAN, REFERENCE
+from .delay_lines import newest
+from .kernels import FAST, dot
+
+# Rules. From TWO_GRADIENT on they have an amplitude limit, from RESCALING on they hold the control signal to it.
+PLAIN, NORMALISED, LEAK, RATED_LEAK, PENALTY, RATED_PENALTY, TWO_GRADIENT, RESCALING, CLIPPING = range(9)
+STEP_SIZE, RULE, FACTOR, LIMIT, MODIFIED = range(5)  # settings of an LMS controller
+
+
+def lms_settings(
+    rule: int, step_size: float, *, factor: float = 0.0, limit: float = np.inf, modified: bool = False
+) -> list[float]:
+    """Settings of a rule.
+
+    `factor` is the regularisation, the leak, the penalty factor or the step size of the second gradient, of the rules
+    that have one; `modified` replaces the error by the disturbance estimate less ``w' x'``.
+    """
+    return [step_size, rule, factor, limit, modified]
+
+
+@part(forceinline=True)
+def penalty_of_budget(constraint, factor):
+    """gamma = G_s (1/alpha - 1): zero where the rated power is enough.
+
+    While nothing has come through the estimated path, G_s = 0 and gamma = sqrt(G_s delta_d^2 / rho_o) - G_s is 0 too.
+    """
+    gain = constraint.table[LAST, GAIN]
+    return gain * (1.0 / factor - 1.0) if factor < 1.0 and gain > 0.0 else 0.0
+
+
+@part(forceinline=True)
+def lms_change(controller, disturbance, error, y, factor):
+    """k, c and p of this sample; `factor` is the constraint factor, `y` the control signal that was emitted."""
+    settings, w = controller.settings, controller.weights
+    mu, rule, second = settings[STEP_SIZE], settings[RULE], settings[FACTOR]
+    if settings[MODIFIED] != 0.0:
+        error = disturbance - dot(w, newest(controller.filtered, w.size))
+    if rule == NORMALISED:
+        xf = newest(controller.filtered, w.size)
+        return 1.0, mu * error / (second + dot(xf, xf)), 0.0
+    if rule == LEAK:
+        return 1.0 - mu * second, mu * error, 0.0
+    if rule == RATED_LEAK:
+        gamma = penalty_of_budget(controller.constraint, factor) * controller.constraint.table[MEAN, REFERENCE]
+        return 1.0 - mu * gamma, mu * error, 0.0
+    if rule == PENALTY:
+        return 1.0, mu * error, mu * second * y
+    if rule == RATED_PENALTY:
+        return 1.0, mu * error, mu * penalty_of_budget(controller.constraint, factor) * y
+    if rule == TWO_GRADIENT and abs(y) > settings[LIMIT]:
+        return 1.0, 0.0, second * y
+    return 1.0, mu * error, 0.0
+
+
+@part(fastmath=FAST, forceinline=True)
+def change_weights(w, x, xf, keep, correction, penalty):
+    """w = k w + c x' - p x."""
+    for i in range(w.size):
+        w[i] = keep * w[i] + correction * xf[i] - penalty * x[i]
+
+
+@part(forceinline=True)
+def hold_amplitude(settings, w, y):
+    """y held to its limit, by the rules that hold it; re-scaling takes the weights along."""
+    if settings[RULE] < RESCALING or not settings[LIMIT] < abs(y) < np.inf:  # Inf and NaN: the loop sees a divergence
+        return y
+    if settings[RULE] == RESCALING:
+        ratio = settings[LIMIT] / abs(y)
+        for i in range(w.size):
+            w[i] *= ratio
+    return settings[LIMIT] if y > 0.0 else -settings[LIMIT]
