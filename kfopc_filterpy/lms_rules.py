@@ -20,6 +20,10 @@ from .kernels import FAST, dot
 # Rules. From TWO_GRADIENT on they have an amplitude limit, from RESCALING on they hold the control signal to it.
 PLAIN, NORMALISED, LEAK, RATED_LEAK, PENALTY, RATED_PENALTY, TWO_GRADIENT, RESCALING, CLIPPING = range(9)
 STEP_SIZE, RULE, FACTOR, LIMIT, MODIFIED = range(5)  # settings of an LMS controller
+MEASUREMENT_NOISE, STATE_NOISE = (
+    STEP_SIZE,
+    FACTOR,
+)  # of the diagonal Kalman filter, which is LMS with a step for each tap
 
 
 def lms_settings(
@@ -72,6 +76,27 @@ def change_weights(w, x, xf, keep, correction, penalty):
     """w = k w + c x' - p x."""
     for i in range(w.size):
         w[i] = keep * w[i] + correction * xf[i] - penalty * x[i]
+
+
+@part(fastmath=FAST, forceinline=True)
+def correct_diagonal(variances, w, xf, d, settings):
+    """Eq. 3-8 with P = diag(p): p += r, S = sum p x'^2 + q, K = p x' / S, w += K (d - w'x'), p -= K x' p.
+
+    False for a controller that has no variances.
+    """
+    if variances is None:
+        return False
+    r, S, residual = settings[STATE_NOISE], settings[MEASUREMENT_NOISE], d
+    for i in range(w.size):
+        variances[i] += r
+        S += variances[i] * xf[i] * xf[i]
+        residual -= w[i] * xf[i]
+    if S > 0.0:  # q = 0 and a silent reference tell nothing
+        for i in range(w.size):
+            gain = variances[i] * xf[i] / S
+            w[i] += gain * residual
+            variances[i] *= max(1.0 - gain * xf[i], 0.0)  # rounding of S may put the share above 1
+    return True
 
 
 @part(forceinline=True)

@@ -40,7 +40,7 @@ from .kernels import (
     update_weights,
 )
 from .limiter import LimiterState, limit_sample
-from .lms_rules import change_weights, hold_amplitude, lms_change
+from .lms_rules import change_weights, correct_diagonal, hold_amplitude, lms_change
 from .power_budget import WEIGHT, BudgetState, advance_budget, take_correlations
 from .repairs import RepairState, advance_repair, gain_samples, measurement_factor, output_gain
 
@@ -67,6 +67,7 @@ class ControllerState(NamedTuple):
     budget: BudgetState | None = None  # of a power-budgeted filter
     repair: RepairState | None = None  # of KF-OPC with its gain repaired
     limiter: LimiterState | None = None
+    variances: np.ndarray | None = None  # (L,) of the weights, of a diagonal Kalman filter
 
 
 @part(forceinline=True)
@@ -186,6 +187,8 @@ def adapt_lms(controller, error, y):
     w = controller.weights
     xf, x = newest(controller.filtered, w.size), newest(controller.reference, w.size)
     factor = advance_constraint(controller.constraint, d, xf[0], x[0])
+    if correct_diagonal(controller.variances, w, xf, factor * d, controller.settings):
+        return
     keep, correction, penalty = lms_change(controller, d, error, y, factor)
     change_weights(w, x, xf, keep, correction, penalty)
 

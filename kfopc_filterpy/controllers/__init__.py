@@ -2,7 +2,9 @@
 
 from .amplitude_limited import ClippingFxLMS, RescalingFxLMS, TwoGradientFxLMS
 from .base import Controller
+from .diagonal import DiagonalKalman
 from .fxlms import FxLMS, FxNLMS
+from .fxrls import fx_rls
 from .kalman import KalmanController, kf_anc, kf_opc, kf_pb
 from .limited import LimitedController
 from .penalized import LeakyFxLMS, MOVFxLMS, OptimalLeakyFxLMS, leak_factor, penalty_factor
@@ -11,6 +13,7 @@ from .repaired import RepairedKFOPC, kf_opc_repaired
 __all__ = [
     "ClippingFxLMS",
     "Controller",
+    "DiagonalKalman",
     "FxLMS",
     "FxNLMS",
     "KalmanController",
@@ -21,6 +24,7 @@ __all__ = [
     "RepairedKFOPC",
     "RescalingFxLMS",
     "TwoGradientFxLMS",
+    "fx_rls",
     "kf_anc",
     "kf_opc",
     "kf_opc_repaired",

@@ -1,0 +1,82 @@
+"""Filtered-reference RLS: least squares with exponential forgetting, which is a Kalman filter with fading memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_positive
+from ..amplifiers import Amplifier
+from ..estimator import KFOPC
+from ..limiter import OutputLimiter
+from .kalman import KalmanController
+
+
+def fx_rls(
+    n_taps: int,
+    secondary_path: Any,
+    *,
+    forgetting: float = 0.9999,
+    initial_variance: float = 1.0,
+    amplifier: Amplifier | None = None,
+    limiter: OutputLimiter | None = None,
+    dtype: Any = np.float64,
+) -> KalmanController:
+    r"""FxRLS: the control filter of least :math:`\sum_k \lambda^{n-k} (\hat d(k) - w^T x'(k))^2`, without a constraint.
+
+    .. math:: K = \frac{P x'}{\lambda + x'^T P x'}, \qquad w \leftarrow w + K (\hat d - x'^T w), \qquad
+       P \leftarrow (P - K x'^T P) / \lambda
+
+    from P = `initial_variance` I. It is the Kalman filter with r = 0, q = 1 and filterpy's fading memory
+    :math:`\alpha^2 = 1/\lambda`, whose P is this one before its division by lambda; it runs as that.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, amplifier, limiter, dtype
+        As for `kf_anc`.
+    forgetting : float, default 0.9999
+        Forgetting factor lambda, above 0 and at most 1: the memory is about 1/(1 - lambda) samples.
+    initial_variance : float, default 1
+        P at the start over the variance of the measurement noise: large for a fast start, in the unit of w^2/d^2.
+
+    Returns
+    -------
+    KalmanController
+        A controller named FxRLS.
+
+    Raises
+    ------
+    ValueError
+        A forgetting factor outside (0, 1], what `kf_anc` refuses. In a run: a P that is no longer positive definite. Where
+        the filtered reference leaves directions of the control filter unexcited, as band-limited noise and tones do, P
+        grows there by 1/lambda a sample until rounding spoils it, after some 23 time constants of the memory; state
+        noise in place of forgetting (`kf_anc`) has no such growth.
+
+    References
+    ----------
+    S. M. Kuo, D. R. Morgan, Active Noise Control Systems, Wiley 1996, sec. 5.5 (RLS in place of LMS); S. Haykin,
+    Adaptive Filter Theory, 4th ed., table 9.1.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import fx_rls
+    >>> controller = fx_rls(1, [1.0], forgetting=0.5)
+    >>> controller.control_signal(1.0)
+    0.0
+    >>> controller.update(3.0)
+    >>> round(float(controller.weights[0]), 6)  # K = 1 / (0.5 + 1)
+    2.0
+    """
+    forgetting = as_positive(forgetting, "forgetting")
+    if forgetting > 1.0:
+        raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+    estimator = KFOPC.random_walk(
+        n_taps,
+        state_noise=0.0,
+        measurement_noise=1.0,
+        initial_variance=as_positive(initial_variance, "initial_variance"),
+        dtype=dtype,
+    )
+    estimator.alpha = forgetting**-0.5
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter, name="FxRLS")

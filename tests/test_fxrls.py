@@ -1,0 +1,83 @@
+"""FxRLS against the textbook recursion and against the batch least squares it solves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import HardClipAmplifier, fx_rls, simulate
+
+L = 6
+PATH = np.array([0.0, 0.8, -0.3])
+
+
+def signals(n: int = 300) -> tuple[np.ndarray, np.ndarray]:
+    x, other = np.random.default_rng(5).standard_normal((2, n))
+    return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:n] + 0.1 * other
+
+
+def rows_of(signal: np.ndarray) -> np.ndarray:
+    """(n, L) newest sample first."""
+    padded = np.r_[np.zeros(L - 1), signal]
+    return np.array([padded[n : n + L][::-1] for n in range(signal.size)])
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize(("forgetting", "variance"), [(1.0, 1.0), (0.999, 10.0), (0.95, 0.1)])
+def test_the_weights_are_those_of_the_textbook_recursion(forgetting: float, variance: float, compiled: bool) -> None:
+    """Haykin's table 9.1 on d^ = d, since the path is known exactly. Tolerance: rounding of two forms of P."""
+    x, d = signals()
+    controller = fx_rls(L, PATH, forgetting=forgetting, initial_variance=variance)
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH, record_weights_every=1, compiled=compiled)
+    w, P = np.zeros(L), variance * np.eye(L)
+    for n, h in enumerate(rows_of(np.convolve(x, PATH)[: x.size])):
+        k = P @ h / (forgetting + h @ P @ h)
+        w = w + k * (d[n] - w @ h)
+        P = (P - np.outer(k, h @ P)) / forgetting
+        assert result.weights is not None
+        np.testing.assert_allclose(result.weights[n], w, rtol=0, atol=1e-9)
+    assert result.algorithm == controller.name == "FxRLS"
+
+
+@pytest.mark.parametrize("forgetting", [1.0, 0.99])
+def test_the_weights_are_the_weighted_least_squares(forgetting: float) -> None:
+    """Normal equations over all samples, with the start's lambda^n / variance on the diagonal: a dense solve."""
+    x, d = signals()
+    controller = fx_rls(L, PATH, forgetting=forgetting, initial_variance=2.0)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    H = rows_of(np.convolve(x, PATH)[: x.size])
+    weight = forgetting ** np.arange(x.size - 1, -1, -1.0)
+    normal = H.T @ (weight[:, None] * H) + forgetting**x.size / 2.0 * np.eye(L)
+    np.testing.assert_allclose(controller.weights, np.linalg.solve(normal, H.T @ (weight * d)), rtol=0, atol=1e-10)
+
+
+def test_it_forgets() -> None:
+    """After a change of the disturbance by a factor of -1 it follows in some 1/(1 - lambda) samples, and 1 does not."""
+    x, d = signals(4000)
+    d[2000:] *= -1.0
+    errors = []
+    for forgetting in (0.99, 1.0):
+        result = simulate(fx_rls(L, PATH, forgetting=forgetting), x, disturbance=d, secondary_path=PATH)
+        errors.append(np.mean(result.error[3000:] ** 2))
+    assert errors[0] < 0.02  # the noise of 0.1 and its own
+    assert errors[1] > 0.5
+
+
+def test_a_known_amplifier_and_a_limiter_are_passed_on() -> None:
+    controller = fx_rls(L, PATH, amplifier=HardClipAmplifier(0.5), dtype=np.float32)
+    assert controller.estimator.dtype == np.float32
+    np.testing.assert_array_equal(controller._state.amplifier, HardClipAmplifier(0.5).parameters)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.5, 1.1, np.nan, np.inf])
+def test_a_forgetting_factor_out_of_range_is_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="forgetting"):
+        fx_rls(L, PATH, forgetting=value)
+
+
+@pytest.mark.parametrize("options", [{"initial_variance": 0.0}, {"initial_variance": -1.0}, {"n_taps": 0}])
+def test_other_bad_arguments_are_refused(options: Any) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        fx_rls(**({"n_taps": L, "secondary_path": PATH} | options))
