@@ -26,20 +26,9 @@ from kfopc_filterpy.plotting import (
     plot_output_power,
 )
 
+from .algorithms import ALGORITHMS, CONSTRAINED, make_controller
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import (
-    ALGORITHMS,
-    CONSTRAINED,
-    Runs,
-    Scene,
-    Tuned,
-    figures_of_merit,
-    make_controller,
-    make_scene,
-    run_settings,
-    tune,
-    tuning_runs,
-)
+from .scene import Runs, Scene, figures_of_merit, make_scene
 from .study import (
     BANDPASS_PATHS,
     ceiling_note,
@@ -50,6 +39,7 @@ from .study import (
     sounds,
     tuning_note,
 )
+from .tuning import Tuned, run_settings, tune, tuning_runs, went_through
 
 FS = 16000.0
 BAND = (200.0, 2000.0)
@@ -135,7 +125,7 @@ def _scene(n_taps: int) -> Scene:
 
 def _run_all(runs: Runs, scene: Scene, tuned: dict[str, Tuned], seeds: int = len(SEEDS)) -> Results:
     jobs = [(name, tuned[name].setting, k) for name in tuned for k in range(seeds)]
-    outcomes = run_settings(runs, scene, jobs, lambda result: result)
+    outcomes = run_settings(runs, scene, jobs, went_through)
     return {name: [r for job, r in zip(jobs, outcomes, strict=True) if job[0] == name] for name in tuned}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from kfopc_filterpy.power_budget import DEFAULT_CORRELATION_MEMORY_S, DEFAULT_CREDIT_S
 
+from .algorithms import STATE_NOISE_GRID
 from .constraint_cases import (
     FS,
     N_TAPS,
@@ -39,8 +40,8 @@ from .constraint_runs import (
     with_rated_power,
 )
 from .report import Parameter, StudyReport, Table, Verdict
-from .scene import STATE_NOISE_GRID, Runs, Scene, Tuned, tune
-from .study import RULE
+from .scene import Runs, Scene
+from .tuning import RULE, Tuned, tune
 
 DURATIONS_S = (8.0, 60.0)  # the first is short: it is tuned on, and convergence is measured on it
 SEEDS = (1, 2, 3, 4)

@@ -115,7 +115,8 @@ def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray) -> Scene:
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=0.05,
     )
-    return louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
+    normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
+    return replace(normal, unconstrained_power=1.0)
 
 
 def louder(scene: Scene, gain: float) -> Scene:
@@ -126,6 +127,7 @@ def louder(scene: Scene, gain: float) -> Scene:
         disturbances=[gain * d for d in scene.disturbances],
         sensor_noise_std=gain * scene.sensor_noise_std,
         measurement_noise=gain**2 * scene.measurement_noise,
+        unconstrained_power=gain**2 * scene.unconstrained_power,
         wiener_control_power=gain**2 * scene.wiener_control_power,
     )
 

@@ -21,8 +21,10 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy._figures import decibels
 
+from .algorithms import BUDGETED, make_controller
 from .constraint_cases import FS, SWITCH_ON_S, Setting, bound_of, make_case, with_jump
-from .scene import BUDGETED, Scene, Tuned, make_controller
+from .scene import Scene
+from .tuning import Tuned
 
 SHARES = (0.25, 0.10)  # rated power over the unconstrained control power
 LIMITED = ("KF-OPC", "KF-PB")  # also run behind the limiter

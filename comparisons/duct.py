@@ -33,19 +33,11 @@ from kfopc_filterpy.path_plots import (
 )
 from kfopc_filterpy.plotting import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 
+from .algorithms import ALGORITHMS, POWER_MEMORY_S, make_controller
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import (
-    ALGORITHMS,
-    POWER_MEMORY_S,
-    Runs,
-    Scene,
-    figures_of_merit,
-    make_controller,
-    make_scene,
-    tune,
-    tuning_runs,
-)
+from .scene import Runs, Scene, figures_of_merit, make_scene
 from .study import ceiling_note, common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
+from .tuning import tune, tuning_runs
 
 FS = 16000.0
 DURATION_S = 10.5

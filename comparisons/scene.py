@@ -1,4 +1,4 @@
-"""What every study shares: a scene to run controllers in, the four algorithms, and the rule that tunes them."""
+"""What every study shares: a scene to run controllers in, and the jobs that run there."""
 
 from __future__ import annotations
 
@@ -11,19 +11,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from kfopc_filterpy import (
-    FxLMS,
     KalmanController,
-    MOVFxLMS,
     SimulationResult,
     clipped_fraction,
     convergence_time_s,
-    kf_anc,
-    kf_opc,
-    kf_opc_repaired,
-    kf_pb,
     measurement_noise_from_run,
     noise_reduction_db,
-    nse_db,
     output_power,
     path_taps,
     peak_control_signal,
@@ -33,19 +26,7 @@ from kfopc_filterpy import (
     wiener_solution,
 )
 from kfopc_filterpy.amplifiers import Amplifier
-from kfopc_filterpy.controllers.base import FilteredReferenceController
 
-ALGORITHMS = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
-KALMAN = ("KF-ANC", "KF-OPC")
-BUDGETED = ("KF-OPC repaired", "KF-PB")  # Kalman filters whose runs share no gains
-CONSTRAINED = ("KF-OPC", "MOV-FxLMS", *BUDGETED)
-BUDGET = 1.02  # a constrained method keeps its budget with up to this share of the rated power
-# r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
-# noise is no random walk any more but recursive least squares that never forgets, which a stationary noise would always
-# favour; the tonal study shows what it changes.
-STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
-STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
-POWER_MEMORY_S = 0.5
 SENSOR_NOISE_SEED = 1000  # plus the seed of the noise
 
 Item = TypeVar("Item")
@@ -92,9 +73,11 @@ class Scene:
     amplifier: Amplifier | None = None
     measurement_noise: float = 0.0
     initial_variance: float = 0.0
+    unconstrained_power: float = 1.0  # output power that the noise asks for without a constraint
     wiener_control_power: float = 0.0
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
+    secondary_estimate: np.ndarray | None = None  # what controllers know of the secondary path; None: the path itself
 
     @property
     def amplitude_limit(self) -> float:
@@ -108,10 +91,20 @@ class Scene:
         return self.references[0][start:], self.disturbances[0][start:]
 
     @property
+    def known_secondary(self) -> np.ndarray:
+        """What controllers know of the secondary path."""
+        return self.secondary if self.secondary_estimate is None else self.secondary_estimate
+
+    @property
     def filtered_power(self) -> float:
         """Power of the filtered reference, which makes step sizes and state noises comparable."""
         x = self.references[0]
-        return float(np.mean(np.convolve(x, self.secondary)[: x.size] ** 2))
+        return float(np.mean(np.convolve(x, self.known_secondary)[: x.size] ** 2))
+
+    @property
+    def secondary_gain(self) -> float:
+        """Power gain G_s of the secondary path that controllers know, for the reference (eq. 11)."""
+        return self.filtered_power / float(np.mean(self.references[0] ** 2))
 
     def run(self, controller: Any, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a controller on the noise of one seed."""
@@ -182,146 +175,11 @@ def make_scene(
         amplifier=amplifier,
         measurement_noise=measurement_noise_from_run(scaled[0][settled], recorded, s, n_taps),
         initial_variance=power_multiple * rated_power / (n_taps * power),
+        unconstrained_power=power_multiple * rated_power,
         wiener_control_power=power_multiple * rated_power,
         wiener_noise_reduction_db=wiener.noise_reduction_db,
         seeds=list(references),
     )
-
-
-def make_controller(
-    scene: Scene, algorithm: str, setting: float, *, amplifier: Amplifier | None = None
-) -> FilteredReferenceController:
-    """A fresh controller. `setting` is r E[x'^2] / q for the Kalman filters, mu L E[x'^2] for the LMS family.
-
-    `amplifier` is the one that a Kalman filter's disturbance estimate knows.
-    """
-    scaled = setting_value(scene, algorithm, setting)
-    if algorithm in (*KALMAN, *BUDGETED):
-        kalman: dict[str, Any] = {
-            "state_noise": scaled,
-            "measurement_noise": scene.measurement_noise,
-            "initial_variance": scene.initial_variance,
-            "amplifier": amplifier,
-        }
-        if algorithm == "KF-ANC":
-            return kf_anc(scene.n_taps, scene.secondary, **kalman)
-        kalman |= {"rated_power": scene.rated_power, "fs": scene.fs}
-        if algorithm == "KF-PB":
-            return kf_pb(scene.n_taps, scene.secondary, **kalman)
-        make = kf_opc if algorithm == "KF-OPC" else kf_opc_repaired
-        return make(scene.n_taps, scene.secondary, power_memory=POWER_MEMORY_S, **kalman)
-    if algorithm == "FxLMS":
-        return FxLMS(scene.n_taps, scene.secondary, step_size=scaled)
-    return MOVFxLMS(
-        scene.n_taps,
-        scene.secondary,
-        step_size=scaled,
-        rated_power=scene.rated_power,
-        fs=scene.fs,
-        power_memory=POWER_MEMORY_S,
-    )
-
-
-def setting_value(scene: Scene, algorithm: str, setting: float) -> float:
-    """State noise r or step size mu of a setting, in the scene's units."""
-    if algorithm in (*KALMAN, *BUDGETED):
-        return setting * scene.measurement_noise / scene.filtered_power
-    return setting / (scene.n_taps * scene.filtered_power)
-
-
-def run_settings(
-    runs: Runs,
-    scene: Scene,
-    jobs: Sequence[tuple[str, float, int]],
-    measure: Callable[[SimulationResult], Outcome],
-) -> list[Outcome]:
-    """What `measure` makes of a run of each (algorithm, setting, index of the seed).
-
-    Kalman filters of one setting on one noise differ in the constraint only: they share their gains.
-    """
-    groups: dict[Any, list[tuple[str, float, int]]] = {}
-    for job in jobs:
-        groups.setdefault(("Kalman", *job[1:]) if job[0] in KALMAN else job, []).append(job)
-
-    def run(group: list[tuple[str, float, int]]) -> list[Outcome]:
-        controllers = [make_controller(scene, name, setting) for name, setting, _ in group]
-        kalman = [c for c in controllers if isinstance(c, KalmanController)]
-        if len(kalman) > 1:
-            return [measure(result) for result in scene.run_together(kalman, group[0][2])]
-        return [measure(scene.run(controllers[0], group[0][2]))]
-
-    outcomes = runs.map(run, groups.values(), worth=len)
-    by_job = {
-        job: o for group, own in zip(groups.values(), outcomes, strict=True) for job, o in zip(group, own, strict=True)
-    }
-    return [by_job[job] for job in jobs]
-
-
-def grid(algorithm: str) -> tuple[float, ...]:
-    """Settings that are tried for an algorithm."""
-    return STATE_NOISE_GRID if algorithm in (*KALMAN, *BUDGETED) else STEP_SIZE_GRID
-
-
-def tuning_runs(algorithms: Sequence[str] = ALGORITHMS, seeds: int = 1) -> int:
-    """Runs that `tune` takes."""
-    return seeds * sum(len(grid(name)) for name in algorithms)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One setting of one algorithm: mean NSE over the whole run in dB, output power over the steady half."""
-
-    setting: float
-    mean_nse_db: float
-    output_power: float
-    diverged: bool
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """The best setting of an algorithm, and all that were tried."""
-
-    setting: float
-    within_budget: bool
-    at_edge: bool
-    trials: list[Trial]
-
-
-def tune(runs: Runs, scene: Scene, algorithms: Sequence[str] = ALGORITHMS, seeds: int = 1) -> dict[str, Tuned]:
-    """Best setting of each algorithm, one rule for all.
-
-    The lowest mean NSE over the whole run, start included, among settings that do not diverge and, for constrained
-    methods, keep the budget to 2 % over the steady half. Where no setting keeps it, the lowest mean NSE, and
-    `within_budget` is False. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
-    """
-    jobs = [(name, setting, k) for name in algorithms for setting in grid(name) for k in range(seeds)]
-
-    def trial(result: SimulationResult) -> tuple[float, float, bool]:
-        if result.diverged_at_s is not None:
-            return np.inf, np.inf, True
-        nse = nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s)
-        return float(np.mean(nse)), output_power(result.control_signal), False
-
-    outcomes = dict(zip(jobs, run_settings(runs, scene, jobs, trial), strict=True))
-    tuned = {}
-    for name in algorithms:
-        trials = []
-        for setting in grid(name):
-            rows = [outcomes[name, setting, k] for k in range(seeds)]
-            means = np.mean([row[:2] for row in rows], axis=0)
-            trials.append(Trial(setting, float(means[0]), float(means[1]), any(row[2] for row in rows)))
-        tuned[name] = _best(trials, scene.rated_power if name in CONSTRAINED else np.inf, name)
-    return tuned
-
-
-def _best(trials: list[Trial], rated_power: float, name: str) -> Tuned:
-    stable = [t for t in trials if not t.diverged]
-    if not stable:
-        raise RuntimeError(f"{name} diverged at every setting tried: {[t.setting for t in trials]}")
-    kept = [t for t in stable if t.output_power <= BUDGET * rated_power]
-    best = min(kept or stable, key=lambda t: (round(t.mean_nse_db, 2), t.setting))  # a tie: the smaller setting
-    edges = (min(t.setting for t in trials), max(t.setting for t in trials))
-    return Tuned(best.setting, bool(kept), best.setting in edges, trials)
 
 
 def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[str, float | None]:

@@ -10,13 +10,11 @@ import numpy as np
 from kfopc_filterpy import SimulationResult, power_constrained_solution
 from kfopc_filterpy.path_plots import plot_bode
 
+from .algorithms import POWER_MEMORY_S, REGISTRY, setting_value
 from .report import FigureItem, Parameter, Sound
-from .scene import BUDGET, KALMAN, POWER_MEMORY_S, SENSOR_NOISE_SEED, Scene, Tuned, setting_value
+from .scene import SENSOR_NOISE_SEED, Scene
+from .tuning import RULE, Tuned
 
-RULE = (
-    "lowest mean NSE over the whole run, start included, among settings that do not diverge and, for constrained "
-    f"methods, keep the budget to {100 * (BUDGET - 1):.0f} % over the steady half; a tie to 0.01 dB goes to the smaller"
-)
 BANDPASS_PATHS = {
     "primary_path": Parameter("band-pass FIR, 20-5000 Hz, 128 taps", "the paper's; Hamming window"),
     "secondary_path": Parameter("band-pass FIR, 20-5000 Hz, 32 taps", "the paper's; Hamming window"),
@@ -80,7 +78,7 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
         "sensor_noise_seeds": Parameter([SENSOR_NOISE_SEED + seed for seed in scene.seeds], "apart from the noise's"),
     }
     for name, best in tuned.items():
-        symbol, kind = ("r", "r E[x'^2]/q") if name in KALMAN else ("mu", "mu L E[x'^2]")
+        symbol, kind = REGISTRY[name].symbol, REGISTRY[name].kind
         parameters[f"{name} {symbol}"] = Parameter(
             setting_value(scene, name, best.setting), "follows from the next line"
         )

@@ -26,20 +26,11 @@ from kfopc_filterpy.plotting import (
     plot_weight_history,
 )
 
+from .algorithms import ALGORITHMS, KALMAN, Setting, make_controller
 from .report import FigureItem, Parameter, StudyReport, Verdict
-from .scene import (
-    ALGORITHMS,
-    KALMAN,
-    Runs,
-    Scene,
-    Tuned,
-    figures_of_merit,
-    make_controller,
-    make_scene,
-    tune,
-    tuning_runs,
-)
+from .scene import Runs, Scene, figures_of_merit, make_scene
 from .study import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
+from .tuning import Tuned, tune, tuning_runs
 
 FS = 16000.0
 TONE_HZ = 400.0
@@ -184,7 +175,7 @@ def _without_forgetting(runs: Runs, scene: Scene) -> dict[str, dict[str, float]]
     return {f"{name} at {setting:g}": row for (name, setting), row in zip(jobs, runs.map(run, jobs), strict=True)}
 
 
-def _by_filterpy(scene: Scene, setting: float) -> SimulationResult:
+def _by_filterpy(scene: Scene, setting: Setting) -> SimulationResult:
     """The first part of the study with filterpy's own KalmanFilter as the estimator of KF-ANC."""
     fast = make_controller(scene, "KF-ANC", setting)
     assert isinstance(fast, KalmanController)

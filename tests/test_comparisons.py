@@ -10,17 +10,9 @@ import pytest
 
 from comparisons import broadband, duct, tonal
 from comparisons.__main__ import STUDIES, main
-from comparisons.scene import (
-    ALGORITHMS,
-    Runs,
-    Trial,
-    _best,
-    figures_of_merit,
-    grid,
-    make_controller,
-    make_scene,
-    tune,
-)
+from comparisons.algorithms import ALGORITHMS, grid, make_controller
+from comparisons.scene import Runs, figures_of_merit, make_scene
+from comparisons.tuning import Trial, _best, tune
 from kfopc_filterpy import bandpass_path, output_power, path_taps, tone, wiener_solution
 
 
