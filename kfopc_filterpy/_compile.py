@@ -23,6 +23,7 @@ COMPILED_MODULES = (
     "block",
     "constraint",
     "delay_lines",
+    "fast_array",
     "kernels",
     "limiter",
     "lms_rules",

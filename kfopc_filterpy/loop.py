@@ -27,6 +27,7 @@ from .constraint import (
     preview_constraint,
 )
 from .delay_lines import latest, newest, push
+from .fast_array import FastArrayState, correct_fast_array, fast_array_holds
 from .kernels import (
     CANCELLATION,
     DIAGONAL,
@@ -68,6 +69,7 @@ class ControllerState(NamedTuple):
     repair: RepairState | None = None  # of KF-OPC with its gain repaired
     limiter: LimiterState | None = None
     variances: np.ndarray | None = None  # (L,) of the weights, of a diagonal Kalman filter
+    fast_array: FastArrayState | None = None
 
 
 @part(forceinline=True)
@@ -182,15 +184,23 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
 
 @part(forceinline=True)
 def adapt_lms(controller, error, y):
-    """One step of the filtered-reference LMS family (see `lms_rules`); `y` is the control signal that was emitted."""
+    """One step of the filtered-reference LMS family (see `lms_rules`); `y` is the control signal that was emitted.
+
+    False, with nothing changed, where the controller cannot go on.
+    """
+    if not fast_array_holds(controller.fast_array, newest(controller.filtered, controller.weights.size + 1)):
+        return False
     d = disturbance_estimate(controller, error)
     w = controller.weights
     xf, x = newest(controller.filtered, w.size), newest(controller.reference, w.size)
     factor = advance_constraint(controller.constraint, d, xf[0], x[0])
     if correct_diagonal(controller.variances, w, xf, factor * d, controller.settings):
-        return
+        return True
+    if correct_fast_array(controller.fast_array, w, newest(controller.filtered, w.size + 1), factor * d):
+        return True
     keep, correction, penalty = lms_change(controller, d, error, y, factor)
     change_weights(w, x, xf, keep, correction, penalty)
+    return True
 
 
 @part(forceinline=True)
@@ -273,7 +283,8 @@ def run(controller, block, plant, signals, weights, limit, every, first, begin, 
         e = signals[DISTURBANCE_IN, k] - a + signals[SENSOR_NOISE, k]
         signals[ERROR, k], signals[CONTROL, k] = e, y
         if controller.kind == LMS:
-            adapt_lms(controller, e, y)
+            if not adapt_lms(controller, e, y):
+                return REFUSED, k
         elif controller.kind == LISTENING:
             follow(controller, e)
         elif not adapt_kalman(controller, e, y, block):

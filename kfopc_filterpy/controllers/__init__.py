@@ -3,6 +3,7 @@
 from .amplitude_limited import ClippingFxLMS, RescalingFxLMS, TwoGradientFxLMS
 from .base import Controller
 from .diagonal import DiagonalKalman
+from .fast_array import FastArrayKalman
 from .fxlms import FxLMS, FxNLMS
 from .fxrls import fx_rls
 from .kalman import KalmanController, kf_anc, kf_opc, kf_pb
@@ -14,6 +15,7 @@ __all__ = [
     "ClippingFxLMS",
     "Controller",
     "DiagonalKalman",
+    "FastArrayKalman",
     "FxLMS",
     "FxNLMS",
     "KalmanController",

@@ -88,6 +88,7 @@ class FilteredReferenceController:
     """
 
     name = "controller"
+    _refusal = NO_SOLUTION
 
     def __init__(
         self,
@@ -182,7 +183,8 @@ class FilteredReferenceController:
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""
-        adapt_lms(self._state, as_number(error, "error"), self._y)
+        if not adapt_lms(self._state, as_number(error, "error"), self._y):
+            raise ValueError(self._refusal)
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
@@ -195,13 +197,17 @@ class FilteredReferenceController:
         x = as_signal(references, "references")
         e = as_signal(errors, "errors", length=x.size)
         self._require_finite_squares(x, e)
-        zeros = np.zeros(self._state.weights.size)
-        silent = self._state._replace(kind=LISTENING, weights=zeros, control_filter=zeros)
+        silent = self._silent_state()
         nothing = Plant(np.zeros(1), np.zeros(0), delay_line(1), LinearAmplifier().parameters)
         for first in range(0, x.size, STEP):
             signals = np.zeros((ROWS, min(STEP, x.size - first)))
             signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STEP], e[first : first + STEP]
             run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, signals.shape[1])
+
+    def _silent_state(self) -> ControllerState:
+        """State for the compiled loop to listen with."""
+        zeros = np.zeros(self._state.weights.size)
+        return self._state._replace(kind=LISTENING, weights=zeros, control_filter=zeros)
 
     def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:
         s, heard = self._state.secondary_estimate, self._state.reference
