@@ -41,7 +41,7 @@ STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.25)).tolist())
-PEAK_GRID = tuple((2.0 ** np.arange(-8.0, 4.1, 0.5)).tolist())
+PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1)).tolist())
 
 Setting = float | tuple[float, float]
 

@@ -21,6 +21,7 @@ PANELS = {
     "FxLMS with an amplitude limit": ("two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"),
 }
 MARKERS = "oDs^vP"
+OVER = 1.05  # output power over the rated one from which a mark is hollow
 
 
 def budget_figures(rows: Sequence[Row]) -> list[FigureItem]:
@@ -42,8 +43,12 @@ def _case(rows: Sequence[Row], case: Any) -> FigureItem:
             above.plot(*_line(means[label], "noise_reduction_db"), color="black", linestyle=dashes, label=label)
         for k, name in enumerate(names):
             style = line_style(k) | {"marker": MARKERS[k], "markersize": 4}
-            above.plot(*_line(means[name], "noise_reduction_db"), label=name, **style)
-            below.plot(*_line(means[name], "power"), **style)
+            over = [row.share_db for row in means[name] if row.power > OVER]
+            for ax, value in ((above, "noise_reduction_db"), (below, "power")):
+                shares, values = _line(means[name], value)
+                ax.plot(shares, values, label=name, **style)
+                hollow = np.isin(shares, over)
+                ax.plot(shares[hollow], values[hollow], **style | {"linestyle": "", "markerfacecolor": "white"})
         above.set_title(family, fontsize="medium")
         above.legend(fontsize="small", frameon=False)
         below.axhline(1.0, color=MARK, linewidth=1)
@@ -52,6 +57,8 @@ def _case(rows: Sequence[Row], case: Any) -> FigureItem:
             ax.grid(True, alpha=0.3)
     unconstrained = max(row.noise_reduction_db for name in ("KF-ANC", "FxLMS") for row in means[name])
     axes[0, 0].set_ylim(0.0, 1.1 * max(unconstrained, means[BOUND][-1].noise_reduction_db))
+    axes[1, 0].set_yscale("log")
+    axes[1, 0].set_ylim(0.3, 30.0)
     axes[0, 0].set_ylabel("Noise reduction (dB)")
     axes[1, 0].set_ylabel("Output power / rated power")
     free = ", ".join(
@@ -61,7 +68,7 @@ def _case(rows: Sequence[Row], case: Any) -> FigureItem:
     )
     caption = (
         f"{case.noise.capitalize()}, {case.path}: noise reduction (above) and output power (below) against the rated power, "
-        f"means over seeds. Black: the power-constrained Wiener solution and the scaled one. Without a constraint: {free}."
+        f"means over seeds; hollow where the power is above {OVER:g} of the rated one. Black: the power-constrained Wiener solution and the scaled one. Without a constraint: {free}."
     )
     return FigureItem(f"{case.path} {case.noise}".replace(" ", "-"), caption, figure)
 

@@ -2,6 +2,8 @@
 
 They keep a peak, not a power. A sine at the rated power peaks at sqrt(2 rated_power); noise at that amplitude limit
 has a lower mean power while it is rarely held, and never more than twice the rated one.
+
+The original papers' texts were not at hand: the equations are those by which later papers describe the algorithms.
 """
 
 from __future__ import annotations
