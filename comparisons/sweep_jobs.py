@@ -1,0 +1,125 @@
+"""The jobs of a sweep, and where they run: this machine's cores, or a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+from kfopc_filterpy._validate import as_count
+
+from .sweep_grid import Grid, Run, Values
+from .sweep_scenario import group_of, most_together, naming, run_group
+from .sweep_store import Outcome
+
+CONNECT_S = 15.0  # time to find a scheduler, and then its workers
+
+Scenario = Callable[[Values], Mapping[str, Any]]
+Job = Callable[[], list[Outcome]]
+
+
+def plan(pending: Sequence[Run], workers: int) -> list[list[Run]]:
+    """Runs of the built-in scenario in jobs: what can be shared together, no job beyond its share of all cores."""
+    share = -(-len(pending) // workers)
+    groups: dict[Any, list[Run]] = {}
+    for run in pending:
+        groups.setdefault(group_of(run.scenario), []).append(run)
+    return [part for runs in groups.values() for part in _parts(runs, min(most_together(runs[0].scenario), share))]
+
+
+def _parts(runs: list[Run], size: int) -> list[list[Run]]:
+    return [runs[i : i + size] for i in range(0, len(runs), size)]
+
+
+def jobs_of(grid: Grid, pending: Sequence[Run], workers: int, scenario: Scenario | None) -> list[Job]:
+    """What is to be called for the runs; an own scenario has a job for each."""
+    if scenario is not None:
+        return [partial(own_job, scenario, run.index, run.scenario) for run in pending]
+    return [
+        partial(built_in_job, [run.index for run in part], [run.scenario for run in part], grid.seeds[0])
+        for part in plan(pending, workers)
+    ]
+
+
+def built_in_job(indices: Sequence[int], scenarios: Sequence[Values], tuning_seed: int) -> list[Outcome]:
+    """Run scenarios of one scene."""
+    with one_thread():
+        return list(zip(indices, run_group(scenarios, tuning_seed), strict=True))
+
+
+def own_job(scenario: Scenario, index: int, values: Values) -> list[Outcome]:
+    """Call a scenario function of one's own."""
+    with naming(values), one_thread():
+        return [(index, as_figures(scenario(dict(values))))]
+
+
+def as_figures(returned: Any) -> dict[str, Any]:
+    """Figures of an own scenario as floats; `diverged` as a boolean, False where it does not say."""
+    if not isinstance(returned, Mapping):
+        raise TypeError(f"a scenario must return a dict of figures, got {type(returned).__name__}")
+    figures: dict[str, Any] = {}
+    for name, value in returned.items():
+        if not isinstance(name, str):
+            raise TypeError(f"the figures of a scenario must have strings for names, got {name!r}")
+        if name != "diverged":
+            try:
+                figures[name] = float("nan") if value is None else float(value)
+            except (TypeError, ValueError) as error:
+                raise TypeError(f"figure {name!r} of a scenario must be a number, got {value!r}") from error
+    return figures | {"diverged": bool(returned.get("diverged", False))}
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One BLAS thread, whatever a worker was started with: each core has a job, and sums of several threads differ."""
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1):
+        yield
+
+
+@contextmanager
+def local(jobs: int | None) -> Iterator[tuple[int, Callable[[list[Job]], Iterator[list[Outcome]]]]]:
+    """Number of workers, and what runs jobs on as many processes of this machine, all cores by default."""
+    import joblib
+
+    workers = joblib.cpu_count() if jobs is None else as_count(jobs, "jobs")
+    threads: dict[str, Any] = {} if workers == 1 else {"inner_max_num_threads": 1}
+    with joblib.parallel_config(backend="loky", n_jobs=workers, **threads):
+        yield workers, _outcomes
+
+
+@contextmanager
+def cluster(scheduler: str) -> Iterator[tuple[int, Callable[[list[Job]], Iterator[list[Outcome]]]]]:
+    """Number of threads of a Dask cluster's workers, and what runs jobs on them."""
+    if find_spec("distributed") is None:
+        raise ModuleNotFoundError(
+            'a scheduler needs the extra cluster: python -m pip install -c constraints.txt -e ".[cluster]"'
+        )
+    import joblib
+    from distributed import Client
+
+    try:
+        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise OSError(f"no Dask scheduler answers at {scheduler}: {error}") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError as error:
+            raise OSError(f"the Dask scheduler at {scheduler} has no workers: start one with dask worker") from error
+        with joblib.parallel_config(backend="dask", client=client):
+            yield sum(client.nthreads().values()), _outcomes
+
+
+def _outcomes(jobs: list[Job]) -> Iterator[list[Outcome]]:
+    """What jobs give, in the order in which they end."""
+    import joblib
+
+    return joblib.Parallel(return_as="generator_unordered")(joblib.delayed(_call)(job) for job in jobs)
+
+
+def _call(job: Job) -> list[Outcome]:
+    return job()
