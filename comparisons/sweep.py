@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +14,11 @@ from typing import Any
 
 from kfopc_filterpy.plotting import save_figure
 
-from .sweep_figures import BUILT_IN_FIGURES, MOST_FIGURES, sweep_figures, swept_axis
+from .sweep_figures import BUILT_IN_FIGURES, sweep_figures, swept_axis
 from .sweep_grid import Grid, Run, built_in_grid, own_grid
-from .sweep_jobs import Job, Scenario, cluster, jobs_of, local
+from .sweep_jobs import Scenario, cluster, jobs_of, local
 from .sweep_scenario import ScenarioError
-from .sweep_store import Outcome, SweepFolder
+from .sweep_store import SweepFolder
 from .sweep_table import Row, cell_rows, figure_names, require_format, run_rows, write_table
 
 __all__ = ["ScenarioError", "Sweep", "run_sweep"]
@@ -160,20 +160,13 @@ def _work_off(
     with (
         place as (workers, run),
         tqdm(total=len(grid), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
-        closing(_started(run, jobs_of(grid, pending, workers, scenario))) as outcomes,
+        closing(run(jobs_of(grid, pending, workers, scenario))) as outcomes,
     ):
         for own in outcomes:
             store.keep(own)
             done |= dict(own)
             bar.update(len(own))
             bar.set_postfix(diverged=sum(figures["diverged"] for figures in done.values()), refresh=False)
-
-
-def _started(
-    run: Callable[[list[Job]], Iterator[list[Outcome]]], jobs: list[Job]
-) -> Iterator[list[Outcome]]:
-    """Outcomes as a generator that can be closed, which stops what is still running."""
-    yield from run(jobs)
 
 
 def _drawn(chosen: Sequence[str] | None, present: Sequence[str], built_in: bool) -> list[str]:

@@ -69,7 +69,9 @@ def _figure(
     if curves is not None:
         legend_above(axes[0])
     if fixed:
-        figure.suptitle(", ".join(f"{_label(name)}: {_words(value)}" for name, value in fixed.items()), fontsize="medium")
+        figure.suptitle(
+            ", ".join(f"{_label(name)}: {_words(value)}" for name, value in fixed.items()), fontsize="medium"
+        )
     return figure
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from importlib.util import find_spec
@@ -18,6 +19,7 @@ CONNECT_S = 15.0  # time to find a scheduler, and then its workers
 
 Scenario = Callable[[Values], Mapping[str, Any]]
 Job = Callable[[], list[Outcome]]
+Outcomes = Callable[[list[Job]], Generator[list[Outcome], None, None]]  # what runs jobs
 
 
 def plan(pending: Sequence[Run], workers: int) -> list[list[Run]]:
@@ -81,7 +83,7 @@ def one_thread() -> Iterator[None]:
 
 
 @contextmanager
-def local(jobs: int | None) -> Iterator[tuple[int, Callable[[list[Job]], Iterator[list[Outcome]]]]]:
+def local(jobs: int | None) -> Iterator[tuple[int, Outcomes]]:
     """Number of workers, and what runs jobs on as many processes of this machine, all cores by default."""
     import joblib
 
@@ -92,7 +94,7 @@ def local(jobs: int | None) -> Iterator[tuple[int, Callable[[list[Job]], Iterato
 
 
 @contextmanager
-def cluster(scheduler: str) -> Iterator[tuple[int, Callable[[list[Job]], Iterator[list[Outcome]]]]]:
+def cluster(scheduler: str) -> Iterator[tuple[int, Outcomes]]:
     """Number of threads of a Dask cluster's workers, and what runs jobs on them."""
     if find_spec("distributed") is None:
         raise ModuleNotFoundError(
@@ -110,15 +112,39 @@ def cluster(scheduler: str) -> Iterator[tuple[int, Callable[[list[Job]], Iterato
             client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError as error:
             raise OSError(f"the Dask scheduler at {scheduler} has no workers: start one with dask worker") from error
-        with joblib.parallel_config(backend="dask", client=client):
+        with joblib.parallel_config(backend=_dask_backend(client)):
             yield sum(client.nthreads().values()), _outcomes
 
 
-def _outcomes(jobs: list[Job]) -> Iterator[list[Outcome]]:
-    """What jobs give, in the order in which they end."""
+def _dask_backend(client: Any) -> Any:
+    """joblib's Dask backend, which would wait for ever for a job that Dask has given up.
+
+    It takes a result from its callback alone, and calls that for no job whose workers died one after another.
+    """
+    from joblib._dask import DaskDistributedBackend
+
+    class Backend(DaskDistributedBackend):
+        def submit(self, func: Any, callback: Any = None) -> Any:
+            future = super().submit(func, callback)
+            future.add_done_callback(lambda ended: ended.exception() and callback(ended.exception()))
+            return future
+
+        def retrieve_result_callback(self, out: Any) -> Any:
+            if isinstance(out, BaseException):
+                raise OSError(f"the cluster gave a job up: {out}") from out
+            return super().retrieve_result_callback(out)
+
+    return Backend(client=client)
+
+
+def _outcomes(jobs: list[Job]) -> Generator[list[Outcome], None, None]:
+    """What jobs give, in the order in which they end; to close it stops what still runs."""
     import joblib
 
-    return joblib.Parallel(return_as="generator_unordered")(joblib.delayed(_call)(job) for job in jobs)
+    try:
+        yield from joblib.Parallel(return_as="generator_unordered")(joblib.delayed(_call)(job) for job in jobs)
+    except BrokenProcessPool as error:
+        raise OSError(f"a worker process was killed, perhaps for want of memory (take fewer jobs): {error}") from error
 
 
 def _call(job: Job) -> list[Outcome]:

@@ -31,7 +31,7 @@ from kfopc_filterpy import (
 from kfopc_filterpy._figures import decibels
 from kfopc_filterpy.amplifiers import Amplifier
 
-from .constraint_cases import FS, SWITCH_ON_S, make_case, made_noises, modelled_paths, noises, paths
+from .constraint_cases import FS, SWITCH_ON_S, made_noises, make_case, modelled_paths, noises, paths
 from .scene import KALMAN, Scene, grid, make_controller, tune
 from .sweep_grid import AMPLIFIERS, DEFAULT_SETTING, TUNED_SETTING, Values
 
@@ -201,9 +201,9 @@ def _figures(one: _Prepared, result: SimulationResult) -> Figures:
     names = (
         "noise_reduction_db",
         "output_power_db",
-        "output_power",
         "power_over_rated",
         "worst_window_over_rated",
+        "output_power",
         "clipped_fraction",
         "mean_nse_db",
         "convergence_time_s",
@@ -223,9 +223,9 @@ def _measured(one: _Prepared, result: SimulationResult) -> list[float]:
     return [
         noise_reduction_db(e, d),
         float(decibels(power / UNCONSTRAINED_POWER)),
-        power,
         power / one.rated_power,
         overshoot(y, one.rated_power, FS, window_s=POWER_WINDOW_S),
+        power,
         clipped_fraction(y, one.limit),
         float(np.mean(nse_db(e, d, FS, NSE_WINDOW_S))),
         convergence_time_s(e, d, FS, window_s=NSE_WINDOW_S),

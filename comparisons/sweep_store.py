@@ -14,6 +14,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,9 @@ class SweepFolder:
         file = self.path / DESCRIPTION
         if not file.exists():
             if self._runs.exists():
-                raise ValueError(f"folder {str(self.path)!r} holds {RUNS} but no {DESCRIPTION}: choose another output folder")
+                raise ValueError(
+                    f"folder {str(self.path)!r} holds {RUNS} but no {DESCRIPTION}: choose another output folder"
+                )
             return None
         try:
             there = json.loads(file.read_text(encoding="utf-8"))
@@ -113,10 +116,8 @@ def code_hash(scenario: Callable[..., Any] | None) -> str:
     for file in (*sorted(package.rglob("*.py")), *(studies / name for name in PART_OF_SWEEP)):
         digest.update(file.name.encode() + file.read_bytes())
     if scenario is not None:
-        try:
+        with suppress(OSError, TypeError):  # typed at a prompt, or an object: it goes by its name
             digest.update(inspect.getsource(scenario).encode())
-        except (OSError, TypeError):  # typed at a prompt, or an object: it goes by its name
-            pass
     return digest.hexdigest()
 
 
@@ -158,7 +159,8 @@ def _outcomes(line: bytes) -> list[Outcome]:
 def _to_json(figures: Mapping[str, Any]) -> dict[str, Any]:
     """Figures with null for what is not finite, which JSON has no number for."""
     return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in figures.items()
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in figures.items()
     }
 
 
