@@ -17,7 +17,7 @@ from kfopc_filterpy.plotting import save_figure
 from .sweep_figures import BUILT_IN_FIGURES, sweep_figures, swept_axis
 from .sweep_grid import Grid, Run, built_in_grid, own_grid
 from .sweep_jobs import Scenario, cluster, jobs_of, local
-from .sweep_scenario import ScenarioError
+from .sweep_scenario import FIGURES, ScenarioError
 from .sweep_store import SweepFolder
 from .sweep_table import Row, cell_rows, figure_names, require_format, run_rows, write_table
 
@@ -130,6 +130,8 @@ def run_sweep(
         raise ValueError("give either jobs or scheduler: a cluster's workers are as many as it has")
     require_format(format)
     against = swept_axis(made, x)
+    if scenario is None and figures is not None:
+        _drawn(figures, FIGURES, True)  # better refused before the runs than after
     store = SweepFolder(folder, made, scenario)
     done = store.done()
     pending = [run for run in made.runs() if run.index not in done]

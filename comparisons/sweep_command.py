@@ -143,8 +143,8 @@ def parsed_values(text: str, name: str) -> list[Any]:
 
     Examples
     --------
-    >>> parsed_values("-20:0:3", "rated_power_db")
-    [-20.0, -10.0, 0.0]
+    >>> parsed_values("-20:0:3", "rated_power_db"), parsed_values("1e-8:1e-6:3:log", "setting")
+    ([-20, -10, 0], [1e-08, 1e-07, 1e-06])
     >>> parsed_values("KF-OPC,KF-PB", "algorithm"), parsed_values("64,128", "n_taps")
     (['KF-OPC', 'KF-PB'], [64, 128])
     """
@@ -165,7 +165,7 @@ def _value(text: str) -> Any:
     return text
 
 
-def _range(text: str, name: str) -> list[float]:
+def _range(text: str, name: str) -> list[Any]:
     first, last, count, *rest = [*text.split(":"), "", ""]
     try:
         ends, number = (float(first), float(last)), int(count)
@@ -179,7 +179,9 @@ def _range(text: str, name: str) -> list[float]:
     if spacing and min(ends) <= 0:
         raise ValueError(f"{name} must have ends above 0 to be spaced logarithmically, got {text!r}")
     spaced = np.geomspace(*ends, number) if spacing else np.linspace(*ends, number)
-    return [float(f"{value:.12g}") for value in spaced]
+    values = [float(f"{value:.12g}") for value in spaced]
+    whole = not re.search("[.e]", text.casefold().removesuffix("log")) and all(value == int(value) for value in values)
+    return [int(value) for value in values] if whole else values
 
 
 def _seeds(text: str) -> Any:

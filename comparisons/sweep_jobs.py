@@ -54,7 +54,11 @@ def built_in_job(indices: Sequence[int], scenarios: Sequence[Values], tuning_see
 def own_job(scenario: Scenario, index: int, values: Values) -> list[Outcome]:
     """Call a scenario function of one's own."""
     with naming(values), one_thread():
-        return [(index, as_figures(scenario(dict(values))))]
+        figures = as_figures(scenario(dict(values)))
+        clash = [name for name in figures if name in values]
+        if clash:
+            raise ValueError(f"the figure {clash[0]!r} has the name of an axis or the seed: call it something else")
+        return [(index, figures)]
 
 
 def as_figures(returned: Any) -> dict[str, Any]:

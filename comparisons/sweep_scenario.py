@@ -42,6 +42,17 @@ UNCONSTRAINED_POWER = 1.0  # of every scene; it sets the scale of the divergence
 NSE_WINDOW_S, POWER_WINDOW_S = 0.05, 0.1
 SHARED_BYTES = 256e6  # of the signals of runs that go on side by side
 MOST_SHARED, MOST_ALONE = 64, 8  # runs of a job
+MEASURED = (
+    "noise_reduction_db",
+    "output_power_db",
+    "power_over_rated",
+    "worst_window_over_rated",
+    "output_power",
+    "clipped_fraction",
+    "mean_nse_db",
+    "convergence_time_s",
+)
+FIGURES = (*MEASURED, "setting_used", "diverged_at_s")
 RECORDED = 5  # signals of a run that `simulate_scenarios` keeps
 
 Figures = dict[str, Any]
@@ -198,19 +209,9 @@ def _run(members: list[_Prepared]) -> list[Figures]:
 
 def _figures(one: _Prepared, result: SimulationResult) -> Figures:
     """Figures of merit of a run; of one that diverged NaN, and the time."""
-    names = (
-        "noise_reduction_db",
-        "output_power_db",
-        "power_over_rated",
-        "worst_window_over_rated",
-        "output_power",
-        "clipped_fraction",
-        "mean_nse_db",
-        "convergence_time_s",
-    )
     diverged = result.diverged_at_s is not None
-    values = [np.nan] * len(names) if diverged else _measured(one, result)
-    return dict(zip(names, values, strict=True)) | {
+    values = [np.nan] * len(MEASURED) if diverged else _measured(one, result)
+    return dict(zip(MEASURED, values, strict=True)) | {
         "setting_used": one.setting,
         "diverged_at_s": result.diverged_at_s if diverged else np.nan,
         "diverged": diverged,
