@@ -1,4 +1,7 @@
-"""Figures of a sweep: noise reduction and output power against the swept axis, with intervals."""
+"""Figures of a sweep: noise reduction and output power against the swept axis, with intervals.
+
+A cross at the foot of a panel marks a cell of which runs diverged: its mean is of the others, or there is none.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +80,7 @@ def _figure(
 
 def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves: str | None) -> None:
     values, numeric = grid.axes[x], _is_numeric(grid.axes[x])
-    order = [value for value in (grid.axes[curves] if curves else (None,))]
+    order = grid.axes[curves] if curves else (None,)
     for k, curve in enumerate(order):
         own = sorted(
             (row for row in rows if curves is None or row[curves] == curve), key=lambda row: values.index(row[x])
@@ -91,6 +94,8 @@ def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves:
         if not numeric:
             style["linestyle"] = "none"
         ax.errorbar(places, mean, yerr=bars, capsize=2.5, elinewidth=1, label=_words(curve), **style)
+        lost = [place for place, row in zip(places, own, strict=True) if row["diverged"]]
+        ax.plot(lost, [0.03] * len(lost), "x", color=style["color"], transform=ax.get_xaxis_transform(), label="_")
     if name == "output_power_db" and "rated_power_db" in grid.axes:
         _mark_rated_power(ax, grid, x)
     if numeric:
@@ -113,9 +118,17 @@ def _mark_rated_power(ax: Axes, grid: Grid, x: str) -> None:
 
 
 def _scale(ax: Axes, values: Sequence[float]) -> None:
+    """Limits from the grid, so that a value at which nothing was stable keeps its place."""
     smallest, largest = min(values), max(values)
+    if smallest == largest:
+        return
     if smallest > 0 and largest / smallest >= LOGARITHMIC_FROM:
         ax.set_xscale("log")
+        margin = (largest / smallest) ** 0.05
+        ax.set_xlim(smallest / margin, largest * margin)
+    else:
+        margin = 0.05 * (largest - smallest)
+        ax.set_xlim(smallest - margin, largest + margin)
 
 
 def _is_numeric(values: Sequence[Any]) -> bool:
