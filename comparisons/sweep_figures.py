@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 BUILT_IN_FIGURES = ("noise_reduction_db", "output_power_db")
 LABELS = {"noise_reduction_db": "Noise reduction (dB)", "output_power_db": "Output power / unconstrained (dB)"}
 MARKERS = ("o", "s", "^", "D", "v", "P")
+# Beyond these a run was on its way to divergence; it would leave the others no room. The tables have the figures.
+LOWEST, HIGHEST = {"noise_reduction_db": -20.0}, {"output_power_db": 40.0}
 SHIFT = 0.08  # of a curve's marks beside those of the one before, where the axis has names
 MOST_FIGURES = 40
 LOGARITHMIC_FROM = 50.0  # ratio of the largest to the smallest positive value
@@ -103,6 +105,8 @@ def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves:
     else:
         ax.set_xticks(range(len(values)), [_words(value) for value in values])
         ax.set_xlim(-0.5, len(values) - 0.5)
+    bottom, top = ax.get_ylim()
+    ax.set_ylim(max(bottom, LOWEST.get(name, bottom)), min(top, HIGHEST.get(name, top)))
     ax.set_ylabel(LABELS.get(name, name))
     ax.grid(True, alpha=0.3)
 
@@ -110,11 +114,15 @@ def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves:
 def _mark_rated_power(ax: Axes, grid: Grid, x: str) -> None:
     """The rated power as a line, where all that is drawn has one."""
     rated = grid.axes["rated_power_db"]
+    style: Any = {"color": MARK, "linewidth": 1, "linestyle": ":", "zorder": 1}
     if x == "rated_power_db":
         ends = [min(rated), max(rated)]
-        ax.plot(ends, ends, color=MARK, linewidth=1, linestyle=":", zorder=1)
+        line = ax.plot(ends, ends, **style)[0]
     elif len(rated) == 1:
-        ax.axhline(rated[0], color=MARK, linewidth=1, linestyle=":", zorder=1)
+        line = ax.axhline(rated[0], **style)
+    else:
+        return
+    ax.legend([line], ["rated power"], frameon=False, fontsize="small", loc="best")
 
 
 def _scale(ax: Axes, values: Sequence[float]) -> None:

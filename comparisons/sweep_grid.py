@@ -248,7 +248,7 @@ AXES: dict[str, Axis] = {
         ),
         Axis(
             "setting",
-            "Setting",
+            "Setting: r E[x'²]/q or μ L E[x'²]",
             DEFAULT_SETTING,
             _setting,
             "r E[x'^2]/q of a Kalman filter, mu L E[x'^2] of the LMS family; default: the middle of the grid that the "

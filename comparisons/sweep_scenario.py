@@ -106,11 +106,8 @@ class _Prepared:
 
     def controller(self) -> Any:
         """A fresh controller, which knows the path as well as the scenario says."""
-        wrong = {"gain_db": "path_gain_db", "delay_samples": "path_delay", "phase_deg": "path_phase_deg"}
-        error = {name: self.scenario[axis] for name, axis in wrong.items()}
-        estimate = self.scene.secondary
-        if any(error.values()):
-            estimate = path_taps(perturbed_path(estimate, fs=FS, **error))
+        errors = (self.scenario[axis] for axis in ("path_gain_db", "path_delay", "path_phase_deg"))
+        estimate = estimated_path(self.scenario["path"], *errors)
         known = replace(self.scene, secondary=estimate, rated_power=self.rated_power)
         return make_controller(known, self.scenario["algorithm"], self.setting)
 
@@ -148,6 +145,15 @@ def path_pair(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Primary and secondary taps."""
     modelled = modelled_paths()
     return modelled[name] if name in modelled else paths()[name]
+
+
+@lru_cache(maxsize=256)  # a phase is fitted by least squares: seconds for a long path
+def estimated_path(path: str, gain_db: float, delay: float, phase_deg: float) -> np.ndarray:
+    """Taps of a secondary path estimated with an error."""
+    taps = path_pair(path)[1]
+    if not (gain_db or delay or phase_deg):
+        return taps
+    return path_taps(perturbed_path(taps, fs=FS, gain_db=gain_db, delay_samples=delay, phase_deg=phase_deg))
 
 
 @lru_cache(maxsize=4)

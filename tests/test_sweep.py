@@ -434,6 +434,25 @@ def test_figures_show_the_means_and_intervals():
     assert ax.get_legend_handles_labels()[1] == ["a", "b"]
 
 
+def test_figures_keep_a_place_for_what_diverged_and_room_for_what_did_not():
+    grid = built_in_grid({"setting": [1e-3, 1.0], "algorithm": ["KF-OPC", "FxLMS"]}, 2)
+    done = {
+        run.index: {"noise_reduction_db": 10.0, "output_power_db": 0.0, "diverged": run.values["setting"] == 1.0}
+        for run in grid.runs()
+    }
+    done[0] |= {"noise_reduction_db": -300.0, "output_power_db": 300.0}
+    figure = sweep_figures(grid, cell_rows(grid, done), ["noise_reduction_db", "output_power_db"], "setting")["setting"]
+    reduction, power = figure.axes
+    assert reduction.get_xscale() == "log"
+    assert reduction.get_xlim()[0] < 1e-3 < 1.0 < reduction.get_xlim()[1]
+    assert reduction.get_ylim()[0] == -20.0
+    assert power.get_ylim()[1] == 40.0
+    crosses = [line for line in reduction.lines if line.get_marker() == "x"]
+    assert [list(line.get_xdata()) for line in crosses] == [[1.0], [1.0]]  # of either algorithm
+    assert [text.get_text() for text in power.get_legend().get_texts()] == ["rated power"]
+    figure.canvas.draw()  # no warning
+
+
 def test_figures_are_written(tmp_path):
     sweep = swept(tmp_path, x="kind", figures=["height"])
     images = [path for path in sweep.files if path.suffix == ".png"]
