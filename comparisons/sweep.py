@@ -16,7 +16,7 @@ from kfopc_filterpy.plotting import save_figure
 
 from .sweep_figures import BUILT_IN_FIGURES, sweep_figures, swept_axis
 from .sweep_grid import Grid, Run, built_in_grid, own_grid
-from .sweep_jobs import Scenario, cluster, jobs_of, local
+from .sweep_jobs import Scenario, Sent, cluster, jobs_of, local
 from .sweep_scenario import FIGURES, ScenarioError
 from .sweep_store import SweepFolder
 from .sweep_table import Row, cell_rows, figure_names, require_format, run_rows, write_table
@@ -158,17 +158,20 @@ def _work_off(
     """Do the runs that are pending, keeping each job's as it ends."""
     from tqdm import tqdm
 
-    place = local(jobs) if scheduler is None else cluster(scheduler)
+    diverged = sum(figures["diverged"] for figures in done.values())
     with (
-        place as (workers, run),
+        local(jobs) if scheduler is None else cluster(scheduler) as (workers, run),
         tqdm(total=len(grid), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
-        closing(run(jobs_of(grid, pending, workers, scenario))) as outcomes,
+        closing(
+            run(jobs_of(grid, pending, workers, Sent(scenario) if scenario and scheduler else scenario))
+        ) as outcomes,
     ):
         for own in outcomes:
             store.keep(own)
             done |= dict(own)
             bar.update(len(own))
-            bar.set_postfix(diverged=sum(figures["diverged"] for figures in done.values()), refresh=False)
+            diverged += sum(figures["diverged"] for _, figures in own)
+            bar.set_postfix(diverged=diverged, refresh=False)
 
 
 def _drawn(chosen: Sequence[str] | None, present: Sequence[str], built_in: bool) -> list[str]:

@@ -27,6 +27,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P")
 LOWEST, HIGHEST = {"noise_reduction_db": -20.0}, {"output_power_db": 40.0}
 SHIFT = 0.08  # of a curve's marks beside those of the one before, where the axis has names
 MOST_FIGURES = 40
+MOST_MARKS = 30  # of a curve
 LOGARITHMIC_FROM = 50.0  # ratio of the largest to the smallest positive value
 
 
@@ -92,10 +93,19 @@ def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves:
         places = [row[x] if numeric else values.index(row[x]) + shift for row in own]
         mean, low, high = (np.array([row[f"{name}_{end}"] for row in own], float) for end in ("mean", "low", "high"))
         bars = np.nan_to_num([mean - low, high - mean])  # no interval, no bar
-        style = line_style(k) | {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "linewidth": 1.2}
+        marks = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "markevery": 1 + len(own) // MOST_MARKS}
+        style = line_style(k) | marks | {"linewidth": 1.2}
         if not numeric:
             style["linestyle"] = "none"
-        ax.errorbar(places, mean, yerr=bars, capsize=2.5, elinewidth=1, label=_words(curve), **style)
+        ax.errorbar(
+            places,
+            mean,
+            yerr=bars,
+            capsize=2.5 if len(own) <= MOST_MARKS else 0.0,
+            elinewidth=1,
+            label=_words(curve),
+            **style,
+        )
         lost = [place for place, row in zip(places, own, strict=True) if row["diverged"]]
         ax.plot(lost, [0.03] * len(lost), "x", color=style["color"], transform=ax.get_xaxis_transform(), label="_")
     if name == "output_power_db" and "rated_power_db" in grid.axes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -75,6 +75,28 @@ def as_figures(returned: Any) -> dict[str, Any]:
             except (TypeError, ValueError) as error:
                 raise TypeError(f"figure {name!r} of a scenario must be a number, got {value!r}") from error
     return figures | {"diverged": bool(returned.get("diverged", False))}
+
+
+class Sent:
+    """A scenario function as cloudpickle sends it: with its source, where its module is registered for that.
+
+    distributed itself looks at the outermost object only, and would send a function within it by name.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        import cloudpickle
+
+        self._pickled: bytes = cloudpickle.dumps(scenario)
+
+    def __call__(self, values: Values) -> Mapping[str, Any]:
+        return _unpickled(self._pickled)(values)
+
+
+@lru_cache(maxsize=4)
+def _unpickled(pickled: bytes) -> Scenario:
+    import cloudpickle
+
+    return cloudpickle.loads(pickled)
 
 
 @contextmanager

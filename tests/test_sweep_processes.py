@@ -15,6 +15,7 @@ from threading import Thread
 
 import pytest
 
+from comparisons.__main__ import main
 from comparisons.sweep import ScenarioError, run_sweep
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -169,7 +170,7 @@ def test_cluster_loses_a_worker_and_no_cell(own, cluster, tmp_path):
         workers[0].send_signal(signal.SIGKILL)
         killed.append(lines(file))
 
-    thread = Thread(target=slow_then_killed)
+    thread = Thread(target=slow_then_killed, daemon=True)
     thread.start()
     sweep = run_sweep(GRID, out, seeds=4, scenario=own.slow, scheduler=address, quiet=True)
     thread.join()
@@ -193,6 +194,20 @@ def test_cluster_loses_a_worker_and_no_cell(own, cluster, tmp_path):
 
     with pytest.raises(ScenarioError, match="scenario a=3, seed=1: ArithmeticError: three"):
         run_sweep({"a": [3]}, tmp_path / "broken", seeds=1, scenario=own.broken, scheduler=address, quiet=True)
+
+
+@posix
+@dask
+def test_command_sends_a_module_that_the_workers_lack(cluster, tmp_path, monkeypatch, capsys):
+    address, _ = cluster
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "own_far_module.py").write_text("def far(scenario):\n    return {'sum': scenario['a'] + 1}\n")
+    monkeypatch.chdir(elsewhere)
+    monkeypatch.syspath_prepend(str(elsewhere))
+    arguments = ["--scenario", "own_far_module:far", "--axis", "a=1,2", "--seeds", "2", "--scheduler", address]
+    assert main(["sweep", *arguments, "--output", "out", "--quiet"]) == 0
+    assert "4 runs, 2 cells" in capsys.readouterr().out
 
 
 @posix
