@@ -15,7 +15,7 @@ from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
-SPEED = "speed"
+SPEED, SWEEP = "speed", "sweep"
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -30,6 +30,11 @@ FURTHER: dict[str, Study] = {  # beyond the paper
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the studies named, all by default; write report.html, results.json, figures and audio into a folder."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == [SWEEP]:
+        from . import sweep_command
+
+        return sweep_command.main(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
@@ -38,12 +43,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "or speed, which times the filter against others",
+        "speed, which times the filter against others; or sweep, which runs a grid and has options of its own "
+        "(sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED)
+    known = (*STUDIES, *FURTHER, SPEED, SWEEP)
+    if SWEEP in options.studies:
+        parser.error(f"{SWEEP} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]
     if unknown:
         parser.error(f"no study called {', '.join(unknown)}; there are {', '.join(known)}")

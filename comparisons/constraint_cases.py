@@ -53,13 +53,18 @@ class Setting:
         return self.noise in STATIONARY
 
 
-def paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Primary and secondary taps by name; the measured duct where it is at hand."""
+def modelled_paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Primary and secondary taps of the models, by name."""
     duct = duct_paths(fs=FS)
-    pairs = {
+    return {
         "band-pass": (path_taps(bandpass_path(128)), path_taps(bandpass_path(32))),
         "duct": (path_taps(duct.primary), path_taps(duct.secondary)),
     }
+
+
+def paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Primary and secondary taps by name; the measured duct where it is at hand."""
+    pairs = modelled_paths()
     measured = measured_data()
     if measured is not None:
         scale = np.sqrt(np.sum(measured.secondary**2))  # its scale is arbitrary: unit gain for white noise
@@ -67,9 +72,9 @@ def paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
     return pairs
 
 
-def noises() -> dict[str, Noise]:
-    """Noises by name, functions of duration and seed; the motor recording where it is at hand."""
-    made: dict[str, Noise] = {
+def made_noises() -> dict[str, Noise]:
+    """Noises by name, functions of duration and seed, that are made and not recorded."""
+    return {
         "tone": lambda duration, seed: tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
         "compressor": lambda duration, seed: compressor_noise(duration, fs=FS, rng=seed),
         "band noise": lambda duration, seed: band_limited_noise(BAND_HZ, duration, fs=FS, rng=seed),
@@ -82,6 +87,11 @@ def noises() -> dict[str, Noise]:
             phase_rad=float(seed),
         ),
     }
+
+
+def noises() -> dict[str, Noise]:
+    """Noises by name, functions of duration and seed; the motor recording where it is at hand."""
+    made = made_noises()
     measured = measured_data()
     if measured is not None:
         recording = measured.noise - measured.noise.mean()
@@ -98,21 +108,29 @@ def measured_data() -> Any:
         return None
 
 
-def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray) -> Scene:
+def make_case(
+    pair: tuple[np.ndarray, np.ndarray],
+    noise: np.ndarray,
+    *,
+    n_taps: int = N_TAPS,
+    sensor_noise_db: float = SENSOR_NOISE_DB,
+    seed: int = 0,
+) -> Scene:
     """Scene of one noise whose unconstrained control power is 1.
 
     That power is of the filter that a Kalman filter without state noise would end with, ``(R_x' + q/(N P0) I) w = r``
-    over the record: without the ridge, directions that the noise hardly excites could ask for any power.
+    over the record: without the ridge, directions that the noise hardly excites could ask for any power. The seed is of
+    the sensor noise.
     """
     scene = make_scene(
-        {0: noise},
+        {seed: noise},
         *pair,
         fs=FS,
         rated_power=1.0,
         power_multiple=1.0,
-        n_taps=N_TAPS,
+        n_taps=n_taps,
         switch_on_s=SWITCH_ON_S,
-        sensor_noise_db=SENSOR_NOISE_DB,
+        sensor_noise_db=sensor_noise_db,
         nse_window_s=0.05,
     )
     normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
@@ -139,7 +157,7 @@ def bound_of(scene: Scene) -> PowerConstrainedWiener:
         scene.references[0],
         scene.disturbances[0],
         scene.secondary,
-        N_TAPS,
+        scene.n_taps,
         scene.rated_power,
         fs=FS,
         switch_on_s=SWITCH_ON_S,
