@@ -112,15 +112,15 @@ def make_case(
     pair: tuple[np.ndarray, np.ndarray],
     noise: np.ndarray,
     *,
-    n_taps: int = N_TAPS,
+    n_taps: int | None = None,
     sensor_noise_db: float = SENSOR_NOISE_DB,
     seed: int = 0,
 ) -> Scene:
     """Scene of one noise whose unconstrained control power is 1.
 
     That power is of the filter that a Kalman filter without state noise would end with, ``(R_x' + q/(N P0) I) w = r``
-    over the record: without the ridge, directions that the noise hardly excites could ask for any power. The seed is of
-    the sensor noise.
+    over the record: without the ridge, directions that the noise hardly excites could ask for any power. `n_taps` is
+    N_TAPS by default; the seed is of the sensor noise.
     """
     scene = make_scene(
         {seed: noise},
@@ -128,7 +128,7 @@ def make_case(
         fs=FS,
         rated_power=1.0,
         power_multiple=1.0,
-        n_taps=n_taps,
+        n_taps=N_TAPS if n_taps is None else n_taps,
         switch_on_s=SWITCH_ON_S,
         sensor_noise_db=sensor_noise_db,
         nse_window_s=0.05,

@@ -12,8 +12,8 @@ import numpy as np
 
 from kfopc_filterpy._validate import as_count, as_number, as_positive
 
+from .algorithms import REGISTRY
 from .constraint_cases import made_noises, measured_data, modelled_paths, noises, paths
-from .scene import ALGORITHMS, BUDGETED, CONSTRAINED, KALMAN, Scene, make_controller
 
 Values = dict[str, Any]  # one value an axis
 
@@ -188,39 +188,9 @@ def _amplifier(value: Any, name: str) -> str:
     return _named(value, name, AMPLIFIERS)
 
 
-def listed_algorithms() -> tuple[str, ...]:
-    """Names that the studies list; `make_controller` may know more."""
-    return tuple(dict.fromkeys((*ALGORITHMS, *KALMAN, *BUDGETED, *CONSTRAINED)))
-
-
 def _algorithm(value: Any, name: str) -> str:
-    """A name that `make_controller` makes a controller of that name for."""
-    folded = {_folded(known): known for known in listed_algorithms()}
-    if isinstance(value, str):
-        wanted = folded.get(_folded(value), value)
-        try:
-            made = make_controller(_PROBE, wanted, 1e-3).name
-        except (ValueError, KeyError):
-            made = None
-        if made == wanted:
-            return wanted
-    raise ValueError(f"{name} must be one of {', '.join(folded.values())}, got {value!r}")
+    return _named(value, name, tuple(REGISTRY))
 
-
-_PROBE = Scene(
-    fs=16000.0,
-    secondary=np.array([0.0, 1.0]),
-    references=[np.ones(8)],
-    disturbances=[np.ones(8)],
-    rated_power=1.0,
-    n_taps=2,
-    sensor_noise_std=0.0,
-    switch_on_s=0.0,
-    nse_window_s=0.05,
-    measurement_noise=1e-3,
-    initial_variance=1.0,
-    seeds=[0],
-)
 
 AXES: dict[str, Axis] = {
     axis.name: axis
@@ -244,15 +214,16 @@ AXES: dict[str, Axis] = {
             "Algorithm",
             "KF-OPC",
             _algorithm,
-            f"{', '.join(listed_algorithms())}, or another that comparisons.scene.make_controller knows",
+            ", ".join(REGISTRY),
         ),
         Axis(
             "setting",
-            "Setting: r E[x'²]/q or μ L E[x'²]",
+            "Setting: r E[x'²]/q, μ L E[x'²] or 1 - λ",
             DEFAULT_SETTING,
             _setting,
-            "r E[x'^2]/q of a Kalman filter, mu L E[x'^2] of the LMS family; default: the middle of the grid that the "
-            "studies tune on; tuned: the best of that grid by the studies' rule, on the first seed",
+            "r E[x'^2]/q of a Kalman filter, mu L E[x'^2] of the LMS family, 1 - lambda of FxRLS; default: the middle of "
+            "the grid that the studies tune on; tuned: the best of that grid by the studies' rule, on the first seed. An "
+            "algorithm's second setting is tuned with the first, else the middle of its grid",
         ),
         Axis(
             "rated_power_db",

@@ -31,9 +31,11 @@ from kfopc_filterpy import (
 from kfopc_filterpy._figures import decibels
 from kfopc_filterpy.amplifiers import Amplifier
 
+from .algorithms import KALMAN, REGISTRY, Setting, make_controller
 from .constraint_cases import FS, SWITCH_ON_S, made_noises, make_case, modelled_paths, noises, paths
-from .scene import KALMAN, Scene, grid, make_controller, tune
+from .scene import Scene
 from .sweep_grid import AMPLIFIERS, DEFAULT_SETTING, TUNED_SETTING, Values
+from .tuning import tune, unless_refused
 
 # Axes that runs of one scene agree in, and those that a gain sequence depends on besides.
 OF_SCENE = ("path", "noise", "duration_s", "n_taps", "sensor_noise_db", "seed")
@@ -52,7 +54,7 @@ MEASURED = (
     "mean_nse_db",
     "convergence_time_s",
 )
-FIGURES = (*MEASURED, "setting_used", "diverged_at_s")
+FIGURES = (*MEASURED, "setting_used", "second_setting_used", "diverged_at_s")
 RECORDED = 5  # signals of a run that `simulate_scenarios` keeps
 
 Figures = dict[str, Any]
@@ -108,15 +110,14 @@ class _Prepared:
         """A fresh controller, which knows the path as well as the scenario says."""
         errors = (self.scenario[axis] for axis in ("path_gain_db", "path_delay", "path_phase_deg"))
         estimate = estimated_path(self.scenario["path"], *errors)
-        known = replace(self.scene, secondary=estimate, rated_power=self.rated_power)
+        known = replace(self.scene, secondary_estimate=estimate, rated_power=self.rated_power)
         return make_controller(known, self.scenario["algorithm"], self.setting)
 
-    def _setting(self, tuning_seed: int) -> float:
-        setting = self.scenario["setting"]
-        if setting == DEFAULT_SETTING:
-            return default_setting(self.scenario["algorithm"])
+    def _setting(self, tuning_seed: int) -> Setting:
+        setting, algorithm = self.scenario["setting"], REGISTRY[self.scenario["algorithm"]]
         if setting != TUNED_SETTING:
-            return setting
+            first = middle(algorithm.first) if setting == DEFAULT_SETTING else setting
+            return (first, middle(algorithm.second)) if algorithm.second else first
         scene = [self.scenario[name] for name in OF_SCENE[:-1]]
         return _tuned(*scene, tuning_seed, self.scenario["algorithm"], self.rated_power, self.amplifier)
 
@@ -135,10 +136,9 @@ def naming(scenario: Values) -> Iterator[None]:
         raise ScenarioError(f"scenario {words}: {type(error).__name__}: {error}") from error
 
 
-def default_setting(algorithm: str) -> float:
-    """The middle of the grid that the studies tune an algorithm on."""
-    tried = sorted(grid(algorithm))
-    return tried[len(tried) // 2]
+def middle(grid: Sequence[float]) -> float:
+    """The middle of the settings that the studies tune an algorithm on."""
+    return sorted(grid)[len(grid) // 2]
 
 
 def path_pair(name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +182,7 @@ def _tuned(
     algorithm: str,
     rated_power: float,
     amplifier: Amplifier | None,
-) -> float:
+) -> Setting:
     """Best setting by the studies' rule on the noise of one seed, with the path known exactly."""
     scene = scene_of(path, noise, duration_s, n_taps, sensor_noise_db, seed)
     scene = replace(scene, rated_power=rated_power, amplifier=amplifier)
@@ -200,7 +200,8 @@ def _run(members: list[_Prepared]) -> list[Figures]:
         (alone,) = members
         with naming(alone.scenario):
             scene = replace(alone.scene, amplifier=alone.amplifier)
-            return [_figures(alone, scene.run(alone.controller()))]
+            result = unless_refused(alone.scenario["algorithm"], lambda: scene.run(alone.controller()))
+            return [_figures(alone, result)]
     try:
         results = members[0].scene.run_together(
             [one.controller() for one in members], amplifier=[one.amplifier for one in members]
@@ -213,13 +214,15 @@ def _run(members: list[_Prepared]) -> list[Figures]:
     return [_figures(one, result) for one, result in zip(members, results, strict=True)]
 
 
-def _figures(one: _Prepared, result: SimulationResult) -> Figures:
-    """Figures of merit of a run; of one that diverged NaN, and the time."""
-    diverged = result.diverged_at_s is not None
-    values = [np.nan] * len(MEASURED) if diverged else _measured(one, result)
+def _figures(one: _Prepared, result: SimulationResult | None) -> Figures:
+    """Figures of merit of a run; of one that diverged NaN, and the time, where it did not refuse to go on."""
+    diverged = result is None or result.diverged_at_s is not None
+    values = [np.nan] * len(MEASURED) if result is None or diverged else _measured(one, result)
+    first, second = one.setting if isinstance(one.setting, tuple) else (one.setting, np.nan)
     return dict(zip(MEASURED, values, strict=True)) | {
-        "setting_used": one.setting,
-        "diverged_at_s": result.diverged_at_s if diverged else np.nan,
+        "setting_used": first,
+        "second_setting_used": second,
+        "diverged_at_s": result.diverged_at_s if result is not None and diverged else np.nan,
         "diverged": diverged,
     }
 

@@ -21,14 +21,19 @@ RULE = (
 Job = tuple[str, Setting, int]
 
 
-def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0) -> SimulationResult | None:
-    """Run of an algorithm in a scene; None where the filter finds that it cannot go on, for those that may."""
+def unless_refused(algorithm: str, run: Callable[[], SimulationResult]) -> SimulationResult | None:
+    """Result of a run; None where the filter finds that it cannot go on, for the algorithms that may."""
     try:
-        return scene.run(make_controller(scene, algorithm, setting), seed_index)
+        return run()
     except ValueError:
         if not REGISTRY[algorithm].may_refuse:
             raise
         return None
+
+
+def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0) -> SimulationResult | None:
+    """Run of an algorithm in a scene, see `unless_refused`."""
+    return unless_refused(algorithm, lambda: scene.run(make_controller(scene, algorithm, setting), seed_index))
 
 
 def went_through(result: SimulationResult | None) -> SimulationResult:

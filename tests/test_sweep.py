@@ -15,7 +15,7 @@ from comparisons.__main__ import main
 from comparisons.sweep import ScenarioError, run_sweep
 from comparisons.sweep_command import loaded_scenario, parsed_values, values_joined
 from comparisons.sweep_figures import sweep_figures, swept_axis
-from comparisons.sweep_grid import Grid, built_in_grid, listed_algorithms, own_grid
+from comparisons.sweep_grid import Grid, built_in_grid, own_grid
 from comparisons.sweep_jobs import as_figures
 from comparisons.sweep_store import SweepFolder
 from comparisons.sweep_table import cell_rows, mean_and_interval, write_table
@@ -256,7 +256,12 @@ def test_no_function_is_refused(tmp_path):
 
 def test_figures_are_drawn_against_the_numbers_with_most_values():
     grid = built_in_grid(
-        {"rated_power_db": [-10, 0], "n_taps": [16, 32, 64], "algorithm": list(listed_algorithms())}, 1
+        {
+            "rated_power_db": [-10, 0],
+            "n_taps": [16, 32, 64],
+            "algorithm": ["KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS", "KF-OPC repaired", "KF-PB"],
+        },
+        1,
     )
     assert swept_axis(grid) == "n_taps"
     assert swept_axis(grid, "rated_power_db") == "rated_power_db"

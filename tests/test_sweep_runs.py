@@ -12,11 +12,13 @@ import pytest
 
 from comparisons import sweep_scenario
 from comparisons.__main__ import main
+from comparisons.algorithms import REGISTRY, make_controller
 from comparisons.constraint_cases import FS, SWITCH_ON_S, make_case, measured_data, noises, paths
-from comparisons.scene import SENSOR_NOISE_SEED, Runs, make_controller, tune
+from comparisons.scene import SENSOR_NOISE_SEED, Runs, Scene
 from comparisons.sweep import ScenarioError, run_sweep
-from comparisons.sweep_grid import built_in_grid, listed_algorithms
-from comparisons.sweep_scenario import default_setting, run_group, scene_of
+from comparisons.sweep_grid import built_in_grid
+from comparisons.sweep_scenario import middle, run_group, scene_of
+from comparisons.tuning import tune
 from kfopc_filterpy import (
     HardClipAmplifier,
     SoftSaturationAmplifier,
@@ -66,7 +68,10 @@ def plain_run(values, seed):
     )
 
 
-@pytest.mark.parametrize("algorithm", listed_algorithms())
+@pytest.mark.parametrize(
+    "algorithm",
+    ["KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "diagonal KF-OPC", "FxLMS", "FxNLMS", "MOV-FxLMS", "MOV-MFxLMS"],
+)
 @pytest.mark.parametrize("amplifier", ["linear", "hard clip", "soft"])
 def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
     grid = {
@@ -77,7 +82,7 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
         "path_gain_db": 2.0,
         "path_delay": 1,
         "sensor_noise_db": -30.0,
-        "setting": default_setting(algorithm),
+        "setting": middle(REGISTRY[algorithm].first),
     }
     sweep = swept(tmp_path, grid)
     assert len(sweep.runs) == 4
@@ -90,6 +95,31 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
         assert run["output_power"] == pytest.approx(power, rel=1e-6)
         assert run["output_power_db"] == pytest.approx(10 * math.log10(power), abs=1e-5)
         assert run["power_over_rated"] == pytest.approx(power / 10 ** (run["rated_power_db"] / 10), rel=1e-6)
+
+
+@pytest.mark.parametrize("setting", [0.01, "default", "tuned"])
+def test_an_algorithm_of_two_settings_has_its_second(tmp_path, setting):
+    grid = {"algorithm": "leaky FxLMS", "setting": setting}
+    (run,) = swept(tmp_path, grid, seeds=1).runs
+    own = REGISTRY["leaky FxLMS"]
+    if setting == "tuned":
+        scene = replace(scene_of("duct", "band noise", 0.5, 24, -40.0, 1), rated_power=0.1)
+        first, second = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
+    else:
+        first, second = (middle(own.first) if setting == "default" else setting), middle(own.second)
+    assert (run["setting_used"], run["second_setting_used"]) == (first, second)
+
+
+def test_a_filter_that_refuses_to_go_on_counts_as_diverged(tmp_path, monkeypatch):
+    def refuse(*arguments, **options):
+        raise ValueError("P is not positive definite")
+
+    monkeypatch.setattr(Scene, "run", refuse)
+    scenario = built_in_grid(SMALL | {"algorithm": "FxRLS"}, 1).cells()[0] | {"seed": 1}
+    (figures,) = run_group([scenario], 1)
+    assert figures["diverged"]
+    assert math.isnan(figures["diverged_at_s"])
+    assert math.isnan(figures["noise_reduction_db"])
 
 
 def test_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
@@ -176,7 +206,7 @@ def test_setting_tuned_is_the_winner_of_the_studies_rule(tmp_path):
     (run, other) = swept(tmp_path, {"algorithm": "FxLMS", "setting": "tuned", "noise": "tone"}).runs
     scene = replace(scene_of("duct", "tone", 0.5, 24, -40.0, 1), rated_power=0.1)
     assert run["setting_used"] == tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting
-    assert run["setting_used"] != default_setting("FxLMS")  # else this test says nothing
+    assert run["setting_used"] != middle(REGISTRY["FxLMS"].first)  # else this test says nothing
     assert other["setting_used"] == run["setting_used"]  # of the first seed, for all
 
 
