@@ -1,0 +1,57 @@
+"""Sphinx's settings: `python -m sphinx -W docs docs/_build/html`. Nothing here needs the network."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the kernels too: tutorials run beside each other
+
+project = "kfopc_filterpy"
+author = "The kfopc_filterpy developers"
+copyright = author
+exclude_patterns = ["_build", "figures", "**.ipynb_checkpoints"]
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.linkcode",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+    "myst_nb",
+    "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
+    "public_names",  # docs/extensions: a reference page for each of kfopc_filterpy.__all__
+]
+from source_lines import linkcode_resolve  # noqa: E402, F401
+
+# Tutorials are MyST text notebooks, executed anew in every build; a cell that raises ends it.
+nb_execution_mode = "force"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+myst_links_external_new_tab = True
+
+# numpydoc writes the docstrings; members come from autodoc, not from its own tables.
+default_role = "py:obj"
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # the docstrings say the types
+python_use_unqualified_type_names = True
+
+# A missing network is no fault of the pages: only an answer that says "gone" breaks the check.
+linkcheck_timeout = 10
+linkcheck_retries = 1
+linkcheck_workers = 4
+linkcheck_anchors = False
+linkcheck_report_timeouts_as_broken = False
+linkcheck_allow_unauthorized = True
+
+html_theme = "furo"
+html_title = "kfopc_filterpy"
+html_copy_source = False
+html_show_copyright = False
+html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
