@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from docutils import nodes
-
 PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
 
 
@@ -33,6 +31,8 @@ def page_of(module: str) -> str:
 
 def line_role(name: str, rawtext: str, text: str, lineno: int, inliner: Any, options: Any = None, content: Any = ()):
     """Link to a line of the source."""
+    from docutils import nodes
+
     module, _, code = text.partition(": ")
     try:
         number = find_line(module, code)
