@@ -55,3 +55,16 @@ html_title = "kfopc_filterpy"
 html_copy_source = False
 html_show_copyright = False
 html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
+
+
+def spread_notebooks(app, env, docnames):
+    """Spread the pages that are executed over the list: Sphinx hands its processes stretches of it."""
+    executed = [name for name in docnames if name.startswith("tutorials/") or name in ("theory", "limits")]
+    others = [name for name in docnames if name not in executed]
+    step = -(-len(others) // max(len(executed), 1))
+    docnames[:] = [name for k, page in enumerate(executed) for name in (page, *others[k * step : (k + 1) * step])]
+    docnames += [name for name in others if name not in docnames]
+
+
+def setup(app):
+    app.connect("env-before-read-docs", spread_notebooks)

@@ -45,7 +45,7 @@ def test_every_line_that_a_page_points_at_is_there_once(page):
 def test_a_line_that_is_not_there_or_not_alone_is_refused():
     with pytest.raises(ValueError, match="0 lines"):
         source_lines.find_line("kernels", "no such line of code")
-    with pytest.raises(ValueError, match="lines of kernels.py hold"):
+    with pytest.raises(ValueError, match=r"lines of kernels\.py hold"):
         source_lines.find_line("kernels", "return")
 
 
