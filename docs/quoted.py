@@ -173,7 +173,7 @@ def _broadband() -> Iterator[Quote]:
     )
     yield Quote(
         "limits.md",
-        "the amplifier known to the estimate they are {:.1f} and {:.1f} dB",
+        "the control signal goes up to {:.1f}, and the reduction is {:.1f} dB",
         ("broadband",),
         lambda r: [clipped(known, peak)(r), clipped(known, first)(r)],
     )
