@@ -203,3 +203,19 @@ def test_the_covariance_of_the_state_prediction_error_is_P():
     scatter = np.sqrt((diagonal[:, :, None] * diagonal[:, None, :] + P**2) / n_walks)
     assert np.all(np.abs(sampled - P) < 5 * scatter)
     assert np.abs(P[-1, 0, 1]) > 10 * scatter[-1, 0, 1]  # the elements off the diagonal were put to the test too
+
+
+@pytest.mark.parametrize("name", ["state_space_model", "kalman_anc", "kalman_opc"])
+def test_the_block_diagrams_are_drawn_with_the_sign_convention(name, monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    import diagrams
+    import matplotlib.pyplot as plt
+
+    figure = getattr(diagrams, name)()
+    figure.canvas.draw()  # a formula that cannot be set raises
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    plt.close(figure)
+    if name != "state_space_model":
+        assert texts.count("−") == 1  # e = d - y', the only difference
+        assert "$e(n) = d - y'$" in texts
+    assert (r"$\times\;\alpha$" in texts) == (name == "kalman_opc")
