@@ -119,8 +119,7 @@ _NOISE = _PublicFile(
 def load_measured_duct(
     folder: str | os.PathLike[str] | None = None, *, allow_download: bool = False, timeout_s: float = 5.0
 ) -> MeasuredDuct:
-    """Measured duct paths and recorded motor noise at 16 kHz, stand-ins for the paper's, which are not
-    public.
+    """Measured duct paths and recorded motor noise at 16 kHz, in place of the paper's, which are not public.
 
     The first of these that is given is used, and no other is tried after it: `folder`; the folder named by
     the environment variable KFOPC_DATA; the public sources, where `allow_download` is true and pooch is

@@ -244,7 +244,7 @@ class OutputLimiter:
         return int(self._state.numbers[CLIPPED])
 
     def __call__(self, u: float) -> float:
-        """Output for the next input sample."""
+        """Output for the next input sample `u`."""
         return float(limit_sample(self._state, as_number(u, "u")))
 
     def process(self, signal: Any) -> np.ndarray:

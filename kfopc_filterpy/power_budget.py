@@ -432,7 +432,7 @@ class PowerBudget:
         )
 
     def listen(self, reference: float, filtered_reference: float) -> None:
-        """Take one sample into the correlations only, while the control is switched off."""
+        """Take one sample, `reference` x(n) and `filtered_reference` x'(n), while the control is switched off."""
         sample = self._sample(reference, "reference"), self._sample(filtered_reference, "filtered_reference")
         take_correlations(self._state, *sample)
 

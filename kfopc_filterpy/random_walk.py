@@ -21,7 +21,7 @@ from .read_only import ReadOnlyMatrix
 class RandomWalkKFOPC(KFOPC):
     """Kalman filter of a random-walk control filter (eq. 1-8) with output power constraint, O(L^2) a sample.
 
-    Made by `KFOPC.random_walk`, which describes the parameters. It answers as a filterpy `KalmanFilter` with
+    Made by `KFOPC.random_walk`. It answers as a filterpy `KalmanFilter` with
     F = I, Q = r I and R = q does, to rounding:
 
     - `F`, `Q` and `R` read as read-only arrays. Assign a number to `Q` or `R` to change the noise.
@@ -29,7 +29,12 @@ class RandomWalkKFOPC(KFOPC):
     - Another F or a full Q, assigned or passed, `B` with `u`, and an H of several rows hand the step to
       filterpy's own equations, at their O(L^3).
     - filterpy's fading memory ``alpha`` stays fast.
-    - `dtype` is the precision that P is kept in, float64 unless float32 was asked for (see `KFOPC.random_walk`).
+    - `dtype` is the precision that P is kept in, float64 unless float32 was asked for.
+
+    Parameters
+    ----------
+    n_taps, state_noise, measurement_noise, initial_variance, rated_power, dtype, **constraint
+        As for `KFOPC.random_walk`.
 
     Examples
     --------
@@ -305,7 +310,7 @@ class RandomWalkKFOPC(KFOPC):
     # A whole signal at compiled speed: the arrays go out, and come back advanced.
 
     def compiled_state(self, to_step: bool = True) -> tuple[Covariance, tuple[float, float, float]] | None:
-        """The covariance arrays and (r, q, fading alpha squared); None where filterpy's equations step."""
+        """The covariance arrays, `to_step` or to read, and (r, q, fading alpha squared); None where filterpy steps."""
         if self._F is not None or self._Q is not None or self.inv is not np.linalg.inv:
             return None
         self._take_in_edits()
@@ -318,7 +323,7 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance.project(np.zeros(self.dim_x))
 
     def go_on_from(self, shared: Covariance) -> None:
-        """Take the covariance of other filters without an update of one's own."""
+        """Take the covariance `shared` with other filters without an update of one's own."""
         self._K, prior = self.K, self.P_prior
         self._covariance.share(shared)
         self._covariance.prior = prior
@@ -327,7 +332,7 @@ class RandomWalkKFOPC(KFOPC):
     def after_compiled(
         self, weights: np.ndarray, z: float, y: float, S: float, shared: Covariance | None = None
     ) -> None:
-        """Take back the arrays after one sample or more: `weights`, the last measurement, its residual and S.
+        """Take back the arrays after one sample or more: `weights`, the last measurement `z`, its residual `y`, and `S`.
 
         `shared` are the arrays where other filters go on from them too.
         """

@@ -100,8 +100,8 @@ def coherence_and_gain(
 ) -> CoherenceAndGain:
     """How linear the anti-noise is in the disturbance: mean coherence over a band, and the gain between them.
 
-    The coherence is |S_da|² / (S_dd S_aa), averaged over the bins in the band; the gain is the least-squares
-    one of the band, Re(sum S_da) / sum S_dd: for an output-constrained controller that is otherwise perfect
+    The coherence is ``|S_da|² / (S_dd S_aa)``, averaged over the bins in the band; the gain is the least-squares
+    one of the band, ``Re(sum S_da) / sum S_dd``: for an output-constrained controller that is otherwise perfect
     it is the constraint factor. Spectra are Welch's, Hann window, half overlap. Unrelated signals read about
     1 / (number of independent segments), not 0.
 

@@ -22,7 +22,9 @@ SET_UP = "python3 -m venv .venv && .venv/bin/python -m pip install -q -c constra
 README_COMMANDS = [
     f'{SET_UP} ".[test]" && .venv/bin/python -m pytest',
     f'{SET_UP} ".[studies]" && .venv/bin/python -m comparisons',
+    f'{SET_UP} ".[docs]" && .venv/bin/python -m sphinx -W -j auto docs docs/_build/html',
 ]
+NOT_FOR_TESTS = ("bench", "docs")  # extras that the tests run without
 LOADED_WHEN_FIRST_USED = ("control", "matplotlib", "numba", "pooch", "tqdm")
 
 
@@ -40,10 +42,10 @@ def pins() -> dict[str, str]:
     return versions
 
 
-def requirements(without: str = "") -> list[Requirement]:
-    """Return what pyproject.toml asks for, extras but one included, the package itself left out."""
+def requirements(without: tuple[str, ...] = ()) -> list[Requirement]:
+    """Return what pyproject.toml asks for, extras but those named included, the package itself left out."""
     project = tomllib.loads(read("pyproject.toml"))["project"]
-    extras = [lines for name, lines in project["optional-dependencies"].items() if name != without]
+    extras = [lines for name, lines in project["optional-dependencies"].items() if name not in without]
     groups = [project["dependencies"], *extras]
     parsed = [Requirement(line) for group in groups for line in group]
     return [requirement for requirement in parsed if requirement.name != DISTRIBUTION]
@@ -98,10 +100,10 @@ def test_every_requirement_is_pinned_within_its_range():
 def test_everything_an_install_brings_is_pinned():
     """Follow the requirements of what is installed, from this package's own down to the last.
 
-    The extra bench need not be installed; what of it is, is followed too.
+    The extras bench and docs need not be installed; what of them is, is followed too.
     """
     versions = pins()
-    always = {str(canonicalize_name(requirement.name)) for requirement in requirements(without="bench")}
+    always = {str(canonicalize_name(requirement.name)) for requirement in requirements(without=NOT_FOR_TESTS)}
     waiting, seen = [str(canonicalize_name(requirement.name)) for requirement in requirements()], set()
     while waiting:
         name = waiting.pop()

@@ -226,7 +226,7 @@ class FilteredReferenceController:
         return self.constraint.fs
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError where the secondary path, the memory of the powers or the limiter is of another sample rate."""
+        """Raise ValueError where the secondary path, the memory of the powers or the limiter is not for `fs` in Hz."""
         require_rates(
             fs,
             {
@@ -251,8 +251,8 @@ class FilteredReferenceController:
         return None
 
     def blocks(self, state: ControllerState, n_samples: int) -> Iterator[tuple[int, int]]:
-        """Begin and end of the blocks that the compiled loop may run without a pause; here all samples."""
+        """Begin and end of the blocks that the loop may run on `state` without a pause; here all `n_samples`."""
         yield 0, n_samples
 
     def after_compiled(self, state: ControllerState) -> None:
-        """Take back what the compiled loop advanced, however many samples it ran."""
+        """Take back what the compiled loop advanced in `state`, however many samples it ran."""

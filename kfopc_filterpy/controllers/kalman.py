@@ -172,7 +172,7 @@ class KalmanController(FilteredReferenceController):
         return KalmanController
 
     def compiled_state(self, to_step: bool = True) -> ControllerState | None:
-        """State for the compiled loop, to step it or to read only; None where filterpy's own equations step."""
+        """State for the compiled loop, `to_step` it or to read only; None where filterpy's own equations step."""
         estimator = self.estimator
         if type(estimator) not in (RandomWalkKFOPC, PowerBudgetKalmanFilter) or not self.steps_of(self._family()):
             return None
@@ -195,7 +195,7 @@ class KalmanController(FilteredReferenceController):
         return None if self._block is None else self._block.state
 
     def blocks(self, state: ControllerState, n_samples: int) -> Iterator[tuple[int, int]]:
-        """Begin and end of the blocks that the compiled loop may run without a pause, opened and closed around each."""
+        """Begin and end of the blocks of `n_samples` that the loop may run on `state`, opened and closed around each."""
         _, _, alpha_sq = state.settings
         if self._block is None or alpha_sq != 1.0:
             yield from super().blocks(state, n_samples)
@@ -207,7 +207,7 @@ class KalmanController(FilteredReferenceController):
             self._block.close(state.covariance, state.settings[0])
 
     def after_compiled(self, state: ControllerState, shared: bool = False) -> None:
-        """Give the estimator the weights, residual, S and gain of the last sample run, and a covariance it shares."""
+        """Give the estimator what the last sample run left in `state`; `shared` where other filters go on from it too."""
         if self._block is not None:
             self._block.close(state.covariance, state.settings[0])
         d, y, S = state.last.tolist()

@@ -54,7 +54,7 @@ class LimitedController:
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
 
     def control_signal(self, reference: float) -> float:
-        """Control signal y(n) that the limiter lets through."""
+        """Control signal y(n) that the limiter lets through, for the newest reference sample x(n)."""
         y = self.controller.control_signal(reference)
         if not np.isfinite(y):  # a divergence, for the loop to see
             return y
@@ -65,7 +65,7 @@ class LimitedController:
         return y
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError where the limiter is of another sample rate."""
+        """Raise ValueError where the limiter is not for the sample rate `fs` in Hz."""
         require_rates(fs, {"limiter": self.limiter.fs})
 
     def update(self, error: float) -> None:
@@ -73,7 +73,7 @@ class LimitedController:
         self.controller.update(error)
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Let the controller follow the noise before the control is switched on, the limiter silent."""
+        """Let the controller follow `references` and `errors` before the control is switched on, the limiter silent."""
         if not hasattr(self.controller, "listen"):
             raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
         self.controller.listen(references, errors)

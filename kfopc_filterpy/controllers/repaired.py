@@ -21,8 +21,30 @@ DEFAULT_TRIM_S = 1.0
 class RepairedKFOPC(KalmanController):
     """KF-OPC whose constraint factor keeps the rated power on more paths than the published one's.
 
-    Made by `kf_opc_repaired`, which describes the parameters. The estimator has no constraint of its own: the
-    controller gives it the factor.
+    Made by `kf_opc_repaired`. The estimator has no constraint of its own: the controller gives it the factor.
+
+    Parameters
+    ----------
+    estimator : RandomWalkKFOPC
+        Filter without a rated power.
+    secondary_path, amplifier, name, limiter
+        As for `KalmanController`.
+    constraint : OutputPowerConstraint
+        What keeps the powers and the factor.
+    gain_of, trim_s, factor_at
+        As for `kf_opc_repaired`.
+
+    Raises
+    ------
+    ValueError
+        An estimator of another kind or with a rated power; another gain or place; a time not positive.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import kf_opc_repaired
+    >>> controller = kf_opc_repaired(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1)
+    >>> type(controller).__name__, controller.rated_power
+    ('RepairedKFOPC', 0.5)
     """
 
     estimator: RandomWalkKFOPC
@@ -87,7 +109,7 @@ class RepairedKFOPC(KalmanController):
         advance_repair(repair, self.constraint.state, self._y)
 
     def after_compiled(self, state: ControllerState, shared: bool = False) -> None:
-        """As `KalmanController`; the estimator holds the factor of the last sample."""
+        """See `KalmanController.after_compiled`, `state` and `shared`; the estimator holds the last sample's factor."""
         super().after_compiled(state, shared)
         self.estimator.constraint_factor = 1.0 if self.factor_at == "output" else self.constraint_factor
 

@@ -1,0 +1,87 @@
+"""Sphinx's settings: `python -m sphinx -W docs docs/_build/html`. Nothing here needs the network."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the kernels too: tutorials run beside each other
+os.environ["MATPLOTLIBRC"] = str(Path(__file__).parent / "matplotlibrc")
+
+project = "kfopc_filterpy"
+author = "The kfopc_filterpy developers"
+copyright = author
+exclude_patterns = ["_build", "figures", "**.ipynb_checkpoints"]
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.linkcode",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+    "myst_nb",
+    "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
+    "public_names",  # docs/extensions: a reference page for each of kfopc_filterpy.__all__
+]
+from source_lines import linkcode_resolve  # noqa: E402, F401
+
+# Tutorials are MyST text notebooks, executed anew in every build; a cell that raises ends it.
+nb_execution_mode = "force"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+nb_output_stderr = "warn"  # a warning in a cell is a fault of the page
+nb_render_markdown_format = "gfm"
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 3
+myst_links_external_new_tab = True
+
+# numpydoc writes the docstrings; members come from autodoc, not from its own tables.
+default_role = "py:obj"
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints = "none"  # the docstrings say the types
+python_use_unqualified_type_names = True
+
+# `python -m sphinx -b linkcheck ...`: a missing network is no fault of the pages.
+linkcheck_ignore = [r"(\.\./)*source/.*"]  # the role line has found these
+linkcheck_timeout = 10
+linkcheck_anchors = False
+linkcheck_allow_unauthorized = True
+
+html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_title = "kfopc_filterpy"
+html_copy_source = False
+html_show_copyright = False
+html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
+
+
+def spread_notebooks(app, env, docnames):
+    """Spread the pages that are executed over the list: Sphinx hands its processes stretches of it."""
+    executed = [name for name in docnames if name.startswith("tutorials/") or name in ("theory", "limits")]
+    others = [name for name in docnames if name not in executed]
+    step = -(-len(others) // max(len(executed), 1))
+    docnames[:] = [name for k, page in enumerate(executed) for name in (page, *others[k * step : (k + 1) * step])]
+    docnames += [name for name in others if name not in docnames]
+
+
+def leave_links_offline(app):
+    """Check no links where there is no network, and say so."""
+    if app.builder.name != "linkcheck":
+        return
+    try:
+        socket.getaddrinfo("github.com", 443)
+    except OSError:
+        print("offline: links out of the documentation are not checked")
+        app.config.linkcheck_ignore.append("https?://.*")
+
+
+def setup(app):
+    app.connect("builder-inited", leave_links_offline)
+    app.connect("env-before-read-docs", spread_notebooks)

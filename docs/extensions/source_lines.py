@@ -1,0 +1,84 @@
+"""The package's source as pages with numbered lines, and links to lines that are found by what stands there.
+
+The role ``{line}`kernels: S = x + q` `` links to the one line of ``kfopc_filterpy/kernels.py`` that holds the text. A
+text that is in no line, or in several, is a warning: a page cannot go on pointing at code that has moved or changed.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
+
+
+def find_line(module: str, text: str) -> int:
+    """Number, from 1, of the only line of a module that holds `text`; ValueError where there is not one."""
+    path = PACKAGE / f"{module.replace('.', '/')}.py"
+    lines = path.read_text(encoding="utf-8").splitlines()
+    found = [number for number, line in enumerate(lines, 1) if text in line]
+    if len(found) != 1:
+        raise ValueError(f"{len(found)} lines of {path.name} hold {text!r}, expected one")
+    return found[0]
+
+
+def page_of(module: str) -> str:
+    """Name of the page that shows a module's source."""
+    return f"source/{module.replace('.', '-')}"
+
+
+def line_role(name: str, rawtext: str, text: str, lineno: int, inliner: Any, options: Any = None, content: Any = ()):
+    """Link to a line of the source."""
+    from docutils import nodes
+
+    module, _, code = text.partition(": ")
+    try:
+        number = find_line(module, code)
+    except (OSError, ValueError) as error:
+        message = inliner.reporter.warning(f"role line: {error}", line=lineno)
+        return [inliner.problematic(rawtext, rawtext, message)], [message]
+    environment = inliner.document.settings.env
+    up = "../" * environment.docname.count("/")
+    link = nodes.reference(rawtext, "", refuri=f"{up}{page_of(module)}.html#L-{number}", internal=True)
+    link += nodes.literal(code, code)
+    return [link, nodes.inline("", f" ({module.replace('.', '/')}.py, line {number})")], []
+
+
+def linkcode_resolve(domain: str, info: dict[str, str]) -> str | None:
+    """Link of a reference page, all of which lie in one folder, to the source of what it describes."""
+    import kfopc_filterpy
+
+    thing: Any = kfopc_filterpy if info["module"] == "kfopc_filterpy" else __import__(info["module"], fromlist=["_"])
+    for part in info["fullname"].split("."):
+        thing = getattr(thing, part, None)
+    thing = inspect.unwrap(thing.fget if isinstance(thing, property) and thing.fget else thing) if thing else None
+    try:
+        path, number = Path(inspect.getsourcefile(thing) or ""), inspect.getsourcelines(thing)[1]
+    except (OSError, TypeError):
+        return None
+    if PACKAGE not in path.parents:
+        return None
+    return f"../{page_of('.'.join(path.relative_to(PACKAGE).with_suffix('').parts))}.html#L-{number}"
+
+
+def source_pages(app: Any) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """A page for each module."""
+    from pygments import highlight
+    from pygments.formatters import HtmlFormatter
+    from pygments.lexers import PythonLexer
+
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        formatter = HtmlFormatter(linenos="inline", lineanchors="L", anchorlinenos=True, wrapcode=True)
+        title = f"kfopc_filterpy/{'/'.join(parts)}.py"
+        body = f"<h1>{title}</h1>{highlight(path.read_text(encoding='utf-8'), PythonLexer(), formatter)}"
+        yield page_of(".".join(parts)), {"title": title, "body": body, "parents": []}, "page.html"
+
+
+def setup(app: Any) -> dict[str, bool]:
+    """Called by Sphinx."""
+    app.add_role("line", line_role)
+    app.connect("html-collect-pages", source_pages)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
