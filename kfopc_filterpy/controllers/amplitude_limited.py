@@ -12,7 +12,7 @@ from typing import Any
 
 from .._validate import as_positive
 from ..limiter import OutputLimiter
-from ..lms_rules import CLIPPING, RESCALING, TWO_GRADIENT, lms_settings
+from ..lms_rules import CLIPPING, FACTOR, RESCALING, TWO_GRADIENT, lms_settings
 from .fxlms import LMSController
 
 
@@ -29,11 +29,10 @@ class _AmplitudeLimited(LMSController):
         step_size: float,
         amplitude_limit: float,
         limiter: OutputLimiter | None = None,
-        factor: float = 0.0,
     ) -> None:
         step_size = as_positive(step_size, "step_size")
         limit = as_positive(amplitude_limit, "amplitude_limit")
-        settings = lms_settings(self._rule, step_size, factor=factor, limit=limit)
+        settings = lms_settings(self._rule, step_size, limit=limit)
         super().__init__(n_taps, secondary_path, settings, limiter=limiter)
 
     @property
@@ -101,8 +100,8 @@ class TwoGradientFxLMS(_AmplitudeLimited):
             step_size=step_size,
             amplitude_limit=amplitude_limit,
             limiter=limiter,
-            factor=float(as_positive(second, "step_size")),
         )
+        self._state.settings[FACTOR] = second
 
     @property
     def output_step_size(self) -> float:
