@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from . import broadband, constraint, duct, tonal
+from . import broadband, constraint, duct, mismatch, tonal
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
@@ -22,7 +22,10 @@ STUDIES: dict[str, Study] = {
     "duct": (duct.main, duct.planned_runs),
     "duct-measured": (duct.main_measured, duct.planned_runs),
 }
-FURTHER: dict[str, Study] = {"constraint": (constraint.main, constraint.planned_runs)}  # beyond the paper
+FURTHER: dict[str, Study] = {  # beyond the paper
+    "constraint": (constraint.main, constraint.planned_runs),
+    "mismatch": (mismatch.main, mismatch.planned_runs),
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

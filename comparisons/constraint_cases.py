@@ -98,8 +98,8 @@ def measured_data() -> Any:
         return None
 
 
-def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray) -> Scene:
-    """Scene of one noise whose unconstrained control power is 1.
+def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray, n_taps: int | None = None) -> Scene:
+    """Scene of one noise whose unconstrained control power is 1, by default of `N_TAPS`.
 
     That power is of the filter that a Kalman filter without state noise would end with, ``(R_x' + q/(N P0) I) w = r``
     over the record: without the ridge, directions that the noise hardly excites could ask for any power.
@@ -110,7 +110,7 @@ def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray) -> Scene:
         fs=FS,
         rated_power=1.0,
         power_multiple=1.0,
-        n_taps=N_TAPS,
+        n_taps=n_taps or N_TAPS,
         switch_on_s=SWITCH_ON_S,
         sensor_noise_db=SENSOR_NOISE_DB,
         nse_window_s=0.05,
@@ -139,7 +139,7 @@ def bound_of(scene: Scene) -> PowerConstrainedWiener:
         scene.references[0],
         scene.disturbances[0],
         scene.secondary,
-        N_TAPS,
+        scene.n_taps,
         scene.rated_power,
         fs=FS,
         switch_on_s=SWITCH_ON_S,
