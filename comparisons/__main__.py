@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from . import broadband, constraint, duct, mismatch, tonal
+from . import broadband, constraint, duct, mismatch, tonal, tracking
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
@@ -25,6 +25,7 @@ STUDIES: dict[str, Study] = {
 FURTHER: dict[str, Study] = {  # beyond the paper
     "constraint": (constraint.main, constraint.planned_runs),
     "mismatch": (mismatch.main, mismatch.planned_runs),
+    "tracking": (tracking.main, tracking.planned_runs),
 }
 
 
