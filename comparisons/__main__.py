@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from . import broadband, constraint, duct, mismatch, tonal, tracking
+from . import amplifier, broadband, constraint, duct, mismatch, tonal, tracking
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
@@ -26,6 +26,7 @@ FURTHER: dict[str, Study] = {  # beyond the paper
     "constraint": (constraint.main, constraint.planned_runs),
     "mismatch": (mismatch.main, mismatch.planned_runs),
     "tracking": (tracking.main, tracking.planned_runs),
+    "amplifier": (amplifier.main, amplifier.planned_runs),
 }
 
 
