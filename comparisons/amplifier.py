@@ -170,12 +170,16 @@ def _ordering(rows: Sequence[Row]) -> Verdict:
         if r.overdrive_db > 0.0
         for key in [(_place(r), r.noise)]
     }
-    behind = sorted({key[0][2] for key, lead in leads.items() if not lead > 0.0})
+    behind: dict[str, set[float]] = {}
+    for (place, noise), lead in leads.items():
+        if not lead > 0.0:
+            behind.setdefault(noise, set()).add(place[2])
+    where = [f"{noise} at {', '.join(f'{level:g}' for level in sorted(own))} dB" for noise, own in behind.items()]
     return Verdict(
         "KF-OPC reduces the noise more than KF-ANC at every overdrive",
         not behind,
         f"by {max(leads.values()):+.1f} dB at best and {min(leads.values()):+.1f} dB at worst"
-        + (f"; not at {', '.join(f'{level:g}' for level in behind)} dB in every case" if behind else ""),
+        + (f"; somewhere not: {'; '.join(where)}" if where else ""),
     )
 
 

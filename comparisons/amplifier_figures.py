@@ -47,6 +47,8 @@ def _figure(rows: Sequence[Row], distortion: str) -> Any:
     figure = Figure(figsize=(11.0, 6.4), layout="constrained")
     shown = ("noise_reduction_db", distortion, "power")
     axes = figure.subplots(2, 3, sharex=True, sharey="col")
+    reductions = [row.noise_reduction_db for row in rows if row.diverged_at_s is None]
+    lowest, highest = min(reductions), max(reductions)
     for line, known in zip(axes, (UNKNOWN, KNOWN), strict=True):
         own = [row for row in rows if row.known == known]
         for ax, name in zip(line, shown, strict=True):
@@ -54,7 +56,7 @@ def _figure(rows: Sequence[Row], distortion: str) -> Any:
                 _draw(ax, [row for row in own if row.algorithm == algorithm], name)
             ax.grid(True, alpha=0.3)
             ax.set_ylabel(f"amplifier {known}\n{LABELS[name]}" if ax is line[0] else LABELS[name])
-        line[0].set_ylim(-2.0, TOP_DB)
+        line[0].set_ylim(min(0.0, 1.1 * lowest), min(TOP_DB, 1.1 * highest))
         line[2].axhline(1.0, color=MARK, linewidth=1)
         line[2].set_yscale("log")
     for ax in axes[1]:
@@ -70,4 +72,5 @@ def _draw(ax: Any, rows: Sequence[Row], figure: str) -> None:
     over = np.array([row.overruns and row.diverged_at_s is None for row in rows])
     ax.plot(levels[over], values[over], "x", color="black", markersize=7, markeredgewidth=0.9)
     lost = levels[[row.diverged_at_s is not None for row in rows]]
-    ax.plot(lost, np.zeros(lost.size), "x", color="black", transform=ax.get_xaxis_transform(), clip_on=False)
+    if lost.size:  # an empty line would have no place, which the layout cannot bear
+        ax.plot(lost, np.zeros(lost.size), "x", color="black", transform=ax.get_xaxis_transform(), clip_on=False)
