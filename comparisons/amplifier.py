@@ -199,6 +199,8 @@ def _notes(pairs: Iterable[str], rows: Sequence[Row]) -> list[str]:
         "The weights grow for as long as the run lasts, so the powers asked for are those of this duration.",
         "Far overdriven, a square wave of the amplifier's limit has a fundamental 4/pi as large (2.1 dB) as the sine at "
         "rated power: that is why an overrunning filter can leave less of a tone, and its harmonics with it.",
+        "Harmonics near -63 dB are the sensor noise under them, 40 dB below the disturbance in all: a tone that is not "
+        "clipped has none of its own.",
         "A hard clip spares a sine at rated power; a soft saturation bends it too, so harmonics remain with every "
         "algorithm that uses its rated power.",
         "The peak-limited algorithms were tuned with the amplifier's limit and with the one at which a square wave keeps the "

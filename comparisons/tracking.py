@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 
 from kfopc_filterpy import SimulationResult
+from kfopc_filterpy.power_budget import DEFAULT_CORRELATION_MEMORY_S
 
 from .algorithms import POWER_MEMORY_S
 from .cases import FS, grids, paths, shared_parameters, tuned_in_words, without_measured
@@ -25,6 +27,7 @@ from .tracking_runs import (
     OTHER_LENGTH_M,
     OVERDRIVE_DB,
     SEEDS,
+    START_SHARES,
     SWEEP_S,
     SWEEPS,
     Course,
@@ -33,6 +36,7 @@ from .tracking_runs import (
     events,
     jobs,
     run_event,
+    run_start,
     scenes_of,
     tune_event,
 )
@@ -40,12 +44,15 @@ from .tuning import Tuned
 
 CONSTRAINED = ("KF-OPC", "KF-PB", "MOV-FxLMS")
 CHANGES = ("sign", "delay", "longer duct")
+ONE_SWEEP = "one sweep"
 HEARD = {"sign": ("KF-ANC", "KF-PB", "FxLMS"), "sweeps": ("KF-ANC", "KF-PB", "FxLMS")}
 
 
 def planned_runs() -> int:
     """Runs of the study; an algorithm's runs of one event on all seeds count as one."""
-    return len(jobs(paths())) * (sum(len(own) for own in grids(ALGORITHMS).values()) + len(ALGORITHMS))
+    places = jobs(paths())
+    starts = len(START_SHARES) * sum(event.name == ONE_SWEEP for event, _ in places)
+    return len(places) * (sum(len(own) for own in grids(ALGORITHMS).values()) + len(ALGORITHMS)) + starts
 
 
 def main(runs: Runs) -> StudyReport:
@@ -53,7 +60,7 @@ def main(runs: Runs) -> StudyReport:
     pairs = paths()
     rows: list[Row] = []
     courses: dict[tuple[str, str], dict[str, Course]] = {}
-    tuned, sounds = {}, []
+    tuned, sounds, starts = {}, [], {}
     for event, path in jobs(pairs):
         scenes = scenes_of(event, pairs[path])
         best = tune_event(runs, scenes)
@@ -61,6 +68,8 @@ def main(runs: Runs) -> StudyReport:
         rows += [row for row, _, _ in outcomes]
         courses[event.name, path] = {row.algorithm: course for row, course, _ in outcomes if course is not None}
         tuned[f"{event.name}, {path}"] = tuned_in_words(best)
+        if event.name == ONE_SWEEP:
+            starts[path] = runs.map(partial(run_start, scenes[0]), START_SHARES)
         if path == next(iter(pairs)):
             heard = {row.algorithm: result for row, _, result in outcomes if result is not None}
             sounds += sounds_of(event, heard)
@@ -90,11 +99,11 @@ def main(runs: Runs) -> StudyReport:
             "settings": Parameter(tuned, "best and tried of each event"),
         },
         algorithms={},
-        extra={"rows": [asdict(row) for row in rows]},
+        extra={"rows": [asdict(row) for row in rows], "one_sweep_from_less_initial_variance_db": starts},
         verdicts=verdicts(rows),
-        figures=tracking_figures(courses, {event.name: event.nse_window_s for event in events()}),
+        figures=tracking_figures(courses, {event.name: event.shown_window_s for event in events()}),
         sounds=sounds,
-        notes=_notes(pairs, rows),
+        notes=[*_notes(pairs, rows), *_sweep_notes(rows, starts)],
         tables=[*event_tables(rows), _settling_table(rows)],
         claims="Findings",
     )
@@ -213,14 +222,28 @@ def _notes(pairs: Iterable[str], rows: Sequence[Row]) -> list[str]:
         "To be back within 3 dB of the steady NSE is easy for an algorithm that reduces the noise by little: the settling "
         "times of MOV-FxLMS and optimal leaky FxLMS compare with others' only beside their noise reduction. Within a jump "
         "of +20 dB, where the budget allows less than 1 dB, the constrained ones are settled whatever they do.",
-        f"What holds the constrained algorithms back after a loud noise is its power in their memory ({POWER_MEMORY_S:g} s "
-        "for KF-OPC): 20 dB take 4.6 times the memory to be forgotten. What lets them overspend at its start is the same "
-        "memory: the power estimate follows behind the noise, and only a limiter behind the filter holds from the first "
-        "sample.",
+        f"What holds the constrained algorithms back after a loud noise is its power in their memory. KF-OPC's fades with "
+        f"{POWER_MEMORY_S:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB's is a window of "
+        f"{DEFAULT_CORRELATION_MEMORY_S:g} s, which believes on purpose that a noise has become softer only when the loud "
+        "part has left it: it comes back at once then. The same memory lets them overspend at the jump itself, for an "
+        "estimate of power follows behind the noise; only a limiter behind the filter holds from the first sample.",
         "Settings are tuned on the mean NSE over the whole run, which a change in the midst hardly moves: the Kalman "
         "filters get longer memories than would bring them back soonest.",
-        "A sweep is over before the power estimates know it: the figures of one sweep are those of the start.",
     ]
+
+
+def _sweep_notes(rows: Sequence[Row], starts: Mapping[str, Sequence[float]]) -> list[str]:
+    own = [row for row in rows if row.event == ONE_SWEEP]
+    louder = [
+        f"{row.algorithm} {row.noise_reduction_db:.1f} dB ({row.path})" for row in own if row.noise_reduction_db < 0
+    ]
+    notes = [
+        f"One sweep starts from the initial variance P0 of a stationary noise. With {START_SHARES[1]:g} of it and the least "
+        f"state noise of the grid, KF-ANC reduces it by {less:.1f} dB in place of {usual:.1f} dB ({path}): a filter that hardly "
+        "knows its weights moves them far for each frequency that the sweep comes by, and is wrong at the next."
+        for path, (usual, less) in starts.items()
+    ]
+    return notes + ([f"One sweep was left louder than it was by: {', '.join(louder)}."] if louder else [])
 
 
 def event_tables(rows: Sequence[Row]) -> list[Table]:

@@ -40,16 +40,18 @@ def _figure(courses: Mapping[str, Mapping[str, Course]]) -> Any:
 
     figure = Figure(figsize=(10.5 if len(courses) > 1 else 7.5, 5.6), layout="constrained")
     axes = figure.subplots(2, len(courses), sharex=True, sharey="row", squeeze=False)
+    highest = max(float(np.nanmax(course.power)) for own in courses.values() for course in own.values())
     for (nse, power), (path, own) in zip(axes.T, courses.items(), strict=True):
-        for name, course in own.items():
-            nse.plot(course.time_s, np.clip(course.nse_db, *NSE_DB), label=name, **curve_style(name))
-            power.plot(course.time_s, course.power, **curve_style(name))
+        for k, (name, course) in enumerate(own.items()):
+            above = 3.0 - 0.1 * k  # the first in front
+            nse.plot(course.time_s, np.clip(course.nse_db, *NSE_DB), label=name, zorder=above, **curve_style(name))
+            power.plot(course.time_s, course.power, zorder=above, **curve_style(name))
             nse.set_xlim(0, course.time_s[-1])
         nse.set_title(path, fontsize="medium")
         nse.axhline(0.0, color=MARK, linewidth=1)
         power.axhline(1.0, color=MARK, linewidth=1)
         power.set_yscale("log")
-        power.set_ylim(*POWERS)
+        power.set_ylim(POWERS[0], min(POWERS[1], 1.5 * highest))
         power.set_xlabel("Time (s)")
         for ax in (nse, power):
             ax.grid(True, alpha=0.3)

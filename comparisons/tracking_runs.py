@@ -20,10 +20,11 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy.plotting import _short_time_power
 
+from .algorithms import REGISTRY
 from .cases import FS, SEED, SWITCH_ON_S, WORST_WINDOW_S, grids, make_case, noise_of, tune_all
 from .constraint_cases import with_jump
 from .scene import Runs, Scene
-from .tuning import Tuned, run_setting
+from .tuning import Tuned, run_setting, went_through
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 OVERDRIVE_DB = 3.0
@@ -34,8 +35,10 @@ CHANGE_S, CHANGE_RUN_S = 2.0, 6.0
 DELAY_SAMPLES = 16
 OTHER_LENGTH_M = 2.6
 CHIRP_HZ, SWEEP_S, SWEEPS = (20.0, 1600.0), 0.25, 16
+START_SHARES = (1.0, 0.01)  # of the usual initial variance, to see what a start from little knowledge costs
 SEEDS = (SEED, 2, 3)  # the first is tuned on
 NSE_WINDOW_S = 0.05
+SWEEP_NSE_S = 0.01
 POINTS_A_SECOND = 200  # of the curves that are kept
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -54,6 +57,7 @@ class Event:
     paths: tuple[str, ...] | None = None  # None: all
     seeds: tuple[int, ...] | None = None  # None: SEEDS
     nse_window_s: float = NSE_WINDOW_S
+    shown_window_s: float = NSE_WINDOW_S  # of the NSE in the figure
 
 
 def events() -> list[Event]:
@@ -67,8 +71,8 @@ def events() -> list[Event]:
         Event("sign", lambda pair, seed: change_scene(pair, seed, -pair[0]), changed),
         Event("delay", lambda pair, seed: change_scene(pair, seed, np.pad(pair[0], (DELAY_SAMPLES, 0))), changed),
         Event("longer duct", lambda pair, seed: change_scene(pair, seed, _longer_duct()), changed, paths=("duct",)),
-        Event("one sweep", lambda pair, seed: sweep_scene(pair, 1), {}, seeds=(SEED,), nse_window_s=0.01),
-        Event("sweeps", lambda pair, seed: sweep_scene(pair, SWEEPS), {}, seeds=(SEED,), nse_window_s=0.01),
+        Event("one sweep", lambda pair, _: sweep_scene(pair, 1), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_NSE_S),
+        Event("sweeps", lambda pair, _: sweep_scene(pair, SWEEPS), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_S),
     ]
 
 
@@ -172,7 +176,7 @@ def _settled(e: np.ndarray, d: np.ndarray, window_s: float) -> float | None:
 
 def _course(e: np.ndarray, d: np.ndarray, y: np.ndarray, rated_power: float, event: Event) -> Course:
     every = max(1, round(FS / POINTS_A_SECOND * min(1.0, e.shape[1] / FS)))
-    nse = nse_db(e, d, FS, event.nse_window_s)
+    nse = nse_db(e, d, FS, event.shown_window_s)
     power = _short_time_power(y, round(min(WORST_WINDOW_S, 0.1 * e.shape[1] / FS) * FS)) / rated_power
     points = np.arange(every - 1, nse.size, every)
     return Course((points + 1) / FS, nse[points], power[points])
@@ -183,6 +187,13 @@ def scenes_of(event: Event, pair: Pair) -> list[Scene]:
     return [
         replace(event.scene(pair, seed), seeds=[seed], nse_window_s=event.nse_window_s) for seed in event.seeds or SEEDS
     ]
+
+
+def run_start(scene: Scene, share: float) -> float:
+    """Noise reduction of KF-ANC over a whole run, with its least state noise and a share of the initial variance."""
+    started = replace(scene, initial_variance=share * scene.initial_variance)
+    result = went_through(run_setting(started, "KF-ANC", REGISTRY["KF-ANC"].grid[0]))
+    return noise_reduction_db(result.error, result.disturbance, steady=1.0)
 
 
 def tune_event(runs: Runs, scenes: Sequence[Scene]) -> dict[str, Tuned | None]:

@@ -50,8 +50,8 @@ def small() -> Any:
 
 def test_planned_runs_are_those_taken(small: Any) -> None:
     _, done, planned, _ = small
-    # three events, three filters of 5 settings and two of 14, and each at its best
-    assert planned == done == 3 * (3 * 5 + 2 * 14 + 5)
+    # three events, three filters of 5 settings and two of 14, and each at its best; two starts of the sweep
+    assert planned == done == 3 * (3 * 5 + 2 * 14 + 5) + 2
 
 
 def test_the_report_is_complete(small: Any) -> None:
@@ -71,6 +71,9 @@ def test_the_report_is_complete(small: Any) -> None:
     ]
     assert set(report.parameters["settings"].value) == {"20 dB louder, duct", "sign, duct", "one sweep, duct"}
     assert len(report.extra["rows"]) == 3 * len(STUDIED)
+    usual, less = report.extra["one_sweep_from_less_initial_variance_db"]["duct"]
+    assert np.isfinite([usual, less]).all()
+    assert usual != less
 
 
 @pytest.mark.parametrize("algorithm", ["KF-PB", "FxLMS"])
