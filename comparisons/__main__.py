@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from . import broadband, constraint, duct, power_budget, tonal
+from . import amplifier, broadband, constraint, duct, mismatch, power_budget, tonal, tracking
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
@@ -25,6 +25,9 @@ STUDIES: dict[str, Study] = {
 FURTHER: dict[str, Study] = {  # beyond the paper
     "constraint": (constraint.main, constraint.planned_runs),
     "power_budget": (power_budget.main, power_budget.planned_runs),
+    "mismatch": (mismatch.main, mismatch.planned_runs),
+    "tracking": (tracking.main, tracking.planned_runs),
+    "amplifier": (amplifier.main, amplifier.planned_runs),
 }
 
 

@@ -202,9 +202,11 @@ def make_controller(
 ) -> FilteredReferenceController:
     """A fresh controller of an algorithm of `REGISTRY`, with a setting of its grid or like it.
 
-    `amplifier` is the one that the disturbance estimate knows, for algorithms that have one.
+    `amplifier` is the one that the disturbance estimate knows, for algorithms that have one; by default the scene's
+    known one.
     """
     second = setting[1] if isinstance(setting, tuple) else np.nan
+    amplifier = scene.known_amplifier if amplifier is None else amplifier
     return REGISTRY[algorithm].make(scene, setting_value(scene, algorithm, setting), second, amplifier)
 
 

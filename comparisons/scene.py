@@ -78,6 +78,7 @@ class Scene:
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
     secondary_estimate: np.ndarray | None = None  # what controllers know of the secondary path; None: the path itself
+    known_amplifier: Amplifier | None = None  # what controllers know of the amplifier; None: that it is linear
 
     @property
     def amplitude_limit(self) -> float:
