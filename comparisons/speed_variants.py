@@ -169,7 +169,7 @@ def _kf_opc(taps: int, i: int) -> Any:
 
 def scenarios(taps: int) -> Work:
     """One of 64 scenarios in `simulate_scenarios`: samples of all are counted."""
-    samples = 8000 if taps <= 256 else 4000
+    samples = 16000 if taps <= 256 else 4000  # a second at 16 kHz
     x = signal(0, samples)
     d = np.random.default_rng(2).standard_normal(samples)
     controllers = [_kf_opc(taps, i) for i in range(SCENARIOS)]

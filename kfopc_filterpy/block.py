@@ -45,7 +45,9 @@ from .kernels import (
     predict_covariance,
     project_covariance,
 )
+from .pairs import WORK, take_pairs
 
+STEPS = 16  # samples taken one by one after a pair that could not be
 AHEAD, COLUMNS, SCALED = 0, 1, 2  # of a CausalBlock: P h_k as far as h_k is known; columns of P; K_k sqrt(S_k)
 
 
@@ -65,6 +67,7 @@ class Block:
     def __init__(self, n_taps: int, size: int) -> None:
         self.rows, self.directions = aligned_zeros(2, size, n_taps)
         self._covariance = np.zeros((size, size), order="F")
+        self._work = aligned_zeros(WORK, n_taps)
 
     def advance(
         self, cov: Covariance, state_noise: float, measurement_noise: float, alpha_sq: float = 1.0
@@ -81,6 +84,25 @@ class Block:
         S = np.full(len(self.rows), np.nan)
         _steps(cov, self.rows, state_noise, measurement_noise, alpha_sq, self.directions, S)
         return S
+
+    def advance_in_pairs(
+        self, cov: Covariance, state_noise: float, measurement_noise: float, alpha_sq: float = 1.0
+    ) -> np.ndarray:
+        """`advance`, two samples at a time (see `pairs`), and by steps where it must."""
+        if alpha_sq != 1.0 or cov.triangle.dtype != np.float64:
+            return self.advance_by_steps(cov, state_noise, measurement_noise, alpha_sq)
+        S, size = np.full(len(self.rows), np.nan), len(self.rows)
+        first = 0
+        while True:
+            settle(cov)
+            rows, directions = self.rows[first:], self.directions[first:]
+            first += take_pairs(cov, rows, state_noise, measurement_noise, self._work, directions, S[first:])
+            end = min(first + STEPS, size)
+            steps = slice(first, end)
+            _steps(cov, self.rows[steps], state_noise, measurement_noise, alpha_sq, self.directions[steps], S[steps])
+            first = end
+            if first == size or np.isnan(S[first - 1]):
+                return S
 
     def _in_products(self, cov: Covariance, state_noise: float, measurement_noise: float) -> np.ndarray | None:
         """None, with nothing changed, where Sigma has no Cholesky factor or its variances exceed q too far."""

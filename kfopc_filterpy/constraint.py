@@ -38,34 +38,40 @@ class ConstraintState(NamedTuple):
 
 
 @part(forceinline=True)
-def _next_mean(state, row, square):
-    """Mean square with one more sample, unbiased from the first sample on."""
-    n, m, mean = state.table[TAKEN, row], state.window.shape[1], state.table[MEAN, row]
-    if m == 0:
-        return mean + max(state.table[SETTINGS, FORGETTING], 1.0 / (n + 1)) * (square - mean)
-    position = int(n) % m
-    rest = state.window[row, position + 1] if position + 1 < m else 0.0
-    return (state.table[LAP, row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
+def forgetting_mean(mean, n, rate, square):
+    """Mean square with one more sample after n, of exponential memory and unbiased from the first sample on."""
+    return mean + max(rate, 1.0 / (n + 1)) * (square - mean)
 
 
 @part(forceinline=True)
-def _gain(state, filtered_power, reference_power):
+def power_gain(supplied, last, filtered_power, reference_power):
     """Eq. 11, or the gain supplied, or the last one while the reference is silent."""
-    if not np.isnan(state.table[SUPPLIED, GAIN]):
-        return state.table[SUPPLIED, GAIN]
+    if not np.isnan(supplied):
+        return supplied
     if reference_power > SILENCE:
         return filtered_power / reference_power
-    return state.table[LAST, GAIN]
+    return last
 
 
 @part(forceinline=True)
-def _factor(state, disturbance_power, gain):
+def constraint_factor(supplied, rated_power, disturbance_power, gain):
     """Eq. 13; 1 where there is nothing to constrain (no disturbance, or no gain known yet)."""
-    if not np.isnan(state.table[SUPPLIED, FACTOR]):
-        return state.table[SUPPLIED, FACTOR]
+    if not np.isnan(supplied):
+        return supplied
     if disturbance_power <= SILENCE or np.isnan(gain):
         return 1.0
-    return min(math.sqrt(state.table[SETTINGS, RATED_POWER] * gain / disturbance_power), 1.0)
+    return min(math.sqrt(rated_power * gain / disturbance_power), 1.0)
+
+
+@part(forceinline=True)
+def _next_mean(state, row, square):
+    """Mean square with one more sample."""
+    n, m, mean = state.table[TAKEN, row], state.window.shape[1], state.table[MEAN, row]
+    if m == 0:
+        return forgetting_mean(mean, n, state.table[SETTINGS, FORGETTING], square)
+    position = np.int64(n) % m
+    rest = state.window[row, position + 1] if position + 1 < m else 0.0
+    return (state.table[LAP, row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
 
 
 @part(forceinline=True)
@@ -80,9 +86,11 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     if not np.isnan(reference):
         mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference * filtered_reference)
         mean_x = _next_mean(state, REFERENCE, reference * reference)
-    gain = _gain(state, mean_xf, mean_x)
-    power = mean_d if np.isnan(state.table[SUPPLIED, POWER]) else state.table[SUPPLIED, POWER]
-    return _factor(state, power, gain), power, gain, mean_d, mean_xf, mean_x
+    table = state.table
+    gain = power_gain(table[SUPPLIED, GAIN], table[LAST, GAIN], mean_xf, mean_x)
+    power = mean_d if np.isnan(table[SUPPLIED, POWER]) else table[SUPPLIED, POWER]
+    factor = constraint_factor(table[SUPPLIED, FACTOR], table[SETTINGS, RATED_POWER], power, gain)
+    return factor, power, gain, mean_d, mean_xf, mean_x
 
 
 @part(forceinline=True)
@@ -111,7 +119,7 @@ def _take(state, row, value, mean):
     state.table[MEAN, row] = mean
     m = state.window.shape[1]
     if m > 0:
-        position = int(state.table[TAKEN, row]) % m
+        position = np.int64(state.table[TAKEN, row]) % m
         state.table[LAP, row] += value * value
         state.window[row, position] = value * value
         if position == m - 1:

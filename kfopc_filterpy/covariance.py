@@ -64,6 +64,10 @@ class RandomWalkCovariance:
         """P at a moment, as a full symmetric array of its own."""
         if isinstance(moment, np.ndarray):
             return moment.copy()
+        if moment == (1.0, 0.0, 0.0):  # nothing owed, as when a filter is made: nothing to compile
+            n = self.arrays.product.size
+            lower = np.tril(self.arrays.triangle[:n, :n].astype(np.float64))
+            return lower + np.tril(lower, -1).T
         return full_covariance(self.arrays.triangle, self.arrays.gain_direction, *moment)
 
     def show(self) -> np.ndarray:

@@ -29,9 +29,9 @@ def refill(line: np.ndarray, samples: np.ndarray) -> None:
 @part(forceinline=True)
 def push(line, sample):
     """Make `sample` the newest one."""
-    start = int(line[START]) - 1
+    start = np.int64(line[START]) - 1
     if start < HEAD:
-        kept = int(line[TAPS]) - 1
+        kept = np.int64(line[TAPS]) - 1
         start = line.size - kept - 1
         for i in range(kept):
             line[start + 1 + i] = line[HEAD + i]
@@ -42,11 +42,11 @@ def push(line, sample):
 @part(forceinline=True)
 def newest(line, taps):
     """The newest `taps` samples, newest first, as a view."""
-    start = int(line[START])
+    start = np.int64(line[START])
     return line[start : start + taps]
 
 
 @part(forceinline=True)
 def latest(line):
     """The newest sample."""
-    return line[int(line[START])]
+    return line[np.int64(line[START])]

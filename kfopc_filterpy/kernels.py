@@ -98,14 +98,14 @@ def _in_precision(row, h):
     return copied
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def predict_covariance(cov, alpha_sq, state_noise):
     """Eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
     cov.owed[SCALE] *= alpha_sq
     cov.owed[DIAGONAL] = alpha_sq * cov.owed[DIAGONAL] + state_noise
 
 
-@compiled(fastmath=FAST)
+@part(fastmath=FAST)
 def project_covariance(cov, h):
     """Pay what is owed to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
 
@@ -208,7 +208,7 @@ def add_product(total, rest, a, b):
 def downdate_carefully(cov, h, noise):
     """Eq. 8 in twice the precision and at once, after `project_covariance`; False, undone, where it would overflow."""
     T, n = cov.triangle, h.size
-    g, g_low = np.zeros(n), np.zeros(n)
+    g, g_low, k, k_low = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)  # direction, and the gain g/S
     for i in range(n):
         for j in range(i):
             g[i], g_low[i] = add_product(g[i], g_low[i], T[i, j], h[j])
@@ -218,7 +218,6 @@ def downdate_carefully(cov, h, noise):
     for i in range(n):
         S, S_low = add_product(S, S_low + h[i] * g_low[i], h[i], g[i])
     S, S_low = two_sum(S, S_low)
-    k, k_low = np.empty(n), np.empty(n)  # the gain g/S
     size = S
     for i in range(n):
         k[i] = g[i] / S
@@ -281,7 +280,7 @@ def correction_is_finite(w, gain_direction, innovation_over_S):
     return np.isfinite(total)
 
 
-@compiled(forceinline=True)
+@part(forceinline=True)
 def update_weights(cov, w, h, scaled_measurement, S, noise):
     """Eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
 

@@ -14,14 +14,15 @@ from .block import Block
 from .constraint import DEFAULT_FS
 from .controllers.base import NO_SOLUTION
 from .controllers.kalman import KalmanController
-from .delay_lines import TAPS, delay_line, newest, refill
+from .delay_lines import TAPS, newest, refill
 from .kernels import INVERSE_S, aligned_zeros, copy_covariance, covariance_matrix
-from .lockstep import Scenarios, SharedBlock, run_block
+from .lockstep import DONE, LAST_UPDATE, STATUS, TABLE, Scenarios, SharedBlock, of_lanes, run_block, stacked
 from .loop import DIVERGED, REFUSED, ControllerState
 from .paths import is_system, path_taps
 from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
 
 BLOCK = 256
+ADVANCE = {"streaming": "advance_by_steps", "block": "advance", "pairs": "advance_in_pairs"}
 
 
 def simulate_scenarios(
@@ -39,7 +40,7 @@ def simulate_scenarios(
     switch_on_s: float = 0.0,
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,
-    kernel: str = "streaming",
+    kernel: str = "pairs",
 ) -> list[SimulationResult]:
     """Run Kalman controllers that share one gain sequence, as `simulate` would run each, to rounding.
 
@@ -81,9 +82,10 @@ def simulate_scenarios(
         See `simulate`.
     progress : callable, optional
         Called with the number of samples done since its last call.
-    kernel : {"streaming", "block"}, default "streaming"
-        How the gains are made: sample by sample, or in matrix products. Equal to rounding; which is faster is the
-        machine's matter (``python -m comparisons speed``).
+    kernel : {"pairs", "streaming", "block"}, default "pairs"
+        How the gains are made: two samples at a time, sample by sample (as float32 filters and fading memories are in
+        any case), or in matrix products. Equal to rounding; which is fastest is the machine's matter
+        (``python -m comparisons speed``).
 
     Returns
     -------
@@ -113,7 +115,7 @@ def simulate_scenarios(
     >>> [round(output_power(r.control_signal), 1) for r in results]
     [0.1, 0.2, 0.4]
     """
-    as_choice(kernel, "kernel", ("streaming", "block"))
+    as_choice(kernel, "kernel", tuple(ADVANCE))
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
     if isinstance(controllers, KalmanController):
@@ -137,23 +139,28 @@ def simulate_scenarios(
             controller.listen(x[:on], d[i if len(d) > 1 else 0, :on] + noise.take(on))
         x, d = x[on:], np.ascontiguousarray(d[:, on:])
 
-    scenarios = _stacked(states, paths, amplifiers, [1.0 if p is None else p for p in rated])
+    limits = DIVERGENCE_LIMIT * np.sqrt([1.0 if p is None else p for p in rated])
+    scenarios = stacked(states, paths, amplifiers, limits, BLOCK)
     gains = _SharedGains(states[0], x, kernel)
-    recorded = np.empty((count, 7 if record_powers else 5, x.size))
+    # An odd number of cache lines (8 values) to a row: at a power of two all rows would fall on the same places of the
+    # cache, which as many scenarios write in turn.
+    recorded = np.empty((count, 7 if record_powers else 5, (-(-x.size // 8) | 1) * 8))
     for first, shared in gains.blocks():
         length = len(shared.variances)
-        sensed = np.zeros((count, length))
-        for row, noise in zip(sensed, noises, strict=True):
-            row[:] = noise.take(length)
+        if any(noise.std for noise in noises):
+            sensed = np.array([np.broadcast_to(noise.take(length), (length,)) for noise in noises])
+        else:
+            sensed = np.zeros((1, length))
         solved = length if np.isfinite(shared.variances[-1]) else int(np.isnan(shared.variances).argmax())
         run_block(scenarios, shared, d, sensed, recorded, first, solved)
         _raise_where_refused(scenarios, first + solved if solved < length else None)
         if progress:
             progress(count * length)
     gains.hand_back(controllers, states, scenarios)
+    diverged, done = of_lanes(scenarios, STATUS) == DIVERGED, of_lanes(scenarios, DONE).astype(int)
     return [
-        _result(controller, fs, rated[i], x, d[i if len(d) > 1 else 0], recorded[i], scenarios, i)
-        for i, controller in enumerate(controllers)
+        _result(c, fs, rated[i], x, d[i if len(d) > 1 else 0], recorded[i], int(done[i, 0]), bool(diverged[i, 0]))
+        for i, c in enumerate(controllers)
     ]
 
 
@@ -164,10 +171,10 @@ def _result(
     x: np.ndarray,
     d: np.ndarray,
     recorded: np.ndarray,
-    scenarios: Scenarios,
-    i: int,
+    end: int,
+    diverged: bool,
 ) -> SimulationResult:
-    end = int(scenarios.done[i])
+    recorded = recorded[:, : x.size]
     recorded[:, end:] = np.nan
     e, y, y_amplified, a, factor, *powers = recorded
     return SimulationResult(
@@ -183,7 +190,7 @@ def _result(
         constraint_factor=factor,
         disturbance_power=powers[0] if powers else None,
         secondary_path_gain=powers[1] if powers else None,
-        diverged_at_s=end / fs if scenarios.status[i] == DIVERGED else None,
+        diverged_at_s=end / fs if diverged else None,
     )
 
 
@@ -293,27 +300,6 @@ def _parameters(amplifier: Amplifier | None) -> np.ndarray:
     return parameters
 
 
-def _stacked(states: list[ControllerState], paths: np.ndarray, amplifiers: np.ndarray, rated: list[float]) -> Scenarios:
-    count, n = len(states), states[0].weights.size
-    weights = aligned_zeros(count, n)
-    for row, state in zip(weights, states, strict=True):
-        row[:n] = state.weights
-    return Scenarios(
-        weights=weights,
-        output=np.array([s.output for s in states]),
-        model=np.array([s.amplifier for s in states]),
-        emitted=np.array([delay_line(paths.shape[1]) for _ in states]),
-        amplifier=amplifiers,
-        secondary=paths,
-        table=np.array([s.constraint.table for s in states]),
-        window=np.array([s.constraint.window for s in states]),
-        last=np.full((count, 3), np.nan),
-        limit=DIVERGENCE_LIMIT * np.sqrt(rated),
-        done=np.zeros(count, dtype=np.int64),
-        status=np.zeros(count, dtype=np.int64),
-    )
-
-
 class _SharedGains:
     """The gains of a run, a block at a time in the same arrays, from a copy of the covariance."""
 
@@ -325,43 +311,53 @@ class _SharedGains:
         self.reference = np.concatenate((heard, x))
         self.filtered = np.convolve(self.reference, s)[: self.reference.size]
         self.filtered[self.heard - n : self.heard] = newest(state.filtered, n)[::-1]
+        # Newest first, so that each row is a slice.
+        self.reference, self.filtered = self.reference[::-1].copy(), self.filtered[::-1].copy()
 
     def blocks(self) -> Iterator[tuple[int, SharedBlock]]:
         """First sample and gains of each block."""
-        n, s = self.state.weights.size, self.state.secondary_estimate
+        n = self.state.weights.size
         for first in range(0, self.n_samples, BLOCK):
             size = min(BLOCK, self.n_samples - first)
             if size < BLOCK or first == 0:
                 block, references = Block(n, size), aligned_zeros(size, n)
             references[:, :n] = self._rows(self.reference, first, size)
             block.rows[:, :n] = self._rows(self.filtered, first, size)
-            advance = block.advance if self.kernel == "block" else block.advance_by_steps
+            advance = getattr(block, ADVANCE[self.kernel])
             variances = advance(self.state.covariance, *self.state.settings.tolist())
             largest = np.abs(block.directions).max(axis=1)
-            yield first, SharedBlock(references, block.rows, block.directions, largest, variances, s)
+            yield first, SharedBlock(references, block.rows, block.directions, largest, variances)
 
     def _rows(self, signal: np.ndarray, first: int, size: int) -> np.ndarray:
-        n, now = self.state.weights.size, self.heard + first
-        return sliding_window_view(signal[now + 1 - n : now + size], n)[:, ::-1]
+        begin = signal.size - self.heard - first - size  # of the last of the rows
+        return sliding_window_view(signal, self.state.weights.size)[begin : begin + size][::-1]
 
     def hand_back(
         self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios
     ) -> None:
         """Leave each controller as its scenario left it; all read one covariance until they step."""
+        last, tables = of_lanes(scenarios, LAST_UPDATE, 3), scenarios.table
+        if tables is None:
+            tables = of_lanes(scenarios, TABLE, 18).reshape(-1, 6, 3)
+        taps = scenarios.secondary_estimate.shape[1]  # past samples at the beginning of a line
+        heard = scenarios.output[:, taps - 1 :: -1].swapaxes(1, 2).reshape(-1, taps)
         for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
-            refill(state.reference, self.reference[::-1])
-            refill(state.filtered, self.filtered[::-1])
-            state.output[:], state.weights[:] = scenarios.output[i], scenarios.weights[i, : state.weights.size]
-            state.constraint.table[:], state.constraint.window[:] = scenarios.table[i], scenarios.window[i]
-            state.last[:] = scenarios.last[i]
+            refill(state.reference, self.reference)
+            refill(state.filtered, self.filtered)
+            refill(state.output, heard[i])
+            state.weights[:] = scenarios.weights[i, : state.weights.size]
+            state.constraint.table[:] = tables[i]
+            if scenarios.window is not None:
+                state.constraint.window[:] = scenarios.window[i]
+            state.last[:] = last[i]
             controller.after_compiled(state._replace(covariance=self.state.covariance), shared=True)
 
 
 def _raise_where_refused(scenarios: Scenarios, unsolved: int | None) -> None:
-    for i in np.flatnonzero(scenarios.status == REFUSED):
+    for i in np.flatnonzero(of_lanes(scenarios, STATUS) == REFUSED):
         raise ValueError(
-            f"the weights of controllers[{i}] would overflow in sample {scenarios.done[i]} of the run: its disturbance "
-            "estimate or residual is too large"
+            f"the weights of controllers[{i}] would overflow in sample {of_lanes(scenarios, DONE)[i, 0]:.0f} of the run: "
+            "its disturbance estimate or residual is too large"
         )
     if unsolved is not None:
         raise ValueError(f"{NO_SOLUTION} (sample {unsolved} of the run)")

@@ -66,7 +66,11 @@ def refuse_steps(monkeypatch):
     monkeypatch.setattr(Block, "advance_by_steps", steps)
 
 
-@pytest.mark.parametrize("how", [("advance",), ("advance_by_steps",), ("advance", "advance_by_steps")], ids="+".join)
+@pytest.mark.parametrize(
+    "how",
+    [("advance",), ("advance_by_steps",), ("advance_in_pairs",), ("advance", "advance_by_steps", "advance_in_pairs")],
+    ids="+".join,
+)
 @pytest.mark.parametrize("r", [0.0, 1e-4])
 @pytest.mark.parametrize("kind", ["unrelated", "line"])
 @pytest.mark.parametrize("size", [1, 5, 48, 100])
@@ -420,3 +424,38 @@ def test_any_taps_and_any_size(n_taps, size, seed):
 def test_refuses(size, kind, message, name):
     with pytest.raises(kind, match=message):
         controller(name, block_size=size) if name else KalmanController(KFOPC(4), S_HAT, block_size=size)
+
+
+# ---- Two samples at a time
+
+
+@pytest.mark.parametrize("alpha", [1.0, 1.001])
+@pytest.mark.parametrize("n", [1, 7, 30])
+def test_pairs_leave_to_steps_what_would_cancel(n, alpha):
+    """S starts 1e6 times q: those samples are as by steps to the bit, the rest to rounding; so is a fading memory."""
+    rows = rows_of("line", n, 101, np.random.default_rng(n))
+    pairs, steps = (Filter(1e3 * np.eye(n), 1e-6, 1e-3, alpha) for _ in range(2))
+    (g, S), (g_steps, S_steps) = pairs.take(rows, "advance_in_pairs"), steps.take(rows, "advance_by_steps")
+    assert S_steps[0] > 1e3 * 1e-3
+    np.testing.assert_array_equal(S[: min(n, 16)], S_steps[: min(n, 16)])
+    assert_close(S, S_steps, 1e-9)
+    assert_close(g, g_steps, 1e-9)
+    assert_close(pairs.P, steps.P, 1e-9)
+    assert np.array_equal(S, S_steps) == (alpha != 1.0)
+
+
+def test_pairs_stop_where_a_sample_has_no_solution():
+    """A silent row without measurement noise, after ones that are taken."""
+    rows = rows_of("line", 5, 20, np.random.default_rng(0))
+    rows[9:] = 0.0
+    _, S = Filter(np.eye(5), 1e-4, 0.0).take(rows, "advance_in_pairs")
+    np.testing.assert_array_equal(np.isnan(S), np.arange(20) >= 9)
+
+
+@pytest.mark.parametrize("n", [3, 16, 21])
+def test_the_blocks_on_the_diagonal_stay_symmetric_to_the_bit(n):
+    kept = Filter(np.eye(n), 1e-4, 0.5)
+    kept.take(rows_of("line", n, 400, np.random.default_rng(n)), "advance_in_pairs")
+    for i in range(0, n, 8):
+        block = kept.cov.triangle[i : i + 8, i : i + 8]
+        np.testing.assert_array_equal(block, block.T)
