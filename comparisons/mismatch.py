@@ -195,8 +195,15 @@ def _notes(pairs: Pairs, rows: Sequence[Row], accuracy: Mapping[str, float]) -> 
     anc = [row for row in rows if row.algorithm == "KF-ANC" and row.tuned_with == EXACT and row.kind == "phase"]
     late = [row.diverged_at_s for row in anc if row.diverged_at_s is not None]
     times = f"after {min(late):.1f} s at the earliest" if late else "at none of the phase errors within the run"
+    over = [
+        f"{row.algorithm} ({row.path}, {row.noise}: {row.power:.2f})"
+        for row in rows
+        if (row.kind, row.amount, row.tuned_with) == ("phase", 0.0, EXACT) and not row.within_budget
+    ]
+    kept = [f"Over its budget with the exact path too, at every setting tried: {', '.join(over)}."] if over else []
     return [
         *without_measured(pairs),
+        *kept,
         "Why the Kalman filters have the bound of 90 degrees too: they trust d^ = e + s^*y, which is off by (s^ - s)*y. "
         "Filter weights that change slowly still settle where E[x' e] = 0, as those of FxLMS do, and move there along "
         "R_x'^-1 E[x' e], per frequency at a rate of s/s^: the gain no longer matters, the sign of its real part does.",

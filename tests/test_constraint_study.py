@@ -411,7 +411,7 @@ def test_measured_data_join_where_they_are_at_hand(shared_data: Any, monkeypatch
 def test_the_command_lists_it_and_runs_it_only_where_it_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert dict(command.FURTHER) == {"constraint": (constraint.main, constraint.planned_runs)}
+    assert command.FURTHER["constraint"] == (constraint.main, constraint.planned_runs)
     assert "constraint" not in command.STUDIES
     ran: list[str] = []
 
