@@ -26,6 +26,8 @@ DEBT_S = 1.0  # overspending beyond this much of the rated power is forgotten, s
 REPAYMENT = 3.0  # 1/s: what the account holds changes the target by this share of itself
 PATIENCE = 6.0  # 1/s: and by less, the more of the account chance makes
 LARGEST_CHANCE_S = 0.5
+UNSPENT_S = 4.0  # memory of the share that was spent
+UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # what is left of 100 % raises the target by ten times that, 30 % at most
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
 INTERVAL = 128  # samples between two solutions; fewer at the start
 STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its standard error
@@ -46,7 +48,8 @@ OWN_X, OWN_XF, ACROSS_X, ACROSS_XF = range(4)
     WEIGHT,  # lambda
     SPAN,  # segments in the window
     CHANCE,  # seconds of rated power: standard deviation that the scatter of levels gives to the account in a second
-) = range(11)
+    SPENT,  # mean share of the rated power spent of late, of the time when the noise needed all of it
+) = range(12)
 
 
 class BudgetState(NamedTuple):
@@ -57,7 +60,7 @@ class BudgetState(NamedTuple):
     filtered: np.ndarray  # delay line of x'
     correlations: np.ndarray  # (LONG + 1, 4, L) sums of products at lags 0 ... L - 1
     counts: np.ndarray  # (LONG + 1,) samples in each segment
-    table: np.ndarray  # (11,) numbers named above
+    table: np.ndarray  # (12,) numbers named above
     work: np.ndarray  # (WORK_ROWS + 2, L)
 
 
@@ -227,8 +230,19 @@ def target_power(budget, forecast):
     table = budget.table
     account, chance = table[ACCOUNT], table[CHANCE]
     excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
-    share = math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
+    share = unspent(table) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
     return table[RATED_POWER] * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
+
+
+@part()
+def unspent(table):
+    """Factor of the target for power that was left of late, beyond what chance makes of a mean over that time.
+
+    Credit that could not be spent in time is lost to the account. For noise that swells that is a part of the power at
+    each swell, since falls of the level are believed slowly; the noise's own past tells how large a part.
+    """
+    left = 1.0 - table[SPENT] - table[CHANCE] / math.sqrt(2.0 * UNSPENT_S)
+    return min(1.0 + UNSPENT_GAIN * max(left, 0.0), UNSPENT_MOST)
 
 
 @compiled()
@@ -250,6 +264,8 @@ def advance_budget(budget, w, x, xf, y):
     take_correlations(budget, x, xf)
     spent = table[ACCOUNT] + (y * y / table[RATED_POWER] - 1.0) / table[FS]
     table[ACCOUNT] = min(max(spent, -table[CREDIT] - table[CHANCE]), DEBT_S)
+    if table[WEIGHT] > 0.0:
+        table[SPENT] += (y * y / table[RATED_POWER] - table[SPENT]) / (UNSPENT_S * table[FS])
     table[TAKEN] += 1.0
     table[WAITED] += 1.0
     # At the start, when the estimate grows fast, after every eighth part of the time so far.
@@ -290,7 +306,8 @@ class PowerBudget:
     - an account of the power spent beyond what was due, in seconds of rated power: the target is the rated power times
       ``exp(-3 excess / (1 + 6 chance))``. It steers the mean power to the rated one, and repays what a surprise has
       overspent, up to a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
-      to the account within a second; it adds to the credit, half of which it lets be.
+      to the account within a second; it adds to the credit, half of which it lets be. Power that was left unspent over some
+      four seconds while there was use for it, beyond what chance makes of that, raises the target by up to 30 %.
 
     Parameters
     ----------
@@ -349,7 +366,8 @@ class PowerBudget:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
-        table = np.zeros(11)
+        table = np.zeros(12)
+        table[SPENT] = 1.0
         table[RATED_POWER], table[FS], table[CREDIT] = rated_power, self.fs, self.credit_s
         table[SEGMENT] = max(round(self.memory_s * self.fs / USUAL), n_taps)
         table[SPAN] = USUAL

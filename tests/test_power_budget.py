@@ -16,7 +16,16 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import KalmanController, PowerBudget, SimulationResult, band_limited_noise, kf_pb, simulate, tone
+from kfopc_filterpy import (
+    KalmanController,
+    PowerBudget,
+    SimulationResult,
+    band_limited_noise,
+    kf_pb,
+    simulate,
+    swelling,
+    tone,
+)
 from kfopc_filterpy.allocation import POWER_TOLERANCE, RIDGE
 from kfopc_filterpy.power_budget import (
     ACCOUNT,
@@ -34,6 +43,7 @@ from kfopc_filterpy.power_budget import (
     SHORT,
     SHORTEST_PART,
     SPAN,
+    SPENT,
     STEADY,
     TARGET_LEAST,
     TARGET_MOST,
@@ -488,6 +498,53 @@ def test_the_target_repays_what_the_account_holds(spent: float, rated_power: flo
     budget.advance(1.0, 1.0, [1.0], control_signal=math.sqrt(max(spent + 1.0, 0.0) * rated_power))
     share = np.clip(math.exp(-3.0 * budget.account_s), TARGET_LEAST, TARGET_MOST)
     assert target_power(budget.state, forecast) == pytest.approx(rated_power * share / forecast, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("spent", "chance", "factor"),
+    [
+        (1.0, 0.0, 1.0),
+        (1.7, 0.0, 1.0),  # overspending is the account's affair
+        (0.98, 0.0, 1.2),
+        (0.97, 0.0, 1.3),
+        (0.5, 0.0, 1.3),
+        (0.98, 0.02 * math.sqrt(8.0), 1.0),  # what chance makes of a mean over 2 * 4 s
+        (0.95, 0.03 * math.sqrt(8.0), 1.2),
+    ],
+)
+def test_power_left_unspent_beyond_chance_raises_the_target(spent: float, chance: float, factor: float) -> None:
+    budget = PowerBudget(1, 0.5)
+    budget.state.table[SPENT], budget.state.table[CHANCE] = spent, chance
+    budget.state.table[ACCOUNT] = -0.5 * chance  # a credit that chance makes: no part in the target
+    assert target_power(budget.state, 1.0) == pytest.approx(0.5 * factor, rel=1e-12)
+
+
+def test_the_share_that_is_spent_is_followed_while_there_is_use_for_more() -> None:
+    """An exponential mean over 4 s, of the samples at which lambda was above zero."""
+    budget, rng, expected, used = PowerBudget(2, 0.5, fs=100.0), np.random.default_rng(4), 1.0, 0
+    for n, x in enumerate(rng.standard_normal(3000)):
+        needed = budget.power_weight > 0.0
+        y = budget.control_signal(x)
+        budget.advance(x, x, [0.0, 0.1] if 1000 <= n < 2000 else [2.0, -1.0])  # a third of it asks for little
+        expected += needed * (y * y / 0.5 - expected) / 400.0
+        used += needed
+        assert budget.state.table[SPENT] == pytest.approx(expected, rel=1e-9)
+    assert 1500 < used < 2500
+
+
+def test_most_of_the_power_is_spent_on_noise_that_swells() -> None:
+    """0.99 of the rated one; without what returns of the unspent power it was 0.92."""
+    w, powers = np.array([0.0, 2.0, -1.0]), []
+    for seed in range(3):
+        x = swelling(np.random.default_rng(seed).standard_normal(20 * 2000), fs=2000.0, swing_db=6.0, period_s=4.0)
+        budget = PowerBudget(3, 0.6, fs=2000.0)
+        y = np.zeros(x.size)
+        for n in range(x.size):
+            y[n] = budget.control_signal(x[n])
+            budget.advance(x[n], x[n], w)
+        powers.append(np.mean(y[x.size // 2 :] ** 2) / 0.6)
+    assert 0.96 < np.mean(powers) < 1.02
+    assert max(powers) <= 1.05
 
 
 def target(account: float, chance: float, forecast: float = 1.0, rated_power: float = 1.0) -> float:
