@@ -193,6 +193,8 @@ def adapt_lms(controller, error, y):
     d = disturbance_estimate(controller, error)
     w = controller.weights
     xf, x = newest(controller.filtered, w.size), newest(controller.reference, w.size)
+    if not squares_are_finite(d, xf[0], x[0]):
+        return False
     factor = advance_constraint(controller.constraint, d, xf[0], x[0])
     if correct_diagonal(controller.variances, w, xf, factor * d, controller.settings):
         return True

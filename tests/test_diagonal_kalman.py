@@ -93,6 +93,18 @@ def test_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:
     assert np.all(np.isfinite(controller.weights))
 
 
+def test_an_error_whose_square_overflows_is_refused_and_nothing_changed() -> None:
+    x, d = signals()
+    controller = DiagonalKalman(L, PATH, rated_power=0.3, **NOISES)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    controller.control_signal(0.3)
+    before = pickle.dumps(controller)
+    with pytest.raises(ValueError, match="must have finite squares"):
+        controller.update(1e200)
+    assert pickle.dumps(controller) == before
+    assert (controller.state_noise, controller.measurement_noise) == (1e-5, 0.02)
+
+
 def test_a_copy_goes_on_alone() -> None:
     x, d = signals()
     controller = DiagonalKalman(L, PATH, amplifier=HardClipAmplifier(1.0), **NOISES)

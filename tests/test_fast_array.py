@@ -107,7 +107,17 @@ def test_an_array_that_rounding_has_spoilt_is_refused_and_nothing_changed(compil
     controller = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
     with pytest.raises(ValueError, match="the fast array is lost to rounding") as caught:
         simulate(controller, x, disturbance=d, secondary_path=PATH, compiled=compiled)
-    assert caught.value.__notes__[0].startswith("in sample ")
+    note = caught.value.__notes__[0]
+    assert note.startswith("in sample ")
+    lost_at = int(note.split()[2])
+    again = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
+    simulate(again, x[:lost_at], disturbance=d[:lost_at], secondary_path=PATH, compiled=compiled)
+    # the refused sample changed neither weights, array nor powers
+    np.testing.assert_array_equal(controller.weights, again.weights)
+    np.testing.assert_array_equal(controller.constraint.state.table, again.constraint.state.table)
+    for part in ("gain", "ahead", "behind"):
+        arrays = (getattr(made._state.fast_array, part) for made in (controller, again))
+        np.testing.assert_array_equal(*arrays, err_msg=part)
     before = pickle.dumps(controller)
     with pytest.raises(ValueError, match="lost to rounding"):
         controller.update(1.0)
@@ -142,6 +152,29 @@ def test_while_it_listens_it_learns() -> None:
     np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-10)
     result = simulate(controller, x[300:], disturbance=d[300:], secondary_path=PATH)
     assert np.mean(result.error[10:] ** 2) < 0.05  # from its first samples on: the noise is 0.01
+
+
+def test_an_array_that_is_lost_while_listening_is_refused() -> None:
+    x, d = signals(8000)
+    controller = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
+    with pytest.raises(ValueError, match="the fast array is lost to rounding") as caught:
+        controller.listen(x, d)
+    assert caught.value.__notes__[0].endswith("of those listened to")
+    assert controller.forgetting == 0.95
+
+
+def test_an_error_whose_square_overflows_is_refused_and_nothing_changed() -> None:
+    x, d = signals()
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, rated_power=0.3)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    controller.control_signal(0.3)
+    twin = pickle.loads(pickle.dumps(controller))
+    with pytest.raises(ValueError, match="must have finite squares"):
+        controller.update(1e200)
+    for made in (controller, twin):  # as if nothing had been
+        made.update(0.1)
+    np.testing.assert_array_equal(controller.weights, twin.weights)
+    assert controller.constraint_factor == twin.constraint_factor
 
 
 def test_a_copy_goes_on_alone() -> None:

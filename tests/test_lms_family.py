@@ -460,9 +460,13 @@ def test_a_refused_error_changes_nothing(name: str) -> None:
     before = pickle.dumps(controller)
     with pytest.raises(ValueError, match="error"):
         controller.update(np.nan)
+    with pytest.raises(ValueError, match="must have finite squares"):
+        controller.update(1e200)
     with pytest.raises(ValueError, match="reference"):
         controller.control_signal(np.inf)
     assert pickle.dumps(controller) == before
+    controller.update(0.1)  # and it goes on
+    assert np.all(np.isfinite(controller.weights))
 
 
 @pytest.mark.parametrize("name", EVERY)

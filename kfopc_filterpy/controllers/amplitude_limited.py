@@ -1,9 +1,7 @@
 """FxLMS with a limit on the amplitude of the control signal: two gradients, re-scaling, clipping.
 
 They keep a peak, not a power. A sine at the rated power peaks at sqrt(2 rated_power); noise at that amplitude limit
-has a lower mean power while it is rarely held, and never more than twice the rated one.
-
-The original papers' texts were not at hand: the equations are those by which later papers describe the algorithms.
+has a lower mean power while it is rarely held. Where it is held, never more than twice the rated one.
 """
 
 from __future__ import annotations
@@ -67,7 +65,8 @@ class TwoGradientFxLMS(_AmplitudeLimited):
     References
     ----------
     D. Shi, W.-S. Gan, B. Lam, C. Shi, "Two-gradient direction FXLMS: an adaptive active noise control algorithm with
-    output constraint", Mechanical Systems and Signal Processing 116, 2019.
+    output constraint", Mechanical Systems and Signal Processing 116, 2019: the text was not at hand, the equations are
+    those by which later papers describe it.
 
     Examples
     --------
@@ -130,7 +129,8 @@ class RescalingFxLMS(_AmplitudeLimited):
 
     References
     ----------
-    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001.
+    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001:
+    the text was not at hand, the equations are those by which later papers describe it.
 
     Examples
     --------
@@ -167,7 +167,8 @@ class ClippingFxLMS(_AmplitudeLimited):
 
     References
     ----------
-    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001.
+    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001:
+    the text was not at hand, the equations are those by which later papers describe it.
 
     Examples
     --------

@@ -11,26 +11,35 @@ from .._validate import as_count, as_number, as_signal
 from ..amplifiers import Amplifier, LinearAmplifier, compiled_parameters
 from ..block import OpenBlock
 from ..constraint import OutputPowerConstraint
-from ..delay_lines import delay_line, newest
+from ..delay_lines import delay_line, latest, newest
 from ..kernels import new_covariance
 from ..limiter import OutputLimiter
 from ..loop import (
     DISTURBANCE_IN,
     LISTENING,
     REFERENCE_IN,
+    REFUSED,
     ROWS,
     STEP,
     ControllerState,
     Plant,
     adapt_lms,
     control_signal,
+    disturbance_estimate,
     run,
+    squares_are_finite,
 )
 from ..paths import is_system, path_taps, sampling_rate
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
     "measurement_noise = 0 tells nothing: give measurement_noise > 0"
+)
+
+
+OVERFLOW = (
+    "the disturbance estimate, the reference and the filtered reference must have finite squares, and one overflows: "
+    "nothing was changed; scale the signals, or use a smaller step"
 )
 
 
@@ -88,7 +97,7 @@ class FilteredReferenceController:
     """
 
     name = "controller"
-    _refusal = NO_SOLUTION
+    _refusal = OVERFLOW  # why an update is refused whose numbers are finite
 
     def __init__(
         self,
@@ -183,8 +192,14 @@ class FilteredReferenceController:
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""
-        if not adapt_lms(self._state, as_number(error, "error"), self._y):
-            raise ValueError(self._refusal)
+        error = as_number(error, "error")
+        if not adapt_lms(self._state, error, self._y):
+            raise ValueError(self._refusal if self._squares_are_finite(error) else OVERFLOW)
+
+    def _squares_are_finite(self, error: float) -> bool:
+        state = self._state
+        d = disturbance_estimate(state, error)
+        return bool(squares_are_finite(d, latest(state.filtered), latest(state.reference)))
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
@@ -202,7 +217,12 @@ class FilteredReferenceController:
         for first in range(0, x.size, STEP):
             signals = np.zeros((ROWS, min(STEP, x.size - first)))
             signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STEP], e[first : first + STEP]
-            run(silent, self.open_block, nothing, signals, np.empty((0, 0)), np.inf, 1, 0, 0, signals.shape[1])
+            no_weights = np.empty((0, 0))
+            status, done = run(silent, self.open_block, nothing, signals, no_weights, np.inf, 1, 0, 0, signals.shape[1])
+            if status == REFUSED:
+                refused = ValueError(self._refusal)
+                refused.add_note(f"in sample {first + done} of those listened to")
+                raise refused
 
     def _silent_state(self) -> ControllerState:
         """State for the compiled loop to listen with."""

@@ -11,10 +11,11 @@ from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
 from ..limiter import OutputLimiter
 from ..lms_rules import MEASUREMENT_NOISE, PLAIN, STATE_NOISE, lms_settings
-from .fxlms import LMSController
+from ..loop import LMS
+from .base import FilteredReferenceController
 
 
-class DiagonalKalman(LMSController):
+class DiagonalKalman(FilteredReferenceController):
     r"""Reduced-complexity Kalman filter: eq. 2-9 with P held to its diagonal p, an NLMS with a step for each tap.
 
     .. math:: p \leftarrow p + r, \quad S = \sum_i p_i x_i'^2 + q, \quad K_i = p_i x'_i / S, \quad
@@ -56,8 +57,8 @@ class DiagonalKalman(LMSController):
 
     References
     ----------
-    J. Fabry, S. Liebich, P. Vary, P. Jax, "Active noise control with reduced-complexity Kalman filter", IWAENC 2018:
-    the approximation that it makes in frequency bins, made here in the time domain, from eq. 2-9.
+    After J. Fabry, S. Liebich, P. Vary, P. Jax, "Active noise control with reduced-complexity Kalman filter", IWAENC 2018,
+    whose text was not at hand: derived here from eq. 2-9.
 
     Examples
     --------
@@ -98,9 +99,19 @@ class DiagonalKalman(LMSController):
             self.name = "diagonal KF-OPC"
         settings = lms_settings(PLAIN, 0.0)
         settings[STATE_NOISE], settings[MEASUREMENT_NOISE] = r, q
-        super().__init__(n_taps, secondary_path, settings, amplifier, constraint, limiter)
+        super().__init__(LMS, n_taps, secondary_path, settings, amplifier, constraint, limiter)
         self._constrained = constraint is not None
         self._state = self._state._replace(variances=np.full(self._state.weights.size, variance))
+
+    @property
+    def state_noise(self) -> float:
+        """State noise variance r."""
+        return float(self._state.settings[STATE_NOISE])
+
+    @property
+    def measurement_noise(self) -> float:
+        """Measurement noise variance q."""
+        return float(self._state.settings[MEASUREMENT_NOISE])
 
     @property
     def rated_power(self) -> float | None:

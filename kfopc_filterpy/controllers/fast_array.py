@@ -10,14 +10,14 @@ from .._validate import as_positive
 from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
 from ..delay_lines import delay_line
-from ..fast_array import new_fast_array
+from ..fast_array import FORGETTING, new_fast_array
 from ..limiter import OutputLimiter
 from ..lms_rules import PLAIN, lms_settings
-from ..loop import ControllerState
-from .fxlms import LMSController
+from ..loop import LMS, ControllerState
+from .base import FilteredReferenceController
 
 
-class FastArrayKalman(LMSController):
+class FastArrayKalman(FilteredReferenceController):
     r"""Fast-array Kalman filter: eq. 2-9 with r = 0 in O(L), by the shift of the filtered reference.
 
     With `forgetting` = 1 it is `kf_anc` with ``state_noise=0`` (or `kf_opc`, with a rated power), to rounding; below 1 it
@@ -110,12 +110,18 @@ class FastArrayKalman(LMSController):
                 rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
             )
             self.name = "fast-array KF-OPC"
-        super().__init__(n_taps, secondary_path, lms_settings(PLAIN, 0.0), amplifier, constraint, limiter)
+        super().__init__(LMS, n_taps, secondary_path, lms_settings(PLAIN, 0.0), amplifier, constraint, limiter)
         self._constrained = constraint is not None
         taps = self._state.weights.size
         self._state = self._state._replace(
             filtered=delay_line(taps + 1), fast_array=new_fast_array(taps, variance / (q * forgetting), forgetting)
         )
+
+    @property
+    def forgetting(self) -> float:
+        """Forgetting factor lambda."""
+        assert self._state.fast_array is not None
+        return float(self._state.fast_array.numbers[FORGETTING])
 
     @property
     def rated_power(self) -> float | None:

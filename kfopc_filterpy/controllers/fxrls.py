@@ -29,7 +29,7 @@ def fx_rls(
        P \leftarrow (P - K x'^T P) / \lambda
 
     from P = `initial_variance` I. It is the Kalman filter with r = 0, q = 1 and filterpy's fading memory
-    :math:`\alpha^2 = 1/\lambda`, whose P is this one before its division by lambda; it runs as that.
+    :math:`\alpha^2 = 1/\lambda`, and runs as that.
 
     Parameters
     ----------
