@@ -39,9 +39,11 @@ POWER_MEMORY_S = 0.5
 # favour; the tonal study shows what it changes.
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
+# The diagonal filter learns as slowly as NLMS does, and asks for less state noise.
+DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
-PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.25)).tolist())
-PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1)).tolist())
+PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer one follows around the best
+PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
 
@@ -77,7 +79,7 @@ class Algorithm:
         if not isinstance(best, tuple):
             return []
         ratio = self.second[1] / self.second[0]
-        near = [best[1] * ratio ** (k / 6) for k in range(-6, 7) if k]
+        near = [best[1] * ratio ** (k / 6) for k in range(-5, 6) if k]
         return [(one, two) for one in (best[0] / 2, best[0], 2 * best[0]) for two in near]
 
 
@@ -165,6 +167,7 @@ _RANDOM_WALK: dict[str, Any] = {
     "first": STATE_NOISE_GRID,
     "knows_amplifier": True,
 }
+_DIAGONAL = _RANDOM_WALK | {"first": DIAGONAL_GRID}
 _STEP: dict[str, Any] = {"symbol": "mu", "kind": "mu L E[x'^2]", "first": STEP_SIZE_GRID}
 _LEAST_FORGOTTEN: dict[str, Any] = {"symbol": "1 - lambda", "kind": "1 - lambda", "first": FORGETTING_GRID}
 _PEAK: dict[str, Any] = _STEP | {
@@ -179,8 +182,8 @@ REGISTRY: dict[str, Algorithm] = {
     "KF-OPC": Algorithm(_kalman(kf_opc, power_memory=POWER_MEMORY_S), **_RANDOM_WALK),
     "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired, power_memory=POWER_MEMORY_S), **_RANDOM_WALK),
     "KF-PB": Algorithm(_kalman(kf_pb), **_RANDOM_WALK),
-    "diagonal KF": Algorithm(_kalman(DiagonalKalman, False), **_RANDOM_WALK, **_FREE),
-    "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman, power_memory=POWER_MEMORY_S), **_RANDOM_WALK),
+    "diagonal KF": Algorithm(_kalman(DiagonalKalman, False), **_DIAGONAL, **_FREE),
+    "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman, power_memory=POWER_MEMORY_S), **_DIAGONAL),
     "FxRLS": Algorithm(_rls, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
     "FxLMS": Algorithm(_plain(FxLMS), **_STEP, **_FREE),
     "FxNLMS": Algorithm(_normalised, **_STEP, **_FREE),

@@ -134,7 +134,7 @@ def _known(rows: Sequence[Row]) -> Verdict:
 def _clean(rows: Sequence[Row]) -> Verdict:
     free = {_place(row): row.harmonics_db for row in _of(rows, "KF-ANC", noise="tone") if row.overdrive_db > 0.0}
     below = {
-        (name, *_place(row)): free[_place(row)] - row.harmonics_db
+        (name, *_place(row)): _ahead(-row.harmonics_db, -free[_place(row)])
         for name in KEEPS_POWER
         for row in _of(rows, name, noise="tone")
         if row.overdrive_db > 0.0 and row.amplifier == "hard clip"
@@ -146,6 +146,13 @@ def _clean(rows: Sequence[Row]) -> Verdict:
         below[least] >= CLEANER_DB,
         f"by {below[least]:.1f} dB at least ({', '.join(map(str, least))} dB), by {max(below.values()):.1f} dB at most",
     )
+
+
+def _ahead(own: float, other: float) -> float:
+    """How far one figure is ahead of another; NaN, of a run that diverged, is behind all."""
+    if np.isnan(own):
+        return -np.inf
+    return np.inf if np.isnan(other) else own - other
 
 
 def _place(row: Row) -> tuple[str, str, float]:
@@ -165,7 +172,7 @@ def _power(rows: Sequence[Row]) -> Verdict:
 def _ordering(rows: Sequence[Row]) -> Verdict:
     free = {(_place(r), r.noise): r.noise_reduction_db for r in _of(rows, "KF-ANC")}
     leads = {
-        key: r.noise_reduction_db - free[key]
+        key: _ahead(r.noise_reduction_db, free[key])
         for r in _of(rows, "KF-OPC")
         if r.overdrive_db > 0.0
         for key in [(_place(r), r.noise)]

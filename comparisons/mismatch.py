@@ -211,8 +211,8 @@ def _notes(pairs: Pairs, rows: Sequence[Row], accuracy: Mapping[str, float]) -> 
         "is louder all the same. Other settings hardly help there: the best of FxLMS is its smallest step size, which "
         "grows too, only slowly.",
         *_tone_note(pairs),
-        "An output constraint works as a leak: per frequency the error is d / (1 + s s^*/lambda), which stays bounded "
-        "while the real part of s s^* is above -lambda, and below the noise somewhat past 90 degrees.",
+        "An output constraint works as a leak: per frequency the error is d / (1 + s conj(s^)/lambda), which stays bounded "
+        "while the real part of s conj(s^) is above -lambda, and below the noise somewhat past 90 degrees.",
         "Constant phase errors are fitted by causal filters: off by at most "
         + ", ".join(f"{value:.1f} degrees ({name})" for name, value in accuracy.items())
         + f" over the band. A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, "

@@ -99,8 +99,9 @@ def run_case(
 ) -> tuple[list[Row], dict[tuple[str, float], dict[str, Tuned | None]]]:
     """Every algorithm at every mismatch: at the setting that is best with the exact path, and at its best with the wrong one.
 
-    Settings are relative to the power of the reference filtered by what the controller knows of the path. To a
-    controller an estimate with another gain is then the same as a true path that has drifted by the inverse.
+    Settings are relative to the power of the reference filtered by what the controller knows of the path. To FxLMS and
+    KF-ANC an estimate with another gain is then the same as a true path that has drifted by the inverse; to one with a rated
+    power it is not, since a true path of less gain asks for more power.
     """
     outcomes = {
         point: measure_settings(runs, replace(scene, secondary_estimate=taps), grids(ALGORITHMS))

@@ -219,9 +219,7 @@ def _sizing_table(rows: Sequence[Row]) -> Table:
     for (case, name), own in mean_rows(rows).items():
         if name in REGISTRY and not REGISTRY[name].keeps_budget:
             continue
-        needed = [_needed(own, target) for target in TARGETS_DB]
-        if not np.all(np.isnan(needed)):
-            lines.append([case.path, case.noise, name, *needed])
+        lines.append([case.path, case.noise, name, *(_needed(own, target) for target in TARGETS_DB)])
     return Table(
         "sizing",
         "Rated power, in dB over the unconstrained one, at which each reaches a noise reduction, between the rated powers "
@@ -231,14 +229,16 @@ def _sizing_table(rows: Sequence[Row]) -> Table:
     )
 
 
-def _needed(rows: Sequence[Row], target_db: float) -> float:
-    """Least rated power for a noise reduction; NaN where it is not reached or lies below the study's least."""
-    kept = [row for row in rows if row.power <= BUDGET and np.isfinite(row.noise_reduction_db)]
-    for lower, upper in pairwise(kept):
-        if lower.noise_reduction_db < target_db <= upper.noise_reduction_db:
+def _needed(rows: Sequence[Row], target_db: float) -> float | str:
+    """Least rated power for a noise reduction, of which there may be less than the study's least, or none."""
+    kept = [row.power <= BUDGET and np.isfinite(row.noise_reduction_db) for row in rows]
+    if kept[0] and rows[0].noise_reduction_db >= target_db:
+        return f"below {rows[0].share_db:g}"
+    for (lower, upper), both in zip(pairwise(rows), pairwise(kept), strict=True):
+        if all(both) and lower.noise_reduction_db < target_db <= upper.noise_reduction_db:
             part = (target_db - lower.noise_reduction_db) / (upper.noise_reduction_db - lower.noise_reduction_db)
             return lower.share_db + part * (upper.share_db - lower.share_db)
-    return np.nan
+    return "not reached"
 
 
 def _tuning_table(tuned: Mapping[Setting, Mapping[float, Mapping[str, Tuned]]]) -> Table:
@@ -250,11 +250,25 @@ def _tuning_table(tuned: Mapping[Setting, Mapping[float, Mapping[str, Tuned]]]) 
                 first, second = best.setting if isinstance(best.setting, tuple) else (best.setting, np.nan)
                 diverged = sum(trial.diverged for trial in best.trials)
                 kept = "yes" if best.within_budget else "no"
-                lines.append([case.path, case.noise, share_db, name, first, second, kept, len(best.trials), diverged])
+                edge = "yes" if best.at_edge else "no"
+                lines.append(
+                    [case.path, case.noise, share_db, name, first, second, kept, edge, len(best.trials), diverged]
+                )
     return Table(
         "tuning",
         "The setting of each algorithm at each rated power, tuned on all seeds",
-        ["paths", "noise", "rated dB", "algorithm", "setting", "second", "kept the budget", "tried", "diverged"],
+        [
+            "paths",
+            "noise",
+            "rated dB",
+            "algorithm",
+            "setting",
+            "second",
+            "kept the budget",
+            "at an edge",
+            "tried",
+            "diverged",
+        ],
         lines,
     )
 
@@ -328,11 +342,17 @@ def _parameters(tuned: Mapping[Setting, Mapping[float, Mapping[str, Tuned]]]) ->
                 for case, shares in tuned.items()
                 for share, own in shares.items()
                 for name, best in own.items()
-                if REGISTRY[name].sees_budget
+                if REGISTRY[name].sees_budget or share == SHARES_DB[0]  # the others' grids serve for all rated powers
             },
             f"setting, mean NSE in dB (none: diverged), output power; {RULE}",
         ),
     }
+
+
+def _slowest(name: str, best: Tuned) -> bool:
+    """Whether the least step size that was tried is the best."""
+    setting = best.setting[0] if isinstance(best.setting, tuple) else best.setting
+    return REGISTRY[name].symbol == "mu" and setting <= min(REGISTRY[name].first)
 
 
 def _notes(rows: Sequence[Row], tuned: Mapping[Setting, Any]) -> list[str]:
@@ -346,6 +366,14 @@ def _notes(rows: Sequence[Row], tuned: Mapping[Setting, Any]) -> list[str]:
         if algorithm.keeps_budget and over:
             notes.append(
                 f"{name} is above {BUDGET:g} of its rated power in {len(over)} of {len(own)} points, up to {max(over):.2f} of it."
+            )
+        unfinished = [
+            share for shares in tuned.values() for share, best in shares.items() if _slowest(name, best[name])
+        ]
+        if unfinished and algorithm.keeps_budget:
+            notes.append(
+                f"{name} has the least step size of its grid in {len(unfinished)} of {len(own)} points: there it keeps its budget "
+                "by not having converged, no step size at which it has keeps it."
             )
         diverged = sum(np.isnan(row.power) for row in own)
         if diverged:

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kfopc_filterpy._figures import MARK, line_style
+from kfopc_filterpy._figures import MARK
 
 from .algorithms import REGISTRY
 from .report import FigureItem
+from .styles import style as style_of
+from .tuning import BUDGET
 
 if TYPE_CHECKING:
     from .power_budget import Row
@@ -20,8 +22,6 @@ PANELS = {
     "FxLMS with a price": ("leaky FxLMS", "optimal leaky FxLMS", "MOV-FxLMS fixed", "MOV-FxLMS", "MOV-MFxLMS"),
     "FxLMS with an amplitude limit": ("two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"),
 }
-MARKERS = "oDs^vP"
-OVER = 1.05  # output power over the rated one from which a mark is hollow
 
 
 def budget_figures(rows: Sequence[Row]) -> list[FigureItem]:
@@ -41,9 +41,9 @@ def _case(rows: Sequence[Row], case: Any) -> FigureItem:
         above, below = axes[:, column]
         for label, dashes in ((BOUND, "-"), (SCALED, ":")):
             above.plot(*_line(means[label], "noise_reduction_db"), color="black", linestyle=dashes, label=label)
-        for k, name in enumerate(names):
-            style = line_style(k) | {"marker": MARKERS[k], "markersize": 4}
-            over = [row.share_db for row in means[name] if row.power > OVER]
+        for name in names:
+            style = style_of(name) | {"markersize": 4}
+            over = [row.share_db for row in means[name] if row.power > BUDGET]
             for ax, value in ((above, "noise_reduction_db"), (below, "power")):
                 shares, values = _line(means[name], value)
                 ax.plot(shares, values, label=name, **style)
@@ -68,7 +68,7 @@ def _case(rows: Sequence[Row], case: Any) -> FigureItem:
     )
     caption = (
         f"{case.noise.capitalize()}, {case.path}: noise reduction (above) and output power (below) against the rated power, "
-        f"means over seeds; hollow where the power is above {OVER:g} of the rated one. Black: the power-constrained Wiener solution and the scaled one. Without a constraint: {free}."
+        f"means over seeds; hollow where the power is above {BUDGET:g} of the rated one. Black: the power-constrained Wiener solution and the scaled one. Without a constraint: {free}."
     )
     return FigureItem(f"{case.path} {case.noise}".replace(" ", "-"), caption, figure)
 

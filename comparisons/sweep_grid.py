@@ -94,6 +94,11 @@ def built_in_grid(axes: Mapping[str, Any], seeds: Any) -> Grid:
     for name, axis in AXES.items():
         given = _listed(axes.get(name, axis.default), name)
         checked[name] = _different(tuple(axis.check(value, name) for value in given), name)
+    two = [name for name in checked["algorithm"] if REGISTRY[name].second]
+    if two and checked["setting"] != (TUNED_SETTING,):
+        raise ValueError(
+            f'{", ".join(two)} has two settings, of which the second decides the output power: give setting "{TUNED_SETTING}"'
+        )
     return Grid(checked, as_seeds(seeds))
 
 
@@ -222,8 +227,8 @@ AXES: dict[str, Axis] = {
             DEFAULT_SETTING,
             _setting,
             "r E[x'^2]/q of a Kalman filter, mu L E[x'^2] of the LMS family, 1 - lambda of FxRLS; default: the middle of "
-            "the grid that the studies tune on; tuned: the best of that grid by the studies' rule, on the first seed. An "
-            "algorithm's second setting is tuned with the first, else the middle of its grid",
+            "the grid that the studies tune on; tuned: the best of that grid by the studies' rule, on the first seed, "
+            "and needed for algorithms of two settings",
         ),
         Axis(
             "rated_power_db",

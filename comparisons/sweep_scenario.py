@@ -35,7 +35,7 @@ from .algorithms import KALMAN, REGISTRY, Setting, make_controller
 from .constraint_cases import FS, SWITCH_ON_S, made_noises, make_case, modelled_paths, noises, paths
 from .scene import Scene
 from .sweep_grid import AMPLIFIERS, DEFAULT_SETTING, TUNED_SETTING, Values
-from .tuning import tune, unless_refused
+from .tuning import AllDivergedError, tune, unless_refused
 
 # Axes that runs of one scene agree in, and those that a gain sequence depends on besides.
 OF_SCENE = ("path", "noise", "duration_s", "n_taps", "sensor_noise_db", "seed")
@@ -111,13 +111,13 @@ class _Prepared:
         errors = (self.scenario[axis] for axis in ("path_gain_db", "path_delay", "path_phase_deg"))
         estimate = estimated_path(self.scenario["path"], *errors)
         known = replace(self.scene, secondary_estimate=estimate, rated_power=self.rated_power)
+        assert self.setting is not None
         return make_controller(known, self.scenario["algorithm"], self.setting)
 
-    def _setting(self, tuning_seed: int) -> Setting:
+    def _setting(self, tuning_seed: int) -> Setting | None:
         setting, algorithm = self.scenario["setting"], REGISTRY[self.scenario["algorithm"]]
         if setting != TUNED_SETTING:
-            first = middle(algorithm.first) if setting == DEFAULT_SETTING else setting
-            return (first, middle(algorithm.second)) if algorithm.second else first
+            return middle(algorithm.first) if setting == DEFAULT_SETTING else setting
         scene = [self.scenario[name] for name in OF_SCENE[:-1]]
         return _tuned(*scene, tuning_seed, self.scenario["algorithm"], self.rated_power, self.amplifier)
 
@@ -182,11 +182,14 @@ def _tuned(
     algorithm: str,
     rated_power: float,
     amplifier: Amplifier | None,
-) -> Setting:
-    """Best setting by the studies' rule on the noise of one seed, with the path known exactly."""
+) -> Setting | None:
+    """Best setting by the studies' rule on the noise of one seed, the path known exactly; None where all diverge."""
     scene = scene_of(path, noise, duration_s, n_taps, sensor_noise_db, seed)
     scene = replace(scene, rated_power=rated_power, amplifier=amplifier)
-    return tune(_OneByOne(), scene, (algorithm,))[algorithm].setting  # type: ignore[arg-type]
+    try:
+        return tune(_OneByOne(), scene, (algorithm,))[algorithm].setting  # type: ignore[arg-type]
+    except AllDivergedError:
+        return None
 
 
 def _amplifier(name: str, limit: float) -> Amplifier | None:
@@ -195,12 +198,15 @@ def _amplifier(name: str, limit: float) -> Amplifier | None:
 
 
 def _run(members: list[_Prepared]) -> list[Figures]:
-    """Runs that share a gain sequence, or a single run."""
+    """Runs that share a gain sequence, or a single run; without a stable setting there is none."""
+    if members[0].setting is None:
+        return [_figures(one, None) for one in members]
     if not members[0].shares:
         (alone,) = members
         with naming(alone.scenario):
             scene = replace(alone.scene, amplifier=alone.amplifier)
-            result = unless_refused(alone.scenario["algorithm"], lambda: scene.run(alone.controller()))
+            controller = alone.controller()
+            result = unless_refused(alone.scenario["algorithm"], lambda: scene.run(controller))
             return [_figures(alone, result)]
     try:
         results = members[0].scene.run_together(
@@ -219,6 +225,7 @@ def _figures(one: _Prepared, result: SimulationResult | None) -> Figures:
     diverged = result is None or result.diverged_at_s is not None
     values = [np.nan] * len(MEASURED) if result is None or diverged else _measured(one, result)
     first, second = one.setting if isinstance(one.setting, tuple) else (one.setting, np.nan)
+    first = np.nan if first is None else first
     return dict(zip(MEASURED, values, strict=True)) | {
         "setting_used": first,
         "second_setting_used": second,

@@ -25,7 +25,7 @@ from .sweep_grid import Grid
 
 FORMAT = 1
 DESCRIPTION, RUNS = "sweep.json", "runs.jsonl"
-PART_OF_SWEEP = ("scene.py", "constraint_cases.py", "sweep_grid.py", "sweep_scenario.py")
+PART_OF_SWEEP = ("algorithms.py", "constraint_cases.py", "scene.py", "sweep_grid.py", "sweep_scenario.py", "tuning.py")
 
 Outcome = tuple[int, dict[str, Any]]  # number of a run, and its figures
 

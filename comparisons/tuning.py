@@ -22,18 +22,20 @@ Job = tuple[str, Setting, int]
 
 
 def unless_refused(algorithm: str, run: Callable[[], SimulationResult]) -> SimulationResult | None:
-    """Result of a run; None where the filter finds that it cannot go on, for the algorithms that may."""
+    """Result of a run; None where the filter finds in its midst that it cannot go on, for the algorithms that may."""
     try:
         return run()
-    except ValueError:
-        if not REGISTRY[algorithm].may_refuse:
+    except ValueError as error:
+        in_its_midst = any(note.startswith("in sample") for note in getattr(error, "__notes__", ()))
+        if not (REGISTRY[algorithm].may_refuse and in_its_midst):
             raise
         return None
 
 
 def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0) -> SimulationResult | None:
     """Run of an algorithm in a scene, see `unless_refused`."""
-    return unless_refused(algorithm, lambda: scene.run(make_controller(scene, algorithm, setting), seed_index))
+    controller = make_controller(scene, algorithm, setting)
+    return unless_refused(algorithm, lambda: scene.run(controller, seed_index))
 
 
 def went_through(result: SimulationResult | None) -> SimulationResult:
@@ -143,10 +145,14 @@ def refine(runs: Runs, scene: Scene, algorithm: str, trials: list[Trial], seeds:
     return _best([*trials, *own], rated_power, algorithm)
 
 
+class AllDivergedError(RuntimeError):
+    """No setting that was tried is stable."""
+
+
 def _best(trials: list[Trial], rated_power: float, name: str) -> Tuned:
     stable = [t for t in trials if not t.diverged]
     if not stable:
-        raise RuntimeError(f"{name} diverged at every setting tried: {[t.setting for t in trials]}")
+        raise AllDivergedError(f"{name} diverged at every setting tried: {[t.setting for t in trials]}")
     kept = [t for t in stable if t.output_power <= BUDGET * rated_power]
     best = min(kept or stable, key=lambda t: (round(t.mean_nse_db, 2), t.setting))  # a tie: the smaller setting
     return Tuned(best.setting, bool(kept), _at_edge(best.setting, trials), trials)

@@ -47,7 +47,12 @@ def test_names_may_have_hyphens_for_spaces():
 
 @pytest.mark.parametrize("name", REGISTRY)
 def test_every_listed_algorithm_is_known(name):
-    assert built_in_grid({"algorithm": name}, 1).axes["algorithm"] == (name,)
+    assert built_in_grid({"algorithm": name, "setting": "tuned"}, 1).axes["algorithm"] == (name,)
+
+
+def test_an_algorithm_of_two_settings_has_to_be_tuned():
+    with pytest.raises(ValueError, match=r'leaky FxLMS has two settings.*give setting "tuned"'):
+        built_in_grid({"algorithm": ["KF-OPC", "leaky FxLMS"]}, 1)
 
 
 @pytest.mark.parametrize(

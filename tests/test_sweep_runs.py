@@ -18,7 +18,7 @@ from comparisons.scene import SENSOR_NOISE_SEED, Runs, Scene
 from comparisons.sweep import ScenarioError, run_sweep
 from comparisons.sweep_grid import built_in_grid
 from comparisons.sweep_scenario import middle, run_group, scene_of
-from comparisons.tuning import tune
+from comparisons.tuning import AllDivergedError, tune
 from kfopc_filterpy import (
     HardClipAmplifier,
     SoftSaturationAmplifier,
@@ -97,22 +97,36 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
         assert run["power_over_rated"] == pytest.approx(power / 10 ** (run["rated_power_db"] / 10), rel=1e-6)
 
 
-@pytest.mark.parametrize("setting", [0.01, "default", "tuned"])
-def test_an_algorithm_of_two_settings_has_its_second(tmp_path, setting):
-    grid = {"algorithm": "leaky FxLMS", "setting": setting}
-    (run,) = swept(tmp_path, grid, seeds=1).runs
-    own = REGISTRY["leaky FxLMS"]
-    if setting == "tuned":
-        scene = replace(scene_of("duct", "band noise", 0.5, 24, -40.0, 1), rated_power=0.1)
-        first, second = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
-    else:
-        first, second = (middle(own.first) if setting == "default" else setting), middle(own.second)
-    assert (run["setting_used"], run["second_setting_used"]) == (first, second)
+def test_an_algorithm_of_two_settings_is_tuned_in_both(tmp_path):
+    (run,) = swept(tmp_path, {"algorithm": "leaky FxLMS", "setting": "tuned"}, seeds=1).runs
+    scene = replace(scene_of("duct", "band noise", 0.5, 24, -40.0, 1), rated_power=0.1)
+    best = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
+    assert (run["setting_used"], run["second_setting_used"]) == best
+
+
+def test_where_every_setting_diverges_the_run_counts_as_diverged(monkeypatch):
+    def diverged(*arguments, **options):
+        raise AllDivergedError("at every setting")
+
+    monkeypatch.setattr(sweep_scenario, "tune", diverged)
+    sweep_scenario._tuned.cache_clear()
+    scenario = built_in_grid(SMALL | {"algorithm": "FxLMS", "setting": "tuned"}, 1).cells()[0] | {"seed": 1}
+    (figures,) = run_group([scenario], 1)
+    sweep_scenario._tuned.cache_clear()
+    assert figures["diverged"]
+    assert math.isnan(figures["setting_used"])
+
+
+def test_a_bad_setting_is_an_error_and_no_divergence(tmp_path):
+    with pytest.raises(ScenarioError, match="forgetting must be"):
+        swept(tmp_path, {"algorithm": "FxRLS", "setting": 1.5}, seeds=1)
 
 
 def test_a_filter_that_refuses_to_go_on_counts_as_diverged(tmp_path, monkeypatch):
     def refuse(*arguments, **options):
-        raise ValueError("P is not positive definite")
+        error = ValueError("P is not positive definite")
+        error.add_note("in sample 3 of the run")
+        raise error
 
     monkeypatch.setattr(Scene, "run", refuse)
     scenario = built_in_grid(SMALL | {"algorithm": "FxRLS"}, 1).cells()[0] | {"seed": 1}
