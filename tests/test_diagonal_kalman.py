@@ -127,3 +127,5 @@ def test_bad_variances_are_refused(name: str, value: float) -> None:
 def test_a_bad_rated_power_is_refused() -> None:
     with pytest.raises(ValueError, match="rated_power"):
         DiagonalKalman(L, PATH, rated_power=0.0, **NOISES)
+    with pytest.raises(ValueError, match="memory"):  # without a rated power too
+        DiagonalKalman(L, PATH, power_memory=0.0, **NOISES)

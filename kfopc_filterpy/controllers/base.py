@@ -61,10 +61,11 @@ class Controller(Protocol):
         ...
 
 
-def unconstrained() -> OutputPowerConstraint:
-    """Constraint of a controller that has none: the factor is held at 1; the powers are still followed."""
-    constraint = OutputPowerConstraint(1.0)
-    constraint.factor = 1.0
+def constraint_or_none(rated_power: float | None = None, **settings: Any) -> OutputPowerConstraint:
+    """Constraint of a rated power; without one the factor is held at 1, and the powers are still followed."""
+    constraint = OutputPowerConstraint(1.0 if rated_power is None else rated_power, **settings)
+    if rated_power is None:
+        constraint.factor = 1.0
     return constraint
 
 
@@ -115,7 +116,7 @@ class FilteredReferenceController:
         if parameters is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
         self._path_fs = sampling_rate(secondary_path, name="secondary_path") if is_system(secondary_path) else None
-        self._own_constraint = constraint or unconstrained()
+        self._own_constraint = constraint or constraint_or_none()
         weights = np.zeros(n_taps)
         self._state = ControllerState(
             kind=kind,

@@ -8,11 +8,11 @@ import numpy as np
 
 from .._validate import as_nonnegative
 from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S
 from ..limiter import OutputLimiter
 from ..lms_rules import MEASUREMENT_NOISE, PLAIN, STATE_NOISE, lms_settings
 from ..loop import LMS
-from .base import FilteredReferenceController
+from .base import FilteredReferenceController, constraint_or_none
 
 
 class DiagonalKalman(FilteredReferenceController):
@@ -91,16 +91,15 @@ class DiagonalKalman(FilteredReferenceController):
     ) -> None:
         r, q = as_nonnegative(state_noise, "state_noise"), as_nonnegative(measurement_noise, "measurement_noise")
         variance = as_nonnegative(initial_variance, "initial_variance")
-        constraint = None
-        if rated_power is not None:
-            constraint = OutputPowerConstraint(
-                rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
-            )
+        constraint = constraint_or_none(
+            rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
+        )
+        self._constrained = rated_power is not None
+        if self._constrained:
             self.name = "diagonal KF-OPC"
         settings = lms_settings(PLAIN, 0.0)
         settings[STATE_NOISE], settings[MEASUREMENT_NOISE] = r, q
         super().__init__(LMS, n_taps, secondary_path, settings, amplifier, constraint, limiter)
-        self._constrained = constraint is not None
         self._state = self._state._replace(variances=np.full(self._state.weights.size, variance))
 
     @property

@@ -8,13 +8,13 @@ import numpy as np
 
 from .._validate import as_positive
 from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S
 from ..delay_lines import delay_line
 from ..fast_array import FORGETTING, new_fast_array
 from ..limiter import OutputLimiter
 from ..lms_rules import PLAIN, lms_settings
 from ..loop import LMS, ControllerState
-from .base import FilteredReferenceController
+from .base import FilteredReferenceController, constraint_or_none
 
 
 class FastArrayKalman(FilteredReferenceController):
@@ -104,14 +104,13 @@ class FastArrayKalman(FilteredReferenceController):
         forgetting = as_positive(forgetting, "forgetting")
         if forgetting > 1.0:
             raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
-        constraint = None
-        if rated_power is not None:
-            constraint = OutputPowerConstraint(
-                rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
-            )
+        constraint = constraint_or_none(
+            rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
+        )
+        self._constrained = rated_power is not None
+        if self._constrained:
             self.name = "fast-array KF-OPC"
         super().__init__(LMS, n_taps, secondary_path, lms_settings(PLAIN, 0.0), amplifier, constraint, limiter)
-        self._constrained = constraint is not None
         taps = self._state.weights.size
         self._state = self._state._replace(
             filtered=delay_line(taps + 1), fast_array=new_fast_array(taps, variance / (q * forgetting), forgetting)
