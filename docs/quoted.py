@@ -299,7 +299,93 @@ def _worst_loss(results: Results, noise: str) -> float:
     return max(row["bound_db"] - row["noise_reduction_db"] for row in rows)
 
 
-QUOTES: tuple[Quote, ...] = (*_tonal(), *_broadband(), *_duct(), *_constraint())
+CASES = (("duct", "band noise"), ("duct", "compressor"), ("measured duct", "compressor"), ("measured duct", "motor"))
+TABLED = (
+    "bound",
+    "scaled Wiener",
+    "KF-PB",
+    "KF-OPC",
+    "KF-OPC repaired",
+    "diagonal KF-OPC",
+    "leaky FxLMS",
+    "optimal leaky FxLMS",
+    "MOV-FxLMS fixed",
+    "MOV-FxLMS",
+    "MOV-MFxLMS",
+    "two-gradient FxLMS",
+    "re-scaling FxLMS",
+    "clipping FxLMS",
+)
+TABLED_DB = -6.0
+
+
+def _algorithms() -> Iterator[Quote]:
+    def quote(words: str, numbers: Callable[[Results], Sequence[float]]) -> Quote:
+        return Quote("algorithms.md", words, ("power-budget",), numbers, "python -m comparisons power_budget")
+
+    line = "| {} |" + 4 * " {{:.1f}} dB, {{:.2f}} |"
+    for name in TABLED:
+        yield quote(line.format(name), lambda r, name=name: _budget_line(r, name))
+    yield quote(
+        "the diagonal alone reaches {:.1f}, {:.1f}, {:.1f} and {:.1f} dB without a constraint, the full filter {:.1f}, "
+        "{:.1f}, {:.1f} and {:.1f} dB",
+        lambda r: [_budget_line(r, name)[2 * k] for name in ("diagonal KF", "KF-ANC") for k in range(4)],
+    )
+
+
+def _budget_line(results: Results, algorithm: str) -> list[float]:
+    """Noise reduction and output power over the rated one in each case, means over seeds."""
+    rows = results.extra("power-budget", "rows")
+    numbers = []
+    for path, noise in CASES:
+        own = [
+            row
+            for row in rows
+            if (row["case"]["path"], row["case"]["noise"]) == (path, noise)
+            and (row["algorithm"], row["share_db"]) == (algorithm, TABLED_DB)
+        ]
+        numbers += [sum(row[figure] for row in own) / len(own) for figure in ("noise_reduction_db", "power")]
+    return numbers
+
+
+def _further() -> Iterator[Quote]:
+    """Figures of the studies of mismatch, tracking and amplifiers, out of their verdicts."""
+
+    def quote(study: str, words: str, claim: str, *which: int) -> Quote:
+        def numbers(results: Results) -> list[float]:
+            said = results.said(study, claim)
+            return [abs(said[k]) for k in which]
+
+        return Quote("studies.md", words, (study,), numbers, f"python -m comparisons {study}")
+
+    yield quote(
+        "mismatch",
+        "costs KF-ANC {:.1f} dB and KF-PB {:.1f} dB without tuning again; FxLMS diverges, MOV-FxLMS loses {:.1f} dB",
+        "A gain up to",
+        *(0, 1, 2),
+    )
+    yield quote("mismatch", "diverge in none of {:.0f} runs", "KF-OPC, KF-PB and MOV-FxLMS never", 1)
+    yield quote(
+        "mismatch",
+        "KF-PB spends {:.2f} to {:.2f} of its rated power, KF-OPC {:.2f} to {:.2f}",
+        "With a wrong gain KF-PB",
+        *(2, 3, 0, 1),
+    )
+    yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
+    yield quote("amplifier", "by {:.1f} dB at best", "KF-OPC reduces the noise more", 0)
+    yield quote("amplifier", "by {:.1f} dB less", "KF-OPC reduces the noise more", 1)
+    yield quote(
+        "amplifier",
+        "KF-OPC and KF-PB keep {:.2f} to {:.2f} and {:.2f} to {:.2f} of",
+        "KF-OPC and KF-PB keep",
+        0,
+        1,
+        2,
+        3,
+    )
+
+
+QUOTES: tuple[Quote, ...] = (*_tonal(), *_broadband(), *_duct(), *_constraint(), *_algorithms(), *_further())
 # Times of one machine, which stand in speed.md: not held against anything.
 TIMED = (
     "dgemm runs at 56 GFLOP/s",
