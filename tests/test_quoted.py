@@ -35,9 +35,7 @@ def test_the_times_stand_in_the_page_on_speed(words):
 def test_no_page_waits_for_its_figures():
     for path in sorted(DOCS.rglob("*.md")):
         if "_build" not in path.parts:
-            assert not re.search(r"\b(RESULTS|TODO|TBD)\b", path.read_text(encoding="utf-8"), flags=re.M), (
-                path
-            )
+            assert not re.search(r"\b(RESULTS|TODO|TBD)\b", path.read_text(encoding="utf-8"), flags=re.M), path
 
 
 @pytest.mark.parametrize("page", ["constraint.md", "limits.md", "theory.md", "symbols.md"])
