@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -21,9 +21,19 @@ from .amplifier_runs import (
     run_case,
     runs_of_a_case,
 )
-from .cases import FS, paths, shared_parameters, tuned_in_words, without_measured
+from .cases import (
+    FS,
+    ceilings_note,
+    make_case,
+    noise_of,
+    paths,
+    shared_parameters,
+    tuned_in_words,
+    with_overdrive,
+    without_measured,
+)
 from .report import Parameter, StudyReport, Table, Verdict
-from .scene import Runs
+from .scene import Runs, Scene
 
 KEEPS_POWER = ("KF-OPC", "KF-PB")
 CLEANER_DB = 40.0  # as in the tonal study
@@ -68,7 +78,7 @@ def main(runs: Runs) -> StudyReport:
         extra={"rows": [asdict(row) for row in rows]},
         verdicts=verdicts(rows),
         figures=amplifier_figures(rows),
-        notes=_notes(pairs, rows),
+        notes=[*_notes(pairs, rows), ceilings_note(_scenes(pairs))],
         tables=[
             _table(rows, "reduction", "noise_reduction_db", "Noise reduction over the steady half in dB (! overruns)"),
             _table(
@@ -83,6 +93,15 @@ def main(runs: Runs) -> StudyReport:
         ],
         claims="Findings",
     )
+
+
+def _scenes(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, Scene]:
+    """Every noise at every overdrive."""
+    made: dict[str, Scene] = {}
+    for path, noise in dict.fromkeys((case.path, case.noise) for case in cases(list(pairs))):
+        scene = make_case(pairs[path], noise_of(noise, DURATION_S), 0.0)
+        made |= {f"{path}, {noise}, {level:g} dB": with_overdrive(scene, level) for level in OVERDRIVES_DB}
+    return made
 
 
 def verdicts(rows: Sequence[Row]) -> list[Verdict]:

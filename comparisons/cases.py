@@ -48,6 +48,20 @@ def with_overdrive(scene: Scene, overdrive_db: float) -> Scene:
     return replace(scene, rated_power=scene.unconstrained_power / 10 ** (overdrive_db / 10))
 
 
+def ceilings_note(scenes: Mapping[str, Scene]) -> str:
+    """The ceiling of every constrained algorithm in each scene, as a sentence."""
+    reached = [f"{name}: {_ceiling_db(scene):.1f} dB" for name, scene in scenes.items()]
+    return (
+        "The ceiling within the rated power, of one fixed filter for the whole run, over the steady half, with a linear "
+        f"amplifier and no sensor noise (power-constrained Wiener solution): {'; '.join(reached)}."
+    )
+
+
+def _ceiling_db(scene: Scene) -> float:
+    bound = constraint_cases.bound_of(scene)
+    return bound.noise_reduction_over(0.5 * bound.whole.end_s)["whole"]
+
+
 @dataclass(frozen=True)
 class Measured:
     """What is kept of a run: its trial, and over the steady half noise reduction in dB and power over the rated one."""

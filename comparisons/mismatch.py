@@ -9,7 +9,17 @@ import numpy as np
 
 from kfopc_filterpy import group_delay
 
-from .cases import BAND_HZ, FS, TONE_HZ, grids, paths, shared_parameters, tuned_in_words, without_measured
+from .cases import (
+    BAND_HZ,
+    FS,
+    TONE_HZ,
+    ceilings_note,
+    grids,
+    paths,
+    shared_parameters,
+    tuned_in_words,
+    without_measured,
+)
 from .mismatch_figures import mismatch_figures
 from .mismatch_runs import (
     ALGORITHMS,
@@ -45,9 +55,10 @@ def main(runs: Runs) -> StudyReport:
     """Run the study on all paths at hand."""
     pairs = paths()
     known = {name: estimates(secondary) for name, (_, secondary) in pairs.items()}
-    rows, tuned = [], {}
+    rows, tuned, scenes = [], {}, {}
     for case in cases(list(pairs)):
-        own, best = run_case(runs, case, case_scene(case, pairs[case.path]), known[case.path])
+        scene = scenes[f"{case.path}, {case.noise}"] = case_scene(case, pairs[case.path])
+        own, best = run_case(runs, case, scene, known[case.path])
         rows += own
         tuned[f"{case.path}, {case.noise}"] = {
             f"{kind} {amount:g}": tuned_in_words(t) for (kind, amount), t in best.items()
@@ -78,7 +89,7 @@ def main(runs: Runs) -> StudyReport:
         extra={"rows": [asdict(row) for row in rows]},
         verdicts=verdicts(rows),
         figures=mismatch_figures(rows),
-        notes=_notes(pairs, rows, accuracy),
+        notes=[*_notes(pairs, rows, accuracy), ceilings_note(scenes)],
         tables=[
             _table(
                 "exact",

@@ -12,7 +12,7 @@ from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.power_budget import DEFAULT_CORRELATION_MEMORY_S
 
 from .algorithms import POWER_MEMORY_S
-from .cases import FS, grids, paths, shared_parameters, tuned_in_words, without_measured
+from .cases import FS, ceilings_note, grids, paths, shared_parameters, tuned_in_words, without_measured
 from .report import Parameter, Sound, StudyReport, Table, Verdict
 from .scene import Runs, Scene
 from .tracking_figures import tracking_figures
@@ -60,9 +60,10 @@ def main(runs: Runs) -> StudyReport:
     pairs = paths()
     rows: list[Row] = []
     courses: dict[tuple[str, str], dict[str, Course]] = {}
-    tuned, sounds, starts = {}, [], {}
+    tuned, sounds, starts, first = {}, [], {}, {}
     for event, path in jobs(pairs):
         scenes = scenes_of(event, pairs[path])
+        first[f"{event.name}, {path}"] = scenes[0]
         best = tune_event(runs, scenes)
         outcomes = _run_all(runs, event, path, scenes, best)
         rows += [row for row, _, _ in outcomes]
@@ -103,7 +104,7 @@ def main(runs: Runs) -> StudyReport:
         verdicts=verdicts(rows),
         figures=tracking_figures(courses, {event.name: event.shown_window_s for event in events()}),
         sounds=sounds,
-        notes=[*_notes(pairs, rows), *_sweep_notes(rows, starts)],
+        notes=[*_notes(pairs, rows), *_sweep_notes(rows, starts), ceilings_note(first)],
         tables=[*event_tables(rows), _settling_table(rows)],
         claims="Findings",
     )

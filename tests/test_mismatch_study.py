@@ -64,6 +64,7 @@ def test_the_report_is_complete(small: Any) -> None:
         "power-duct-tone",
     ]
     assert report.notes[0] == "The measured duct was not at hand (KFOPC_DATA): it is left out."
+    assert report.notes[-1].startswith("The ceiling within the rated power")
     rows = report.extra["rows"]
     keys = [
         (row["path"], row["noise"], row["kind"], row["amount"], row["algorithm"], row["tuned_with"]) for row in rows
