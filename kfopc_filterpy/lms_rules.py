@@ -26,6 +26,12 @@ MEASUREMENT_NOISE, STATE_NOISE = (
 )  # of the diagonal Kalman filter, which is LMS with a step for each tap
 
 
+def further_rules(settings: np.ndarray) -> np.ndarray | None:
+    """The settings as `lms_change` takes them: None where FxLMS's and MOV-FxLMS's own step is all there is to do."""
+    plain = settings[RULE] in (PLAIN, RATED_PENALTY) and not settings[MODIFIED]
+    return None if plain else settings
+
+
 def lms_settings(
     rule: int, step_size: float, *, factor: float = 0.0, limit: float = np.inf, modified: bool = False
 ) -> list[float]:
@@ -48,11 +54,23 @@ def penalty_of_budget(constraint, factor):
 
 
 @part(forceinline=True)
-def lms_change(controller, disturbance, error, y, factor):
-    """k, c and p of this sample; `factor` is the constraint factor, `y` the control signal that was emitted."""
-    settings, w = controller.settings, controller.weights
-    mu, rule, second = settings[STEP_SIZE], settings[RULE], settings[FACTOR]
-    if settings[MODIFIED] != 0.0:
+def lms_change(rules, controller, disturbance, error, y, factor):
+    """k, c and p of this sample; `factor` is the constraint factor, `y` the control signal that was emitted.
+
+    `rules` are the settings of an algorithm beyond FxLMS and MOV-FxLMS, None for those two: they are what most runs need,
+    and the rest is another type to the compiler, made when it is first used. (FxLMS is MOV-FxLMS with a factor of 1.)
+    """
+    if rules is None:
+        mu = controller.settings[STEP_SIZE]
+        return 1.0, mu * error, mu * penalty_of_budget(controller.constraint, factor) * y
+    return further_change(rules, controller, disturbance, error, y, factor)
+
+
+@part(forceinline=True)
+def further_change(rules, controller, disturbance, error, y, factor):
+    """`lms_change` of the other algorithms."""
+    mu, rule, second, w = rules[STEP_SIZE], rules[RULE], rules[FACTOR], controller.weights
+    if rules[MODIFIED] != 0.0:
         error = disturbance - dot(w, newest(controller.filtered, w.size))
     if rule == NORMALISED:
         xf = newest(controller.filtered, w.size)
@@ -66,7 +84,7 @@ def lms_change(controller, disturbance, error, y, factor):
         return 1.0, mu * error, mu * second * y
     if rule == RATED_PENALTY:
         return 1.0, mu * error, mu * penalty_of_budget(controller.constraint, factor) * y
-    if rule == TWO_GRADIENT and abs(y) > settings[LIMIT]:
+    if rule == TWO_GRADIENT and abs(y) > rules[LIMIT]:
         return 1.0, 0.0, second * y
     return 1.0, mu * error, 0.0
 
@@ -100,12 +118,14 @@ def correct_diagonal(variances, w, xf, d, settings):
 
 
 @part(forceinline=True)
-def hold_amplitude(settings, w, y):
+def hold_amplitude(rules, w, y):
     """y held to its limit, by the rules that hold it; re-scaling takes the weights along."""
-    if settings[RULE] < RESCALING or not settings[LIMIT] < abs(y) < np.inf:  # Inf and NaN: the loop sees a divergence
+    if rules is None:
         return y
-    if settings[RULE] == RESCALING:
-        ratio = settings[LIMIT] / abs(y)
+    if rules[RULE] < RESCALING or not rules[LIMIT] < abs(y) < np.inf:  # Inf and NaN: the loop sees a divergence
+        return y
+    if rules[RULE] == RESCALING:
+        ratio = rules[LIMIT] / abs(y)
         for i in range(w.size):
             w[i] *= ratio
-    return settings[LIMIT] if y > 0.0 else -settings[LIMIT]
+    return rules[LIMIT] if y > 0.0 else -rules[LIMIT]

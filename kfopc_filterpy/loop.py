@@ -68,6 +68,7 @@ class ControllerState(NamedTuple):
     budget: BudgetState | None = None  # of a power-budgeted filter
     repair: RepairState | None = None  # of KF-OPC with its gain repaired
     limiter: LimiterState | None = None
+    rules: np.ndarray | None = None  # the settings again, of LMS algorithms beyond FxLMS and MOV-FxLMS
     variances: np.ndarray | None = None  # (L,) of the weights, of a diagonal Kalman filter
     fast_array: FastArrayState | None = None
 
@@ -86,8 +87,7 @@ def control_signal(controller, x):
     take_reference(controller, x)
     w = controller.control_filter
     y = output_gain(controller.repair) * dot(w, newest(controller.reference, w.size))
-    if controller.kind == LMS:
-        y = hold_amplitude(controller.settings, w, y)
+    y = hold_amplitude(controller.rules, w, y)
     y = limited(controller.limiter, y)
     model = controller.amplifier
     push(controller.output, amplify(model[0], model[1], model[2], y))
@@ -200,7 +200,7 @@ def adapt_lms(controller, error, y):
         return True
     if correct_fast_array(controller.fast_array, w, newest(controller.filtered, w.size + 1), factor * d):
         return True
-    keep, correction, penalty = lms_change(controller, d, error, y, factor)
+    keep, correction, penalty = lms_change(controller.rules, controller, d, error, y, factor)
     change_weights(w, x, xf, keep, correction, penalty)
     return True
 

@@ -8,7 +8,7 @@ from .._validate import as_positive
 from ..amplifiers import Amplifier
 from ..constraint import OutputPowerConstraint
 from ..limiter import OutputLimiter
-from ..lms_rules import FACTOR, LIMIT, NORMALISED, PLAIN, STEP_SIZE, lms_settings
+from ..lms_rules import FACTOR, LIMIT, NORMALISED, PLAIN, STEP_SIZE, further_rules, lms_settings
 from ..loop import LMS
 from .base import FilteredReferenceController
 
@@ -26,6 +26,7 @@ class LMSController(FilteredReferenceController):
         limiter: OutputLimiter | None = None,
     ) -> None:
         super().__init__(LMS, n_taps, secondary_path, settings, amplifier, constraint, limiter)
+        self._state = self._state._replace(rules=further_rules(self._state.settings))
 
     @property
     def step_size(self) -> float:
