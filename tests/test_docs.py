@@ -142,9 +142,8 @@ def methods(kind: type) -> list[tuple[str, Any]]:
 
 def full_text(kind: type, name: str, depth: int = 2) -> str:
     """Docstrings of a method along its bases, filterpy's included, and of the methods that they refer to."""
-    text = "\n".join(
-        vars(base)[name].__doc__ or "" for base in kind.__mro__ if getattr(vars(base).get(name), "__doc__", None)
-    )
+    own = [vars(base)[name] for base in kind.__mro__ if name in vars(base)]
+    text = "\n".join(getattr(method, "__doc__", None) or "" for method in own)
     if depth:
         for other in set(re.findall(r"`(?:\w+\.)?(\w+)`", text)) - {name}:
             text += full_text(kind, other, depth - 1)
