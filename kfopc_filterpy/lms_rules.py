@@ -32,15 +32,13 @@ def further_rules(settings: np.ndarray) -> np.ndarray | None:
     return None if plain else settings
 
 
-def lms_settings(
-    rule: int, step_size: float, *, factor: float = 0.0, limit: float = np.inf, modified: bool = False
-) -> list[float]:
+def lms_settings(rule: int, step_size: float, *, factor: float = 0.0, limit: float = np.inf) -> list[float]:
     """Settings of a rule.
 
     `factor` is the regularisation, the leak, the penalty factor or the step size of the second gradient, of the rules
-    that have one; `modified` replaces the error by the disturbance estimate less ``w' x'``.
+    that have one. MODIFIED, which MOV-FxLMS sets, replaces the error by the disturbance estimate less ``w' x'``.
     """
-    return [step_size, rule, factor, limit, modified]
+    return [step_size, rule, factor, limit, 0.0]
 
 
 @part(forceinline=True)

@@ -12,7 +12,17 @@ from .._validate import as_nonnegative, as_positive
 from ..amplifiers import Amplifier
 from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
 from ..limiter import OutputLimiter
-from ..lms_rules import LEAK, MODIFIED, PENALTY, RATED_LEAK, RATED_PENALTY, lms_settings
+from ..lms_rules import (
+    FACTOR,
+    LEAK,
+    MODIFIED,
+    PENALTY,
+    RATED_LEAK,
+    RATED_PENALTY,
+    RULE,
+    further_rules,
+    lms_settings,
+)
 from .fxlms import LMSController
 
 
@@ -177,14 +187,11 @@ class _RatedLMS(LMSController):
         secondary_path_gain: float | None = None,
         amplifier: Amplifier | None = None,
         limiter: OutputLimiter | None = None,
-        modified: bool = False,
-        fixed: float | None = None,
     ) -> None:
         constraint = OutputPowerConstraint(
             rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
         )
-        rule, factor = (self._rule, 0.0) if fixed is None else (PENALTY, as_nonnegative(fixed, "penalty_factor"))
-        settings = lms_settings(rule, as_positive(step_size, "step_size"), factor=factor, modified=bool(modified))
+        settings = lms_settings(self._rule, as_positive(step_size, "step_size"))
         super().__init__(n_taps, secondary_path, settings, amplifier, constraint, limiter)
 
     @property
@@ -234,33 +241,6 @@ class OptimalLeakyFxLMS(_RatedLMS):
 
     name = "optimal leaky FxLMS"
     _rule = RATED_LEAK
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: Any,
-        *,
-        step_size: float,
-        rated_power: float,
-        fs: float = DEFAULT_FS,
-        power_memory: float = DEFAULT_MEMORY_S,
-        power_window: str = "exponential",
-        secondary_path_gain: float | None = None,
-        amplifier: Amplifier | None = None,
-        limiter: OutputLimiter | None = None,
-    ) -> None:
-        super().__init__(
-            n_taps,
-            secondary_path,
-            step_size=step_size,
-            rated_power=rated_power,
-            fs=fs,
-            power_memory=power_memory,
-            power_window=power_window,
-            secondary_path_gain=secondary_path_gain,
-            amplifier=amplifier,
-            limiter=limiter,
-        )
 
 
 class MOVFxLMS(_RatedLMS):
@@ -345,11 +325,13 @@ class MOVFxLMS(_RatedLMS):
             secondary_path_gain=secondary_path_gain,
             amplifier=amplifier,
             limiter=limiter,
-            modified=modified,
-            fixed=penalty_factor,
         )
+        settings = self._state.settings
+        if penalty_factor is not None:
+            settings[RULE], settings[FACTOR] = PENALTY, as_nonnegative(penalty_factor, "penalty_factor")
         if modified:
-            self.name = "MOV-MFxLMS"
+            settings[MODIFIED], self.name = True, "MOV-MFxLMS"
+        self._state = self._state._replace(rules=further_rules(settings))
 
     @property
     def modified(self) -> bool:
