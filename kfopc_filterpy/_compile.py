@@ -13,6 +13,7 @@ from typing import Any
 
 import numba
 from numba import njit, types
+from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
@@ -63,7 +64,40 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
-class Apart(Compiler):
+class PartLibrary(JITCodeLibrary):
+    """Code that is only ever linked into its callers' and made good with theirs.
+
+    numba would optimise each function on the way up and make machine code of it, with all that it calls, over again.
+    """
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """No machine code: the null pointer, as numba has it for a function without an entry from Python."""
+        self._ensure_finalized()
+        return 0
+
+    @property
+    def codegen(self) -> PartLibrary:
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """No globals in memory whose value could be set."""
+
+
+class PartCompiler(Compiler):
+    """`pipeline_class` of a part."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.state.library = PartLibrary(self.state.targetctx.codegen(), "part")
+
+
+class ApartCompiler(PartCompiler):
     """`pipeline_class` of a part whose array arguments never overlap where one is written.
 
     The compiler believes it, where it would else test all pairs of them at run time before each loop, and leave short
@@ -90,11 +124,15 @@ class Part(CPUDispatcher):
         return self._entry(*args)
 
 
-def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: as `compiled`, for functions that mostly other compiled functions call."""
+def part(*, apart: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: as `compiled`, for functions that mostly other compiled functions call.
+
+    `apart`: array arguments never overlap where one is written (`ApartCompiler`).
+    """
+    compiler = ApartCompiler if apart else PartCompiler
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = compiled(no_cpython_wrapper=True, cache=False, **options)(function)
+        dispatcher = compiled(no_cpython_wrapper=True, cache=False, pipeline_class=compiler, **options)(function)
         if not SWITCHED_OFF:
             dispatcher.__class__, dispatcher._own_options = Part, options
         return dispatcher

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._compile import Apart, borrowed, compiled, part
+from ._compile import borrowed, compiled, part
 from .amplifiers import amplify
 from .constraint import (
     FORGETTING,
@@ -135,7 +135,7 @@ def emit(weights, lanes, shared, begin, end, k):
             lanes[STATUS + i] = DIVERGED
 
 
-@part(fastmath=FAST, forceinline=True, pipeline_class=Apart)
+@part(fastmath=FAST, forceinline=True, apart=True)
 def correct_two(w, v, a, b, g, x, h):
     """w += a g and v += b g; returns w'x, w'h, v'x, v'h. Each load of g, x and h serves two scenarios."""
     wx = wh = vx = vh = 0.0
@@ -168,7 +168,7 @@ def convolve(path, line, lanes, row, first):
         add_four_taps(lanes, row, s0, s1, s2, s3, line[k], line[k + 1], line[k + 2], line[k + 3])
 
 
-@part(fastmath=FAST, forceinline=True, pipeline_class=Apart)
+@part(fastmath=FAST, forceinline=True, apart=True)
 def add_four_taps(lanes, row, s0, s1, s2, s3, y0, y1, y2, y3):
     """Four taps go together, or each sum would wait for the one before to come out of memory."""
     for i in range(LANES):
