@@ -15,7 +15,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.lib.stride_tricks import sliding_window_view
 
 from kfopc_filterpy import KFOPC, MOVFxLMS, kf_opc, kf_pb, simulate, simulate_scenarios
-from kfopc_filterpy._compile import borrowed
+from kfopc_filterpy._compile import compiled
 from kfopc_filterpy.block import Block, CausalBlock, project_in_block, update_in_block
 from kfopc_filterpy.kernels import (
     Covariance,
@@ -43,9 +43,8 @@ def signal(taps: int, samples: int) -> np.ndarray:
     return np.random.default_rng(1).standard_normal(samples + taps)
 
 
-@numba.njit(error_model="numpy")
+@compiled()
 def _stream(cov, w, x, d, state_noise, measurement_noise):
-    cov, w, x = borrowed(cov), borrowed(w), borrowed(x)  # as `loop.run` does
     for k in range(d.size):
         h = x[k : k + w.size]
         predict_covariance(cov, 1.0, state_noise)
@@ -53,9 +52,8 @@ def _stream(cov, w, x, d, state_noise, measurement_noise):
         update_weights(cov, w, h, d[k], S, measurement_noise)
 
 
-@numba.njit(error_model="numpy")
+@compiled()
 def _stream_in_block(cov, block, w, rows, d, state_noise, measurement_noise):
-    cov, block, w, rows = borrowed(cov), borrowed(block), borrowed(w), borrowed(rows)
     for k in range(d.size):
         h = rows[k, : w.size]
         S = project_in_block(cov, block, h, state_noise)[0] + measurement_noise

@@ -12,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba import njit, types
+from numba import njit
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
-from numba.extending import intrinsic
 
 COMPILED_MODULES = (
     "_compile",
@@ -36,14 +35,17 @@ COMPILED_MODULES = (
     "repairs",
 )
 # All said for every function: what is not said, numba takes from the caller that happens to compile a function first,
-# and leaves it on disk for all the others. Division is numpy's (Inf or NaN, which the callers look for): a test for
-# zero at each would make a way out of every function, at which references to all its arrays are counted.
+# and leaves it on disk for all the others. Division is numpy's: Inf or NaN, which the callers look for. No references
+# to arrays are counted (`_nrt`), as they would be for each array that passes through a call or a tuple, one locked
+# instruction each: in a loop over samples more work than the arithmetic of a short control filter. Nothing here makes
+# an array; they are the caller's.
 OPTIONS: dict[str, Any] = {
     "cache": True,
     "error_model": "numpy",
     "fastmath": False,
     "forceinline": False,
     "no_cfunc_wrapper": True,
+    "_nrt": False,
 }
 SOURCES = hashlib.sha256(
     b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in COMPILED_MODULES)
@@ -138,28 +140,3 @@ def part(*, apart: bool = False, **options: Any) -> Callable[[Callable[..., Any]
         return dispatcher
 
     return decorate
-
-
-def _borrowed(typingctx: Any, value: Any) -> Any:
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return _without_count(context, builder, value, args[0])
-
-    return value(value), codegen
-
-
-def _without_count(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    if isinstance(kind, types.Array):
-        array = context.make_array(kind)(context, builder, value)
-        array.meminfo, array.parent = array.meminfo.type(None), array.parent.type(None)
-        return array._getvalue()
-    if isinstance(kind, types.BaseTuple):
-        for i, item in enumerate(tuple(kind)):  # type: ignore[var-annotated,arg-type]
-            part = _without_count(context, builder, item, builder.extract_value(value, i))
-            value = builder.insert_value(value, part, i)
-    return value
-
-
-# The same array, or tuple of arrays, without reference counts: for the time of a call whose caller holds it. numba
-# counts the references to each array that passes through a call or a tuple, one locked instruction each: in a loop
-# over samples more work than the arithmetic of a short control filter.
-borrowed: Any = (lambda value: value) if SWITCHED_OFF else intrinsic(_borrowed)

@@ -26,7 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg.blas import dgemm, dsymm, dsyrk, dtrsm
 from scipy.linalg.lapack import dpotrf
 
-from ._compile import borrowed, compiled, part
+from ._compile import compiled, part
 from .kernels import (
     CANCELLATION,
     DIAGONAL,
@@ -135,7 +135,7 @@ def _add_random_walk(products, rows, state_noise):
 
 @compiled(nogil=True)
 def _steps(cov, rows, state_noise, measurement_noise, alpha_sq, directions, S):
-    cov, rows, n = borrowed(cov), borrowed(rows), cov.product.size
+    n = cov.product.size
     for k in range(len(rows)):
         h = rows[k, :n]
         predict_covariance(cov, alpha_sq, state_noise)

@@ -39,7 +39,7 @@ def push(line, sample):
     line[START] = start
 
 
-@part(forceinline=True)
+@part(forceinline=True, inline="always", _nrt=True)
 def newest(line, taps):
     """The newest `taps` samples, newest first, as a view."""
     start = np.int64(line[START])

@@ -38,6 +38,7 @@ class Covariance(NamedTuple):
     row: np.ndarray  # (n,) where x' is put into T's precision, if it is of another
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the pass under way
+    exact: np.ndarray  # (4, n) work of `downdate_carefully`
     owed: np.ndarray  # (4,): scale, diagonal, 1/S or 0 where the downdate was done at once; 1/S of the last update
 
 
@@ -59,7 +60,7 @@ def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     triangle = aligned_zeros(-(-n // line) * line, n, dtype=dtype)  # square for BLAS, zero past n
     triangle[:n, :n] = P
     row, gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(3))
-    return Covariance(triangle, row, gain_direction, product, np.array([1.0, 0.0, 0.0, 0.0]))
+    return Covariance(triangle, row, gain_direction, product, np.zeros((4, n)), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def copy_covariance(cov: Covariance) -> Covariance:
@@ -208,8 +209,9 @@ def add_product(total, rest, a, b):
 def downdate_carefully(cov, h, noise):
     """Eq. 8 in twice the precision and at once, after `project_covariance`; False, undone, where it would overflow."""
     T, n = cov.triangle, h.size
-    g, g_low, k, k_low = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)  # direction, and the gain g/S
+    g, g_low, k, k_low = cov.exact[0], cov.exact[1], cov.exact[2], cov.exact[3]  # direction, and the gain g/S
     for i in range(n):
+        g[i], g_low[i] = 0.0, 0.0
         for j in range(i):
             g[i], g_low[i] = add_product(g[i], g_low[i], T[i, j], h[j])
             g[j], g_low[j] = add_product(g[j], g_low[j], T[i, j], h[i])
@@ -235,18 +237,21 @@ def downdate_carefully(cov, h, noise):
     return True
 
 
-@compiled(fastmath=FAST)
-def full_covariance(T, g, scale, diagonal, weight):
+def full_covariance(T: np.ndarray, g: np.ndarray, scale: float, diagonal: float, weight: float) -> np.ndarray:
     """Full symmetric array scale T + weight g g' + diagonal I."""
-    n = g.size
-    P = np.empty((n, n))
-    for i in range(n):
+    P = np.empty((g.size, g.size))
+    _fill(P, T, g, scale, diagonal, weight)
+    return P
+
+
+@compiled(fastmath=FAST)
+def _fill(P, T, g, scale, diagonal, weight):
+    for i in range(g.size):
         gi = weight * g[i]
         for j in range(i + 1):
             P[i, j] = scale * T[i, j] + gi * g[j]
             P[j, i] = P[i, j]
         P[i, i] += diagonal
-    return P
 
 
 def covariance_matrix(cov: Covariance) -> np.ndarray:

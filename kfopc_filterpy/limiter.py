@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._compile import borrowed, compiled, part
+from ._compile import compiled, part
 from ._validate import as_number, as_positive, as_signal
 from .constraint import DEFAULT_FS
 
@@ -121,7 +121,6 @@ def _start_lap(state, size):
 
 @compiled(nogil=True)
 def _limit_all(state, signal, out):
-    state, signal, out = borrowed(state), borrowed(signal), borrowed(out)
     for n in range(signal.size):
         out[n] = limit_sample(state, signal[n])
 

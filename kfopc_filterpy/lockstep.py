@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ._compile import borrowed, compiled, part
+from ._compile import compiled, part
 from .amplifiers import amplify
 from .constraint import (
     FORGETTING,
@@ -96,8 +96,6 @@ def run_block(scenarios, shared, disturbance, sensor_noise, recorded, first, cou
 
     `disturbance` (N or 1, n_samples), `sensor_noise` (N or 1, m), `recorded` (N, 5 or 7, n_samples).
     """
-    scenarios, shared, recorded = borrowed(scenarios), borrowed(shared), borrowed(recorded)
-    disturbance, sensor_noise = borrowed(disturbance), borrowed(sensor_noise)
     taps, true_taps = scenarios.secondary_estimate.shape[1], scenarios.secondary.shape[1]
     for group in range(len(scenarios.lanes)):
         lanes, output, emitted = scenarios.lanes[group], scenarios.output[group], scenarios.emitted[group]

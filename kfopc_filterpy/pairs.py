@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._compile import borrowed, compiled, part
+from ._compile import compiled, part
 from .kernels import CANCELLATION, DIAGONAL, FAST, INVERSE_S, LAST_INVERSE_S, SCALE
 
 VECTOR = 8  # a power of two; rows of float64 are padded to it
@@ -33,7 +33,6 @@ def take_pairs(cov, rows, state_noise, measurement_noise, work, directions, S):
     Returns how many were taken: a last odd one is not, and none from a pair on whose variance exceeds the noise so far
     that the downdate would cost digits of P, or that has no solution.
     """
-    cov, rows, work, directions = borrowed(cov), borrowed(rows), borrowed(work), borrowed(directions)
     T, n, noise = cov.triangle, cov.product.size, measurement_noise
     first, second, Ph, Pf = work[FIRST], work[SECOND], work[PRODUCT], work[SECOND_PRODUCT]
     complete_diagonal_blocks(T, n)
