@@ -28,6 +28,7 @@ SCALE, DIAGONAL, INVERSE_S, LAST_INVERSE_S = 0, 1, 2, 3
 # twice the precision: the first samples after a large initial variance.
 CANCELLATION = 1e3
 LINE = 64  # bytes in a cache line
+FIRST_COLUMN = np.int64(0)
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
 
@@ -106,6 +107,42 @@ def predict_covariance(cov, alpha_sq, state_noise):
     cov.owed[DIAGONAL] = alpha_sq * cov.owed[DIAGONAL] + state_noise
 
 
+@part(fastmath=FAST, forceinline=True, apart=True)
+def four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i):
+    """Rows i to i + 3 of `project_covariance` up to column i; returns their sums over the columns."""
+    h0, h1, h2, h3 = h[i], h[i + 1], h[i + 2], h[i + 3]
+    a0 = a1 = a2 = a3 = scale - scale
+    for j in range(i):
+        p0 = scale * T0[j] - g0 * g[j]
+        p1 = scale * T1[j] - g1 * g[j]
+        p2 = scale * T2[j] - g2 * g[j]
+        p3 = scale * T3[j] - g3 * g[j]
+        T0[j] = p0
+        T1[j] = p1
+        T2[j] = p2
+        T3[j] = p3
+        a0 += p0 * h[j]
+        a1 += p1 * h[j]
+        a2 += p2 * h[j]
+        a3 += p3 * h[j]
+        Ph[j] += p0 * h0 + p1 * h1 + p2 * h2 + p3 * h3
+    return a0, a1, a2, a3
+
+
+@part(fastmath=FAST, forceinline=True, apart=True)
+def row_end(T, g, h, Ph, scale, diagonal, gk, total, i, k):
+    """Row k of `project_covariance` from column i to the diagonal."""
+    hk = h[k]
+    for j in range(i, k):
+        p = scale * T[j] - gk * g[j]
+        T[j] = p
+        total += p * h[j]
+        Ph[j] += p * hk
+    p = scale * T[k] - gk * g[k] + diagonal
+    T[k] = p
+    Ph[k] += total + p * hk
+
+
 @part(fastmath=FAST)
 def project_covariance(cov, h):
     """Pay what is owed to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
@@ -123,49 +160,17 @@ def project_covariance(cov, h):
     whole = n - n % 4
     for i in range(0, whole, 4):
         T0, T1, T2, T3 = T[i], T[i + 1], T[i + 2], T[i + 3]
-        G0, G1, G2, G3 = g[i], g[i + 1], g[i + 2], g[i + 3]
-        g0, g1, g2, g3 = weight * G0, weight * G1, weight * G2, weight * G3
-        h0, h1, h2, h3 = h[i], h[i + 1], h[i + 2], h[i + 3]
-        a0 = a1 = a2 = a3 = number(0.0)
-        for j in range(i):
-            p0 = scale * T0[j] - g0 * g[j]
-            p1 = scale * T1[j] - g1 * g[j]
-            p2 = scale * T2[j] - g2 * g[j]
-            p3 = scale * T3[j] - g3 * g[j]
-            T0[j], T1[j], T2[j], T3[j] = p0, p1, p2, p3
-            a0 += p0 * h[j]
-            a1 += p1 * h[j]
-            a2 += p2 * h[j]
-            a3 += p3 * h[j]
-            Ph[j] += p0 * h0 + p1 * h1 + p2 * h2 + p3 * h3
-        # The 4 x 4 block on the diagonal, written out: as loops it costs a fifth of the whole pass at 64 taps.
-        p00 = scale * T0[i] - g0 * G0 + diagonal
-        p10 = scale * T1[i] - g1 * G0
-        p20 = scale * T2[i] - g2 * G0
-        p30 = scale * T3[i] - g3 * G0
-        p11 = scale * T1[i + 1] - g1 * G1 + diagonal
-        p21 = scale * T2[i + 1] - g2 * G1
-        p31 = scale * T3[i + 1] - g3 * G1
-        p22 = scale * T2[i + 2] - g2 * G2 + diagonal
-        p32 = scale * T3[i + 2] - g3 * G2
-        p33 = scale * T3[i + 3] - g3 * G3 + diagonal
-        T0[i] = p00
-        T1[i], T1[i + 1] = p10, p11
-        T2[i], T2[i + 1], T2[i + 2] = p20, p21, p22
-        T3[i], T3[i + 1], T3[i + 2], T3[i + 3] = p30, p31, p32, p33
-        Ph[i] += a0 + p00 * h0 + p10 * h1 + p20 * h2 + p30 * h3
-        Ph[i + 1] += a1 + p10 * h0 + p11 * h1 + p21 * h2 + p31 * h3
-        Ph[i + 2] += a2 + p20 * h0 + p21 * h1 + p22 * h2 + p32 * h3
-        Ph[i + 3] += a3 + p30 * h0 + p31 * h1 + p32 * h2 + p33 * h3
+        g0 = weight * g[i]
+        g1 = weight * g[i + 1]
+        g2 = weight * g[i + 2]
+        g3 = weight * g[i + 3]
+        a0, a1, a2, a3 = four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i)
+        row_end(T0, g, h, Ph, scale, diagonal, g0, a0, i, i)
+        row_end(T1, g, h, Ph, scale, diagonal, g1, a1, i, i + 1)
+        row_end(T2, g, h, Ph, scale, diagonal, g2, a2, i, i + 2)
+        row_end(T3, g, h, Ph, scale, diagonal, g3, a3, i, i + 3)
     for k in range(whole, n):  # the last n % 4 rows
-        gk, hk = weight * g[k], h[k]
-        for j in range(k):
-            p = scale * T[k, j] - gk * g[j]
-            T[k, j] = p
-            Ph[k] += p * h[j]
-            Ph[j] += p * hk
-        T[k, k] = scale * T[k, k] - gk * g[k] + diagonal
-        Ph[k] += T[k, k] * hk
+        row_end(T[k], g, h, Ph, scale, diagonal, weight * g[k], number(0.0), FIRST_COLUMN, k)
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = 1.0, 0.0, 0.0
     return dot(h, Ph)
 
