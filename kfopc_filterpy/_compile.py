@@ -72,8 +72,11 @@ class PartLibrary(JITCodeLibrary):
     numba would optimise each function on the way up and make machine code of it, with all that it calls, over again.
     """
 
+    by_itself = False  # whether it is optimised before it is linked, too
+
     def _optimize_final_module(self) -> None:
-        pass
+        if self.by_itself:
+            super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
         self._finalized = True
@@ -109,6 +112,7 @@ class ApartCompiler(PartCompiler):
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.state.flags.noalias = True
+        self.state.library.by_itself = True
 
 
 class Part(CPUDispatcher):

@@ -129,7 +129,7 @@ def four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i):
     return a0, a1, a2, a3
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True)
 def row_end(T, g, h, Ph, scale, diagonal, gk, total, i, k):
     """Row k of `project_covariance` from column i to the diagonal."""
     hk = h[k]
