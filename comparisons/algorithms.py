@@ -32,7 +32,6 @@ from .scene import Scene
 ALGORITHMS = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")  # the paper's
 KALMAN = ("KF-ANC", "KF-OPC")  # whose runs share gains
 BUDGETED = ("KF-OPC repaired", "KF-PB")
-CONSTRAINED = ("KF-OPC", "MOV-FxLMS", *BUDGETED)
 POWER_MEMORY_S = 0.5
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
 # noise is no random walk any more but recursive least squares that never forgets, which a stationary noise would always

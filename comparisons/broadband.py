@@ -26,7 +26,7 @@ from kfopc_filterpy.plotting import (
     plot_output_power,
 )
 
-from .algorithms import ALGORITHMS, CONSTRAINED, make_controller
+from .algorithms import ALGORITHMS, make_controller
 from .report import FigureItem, Parameter, StudyReport, Verdict
 from .scene import Runs, Scene, figures_of_merit, make_scene
 from .study import (
@@ -48,6 +48,7 @@ RATED_POWER = 0.8
 POWER_MULTIPLE = 4.0
 N_TAPS = 128
 OTHER_N_TAPS = 256
+CONSTRAINED = ("KF-OPC", "MOV-FxLMS")
 SEEDS = tuple(range(1, 9))
 TUNING_SEEDS = 2
 

@@ -6,6 +6,7 @@ after an upgrade or an edit of one of them it would go on with the old ones.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 import numba
 from numba import njit
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
+from numba.core.compiler import Compiler, Flags
 from numba.core.registry import CPUDispatcher
 
 COMPILED_MODULES = (
@@ -34,36 +35,42 @@ COMPILED_MODULES = (
     "power_budget",
     "repairs",
 )
-# All said for every function: what is not said, numba takes from the caller that happens to compile a function first,
-# and leaves it on disk for all the others. Division is numpy's: Inf or NaN, which the callers look for. No references
-# to arrays are counted (`_nrt`), as they would be for each array that passes through a call or a tuple, one locked
-# instruction each: in a loop over samples more work than the arithmetic of a short control filter. Nothing here makes
-# an array; they are the caller's.
-OPTIONS: dict[str, Any] = {
-    "cache": True,
-    "error_model": "numpy",
-    "fastmath": False,
-    "forceinline": False,
-    "no_cfunc_wrapper": True,
-    "_nrt": False,
-}
 SOURCES = hashlib.sha256(
     b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in COMPILED_MODULES)
 ).hexdigest()
 SWITCHED_OFF: bool = vars(numba)["config"].DISABLE_JIT  # numba's own switch: everything is called as plain Python
 
 
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: `numba.njit(**OPTIONS)`, with what is given here in place of them."""
+class Settings(Flags):
+    """A compilation's flags, compared as fast as its options are looked up.
 
-    def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(**(OPTIONS | options))(function)
-        cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if hasattr(cache_file, "_source_stamp"):  # not where numba's compiler is switched off
-            cache_file._source_stamp = (cache_file._source_stamp, SOURCES)
-        return dispatcher
+    numba compares its own by asking each for all it has, 30 calls, and does it at every operation that it types:
+    their hash is the same for all.
+    """
 
-    return decorate
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Flags) and self._values == other._values
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self._values))
+
+
+class OwnCompiler(Compiler):
+    """`pipeline_class` of all functions here."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.state.flags = Settings(self.state.flags)
+
+    def compile_extra(self, function: Any) -> Any:
+        """Compile without a pause for collecting garbage: some 100,000 objects stay until all is done."""
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return super().compile_extra(function)
+        finally:
+            if collecting:
+                gc.enable()
 
 
 class PartLibrary(JITCodeLibrary):
@@ -94,7 +101,7 @@ class PartLibrary(JITCodeLibrary):
         """No globals in memory whose value could be set."""
 
 
-class PartCompiler(Compiler):
+class PartCompiler(OwnCompiler):
     """`pipeline_class` of a part."""
 
     def __init__(self, *arguments: Any) -> None:
@@ -113,6 +120,35 @@ class ApartCompiler(PartCompiler):
         super().__init__(*arguments)
         self.state.flags.noalias = True
         self.state.library.by_itself = True
+
+
+# All said for every function: what is not said, numba takes from the caller that happens to compile a function first,
+# and leaves it on disk for all the others. Division is numpy's: Inf or NaN, which the callers look for. No references
+# to arrays are counted (`_nrt`), as they would be for each array that passes through a call or a tuple, one locked
+# instruction each: in a loop over samples more work than the arithmetic of a short control filter. Nothing here makes
+# an array; they are the caller's.
+OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "error_model": "numpy",
+    "fastmath": False,
+    "forceinline": False,
+    "no_cfunc_wrapper": True,
+    "_nrt": False,
+    "pipeline_class": OwnCompiler,
+}
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: `numba.njit(**OPTIONS)`, with what is given here in place of them."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        dispatcher = njit(**(OPTIONS | options))(function)
+        cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if hasattr(cache_file, "_source_stamp"):  # not where numba's compiler is switched off
+            cache_file._source_stamp = (cache_file._source_stamp, SOURCES)
+        return dispatcher
+
+    return decorate
 
 
 class Part(CPUDispatcher):
