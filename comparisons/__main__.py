@@ -11,6 +11,7 @@ from pathlib import Path
 from textwrap import fill
 
 from . import amplifier, broadband, constraint, duct, mismatch, power_budget, tonal, tracking
+from .first_use import compile_ahead
 from .report import StudyReport, prepare_folder, results_table, write_report
 from .scene import Runs
 
@@ -72,6 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if SPEED in options.studies:
         return _speed(parser, options)
     began = time.perf_counter()
+    compile_ahead()
     reports: list[StudyReport] = []
     chosen = {name: (STUDIES | FURTHER)[name] for name in options.studies or STUDIES}
     planned = sum(planned_runs() for _, planned_runs in chosen.values())

@@ -41,15 +41,13 @@ NEEDS = {
 }
 OTHER_RECURSIONS = ("padasip RLS", "pyroomacoustics RLS")
 FIRST_USE = """
-import time, numpy as np
-from kfopc_filterpy import kf_opc, simulate
-x = np.ones(100)
-def run():
+import time
+from comparisons.first_use import {name}
+def seconds():
     began = time.perf_counter()
-    controller = kf_opc(8, [0.0, 1.0], rated_power=1.0, state_noise=1e-8, measurement_noise=1e-2)
-    simulate(controller, x, disturbance=x, secondary_path=[0.0, 1.0])
+    {name}()
     return time.perf_counter() - began
-print(run() - run())
+print(seconds() - seconds())
 """
 
 
@@ -149,11 +147,12 @@ def first_samples_us(taps: int) -> float:
     return float(np.median(times[10:]) * 1e6)
 
 
-def first_use_s() -> float:
-    """Seconds that the first run takes longer than the second where nothing has been compiled yet."""
+def first_use_s(name: str) -> float:
+    """Seconds that a function of `first_use` takes longer the first time, where nothing has been compiled yet."""
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache}
-        ran = subprocess.run([sys.executable, "-c", FIRST_USE], env=environment, capture_output=True, text=True)
+        command = [sys.executable, "-c", FIRST_USE.format(name=name)]
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True)
     if ran.returncode:
         raise RuntimeError(f"the first run failed: {ran.stderr}")
     return float(ran.stdout)
@@ -237,7 +236,8 @@ def remarks(result: dict[str, Any]) -> list[str]:
             f"P(0|0): {w['first_samples_us']:.0f} µs."
             for w in result["worst_sample"]
         ),
-        f"First use, nothing compiled yet: {result['first_use_s']:.1f} s.",
+        "First use, nothing compiled yet: {alone:.1f} s for `simulate`, {together:.1f} s for `simulate_scenarios`, "
+        "{compile_ahead:.1f} s for the studies, which have both compiled at once.".format(**result["first_use_s"]),
         f"{' and '.join(OTHER_RECURSIONS)}: another recursion, with forgetting in place of state noise.",
         *([f"Not installed, left out: {', '.join(missing)}; they come with the extra bench."] if missing else []),
     ]
@@ -262,7 +262,7 @@ def main(folder: Path, quiet: bool = False) -> int:
             bar.set_description(f"speed, worst of {WORST_SAMPLES:,} samples, {taps} taps")
             worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
             bar.update()
-        first_use = first_use_s()
+        first_use = {name: first_use_s(name) for name in ("alone", "together", "compile_ahead")}
         bar.update()
     result = {"dgemm_gflops": max(rates), "rows": rows, "worst_sample": worst, "first_use_s": first_use}
     (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")

@@ -143,18 +143,30 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = njit(**(OPTIONS | options))(function)
-        cache_file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-        if hasattr(cache_file, "_source_stamp"):  # not where numba's compiler is switched off
+        cache_file = _cache_file(dispatcher)
+        if cache_file is not None:
             cache_file._source_stamp = (cache_file._source_stamp, SOURCES)
         return dispatcher
 
     return decorate
 
 
+def _cache_file(dispatcher: Any) -> Any:
+    """numba's index on disk; None where there is none, or numba's compiler is switched off."""
+    cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+    return cache_file if hasattr(cache_file, "_source_stamp") else None
+
+
+def on_disk(dispatcher: Any) -> bool:
+    """Whether something of a compiled function is kept on disk, and nothing is left to compile for a first use."""
+    cache_file = _cache_file(dispatcher)
+    return cache_file is None or bool(cache_file._load_index())
+
+
 class Part(CPUDispatcher):
     """A function compiled into others, without the entry from Python that for small ones takes longest to make.
 
-    One is made where Python does call it.
+    One is made where Python does call it, except for those so short that they are inlined as source.
     """
 
     _entry: Any = None
@@ -162,7 +174,8 @@ class Part(CPUDispatcher):
 
     def __call__(self, *args: Any) -> Any:
         if self._entry is None:
-            self._entry = compiled(**self._own_options)(self.py_func)
+            short = self._own_options.get("inline") == "always"
+            self._entry = self.py_func if short else compiled(**self._own_options)(self.py_func)
         return self._entry(*args)
 
 

@@ -29,11 +29,8 @@ from scipy.linalg.lapack import dpotrf
 from ._compile import compiled, part
 from .kernels import (
     CANCELLATION,
-    DIAGONAL,
     FAST,
-    INVERSE_S,
     LAST_INVERSE_S,
-    SCALE,
     Covariance,
     aligned_zeros,
     copy_into,
@@ -53,8 +50,14 @@ AHEAD, COLUMNS, SCALED = 0, 1, 2  # of a CausalBlock: P h_k as far as h_k is kno
 
 def settle(cov: Covariance) -> None:
     """Pay what is owed: P is the triangle."""
-    if cov.owed[SCALE] != 1.0 or cov.owed[DIAGONAL] or cov.owed[INVERSE_S]:
-        project_covariance(cov, np.zeros(cov.product.size))
+    scale, diagonal, inverse_S, _ = cov.owed
+    if scale != 1.0 or diagonal or inverse_S:
+        triangle = cov.triangle
+        triangle *= scale
+        G = np.zeros((len(triangle), 1), order="F")
+        G[: cov.product.size, 0] = np.sqrt(scale * inverse_S) * cov.gain_direction
+        downdate_by_columns(cov, G, diagonal)
+        cov.owed[:3] = 1.0, 0.0, 0.0
 
 
 class Block:

@@ -27,7 +27,7 @@ RATED_POWER, FORGETTING = range(2)  # of SETTINGS
 class ConstraintState(NamedTuple):
     """What the compiled functions below read and advance.
 
-    Few arrays, since the compiled loop counts references to each at every call. The table's rows: MEAN, mean squares
+    Few arrays, since each is an argument more to compile in every function. The table's rows: MEAN, mean squares
     of disturbance, filtered reference and reference; LAP, their sums of squares since the sliding window last wrapped;
     TAKEN, samples taken; SUPPLIED, factor, disturbance power and gain set by the caller, NaN where estimated; LAST, the
     same as last used; SETTINGS, rated power and 1 - forgetting factor.
@@ -71,7 +71,8 @@ def _next_mean(state, row, square):
         return forgetting_mean(mean, n, state.table[SETTINGS, FORGETTING], square)
     position = np.int64(n) % m
     rest = state.window[row, position + 1] if position + 1 < m else 0.0
-    return (state.table[LAP, row] + square + rest) / min(n + 1, m)  # sums only, so that rounding never accumulates
+    total = state.table[LAP, row] + square + rest  # sums only, so that rounding never accumulates
+    return total / min(n + 1.0, float(m))
 
 
 @part(forceinline=True)

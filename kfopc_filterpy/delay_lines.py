@@ -39,14 +39,14 @@ def push(line, sample):
     line[START] = start
 
 
-@part(forceinline=True, inline="always", _nrt=True)
+@part(inline="always")
 def newest(line, taps):
     """The newest `taps` samples, newest first, as a view."""
     start = np.int64(line[START])
     return line[start : start + taps]
 
 
-@part(forceinline=True)
+@part(inline="always")
 def latest(line):
     """The newest sample."""
     return line[np.int64(line[START])]

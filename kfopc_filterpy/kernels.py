@@ -109,8 +109,9 @@ def predict_covariance(cov, alpha_sq, state_noise):
 
 @part(fastmath=FAST, forceinline=True, apart=True)
 def four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i):
-    """Rows i to i + 3 of `project_covariance` up to column i; returns their sums over the columns."""
-    h0, h1, h2, h3 = h[i], h[i + 1], h[i + 2], h[i + 3]
+    """Rows i to i + 3 of `project_covariance` up to column i."""
+    h0, h1 = h[i], h[i + 1]
+    h2, h3 = h[i + 2], h[i + 3]
     a0 = a1 = a2 = a3 = scale - scale
     for j in range(i):
         p0 = scale * T0[j] - g0 * g[j]
@@ -126,13 +127,16 @@ def four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i):
         a2 += p2 * h[j]
         a3 += p3 * h[j]
         Ph[j] += p0 * h0 + p1 * h1 + p2 * h2 + p3 * h3
-    return a0, a1, a2, a3
+    Ph[i] += a0
+    Ph[i + 1] += a1
+    Ph[i + 2] += a2
+    Ph[i + 3] += a3
 
 
 @part(fastmath=FAST, forceinline=True)
-def row_end(T, g, h, Ph, scale, diagonal, gk, total, i, k):
+def row_end(T, g, h, Ph, scale, diagonal, gk, i, k):
     """Row k of `project_covariance` from column i to the diagonal."""
-    hk = h[k]
+    hk, total = h[k], Ph[k]
     for j in range(i, k):
         p = scale * T[j] - gk * g[j]
         T[j] = p
@@ -140,7 +144,7 @@ def row_end(T, g, h, Ph, scale, diagonal, gk, total, i, k):
         Ph[j] += p * hk
     p = scale * T[k] - gk * g[k] + diagonal
     T[k] = p
-    Ph[k] += total + p * hk
+    Ph[k] = total + p * hk
 
 
 @part(fastmath=FAST)
@@ -164,13 +168,13 @@ def project_covariance(cov, h):
         g1 = weight * g[i + 1]
         g2 = weight * g[i + 2]
         g3 = weight * g[i + 3]
-        a0, a1, a2, a3 = four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i)
-        row_end(T0, g, h, Ph, scale, diagonal, g0, a0, i, i)
-        row_end(T1, g, h, Ph, scale, diagonal, g1, a1, i, i + 1)
-        row_end(T2, g, h, Ph, scale, diagonal, g2, a2, i, i + 2)
-        row_end(T3, g, h, Ph, scale, diagonal, g3, a3, i, i + 3)
+        four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i)
+        row_end(T0, g, h, Ph, scale, diagonal, g0, i, i)
+        row_end(T1, g, h, Ph, scale, diagonal, g1, i, i + 1)
+        row_end(T2, g, h, Ph, scale, diagonal, g2, i, i + 2)
+        row_end(T3, g, h, Ph, scale, diagonal, g3, i, i + 3)
     for k in range(whole, n):  # the last n % 4 rows
-        row_end(T[k], g, h, Ph, scale, diagonal, weight * g[k], number(0.0), FIRST_COLUMN, k)
+        row_end(T[k], g, h, Ph, scale, diagonal, weight * g[k], FIRST_COLUMN, k)
     cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = 1.0, 0.0, 0.0
     return dot(h, Ph)
 

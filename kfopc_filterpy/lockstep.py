@@ -73,7 +73,7 @@ class SharedBlock(NamedTuple):
     references: np.ndarray  # (m, n or more) rows x(k), newest sample first
     rows: np.ndarray  # (m, n or more) rows x'(k)
     directions: np.ndarray  # (m, n or more) g_k = S_k K_k
-    largest: np.ndarray  # (m,) largest magnitude in g_k
+    largest: np.ndarray  # (m,) norm of g_k, which no magnitude in it exceeds
     variances: np.ndarray  # (m,) S_k
 
 
@@ -242,13 +242,12 @@ def decide(lanes, h, x, S, largest):
 @part(forceinline=True)
 def commit_lanes(lanes):
     """`commit_constraint` of what `preview_lanes` found, where the scenario goes on."""
-    for i in range(LANES):
-        if lanes[GOES_ON + i] > 0.0:
-            lanes[MEAN_D + i], lanes[TAKEN_D + i] = lanes[NEXT_D + i], lanes[TAKEN_D + i] + 1.0
-            lanes[MEAN_H + i], lanes[TAKEN_H + i] = lanes[NEXT_H + i], lanes[TAKEN_H + i] + 1.0
-            lanes[MEAN_X + i], lanes[TAKEN_X + i] = lanes[NEXT_X + i], lanes[TAKEN_X + i] + 1.0
-            lanes[LAST_FACTOR + i] = lanes[NEXT_FACTOR + i]
-            lanes[LAST_POWER + i], lanes[LAST_GAIN + i] = lanes[NEXT_POWER + i], lanes[NEXT_GAIN + i]
+    for row in range(0, 3 * LANES, LANES):  # of three each
+        for i in range(row, row + LANES):
+            if lanes[GOES_ON - row + i] > 0.0:
+                lanes[MEAN_D + i] = lanes[NEXT_D + i]
+                lanes[TAKEN_D + i] += 1.0
+                lanes[LAST_FACTOR + i] = lanes[NEXT_FACTOR + i]
 
 
 @part(forceinline=True)

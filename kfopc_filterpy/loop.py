@@ -3,8 +3,8 @@
 Sample-by-sample use (`controllers`, `simulation`) calls the same functions one at a time, so each equation stands
 here once.
 
-Small functions are inlined by force: called, each would count references to every array of its arguments, which for
-a short control filter takes longer than the arithmetic.
+Small functions are inlined by force: called, each would be handed every array of a controller over again, which for a
+short control filter takes longer than the arithmetic.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from .fast_array import FastArrayState, correct_fast_array, fast_array_holds
 from .kernels import (
     CANCELLATION,
     DIAGONAL,
+    INVERSE_S,
     SCALE,
     Covariance,
     copy_into,
@@ -135,12 +136,13 @@ def adapt_kalman(controller, error, y_emitted, block):
         else:
             leave_block(cov, block, r)
     if np.isnan(y):
+        scale, diagonal, inverse_S = cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S]
         predict_covariance(cov, alpha_sq, r)
         S = project_covariance(cov, h) + q
         if 0.0 < S < np.inf:
             y = update_weights(cov, w, h, scaled, S, q)
         if not np.isfinite(y):
-            take_back(cov, alpha_sq, r)
+            take_back(cov, scale, diagonal, inverse_S, alpha_sq, r)
             return False
     commit_constraint(controller.constraint, previewed, d, seen[0], seen[1])
     advance_repair(controller.repair, controller.constraint, y_emitted)
@@ -169,10 +171,15 @@ def squares_are_finite(d, filtered, x):
     return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
 
 
-@part(forceinline=True)
-def take_back(cov, alpha_sq, r):
-    """Undo, to rounding, the prediction of a step that cannot be completed, after its projection."""
-    cov.owed[SCALE], cov.owed[DIAGONAL] = 1.0 / alpha_sq, -r / alpha_sq
+@part()
+def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
+    """Undo, to rounding, the prediction and projection of a step that cannot be completed."""
+    T, g = cov.triangle, cov.gain_direction
+    for i in range(g.size):
+        T[i, i] -= alpha_sq * diagonal + r
+        for j in range(i + 1):
+            T[i, j] = T[i, j] / (alpha_sq * scale) + inverse_S * g[i] * g[j]
+    cov.owed[SCALE], cov.owed[DIAGONAL], cov.owed[INVERSE_S] = scale, diagonal, inverse_S
 
 
 @part(forceinline=True)

@@ -325,7 +325,7 @@ class _SharedGains:
             block.rows[:, :n] = self._rows(self.filtered, first, size)
             advance = getattr(block, ADVANCE[self.kernel])
             variances = advance(self.state.covariance, *self.state.settings.tolist())
-            largest = np.abs(block.directions).max(axis=1)
+            largest = np.sqrt(np.einsum("ij,ij->i", block.directions, block.directions))
             yield first, SharedBlock(references, block.rows, block.directions, largest, variances)
 
     def _rows(self, signal: np.ndarray, first: int, size: int) -> np.ndarray:

@@ -37,7 +37,6 @@ from .loop import (
     Plant,
     anti_noise,
     measured_reference,
-    note_weights,
     run,
 )
 from .paths import path_taps
@@ -330,11 +329,9 @@ def _run_steps(
         stretch[USED_POWER, k] = getattr(controller, "disturbance_power", np.nan)
         stretch[USED_GAIN, k] = getattr(controller, "secondary_path_gain", np.nan)
         stretch[USED_WEIGHT, k] = getattr(controller, "power_weight", np.nan)
-        if weights.shape[0] > 0:
-            now = np.array(
-                getattr(controller, "control_filter", getattr(controller, "weights", None)), dtype=np.float64
-            )
-            note_weights(weights, now.reshape(-1), every, first + k)
+        if weights.shape[0] > 0 and (first + k) % every == 0:
+            now = getattr(controller, "control_filter", getattr(controller, "weights", None))
+            weights[(first + k) // every] = np.array(now, dtype=np.float64).reshape(-1)
         if progress:
             progress(1)
     return RUNNING, stretch.shape[1]

@@ -19,7 +19,7 @@ def small(monkeypatch):
     """The study with few taps and samples, and no compilation timed."""
     for name, value in {"TAPS": (128, 256), "ROUNDS": 1, "WORST_TAPS": (16,), "WORST_SAMPLES": 200}.items():
         monkeypatch.setattr(speed, name, value)
-    monkeypatch.setattr(speed, "first_use_s", lambda: 1.0)
+    monkeypatch.setattr(speed, "first_use_s", lambda name: 1.0)
     monkeypatch.setattr(speed, "find_spec", lambda name: None)  # the same wherever it runs
     monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
 
