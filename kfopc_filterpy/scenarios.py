@@ -16,7 +16,7 @@ from .controllers.base import NO_SOLUTION
 from .controllers.kalman import KalmanController
 from .delay_lines import TAPS, newest, refill
 from .kernels import INVERSE_S, aligned_zeros, copy_covariance, covariance_matrix
-from .lockstep import DONE, LAST_UPDATE, STATUS, TABLE, Scenarios, SharedBlock, of_lanes, run_block, stacked
+from .lockstep import DONE, LANES, LAST_UPDATE, STATUS, TABLE, Scenarios, SharedBlock, of_lanes, run_block, stacked
 from .loop import DIVERGED, REFUSED, ControllerState
 from .paths import is_system, path_taps
 from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
@@ -145,9 +145,10 @@ def simulate_scenarios(
     # An odd number of cache lines (8 values) to a row: at a power of two all rows would fall on the same places of the
     # cache, which as many scenarios write in turn.
     recorded = np.empty((count, 7 if record_powers else 5, (-(-x.size // 8) | 1) * 8))
+    noisy = any(noise.std for noise in noises)
     for first, shared in gains.blocks():
         length = len(shared.variances)
-        if any(noise.std for noise in noises):
+        if noisy:
             sensed = np.array([np.broadcast_to(noise.take(length), (length,)) for noise in noises])
         else:
             sensed = np.zeros((1, length))
@@ -313,6 +314,9 @@ class _SharedGains:
         self.filtered[self.heard - n : self.heard] = newest(state.filtered, n)[::-1]
         # Newest first, so that each row is a slice.
         self.reference, self.filtered = self.reference[::-1].copy(), self.filtered[::-1].copy()
+        self._reference_rows, self._filtered_rows = (
+            sliding_window_view(signal, n)[::-1] for signal in (self.reference, self.filtered)
+        )
 
     def blocks(self) -> Iterator[tuple[int, SharedBlock]]:
         """First sample and gains of each block."""
@@ -321,16 +325,13 @@ class _SharedGains:
             size = min(BLOCK, self.n_samples - first)
             if size < BLOCK or first == 0:
                 block, references = Block(n, size), aligned_zeros(size, n)
-            references[:, :n] = self._rows(self.reference, first, size)
-            block.rows[:, :n] = self._rows(self.filtered, first, size)
+            rows = slice(first + self.heard - n + 1, first + self.heard - n + 1 + size)
+            references[:, :n] = self._reference_rows[rows]
+            block.rows[:, :n] = self._filtered_rows[rows]
             advance = getattr(block, ADVANCE[self.kernel])
             variances = advance(self.state.covariance, *self.state.settings.tolist())
             largest = np.sqrt(np.einsum("ij,ij->i", block.directions, block.directions))
             yield first, SharedBlock(references, block.rows, block.directions, largest, variances)
-
-    def _rows(self, signal: np.ndarray, first: int, size: int) -> np.ndarray:
-        begin = signal.size - self.heard - first - size  # of the last of the rows
-        return sliding_window_view(signal, self.state.weights.size)[begin : begin + size][::-1]
 
     def hand_back(
         self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios
@@ -354,7 +355,7 @@ class _SharedGains:
 
 
 def _raise_where_refused(scenarios: Scenarios, unsolved: int | None) -> None:
-    for i in np.flatnonzero(of_lanes(scenarios, STATUS) == REFUSED):
+    for i in np.flatnonzero(scenarios.lanes[:, STATUS : STATUS + LANES] == REFUSED):
         raise ValueError(
             f"the weights of controllers[{i}] would overflow in sample {of_lanes(scenarios, DONE)[i, 0]:.0f} of the run: "
             "its disturbance estimate or residual is too large"
