@@ -12,7 +12,7 @@ from test_loop import S_HAT, SIGNALS, S, assert_same_estimator, assert_same_run,
 from test_random_walk import rows_of
 
 from kfopc_filterpy import KFOPC, HardClipAmplifier, KalmanController, kf_anc, kf_opc, simulate, simulation
-from kfopc_filterpy.block import Block
+from kfopc_filterpy.block import Block, settle
 from kfopc_filterpy.kernels import CANCELLATION, INVERSE_S, LAST_INVERSE_S, covariance_matrix, new_covariance
 
 
@@ -20,6 +20,26 @@ def assert_close(got, want, tolerance=1e-10, scale=None, name=""):
     """To a tolerance relative to the largest value, or to `scale`; NaN where NaN is wanted."""
     scale = np.nanmax(np.abs(want)) if scale is None else scale
     np.testing.assert_allclose(got, want, rtol=0, atol=tolerance * scale, err_msg=name)
+
+
+# ---- What a block starts from
+
+
+@pytest.mark.parametrize("owed", [(1.0, 0.0, 0.0), (1.0, 2e-3, 0.0), (1.02, 1e-3, 0.4), (0.5, 0.0, 3.0)])
+@pytest.mark.parametrize("n", [1, 7, 16])
+def test_settling_pays_what_is_owed(n, owed):
+    """scale (T - g g'/S) + diagonal I written out; 4 roundings of numbers up to the largest in P."""
+    rng = np.random.default_rng(n)
+    A = rng.standard_normal((n, n))
+    cov, g, (scale, diagonal, inverse_S) = new_covariance(A @ A.T), rng.standard_normal(n), owed
+    cov.gain_direction[:] = g
+    cov.owed[:3] = owed
+    P = scale * (A @ A.T - inverse_S * np.outer(g, g)) + diagonal * np.eye(n)
+    settle(cov)
+    np.testing.assert_array_equal(cov.owed[:3], [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(cov.gain_direction, g)
+    np.testing.assert_allclose(np.tril(cov.triangle[:n, :n]), np.tril(P), rtol=0, atol=1e-15 * 4 * np.abs(P).max())
+    np.testing.assert_array_equal(cov.triangle[n:], 0.0)
 
 
 # ---- A block whose rows are all known
