@@ -79,7 +79,17 @@ def _block_samples(taps: int) -> int:
 
 
 def block(taps: int) -> Work:
-    """All rows of a block known, weights as `simulate_scenarios` has them (two products with the gains)."""
+    """All rows of a block known, in matrix products."""
+    return _rows_known(taps, "advance")
+
+
+def pairs(taps: int) -> Work:
+    """All rows of a block known, two at a time."""
+    return _rows_known(taps, "advance_in_pairs")
+
+
+def _rows_known(taps: int, how: str) -> Work:
+    """The weights as `simulate_scenarios` has them: two products with the gains."""
     samples = _block_samples(taps)
     x, (cov, w) = signal(taps, samples), filter_state(taps)
     d, work = x[:samples].copy(), Block(taps, BLOCK_SIZE)
@@ -87,7 +97,7 @@ def block(taps: int) -> Work:
     def run() -> None:
         for first in range(0, samples, BLOCK_SIZE):
             work.rows[:, :taps] = sliding_window_view(x[first : first + BLOCK_SIZE + taps - 1], taps)
-            S = work.advance(cov, R, Q)
+            S = getattr(work, how)(cov, R, Q)
             _correct_in_turn(w, work.rows, work.directions, S, d[first : first + BLOCK_SIZE])
 
     run()
@@ -283,6 +293,7 @@ OURS: dict[str, Callable[[int], Work]] = {
     "streaming kernel": streaming,
     "block kernel, rows known": block,
     "block kernel, causal": block_causal,
+    "two at a time, rows known": pairs,
     "filterpy API of KFOPC": filterpy_api,
     "closed loop, KF-OPC": closed_loop,
     "closed loop, KF-PB": closed_loop_budget,

@@ -53,6 +53,7 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "times as fast as filterpy" in printed
     assert "16 taps, 200 samples" in printed
+    assert "1.0 s for `simulate`" in printed
 
 
 def test_rows_follow_from_the_measured_times():
