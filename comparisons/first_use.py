@@ -13,10 +13,13 @@ from filterpy.kalman import KalmanFilter
 
 from kfopc_filterpy import HardClipAmplifier, KalmanController, kf_opc, simulate, simulate_scenarios
 from kfopc_filterpy._compile import on_disk
+from kfopc_filterpy.block import STEPS, Block
+from kfopc_filterpy.kernels import new_covariance
 from kfopc_filterpy.lockstep import run_block
 
 REFERENCE = np.ones(100)
 PATH = [0.0, 1.0]
+IN_ANOTHER = f"from {__name__} import stepped, together; together('block'); stepped()"
 
 
 def _controller() -> KalmanController:
@@ -33,6 +36,11 @@ def together(kernel: str = "pairs") -> None:
     simulate_scenarios([_controller()], REFERENCE, disturbance=REFERENCE, secondary_path=PATH, kernel=kernel)
 
 
+def shared_gains() -> None:
+    """The gains of `together` alone."""
+    Block(8, STEPS).advance_in_pairs(new_covariance(np.eye(8)), 1e-8, 1e-2)
+
+
 def stepped() -> None:
     """One run of a controller whose filter is filterpy's own, step by step, through an amplifier."""
     estimator = KalmanFilter(dim_x=8, dim_z=1)
@@ -43,15 +51,15 @@ def stepped() -> None:
 
 
 def compile_ahead() -> None:
-    """Have all compiled, part of it in another process: it is on disk when this one comes to it.
+    """Have all compiled, part of it in another process, which is over before this one looks for that on disk.
 
     The gains by BLAS have next to nothing to compile. Where the other process fails, this one compiles all.
     """
     if on_disk(run_block):
         return
-    code = f"from {__name__} import stepped, together; together('block'); stepped()"
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(entry or os.getcwd() for entry in sys.path)}
-    with subprocess.Popen([sys.executable, "-c", code], env=environment, stderr=subprocess.DEVNULL):
+    with subprocess.Popen([sys.executable, "-c", IN_ANOTHER], env=environment, stderr=subprocess.DEVNULL):
         alone()
-        together()
+        shared_gains()
+    together()
     stepped()

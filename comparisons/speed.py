@@ -31,7 +31,7 @@ TURN_S = 0.05  # a variant's turn, about as long as the probe's
 REAL_TIME_FS = (16000.0, 48000.0)
 WORST_TAPS = (128, 256, 512)
 WORST_SAMPLES = 1_000_000
-FIRST_USES = 3  # of which the shortest counts
+FIRST_USES, FIRST_USE_TIMES = ("alone", "together", "compile_ahead"), 3  # of `first_use`; the shortest counts
 # Above these taps a variant would take minutes or gigabytes, and the trend is plain.
 LARGEST = {"pykalman": 512, f"closed loop, each of {variants.SCENARIOS} KF-OPC": 512}
 NEEDS = {
@@ -252,7 +252,10 @@ def main(folder: Path, quiet: bool = False) -> int:
     from tqdm import tqdm
 
     rates, rows = [], []
-    with threadpool_limits(1), tqdm(total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 1, disable=quiet, unit="round") as bar:
+    with (
+        threadpool_limits(1),
+        tqdm(total=len(TAPS) * ROUNDS + len(WORST_TAPS) + len(FIRST_USES), disable=quiet, unit="round") as bar,
+    ):
         for taps in TAPS:
             bar.set_description(f"speed, {taps} taps")
             rate, best = measure(taps, tick=bar.update)
@@ -263,10 +266,11 @@ def main(folder: Path, quiet: bool = False) -> int:
             bar.set_description(f"speed, worst of {WORST_SAMPLES:,} samples, {taps} taps")
             worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
             bar.update()
-        first_use = {
-            name: min(first_use_s(name) for _ in range(FIRST_USES)) for name in ("alone", "together", "compile_ahead")
-        }
-        bar.update()
+        first_use = {}
+        for name in FIRST_USES:
+            bar.set_description(f"speed, first use, {name}")
+            first_use[name] = min(first_use_s(name) for _ in range(FIRST_USE_TIMES))
+            bar.update()
     result = {"dgemm_gflops": max(rates), "rows": rows, "worst_sample": worst, "first_use_s": first_use}
     (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
     figure(result).savefig(folder / "speed.png", dpi=150)

@@ -1,7 +1,8 @@
-"""numba's `njit` with an on-disk cache that notices a change in any of the package's compiled modules.
+"""numba's `njit` as this package uses it: `compiled` for what Python calls, `part` for what only those functions call.
 
-numba watches only the file that a function stands in, but the loop has the kernels of other files compiled into it:
-after an upgrade or an edit of one of them it would go on with the old ones.
+What is compiled is kept on disk, until any of the package's compiled modules changes. numba watches only the file that
+a function stands in, but the loop has the kernels of other files compiled into it: after an upgrade or an edit of one
+of them it would go on with the old ones. The classes here make the first use short.
 """
 
 from __future__ import annotations
@@ -42,14 +43,14 @@ SWITCHED_OFF: bool = vars(numba)["config"].DISABLE_JIT  # numba's own switch: ev
 
 
 class Settings(Flags):
-    """A compilation's flags, compared as fast as its options are looked up.
+    """A compilation's flags, compared by what was set.
 
-    numba compares its own by asking each for all it has, 30 calls, and does it at every operation that it types:
-    their hash is the same for all.
+    numba compares its own by calling for every option there is, with all flags that it has seen, at each operation that
+    it types. Here what was set to its default is not the same as what was not set: one compilation more at most.
     """
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Flags) and self._values == other._values
+        return isinstance(other, Settings) and self._values == other._values
 
     def __hash__(self) -> int:
         return hash(frozenset(self._values))
@@ -79,10 +80,10 @@ class PartLibrary(JITCodeLibrary):
     numba would optimise each function on the way up and make machine code of it, with all that it calls, over again.
     """
 
-    by_itself = False  # whether it is optimised before it is linked, too
+    optimised_first = False  # before it is linked, too
 
     def _optimize_final_module(self) -> None:
-        if self.by_itself:
+        if self.optimised_first:
             super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
@@ -95,6 +96,7 @@ class PartLibrary(JITCodeLibrary):
 
     @property
     def codegen(self) -> PartLibrary:
+        """What numba would set the globals through (`set_env`), and asks for nothing else."""
         return self
 
     def set_env(self, name: str, environment: Any) -> None:
@@ -109,24 +111,24 @@ class PartCompiler(OwnCompiler):
         self.state.library = PartLibrary(self.state.targetctx.codegen(), "part")
 
 
-class ApartCompiler(PartCompiler):
+class DisjointCompiler(PartCompiler):
     """`pipeline_class` of a part whose array arguments never overlap where one is written.
 
     The compiler believes it, where it would else test all pairs of them at run time before each loop, and leave short
-    loops as they are.
+    loops as they are. Optimised by themselves first, since it makes less of it once they are in their callers.
     """
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         self.state.flags.noalias = True
-        self.state.library.by_itself = True
+        self.state.library.optimised_first = True
 
 
 # All said for every function: what is not said, numba takes from the caller that happens to compile a function first,
 # and leaves it on disk for all the others. Division is numpy's: Inf or NaN, which the callers look for. No references
 # to arrays are counted (`_nrt`), as they would be for each array that passes through a call or a tuple, one locked
-# instruction each: in a loop over samples more work than the arithmetic of a short control filter. Nothing here makes
-# an array; they are the caller's.
+# instruction each: in a loop over samples more work than the arithmetic of a short control filter. So nothing here may
+# make an array, nor hand a view of one back to Python, not in a tuple either: the whole array would come back.
 OPTIONS: dict[str, Any] = {
     "cache": True,
     "error_model": "numpy",
@@ -160,13 +162,16 @@ def _cache_file(dispatcher: Any) -> Any:
 def on_disk(dispatcher: Any) -> bool:
     """Whether something of a compiled function is kept on disk, and nothing is left to compile for a first use."""
     cache_file = _cache_file(dispatcher)
-    return cache_file is None or bool(cache_file._load_index())
+    try:
+        return cache_file is None or bool(cache_file._load_index())
+    except OSError:  # another process has it open
+        return False
 
 
 class Part(CPUDispatcher):
     """A function compiled into others, without the entry from Python that for small ones takes longest to make.
 
-    One is made where Python does call it, except for those so short that they are inlined as source.
+    One is made where Python does call it, except for those that are inlined as source: Python has them as they are.
     """
 
     _entry: Any = None
@@ -174,17 +179,17 @@ class Part(CPUDispatcher):
 
     def __call__(self, *args: Any) -> Any:
         if self._entry is None:
-            short = self._own_options.get("inline") == "always"
-            self._entry = self.py_func if short else compiled(**self._own_options)(self.py_func)
+            as_source = self._own_options.get("inline") == "always"
+            self._entry = self.py_func if as_source else compiled(**self._own_options)(self.py_func)
         return self._entry(*args)
 
 
-def part(*, apart: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def part(*, disjoint: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator: as `compiled`, for functions that mostly other compiled functions call.
 
-    `apart`: array arguments never overlap where one is written (`ApartCompiler`).
+    `disjoint`: array arguments never overlap where one is written (`DisjointCompiler`).
     """
-    compiler = ApartCompiler if apart else PartCompiler
+    compiler = DisjointCompiler if disjoint else PartCompiler
 
     def decorate(function: Callable[..., Any]) -> Any:
         dispatcher = compiled(no_cpython_wrapper=True, cache=False, pipeline_class=compiler, **options)(function)

@@ -49,14 +49,12 @@ AHEAD, COLUMNS, SCALED = 0, 1, 2  # of a CausalBlock: P h_k as far as h_k is kno
 
 
 def settle(cov: Covariance) -> None:
-    """Pay what is owed: P is the triangle."""
+    """Pay what is owed: P, in float64, is the triangle."""
     scale, diagonal, inverse_S, _ = cov.owed
     if scale != 1.0 or diagonal or inverse_S:
-        triangle = cov.triangle
-        triangle *= scale
-        G = np.zeros((len(triangle), 1), order="F")
+        G = np.zeros((len(cov.triangle), 1), order="F")
         G[: cov.product.size, 0] = np.sqrt(scale * inverse_S) * cov.gain_direction
-        downdate_by_columns(cov, G, diagonal)
+        downdate_by_columns(cov, G, diagonal, scale)
         cov.owed[:3] = 1.0, 0.0, 0.0
 
 
@@ -153,9 +151,9 @@ def _steps(cov, rows, state_noise, measurement_noise, alpha_sq, directions, S):
         copy_into(directions[k], cov.gain_direction)
 
 
-def downdate_by_columns(cov: Covariance, G: np.ndarray, diagonal: float) -> None:
-    """The settled P to P + diagonal I - G G'; G (n or more, m) by columns."""
-    dsyrk(-1.0, G, beta=1.0, c=cov.triangle.T, overwrite_c=1)
+def downdate_by_columns(cov: Covariance, G: np.ndarray, diagonal: float, scale: float = 1.0) -> None:
+    """The triangle T, in float64, to scale T + diagonal I - G G'; G (n or more, m) by columns."""
+    dsyrk(-1.0, G, beta=scale, c=cov.triangle.T, overwrite_c=1)
     diagonal_of = np.einsum("ii->i", cov.triangle)  # a view
     diagonal_of[: cov.product.size] += diagonal
 

@@ -41,7 +41,7 @@ def push(line, sample):
 
 @part(inline="always")
 def newest(line, taps):
-    """The newest `taps` samples, newest first, as a view."""
+    """The newest `taps` samples, newest first, as a view: inlined as source, since compiled code may not return one."""
     start = np.int64(line[START])
     return line[start : start + taps]
 

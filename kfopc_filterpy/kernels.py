@@ -28,7 +28,7 @@ SCALE, DIAGONAL, INVERSE_S, LAST_INVERSE_S = 0, 1, 2, 3
 # twice the precision: the first samples after a large initial variance.
 CANCELLATION = 1e3
 LINE = 64  # bytes in a cache line
-FIRST_COLUMN = np.int64(0)
+FIRST_COLUMN = np.int64(0)  # numpy's, since numba compiles a function anew for a plain one
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
 
@@ -107,12 +107,12 @@ def predict_covariance(cov, alpha_sq, state_noise):
     cov.owed[DIAGONAL] = alpha_sq * cov.owed[DIAGONAL] + state_noise
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True, disjoint=True)
 def four_rows(T0, T1, T2, T3, g0, g1, g2, g3, g, h, Ph, scale, i):
     """Rows i to i + 3 of `project_covariance` up to column i."""
     h0, h1 = h[i], h[i + 1]
     h2, h3 = h[i + 2], h[i + 3]
-    a0 = a1 = a2 = a3 = scale - scale
+    a0 = a1 = a2 = a3 = scale - scale  # zero in P's precision
     for j in range(i):
         p0 = scale * T0[j] - g0 * g[j]
         p1 = scale * T1[j] - g1 * g[j]

@@ -38,7 +38,7 @@ FOUR = 4  # taps of a path that go together
 KEPT_ERROR, KEPT_CONTROL, KEPT_AMPLIFIED, KEPT_ANTI_NOISE, KEPT_FACTOR, KEPT_POWER, KEPT_GAIN = range(7)
 SAFE = 1e290  # a correction below does not overflow weights that are finite
 
-# Where the rows of the lanes begin; numpy's integers, since numba compiles a function anew for each plain one.
+# Where the rows of the lanes begin, three that belong together in consecutive rows; numpy's integers, since numba compiles a function anew for each plain one.
 (
     STATUS,  # RUNNING, DIVERGED or REFUSED
     DONE,  # samples done
@@ -73,7 +73,7 @@ class SharedBlock(NamedTuple):
     references: np.ndarray  # (m, n or more) rows x(k), newest sample first
     rows: np.ndarray  # (m, n or more) rows x'(k)
     directions: np.ndarray  # (m, n or more) g_k = S_k K_k
-    largest: np.ndarray  # (m,) norm of g_k, which no magnitude in it exceeds
+    norms: np.ndarray  # (m,) of g_k, which no magnitude in it exceeds
     variances: np.ndarray  # (m,) S_k
 
 
@@ -133,7 +133,7 @@ def emit(weights, lanes, shared, begin, end, k):
             lanes[STATUS + i] = DIVERGED
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True, disjoint=True)
 def correct_two(w, v, a, b, g, x, h):
     """w += a g and v += b g; returns w'x, w'h, v'x, v'h. Each load of g, x and h serves two scenarios."""
     wx = wh = vx = vh = 0.0
@@ -166,7 +166,7 @@ def convolve(path, line, lanes, row, first):
         add_four_taps(lanes, row, s0, s1, s2, s3, line[k], line[k + 1], line[k + 2], line[k + 3])
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True, disjoint=True)
 def add_four_taps(lanes, row, s0, s1, s2, s3, y0, y1, y2, y3):
     """Four taps go together, or each sum would wait for the one before to come out of memory."""
     for i in range(LANES):
@@ -187,16 +187,16 @@ def receive(lanes, disturbance, sensor_noise, begin, end, n, k):
 @part(forceinline=True)
 def adapt(lanes, table, window, shared, begin, end, k):
     """Eq. 9-13 for the scenarios that run, as `loop.adapt_kalman`; their weights are corrected in the next pass."""
-    x, h, S, largest = shared.references[k, 0], shared.rows[k, 0], shared.variances[k], shared.largest[k]
+    x, h, S, norm = shared.references[k, 0], shared.rows[k, 0], shared.variances[k], shared.norms[k]
     if window is None:
         preview_lanes(lanes, h, x)
-        decide(lanes, h, x, S, largest)
+        decide(lanes, h, x, S, norm)
         commit_lanes(lanes)
     else:
         for i in range(end - begin):
             constraint = ConstraintState(table[begin + i], window[begin + i])
             lanes[NEXT_FACTOR + i] = preview_constraint(constraint, lanes[ESTIMATE + i], h, x)[0]
-        decide(lanes, h, x, S, largest)
+        decide(lanes, h, x, S, norm)
         for i in range(end - begin):
             if lanes[GOES_ON + i] > 0.0:
                 constraint = ConstraintState(table[begin + i], window[begin + i])
@@ -221,14 +221,14 @@ def preview_lanes(lanes, h, x):
 
 
 @part(forceinline=True)
-def decide(lanes, h, x, S, largest):
+def decide(lanes, h, x, S, norm):
     """Which scenarios run and can take the sample, what their weights are owed, and what is kept of it."""
     for i in range(LANES):
         d = lanes[ESTIMATE + i]
         y = lanes[NEXT_FACTOR + i] * d - lanes[PREDICTED + i]
         step = y / S
         running = lanes[STATUS + i] == RUNNING
-        safe = squares_are_finite(d, h, x) and abs(step) * largest < SAFE
+        safe = squares_are_finite(d, h, x) and abs(step) * norm < SAFE
         if running and not safe:
             lanes[STATUS + i] = REFUSED
         on = running and safe
@@ -242,7 +242,7 @@ def decide(lanes, h, x, S, largest):
 @part(forceinline=True)
 def commit_lanes(lanes):
     """`commit_constraint` of what `preview_lanes` found, where the scenario goes on."""
-    for row in range(0, 3 * LANES, LANES):  # of three each
+    for row in range(0, 3 * LANES, LANES):  # three each of means, samples taken, and what was last used
         for i in range(row, row + LANES):
             if lanes[GOES_ON - row + i] > 0.0:
                 lanes[MEAN_D + i] = lanes[NEXT_D + i]

@@ -63,7 +63,7 @@ def take_pairs(cov, rows, state_noise, measurement_noise, work, directions, S):
     return taken
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True, disjoint=True)
 def directions_alone(g, e, h, f, Ph, Pf, state_noise):
     """The directions as each would be without the other; h'g, f'e and f'g."""
     hg = fe = fg = 0.0
@@ -75,7 +75,7 @@ def directions_alone(g, e, h, f, Ph, Pf, state_noise):
     return hg, fe, fg
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True, disjoint=True)
 def second_direction(e, g, f, share):
     """e less its share of g; f'e."""
     fe = 0.0
@@ -85,7 +85,7 @@ def second_direction(e, g, f, share):
     return fe
 
 
-@part(forceinline=True, apart=True)
+@part(forceinline=True, disjoint=True)
 def scale_both(first, second, g, e, a, b):
     """Directions whose squares are the downdates."""
     for i in range(g.size):
@@ -133,7 +133,7 @@ def downdated(t, a, b, c, d):
     return t - a * b - c * d
 
 
-@part(fastmath=FAST, forceinline=True, apart=True)
+@part(fastmath=FAST, forceinline=True, disjoint=True)
 def take_four_rows(T0, T1, T2, T3, g, e, h, f, past_h, past_f, Ph, Pf, i, end):
     """Rows i to i + 3 of `downdate_and_project` up to column `end`; returns their sums over the columns."""
     g0, g1, g2, g3 = g[i], g[i + 1], g[i + 2], g[i + 3]

@@ -330,8 +330,8 @@ class _SharedGains:
             block.rows[:, :n] = self._filtered_rows[rows]
             advance = getattr(block, ADVANCE[self.kernel])
             variances = advance(self.state.covariance, *self.state.settings.tolist())
-            largest = np.sqrt(np.einsum("ij,ij->i", block.directions, block.directions))
-            yield first, SharedBlock(references, block.rows, block.directions, largest, variances)
+            norms = np.sqrt(np.einsum("ij,ij->i", block.directions, block.directions))
+            yield first, SharedBlock(references, block.rows, block.directions, norms, variances)
 
     def hand_back(
         self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios

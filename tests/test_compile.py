@@ -49,7 +49,7 @@ def test_cached_loop_notices_an_edited_kernel(tmp_path):
 
 
 def test_arrays_keep_their_references():
-    """No references are counted in compiled code: what Python holds before a call it holds after, no more, no less."""
+    """What Python holds before a call of compiled code it holds after, no more, no less."""
     x, state = np.ones(50), KFOPC.random_walk(4, state_noise=1e-6, measurement_noise=1.0).compiled_state()[0]
     counts = [sys.getrefcount(array) for array in (x, *state)]
     for _ in range(100):
@@ -60,14 +60,15 @@ def test_arrays_keep_their_references():
 
 
 @pytest.mark.skipif(SWITCHED_OFF, reason="numba's compiler is switched off")
-def test_flags_compare_as_numbas_do():
-    """As dictionary keys: the same options are the same, whatever their order, and others are not."""
+def test_flags_are_the_same_where_the_same_was_set():
+    """As dictionary keys, in whatever order; and never where numba's own comparison, of all values, finds a difference."""
     one, same, other = Settings(), Settings(), Settings()
     one.nrt, one.noalias = False, True
     same.noalias, same.nrt = True, False
     other.nrt, other.noalias = True, True
     assert one == same
     assert hash(one) == hash(same)
+    assert one.values() == same.values()
     assert one != other
     assert one.values() != other.values()
     assert one.copy() == one
