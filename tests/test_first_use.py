@@ -15,7 +15,7 @@ from kfopc_filterpy import _compile
 ROOT = Path(__file__).resolve().parents[1]
 NOTHING_LEFT = """
 import subprocess
-from comparisons import first_use, speed
+from comparisons import first_use
 from kfopc_filterpy._compile import on_disk
 from kfopc_filterpy.lockstep import run_block
 from kfopc_filterpy.loop import run
