@@ -110,12 +110,12 @@ def disturbance_estimate(controller, error):
 
 
 @part(forceinline=True)
-def adapt_kalman(controller, d, error, y_emitted, block):
+def adapt_kalman(controller, error, y_emitted, block):
     """Eq. 2-9 with the factor of eq. 10-13; False, with nothing changed, where the estimator would refuse the step.
 
-    `d` is the disturbance estimate, `y_emitted` the control signal of the sample; `block` is None, or open for the
-    samples to come (see `block`).
+    `y_emitted` is the control signal of the sample; `block` is None, or open for the samples to come (see `block`).
     """
+    d = disturbance_estimate(controller, error)
     w, x = controller.weights, latest(controller.reference)
     h = newest(controller.filtered, w.size)
     if not squares_are_finite(d, h[0], x):
@@ -183,13 +183,14 @@ def take_back(cov, scale, diagonal, inverse_S, alpha_sq, r):
 
 
 @part(forceinline=True)
-def adapt_lms(controller, d, error, y):
+def adapt_lms(controller, error, y):
     """One step of the filtered-reference LMS family (see `lms_rules`); `y` is the control signal that was emitted.
 
-    `d` is the disturbance estimate. False, with nothing changed, where the controller cannot go on.
+    False, with nothing changed, where the controller cannot go on.
     """
     if not fast_array_holds(controller.fast_array, newest(controller.filtered, controller.weights.size + 1)):
         return False
+    d = disturbance_estimate(controller, error)
     w = controller.weights
     xf, x = newest(controller.filtered, w.size), newest(controller.reference, w.size)
     if not squares_are_finite(d, xf[0], x[0]):
@@ -205,9 +206,9 @@ def adapt_lms(controller, d, error, y):
 
 
 @part(forceinline=True)
-def follow(controller, d):
-    """Take the sample, of disturbance estimate `d`, into the powers only."""
-    filtered, x = latest(controller.filtered), latest(controller.reference)
+def follow(controller, error):
+    """Take the sample into the powers only."""
+    d, filtered, x = disturbance_estimate(controller, error), latest(controller.filtered), latest(controller.reference)
     advance_constraint(controller.constraint, d, filtered, x)
     hear(controller.budget, x, filtered)
 
@@ -281,13 +282,12 @@ def run(controller, block, plant, signals, weights, limit, every, first, begin, 
         a = anti_noise(plant, y_amplified)
         e = signals[DISTURBANCE_IN, k] - a + signals[SENSOR_NOISE, k]
         signals[ERROR, k], signals[CONTROL, k] = e, y
-        d = disturbance_estimate(controller, e)
         if controller.kind == LMS:
-            if not adapt_lms(controller, d, e, y):
+            if not adapt_lms(controller, e, y):
                 return REFUSED, k
         elif controller.kind == LISTENING:
-            follow(controller, d)
-        elif not adapt_kalman(controller, d, e, y, block):
+            follow(controller, e)
+        elif not adapt_kalman(controller, e, y, block):
             return REFUSED, k
         signals[AMPLIFIED, k], signals[ANTI_NOISE, k] = y_amplified, a
         used = controller.constraint.table[LAST]

@@ -194,12 +194,13 @@ class FilteredReferenceController:
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""
         error = as_number(error, "error")
-        d = float(disturbance_estimate(self._state, error))
-        if not adapt_lms(self._state, d, error, self._y):
-            raise ValueError(self._refusal if self._squares_are_finite(d) else OVERFLOW)
+        if not adapt_lms(self._state, error, self._y):
+            raise ValueError(self._refusal if self._squares_are_finite(error) else OVERFLOW)
 
-    def _squares_are_finite(self, d: float) -> bool:
-        return bool(squares_are_finite(d, latest(self._state.filtered), latest(self._state.reference)))
+    def _squares_are_finite(self, error: float) -> bool:
+        state = self._state
+        d = disturbance_estimate(state, error)
+        return bool(squares_are_finite(d, latest(state.filtered), latest(state.reference)))
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
