@@ -73,11 +73,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if SPEED in options.studies:
         return _speed(parser, options)
     began = time.perf_counter()
-    compile_ahead()
     reports: list[StudyReport] = []
     chosen = {name: (STUDIES | FURTHER)[name] for name in options.studies or STUDIES}
     planned = sum(planned_runs() for _, planned_runs in chosen.values())
     with tqdm(total=planned, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
+        bar.set_description("compiling, at the first use")
+        compile_ahead()
         runs = Runs(bar)
         for name, (study, planned_runs) in chosen.items():
             bar.set_description(name)

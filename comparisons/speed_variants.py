@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,6 +17,7 @@ from kfopc_filterpy import KFOPC, MOVFxLMS, kf_opc, kf_pb, simulate, simulate_sc
 from kfopc_filterpy._compile import compiled
 from kfopc_filterpy.block import Block, CausalBlock, project_in_block, update_in_block
 from kfopc_filterpy.kernels import (
+    FAST,
     Covariance,
     new_covariance,
     predict_covariance,
@@ -104,7 +104,7 @@ def _rows_known(taps: int, how: str) -> Work:
     return run, samples
 
 
-@numba.njit(error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+@compiled(fastmath=FAST)
 def _correct_in_turn(w, rows, directions, S, d):
     for k in range(d.size):
         y = d[k]

@@ -38,7 +38,8 @@ FOUR = 4  # taps of a path that go together
 KEPT_ERROR, KEPT_CONTROL, KEPT_AMPLIFIED, KEPT_ANTI_NOISE, KEPT_FACTOR, KEPT_POWER, KEPT_GAIN = range(7)
 SAFE = 1e290  # a correction below does not overflow weights that are finite
 
-# Where the rows of the lanes begin, three that belong together in consecutive rows; numpy's integers, since numba compiles a function anew for each plain one.
+# Where the rows of the lanes begin, three that belong together in consecutive rows; numpy's integers, since numba
+# compiles a function anew for each plain one.
 (
     STATUS,  # RUNNING, DIVERGED or REFUSED
     DONE,  # samples done
