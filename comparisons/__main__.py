@@ -10,10 +10,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from . import amplifier, broadband, constraint, duct, mismatch, power_budget, tonal, tracking
-from .first_use import compile_ahead
-from .report import StudyReport, prepare_folder, results_table, write_report
-from .scene import Runs
+from kfopc_filterpy.bench.report import StudyReport, prepare_folder, results_table, write_report
+from kfopc_filterpy.bench.scene import Runs
+
+from .speed.first_use import compile_ahead
+from .studies import amplifier, broadband, constraint, duct, mismatch, power_budget, tonal, tracking
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
 SPEED, SWEEP = "speed", "sweep"
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the studies named, all by default; write report.html, results.json, figures and audio into a folder."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments[:1] == [SWEEP]:
-        from . import sweep_command
+        from .sweep import command as sweep_command
 
         return sweep_command.main(arguments[1:])
     parser = argparse.ArgumentParser(
@@ -105,7 +106,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _speed(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
     if find_spec("threadpoolctl") is None:
         parser.error('speed needs the extra bench: python -m pip install -c constraints.txt -e ".[bench]"')
-    from . import speed
+    from .speed import study as speed
 
     return speed.main(options.output, options.quiet)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.metadata
 import importlib.resources
 import re
@@ -60,14 +61,17 @@ def test_import_leaves_heavy_modules_for_later_and_warns_of_nothing(statement):
     assert run.stdout.split() == [], f"{statement} loads {run.stdout.strip()}"
 
 
-@pytest.mark.parametrize("name", kfopc_filterpy.__all__)
-def test_public_names_resolve_and_are_listed(name):
-    assert getattr(kfopc_filterpy, name) is not None
-    assert name in dir(kfopc_filterpy)
+NAMESPACES = ("", ".filters", ".power", ".controllers", ".paths", ".signals", ".bounds", ".metrics", ".plot")
 
 
-def test_public_names_are_listed_once():
-    assert len(set(kfopc_filterpy.__all__)) == len(kfopc_filterpy.__all__)
+@pytest.mark.parametrize("namespace", NAMESPACES)
+def test_public_names_resolve_and_are_listed_once(namespace):
+    module = importlib.import_module(f"kfopc_filterpy{namespace}")
+    assert module.__all__
+    assert len(set(module.__all__)) == len(module.__all__)
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+        assert name in dir(module)
 
 
 def test_unknown_name_raises_attribute_error():

@@ -9,60 +9,55 @@ from typing import Any
 
 import kfopc_filterpy
 
-FIGURES = ("plotting", "path_plots")  # modules of figures, public as a whole
 NOT_OURS = "KalmanFilter,tuple,Protocol,Exception"  # bases whose members are described elsewhere
+NAMESPACES = ("", "filters", "power", "controllers", "paths", "signals", "bounds", "metrics", "plot")
 
 
-def module_of(name: str) -> str:
-    """Module, within the package, in which a public name is defined."""
-    return getattr(kfopc_filterpy, name).__module__.removeprefix("kfopc_filterpy.")
+def names_of(namespace: str) -> list[str]:
+    """Return the public names of a namespace ("" is the package itself) that no namespace before it has."""
+    module = importlib.import_module(f"kfopc_filterpy.{namespace}") if namespace else kfopc_filterpy
+    names = [name for name in module.__all__ if not inspect.ismodule(getattr(module, name))]
+    return sorted((name for name in names if not namespace or name not in kfopc_filterpy.__all__), key=str.lower)
+
+
+def public_names() -> list[str]:
+    """Return every public name, dotted from the package on."""
+    return [f"{space}.{name}" if space else name for space in NAMESPACES for name in names_of(space)]
+
+
+def thing_of(name: str) -> Any:
+    """Return what a dotted public name stands for."""
+    space, _, last = name.rpartition(".")
+    return getattr(importlib.import_module(f"kfopc_filterpy.{space}") if space else kfopc_filterpy, last)
 
 
 def summary(thing: Any) -> str:
-    """First line of a docstring."""
+    """Return the first line of a docstring."""
     return (inspect.getdoc(thing) or "").split("\n")[0]
 
 
 def name_page(name: str) -> str:
-    """Page of one public name."""
+    """Return the page of one public name."""
     heading = f"{name}\n{'=' * len(name)}\n\n"
-    if inspect.isclass(getattr(kfopc_filterpy, name)):
+    if inspect.isclass(thing_of(name)):
         options = f"   :members:\n   :inherited-members: {NOT_OURS}\n"
         return f"{heading}.. autoclass:: kfopc_filterpy.{name}\n{options}"
     return f"{heading}.. autofunction:: kfopc_filterpy.{name}\n"
 
 
-def figure_page(module: str) -> str:
-    """Page of a module of figures."""
-    name = f"kfopc_filterpy.{module}"
-    members = figure_names(module)
-    described = "".join(f".. autofunction:: {name}.{member}\n\n" for member in members)
-    return f"{name}\n{'=' * len(name)}\n\n.. automodule:: {name}\n   :no-members:\n\n{described}"
-
-
-def figure_names(module: str) -> list[str]:
-    """Functions of a module of figures."""
-    content = importlib.import_module(f"kfopc_filterpy.{module}")
-    names = getattr(content, "__all__", None)
-    return list(names or sorted(name for name in vars(content) if name.startswith("plot_")))
-
-
 def index_page() -> str:
-    """Table of all public names, by the modules that define them."""
-    modules: dict[str, list[str]] = {}
-    for name in kfopc_filterpy.__all__:
-        modules.setdefault(module_of(name), []).append(name)
+    """Return the table of all public names, by namespace."""
     title = "Every public name"
-    lines = [title, "=" * len(title), "", "All but the figures are imported from ``kfopc_filterpy`` itself.", ""]
-    for module in sorted(modules):
-        content = importlib.import_module(f"kfopc_filterpy.{module}")
-        lines += [module, "-" * len(module), "", summary(content), "", ".. list-table::", "   :widths: 30 70", ""]
-        for name in sorted(modules[module]):
-            lines += [f"   * - :doc:`{name} <{name}>`", f"     - {summary(getattr(kfopc_filterpy, name))}"]
+    lines = [title, "=" * len(title), ""]
+    for space in NAMESPACES:
+        full = f"kfopc_filterpy.{space}" if space else "kfopc_filterpy"
+        lines += [full, "-" * len(full), "", summary(importlib.import_module(full)), ""]
+        lines += [".. list-table::", "   :widths: 35 65", ""]
+        for name in names_of(space):
+            dotted = f"{space}.{name}" if space else name
+            lines += [f"   * - :doc:`{name} <{dotted}>`", f"     - {summary(thing_of(dotted))}"]
         lines.append("")
-    lines += ["Figures", "-------", "", *(f"- :doc:`{module}`" for module in FIGURES), ""]
-    entries = [*sorted(kfopc_filterpy.__all__, key=str.lower), *FIGURES]
-    return "\n".join([*lines, ".. toctree::", "   :hidden:", "", *(f"   {entry}" for entry in entries), ""])
+    return "\n".join([*lines, ".. toctree::", "   :hidden:", "", *(f"   {name}" for name in public_names()), ""])
 
 
 def write_pages(app: Any) -> None:
@@ -70,10 +65,9 @@ def write_pages(app: Any) -> None:
     folder = Path(app.srcdir) / "reference"
     folder.mkdir(exist_ok=True)
     pages = {"index": index_page()}
-    pages |= {name: name_page(name) for name in kfopc_filterpy.__all__}
-    pages |= {module: figure_page(module) for module in FIGURES}
+    pages |= {name: name_page(name) for name in public_names()}
     for path in folder.glob("*.rst"):
-        if path.stem not in pages:
+        if path.name.removesuffix(".rst") not in pages:
             path.unlink()
     for stem, text in pages.items():
         path = folder / f"{stem}.rst"
@@ -86,7 +80,7 @@ def require_all(app: Any, env: Any) -> None:
     from sphinx.util import logging
 
     described = {name for name, *_ in env.get_domain("py").get_objects()}
-    for name in kfopc_filterpy.__all__:
+    for name in public_names():
         if f"kfopc_filterpy.{name}" not in described:
             logging.getLogger(__name__).warning("the reference lacks kfopc_filterpy.%s", name)
 

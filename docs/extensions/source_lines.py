@@ -1,6 +1,6 @@
 """The package's source as pages with numbered lines, and links to lines that are found by what stands there.
 
-The role ``{line}`kernels: S = x + q` `` links to the one line of ``kfopc_filterpy/kernels.py`` that holds the text. A
+The role ``{line}`kernels: S = x + q` `` links to the one line of ``kfopc_filterpy/kernels/covariance.py`` that holds the text. A
 text that is in no line, or in several, is a warning: a page cannot go on pointing at code that has moved or changed.
 """
 

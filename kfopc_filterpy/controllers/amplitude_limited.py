@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 from .._validate import as_positive
-from ..limiter import OutputLimiter
-from ..lms_rules import CLIPPING, FACTOR, RESCALING, TWO_GRADIENT, lms_settings
+from ..power.limiter import OutputLimiter
 from .fxlms import LMSController
+from .lms_rules import CLIPPING, FACTOR, RESCALING, TWO_GRADIENT, lms_settings
 
 
 class _AmplitudeLimited(LMSController):

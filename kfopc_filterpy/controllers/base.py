@@ -8,13 +8,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .._validate import as_count, as_number, as_signal
-from ..amplifiers import Amplifier, LinearAmplifier, compiled_parameters
-from ..block import OpenBlock
-from ..constraint import OutputPowerConstraint
-from ..delay_lines import delay_line, latest, newest
-from ..kernels import new_covariance
-from ..limiter import OutputLimiter
-from ..loop import (
+from ..kernels.block import OpenBlock
+from ..kernels.covariance import new_covariance
+from ..kernels.delay_lines import delay_line, latest, newest
+from ..loop.run import (
     DISTURBANCE_IN,
     LISTENING,
     REFERENCE_IN,
@@ -29,7 +26,10 @@ from ..loop import (
     run,
     squares_are_finite,
 )
-from ..paths import is_system, path_taps, sampling_rate
+from ..paths.models import is_system, path_taps, sampling_rate
+from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_parameters
+from ..power.constraint import OutputPowerConstraint
+from ..power.limiter import OutputLimiter
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "

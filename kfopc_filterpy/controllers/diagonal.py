@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_nonnegative
-from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S
-from ..limiter import OutputLimiter
-from ..lms_rules import MEASUREMENT_NOISE, PLAIN, STATE_NOISE, lms_settings
-from ..loop import LMS
+from ..loop.run import LMS
+from ..power.amplifiers import Amplifier
+from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S
+from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController, constraint_or_none
+from .lms_rules import MEASUREMENT_NOISE, PLAIN, STATE_NOISE, lms_settings
 
 
 class DiagonalKalman(FilteredReferenceController):

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_positive
-from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S
-from ..delay_lines import delay_line
-from ..fast_array import FORGETTING, new_fast_array
-from ..limiter import OutputLimiter
-from ..lms_rules import PLAIN, lms_settings
-from ..loop import LMS, ControllerState
+from ..kernels.delay_lines import delay_line
+from ..loop.run import LMS, ControllerState
+from ..power.amplifiers import Amplifier
+from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S
+from ..power.limiter import OutputLimiter
+from .array_steps import FORGETTING, new_fast_array
 from .base import FilteredReferenceController, constraint_or_none
+from .lms_rules import PLAIN, lms_settings
 
 
 class FastArrayKalman(FilteredReferenceController):
@@ -64,7 +64,7 @@ class FastArrayKalman(FilteredReferenceController):
     References
     ----------
     R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control",
-    Int. J. Adapt. Control Signal Process. 19, 2005; derived in `kfopc_filterpy.fast_array`.
+    Int. J. Adapt. Control Signal Process. 19, 2005; derived in `kfopc_filterpy.controllers.array_steps`.
 
     Examples
     --------

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from .._validate import as_positive
-from ..amplifiers import Amplifier
-from ..constraint import OutputPowerConstraint
-from ..limiter import OutputLimiter
-from ..lms_rules import FACTOR, LIMIT, NORMALISED, PLAIN, STEP_SIZE, further_rules, lms_settings
-from ..loop import LMS
+from ..loop.run import LMS
+from ..power.amplifiers import Amplifier
+from ..power.constraint import OutputPowerConstraint
+from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController
+from .lms_rules import FACTOR, LIMIT, NORMALISED, PLAIN, STEP_SIZE, further_rules, lms_settings
 
 
 class LMSController(FilteredReferenceController):

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_positive
-from ..amplifiers import Amplifier
-from ..estimator import KFOPC
-from ..limiter import OutputLimiter
+from ..filters.kfopc import KFOPC
+from ..power.amplifiers import Amplifier
+from ..power.limiter import OutputLimiter
 from .kalman import KalmanController
 
 

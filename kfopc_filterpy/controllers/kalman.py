@@ -9,16 +9,16 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from .._validate import as_count, as_number
-from ..amplifiers import Amplifier
-from ..block import CausalBlock, OpenBlock
-from ..constraint import OutputPowerConstraint
-from ..delay_lines import latest, newest
-from ..estimator import KFOPC
-from ..limiter import OutputLimiter
-from ..loop import KALMAN, ControllerState, control_signal, disturbance_estimate
-from ..power_budget import PowerBudget
-from ..power_budget_filter import PowerBudgetKalmanFilter
-from ..random_walk import RandomWalkKFOPC
+from ..filters.kfopc import KFOPC
+from ..filters.power_budget import PowerBudgetKalmanFilter
+from ..filters.random_walk import RandomWalkKFOPC
+from ..kernels.block import CausalBlock, OpenBlock
+from ..kernels.delay_lines import latest, newest
+from ..loop.run import KALMAN, ControllerState, control_signal, disturbance_estimate
+from ..power.amplifiers import Amplifier
+from ..power.budget import PowerBudget
+from ..power.constraint import OutputPowerConstraint
+from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController
 
 

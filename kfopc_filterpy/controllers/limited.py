@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..limiter import OutputLimiter
+from ..power.limiter import OutputLimiter
 from .base import Controller, FilteredReferenceController, require_rates
 
 

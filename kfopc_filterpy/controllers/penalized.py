@@ -9,10 +9,11 @@ import math
 from typing import Any
 
 from .._validate import as_nonnegative, as_positive
-from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
-from ..limiter import OutputLimiter
-from ..lms_rules import (
+from ..power.amplifiers import Amplifier
+from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..power.limiter import OutputLimiter
+from .fxlms import LMSController
+from .lms_rules import (
     FACTOR,
     LEAK,
     MODIFIED,
@@ -23,7 +24,6 @@ from ..lms_rules import (
     further_rules,
     lms_settings,
 )
-from .fxlms import LMSController
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
@@ -60,7 +60,7 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
 
     Examples
     --------
-    >>> from kfopc_filterpy import penalty_factor
+    >>> from kfopc_filterpy.controllers import penalty_factor
     >>> penalty_factor(0.25, disturbance_power=4.0, secondary_path_gain=1.0)  # a quarter of the amplitude is left
     3.0
     """
@@ -103,7 +103,7 @@ def leak_factor(
 
     Examples
     --------
-    >>> from kfopc_filterpy import leak_factor
+    >>> from kfopc_filterpy.controllers import leak_factor
     >>> leak_factor(0.25, disturbance_power=4.0, secondary_path_gain=1.0, reference_power=2.0)
     6.0
     """

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 from .._validate import as_choice, as_number, as_positive
-from ..amplifiers import Amplifier
-from ..constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
-from ..delay_lines import latest, newest
-from ..estimator import KFOPC
-from ..limiter import OutputLimiter
-from ..loop import ControllerState, disturbance_estimate
-from ..random_walk import RandomWalkKFOPC
-from ..repairs import advance_repair, gain_samples, measurement_factor, new_repair
+from ..filters.kfopc import KFOPC
+from ..filters.random_walk import RandomWalkKFOPC
+from ..kernels.delay_lines import latest, newest
+from ..loop.run import ControllerState, disturbance_estimate
+from ..power.amplifiers import Amplifier
+from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..power.limiter import OutputLimiter
 from .kalman import KalmanController
+from .repairs import advance_repair, gain_samples, measurement_factor, new_repair
 
 DEFAULT_TRIM_S = 1.0
 

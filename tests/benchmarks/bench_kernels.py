@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from comparisons.speed_variants import OURS
+from comparisons.speed.variants import OURS
 
 
 @pytest.mark.parametrize("taps", [64, 256, 512])

@@ -1,0 +1,279 @@
+"""`python -m comparisons speed`: what a sample costs, against the machine's limit and against other filters.
+
+The limit is 3 L^2 flops at the rate of a matrix product (dgemm, 384 x 384, best of 20), one BLAS thread. The probe and
+all variants take turns, and of each the best time counts: what other work the machine has falls on all alike.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import variants
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TAPS = (32, 64, 128, 256, 512, 1024)
+ROUNDS = 8
+PROBE_SIZE, PROBE_TIMES = 384, 20
+TURN_S = 0.05  # a variant's turn, about as long as the probe's
+REAL_TIME_FS = (16000.0, 48000.0)
+WORST_TAPS = (128, 256, 512)
+WORST_SAMPLES = 1_000_000
+FIRST_USES, FIRST_USE_TIMES = ("alone", "together", "compile_ahead"), 3  # of `first_use`; the shortest counts
+# Above these taps a variant would take minutes or gigabytes, and the trend is plain.
+LARGEST = {"pykalman": 512, f"closed loop, each of {variants.SCENARIOS} KF-OPC": 512}
+NEEDS = {
+    "statsmodels": "statsmodels",
+    "pykalman": "pykalman",
+    "padasip RLS": "padasip",
+    "pyroomacoustics RLS": "pyroomacoustics",
+}
+OTHER_RECURSIONS = ("padasip RLS", "pyroomacoustics RLS")
+FIRST_USE = """
+import time
+from comparisons.speed.first_use import {name}
+def seconds():
+    began = time.perf_counter()
+    {name}()
+    return time.perf_counter() - began
+print(seconds() - seconds())
+"""
+
+
+def seconds(work: Callable[[], Any]) -> float:
+    """Time of one call."""
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def shortest(work: Callable[[], Any]) -> float:
+    """Best time of a turn: as many calls as the probe has where they are short, one where they are long."""
+    best, spent, calls = np.inf, 0.0, 0
+    while calls == 0 or (spent < TURN_S and calls < PROBE_TIMES):
+        took = seconds(work)
+        best, spent, calls = min(best, took), spent + took, calls + 1
+    return best
+
+
+def dgemm_probe() -> Callable[[], float]:
+    """A function that gives the rate of a matrix product in GFLOP/s, the best of some."""
+    from scipy.linalg.blas import dgemm
+
+    a = np.asfortranarray(np.random.default_rng(0).standard_normal((PROBE_SIZE, PROBE_SIZE)))
+    flops = 2 * PROBE_SIZE**3
+    return lambda: max(flops / seconds(lambda: dgemm(1.0, a, a)) for _ in range(PROBE_TIMES)) / 1e9
+
+
+def chosen_variants(taps: int) -> dict[str, Callable[[int], variants.Work]]:
+    """All variants for a number of taps whose packages are installed."""
+    every = variants.OURS | variants.PEERS
+    return {
+        name: make
+        for name, make in every.items()
+        if taps <= LARGEST.get(name, taps) and (name not in NEEDS or find_spec(NEEDS[name]))
+    }
+
+
+def measure(taps: int, rounds: int = ROUNDS, tick: Callable[[], Any] = lambda: None) -> tuple[float, dict[str, float]]:
+    """dgemm rate in GFLOP/s and microseconds a sample of each variant: the best of some rounds, taken in turns."""
+    probe, works = dgemm_probe(), {name: make(taps) for name, make in chosen_variants(taps).items()}
+    rate, best = 0.0, dict.fromkeys(works, np.inf)
+    for _ in range(rounds):
+        for name, (work, samples) in works.items():
+            best[name] = min(best[name], shortest(work) / samples * 1e6)
+        rate = max(rate, probe())
+        tick()
+    return rate, best
+
+
+def rows_of(taps: int, rate: float, best: dict[str, float]) -> list[dict[str, Any]]:
+    """Rows of speed.json."""
+    limit = 3 * taps**2 / rate / 1e3
+    return [
+        {
+            "variant": name,
+            "taps": taps,
+            "us_per_sample": us,
+            "limit_fraction": limit / us,
+            "times_filterpy": best["filterpy"] / us,
+            "times_numpy": best["numpy rank-1"] / us,
+        }
+        for name, us in best.items()
+    ]
+
+
+def worst_sample(taps: int, samples: int = WORST_SAMPLES) -> dict[str, float]:
+    """Longest and usual time of one sample of the streaming kernel, called from Python sample by sample."""
+    from kfopc_filterpy.kernels.covariance import predict_covariance, project_covariance, update_weights
+
+    cov, w = variants.filter_state(taps)
+    x = variants.signal(taps, 4096)
+    times = np.empty(samples)
+    clock = time.perf_counter_ns
+    for k in range(-10, samples):
+        h = x[k % 4096 : k % 4096 + taps]
+        began = clock()
+        predict_covariance(cov, 1.0, variants.R)
+        S = project_covariance(cov, h) + variants.Q
+        update_weights(cov, w, h, 1.0, S, variants.Q)
+        if k >= 0:
+            times[k] = clock() - began
+    usual, rare = np.percentile(times, (50, 99.99)) / 1e3
+    return {"taps": taps, "median_us": float(usual), "percentile_99_99_us": float(rare), "worst_us": times.max() / 1e3}
+
+
+def first_samples_us(taps: int) -> float:
+    """Usual time of the samples after a large P(0|0), here 1 with q = 1e-3, whose downdate is done carefully."""
+    kf = variants.KFOPC.random_walk(taps, state_noise=variants.R, measurement_noise=1e-3)
+    x = variants.signal(taps, 60)
+    times = []
+    for k in range(60):
+        kf.predict()
+        began = time.perf_counter()
+        kf.update(1.0, H=x[k : k + taps])
+        times.append(time.perf_counter() - began)
+    return float(np.median(times[10:]) * 1e6)
+
+
+def first_use_s(name: str) -> float:
+    """Seconds that a function of `first_use` takes longer the first time, where nothing has been compiled yet."""
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        command = [sys.executable, "-c", FIRST_USE.format(name=name)]
+        ran = subprocess.run(command, env=environment, capture_output=True, text=True)
+    if ran.returncode:
+        raise RuntimeError(f"the first run failed: {ran.stderr}")
+    return float(ran.stdout)
+
+
+def real_time_taps(rows: list[dict[str, Any]], name: str, fs: float) -> int | None:
+    """Most taps timed at which a sample of a variant is over before the next."""
+    fits = [row["taps"] for row in rows if row["variant"] == name and row["us_per_sample"] < 1e6 / fs]
+    return max(fits, default=None)
+
+
+def figure(result: dict[str, Any]) -> Figure:
+    """Cost against taps, both logarithmic."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(8.5, 5.5), layout="constrained")
+    ax = drawing.subplots()
+    rows = result["rows"]
+    for name in dict.fromkeys(row["variant"] for row in rows):
+        taps, us = zip(*[(r["taps"], r["us_per_sample"]) for r in rows if r["variant"] == name], strict=True)
+        ours = name in variants.OURS
+        ax.loglog(taps, us, "o-" if ours else "s:", lw=1.8 if ours else 1.0, ms=4, label=name)
+    limit = [3 * n**2 / result["dgemm_gflops"] / 1e3 for n in TAPS]
+    ax.loglog(TAPS, limit, "k--", lw=1.0, label="3 L² flops at the rate of dgemm")
+    for fs in REAL_TIME_FS:
+        ax.axhline(1e6 / fs, color="0.6", lw=0.8)
+        ax.annotate(f"real time\nat {fs / 1e3:g} kHz", (TAPS[0] / 1.9, 1e6 / fs), va="bottom", fontsize=8, color="0.3")
+    ax.set_xlim(left=TAPS[0] / 2)  # room for these labels beside the data
+    ax.set(xlabel="taps L of the control filter", ylabel="time a sample (µs)", xticks=TAPS, xticklabels=TAPS)
+    ax.minorticks_off()
+    ax.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    ax.grid(alpha=0.3)
+    return drawing
+
+
+def table(result: dict[str, Any]) -> str:
+    """What was measured, for the terminal."""
+    rows = result["rows"]
+    lines = [f"{'µs a sample':32}" + "".join(f"{n:>10}" for n in TAPS)]
+    cell = {(row["variant"], row["taps"]): row for row in rows}
+    names = list(dict.fromkeys(row["variant"] for row in rows))
+    for title, key, form in (
+        ("", "us_per_sample", "{:.4g}"),
+        ("of the limit (3 L² flops at dgemm)", "limit_fraction", "{:.0%}"),
+        ("times as fast as filterpy", "times_filterpy", "{:.3g}"),
+        ("times as fast as numpy rank-1", "times_numpy", "{:.3g}"),
+    ):
+        lines += [f"\n{title}"] if title else []
+        for name in names:
+            shown = (form.format(cell[name, n][key]) if (name, n) in cell else "-" for n in TAPS)
+            lines.append(f"{name:32}" + "".join(f"{text:>10}" for text in shown))
+    return "\n".join(lines)
+
+
+def remarks(result: dict[str, Any]) -> list[str]:
+    """What the table does not say."""
+    rows = result["rows"]
+    us = {(row["variant"], row["taps"]): row["us_per_sample"] for row in rows}
+    shared = f"closed loop, each of {variants.SCENARIOS} KF-OPC"
+    real_time = (
+        f"{name} at {fs / 1e3:g} kHz: {real_time_taps(rows, name, fs)}"
+        for name in ("streaming kernel", "closed loop, KF-OPC", "filterpy API of KFOPC", "filterpy")
+        for fs in REAL_TIME_FS
+    )
+    missing = [name for name in variants.PEERS if (name, TAPS[0]) not in us]
+    burst = 3 * 256**2 * variants.BLOCK_SIZE / result["dgemm_gflops"] / 1e3
+    return [
+        f"dgemm, one thread: {result['dgemm_gflops']:.1f} GFLOP/s.",
+        f"Most taps timed that run in real time, {'; '.join(real_time)}.",
+        f"The closed loop at 128 taps costs {us['closed loop, KF-OPC', 128] / us['streaming kernel', 128]:.2f} times its "
+        "filter's update.",
+        f"KF-PB costs {us['closed loop, KF-PB', 256] / us['closed loop, KF-OPC', 256]:.2f} times KF-OPC at 256 taps.",
+        f"{variants.SCENARIOS} scenarios that share gains, at 256 taps: "
+        f"{us['closed loop, KF-OPC', 256] / us[shared, 256]:.1f} times cheaper than as many runs.",
+        f"The causal block kernel puts its work off to the change of blocks ({variants.BLOCK_SIZE} samples): a burst of "
+        f"{burst:.0f} µs or more at 256 taps.",
+        *(
+            f"One sample of the streaming kernel, called from Python, {w['taps']} taps, {WORST_SAMPLES:,} samples: "
+            f"median {w['median_us']:.1f} µs, 99.99 % within {w['percentile_99_99_us']:.1f} µs, worst "
+            f"{w['worst_us']:.0f} µs (the operating system's part in it included). While S/q exceeds 1e3, after a large "
+            f"P(0|0): {w['first_samples_us']:.0f} µs."
+            for w in result["worst_sample"]
+        ),
+        "First use, nothing compiled yet: {alone:.1f} s for `simulate`, {together:.1f} s for `simulate_scenarios`, "
+        "{compile_ahead:.1f} s for the studies, which have both compiled at once.".format(**result["first_use_s"]),
+        f"{' and '.join(OTHER_RECURSIONS)}: another recursion, with forgetting in place of state noise.",
+        *([f"Not installed, left out: {', '.join(missing)}; they come with the extra bench."] if missing else []),
+    ]
+
+
+def main(folder: Path, quiet: bool = False) -> int:
+    """Measure, print, and write speed.json and speed.png into a folder."""
+    from textwrap import fill
+
+    from threadpoolctl import threadpool_limits
+    from tqdm import tqdm
+
+    rates, rows = [], []
+    with (
+        threadpool_limits(1),
+        tqdm(total=len(TAPS) * ROUNDS + len(WORST_TAPS) + len(FIRST_USES), disable=quiet, unit="round") as bar,
+    ):
+        for taps in TAPS:
+            bar.set_description(f"speed, {taps} taps")
+            rate, best = measure(taps, tick=bar.update)
+            rates.append(rate)
+            rows += rows_of(taps, rate, best)
+        worst = []
+        for taps in WORST_TAPS:
+            bar.set_description(f"speed, worst of {WORST_SAMPLES:,} samples, {taps} taps")
+            worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
+            bar.update()
+        first_use = {}
+        for name in FIRST_USES:
+            bar.set_description(f"speed, first use, {name}")
+            first_use[name] = min(first_use_s(name) for _ in range(FIRST_USE_TIMES))
+            bar.update()
+    result = {"dgemm_gflops": max(rates), "rows": rows, "worst_sample": worst, "first_use_s": first_use}
+    (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
+    figure(result).savefig(folder / "speed.png", dpi=150)
+    print(table(result), "", *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)), sep="\n")
+    print(f"\n{folder / 'speed.json'} and speed.png written")
+    return 0

@@ -1,0 +1,1 @@
+"""Sweeps: the Monte-Carlo engine."""

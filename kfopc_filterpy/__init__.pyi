@@ -1,0 +1,95 @@
+from . import (
+    bounds as bounds,
+)
+from . import (
+    controllers as controllers,
+)
+from . import (
+    filters as filters,
+)
+from . import (
+    metrics as metrics,
+)
+from . import (
+    paths as paths,
+)
+from . import (
+    plot as plot,
+)
+from . import (
+    power as power,
+)
+from . import (
+    signals as signals,
+)
+from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
+from .controllers.amplitude_limited import (
+    ClippingFxLMS as ClippingFxLMS,
+)
+from .controllers.amplitude_limited import (
+    RescalingFxLMS as RescalingFxLMS,
+)
+from .controllers.amplitude_limited import (
+    TwoGradientFxLMS as TwoGradientFxLMS,
+)
+from .controllers.diagonal import DiagonalKalman as DiagonalKalman
+from .controllers.fast_array import FastArrayKalman as FastArrayKalman
+from .controllers.fxlms import FxLMS as FxLMS
+from .controllers.fxlms import FxNLMS as FxNLMS
+from .controllers.fxrls import fx_rls as fx_rls
+from .controllers.kalman import (
+    KalmanController as KalmanController,
+)
+from .controllers.kalman import (
+    kf_anc as kf_anc,
+)
+from .controllers.kalman import (
+    kf_opc as kf_opc,
+)
+from .controllers.kalman import (
+    kf_pb as kf_pb,
+)
+from .controllers.limited import LimitedController as LimitedController
+from .controllers.penalized import (
+    LeakyFxLMS as LeakyFxLMS,
+)
+from .controllers.penalized import (
+    MOVFxLMS as MOVFxLMS,
+)
+from .controllers.penalized import (
+    OptimalLeakyFxLMS as OptimalLeakyFxLMS,
+)
+from .controllers.repaired import kf_opc_repaired as kf_opc_repaired
+from .filters.kfopc import KFOPC as KFOPC
+from .loop.scenarios import simulate_scenarios as simulate_scenarios
+from .loop.simulation import SimulationResult as SimulationResult
+from .loop.simulation import simulate as simulate
+from .metrics import (
+    clipped_fraction as clipped_fraction,
+)
+from .metrics import (
+    convergence_time_s as convergence_time_s,
+)
+from .metrics import (
+    noise_reduction_db as noise_reduction_db,
+)
+from .metrics import (
+    nse_db as nse_db,
+)
+from .metrics import (
+    output_power as output_power,
+)
+from .paths.models import bandpass_path as bandpass_path
+from .power.amplifiers import (
+    HardClipAmplifier as HardClipAmplifier,
+)
+from .power.amplifiers import (
+    LinearAmplifier as LinearAmplifier,
+)
+from .power.amplifiers import (
+    SoftSaturationAmplifier as SoftSaturationAmplifier,
+)
+from .power.constraint import OutputPowerConstraint as OutputPowerConstraint
+from .power.limiter import OutputLimiter as OutputLimiter
+
+__version__: str

@@ -1,0 +1,1 @@
+"""What studies and sweeps share: scenes, the registry of algorithms, the tuning rule, reports."""

@@ -1,0 +1,181 @@
+"""The writer of the report: a page, figures, sounds, results.json, and a table for the terminal."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import tempfile
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+
+from kfopc_filterpy.plot import save_figure
+from kfopc_filterpy.signals.recordings import write_wav
+
+from .items import (
+    COLUMNS,
+    FIGURES_OF_MERIT,
+    FigureItem,
+    Parameter,
+    Sound,
+    StudyReport,
+    Table,
+    Verdict,
+    cells,
+    count_of_claims,
+    figure_file,
+    loudness,
+    require_different,
+    sound_file,
+    table_file,
+)
+from .page import page
+
+__all__ = [
+    "FIGURES_OF_MERIT",
+    "FigureItem",
+    "Parameter",
+    "Sound",
+    "StudyReport",
+    "Table",
+    "Verdict",
+    "prepare_folder",
+    "results_table",
+    "write_report",
+]
+
+
+def prepare_folder(folder: str | os.PathLike[str]) -> Path:
+    """Make a folder where it is missing, and see that it can be written: better before the studies than after.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be made or written.
+    """
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise OSError(f"folder {str(path)!r} cannot be written ({error}); choose another output folder") from error
+    return path
+
+
+def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str]) -> Path:
+    """Write report.html, results.json, figures/, audio/ and, where there are any, tables/ into a folder.
+
+    Parameters
+    ----------
+    studies : sequence of StudyReport
+        The studies, in their order.
+    folder : path
+        Where to write; files of the same names are replaced, others stay.
+
+    Returns
+    -------
+    pathlib.Path
+        report.html, which needs none of the other files.
+
+    Raises
+    ------
+    OSError
+        The folder cannot be written.
+    ValueError, TypeError
+        No study, two of one name, or a value that JSON cannot hold.
+    """
+    if not studies:
+        raise ValueError("studies must hold at least one StudyReport, got none")
+    require_different((study.name for study in studies), "studies")
+    results = json.dumps(
+        {"studies": {study.name: study.result for study in studies}}, allow_nan=False, ensure_ascii=False, indent=2
+    )
+    path = prepare_folder(folder)
+    for kind in ("figures", "audio"):
+        prepare_folder(path / kind)
+    for study in studies:
+        for item in study.figures:
+            save_figure(item.figure, figure_file(path, study, item))
+        for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
+            write_wav(sound_file(path, study, sound), clipped, study.fs, peak=peak)
+        for table in study.tables:
+            prepare_folder(path / "tables")
+            _write_csv(table_file(path, study, table), table)
+    _replace(path / "results.json", results + "\n")
+    _replace(path / "report.html", page(studies, path))
+    return path / "report.html"
+
+
+def results_table(studies: Sequence[StudyReport]) -> str:
+    """The studies' figures and verdicts as text for a terminal.
+
+    Examples
+    --------
+    >>> study = StudyReport(
+    ...     "tonal", "A tone", "", 16000, 1.0, {}, {"KF-OPC": {"noise_reduction_db": 10.1, "output_power": 0.9999}},
+    ...     verdicts=[Verdict("KF-OPC keeps its rated power", True, "0.9999 of 1")],
+    ... )
+    >>> print(results_table([study]))
+    tonal: A tone (rated power 1)
+            noise reduction  output power  of rated power  peak control signal  clipped  harmonics  converged  diverged
+                         dB                         times                             %         dB          s         s
+    KF-OPC             10.1        0.9999          0.9999                    -        -          -          -         -
+      REPRODUCED      KF-OPC keeps its rated power
+                      0.9999 of 1
+    <BLANKLINE>
+    1 of 1 claims reproduced
+    """
+    lines = []
+    for study in studies:
+        lines.append(f"{study.name}: {study.title} (rated power {study.rated_power:g})")
+        rows = [[heading for heading, _ in COLUMNS], [unit for _, unit in COLUMNS]]
+        rows += [cells(figures, study.rated_power) for figures in study.algorithms.values()]
+        names = ["", "", *study.algorithms]
+        if study.algorithms:
+            lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})
+        for verdict in study.verdicts:
+            mark = study.marks[0 if verdict.reproduced else 1].upper()
+            lines += textwrap.wrap(verdict.claim, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
+            lines += textwrap.wrap(verdict.figure, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
+        for table in study.tables:
+            lines += ["", table.caption, *_aligned(table)]
+        lines.append("")
+    return "\n".join([*lines, count_of_claims(studies)])
+
+
+def _aligned(table: Table) -> list[str]:
+    """A table's lines for a terminal."""
+    return _columns([list(table.headings), *table.cells], set(range(len(table.headings))) - table.numbers)
+
+
+def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+    """Lines of cells in columns, those of `left` aligned to the left."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def _write_csv(path: Path, table: Table) -> None:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table.headings)
+    writer.writerows(table.rows)
+    _replace(path, text.getvalue())
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a file whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

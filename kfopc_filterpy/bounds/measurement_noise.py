@@ -1,0 +1,94 @@
+"""The measurement noise variance q = E[e_o^2] of eq. 7, for those who do not know theirs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_signal
+from ..paths.models import path_taps
+from .wiener import wiener_solution
+
+
+def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> float:
+    r"""Measurement noise variance from a run without control.
+
+    With the loudspeaker silent the error microphone records the disturbance d. What no control filter of `n_taps`
+    taps explains of it is e_o of eq. 1b: the batch least-squares residual of d on the filtered reference.
+
+    Parameters
+    ----------
+    reference : array_like, shape (n_samples,)
+        Reference x of the run.
+    disturbance : array_like, shape (n_samples,)
+        Error microphone's signal, the disturbance d; not its start-up transient, which counts as unexplained.
+    secondary_path : array_like or control.TransferFunction
+        Estimated secondary path.
+    n_taps : int
+        Taps L of the control filter.
+
+    Returns
+    -------
+    float
+        Estimate of q, in the square of the disturbance's unit, corrected for the `n_taps` weights fitted.
+
+    Raises
+    ------
+    ValueError
+        Signals too short for the fit, of different lengths, silent or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy.bounds import measurement_noise_from_run
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal(20000)
+    >>> d = 0.5 * x + 0.1 * rng.standard_normal(20000)  # q = 0.01
+    >>> round(measurement_noise_from_run(x, d, [1.0], n_taps=8), 3)
+    0.01
+    """
+    x = as_signal(reference, "reference")
+    d = as_signal(disturbance, "disturbance", length=x.size)
+    s = path_taps(secondary_path, name="secondary_path")
+    n_taps = as_count(n_taps, "n_taps")
+    transient = n_taps + s.size - 2
+    if x.size < transient + 2 * n_taps:
+        raise ValueError(
+            f"reference and disturbance must have at least {transient + 2 * n_taps} samples for {n_taps} taps and a "
+            f"secondary path of {s.size}, got {x.size}"
+        )
+    weights = wiener_solution(x, d, s, n_taps).weights
+    explained = np.convolve(np.convolve(x, s), weights)[: x.size]
+    return measurement_noise_from_residual((d - explained)[transient:], n_fitted=n_taps)
+
+
+def measurement_noise_from_residual(residual: Any, *, n_fitted: int = 0) -> float:
+    """Measurement noise variance from the residual of a batch fit.
+
+    Parameters
+    ----------
+    residual : array_like, shape (n_samples,)
+        What the fitted control filter leaves of the disturbance.
+    n_fitted : int, default 0
+        Weights fitted to these very samples, which took that many degrees of freedom.
+
+    Returns
+    -------
+    float
+        Estimate of q.
+
+    Raises
+    ------
+    ValueError
+        A residual that is no longer than `n_fitted`, or not finite.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bounds import measurement_noise_from_residual
+    >>> measurement_noise_from_residual([0.5, -0.5, 0.5, -0.5], n_fitted=2)  # 4 squares of 0.25, 2 degrees of freedom
+    0.5
+    """
+    n_fitted = as_count(n_fitted, "n_fitted", minimum=0)
+    e = as_signal(residual, "residual", min_length=n_fitted + 1)
+    return float(e @ e) / (e.size - n_fitted)

@@ -1,0 +1,397 @@
+"""The bound: the least error that a control filter of a length can reach within a power budget.
+
+Minimum of E[e^2] subject to E[y^2] <= ρ_o, for recorded signals and known paths: over a whole record by one filter,
+and in each second by a filter of its own. Sign convention and delay lines as in `wiener`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .._runs import window_length
+from .._validate import as_count, as_nonnegative, as_positive, as_signal
+from ..paths.models import path_taps
+from .wiener import Stretch, WienerSolution, constrained_weights, full_stretch, mean_square, reduction_db, require_sound
+
+
+@dataclass(frozen=True)
+class ControlFilter(WienerSolution):
+    r"""A fixed control filter over a stretch of a record: a `wiener.WienerSolution` that knows how it was made.
+
+    Its weights solve :math:`(R_{x'} + λ R_x + \mathrm{ridge}\, I)\, w = α r`.
+
+    Attributes
+    ----------
+    weights, control_power, antinoise_power, disturbance_power, error_power, noise_reduction_db
+        As in `wiener.WienerSolution`; the powers are mean squares over the stretch.
+    penalty : float
+        λ; 0 where the budget leaves the filter free.
+    constraint_factor : float
+        α, as KF-OPC's; 1 but for scaled filters.
+    start_s, end_s : float
+        Stretch in seconds from the first sample that counts.
+    stretch : Stretch
+        Its samples.
+    """
+
+    penalty: float
+    constraint_factor: float
+    start_s: float
+    end_s: float
+    stretch: Stretch = field(repr=False, compare=False)
+
+    @property
+    def control_signal(self) -> np.ndarray:
+        """(n_samples,) control signal y = w*x of the stretch."""
+        return self.stretch.control_signal(self.weights)
+
+    @property
+    def error(self) -> np.ndarray:
+        """(n_samples,) error e = d - s*y of the stretch."""
+        return self.stretch.d - self.stretch.antinoise(self.weights)
+
+
+@dataclass(frozen=True)
+class ControlFilters:
+    """A control filter for each segment of a record.
+
+    Attributes
+    ----------
+    segments : tuple of ControlFilter
+        The filter of each segment: its weights, powers, noise reduction, λ, start and end.
+    """
+
+    segments: tuple[ControlFilter, ...]
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(n_segments, n_taps) weights."""
+        return np.array([segment.weights for segment in self.segments])
+
+    @property
+    def penalty(self) -> np.ndarray:
+        """(n_segments,) λ of each segment."""
+        return self._each("penalty")
+
+    @property
+    def control_power(self) -> np.ndarray:
+        """(n_segments,) mean square of y in each segment."""
+        return self._each("control_power")
+
+    @property
+    def error_power(self) -> np.ndarray:
+        """(n_segments,) mean square of e in each segment."""
+        return self._each("error_power")
+
+    @property
+    def segment_noise_reduction_db(self) -> np.ndarray:
+        """(n_segments,) noise reduction of each segment in dB; NaN without a disturbance."""
+        return self._each("noise_reduction_db")
+
+    @property
+    def start_s(self) -> np.ndarray:
+        """(n_segments,) start of each segment in seconds from the first sample that counts."""
+        return self._each("start_s")
+
+    @property
+    def noise_reduction_db(self) -> float:
+        """Noise reduction over all segments, -10 log10(sum e^2 / sum d^2), at most 300 dB."""
+        d = np.concatenate([segment.stretch.d for segment in self.segments])
+        return reduction_db(mean_square(self.error), mean_square(d))
+
+    @property
+    def control_signal(self) -> np.ndarray:
+        """(n_samples,) control signal, each segment with its own weights."""
+        return np.concatenate([segment.control_signal for segment in self.segments])
+
+    @property
+    def error(self) -> np.ndarray:
+        """(n_samples,) error, each segment with its own weights."""
+        return np.concatenate([segment.error for segment in self.segments])
+
+    def _each(self, name: str) -> np.ndarray:
+        return np.array([getattr(segment, name) for segment in self.segments])
+
+
+@dataclass(frozen=True)
+class PowerConstrainedWiener:
+    """What fixed control filters reach on a record within a power budget.
+
+    Signals and times begin with the first sample that counts, as those of a `SimulationResult` with the same
+    `switch_on_s`, so that its figures of merit apply: ``nse_db(bound.per_second.error, bound.disturbance, fs)``.
+
+    Attributes
+    ----------
+    whole : ControlFilter
+        The bound over the whole record: one filter, the budget met on average over the record.
+    per_second : ControlFilters
+        The bound of each segment: filters of their own, the budget met in each.
+    unconstrained : ControlFilter
+        One filter without a budget; its `control_power` is what the noise asks for.
+    scaled : ControlFilter
+        The unconstrained filter times a factor of at most 1 that meets the budget: what KF-OPC steers to.
+    scaled_per_second : ControlFilters
+        The same of each segment: its own unconstrained filter, scaled.
+    rated_power : float
+        Budget ρ_o, mean square of the control signal.
+    filtered_power : float
+        Power of the filtered reference, E[x'^2].
+    disturbance : numpy.ndarray, shape (n_samples,)
+        Disturbance from the first sample that counts on.
+    fs : float
+        Sampling rate in Hz.
+    """
+
+    whole: ControlFilter
+    per_second: ControlFilters
+    unconstrained: ControlFilter
+    scaled: ControlFilter
+    scaled_per_second: ControlFilters
+    rated_power: float
+    filtered_power: float
+    disturbance: np.ndarray = field(repr=False)
+    fs: float
+
+    def noise_reduction_over(self, start_s: float = 0.0, end_s: float | None = None) -> dict[str, float]:
+        """Noise reduction of each solution over a part of the record, -10 log10(sum e^2 / sum d^2) in dB.
+
+        The steady half is ``noise_reduction_over(0.5 * bound.whole.end_s)``.
+
+        Parameters
+        ----------
+        start_s, end_s : float
+            Part in seconds from the first sample that counts; to the end by default.
+
+        Returns
+        -------
+        dict
+            Noise reduction in dB, at most 300, of `whole`, `per_second`, `unconstrained`, `scaled` and
+            `scaled_per_second`; NaN where the disturbance is silent.
+
+        Raises
+        ------
+        TypeError, ValueError
+            No sample lies in the part, or it ends after the record.
+        """
+        n_samples = self.disturbance.size
+        start = round(as_nonnegative(start_s, "start_s", unit="s") * self.fs)
+        stop = n_samples if end_s is None else round(as_positive(end_s, "end_s", unit="s") * self.fs)
+        if not start < stop <= n_samples:
+            raise ValueError(
+                f"start_s and end_s must mark a part of the {n_samples / self.fs:g} s that count, "
+                f"got {start_s:g} s to {stop / self.fs:g} s"
+            )
+        part = slice(start, stop)
+        disturbance_power = mean_square(self.disturbance[part])
+        names = ("whole", "per_second", "unconstrained", "scaled", "scaled_per_second")
+        return {name: reduction_db(mean_square(getattr(self, name).error[part]), disturbance_power) for name in names}
+
+
+def power_constrained_wiener(
+    reference: Any,
+    disturbance: Any,
+    secondary_path: Any,
+    n_taps: int,
+    rated_power: float,
+    *,
+    fs: float,
+    segment_s: float = 1.0,
+    switch_on_s: float = 0.0,
+    ridge: float = 0.0,
+) -> PowerConstrainedWiener:
+    r"""Least error within a power budget, over a record and in each second of it.
+
+    Minimises :math:`E[(d - w^T x')^2]` subject to :math:`E[(w^T x)^2] ≤ ρ_o`. The problem is convex, and its solution
+
+    .. math:: (R_{x'} + λ R_x)\, w = r, \qquad λ ≥ 0, \qquad λ\,(E[y^2] - ρ_o) = 0
+
+    a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power; one that adapts
+    may, where the noise changes within it. The bound knows the stretch beforehand: of what the reference does not
+    explain, chance alone lets it remove some ``n_taps / fs`` in a second. That of each second keeps the budget in each,
+    that of the record on average over all; which of the two is the better depends on the noise.
+
+    Delay lines hold the record's past, at the edge of a segment too, and zeros before its first sample: nothing
+    starts up but the record itself, and the anti-noise at an edge is that of weights which have been there before.
+    Directions in which reference and filtered reference have less than 1e-11 of the energy of the strongest get no
+    weight: float64 correlations tell no more.
+
+    Parameters
+    ----------
+    reference : array_like, shape (n_samples,)
+        Reference signal x.
+    disturbance : array_like, shape (n_samples,)
+        Disturbance d at the error microphone; its sensor noise included, if the error is to include it.
+    secondary_path : control.TransferFunction or array_like, shape (n_path,)
+        Secondary path s with a finite response, at the signals' sampling rate.
+    n_taps : int
+        Length of the control filter.
+    rated_power : float
+        Budget ρ_o, mean square of the control signal.
+    fs : float
+        Sampling rate in Hz.
+    segment_s : float, default 1.0
+        Length of a segment in seconds, at least ``2 n_taps`` samples. What is left at the end is a segment of its
+        own, or, if it is shorter than half a segment, part of the one before.
+    switch_on_s : float, default 0
+        Time in seconds of the first sample that counts, as in `simulate`.
+    ridge : float, default 0
+        For `unconstrained` and the scaled filters only: they solve :math:`(R_{x'} + \mathrm{ridge}\, I) w = r`. With
+        ``ridge = q / (N P0)``, N being the samples that count, these are the weights that a Kalman filter without
+        state noise, with measurement noise q and initial variance P0, ends with. `wiener_solution` takes it relative
+        to the filtered reference's power: ``regularization = ridge / filtered_power``.
+
+    Returns
+    -------
+    PowerConstrainedWiener
+        Both bounds, and beside them the unconstrained filter and KF-OPC's scaled ones.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Signals of differing lengths, with fewer than `n_taps` samples that count, silent from there on, or not
+        finite; an argument out of range, or `fs` not that of `secondary_path`. A silent segment is no error: it
+        needs no power and gets zero weights.
+
+    See Also
+    --------
+    power_constrained_solution : one filter, over the samples at which all delay lines are full.
+
+    References
+    ----------
+    .. [1] D. Shi et al., "Optimal output-constrained active noise control based on inverse adaptive modeling
+       leak factor estimate", IEEE/ACM Trans. Audio Speech Lang. Process. 29, 2021.
+    .. [2] J. J. Moré and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4(3), 1983.
+
+    Examples
+    --------
+    White noise, twice as strong in the last two of four seconds, and a secondary path that favours low frequencies:
+
+    >>> x = np.random.default_rng(0).standard_normal(4000) * np.repeat([1.0, 2.0], 2000)
+    >>> d = np.concatenate([np.zeros(2), x[:-2]])
+    >>> bound = power_constrained_wiener(x, d, [1.0, 0.8], n_taps=8, rated_power=0.5, fs=1000.0)
+    >>> print(f"{bound.unconstrained.control_power:.1f}, {bound.whole.control_power:.3f}, {bound.whole.penalty:.2f}")
+    4.8, 0.500, 0.93
+    >>> bound.per_second.control_power.round(6)
+    array([0.5, 0.5, 0.5, 0.5])
+    >>> bound.per_second.segment_noise_reduction_db.round(1)
+    array([9.2, 8.6, 4.4, 4.3])
+    >>> {name: round(value, 1) for name, value in bound.noise_reduction_over(start_s=2.0).items()}
+    {'whole': 5.6, 'per_second': 4.4, 'unconstrained': 16.0, 'scaled': 3.3, 'scaled_per_second': 2.5}
+    """
+    fs = as_positive(fs, "fs", unit="Hz")
+    rated_power = as_positive(rated_power, "rated_power")
+    ridge = as_nonnegative(ridge, "ridge")
+    record = _record(reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps)
+    first = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
+    n_samples = record.d.size
+    if n_samples - first < record.n_taps:
+        raise ValueError(
+            f"reference must have at least {record.n_taps} samples from switch_on_s on for {record.n_taps} taps, "
+            f"got {max(n_samples - first, 0)}; use a longer signal, an earlier switch_on_s or fewer taps"
+        )
+    length = window_length(segment_s, fs, "segment_s")
+    if length < 2 * record.n_taps:
+        raise ValueError(
+            f"segment_s must be at least {2 * record.n_taps / fs:g} s, twice the {record.n_taps} taps, got "
+            f"{length / fs:g} s: a filter can learn shorter ones by heart; use longer segments or fewer taps"
+        )
+    counted = require_sound(record.part(first, n_samples))
+    edges = list(range(first, n_samples, length))
+    if len(edges) > 1 and n_samples - edges[-1] < length / 2:
+        edges.pop()
+
+    def solve(start: int, stop: int) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
+        return _solve(record.part(start, stop), rated_power, ridge, (start - first) / fs, (stop - first) / fs)
+
+    whole, unconstrained, scaled = solve(first, n_samples)
+    each = [solve(start, stop) for start, stop in zip(edges, [*edges[1:], n_samples], strict=True)]
+    return PowerConstrainedWiener(
+        whole=whole,
+        per_second=ControlFilters(tuple(constrained for constrained, _, _ in each)),
+        unconstrained=unconstrained,
+        scaled=scaled,
+        scaled_per_second=ControlFilters(tuple(scaled for _, _, scaled in each)),
+        rated_power=rated_power,
+        filtered_power=counted.filtered_power,
+        disturbance=counted.d,
+        fs=fs,
+    )
+
+
+def power_constrained_solution(
+    reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, rated_power: float
+) -> WienerSolution:
+    """Least-squares control filter whose control power does not exceed the rated power.
+
+    Finds the penalty γ of `wiener_solution` at which the control power is `rated_power`; γ is zero where the filter
+    needs less. No filter of this length has a smaller error within the power. As in `wiener_solution`, the samples
+    count at which the delay lines of control filter and secondary path are full.
+
+    Parameters
+    ----------
+    reference, disturbance, secondary_path, n_taps
+        As in `wiener_solution`.
+    rated_power : float
+        Rated power (mean square of the control signal).
+
+    Returns
+    -------
+    WienerSolution
+        Weights, powers and noise reduction.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `wiener_solution`, or `rated_power` is not positive.
+
+    See Also
+    --------
+    power_constrained_wiener : the same in each second too, with the scaled filter beside it.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(0).standard_normal(2000)
+    >>> solution = power_constrained_solution(x, 2 * x, [1.0], n_taps=1, rated_power=1.0)
+    >>> round(solution.control_power, 4)
+    1.0
+    """
+    rated_power = as_positive(rated_power, "rated_power")
+    stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
+    return stretch.solution(constrained_weights(stretch, stretch.correlations(), rated_power)[0])
+
+
+def _record(reference: Any, disturbance: Any, taps: np.ndarray, n_taps: int) -> Stretch:
+    """The whole record in copies of its own, zeros for its past."""
+    from scipy.signal import lfilter
+
+    x = as_signal(reference, "reference")
+    d = as_signal(disturbance, "disturbance", length=x.size).copy()
+    n_taps = as_count(n_taps, "n_taps")
+    past = np.zeros(n_taps - 1)
+    record = Stretch(np.concatenate([past, x]), np.concatenate([past, lfilter(taps, 1.0, x)]), d, n_taps)
+    for signal in (record.x, record.filtered, record.d):
+        signal.flags.writeable = False
+    return record
+
+
+def _solve(
+    stretch: Stretch, rated_power: float, ridge: float, start_s: float, end_s: float
+) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
+    """The filter within the power, the one without a budget, and the latter scaled."""
+
+    def control_filter(weights: np.ndarray, penalty: float = 0.0, constraint_factor: float = 1.0) -> ControlFilter:
+        solution = stretch.solution(weights)
+        weights.flags.writeable = False
+        return ControlFilter(**vars(solution), **times, penalty=penalty, constraint_factor=constraint_factor)
+
+    times: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "stretch": stretch}
+    correlations = stretch.correlations()
+    constrained = control_filter(*constrained_weights(stretch, correlations, rated_power))
+    free = control_filter(correlations.weights(ridge=ridge))
+    if free.control_power <= rated_power:
+        return constrained, free, free
+    factor = float(np.sqrt(rated_power / free.control_power))
+    return constrained, free, control_filter(factor * free.weights, constraint_factor=factor)

@@ -1,0 +1,362 @@
+"""The Wiener control filter of recorded signals: the best a fixed causal filter of a length can do.
+
+Sign convention: ``e = d - s*y``, ``y = w*x`` with the newest sample first, filtered reference ``x' = s*x``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_nonnegative, as_positive, as_signal
+from ..paths.models import path_taps
+
+# Eigenvalues of the correlation matrix below this share of the largest count as zero: such directions of
+# the weights (every one but two for a tone) get no weight, which is the minimum-norm solution.
+RANK_TOLERANCE = 1e-11
+# A control power that exceeds the rated one by no more than this share of it keeps within it.
+BUDGET_TOLERANCE = 1e-12
+
+
+@dataclass(frozen=True)
+class WienerSolution:
+    """A fixed control filter and what it does to the signals it was made of.
+
+    All powers are mean squares over the samples the filter was fitted to.
+
+    Attributes
+    ----------
+    weights : numpy.ndarray, shape (n_taps,)
+        Control filter w, newest sample first.
+    control_power : float
+        Mean square of the control signal y = w*x.
+    antinoise_power : float
+        Mean square of the anti-noise s*y.
+    disturbance_power : float
+        Mean square of the disturbance d.
+    error_power : float
+        Mean square of the error e = d - s*y.
+    noise_reduction_db : float
+        ``-10 log10(E[e^2] / E[d^2])``, at most 300 dB.
+    """
+
+    weights: np.ndarray
+    control_power: float
+    antinoise_power: float
+    disturbance_power: float
+    error_power: float
+    noise_reduction_db: float
+
+
+def wiener_solution(
+    reference: Any,
+    disturbance: Any,
+    secondary_path: Any,
+    n_taps: int,
+    *,
+    regularization: float = 0.0,
+    control_penalty: float = 0.0,
+) -> WienerSolution:
+    r"""Least-squares control filter of a reference and a disturbance.
+
+    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2] + \lambda E[x'^2] \|w\|^2` over the samples at
+    which the delay lines of control filter and secondary path are full: exact least squares on the data at
+    hand, not the biased autocorrelation. Leave out the disturbance's own start-up transient if it should
+    not count. Where the data leave weights open (a tone fixes two numbers
+    only), the solution of minimum norm is taken: eigenvalues below 1e-11 of the largest count as zero.
+
+    Parameters
+    ----------
+    reference : array_like, shape (n_samples,)
+        Reference signal x.
+    disturbance : array_like, shape (n_samples,)
+        Disturbance d at the error microphone.
+    secondary_path : control.TransferFunction or array_like, shape (n_path,)
+        Secondary path s with a finite response, at the signals' sampling rate.
+    n_taps : int
+        Length of the control filter.
+    regularization : float
+        Ridge λ, relative to the power of the filtered reference.
+    control_penalty : float
+        Penalty γ on the control power, the optimum that MOV-FxLMS steers to. With the γ at which
+        `control_power` equals the rated power, it is the least error any filter of the length reaches within it.
+
+    Returns
+    -------
+    WienerSolution
+        Weights, powers and noise reduction.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Signals of differing lengths, shorter than the delay lines, silent, or not finite.
+
+    See Also
+    --------
+    kfopc_filterpy.bounds.power_constrained.power_constrained_solution : finds the γ for a rated power.
+
+    References
+    ----------
+    .. [1] S. M. Kuo and D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999.
+    .. [2] D. Shi et al., "Optimal output-constrained active noise control based on inverse adaptive modeling
+       leak factor estimate", IEEE/ACM Trans. Audio Speech Lang. Process. 29, 2021.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(0).standard_normal(2000)
+    >>> d = np.concatenate([np.zeros(3), 0.5 * x[:-3]])
+    >>> solution = wiener_solution(x, d, [0.0, 1.0], n_taps=4)  # P is three samples late, S one
+    >>> solution.weights.round(6) + 0.0
+    array([0. , 0. , 0.5, 0. ])
+    """
+    stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
+    ridge = as_nonnegative(regularization, "regularization") * stretch.filtered_power
+    penalty = as_nonnegative(control_penalty, "control_penalty")
+    return stretch.solution(stretch.correlations().weights(penalty, ridge))
+
+
+@dataclass(frozen=True)
+class CoherenceBound:
+    """The noise reduction that the coherence of reference and disturbance allows.
+
+    Attributes
+    ----------
+    frequencies_hz : numpy.ndarray, shape (n_frequencies,)
+        Frequencies in Hz.
+    noise_reduction_db : numpy.ndarray, shape (n_frequencies,)
+        Greatest noise reduction at each frequency in dB, at most 300 dB.
+    overall_db : float
+        The same for the whole disturbance.
+    """
+
+    frequencies_hz: np.ndarray
+    noise_reduction_db: np.ndarray
+    overall_db: float
+
+
+def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int = 1024) -> CoherenceBound:
+    """Noise reduction of a non-causal filter of any length: ``-10 log10(1 - coherence)``.
+
+    What a microphone's own noise or a second source leaves out of the reference no control filter can
+    reach. Spectra are averaged by Welch's method; with few segments the coherence comes out too high.
+
+    Parameters
+    ----------
+    reference, disturbance : array_like, shape (n_samples,)
+        Reference signal and disturbance.
+    fs : float
+        Sampling rate in Hz.
+    segment : int
+        Samples in a segment; the signals must hold at least eight.
+
+    Returns
+    -------
+    CoherenceBound
+        Frequencies, bound at each and overall.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Signals of differing lengths, too short, or silent.
+
+    References
+    ----------
+    .. [1] S. M. Kuo and D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal(160_000)
+    >>> bound = coherence_bound(x, x + 0.1 * rng.standard_normal(x.size), fs=16000.0)
+    >>> round(bound.overall_db)  # the part without coherence lies 20 dB below
+    20
+    """
+    from scipy.signal import csd, welch
+
+    fs = as_positive(fs, "fs", unit="Hz")
+    segment = as_count(segment, "segment", minimum=8)
+    x = as_signal(reference, "reference", min_length=8 * segment)
+    d = as_signal(disturbance, "disturbance", length=x.size)
+    frequencies, of_x = welch(x, fs, nperseg=segment)
+    of_d = welch(d, fs, nperseg=segment)[1]
+    if not np.any(of_x) or not np.any(of_d):
+        raise ValueError("reference and disturbance must not be silent: their coherence is undefined")
+    coherent = np.abs(csd(x, d, fs, nperseg=segment)[1]) ** 2 / np.maximum(of_x, np.finfo(float).tiny)
+    floor = 1e-30
+    remaining = np.clip(1 - coherent / np.maximum(of_d, np.finfo(float).tiny), floor, 1)
+    overall = max(float(np.sum(remaining * of_d) / np.sum(of_d)), floor)
+    return CoherenceBound(frequencies, -10 * np.log10(remaining), float(-10 * np.log10(overall)))
+
+
+@dataclass(frozen=True)
+class Correlations:
+    """Correlations of a stretch of signals: R_x', R_x and r, from which it is solved for any penalty."""
+
+    filtered: np.ndarray
+    reference: np.ndarray
+    cross: np.ndarray
+
+    def weights(self, penalty: float = 0.0, ridge: float = 0.0) -> np.ndarray:
+        """Minimum-norm solution of (R_x' + penalty R_x + ridge I) w = r."""
+        matrix = self.filtered + penalty * self.reference
+        matrix.flat[:: self.cross.size + 1] += ridge
+        return minimum_norm_solve(matrix, self.cross)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Samples that a control filter is fitted to. x and x' begin `n_taps` - 1 samples early: the delay line's past."""
+
+    x: np.ndarray
+    filtered: np.ndarray
+    d: np.ndarray
+    n_taps: int
+
+    @property
+    def filtered_power(self) -> float:
+        """Power of the filtered reference."""
+        return mean_square(self.filtered[self.n_taps - 1 :])
+
+    def part(self, start: int, stop: int) -> Stretch:
+        """The samples from `start` to before `stop`, with the past they really have."""
+        with_past = slice(start, stop + self.n_taps - 1)
+        return Stretch(self.x[with_past], self.filtered[with_past], self.d[start:stop], self.n_taps)
+
+    def correlations(self) -> Correlations:
+        start = self.n_taps - 1
+        return Correlations(
+            correlation_matrix(self.filtered, self.n_taps, start),
+            correlation_matrix(self.x, self.n_taps, start),
+            cross_correlation(self.d, self.filtered),
+        )
+
+    def control_signal(self, weights: np.ndarray) -> np.ndarray:
+        return np.convolve(self.x, weights, mode="valid")
+
+    def antinoise(self, weights: np.ndarray) -> np.ndarray:
+        return np.convolve(self.filtered, weights, mode="valid")
+
+    def solution(self, weights: np.ndarray) -> WienerSolution:
+        """What the weights do. The powers are those of the signals, not of the matrices, which keep fewer digits."""
+        antinoise = self.antinoise(weights)
+        error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
+        return WienerSolution(
+            weights=weights,
+            control_power=mean_square(self.control_signal(weights)),
+            antinoise_power=mean_square(antinoise),
+            disturbance_power=disturbance_power,
+            error_power=error_power,
+            noise_reduction_db=reduction_db(error_power, disturbance_power),
+        )
+
+
+def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> Stretch:
+    """Check the signals and take the samples at which the delay lines of w and s are full."""
+    from scipy.signal import lfilter
+
+    x = as_signal(reference, "reference")
+    d = as_signal(disturbance, "disturbance", length=x.size)
+    taps = path_taps(secondary_path, name="secondary_path")
+    n_taps = as_count(n_taps, "n_taps")
+    past = taps.size - 1
+    start = past + n_taps - 1
+    if x.size < start + n_taps:
+        raise ValueError(
+            f"reference must have at least {start + n_taps} samples for {n_taps} control "
+            f"and {taps.size} path taps, got {x.size}; use a longer signal or fewer taps"
+        )
+    return require_sound(Stretch(x[past:], lfilter(taps, 1.0, x)[past:], d[start:], n_taps))
+
+
+def require_sound(stretch: Stretch) -> Stretch:
+    """Return the stretch, or raise ValueError where nothing is to be heard of x' or d."""
+    filtered_power = stretch.filtered_power
+    if filtered_power == 0 or mean_square(stretch.d) == 0:
+        silent = "disturbance" if filtered_power else "reference through secondary_path"
+        raise ValueError(f"{silent} must not be silent: there is nothing to solve for")
+    return stretch
+
+
+def mean_square(signal: np.ndarray) -> float:
+    """Power of a signal."""
+    return float(np.mean(signal**2))
+
+
+def reduction_db(error_power: float, disturbance_power: float) -> float:
+    """Noise reduction in dB, at most 300; NaN where there is no disturbance to reduce."""
+    if disturbance_power == 0:
+        return float("nan")
+    return float(-10 * np.log10(max(error_power / disturbance_power, 1e-30)))
+
+
+def cross_correlation(output: np.ndarray, regressor: np.ndarray) -> np.ndarray:
+    """Mean of the products of `output` and each delay of `regressor`, which begins that many samples early."""
+    return np.correlate(regressor, output, mode="valid")[::-1] / output.size
+
+
+def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarray:
+    """Mean of ``signal[n - i] * signal[n - j]`` over n >= start: the covariance method's matrix.
+
+    Each row follows from the one above by the products that enter and leave the window.
+    """
+    count = signal.size - start
+    matrix = np.zeros((n_taps, n_taps))
+    matrix[0] = cross_correlation(signal[start:], signal[start - n_taps + 1 :])
+    entering = signal[start - n_taps + 1 : start][::-1]  # signal[start - 1], signal[start - 2], ...
+    leaving = signal[::-1][: n_taps - 1]  # signal[-1], signal[-2], ...
+    for i in range(n_taps - 1):
+        change = entering[i] * entering[i:] - leaving[i] * leaving[i:]
+        matrix[i + 1, i + 1 :] = matrix[i, i:-1] + change / count
+    return np.triu(matrix) + np.triu(matrix, 1).T
+
+
+def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric positive semidefinite system, leaving out directions without energy."""
+    values, vectors = np.linalg.eigh(matrix)
+    kept = values > RANK_TOLERANCE * values[-1]
+    return vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
+
+
+def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
+    """Weights of the least error within the power, and their λ."""
+    energies = float(np.trace(correlations.filtered)), float(np.trace(correlations.reference))
+    weights, penalty = np.zeros(stretch.n_taps), 0.0
+    if min(energies) > 0:
+        weights, penalty = _least_penalty(correlations, energies[0] / energies[1], rated_power)
+    if penalty == 0:
+        # Of the filters without a penalty, the one of least norm is `wiener_solution`'s. Where the path lets nothing
+        # through it may need more power than is needed, and more than there is.
+        free = correlations.weights()
+        if mean_square(stretch.control_signal(free)) <= rated_power:
+            weights = free
+    return weights, penalty
+
+
+def _least_penalty(correlations: Correlations, balance: float, rated_power: float) -> tuple[np.ndarray, float]:
+    """Weights that solve (R_x' + λ R_x) w = r, and the least λ >= 0 that brings their power down to the rated one.
+
+    In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), where both matrices may be
+    singular, each λ costs a sum over the taps instead of the solution of a system.
+    """
+    values, vectors = np.linalg.eigh(correlations.filtered + balance * correlations.reference)
+    kept = values > RANK_TOLERANCE * values[-1]
+    whitened = vectors[:, kept] / np.sqrt(values[kept])
+    share, turn = np.linalg.eigh(whitened.T @ correlations.filtered @ whitened)
+    heard = share > RANK_TOLERANCE  # of the others the path lets nothing through: they cost power for nothing
+    basis, share = whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
+    cross = basis.T @ correlations.cross
+
+    # Newton's method on 1/sqrt(power), which rises with λ, is concave and all but a straight line: from λ = 0 the steps
+    # approach the root from below, a dozen at most where the eigenvalues span twelve decades (Moré and Sorensen).
+    penalty = 0.0
+    while True:
+        stiffness = share + penalty * (1 - share)
+        parts = cross / stiffness
+        power = float((1 - share) @ parts**2) / balance
+        if power <= rated_power * (1 + BUDGET_TOLERANCE):
+            return basis @ parts, penalty * balance
+        slope = float((1 - share) ** 2 @ (parts**2 / stiffness)) / balance
+        penalty += power / slope * (math.sqrt(power / rated_power) - 1)

@@ -1,0 +1,5 @@
+"""Kalman filters that filterpy users can use in place of filterpy's."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,148 @@
+"""State covariance of the random-walk filter: one triangle inside, full arrays only when they are read."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..kernels.covariance import (
+    INVERSE_S,
+    LAST_INVERSE_S,
+    Covariance,
+    copy_covariance,
+    full_covariance,
+    new_covariance,
+    predict_covariance,
+    project_covariance,
+)
+
+ASYMMETRY_LIMIT = 1e-8  # of the largest element: what rounding leaves; more is a mistake
+
+
+class Moment(NamedTuple):
+    """P at a moment since the last pass over the triangle T: scale T + weight g g' + diagonal I."""
+
+    scale: float
+    diagonal: float
+    weight: float = 0.0
+
+
+class RandomWalkCovariance:
+    """P, P_prior, P_post and the gain of a random-walk filter, each made full when read.
+
+    `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and P_post from it,
+    or are arrays where that is no longer possible.
+    """
+
+    def __init__(self, P: np.ndarray, dtype: Any = np.float64) -> None:
+        self.arrays: Covariance = new_covariance(0.5 * (P + P.T), dtype)
+        self.prior: Moment | np.ndarray = Moment(1.0, 0.0)
+        self.posterior: Moment | np.ndarray = Moment(1.0, 0.0)
+        self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
+        self._largest = float(np.finfo(dtype).max)
+        self._others_read = False  # the arrays are another's too
+
+    def share(self, arrays: Covariance) -> None:
+        """Go on from arrays that others go on from too: whoever steps first takes a copy."""
+        self.arrays, self._others_read, self._shown = arrays, True, []
+
+    def own(self) -> Covariance:
+        """The arrays, which nobody else reads."""
+        if self._others_read:
+            self.arrays, self._others_read = copy_covariance(self.arrays), False
+        return self.arrays
+
+    @property
+    def now(self) -> Moment:
+        """P at present."""
+        scale, diagonal, inverse_S, _ = self.arrays.owed.tolist()
+        return Moment(scale, diagonal, -scale * inverse_S)
+
+    def full(self, moment: Moment | np.ndarray) -> np.ndarray:
+        """P at a moment, as a full symmetric array of its own."""
+        if isinstance(moment, np.ndarray):
+            return moment.copy()
+        if moment == (1.0, 0.0, 0.0):  # nothing owed, as when a filter is made: nothing to compile
+            n = self.arrays.product.size
+            lower = np.tril(self.arrays.triangle[:n, :n].astype(np.float64))
+            return lower + np.tril(lower, -1).T
+        return full_covariance(self.arrays.triangle, self.arrays.gain_direction, *moment)
+
+    def show(self) -> np.ndarray:
+        """P as a full array; what is written into it counts at the next step (`edited`)."""
+        if not self._shown:
+            self._shown.append(self.full(self.now))
+        return self._shown[-1]
+
+    def edited(self) -> np.ndarray | None:
+        """The shown array that was written into, None where none was."""
+        if not self._shown:
+            return None
+        now = self.full(self.now)
+        return next((array for array in reversed(self._shown) if not np.array_equal(array, now)), None)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
+        """filterpy's `Saver` keeps the P it reads and deep-copies the rest: later edits go into another array."""
+        if self._shown:
+            self._shown.append(self._shown[-1].copy())
+        other = memo[id(self)] = object.__new__(type(self))
+        other.__dict__.update(deepcopy({k: v for k, v in vars(self).items() if k != "arrays"}, memo))
+        other.arrays = copy_covariance(self.arrays)
+        return other
+
+    def replaced(self, P: np.ndarray) -> RandomWalkCovariance:
+        """A covariance that goes on from another P and remembers P_prior and P_post."""
+        other = RandomWalkCovariance(P, self.arrays.triangle.dtype)
+        other.prior, other.posterior = self.full(self.prior), self.full(self.posterior)
+        return other
+
+    def predict(self, alpha_sq: float, state_noise: float) -> None:
+        """Eq. 4."""
+        scale, diagonal, _ = self.now
+        if not alpha_sq * max(scale, diagonal) + state_noise < self._largest:
+            raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
+        self._shown = []
+        predict_covariance(self.own(), alpha_sq, state_noise)
+        self.prior = self.now
+
+    def project(self, h: np.ndarray) -> float:
+        """h' P h, with P h left in the arrays for the update; the value of P does not change."""
+        self._shown = []
+        now = self.now
+        if not isinstance(self.prior, np.ndarray) and self.prior != now:  # a second update since the prediction
+            self.prior = self.full(self.prior)
+        hPh = float(project_covariance(self.own(), h))
+        if isinstance(self.prior, Moment):
+            self.prior = Moment(1.0, 0.0)
+        if isinstance(self.posterior, Moment):  # the same P_post, seen from the triangle as it is now
+            ratio = self.posterior.scale / now.scale
+            self.posterior = Moment(ratio, self.posterior.diagonal - ratio * now.diagonal)
+        return hPh
+
+    def updated(self) -> None:
+        """The arrays took an update after `project`: P_prior, where it was the triangle, is P + g g'/S; `settle` next."""
+        if isinstance(self.prior, Moment):
+            inverse_S, last_inverse_S = self.arrays.owed[[INVERSE_S, LAST_INVERSE_S]].tolist()
+            self.prior = Moment(1.0, 0.0, last_inverse_S - inverse_S)
+
+    def settle(self) -> None:
+        """An update is over, or its sample was missed: P is P_post."""
+        self.posterior = self.now
+
+    def after_compiled(self) -> None:
+        """After the compiled loop advanced `arrays`: what is owed is one downdate at most."""
+        self._shown = []
+        self.prior = Moment(1.0, 0.0)
+        self.updated()
+
+
+def require_covariance(P: np.ndarray) -> None:
+    """Raise ValueError unless P is symmetric, to rounding, with no negative variance."""
+    if np.diagonal(P).min() < 0:
+        raise ValueError("P must not have negative variances on its diagonal")
+    difference = np.abs(P - P.T)
+    if difference.max() > ASYMMETRY_LIMIT * np.abs(P).max():
+        i, j = np.unravel_index(np.argmax(difference), P.shape)
+        raise ValueError(f"P must be symmetric, but P[{i}, {j}] = {P[i, j]:g} and P[{j}, {i}] = {P[j, i]:g}")

@@ -1,0 +1,109 @@
+"""What keeps a filterpy filter from being poisoned: checks of a step's arguments, and its undoing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from .._validate import require_finite
+
+SILENT_REFERENCE = (
+    "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
+    "Nothing was changed"
+)
+
+
+@contextmanager
+def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[None]:
+    """Around a step of `kf`: finite `arguments` go in, finite x and P come out, or an error, nothing changed.
+
+    Holds for steps that assign arrays, as filterpy's do; one that writes into them has to copy them first.
+    """
+    for argument, value in arguments.items():
+        if value is not None:
+            require_finite(np.asarray(value, dtype=np.float64), argument)
+    before = dict(kf.__dict__)
+    try:
+        with np.errstate(all="ignore"):  # what overflows or divides by zero is found just below
+            yield
+        _require_sound(kf)
+    except BaseException as error:
+        kf.__dict__.clear()
+        kf.__dict__.update(before)
+        if isinstance(error, np.linalg.LinAlgError):
+            raise ValueError(f"{name}: S = H P H' + R cannot be inverted ({error}); {SILENT_REFERENCE}") from error
+        if not isinstance(error, ValueError | TypeError):
+            raise
+        shapes = {key: np.shape(value) for key, value in {"x": kf.x, "P": kf.P, **arguments}.items()}
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"{name}: {error} (shapes: {shapes}). Nothing was changed") from error
+
+
+def _require_sound(kf: KalmanFilter) -> None:
+    """A step must leave x and P of their size, and finite."""
+    n = kf.dim_x
+    if np.size(kf.x) != n or np.shape(kf.P) not in ((), (n, n)):
+        raise ValueError(f"x would become {np.shape(kf.x)} and P {np.shape(kf.P)}, for dim_x = {n}")
+    for key in ("x", "P"):
+        if not np.all(np.isfinite(getattr(kf, key))):
+            raise ValueError(
+                f"{key} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, "
+                "H, M, K before this step"
+            )
+
+
+def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, Any, np.ndarray | None]:
+    """z, R and H as filterpy handles them, or a clear error."""
+    n = kf.dim_x
+    given = kf.H if H is None else H
+    if H is not None or np.ndim(given) == 1:
+        H = np.asarray(given)
+        H = H.reshape(1, -1) if H.ndim == 1 else H
+        given = H
+    if np.ndim(given) != 2 or np.shape(given)[1] != n:
+        raise ValueError(f"H must have shape ({n},) or (dim_z, {n}), got {np.shape(given)}")
+    require_finite(given, "H")
+    rows = np.shape(given)[0]
+    noise = kf.R if R is None else R
+    require_variance(noise, rows, "R")
+    if np.shape(noise) == (1,):
+        R = np.reshape(noise, (1, 1))
+    require_measurement(z, rows)
+    shape = np.shape(z)
+    # filterpy 2.0.0 takes z as it comes where H is given: (rows,) against a column would broadcast
+    wanted = (rows, 1) if np.ndim(kf.x) == 2 else (rows,)
+    if H is None or not shape or shape == wanted or (rows == 1 and len(wanted) == 2):
+        return z, R, H
+    return np.reshape(z, wanted), R, H
+
+
+def require_measurement(z: Any, rows: int) -> None:
+    """z: finite numbers, one a row of H, in a shape that converts to (rows, 1)."""
+    values = np.asarray(z)
+    if values.dtype.kind not in "biufc":
+        raise TypeError(f"z must be a number or an array of numbers, or None for a missed sample, got {z!r}")
+    shape = values.shape
+    if values.size != rows or shape not in ((), (rows,), (rows, 1), (1, rows)):
+        raise ValueError(f"z must have {rows} value(s), shape ({rows}, 1) or what converts to it, got shape {shape}")
+    require_finite(values, "z")
+
+
+def require_matrix(value: Any, shape: tuple[int, ...], name: str) -> None:
+    """Finite, of this shape."""
+    if np.shape(value) != shape:
+        raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
+    require_finite(value, name)
+
+
+def require_variance(value: Any, size: int, name: str) -> None:
+    """A variance: a number, or (size, size) with no negative value on its diagonal; finite."""
+    if np.ndim(value) > 0 and np.size(value) > 1:
+        require_matrix(value, (size, size), name)
+    else:
+        require_finite(np.asarray(value, dtype=np.float64), name)
+    if np.min(np.diagonal(value) if np.ndim(value) == 2 else value) < 0:
+        raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")

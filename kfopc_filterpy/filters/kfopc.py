@@ -1,0 +1,413 @@
+"""KFOPC: filterpy's KalmanFilter with a time-varying observation row and a scaled measurement (eq. 9-13)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from copy import deepcopy
+from math import sqrt
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from .._validate import as_number, as_signal, require_finite
+from .constrained import BatchReferences, ConstraintAttributes, constraint_settings
+from .guards import (
+    SILENT_REFERENCE,
+    all_or_nothing,
+    checked_measurement,
+    require_matrix,
+    require_measurement,
+    require_variance,
+)
+
+if TYPE_CHECKING:
+    from .random_walk import RandomWalkKFOPC
+
+
+class KFOPC(KalmanFilter, ConstraintAttributes):
+    r"""Kalman filter with output power constraint, a drop-in `filterpy.kalman.KalmanFilter`.
+
+    The measurement is scaled by the constraint factor before it corrects the state (eq. 9),
+
+    .. math:: \hat w(n|n) = \hat w(n|n-1) + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
+
+    With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except
+    that what would poison or break that filter (NaN, Inf, a wrong shape, a negative variance) raises before
+    any change.
+
+    Parameters
+    ----------
+    dim_x : int
+        Number of states; for active noise control the taps of the control filter.
+    dim_z : int, default 1
+        Number of measurements; 1 with a rated power.
+    dim_u : int, default 0
+        Number of control inputs.
+    rated_power : float, optional
+        Rated output power (mean square of the control signal). None: no constraint.
+    secondary_path_gain : float, optional
+        Power gain G_s of the secondary path; by default it is estimated from the newest sample of H and the
+        `reference` given to `update` (eq. 11).
+    fs : float, default 16000
+        Sample rate in Hz, which turns `power_memory` into samples.
+    power_memory : float, default 0.5
+        Memory of the power estimates in seconds.
+    power_window : {"exponential", "sliding"}, default "exponential"
+        Window of the power estimates.
+
+    Attributes
+    ----------
+    z : ndarray
+        Last measurement as given, unscaled.
+    y : ndarray
+        Residual of the scaled measurement, alpha z - H x; `S`, `K` and the likelihoods belong to it too.
+
+    Raises
+    ------
+    ValueError
+        A dimension out of range, a rated power with ``dim_z > 1``, a power or gain that is not positive.
+
+    See Also
+    --------
+    KFOPC.random_walk : the filter of eq. 1-8 at O(L^2) a sample.
+
+    Notes
+    -----
+    filterpy's ``alpha`` is its fading memory; the paper's :math:`\alpha` is `constraint_factor` here.
+
+    References
+    ----------
+    J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo, W.-S. Gan, "Preventing output saturation in active noise control:
+    An output-constrained Kalman filter approach", eq. 1-13.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import KFOPC
+    >>> kf = KFOPC(dim_x=2, rated_power=1.0, secondary_path_gain=1.0)
+    >>> kf.predict()
+    >>> kf.update(4.0, H=np.array([1.0, 0.5]))
+    >>> kf.constraint_factor  # sqrt(1 * 1 / 4**2)
+    0.25
+    >>> kf.y  # 0.25 * 4 - 0
+    array([[1.]])
+    """
+
+    x: Any  # assigned by filterpy, as the rest is
+    y: Any
+    z: Any
+    K: Any
+    _mahalanobis: Any
+
+    def __init__(
+        self,
+        dim_x: int,
+        dim_z: int = 1,
+        dim_u: int = 0,
+        *,
+        rated_power: float | None = None,
+        secondary_path_gain: float | None = None,
+        fs: float | None = None,
+        power_memory: float | None = None,
+        power_window: str = "exponential",
+    ) -> None:
+        self._constraint, self._unconstrained_factor = None, 1.0
+        self._batch_references: BatchReferences | None = None
+        self._constraint_settings = constraint_settings(fs, power_memory, power_window, secondary_path_gain)
+        super().__init__(dim_x, dim_z, dim_u)
+        self.rated_power = rated_power
+
+    @classmethod
+    def random_walk(
+        cls,
+        n_taps: int,
+        *,
+        state_noise: float,
+        measurement_noise: float,
+        initial_variance: float = 1.0,
+        rated_power: float | None = None,
+        dtype: Any = np.float64,
+        **constraint: Any,
+    ) -> RandomWalkKFOPC:
+        """Filter of eq. 1-8 for a control filter that walks at random: F = I, Q = r I, R = q, in O(L^2).
+
+        Parameters
+        ----------
+        n_taps : int
+            Taps L of the control filter, the state.
+        state_noise : float
+            State noise variance r (eq. 4), zero or above.
+        measurement_noise : float
+            Measurement noise variance q (eq. 7), zero or above.
+        initial_variance : float, default 1
+            Variance of each tap before the first sample: P(0|0) = initial_variance I.
+        rated_power : float, optional
+            Rated output power; None: the unconstrained filter, KF-ANC.
+        dtype : {numpy.float64, numpy.float32}, default numpy.float64
+            Precision that P is kept and stepped in; the weights stay float64. float32 halves the memory and, at many
+            taps, the time. It needs a state noise well above 6e-8 of the largest variance in P: below, rounding makes P
+            indefinite within some thousand samples of a band-limited reference, and `update` then refuses.
+        **constraint
+            `secondary_path_gain`, `fs`, `power_memory`, `power_window`, as for `KFOPC`.
+
+        Returns
+        -------
+        RandomWalkKFOPC
+            A KFOPC whose `predict` and `update` cost O(L^2); subclass that class to extend it.
+
+        Raises
+        ------
+        ValueError
+            A negative variance, fewer than one tap, another dtype, or a constraint argument out of range.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC.random_walk(4, state_noise=1e-6, measurement_noise=0.1)
+        >>> kf.predict()
+        >>> kf.update(1.0, H=np.array([1.0, 0.0, 0.0, 0.0]))
+        >>> print(round(float(kf.x[0, 0]), 6))  # P h / (h P h + q) = 1.000001 / 1.100001
+        0.909091
+        """
+        from .random_walk import RandomWalkKFOPC
+
+        return RandomWalkKFOPC(
+            n_taps,
+            state_noise=state_noise,
+            measurement_noise=measurement_noise,
+            initial_variance=initial_variance,
+            rated_power=rated_power,
+            dtype=dtype,
+            **constraint,
+        )
+
+    # filterpy's steps.
+
+    def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
+        """filterpy's `predict`; arguments that would poison the filter raise before any change."""
+        n = self.dim_x
+        transition = self.F if F is None else F
+        require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
+        require_variance(self.Q if Q is None else Q, n, "Q")
+        used_B = None if u is None else self.B if B is None else B
+        with self._all_or_nothing("predict", u=u, B=used_B):
+            super().predict(u, B, F, Q)
+
+    def predict_steadystate(self, u: Any = 0, B: Any = None) -> None:
+        """filterpy's `predict_steadystate`; what would poison the filter raises before any change."""
+        with self._all_or_nothing("predict_steadystate", u=u, B=self.B if B is None else B):
+            super().predict_steadystate(u, B)
+
+    def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
+        """Correct the state with a measurement, scaled by the constraint factor (eq. 9).
+
+        Parameters
+        ----------
+        z : float, array_like or None
+            Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
+            no power estimate advances.
+        R : float or array_like, optional
+            Measurement noise variance of this step; by default `self.R`.
+        H : array_like, optional
+            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power its first
+            element is the newest filtered reference x'(n).
+        reference : float, optional
+            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11).
+
+        Raises
+        ------
+        ValueError
+            NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power
+            with neither a reference nor a secondary-path gain. The filter is as it was and can go on.
+        """
+        reference = self._next_reference(z, reference)
+        if z is None:
+            super().update(None)
+            return
+        z, R, H = checked_measurement(self, z, R, H)
+        self._scaled_step("update", lambda scaled: KalmanFilter.update(self, scaled, R, H), z, H, reference)
+
+    def update_steadystate(self, z: Any, *, reference: float | None = None) -> None:
+        """filterpy's `update_steadystate` with the measurement scaled; see `update`."""
+        if z is None:
+            super().update_steadystate(None)
+            return
+        reference = self._next_reference(z, reference)
+        z, _, _ = checked_measurement(self, z, None, None)
+        step = super().update_steadystate
+        self._scaled_step("update_steadystate", step, z, None, reference)
+
+    def update_correlated(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
+        """filterpy's `update_correlated` with the measurement scaled; see `update`."""
+        if z is None:
+            super().update_correlated(None)
+            return
+        reference = self._next_reference(z, reference)
+        z, R, H = checked_measurement(self, z, R, H)
+        step = super().update_correlated
+        self._scaled_step("update_correlated", lambda scaled: step(scaled, R, H), z, H, reference)
+
+    def update_sequential(
+        self, start: int, z_i: Any, R_i: Any = None, H_i: Any = None, *, reference: float | None = None
+    ) -> None:
+        """filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
+        if not hasattr(KalmanFilter, "update_sequential"):
+            raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
+        reference = self._next_reference(z_i, reference)
+        length = np.size(z_i)
+        if not 0 <= start <= self.dim_z - length:
+            raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
+        require_measurement(z_i, length)
+        rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
+        require_finite(rows, "H_i")
+        noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
+        require_variance(noise, length, "R_i")
+        if not np.any(rows) and not np.any(noise):
+            raise ValueError(SILENT_REFERENCE)
+
+        def step(scaled: Any) -> None:
+            # filterpy writes into these four in place: let it write into copies, so that all can be undone
+            self.x, self.y, self.K = self.x.copy(), self.y.copy(), self.K.copy()
+            self.z = np.array(self.z).reshape(self.dim_z, 1)
+            KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
+
+        self._scaled_step("update_sequential", step, z_i, rows, reference, start)
+
+    def batch_filter(
+        self,
+        zs: Sequence[Any],
+        Fs: Any = None,
+        Qs: Any = None,
+        Hs: Any = None,
+        Rs: Any = None,
+        Bs: Any = None,
+        us: Any = None,
+        update_first: bool = False,
+        saver: Any = None,
+        *,
+        references: Any = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """filterpy's `batch_filter`, with the newest reference sample of each step in `references`.
+
+        Parameters
+        ----------
+        zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver
+            As in filterpy; each step of `Hs` may be (n,).
+        references : array_like, optional
+            (len(zs),) reference samples x(n), for a filter with a rated power.
+
+        Returns
+        -------
+        means, covariances, means_predictions, covariances_predictions : ndarray
+            As in filterpy.
+
+        Raises
+        ------
+        ValueError
+            As `predict` and `update` do; the filter is then as it was before the batch.
+        """
+        if references is not None:
+            references = BatchReferences(as_signal(references, "references", length=len(zs)))
+        for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
+            if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
+                raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
+        before = self.__getstate__()
+        self._batch_references = references
+        try:
+            result = super().batch_filter(zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
+        except BaseException:
+            self.__dict__.clear()
+            self.__dict__.update(before)
+            raise
+        self._batch_references = None
+        return result
+
+    def get_update(self, z: Any = None) -> tuple[np.ndarray, np.ndarray]:
+        """filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
+        return super().get_update(None if z is None else self._presently_scaled(z))
+
+    def residual_of(self, z: Any) -> np.ndarray:
+        """Residual of the measurement scaled by the present factor; nothing changes."""
+        return super().residual_of(self._presently_scaled(z))
+
+    def log_likelihood_of(self, z: Any) -> float:
+        """Log-likelihood of the measurement scaled by the present factor; nothing changes."""
+        return super().log_likelihood_of(None if z is None else self._presently_scaled(z))
+
+    @property
+    def alpha(self) -> float:
+        """filterpy's fading memory, 1 or above; not the constraint factor."""
+        return super().alpha
+
+    @alpha.setter
+    def alpha(self, value: float) -> None:
+        as_number(as_number(value, "alpha") * value, "the square of alpha")
+        KalmanFilter.alpha.fset(self, value)
+
+    @property
+    def mahalanobis(self) -> float:
+        """Mahalanobis distance of the scaled measurement (filterpy 1.4.5's own fails on numpy 2)."""
+        if self._mahalanobis is None:
+            self._mahalanobis = sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
+        return self._mahalanobis
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy starts from; the powers advance in place, so that even a shallow copy needs its own."""
+        return self.__dict__ | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
+
+    def __repr__(self) -> str:
+        constraint = [
+            f"{name} = {getattr(self, name)}"
+            for name in ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
+        ]
+        return "\n".join(
+            [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint]
+        )
+
+    # All or nothing: what a step needs checked, and how it is undone.
+
+    def _next_reference(self, z: Any, reference: float | None) -> float | None:
+        if reference is None and self._batch_references is not None:
+            reference = self._batch_references.next()
+        return None if z is None or reference is None else as_number(reference, "reference")
+
+    def _presently_scaled(self, z: Any) -> Any:
+        require_measurement(z, self.dim_z)
+        return self._scaled(z, self.constraint_factor)
+
+    @staticmethod
+    def _scaled(z: Any, factor: float) -> Any:
+        return z if factor == 1.0 else factor * np.asarray(z)
+
+    def _scaled_step(
+        self,
+        name: str,
+        step: Callable[[Any], None],
+        z: Any,
+        H: np.ndarray | None,
+        reference: float | None,
+        start: int | None = None,
+    ) -> None:
+        """Run `step` on the scaled measurement, then advance the powers; an error leaves all as it was."""
+        sample, factor = None, self.constraint_factor
+        if self._constraint is not None:
+            row = np.asarray(self.H if H is None else H)
+            if row.size != self.dim_x:
+                raise ValueError(f"a rated power needs one measurement, one row of H, got {row.shape[0]} rows")
+            sample = (np.asarray(z).item(), row.flat[0], reference)
+            factor = self._constraint.preview(*sample)
+        with self._all_or_nothing(name):
+            step(self._scaled(z, factor))
+        if factor != 1.0:  # z is kept as given, in the shape that filterpy keeps it
+            if start is None:
+                self.z = np.reshape(z, np.shape(self.z)).copy()
+            else:
+                self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
+        if sample is not None and self._constraint is not None:
+            self._constraint.advance(*sample)
+
+    def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
+        return all_or_nothing(self, name, **arguments)

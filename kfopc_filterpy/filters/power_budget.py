@@ -1,0 +1,219 @@
+"""A filterpy filter with a power budget: the random-walk Kalman filter, and the best filter within the power."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+
+from ..power.budget import DEFAULT_CORRELATION_MEMORY_S, DEFAULT_CREDIT_S, PowerBudget
+from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
+from .random_walk import RandomWalkKFOPC
+
+
+class PowerBudgetKalmanFilter(RandomWalkKFOPC):
+    r"""Kalman filter that spends a rated output power optimally and keeps to it; a filterpy `KalmanFilter`.
+
+    The state `x` is the estimate of the unconstrained control filter (eq. 1-8, without KF-OPC's constraint factor).
+    What drives the actuator is `control_filter`: among all filters of its length within the rated power the one of
+    least error, the power-constrained Wiener solution for that estimate and the recent signals (`PowerBudget`).
+
+    Parameters
+    ----------
+    n_taps : int
+        Taps L of the control filter, the state.
+    state_noise, measurement_noise, initial_variance, dtype
+        r, q, P(0|0) = initial_variance I and the precision of P, see `KFOPC.random_walk`.
+    rated_power : float
+        Rated output power (mean square of the control signal).
+    fs, memory_s, credit_s
+        See `PowerBudget`.
+
+    Raises
+    ------
+    ValueError
+        What `KFOPC.random_walk` and `PowerBudget` refuse.
+
+    See Also
+    --------
+    kf_pb : the same as an active-noise-control controller.
+
+    Notes
+    -----
+    Observing the control signal to be zero with a variance ``q / lambda`` beside each measurement, two observations a
+    sample, has the same fixed point. But what that filter learns at one lambda it must forget at the next, over its
+    whole memory. Here lambda takes effect at once.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy.filters import PowerBudgetKalmanFilter
+    >>> kf = PowerBudgetKalmanFilter(2, state_noise=1e-9, measurement_noise=0.01, rated_power=1.0)
+    >>> row = np.zeros(2)
+    >>> for x in np.random.default_rng(0).standard_normal(16000):
+    ...     row = np.array([x, row[0]])  # the secondary path is a wire: the filtered reference is the reference
+    ...     y = kf.control_signal(x)
+    ...     kf.predict()
+    ...     kf.update(3.0 * row[0] + row[1], H=row, reference=x)
+    >>> kf.x.ravel().round(2)  # without a limit: power 10
+    array([3., 1.])
+    >>> kf.control_filter.round(1)
+    array([0.9, 0.3])
+    """
+
+    _budget: PowerBudget | None = None
+
+    def __init__(
+        self,
+        n_taps: int,
+        *,
+        state_noise: float,
+        measurement_noise: float,
+        rated_power: float,
+        initial_variance: float = 1.0,
+        dtype: Any = np.float64,
+        fs: float = DEFAULT_FS,
+        memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
+        credit_s: float = DEFAULT_CREDIT_S,
+    ) -> None:
+        super().__init__(
+            n_taps,
+            state_noise=state_noise,
+            measurement_noise=measurement_noise,
+            initial_variance=initial_variance,
+            dtype=dtype,
+        )
+        self._budget = PowerBudget(n_taps, rated_power, fs=fs, memory_s=memory_s, credit_s=credit_s)
+
+    @property
+    def budget(self) -> PowerBudget:
+        """What finds the control filter within the power."""
+        assert self._budget is not None
+        return self._budget
+
+    @property
+    def rated_power(self) -> float | None:
+        """Rated output power; can be assigned."""
+        return None if self._budget is None else self._budget.rated_power
+
+    @rated_power.setter
+    def rated_power(self, value: float | None) -> None:
+        if self._budget is not None:
+            self._budget.rated_power = value  # type: ignore[assignment]  # None is refused there
+        elif value is not None:
+            raise ValueError("rated_power is the budget's")
+
+    @property
+    def control_filter(self) -> np.ndarray:
+        """Control filter v within the rated power, (L,), zero before the first sample; a copy."""
+        return self.budget.control_filter
+
+    @property
+    def power_weight(self) -> float:
+        """Weight lambda of the control power; 0: the estimate fits the budget as it is, Inf: it was scaled to fit."""
+        return self.budget.power_weight
+
+    @property
+    def constraint_factor(self) -> float:
+        """1: the estimate is not scaled; what keeps the power is the control filter."""
+        return 1.0
+
+    @constraint_factor.setter
+    def constraint_factor(self, value: float | None) -> None:
+        if value not in (None, 1.0):
+            raise ValueError(f"constraint_factor is 1 in a power budget, got {value!r}: assign rated_power instead")
+
+    def control_signal(self, reference: float) -> float:
+        """Control signal y(n) for the reference x(n); call it before `update` with the same x(n)."""
+        return self.budget.control_signal(reference)
+
+    def update(
+        self,
+        z: Any,
+        R: Any = None,
+        H: Any = None,
+        *,
+        reference: float | None = None,
+        control_signal: float | None = None,
+    ) -> None:
+        """Correct the state with a measurement, and the control filter with what it cost.
+
+        Parameters
+        ----------
+        z, R, H
+            See `KFOPC.update`; H is the filtered reference x'(n), newest sample first. With z None, a missed sample,
+            nothing advances: what was emitted meanwhile is not accounted for.
+        reference : float
+            Newest reference x(n).
+        control_signal : float, optional
+            What was emitted, where it is not `control_filter` applied to the reference: after a limiter, say.
+
+        Raises
+        ------
+        ValueError
+            As `KFOPC.update`, or no reference. The filter is as it was and can go on.
+        """
+        self._spend(lambda: super(PowerBudgetKalmanFilter, self).update(z, R, H), z, H, reference, control_signal)
+
+    def update_steadystate(
+        self, z: Any, *, reference: float | None = None, control_signal: float | None = None
+    ) -> None:
+        """filterpy's `update_steadystate`; see `update`."""
+        step = super().update_steadystate
+        self._spend(lambda: step(z), z, None, reference, control_signal)
+
+    def update_correlated(
+        self,
+        z: Any,
+        R: Any = None,
+        H: Any = None,
+        *,
+        reference: float | None = None,
+        control_signal: float | None = None,
+    ) -> None:
+        """filterpy's `update_correlated`; see `update`."""
+        step = super().update_correlated
+        self._spend(lambda: step(z, R, H), z, H, reference, control_signal)
+
+    def update_sequential(
+        self,
+        start: int,
+        z_i: Any,
+        R_i: Any = None,
+        H_i: Any = None,
+        *,
+        reference: float | None = None,
+        control_signal: float | None = None,
+    ) -> None:
+        """filterpy's `update_sequential` (filterpy 2.0.0); see `update`."""
+        step = super().update_sequential
+        self._spend(lambda: step(start, z_i, R_i, H_i), z_i, H_i, reference, control_signal)
+
+    def _spend(
+        self, step: Callable[[], None], z: Any, H: Any, reference: float | None, control_signal: float | None
+    ) -> None:
+        """Run filterpy's step, and let the budget follow the sample; a missed one is only the step."""
+        reference = self._next_reference(z, reference)
+        references, self._batch_references = self._batch_references, None  # this sample's is taken
+        try:
+            if z is None:
+                step()
+                return
+            if reference is None:
+                raise ValueError("reference is missing: pass reference=, the newest reference sample x(n)")
+            row = np.asarray(self.H if H is None else H)
+            newest = row.flat[0] if row.size == self.dim_x else 0.0  # the step refuses any other size
+            emitted = self.budget.checked_sample(reference, newest, control_signal)
+            step()
+            self.budget.advance(reference, newest, self._weights(), emitted)
+        finally:
+            self._batch_references = references
+
+    def _require_constraint(self, name: str) -> OutputPowerConstraint:
+        raise ValueError(f"{name} has no part in a power budget, which goes by the signals' correlations")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy has a budget of its own."""
+        return super().__getstate__() | {"_budget": deepcopy(self._budget)}

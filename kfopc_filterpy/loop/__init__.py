@@ -1,0 +1,1 @@
+"""The plant and the loop over samples, whole signals and scenarios."""

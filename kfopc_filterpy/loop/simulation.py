@@ -1,0 +1,400 @@
+"""The modified ANC structure of the paper's block diagrams: controller + amplifier + paths -> a frozen result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_generator, as_nonnegative, as_positive, as_signal
+from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
+from ..controllers.limited import LimitedController
+from ..kernels.delay_lines import delay_line
+from ..paths.models import path_taps
+from ..power.amplifiers import Amplifier, compiled_parameters
+from ..power.constraint import DEFAULT_FS
+from .run import (
+    AMPLIFIED,
+    ANTI_NOISE,
+    CONTROL,
+    DISTURBANCE_IN,
+    DIVERGED,
+    ERROR,
+    REFERENCE_IN,
+    REFUSED,
+    ROWS,
+    RUNNING,
+    SENSOR_NOISE,
+    STEP,
+    USED_FACTOR,
+    USED_GAIN,
+    USED_POWER,
+    USED_WEIGHT,
+    ControllerState,
+    Plant,
+    anti_noise,
+    measured_reference,
+    run,
+)
+
+DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
+RECORDED = (ERROR, CONTROL, AMPLIFIED, ANTI_NOISE, USED_FACTOR)  # always; the powers where they are asked for
+
+
+@dataclass(frozen=True)
+class SimulationResult:
+    """What a run left. Signals are (n_samples,), read-only; after a divergence they are NaN.
+
+    Attributes
+    ----------
+    algorithm : str
+        Name of the controller.
+    fs : float
+        Sample rate in Hz.
+    rated_power : float or None
+        Rated output power of the controller, or the one given to `simulate`.
+    reference, disturbance : ndarray
+        Reference x and disturbance d of the run.
+    error : ndarray
+        Error e = d - s*y_amp at the error microphone, sensor noise included.
+    control_signal, amplifier_output : ndarray
+        Control signal y before, and y_amp after the amplifier.
+    anti_noise : ndarray
+        Anti-noise s*y_amp at the error microphone.
+    constraint_factor : ndarray
+        Constraint factor; 1 for a controller without a constraint, NaN for one that does not say.
+    weights : ndarray or None
+        (n_rows, L) control filter after samples 0, k, 2k, ..., where it was asked for.
+    weights_time_s : ndarray or None
+        (n_rows,) their times in seconds.
+    disturbance_power, secondary_path_gain : ndarray or None
+        Power histories (eq. 10, 11), where they were asked for.
+    power_weight : ndarray or None
+        Weight lambda of the control power of a power budget (NaN without one), where powers were asked for.
+    diverged_at_s : float or None
+        Time at which the control signal passed 1e6 sqrt(rated power); None: it did not.
+    """
+
+    algorithm: str
+    fs: float
+    rated_power: float | None
+    reference: np.ndarray
+    disturbance: np.ndarray
+    error: np.ndarray
+    control_signal: np.ndarray
+    amplifier_output: np.ndarray
+    anti_noise: np.ndarray
+    constraint_factor: np.ndarray
+    weights: np.ndarray | None = None
+    weights_time_s: np.ndarray | None = None
+    disturbance_power: np.ndarray | None = None
+    secondary_path_gain: np.ndarray | None = None
+    power_weight: np.ndarray | None = None
+    diverged_at_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(n_samples,) time in seconds."""
+        return np.arange(self.error.size) / self.fs
+
+
+def simulate(
+    controller: Controller,
+    reference: Any,
+    *,
+    secondary_path: Any,
+    primary_path: Any = None,
+    disturbance: Any = None,
+    fs: float = DEFAULT_FS,
+    amplifier: Amplifier | None = None,
+    rated_power: float | None = None,
+    sensor_noise_std: float = 0.0,
+    rng: Any = None,
+    switch_on_s: float = 0.0,
+    feedback_path: Any = None,
+    record_weights_every: int | None = None,
+    record_powers: bool = False,
+    progress: Callable[[int], Any] | None = None,
+    compiled: bool = True,
+) -> SimulationResult:
+    """Run a controller in the modified ANC structure.
+
+    Each sample: the control signal from the last weights, the amplifier, the error e = d - s*y_amp, the controller's
+    update. Single channel. The built-in controllers run at compiled speed; a user's own is called sample by sample.
+
+    Parameters
+    ----------
+    controller : Controller
+        Goes on from the state it is in, with paths that start silent; make a new one for a fresh run.
+    reference : array_like
+        (n_samples,) reference x.
+    secondary_path : array_like or control.TransferFunction
+        True secondary path s, loudspeaker amplifier to error microphone.
+    primary_path : array_like or control.TransferFunction, optional
+        Path from the reference to the error microphone, which makes the disturbance p*x.
+    disturbance : array_like, optional
+        (n_samples,) disturbance d, in place of `primary_path`.
+    fs : float, default 16000
+        Sample rate in Hz; systems given must have it.
+    amplifier : callable, optional
+        Amplifier model, by default linear; any function of a sample that returns a finite number.
+    rated_power : float, optional
+        Rated power, by default the controller's; it sets the scale of the divergence limit (1 where neither says).
+    sensor_noise_std : float, default 0
+        Standard deviation of white noise at the error microphone.
+    rng : int or numpy.random.Generator, optional
+        Seed of the sensor noise, needed where there is any.
+    switch_on_s : float, default 0
+        Time at which the control is switched on. Until then the loudspeaker is silent and the controller listens
+        (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts there.
+    feedback_path : array_like or control.TransferFunction, optional
+        Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
+    record_weights_every : int, optional
+        Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
+    record_powers : bool, default False
+        Record the disturbance power, the secondary-path gain and the weight of a power budget.
+    progress : callable, optional
+        Called with the number of samples done since its last call, such as `tqdm.update`.
+    compiled : bool, default True
+        False: call the controller sample by sample even where a compiled loop exists, with equal results.
+
+    Returns
+    -------
+    SimulationResult
+        Divergence is a result: past ``1e6 sqrt(rated_power)`` the run stops and `diverged_at_s` says when.
+
+    Raises
+    ------
+    ValueError
+        Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
+        `primary_path` and `disturbance`; a feedback path without delay. Nothing was changed. In the midst of a run: an
+        amplifier that returns NaN, or an update without a solution (a silent reference with q = 0).
+    TypeError
+        A controller without `control_signal` and `update`, an amplifier that is no function.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import kf_opc, simulate
+    >>> x = np.random.default_rng(0).standard_normal(16000)
+    >>> controller = kf_opc(16, [0.0, 1.0], rated_power=0.25, state_noise=1e-9, measurement_noise=1e-3)
+    >>> result = simulate(controller, x, secondary_path=[0.0, 1.0], primary_path=[0.0, 0.0, 0.0, 1.0])
+    >>> bool(np.mean(result.control_signal[8000:] ** 2) < 1.02 * 0.25)  # unconstrained it would be 1
+    True
+    """
+    if isinstance(controller, type) or not isinstance(controller, Controller):
+        raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    if amplifier is not None and not callable(amplifier):
+        raise TypeError(f"amplifier must be a function of a sample, or None, got {amplifier!r}")
+    fs = as_positive(fs, "fs", unit="Hz")
+    x = as_signal(reference, "reference")
+    d = disturbance_at_microphone(x, primary_path, disturbance, fs)
+    noise = SensorNoise(sensor_noise_std, rng)
+    if rated_power is None:
+        rated_power = getattr(controller, "rated_power", None)
+    rated_power = None if rated_power is None else as_positive(rated_power, "rated_power")
+    limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
+    every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
+    on = switch_on_sample(switch_on_s, fs, x.size)
+    plant = _plant(secondary_path, feedback_path, amplifier, fs)
+    if isinstance(controller, FilteredReferenceController | LimitedController):
+        controller.require_sample_rate(fs)
+    weights = _weight_rows(x.size - on, controller, every)
+    if on:
+        _listen(controller, x[:on], d[:on] + noise.take(on))
+        x, d = x[on:], d[on:]
+
+    run_stretch = partial(_run_steps, controller, plant, amplifier)
+    if compiled and isinstance(controller, FilteredReferenceController) and compiled_parameters(amplifier) is not None:
+        state = controller.compiled_state()
+        if state is not None:
+            run_stretch = partial(_run_compiled, controller, state, plant)
+    rows = (*RECORDED, USED_POWER, USED_GAIN, USED_WEIGHT) if record_powers else RECORDED
+    recorded = np.empty((len(rows), x.size))
+    status, end = RUNNING, 0
+    for first in range(0, x.size, STEP):
+        stretch = np.empty((ROWS, min(STEP, x.size - first)))
+        stretch[REFERENCE_IN] = x[first : first + STEP]
+        stretch[DISTURBANCE_IN] = d[first : first + STEP]
+        stretch[SENSOR_NOISE] = noise.take(stretch.shape[1])
+        stretch[USED_WEIGHT] = np.nan
+        status, done = run_stretch(stretch, weights, limit, every or 1, first, progress)
+        end = first + done
+        recorded[:, first:end] = stretch[rows, :done]
+        if status != RUNNING:
+            break
+    recorded[:, end:] = np.nan
+    weights[-(-end // (every or 1)) :] = np.nan
+    e, y, y_amplified, a, factor, *powers = recorded
+    return SimulationResult(
+        algorithm=str(getattr(controller, "name", type(controller).__name__)),
+        fs=fs,
+        rated_power=rated_power,
+        reference=x.copy(),
+        disturbance=d.copy(),
+        error=e,
+        control_signal=y,
+        amplifier_output=y_amplified,
+        anti_noise=a,
+        constraint_factor=factor,
+        weights=weights if every else None,
+        weights_time_s=np.arange(len(weights)) * every / fs if every else None,
+        disturbance_power=powers[0] if powers else None,
+        secondary_path_gain=powers[1] if powers else None,
+        power_weight=powers[2] if powers and hasattr(controller, "power_weight") else None,
+        diverged_at_s=end / fs if status == DIVERGED else None,
+    )
+
+
+def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
+    """Samples before the control is switched on."""
+    on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
+    if on >= n_samples:
+        raise ValueError("switch_on_s must leave samples to control: it takes the whole signal")
+    return on
+
+
+def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
+    if not hasattr(controller, "listen"):
+        raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+    controller.listen(x, errors)
+
+
+def _run_compiled(
+    controller: FilteredReferenceController,
+    state: ControllerState,
+    plant: Plant,
+    stretch: np.ndarray,
+    weights: np.ndarray,
+    limit: float,
+    every: int,
+    first: int,
+    progress: Callable[[int], Any] | None,
+) -> tuple[int, int]:
+    """`loop.run`."""
+    status, done = RUNNING, 0
+    try:
+        for begin, end in controller.blocks(state, stretch.shape[1]):
+            block = controller.open_block
+            status, done = run(state, block, plant, stretch, weights, limit, every, first, begin, end)
+            if status != RUNNING:
+                break
+    finally:  # interrupted or not, the controller is as its last sample left it
+        controller.after_compiled(state)
+    if progress:
+        progress(done)
+    if status == REFUSED:
+        with _naming_sample(first + done):
+            controller.update(stretch[ERROR, done])  # refused again, with the reason
+            raise ValueError(NO_SOLUTION)
+    return status, done
+
+
+def _run_steps(
+    controller: Controller,
+    plant: Plant,
+    amplifier: Amplifier | None,
+    stretch: np.ndarray,
+    weights: np.ndarray,
+    limit: float,
+    every: int,
+    first: int,
+    progress: Callable[[int], Any] | None,
+) -> tuple[int, int]:
+    """The loop of `loop.run`, one call of the controller at a time."""
+    for k in range(stretch.shape[1]):
+        with _naming_sample(first + k):
+            x = measured_reference(plant, stretch[REFERENCE_IN, k])
+            y = _as_sample(controller.control_signal(float(x)), "control_signal")
+            if not abs(y) <= limit:
+                return DIVERGED, k
+            y_amplified = y if amplifier is None else _as_sample(amplifier(y), "amplifier")
+            if not np.isfinite(y_amplified):
+                raise ValueError(f"amplifier must return a finite number, got {y_amplified} for {y}")
+            a = anti_noise(plant, y_amplified)
+            e = stretch[DISTURBANCE_IN, k] - a + stretch[SENSOR_NOISE, k]
+            controller.update(float(e))
+        stretch[ERROR, k], stretch[CONTROL, k] = e, y
+        stretch[AMPLIFIED, k], stretch[ANTI_NOISE, k] = y_amplified, a
+        stretch[USED_FACTOR, k] = getattr(controller, "constraint_factor", np.nan)
+        stretch[USED_POWER, k] = getattr(controller, "disturbance_power", np.nan)
+        stretch[USED_GAIN, k] = getattr(controller, "secondary_path_gain", np.nan)
+        stretch[USED_WEIGHT, k] = getattr(controller, "power_weight", np.nan)
+        if weights.shape[0] > 0 and (first + k) % every == 0:
+            now = getattr(controller, "control_filter", getattr(controller, "weights", None))
+            weights[(first + k) // every] = np.array(now, dtype=np.float64).reshape(-1)
+        if progress:
+            progress(1)
+    return RUNNING, stretch.shape[1]
+
+
+@contextmanager
+def _naming_sample(n: int) -> Iterator[None]:
+    """Tell of an error in which sample of the run it came."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in sample {n} of the run")
+        raise
+
+
+def _as_sample(value: Any, source: str) -> float:
+    """What a user's function returned, NaN included, as a float."""
+    try:
+        return float(np.asarray(value).reshape(()))
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{source} must return one number, got {value!r}") from error
+
+
+def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
+    """(n_samples,) d, as given or p*x."""
+    if (primary_path is None) == (disturbance is None):
+        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+    if disturbance is not None:
+        return as_signal(disturbance, "disturbance", length=x.size)
+    return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+
+
+class SensorNoise:
+    """White noise, made a stretch at a time."""
+
+    def __init__(self, std: float, rng: Any) -> None:
+        self.std = as_nonnegative(std, "sensor_noise_std")
+        self.rng = as_generator(rng) if self.std > 0 else None
+
+    def take(self, n_samples: int) -> np.ndarray | float:
+        """The next samples; 0 where there is no noise."""
+        return 0.0 if self.rng is None else self.std * self.rng.standard_normal(n_samples)
+
+
+def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None, fs: float) -> Plant:
+    secondary = path_taps(secondary_path, fs=fs, name="secondary_path")
+    feedback = np.zeros(0)
+    if feedback_path is not None:
+        feedback = path_taps(feedback_path, fs=fs, name="feedback_path")
+        if feedback[0] != 0:
+            raise ValueError(
+                f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0"
+            )
+    parameters = compiled_parameters(amplifier)
+    if parameters is None:  # a user's own: applied in the loop of steps
+        parameters = compiled_parameters(None)
+    assert parameters is not None
+    return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), parameters)
+
+
+def _weight_rows(n_samples: int, controller: Controller, every: int | None) -> np.ndarray:
+    if every is None:
+        return np.empty((0, 0))
+    if not hasattr(controller, "weights"):
+        raise ValueError("record_weights_every needs a controller with an attribute weights, (L,)")
+    return np.empty((-(-n_samples // every), np.size(controller.weights)))

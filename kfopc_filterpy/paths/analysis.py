@@ -1,0 +1,316 @@
+"""Analysis of paths: responses in Hz, group delay, gain (eq. 11), phase error, the band achieved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_band, as_number, as_signal
+from .models import finite_taps, is_system, path_taps, sampling_rate
+
+STABILITY_BOUND_DEG = 90.0
+"""Phase error of the estimate beyond which filtered-reference adaptation diverges, in degrees."""
+
+
+def frequency_response(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
+    """Complex frequency response of a path.
+
+    Parameters
+    ----------
+    path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
+        Discrete-time system or impulse response.
+    frequencies_hz : array_like, shape (n_frequencies,)
+        Frequencies in Hz, within 0 to fs/2.
+    fs : float, optional
+        Sampling rate in Hz, needed for a tap array.
+
+    Returns
+    -------
+    numpy.ndarray, shape (n_frequencies,), complex
+        Response at each frequency.
+
+    Raises
+    ------
+    TypeError, ValueError
+        The path is not a discrete-time single-channel one, or a frequency is out of range.
+
+    Examples
+    --------
+    >>> frequency_response([0.5, 0.5], [0.0, 2000.0, 4000.0], fs=8000.0).round(3)
+    array([1. +0.j , 0.5-0.5j, 0. -0.j ])
+    """
+    fs = sampling_rate(path, fs)
+    omega = 2 * np.pi * _frequencies(frequencies_hz, fs) / fs
+    return _response(path, omega)
+
+
+def _response(path: Any, omega: np.ndarray) -> np.ndarray:
+    """Response at frequencies in rad/sample."""
+    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
+    if taps is None:
+        return np.asarray(path(np.exp(1j * omega)))
+    from scipy.signal import freqz
+
+    return freqz(taps, worN=omega)[1]
+
+
+def _frequencies(frequencies_hz: Any, fs: float) -> np.ndarray:
+    frequencies = as_signal(frequencies_hz, "frequencies_hz")
+    if frequencies.min() < 0 or frequencies.max() > fs / 2:
+        raise ValueError(
+            f"frequencies_hz must lie within 0 to fs/2 = {fs / 2:g} Hz, got "
+            f"{frequencies.min():g} to {frequencies.max():g} Hz"
+        )
+    return frequencies
+
+
+def group_delay(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
+    """Group delay of a path, ``-d(phase)/d(omega)``, in seconds.
+
+    Parameters
+    ----------
+    path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
+        As `frequency_response`; an infinite response is differentiated numerically, to some 1e-6 samples.
+    frequencies_hz : array_like, shape (n_frequencies,)
+        Frequencies in Hz, within 0 to fs/2.
+    fs : float, optional
+        Sampling rate in Hz, needed for a tap array.
+
+    Returns
+    -------
+    numpy.ndarray, shape (n_frequencies,)
+        Group delay in s; NaN at a zero of the response, where it is undefined.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `frequency_response`.
+
+    Examples
+    --------
+    >>> float(group_delay([0.0, 0.0, 1.0], [1000.0], fs=8000.0)[0])  # two samples
+    0.00025
+    """
+    fs = sampling_rate(path, fs)
+    omega = 2 * np.pi * _frequencies(frequencies_hz, fs) / fs
+    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
+    if taps is None:
+        step = 1e-4
+        before, after = _response(path, omega - step), _response(path, omega + step)
+        return np.angle(before * np.conj(after)) / (2 * step * fs)
+    response = _response(taps, omega)
+    ramped = _response(taps * np.arange(taps.size), omega)  # transform of n h[n]
+    zero = np.abs(response) <= 1e-12 * np.sum(np.abs(taps))
+    delay = np.full(omega.size, np.nan)
+    delay[~zero] = np.real(ramped[~zero] / response[~zero]) / fs
+    return delay
+
+
+def secondary_path_gain(
+    path: Any, *, band: tuple[float, float] | None = None, reference: Any = None, fs: float | None = None
+) -> float:
+    """Secondary-path gain ``G_s = E[x'^2] / E[x^2]`` (eq. 11), a power gain.
+
+    Parameters
+    ----------
+    path : control.TransferFunction or array_like, shape (n_taps,)
+        Secondary path with a finite impulse response.
+    band : (float, float), optional
+        For noise white within this band in Hz; from 0 to fs/2 by default. Computed in closed form.
+    reference : array_like, shape (n_samples,), optional
+        For this reference signal instead of noise; the first ``n_taps - 1`` samples, while the delay line
+        fills, do not count.
+    fs : float, optional
+        Sampling rate in Hz, needed for a tap array with a `band`.
+
+    Returns
+    -------
+    float
+        Mean-square gain (not in dB).
+
+    Raises
+    ------
+    TypeError, ValueError
+        Both `band` and `reference` given, or a silent or too short reference.
+
+    References
+    ----------
+    .. [1] D. Shi et al., IEEE/ACM Trans. Audio Speech Lang. Process. 29, 2021.
+
+    Examples
+    --------
+    >>> secondary_path_gain([0.0, 2.0])
+    4.0
+    """
+    taps = path_taps(path, fs=fs)
+    if reference is not None:
+        if band is not None:
+            raise ValueError("band and reference exclude each other: give one of them")
+        return _gain_for_reference(taps, reference)
+    if band is None:
+        return float(taps @ taps)
+    fs = sampling_rate(path, fs)
+    low, high = as_band(band, fs)
+    # |S|² is the cosine series of the taps' autocorrelation; its mean over a band integrates term by term.
+    lags = np.arange(taps.size)
+    autocorrelation = np.correlate(taps, taps, "full")[taps.size - 1 :]
+    mean_cosine = (high * np.sinc(2 * lags * high / fs) - low * np.sinc(2 * lags * low / fs)) / (high - low)
+    return float(autocorrelation[0] + 2 * autocorrelation[1:] @ mean_cosine[1:])
+
+
+def _gain_for_reference(taps: np.ndarray, reference: Any) -> float:
+    from scipy.signal import lfilter
+
+    x = as_signal(reference, "reference", min_length=taps.size)
+    filtered = lfilter(taps, 1.0, x)[taps.size - 1 :]
+    power = np.mean(x[taps.size - 1 :] ** 2)
+    if power == 0:
+        raise ValueError("reference must not be silent: the gain for it is undefined")
+    return float(np.mean(filtered**2) / power)
+
+
+@dataclass(frozen=True)
+class PhaseError:
+    """Phase of a path's estimate against the path.
+
+    Attributes
+    ----------
+    frequencies_hz : numpy.ndarray, shape (n_frequencies,)
+        Frequencies in Hz.
+    error_deg : numpy.ndarray, shape (n_frequencies,)
+        Phase of estimate less that of path in degrees, within -180 to 180.
+    bound_deg : float
+        Stability bound: adaptation diverges at frequencies where the error's magnitude exceeds it.
+    """
+
+    frequencies_hz: np.ndarray
+    error_deg: np.ndarray
+    bound_deg: float = STABILITY_BOUND_DEG
+
+    @property
+    def within_bound(self) -> np.ndarray:
+        """Whether each frequency lies within the stability bound."""
+        return np.abs(self.error_deg) < self.bound_deg
+
+
+def phase_error(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> PhaseError:
+    """Phase error of a secondary-path estimate, with the 90 degree stability bound.
+
+    Parameters
+    ----------
+    path, estimate : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
+        True path and its estimate.
+    frequencies_hz : array_like, shape (n_frequencies,)
+        Frequencies in Hz, within 0 to fs/2.
+    fs : float, optional
+        Sampling rate in Hz, needed for tap arrays.
+
+    Returns
+    -------
+    PhaseError
+        Errors in degrees and the bound.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `frequency_response`, or the paths differ in sampling rate.
+
+    References
+    ----------
+    .. [1] D. Morgan, IEEE Trans. Acoust. Speech Signal Process. 28(4), 1980.
+
+    Examples
+    --------
+    >>> error = phase_error([1.0, 0.0], [0.0, 1.0], [1000.0, 3000.0], fs=8000.0)  # one sample late
+    >>> error.error_deg.round(6), error.within_bound
+    (array([ -45., -135.]), array([ True, False]))
+    """
+    fs = sampling_rate(path, fs)
+    sampling_rate(estimate, fs, name="estimate")
+    true = frequency_response(path, frequencies_hz, fs=fs)
+    estimated = frequency_response(estimate, frequencies_hz, fs=fs)
+    error = np.rad2deg(np.angle(estimated * np.conj(true)))
+    return PhaseError(as_signal(frequencies_hz, "frequencies_hz"), error)
+
+
+@dataclass(frozen=True)
+class AchievedBand:
+    """The band that a path really passes.
+
+    Attributes
+    ----------
+    low_hz, high_hz : float
+        Outermost frequencies at which the response is `level_db` below its peak; 0 or fs/2 where it does
+        not fall so low.
+    peak_hz : float
+        Frequency of the peak.
+    peak_db : float
+        Response at the peak in dB.
+    level_db : float
+        Level, relative to the peak, that marks the band.
+    """
+
+    low_hz: float
+    high_hz: float
+    peak_hz: float
+    peak_db: float
+    level_db: float
+
+
+def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None) -> AchievedBand:
+    """Band within which a path's response stays above a level, to see what its taps really realise.
+
+    Parameters
+    ----------
+    path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
+        Discrete-time system or impulse response.
+    level_db : float
+        Level that marks the edges, in dB relative to the peak; negative.
+    fs : float, optional
+        Sampling rate in Hz, needed for a tap array.
+
+    Returns
+    -------
+    AchievedBand
+        Edges (interpolated on a grid of fs/65536) and peak.
+
+    Raises
+    ------
+    TypeError, ValueError
+        `level_db` is not negative, or the path is silent.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.paths.models import bandpass_path
+    >>> band = achieved_band(bandpass_path(32), level_db=-6.0)  # designed for 20 to 5000 Hz
+    >>> band.low_hz, round(band.high_hz)
+    (0.0, 4997)
+    """
+    fs = sampling_rate(path, fs)
+    level_db = as_number(level_db, "level_db", unit="dB")
+    if level_db >= 0:
+        raise ValueError(f"level_db must be negative (relative to the peak), got {level_db:g} dB")
+    frequencies = np.linspace(0.0, fs / 2, 2**15 + 1)
+    magnitude = np.abs(frequency_response(path, frequencies, fs=fs))
+    peak = int(np.argmax(magnitude))
+    if magnitude[peak] == 0:
+        raise ValueError("path must not be all zeros: a silent path has no band")
+    level = magnitude[peak] * 10 ** (level_db / 20)
+    above = np.flatnonzero(magnitude >= level)
+    return AchievedBand(
+        low_hz=_crossing(frequencies, magnitude, level, above[0], above[0] - 1),
+        high_hz=_crossing(frequencies, magnitude, level, above[-1], above[-1] + 1),
+        peak_hz=float(frequencies[peak]),
+        peak_db=float(20 * np.log10(magnitude[peak])),
+        level_db=level_db,
+    )
+
+
+def _crossing(frequencies: np.ndarray, magnitude: np.ndarray, level: float, inside: int, outside: int) -> float:
+    """Frequency between two grid points at which the magnitude crosses a level."""
+    if not 0 <= outside < frequencies.size:
+        return float(frequencies[inside])
+    share = (magnitude[inside] - level) / (magnitude[inside] - magnitude[outside])
+    return float(frequencies[inside] + share * (frequencies[outside] - frequencies[inside]))

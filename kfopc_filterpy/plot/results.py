@@ -1,0 +1,157 @@
+"""What the figures of runs share: results by name, a fixed style per algorithm, spans of time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from .._validate import as_number
+from ..loop.simulation import SimulationResult
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+# Okabe and Ito's colours, told apart by colour-blind readers too; line styles and markers for print in grey. The solid
+# line is wide and lies beneath the broken ones, so that curves that coincide are both seen.
+STYLES: dict[str, dict[str, Any]] = {
+    "KF-OPC": {"color": "#0072B2", "linestyle": "-", "marker": "o", "linewidth": 2.2, "zorder": 2.0},
+    "KF-ANC": {"color": "#D55E00", "linestyle": (0, (5, 2.5)), "marker": "s", "linewidth": 1.4, "zorder": 2.1},
+    "MOV-FxLMS": {"color": "#009E73", "linestyle": (0, (5, 3, 1, 3)), "marker": "^", "linewidth": 1.4, "zorder": 2.2},
+    "FxLMS": {"color": "#CC79A7", "linestyle": ":", "marker": "D", "linewidth": 1.4, "zorder": 2.3},
+}
+_OTHERS: list[dict[str, Any]] = [
+    {"color": "#E69F00", "linestyle": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "marker": "v", "linewidth": 1.4, "zorder": 2.4},
+    {"color": "#56B4E9", "linestyle": (0, (8, 2)), "marker": "P", "linewidth": 1.4, "zorder": 2.4},
+    {"color": "#000000", "linestyle": (0, (3, 1)), "marker": "X", "linewidth": 1.4, "zorder": 2.4},
+]
+DISTURBANCE: dict[str, Any] = {"color": "0.6", "linestyle": "-", "linewidth": 1.2, "zorder": 1.5}
+RATED: dict[str, Any] = {"color": "0.15", "linestyle": (0, (1, 1.2)), "linewidth": 1.2}
+
+
+class Curve(NamedTuple):
+    """One entry of a legend: its runs (several seeds of one experiment) and its style."""
+
+    label: str
+    runs: list[SimulationResult]
+    style: dict[str, Any]
+
+    @property
+    def run(self) -> SimulationResult:
+        """The first run."""
+        return self.runs[0]
+
+    def stack(self, name: str, part: slice = slice(None)) -> np.ndarray:
+        """(n_runs, n_samples) signals `name` of the runs."""
+        return np.stack([getattr(run, name)[part] for run in self.runs])
+
+    def line(self) -> dict[str, Any]:
+        """Label, with the time of a divergence, and line style of a smooth curve."""
+        return {"label": _label(self), **self.style, "marker": ""}
+
+    def draw(self, ax: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
+        """Draw a curve thin, solid and with sparse markers: dashes are lost in one that wanders.
+
+        The markers of the i-th curve lie between those of the others.
+        """
+        style = {**self.line(), "linestyle": "-", "linewidth": 1.0, "markersize": 4.5}
+        if np.any(np.isfinite(y) & (y != 0)):  # matplotlib cannot place markers along a curve without points
+            style |= {"marker": self.style["marker"], "markevery": (0.02 + 0.025 * (i % 4), 0.1)}
+        ax.plot(x, y, **style)
+
+
+def named_styles(labels: list[str], algorithms: list[str]) -> list[dict[str, Any]]:
+    """Styles of curves, by algorithm where its style is free, else by label, else one of the others."""
+    taken: list[dict[str, Any]] = []
+    for label, algorithm in zip(labels, algorithms, strict=True):
+        others = [style for style in _OTHERS if style not in taken] or _OTHERS
+        known = [STYLES[name] for name in (label, algorithm) if name in STYLES and STYLES[name] not in taken]
+        taken.append((known or others)[0])
+    return taken
+
+
+def curves(results: Any, *, single: bool = False) -> list[Curve]:
+    """Results as curves: one result, a sequence of them, or a mapping of name to result or to several."""
+    named = _grouped(results)
+    if not named or not all(named.values()):
+        raise ValueError("results must hold at least one SimulationResult for each name, got none")
+    for label, runs in named.items():
+        for run in runs:
+            if not isinstance(run, SimulationResult):
+                raise TypeError(f"results must hold SimulationResult, got {type(run).__name__} under {label!r}")
+        if len({(run.fs, run.error.size) for run in runs}) > 1:
+            raise ValueError(f"results {label!r} must be runs of one length and one fs")
+        if single and len(runs) > 1:
+            raise ValueError(f"results must hold one run a name here, got {len(runs)} runs of {label!r}")
+    styles = named_styles(list(named), [runs[0].algorithm for runs in named.values()])
+    return [Curve(label, runs, style) for (label, runs), style in zip(named.items(), styles, strict=True)]
+
+
+def _grouped(results: Any) -> dict[str, list[Any]]:
+    if isinstance(results, Mapping):
+        several = (list, tuple)
+        return {str(name): list(value) if isinstance(value, several) else [value] for name, value in results.items()}
+    if isinstance(results, SimulationResult):
+        return {results.algorithm: [results]}
+    if not isinstance(results, list | tuple):
+        raise TypeError(f"results must be a SimulationResult or a sequence of them, got {type(results).__name__}")
+    named: dict[str, list[Any]] = {}
+    for result in results:
+        name = getattr(result, "algorithm", type(result).__name__)
+        if name in named:
+            raise ValueError(f"results hold two runs of {name!r}; pass a mapping that gives each a name of its own")
+        named[name] = [result]
+    return named
+
+
+def require_common_disturbance(shown: list[Curve]) -> None:
+    """Raise ValueError where runs whose disturbance is drawn once have different ones."""
+    first = shown[0].stack("disturbance")
+    for curve in shown[1:]:
+        if curve.run.fs != shown[0].run.fs or not np.array_equal(curve.stack("disturbance"), first):
+            raise ValueError(
+                f"results must have one disturbance, for it is drawn once: {curve.label!r} and "
+                f"{shown[0].label!r} differ; draw them in two axes"
+            )
+
+
+def span_of(run: SimulationResult, span_s: Any) -> slice:
+    """Samples of a run between two times in seconds."""
+    duration = run.error.size / run.fs
+    try:
+        start, end = (as_number(time, "span_s", unit="s") for time in span_s)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"span_s must be a pair (start, end) in seconds, got {span_s!r}") from error
+    part = slice(round(start * run.fs), round(end * run.fs))
+    if not 0 <= part.start < part.stop <= run.error.size:
+        raise ValueError(f"span_s must satisfy 0 <= start < end <= {duration:g} s, got ({start:g}, {end:g}) s")
+    return part
+
+
+def span_axis(ax: Axes, span_s: Any) -> float:
+    """Time axis over a span, in ms where it is short; returns its units in a second."""
+    start, end = span_s
+    per_second, unit = (1e3, "ms") if end - start < 0.5 else (1.0, "s")
+    ax.set_xlim(start * per_second, end * per_second)
+    ax.set_xlabel(f"Time ({unit})")
+    ax.grid(True, alpha=0.3)
+    return per_second
+
+
+def times(run: SimulationResult, part: slice, per_second: float) -> np.ndarray:
+    """Times of the samples of `part`."""
+    return np.arange(part.start, part.stop) / run.fs * per_second
+
+
+def thinned(n_samples: int, step: int = 1, most: int = 4000) -> np.ndarray:
+    """Indices of every step-th sample, fewer where that would be more than `most`."""
+    return np.arange(0, n_samples, max(1, step, -(-n_samples // most)))
+
+
+def _label(curve: Curve) -> str:
+    ends = [run.diverged_at_s for run in curve.runs if run.diverged_at_s is not None]
+    if not ends:
+        return curve.label
+    several = f"{len(ends)} of {len(curve.runs)} runs " if len(curve.runs) > 1 else ""
+    return f"{curve.label} ({several}diverged at {min(ends):.3g} s)"

@@ -1,0 +1,394 @@
+"""Figures of runs: spectra, waveforms, weights, convergence, output power.
+
+Common to the functions here:
+
+- `results` is one `SimulationResult`, a sequence of them, named in the legend by their `algorithm`, or a mapping of
+  legend entry to result. Each algorithm has one colour, line style and marker in every figure.
+- Where a function says so, a mapping may hold several runs (seeds) under one name, of one length; powers are then
+  averaged over them before any ratio or logarithm is taken.
+- `ax` is where to draw; None makes a new figure. The axes drawn into are returned, their figure is `ax.figure`.
+- What a run that diverged did not reach is left out; its legend entry says when it diverged.
+- Signals are in the unit of the results' signals, powers are mean squares in that unit squared; times in s, frequencies
+  in Hz, levels in dB.
+- Results or settings that are not as described raise TypeError or ValueError naming the argument.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._runs import as_runs, window_length
+from .._validate import as_choice, as_count, as_number, as_positive, as_signal
+from ..metrics import nse_db
+from .results import DISTURBANCE, RATED, Curve, curves, named_styles, thinned
+from .signals import (
+    plot_amplifier_output,
+    plot_anti_noise,
+    plot_disturbance_and_anti_noise,
+    plot_error_spectra,
+)
+from .style import legend_above, new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "plot_amplifier_output",
+    "plot_anti_noise",
+    "plot_constraint_factor",
+    "plot_disturbance_and_anti_noise",
+    "plot_error_spectra",
+    "plot_noise_reduction_against_overdrive",
+    "plot_nse",
+    "plot_output_power",
+    "plot_weight_history",
+    "save_figure",
+]
+
+
+def plot_weight_history(results: Any, *, tap: int, ax: Axes | None = None) -> Axes:
+    """History of one weight of each control filter (the paper's Fig. 5 d).
+
+    The axis is logarithmic beyond the smallest curve where another grows to more than 100 times it.
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs with their weights recorded, one a name.
+    tap : int
+        Index of the weight, from 0.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Weights that were not recorded, a tap that a filter does not have, or another argument not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> x, controller = tone(400.0, 0.1, fs=16000), FxLMS(8, [1.0], step_size=0.01)
+    >>> result = simulate(controller, x, secondary_path=[1.0], primary_path=[0.5], record_weights_every=16)
+    >>> ax = plot_weight_history(result, tap=3)
+    >>> ax.get_ylabel()
+    'Weight 3 of the control filter'
+    >>> plt.close(ax.figure)
+    """
+    shown = curves(results, single=True)
+    index = as_count(tap, "tap", minimum=0)
+    histories = []
+    for curve in shown:
+        weights = curve.run.weights
+        if weights is None:
+            raise ValueError(
+                f"results {curve.label!r} hold no weights; simulate with record_weights_every=, such as 16"
+            )
+        if index >= weights.shape[1]:
+            raise ValueError(f"tap must be below the {weights.shape[1]} weights of {curve.label!r}, got {index}")
+        histories.append(weights[:, index])
+    ax = new_axes(ax)
+    for curve, history in zip(shown, histories, strict=True):
+        rows = thinned(history.size)
+        ax.plot(np.asarray(curve.run.weights_time_s)[rows], history[rows], **curve.line())
+    peaks = [np.max(np.abs(history), initial=0.0, where=~np.isnan(history)) for history in histories]
+    smallest = min((peak for peak in peaks if peak > 0), default=0.0)
+    if max(peaks) > 100 * smallest:
+        ax.set_yscale("symlog", linthresh=smallest)
+    _whole_time_axis(ax, shown)
+    ax.set_ylabel(f"Weight {index} of the control filter")
+    legend_above(ax)
+    return ax
+
+
+def plot_nse(results: Any, *, window_s: float = 0.005, time_axis: str = "linear", ax: Axes | None = None) -> Axes:
+    """Normalised squared error over time (the paper's Fig. 6 a and 7 a).
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs; squares are pooled over several under a name.
+    window_s : float, default 0.005
+        Sliding window in seconds.
+    time_axis : {"linear", "log"}, default "linear"
+        "log" shows the start.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A window shorter than a sample, or another argument not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> x = tone(400.0, 0.1, fs=16000)
+    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> ax = plot_nse(result, time_axis="log")
+    >>> ax.get_ylabel()
+    'Normalised squared error (dB)'
+    >>> plt.close(ax.figure)
+    """
+    shown = curves(results)
+    scale = as_choice(time_axis, "time_axis", ("linear", "log"))
+    width = window_length(window_s, shown[0].run.fs)
+    ax = new_axes(ax)
+    for i, curve in enumerate(shown):
+        nse, fs = nse_db(curve.stack("error"), curve.stack("disturbance"), curve.run.fs, window_s), curve.run.fs
+        # Neighbouring values share their window.
+        rows = thinned(nse.size, width // 4, most=8000)
+        if scale == "log":
+            rows = np.unique(np.geomspace(1, nse.size, 2000).astype(int)) - 1
+        curve.draw(ax, (rows + 1) / fs, nse[rows], i)
+    ax.axhline(0.0, color=DISTURBANCE["color"], linewidth=1.0, zorder=1.5)
+    _whole_time_axis(ax, shown)
+    if scale == "log":
+        ax.set_xscale("log")
+        ax.set_xlim(left=window_s / 5)  # before the first sound has come through the paths
+    ax.set_ylabel("Normalised squared error (dB)")
+    legend_above(ax)
+    return ax
+
+
+def plot_output_power(
+    results: Any, *, rated_power: float | None = None, window_s: float = 0.25, ax: Axes | None = None
+) -> Axes:
+    """Short-time output power, the mean square of the control signal before the amplifier, over time.
+
+    The axis is logarithmic where a power exceeds ten times the rated power.
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs; powers are averaged over several under a name.
+    rated_power : float, optional
+        Rated output power to mark, above 0; by default those of the results.
+    window_s : float, default 0.25
+        Sliding window in seconds; the first values look at the samples there are.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A window shorter than a sample, or another argument not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> x = tone(400.0, 0.1, fs=16000)
+    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> ax = plot_output_power(result, rated_power=0.2, window_s=0.02)
+    >>> ax.get_legend_handles_labels()[1]
+    ['FxLMS', 'Rated power 0.2']
+    >>> plt.close(ax.figure)
+    """
+    shown = curves(results)
+    if rated_power is None:
+        rated = sorted({curve.run.rated_power for curve in shown if curve.run.rated_power is not None})
+    else:
+        rated = [as_positive(rated_power, "rated_power")]
+    widths = [window_length(window_s, curve.run.fs) for curve in shown]
+    ax = new_axes(ax)
+    highest = 0.0
+    for i, (curve, width) in enumerate(zip(shown, widths, strict=True)):
+        power = _short_time_power(curve.stack("control_signal"), width)
+        rows = thinned(power.size)
+        curve.draw(ax, (rows + 1) / curve.run.fs, power[rows], i)
+        highest = max(highest, np.max(power, initial=0.0, where=~np.isnan(power)))
+    for value in rated:
+        ax.axhline(value, label=f"Rated power {value:g}", **RATED)
+    if rated and highest > 10 * rated[-1]:
+        ax.set_yscale("log")
+        ax.set_ylim(rated[0] / 10, 2 * highest)
+    else:
+        ax.set_ylim(0, 1.08 * max([highest, *rated]) or 1.0)
+    _whole_time_axis(ax, shown)
+    ax.set_ylabel("Output power (mean square)")
+    legend_above(ax)
+    return ax
+
+
+def plot_constraint_factor(results: Any, *, ax: Axes | None = None) -> Axes:
+    """Constraint factor over time; 1 is no constraint.
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs, one a name. Controllers that do not say their factor are left out.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        No controller says its factor, or an argument is not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import kf_opc, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> controller = kf_opc(8, [1.0], rated_power=0.1, state_noise=1e-9, measurement_noise=1e-3)
+    >>> result = simulate(controller, tone(400.0, 0.1, fs=16000), secondary_path=[1.0], primary_path=[1.0])
+    >>> ax = plot_constraint_factor(result)
+    >>> ax.get_ylabel()
+    'Constraint factor α'
+    >>> plt.close(ax.figure)
+    """
+    shown = [curve for curve in curves(results, single=True) if not np.all(np.isnan(curve.run.constraint_factor))]
+    if not shown:
+        raise ValueError("results must hold a constraint factor, but no controller has said one")
+    ax = new_axes(ax)
+    for i, curve in enumerate(shown):
+        rows = thinned(curve.run.constraint_factor.size)
+        curve.draw(ax, (rows + 1) / curve.run.fs, curve.run.constraint_factor[rows], i)
+    ax.set_ylim(0, 1.05)
+    _whole_time_axis(ax, shown)
+    ax.set_ylabel("Constraint factor α")
+    legend_above(ax)
+    return ax
+
+
+def plot_noise_reduction_against_overdrive(
+    overdrive_db: Any, noise_reduction_db: Mapping[str, Any], *, flip_db: Any = None, ax: Axes | None = None
+) -> Axes:
+    """Noise reduction over the overdrive, the power that full control needs over the rated power.
+
+    Parameters
+    ----------
+    overdrive_db : array_like, shape (n,)
+        Overdrive in dB.
+    noise_reduction_db : mapping of str to array_like, shape (n,)
+        Noise reduction in dB by algorithm; NaN where it diverged.
+    flip_db : float or sequence of float, optional
+        Overdrive in dB to mark at which the order flips; none where empty.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Arrays that differ in length, no algorithm, or another argument not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> ax = plot_noise_reduction_against_overdrive([0, 5], {"KF-ANC": [30, 7.5], "KF-OPC": [30, 6.9]}, flip_db=4.2)
+    >>> ax.get_legend_handles_labels()[1]
+    ['KF-ANC', 'KF-OPC', 'Order flips at 4.2 dB']
+    >>> plt.close(ax.figure)
+    """
+    overdrive = as_signal(overdrive_db, "overdrive_db")
+    flips = [] if flip_db is None else [as_number(flip, "flip_db", unit="dB") for flip in np.atleast_1d(flip_db)]
+    if not isinstance(noise_reduction_db, Mapping) or not noise_reduction_db:
+        raise TypeError("noise_reduction_db must map at least one algorithm's name to its noise reduction in dB")
+    levels = {str(name): as_runs(value, "noise_reduction_db")[0] for name, value in noise_reduction_db.items()}
+    for name, level in levels.items():
+        if level.size != overdrive.size:
+            raise ValueError(f"noise_reduction_db of {name!r} must have {overdrive.size} values, got {level.size}")
+    ax = new_axes(ax)
+    for (name, level), style in zip(levels.items(), named_styles(list(levels), list(levels)), strict=True):
+        ax.plot(overdrive, level, label=name, **{**style, "linewidth": 1.4, "markersize": 5})
+    for flip in flips:
+        ax.axvline(flip, **RATED)
+    if flips:
+        ax.get_lines()[-1].set_label(f"Order flips at {', '.join(f'{flip:.1f}' for flip in flips)} dB")
+    ax.set_xlabel("Overdrive (dB)")
+    ax.set_ylabel("Noise reduction (dB)")
+    ax.grid(True, alpha=0.3)
+    legend_above(ax)
+    return ax
+
+
+def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> tuple[Path, Path]:
+    """Write a figure as PNG and as SVG, the same bytes for the same figure, and close it.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        The figure.
+    path_without_suffix : path
+        Where to write, without ".png" or ".svg"; folders that are missing are made, files that are there replaced.
+
+    Returns
+    -------
+    (pathlib.Path, pathlib.Path)
+        The PNG, of 160 pixels an inch, and the SVG.
+
+    Raises
+    ------
+    ValueError
+        The path ends in ".png" or ".svg".
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from matplotlib.figure import Figure
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     [path.name for path in save_figure(Figure(), folder + "/nse")]
+    ['nse.png', 'nse.svg']
+    """
+    import matplotlib as mpl
+    import matplotlib.pyplot as plt
+
+    path = Path(path_without_suffix)
+    if path.suffix.lower() in (".png", ".svg"):
+        raise ValueError(f"path_without_suffix must leave out the suffix, for both are written: got {str(path)!r}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    png, svg = (path.with_name(path.name + suffix) for suffix in (".png", ".svg"))
+    with mpl.rc_context({"svg.hashsalt": "kfopc_filterpy"}):
+        figure.savefig(png, dpi=160)
+        figure.savefig(svg, metadata={"Date": None})
+    plt.close(figure)
+    return png, svg
+
+
+def _short_time_power(runs: np.ndarray, width: int) -> np.ndarray:
+    """Mean square over the last `width` samples, fewer at the start, and over the runs."""
+    # The NSE against a disturbance of 1 is this power in dB.
+    return 10 ** (nse_db(runs, np.ones_like(runs), fs=1.0, window_s=width) / 10)
+
+
+def _whole_time_axis(ax: Axes, shown: list[Curve]) -> None:
+    ax.set_xlim(0, max(curve.run.error.size / curve.run.fs for curve in shown))
+    ax.set_xlabel("Time (s)")
+    ax.grid(True, alpha=0.3)

@@ -1,0 +1,288 @@
+"""Figures of the signals of runs: spectra and waveforms. `kfopc_filterpy.plot.runs`, whose conventions on results, axes,
+units and errors they follow, hands them out as well.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._validate import as_band, as_positive
+from ..metrics import output_power
+from ..spectra import coherence_and_gain, power_spectrum_db
+from .results import DISTURBANCE, RATED, curves, require_common_disturbance, span_axis, span_of, times
+from .style import legend_above, new_axes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_amplifier_output", "plot_anti_noise", "plot_disturbance_and_anti_noise", "plot_error_spectra"]
+
+_DEPTH_DB = 120.0  # range of a spectrum's axis at most: numerical floors beneath would take all the room
+_VISIBLE = 0.005  # difference of waveforms, over their peak, that a line's width does not hide
+
+
+def plot_error_spectra(
+    results: Any,
+    *,
+    band: tuple[float, float] | None = None,
+    span_s: tuple[float, float] | None = None,
+    segment_s: float = 0.128,
+    scaling: str = "density",
+    ax: Axes | None = None,
+) -> Axes:
+    """Power spectra of the disturbance and of each error (the paper's Fig. 5 a, 6 b, 7 b).
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs with one disturbance; several under a name are averaged.
+    band : (float, float), optional
+        Band to show in Hz, by default 0 to fs/2.
+    span_s : (float, float), optional
+        Start and end in seconds of what is analysed, by default the second half.
+    segment_s, scaling
+        As for `power_spectrum_db`.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Disturbances that differ, or an argument that is not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> x = tone(400.0, 0.2, fs=16000)
+    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> ax = plot_error_spectra(result, band=(0.0, 4000.0))
+    >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
+    ('Frequency (Hz)', ['Disturbance', 'FxLMS'])
+    >>> plt.close(ax.figure)
+    """
+    shown = curves(results)
+    require_common_disturbance(shown)
+    fs = shown[0].run.fs
+    low, high = as_band((0.0, fs / 2) if band is None else band, fs)
+    part, steady = (slice(None), 0.5) if span_s is None else (span_of(shown[0].run, span_s), 1.0)
+    ax = new_axes(ax)
+    levels = []
+    for curve, name in [(shown[0], "disturbance"), *((curve, "error") for curve in shown)]:
+        frequencies, level = power_spectrum_db(
+            curve.stack(name, part), fs, steady=steady, segment_s=segment_s, scaling=scaling
+        )
+        inside = (frequencies >= low) & (frequencies <= high)
+        style = {"label": "Disturbance", **DISTURBANCE} if name == "disturbance" else curve.line()
+        ax.plot(frequencies[inside], level[inside], **style)
+        levels.append(level[inside][np.isfinite(level[inside])])
+    top = np.max(np.concatenate(levels), initial=-np.inf)
+    if np.isfinite(top):
+        # As deep as the errors: what the disturbance lacks outside its band is of no interest.
+        ax.set_ylim(max(np.min(np.concatenate(levels[1:]), initial=top) - 5, top - _DEPTH_DB), top + 5)
+    ax.set_xlim(low, high)
+    ax.set_xlabel("Frequency (Hz)")
+    ax.set_ylabel("Power per Hz (dB)" if scaling == "density" else "Power (dB)")
+    ax.grid(True, alpha=0.3)
+    legend_above(ax)
+    return ax
+
+
+def plot_anti_noise(results: Any, *, span_s: tuple[float, float], ax: Axes | None = None) -> Axes:
+    """Waveforms of the disturbance and of each anti-noise (the paper's Fig. 5 b).
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs with one disturbance, one a name.
+    span_s : (float, float)
+        Start and end in seconds.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Disturbances that differ, or an argument that is not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> x = tone(400.0, 0.1, fs=16000)
+    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> ax = plot_anti_noise(result, span_s=(0.09, 0.1))
+    >>> ax.get_xlabel()
+    'Time (ms)'
+    >>> plt.close(ax.figure)
+    """
+    shown = curves(results, single=True)
+    require_common_disturbance(shown)
+    run, part = shown[0].run, span_of(shown[0].run, span_s)
+    ax = new_axes(ax)
+    time = times(run, part, span_axis(ax, span_s))
+    ax.plot(time, run.disturbance[part], label="Disturbance", **DISTURBANCE)
+    for curve in shown:
+        ax.plot(time, curve.run.anti_noise[part], **curve.line())
+    ax.set_ylabel("Sound at the error microphone")
+    legend_above(ax)
+    return ax
+
+
+def plot_amplifier_output(
+    results: Any, *, span_s: tuple[float, float], limit: float | None = None, ax: Axes | None = None
+) -> Axes:
+    """Waveforms of the amplifier's output, and of the control signal where the amplifier changed it (Fig. 5 c).
+
+    Parameters
+    ----------
+    results : SimulationResult, sequence or mapping
+        Runs, one a name. The control signal is drawn where it differs by more than 0.5 % of the output's peak; beyond
+        2.5 times the highest output it leaves the axes.
+    span_s : (float, float)
+        Start and end in seconds.
+    limit : float, optional
+        Amplitude limit of the amplifier, above 0, to mark.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An argument that is not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
+    >>> from kfopc_filterpy.signals import tone
+    >>> x, clip = tone(400.0, 0.1, fs=16000), HardClipAmplifier(0.3)
+    >>> controller = FxLMS(8, [1.0], step_size=0.01)
+    >>> result = simulate(controller, x, secondary_path=[1.0], primary_path=[0.5], amplifier=clip)
+    >>> ax = plot_amplifier_output(result, span_s=(0.09, 0.1), limit=0.3)
+    >>> ax.get_legend_handles_labels()[1]
+    ['FxLMS', 'FxLMS before the amplifier', 'Limit ±0.3']
+    >>> plt.close(ax.figure)
+    """
+    shown = curves(results, single=True)
+    peaks = [] if limit is None else [as_positive(limit, "limit")]
+    parts = [span_of(curve.run, span_s) for curve in shown]
+    ax = new_axes(ax)
+    per_second = span_axis(ax, span_s)
+    before = []
+    for curve, part in zip(shown, parts, strict=True):
+        time, y, out = (
+            times(curve.run, part, per_second),
+            curve.run.control_signal[part],
+            curve.run.amplifier_output[part],
+        )
+        ax.plot(time, out, **curve.line())
+        if np.any(changed := np.abs(y - out) > _VISIBLE * _peak(out)):
+            dashed = {"color": curve.style["color"], "linestyle": (0, (2, 1.5)), "linewidth": 0.9}
+            # A sample to each side joins the dashes to the curve.
+            beside = np.convolve(changed, np.ones(3), mode="same") > 0
+            ax.plot(time, np.where(beside, y, np.nan), label=f"{curve.label} before the amplifier", **dashed)
+            before.append(np.nanmax(np.abs(y)))
+        peaks.append(_peak(out))
+    if limit is not None:
+        ax.axhline(limit, label=f"Limit ±{limit:.4g}", **RATED)
+        ax.axhline(-limit, **RATED)
+    top = 1.1 * max([*peaks, min(max(before, default=0.0), 2.5 * max(peaks))])
+    if top > 0:
+        ax.set_ylim(-top, top)
+    ax.set_ylabel("Amplifier output")
+    legend_above(ax)
+    return ax
+
+
+def plot_disturbance_and_anti_noise(
+    result: Any, *, span_s: tuple[float, float], band: tuple[float, float], ax: Axes | None = None
+) -> Axes:
+    """Waveforms of the disturbance and the anti-noise of one run, with how linear they are (the paper's Fig. 6 c).
+
+    Coherence and gain in the band, and the output power, are those of the run's second half; the legend's title
+    states them.
+
+    Parameters
+    ----------
+    result : SimulationResult
+        The run.
+    span_s : (float, float)
+        Start and end in seconds of the waveforms.
+    band : (float, float)
+        Band of the noise in Hz.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+        The axes drawn into.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A run too short for the coherence, several runs, or an argument that is not as described.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.signals import band_limited_noise
+    >>> x = band_limited_noise((200.0, 2000.0), 1.1, fs=16000, rng=0)
+    >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
+    >>> ax = plot_disturbance_and_anti_noise(result, span_s=(1.0, 1.02), band=(200.0, 2000.0))
+    >>> ax.get_legend().get_title().get_text().splitlines()[0]
+    'Anti-noise over disturbance, 200 to 2000 Hz: coherence 1.0000, gain 1.000'
+    >>> plt.close(ax.figure)
+    """
+    from matplotlib.font_manager import FontProperties
+
+    shown = curves(result, single=True)
+    if len(shown) > 1:
+        raise ValueError(f"result must be one run, got {len(shown)}")
+    run = shown[0].run
+    part = span_of(run, span_s)
+    low, high = as_band(band, run.fs)
+    coherence, gain = coherence_and_gain(run.disturbance, run.anti_noise, run.fs, (low, high))
+    text = (
+        f"Anti-noise over disturbance, {low:g} to {high:g} Hz: coherence {coherence:.4f}, gain {gain:.3f}\n"
+        f"Output power {output_power(run.control_signal):.5g}"
+    )
+    if run.rated_power is not None:
+        text += f", rated power {run.rated_power:g}"
+    ax = new_axes(ax)
+    time = times(run, part, span_axis(ax, span_s))
+    ax.plot(time, run.disturbance[part], label="Disturbance", **{**DISTURBANCE, "linewidth": 1.6})
+    line = shown[0].line()
+    ax.plot(time, run.anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
+    ax.set_ylabel("Sound at the error microphone")
+    legend_above(ax)
+    legend = ax.get_legend()
+    assert legend is not None
+    legend.set_title(text, prop=FontProperties(size="small"))
+    return ax
+
+
+def _peak(signal: np.ndarray) -> float:
+    """Largest magnitude, 0 where all is NaN."""
+    return float(np.max(np.abs(signal), initial=0.0, where=~np.isnan(signal)))

@@ -1,0 +1,5 @@
+"""What keeps or spends a rated output power: constraint, budget, limiter, amplifier models."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,140 @@
+"""Loudspeaker amplifier models, memoryless: linear, hard clip, soft saturation.
+
+The rated power of a controller (a mean square) and the amplitude limit of an amplifier are separate parameters.
+``sqrt(2 rated_power)`` relates them for a sine only; Gaussian noise at its rated power exceeds that limit 15.7 % of
+the time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from .._validate import as_positive
+from ..kernels.compiling import compiled, part
+
+LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
+
+
+@part(forceinline=True)
+def amplify(kind, limit, sharpness, y):
+    """Output of one amplifier model for one sample."""
+    if kind == HARD_CLIP:
+        return min(max(y, -limit), limit)
+    if kind == SOFT_SATURATION:
+        ratio = abs(y) / limit
+        if ratio <= 1.0:
+            return y / (1.0 + ratio ** (2.0 * sharpness)) ** (0.5 / sharpness)
+        return math.copysign(limit, y) / (1.0 + ratio ** (-2.0 * sharpness)) ** (0.5 / sharpness)  # no power overflows
+    return y
+
+
+@compiled()
+def _amplify_all(kind, limit, sharpness, signal, out):
+    for n in range(signal.size):
+        out[n] = amplify(kind, limit, sharpness, signal[n])
+
+
+@dataclass(frozen=True)
+class _Amplifier:
+    """Callable on numbers and arrays; `parameters` is what the compiled loop reads."""
+
+    kind: ClassVar[int] = LINEAR
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """(3,) kind, limit and sharpness."""
+        return np.array([self.kind, getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)])
+
+    def __call__(self, signal: Any) -> Any:
+        """Output for `signal`, a number or an array of any shape."""
+        array = np.asarray(signal, dtype=np.float64)
+        out = np.empty(array.size)
+        kind, limit, sharpness = self.parameters
+        _amplify_all(kind, limit, sharpness, array.reshape(-1), out)
+        return out.reshape(array.shape) if array.ndim else float(out[0])
+
+
+@dataclass(frozen=True)
+class LinearAmplifier(_Amplifier):
+    """Amplifier of unit gain without a limit.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import LinearAmplifier
+    >>> LinearAmplifier()(3.0)
+    3.0
+    """
+
+
+@dataclass(frozen=True)
+class HardClipAmplifier(_Amplifier):
+    """Amplifier of unit gain that clips at an amplitude.
+
+    Parameters
+    ----------
+    limit : float
+        Largest output amplitude; ``sqrt(2 rated_power)`` lets a sine of the rated power through unharmed.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import HardClipAmplifier
+    >>> HardClipAmplifier(limit=1.0)([0.5, -2.0])
+    array([ 0.5, -1. ])
+    """
+
+    limit: float
+    kind: ClassVar[int] = HARD_CLIP
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "limit", as_positive(self.limit, "limit"))
+
+
+@dataclass(frozen=True)
+class SoftSaturationAmplifier(_Amplifier):
+    r"""Amplifier that saturates smoothly (Rapp's model), :math:`y / (1 + |y/a|^{2p})^{1/2p}`.
+
+    Parameters
+    ----------
+    limit : float
+        Amplitude a that the output approaches.
+    sharpness : float, default 2
+        Exponent p: the larger, the nearer to a hard clip.
+
+    References
+    ----------
+    C. Rapp, "Effects of HPA-nonlinearity on a 4-DPSK/OFDM-signal for a digital sound broadcasting system", 1991.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import SoftSaturationAmplifier
+    >>> round(SoftSaturationAmplifier(limit=1.0)(1.0), 4)  # 2 ** -0.25
+    0.8409
+    """
+
+    limit: float
+    sharpness: float = 2.0
+    kind: ClassVar[int] = SOFT_SATURATION
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "limit", as_positive(self.limit, "limit"))
+        object.__setattr__(self, "sharpness", as_positive(self.sharpness, "sharpness"))
+
+
+Amplifier = Callable[[Any], Any]  # a user's own may be any function of a sample
+
+
+def compiled_parameters(amplifier: Amplifier | None) -> np.ndarray | None:
+    """Parameters for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
+    if amplifier is None:
+        return LinearAmplifier().parameters
+    if isinstance(amplifier, type):
+        raise TypeError(
+            f"amplifier must be an object, such as HardClipAmplifier(limit=1.0), got the class {amplifier!r}"
+        )
+    models = (LinearAmplifier, HardClipAmplifier, SoftSaturationAmplifier)
+    return amplifier.parameters if isinstance(amplifier, models) and type(amplifier) in models else None

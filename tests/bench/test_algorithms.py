@@ -1,0 +1,155 @@
+"""The registry of algorithms that studies compare, and the tuner with two settings, refusals and divergence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import HardClipAmplifier, nse_db, output_power
+from kfopc_filterpy.bench import registry as algorithms
+from kfopc_filterpy.bench import tuning
+from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller, setting_value
+from kfopc_filterpy.bench.scene import Runs, Scene, make_scene
+from kfopc_filterpy.bench.tuning import Trial, _best, refine, run_setting, try_settings, tune
+from kfopc_filterpy.controllers.base import FilteredReferenceController
+from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.signals import band_limited_noise
+
+FS = 16000.0
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    duct = duct_paths(fs=FS)
+    return make_scene(
+        {3: band_limited_noise((100.0, 2000.0), 0.6, fs=FS, rng=3)},
+        path_taps(duct.primary)[:120],
+        path_taps(duct.secondary)[:80],
+        fs=FS,
+        rated_power=0.5,
+        power_multiple=4.0,
+        n_taps=12,
+        switch_on_s=0.1,
+    )
+
+
+def middle(name: str) -> Any:
+    own = REGISTRY[name]
+    first = own.first[len(own.first) // 2]
+    return (first, own.second[len(own.second) // 2]) if own.second else first
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_each_is_made_as_the_registry_says(name: str, scene: Scene) -> None:
+    estimate = 0.5 * scene.secondary
+    model = HardClipAmplifier(3.0) if REGISTRY[name].knows_amplifier else None
+    known = replace(scene, secondary_estimate=estimate)
+    controller = make_controller(known, name, middle(name), amplifier=model)
+    assert isinstance(controller, FilteredReferenceController)
+    assert controller.name == name
+    np.testing.assert_array_equal(controller._state.secondary_estimate, estimate)
+    assert controller.weights.shape == (12,)
+    if model is not None:
+        np.testing.assert_array_equal(controller._state.amplifier, model.parameters)
+    assert controller.rated_power == (0.5 if REGISTRY[name].sees_budget or name == "MOV-FxLMS fixed" else None)
+    result = run_setting(scene, name, middle(name))
+    assert result is not None
+    assert result.algorithm == name
+
+
+@pytest.mark.parametrize("name", [name for name, own in REGISTRY.items() if not own.sees_budget])
+def test_runs_that_do_not_see_the_budget_serve_for_all(name: str, scene: Scene) -> None:
+    results = [run_setting(replace(scene, rated_power=p), name, middle(name)) for p in (0.1, 1.0)]
+    assert results[0] is not None
+    assert results[1] is not None
+    np.testing.assert_array_equal(results[0].error, results[1].error)
+
+
+def test_settings_are_in_the_units_of_the_scene(scene: Scene) -> None:
+    x = scene.references[0]
+    filtered = np.mean(np.convolve(x, scene.secondary)[: x.size] ** 2)
+    assert setting_value(scene, "KF-OPC", 1e-6) == pytest.approx(1e-6 * scene.measurement_noise / filtered, rel=1e-12)
+    assert setting_value(scene, "leaky FxLMS", (0.1, 3.0)) == pytest.approx(0.1 / (12 * filtered), rel=1e-12)
+    assert setting_value(scene, "FxRLS", 1e-4) == 1e-4
+    leaky: Any = make_controller(scene, "leaky FxLMS", (0.1, 3.0))
+    assert leaky.leak == pytest.approx(3.0 * filtered, rel=1e-12)
+    fixed: Any = make_controller(scene, "MOV-FxLMS fixed", (0.1, 3.0))
+    assert fixed._factor == pytest.approx(3.0 * filtered / np.mean(x**2), rel=1e-12)
+    peak: Any = make_controller(scene, "clipping FxLMS", (0.1, 0.25))
+    assert peak.amplitude_limit == pytest.approx(np.sqrt(0.25 * 2.0), rel=1e-12)  # unconstrained power 4 * 0.5
+
+
+def test_a_leak_is_at_most_the_whole_weight(scene: Scene) -> None:
+    leaky: Any = make_controller(scene, "leaky FxLMS", (0.5, 1000.0))
+    assert leaky.leak * leaky.step_size == pytest.approx(1.0)
+
+
+def test_the_finer_grid_lies_between_the_neighbours_of_the_best() -> None:
+    own = REGISTRY["leaky FxLMS"]
+    best = (own.first[5], own.second[5])
+    finer = np.array(own.finer(best))
+    assert set(finer[:, 0]) == {best[0] / 2, best[0], 2 * best[0]}
+    assert own.second[4] < finer[:, 1].min() < finer[:, 1].max() < own.second[6]
+    assert REGISTRY["FxLMS"].finer(0.1) == []
+
+
+def test_tuning_two_settings_follows_the_rule(scene: Scene, monkeypatch: Any) -> None:
+    """Grid, then the finer one, then the rule: recomputed here from plain runs."""
+    small = replace(REGISTRY["leaky FxLMS"], first=(0.05, 0.0125), second=(0.1, 1.0, 10.0))
+    monkeypatch.setitem(algorithms.REGISTRY, "leaky FxLMS", small)
+    runs = Runs()
+    best = tune(runs, scene, ["leaky FxLMS"])["leaky FxLMS"]
+    assert runs.done == 6  # those of the grid are the ones planned
+    assert len(best.trials) == 6 + 30
+    kept = {}
+    for trial in best.trials:
+        result = run_setting(scene, "leaky FxLMS", trial.setting)
+        assert result is not None
+        nse = float(np.mean(nse_db(result.error, result.disturbance, FS, scene.nse_window_s)))
+        assert trial.mean_nse_db == pytest.approx(nse, rel=1e-12)
+        if output_power(result.control_signal) <= 1.02 * scene.rated_power:
+            kept[trial.setting] = round(nse, 2)
+    assert best.within_budget
+    assert kept[best.setting] == min(kept.values())
+
+
+def test_refining_goes_on_from_trials_made_before(scene: Scene) -> None:
+    settings: list[Any] = [(0.05, 0.1), (0.05, 10.0)]
+    trials = try_settings(Runs(), scene, {"MOV-FxLMS fixed": settings})["MOV-FxLMS fixed"]
+    best = refine(Runs(), scene, "MOV-FxLMS fixed", trials)
+    assert best.trials[:2] == trials
+    assert len(best.trials) == 2 + 30
+
+
+def test_a_filter_that_refuses_to_go_on_counts_as_diverged(scene: Scene, monkeypatch: Any) -> None:
+    def refuse(*arguments: Any, **options: Any) -> Any:
+        error = ValueError("P is not positive definite")
+        error.add_note("in sample 3 of the run")
+        raise error
+
+    monkeypatch.setattr(Scene, "run", refuse)
+    trials = try_settings(Runs(), scene, {"FxRLS": [1e-5]})["FxRLS"]
+    assert trials == [Trial(1e-5, np.inf, np.inf, True)]
+    with pytest.raises(ValueError, match="not positive definite"):  # no other may
+        try_settings(Runs(), scene, {"FxLMS": [0.1]})
+    with pytest.raises(ValueError, match="forgetting must be"):  # nor may a bad setting count as divergence
+        try_settings(Runs(), scene, {"FxRLS": [1.5]})
+
+
+def test_edges_of_one_and_of_two_settings() -> None:
+    one = [Trial(s, -s, 0.1, False) for s in (1.0, 2.0, 3.0)]
+    assert _best(one, 1.0, "a").at_edge
+    assert not _best([replace(one[1], mean_nse_db=-9.0), one[0], one[2]], 1.0, "a").at_edge
+    two = [Trial((a, b), -9.0 * (a == b == 2.0), 0.1, False) for a in (1.0, 2.0, 3.0) for b in (1.0, 2.0, 3.0)]
+    assert not _best(two, 1.0, "a").at_edge
+    assert _best([replace(t, mean_nse_db=-10.0) if t.setting == (2.0, 3.0) else t for t in two], 1.0, "a").at_edge
+
+
+def test_the_state_noises_of_the_full_kalman_filters_are_one_grid() -> None:
+    full = [own for name, own in REGISTRY.items() if own.symbol == "r" and not name.startswith("diagonal")]
+    assert len(full) == 4
+    assert all(own.first == STATE_NOISE_GRID for own in full)
+    assert tuning.tuning_runs(["KF-PB", "leaky FxLMS"], seeds=2) == 2 * (5 + 14 * len(PRICE_GRID))

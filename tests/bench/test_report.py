@@ -1,0 +1,311 @@
+"""The report: strict JSON, a page that needs no other file, sounds of one scale, tables, refusals."""
+
+import csv
+import json
+import re
+from html.parser import HTMLParser
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from kfopc_filterpy.bench import report
+from kfopc_filterpy.bench.report import (
+    FigureItem,
+    Parameter,
+    Sound,
+    StudyReport,
+    Table,
+    Verdict,
+    results_table,
+    write_report,
+)
+from kfopc_filterpy.signals.recordings import read_wav
+
+FS = 8000.0
+D = np.sin(np.arange(400) / 3)
+
+
+def _figure():
+    figure = Figure(figsize=(3, 2))
+    figure.subplots().plot([0, 1])
+    return figure
+
+
+def _study(name="tonal", **changes):
+    settings = {
+        "name": name,
+        "title": "Tone & clip <hard>",
+        "summary": "A tone of 2 > 1.",
+        "fs": FS,
+        "rated_power": 0.8,
+        "parameters": {
+            "q": Parameter(np.float64(1e-4), "estimate <of> eq. 7"),
+            "seeds": Parameter(range(3), "of noise"),
+            "tried": Parameter([(1e-7, np.nan), (1e-6, "diverged")], "grid"),
+        },
+        "algorithms": {
+            "KF-ANC": {"noise_reduction_db": np.float64(8.125), "output_power": np.inf, "diverged_at_s": 1.5},
+            "KF-OPC": {"output_power": 0.79971, "clipped_fraction": 0.25, "harmonics_db": float("nan")},
+        },
+        "extra": {"sweep": {"over_db": np.arange(2), "best": np.array([1.0, -np.inf])}, "flip": np.float32(4.5)},
+        "verdicts": [Verdict("KF-OPC < rated", True, "0.79971 of 0.8"), Verdict("it is faster", np.bool_(False), "no")],
+        "figures": [FigureItem("a-spectra", 'Spectra "of" e & d.', _figure())],
+        "sounds": [Sound("disturbance", "Disturbance", D), Sound("kf-anc", "Residual", np.append(D[:-1] / 2, np.nan))],
+        "notes": ["One <note>."],
+    }
+    return StudyReport(**(settings | changes))
+
+
+class _Links(HTMLParser):
+    """Collect what a page refers to, its ids and its text; see that its tags are closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.references, self.ids, self.tags, self.open, self.text = [], [], [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+        for key, value in attrs:
+            if key in ("src", "href", "srcset", "data", "action", "poster"):
+                self.references.append(value)
+            if key == "id":
+                self.ids.append(value)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] not in (["style"], ["pre"]):
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report") / "new" / "folder"
+    page = write_report([_study(), _study("duct-measured", figures=[], sounds=[], notes=[], extra={})], folder)
+    assert page == folder / "report.html"
+    return folder
+
+
+def test_results_are_strict_json_of_the_agreed_layout(written):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    results = json.loads((written / "results.json").read_text(encoding="utf-8"), parse_constant=refuse)
+    assert list(results) == ["studies"]
+    assert list(results["studies"]) == ["tonal", "duct-measured"]
+    study = results["studies"]["tonal"]
+    assert set(study) == {"rated_power", "parameters", "algorithms", "verdicts", "extra"}
+    assert study["rated_power"] == 0.8
+    assert study["parameters"] == {"q": 1e-4, "seeds": [0, 1, 2], "tried": [[1e-7, None], [1e-6, "diverged"]]}
+    assert study["algorithms"]["KF-ANC"] == {
+        "noise_reduction_db": 8.125,
+        "output_power": None,
+        "peak_control_signal": None,
+        "clipped_fraction": None,
+        "harmonics_db": None,
+        "convergence_time_s": None,
+        "diverged_at_s": 1.5,
+    }
+    assert study["verdicts"][1] == {"claim": "it is faster", "reproduced": False, "figure": "no"}
+    assert study["extra"] == {"sweep": {"over_db": [0, 1], "best": [1.0, None]}, "flip": 4.5}
+
+
+def test_page_needs_no_other_file(written):
+    page = _Links((written / "report.html").read_text(encoding="utf-8"))
+    anchors = [reference for reference in page.references if reference.startswith("#")]
+    others = [reference for reference in page.references if not reference.startswith("#")]
+    assert len(others) == 3
+    assert all(re.match(r"data:(image/svg\+xml|audio/wav);base64,[A-Za-z0-9+/=]+$", other) for other in others)
+    assert {anchor[1:] for anchor in anchors} <= set(page.ids)
+    assert len(page.ids) == len(set(page.ids))
+    assert not {"script", "link", "iframe", "object"} & set(page.tags)
+    assert not re.search(r"@import|url\(", (written / "report.html").read_text(encoding="utf-8"))
+
+
+def test_page_says_everything_and_escapes_it(written):
+    source = (written / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"<(hard|of|note)>", source)
+    text = _Links(source).text
+    for said in (
+        "Tone & clip <hard>",
+        "A tone of 2 > 1.",
+        "2 of 4 claims reproduced",
+        "KF-OPC < rated",
+        "✓ reproduced",
+        "✗ not reproduced",
+        "0.79971 of 0.8",
+        "estimate <of> eq. 7",
+        "1e-07, –",
+        'Spectra "of" e & d.',
+        "Residual (silent after the divergence)",
+        "One <note>.",
+        "Noise reduction (dB)",
+        "so their levels compare",
+    ):
+        assert said in text, said
+    assert "nan" not in text.lower()
+
+
+def test_figures_and_sounds_are_files_too(written):
+    assert {path.name for path in (written / "figures").iterdir()} == {"tonal-a-spectra.png", "tonal-a-spectra.svg"}
+    loud, fs = read_wav(written / "audio" / "tonal-disturbance.wav")
+    soft, _ = read_wav(written / "audio" / "tonal-kf-anc.wav")
+    assert fs == FS
+    assert np.max(np.abs(loud)) == pytest.approx(1.0, abs=1e-3)
+    np.testing.assert_allclose(soft[:-1], loud[:-1] / 2, atol=1e-4)  # one scale
+    assert soft[-1] == 0
+    assert not list(written.glob(".*"))
+
+
+def test_a_residual_far_louder_than_the_disturbance_does_not_silence_it(tmp_path):
+    study = _study(sounds=[Sound("disturbance", "Disturbance", D), Sound("fxlms", "Residual", 1e6 * D)])
+    page = write_report([study], tmp_path).read_text(encoding="utf-8")
+    assert np.max(np.abs(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])) == pytest.approx(0.25, abs=1e-3)
+    assert "louder than full scale: clipped" in page
+    silent = _study(sounds=[Sound("disturbance", "Disturbance", 0 * D)], figures=[])
+    write_report([silent], tmp_path)
+    assert not np.any(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])
+
+
+def test_a_large_figure_is_inlined_as_png(tmp_path, monkeypatch):
+    monkeypatch.setattr("kfopc_filterpy.bench.page._SVG_LIMIT", 10)
+    assert "data:image/png;base64," in write_report([_study()], tmp_path).read_text(encoding="utf-8")
+
+
+def test_same_studies_same_bytes(tmp_path):
+    pages = [write_report([_study()], tmp_path / name).read_bytes() for name in ("one", "two")]
+    assert pages[0] == pages[1]
+
+
+def test_table_for_the_terminal():
+    lines = results_table([_study()]).splitlines()
+    assert lines[0] == "tonal: Tone & clip <hard> (rated power 0.8)"
+    assert lines[4].split() == ["KF-OPC", "-", "0.79971", "0.9996", "-", "25.00", "-", "-", "-"]
+    assert lines[3].split() == ["KF-ANC", "8.1", "-", "-", "-", "-", "-", "-", "1.5"]
+    assert lines[5:9] == [
+        "  REPRODUCED      KF-OPC < rated",
+        "                  0.79971 of 0.8",
+        "  NOT REPRODUCED  it is faster",
+        "                  no",
+    ]
+    assert lines[-1] == "1 of 2 claims reproduced"
+    assert max(map(len, lines)) <= 120
+
+
+POWERS = Table(
+    "powers",
+    "Powers < 1 & more",
+    ["paths", "noise, of <kind>", "power"],
+    [["duct", 'tone "300"', 0.123456789], ["band-pass", "diverged", np.float64(1e6)], ["duct", 7.0, 3]],
+)
+EMPTY = Table("none", "Nothing to show", ["paths", "power"], [])
+
+
+def test_a_table_on_the_page(tmp_path):
+    study = _study(tables=[POWERS, EMPTY])
+    source = write_report([study, _study("duct")], tmp_path).read_text(encoding="utf-8")
+    assert "<kind>" not in source
+    part = source.split("Powers &lt; 1 &amp; more</h3>")
+    assert len(part) == 2  # one heading: the other study has no table
+    table = part[1].split("</table>")[0]
+    rows = [re.findall(r'<t[hd] class="(\w+)">(.*?)</t[hd]>', row) for row in table.split("<tr>")[1:]]
+    assert [[text for _, text in row] for row in rows] == [
+        ["paths", "noise, of &lt;kind&gt;", "power"],
+        ["duct", "tone &quot;300&quot;", "0.1235"],
+        ["band-pass", "diverged", "1e+06"],
+        ["duct", "7", "3"],
+    ]
+    assert all([kind for kind, _ in row] == ["value", "number", "number"] for row in rows)  # of numbers where one is
+    assert source.index("Claims of the paper</h3>") < source.index("Powers &lt; 1") < source.index("Notes</h3>")
+    assert "Nothing to show" not in source
+    assert "Powers < 1 & more" in _Links(source).text
+
+
+def test_a_table_for_the_terminal():
+    lines = results_table([_study(tables=[POWERS])]).splitlines()
+    begin = lines.index(POWERS.caption)
+    assert lines[begin - 1] == ""
+    assert lines[begin + 1 : begin + 5] == [  # text to the left, columns with a number in them to the right
+        "paths      noise, of <kind>   power",
+        'duct             tone "300"  0.1235',
+        "band-pass          diverged   1e+06",
+        "duct                      7       3",
+    ]
+    assert lines[-1] == "1 of 2 claims reproduced"
+
+
+def test_a_table_as_a_file_has_all_digits(tmp_path):
+    write_report([_study(tables=[POWERS, EMPTY]), _study("duct")], tmp_path)
+    assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["tonal-none.csv", "tonal-powers.csv"]
+    with (tmp_path / "tables" / "tonal-powers.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    assert rows[0] == ["paths", "noise, of <kind>", "power"]
+    assert rows[1:] == [
+        ["duct", 'tone "300"', "0.123456789"],
+        ["band-pass", "diverged", "1000000.0"],
+        ["duct", "7.0", "3"],
+    ]
+    assert (tmp_path / "tables" / "tonal-none.csv").read_bytes() == b"paths,power\n"
+
+
+def test_without_tables_there_is_no_folder_of_tables(written):
+    assert sorted(path.name for path in written.iterdir()) == ["audio", "figures", "report.html", "results.json"]
+
+
+def test_whose_claims_the_verdicts_are_on(tmp_path):
+    source = write_report([_study(claims="Aims"), _study("duct")], tmp_path).read_text(encoding="utf-8")
+    headings = re.findall(r"<h3[^>]*>(Aims|Claims of the paper)</h3>", source)
+    assert headings == ["Aims", "Claims of the paper"]
+
+
+def test_figures_held_for_the_report_are_unknown_to_pyplot():
+    for i in range(25):  # pyplot warns from 21 open figures on
+        FigureItem(f"f{i}", "", plt.subplots()[0])
+    assert not plt.get_fignums()
+
+
+def test_refusals_say_what_was_wrong(tmp_path):
+    with pytest.raises(ValueError, match="studies must hold at least one"):
+        write_report([], tmp_path)
+    with pytest.raises(ValueError, match="studies must have different names, got tonal twice"):
+        write_report([_study(), _study()], tmp_path)
+    with pytest.raises(ValueError, match="name must be lower-case letters"):
+        _study("../tonal")
+    with pytest.raises(ValueError, match="stem must be lower-case letters"):
+        Sound("a b", "", D)
+    with pytest.raises(ValueError, match="figures of study 'tonal' must have different names, got a twice"):
+        _study(figures=[FigureItem("a", "", _figure()), FigureItem("a", "", _figure())])
+    with pytest.raises(ValueError, match="tables of study 'tonal' must have different names, got powers twice"):
+        _study(tables=[POWERS, EMPTY, POWERS])
+    with pytest.raises(ValueError, match=r"stem must be lower-case letters.*got '../powers'"):
+        Table("../powers", "", [], [])
+    with pytest.raises(ValueError, match=r"algorithms\['KF-ANC'\] holds unknown figures of merit \['loudness'\]"):
+        _study(algorithms={"KF-ANC": {"loudness": 1.0}})
+    with pytest.raises(TypeError, match=r"study 'tonal', 'extra', 'path' must hold numbers.*got PosixPath|WindowsPath"):
+        write_report([_study(extra={"path": tmp_path})], tmp_path / "unused")
+    assert not (tmp_path / "unused").exists()  # refused before anything is written
+
+
+def test_a_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"file' cannot be written .*choose another output folder"):
+        report.prepare_folder(tmp_path / "file")
+    with pytest.raises(OSError, match="cannot be written"):
+        write_report([_study()], tmp_path / "file" / "below")
+
+
+def test_a_report_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
+    write_report([_study()], tmp_path)
+    before = (tmp_path / "report.html").read_bytes()
+    monkeypatch.setattr(report, "page", lambda *_: "\ud800")  # cannot be encoded
+    with pytest.raises(UnicodeEncodeError):
+        write_report([_study()], tmp_path)
+    assert (tmp_path / "report.html").read_bytes() == before
+    assert not list(tmp_path.glob(".*"))

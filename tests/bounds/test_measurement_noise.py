@@ -1,0 +1,136 @@
+"""Estimates of q = E[e_o^2] (eq. 7) against what was put in, and against an independent least-squares fit."""
+
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy.bounds import measurement_noise_from_residual, measurement_noise_from_run
+from kfopc_filterpy.bounds.wiener import wiener_solution
+from kfopc_filterpy.paths import fir_path
+
+S = np.array([0.0, 0.9, -0.4, 0.2])
+
+
+def recording(n, n_taps, q, seed, coloured=True):
+    """Reference, and d = w' x' + e_o of eq. 1b with white e_o of variance q."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(n)
+    if coloured:
+        x = scipy.signal.lfilter([1.0, 0.3], [1.0, -0.7], x)
+    w = rng.standard_normal(n_taps)
+    return x, np.convolve(np.convolve(x, S), w)[:n] + np.sqrt(q) * rng.standard_normal(n)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    n_taps=st.integers(1, 40),
+    n=st.integers(400, 3000),
+    q=st.floats(1e-4, 1e2),
+)
+@settings(max_examples=40)
+def test_recovers_the_variance_put_in(seed, n_taps, n, q):
+    x, d = recording(n, n_taps, q, seed)
+    estimate = measurement_noise_from_run(x, d, S, n_taps)
+    # chi squared with as many degrees of freedom as samples fitted less weights: 5 of its standard deviations
+    freedom = n - (n_taps + S.size - 2) - n_taps
+    assert estimate == pytest.approx(q, rel=5 * np.sqrt(2 / freedom))
+
+
+def test_has_no_bias_from_the_weights_fitted():
+    """64 weights on 300 samples take a fifth of the residual: 40 estimates average to q within 4 sigma."""
+    estimates = []
+    for seed in range(40):
+        x, d = recording(300, 64, 0.5, seed)
+        estimates.append(measurement_noise_from_run(x, d, S, 64))
+    freedom = 300 - 66 - 64
+    assert np.mean(estimates) == pytest.approx(0.5, rel=4 * np.sqrt(2 / freedom / 40))
+    assert 4 * np.sqrt(2 / freedom / 40) < 64 / 300 / 2  # an uncorrected mean square would be far outside
+
+
+@pytest.mark.parametrize("n_taps", [1, 5, 33])
+def test_is_the_residual_of_least_squares(n_taps):
+    x, d = recording(900, 5, 0.04, 1)
+    filtered = np.convolve(x, S)[:900]
+    start = n_taps + S.size - 2  # delay lines full
+    rows = np.array([filtered[n - n_taps + 1 : n + 1][::-1] for n in range(start, 900)])
+    _, (squares,), rank, _ = np.linalg.lstsq(rows, d[start:])
+    assert rank == n_taps
+    expected = squares / (len(rows) - n_taps)
+    assert measurement_noise_from_run(x, d, S, n_taps) == pytest.approx(expected, rel=1e-9)
+    assert measurement_noise_from_run(x, d, fir_path(S, 16000.0), n_taps) == pytest.approx(expected, rel=1e-9)
+
+
+def test_what_the_filter_cannot_explain_counts():
+    """A disturbance of another source is all measurement error; one too early for the secondary path nearly all."""
+    rng = np.random.default_rng(2)
+    x, other = rng.standard_normal((2, 20_000))
+    assert measurement_noise_from_run(x, other, S, 16) == pytest.approx(np.var(other), rel=0.01)
+    assert measurement_noise_from_run(x, x, [0.0, 0.0, 1.0], 16) == pytest.approx(np.var(x), rel=0.01)
+    assert measurement_noise_from_run(x, x, [1.0], 16) < 1e-25
+
+
+def test_scales_with_the_square_of_the_disturbance():
+    x, d = recording(800, 8, 0.1, 3)
+    one = measurement_noise_from_run(x, d, S, 8)
+    assert measurement_noise_from_run(x, 8.0 * d, S, 8) == pytest.approx(64 * one, rel=1e-12)
+    assert measurement_noise_from_run(8.0 * x, d, S, 8) == pytest.approx(one, rel=1e-9)
+
+
+def test_a_tone_that_is_all_explained_leaves_the_noise():
+    n = np.arange(8000)
+    noise = 0.1 * np.random.default_rng(4).standard_normal(8000)
+    d = 3 * np.sin(0.2 * n + 1.0) + noise
+    assert measurement_noise_from_run(np.sin(0.2 * n), d, S, 16) == pytest.approx(0.01, rel=5 * np.sqrt(2 / 8000))
+
+
+def test_from_a_residual():
+    e = np.random.default_rng(0).standard_normal(100)
+    assert measurement_noise_from_residual(e) == pytest.approx(np.mean(e**2), rel=1e-14)
+    assert measurement_noise_from_residual(e, n_fitted=20) == pytest.approx(np.sum(e**2) / 80, rel=1e-14)
+    assert measurement_noise_from_residual([2.0]) == 4.0
+    assert type(measurement_noise_from_residual(e)) is float
+    x, d = recording(900, 5, 0.04, 1)
+    start = 5 + S.size - 2
+    residual = (d - np.convolve(np.convolve(x, S), wiener_solution(x, d, S, 5).weights)[:900])[start:]
+    assert measurement_noise_from_residual(residual, n_fitted=5) == measurement_noise_from_run(x, d, S, 5)
+
+
+X, D = recording(200, 4, 0.1, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "message"),
+    [
+        ((X, D[:-1], S, 4), ValueError, "disturbance must have 200 values, got 199"),
+        ((X[:0], D[:0], S, 4), ValueError, "reference must have at least 1 value"),
+        ((np.where(X > 2, np.nan, X), D, S, 4), ValueError, "reference must be finite"),
+        ((X, np.where(D > 2, np.inf, D), S, 4), ValueError, "disturbance must be finite"),
+        ((X, D, [np.nan], 4), ValueError, "secondary_path must be finite"),
+        ((X, D, S, 0), ValueError, "n_taps must be at least 1"),
+        ((X, D, S, 2.5), TypeError, "n_taps must be a whole number"),
+        ((X[:13], D[:13], S, 4), ValueError, r"at least 14 samples for 4 taps and a\s+secondary path of 4, got 13"),
+        ((0 * X, D, S, 4), ValueError, "reference"),
+        ((X, D, 0 * S, 4), ValueError, "silent|zero|energy"),
+    ],
+)
+def test_from_run_refuses(arguments, kind, message):
+    with pytest.raises(kind, match=message):
+        measurement_noise_from_run(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("residual", "n_fitted", "kind", "message"),
+    [
+        ([], 0, ValueError, "residual must have at least 1 value"),
+        ([1.0, 2.0], 2, ValueError, "residual must have at least 3 value"),
+        ([1.0, np.nan], 0, ValueError, "residual must be finite"),
+        ([[1.0, 2.0]], 0, ValueError, "residual must be one-dimensional"),
+        ([1.0], -1, ValueError, "n_fitted must be at least 0"),
+        ([1.0], 0.5, TypeError, "n_fitted must be a whole number"),
+    ],
+)
+def test_from_residual_refuses(residual, n_fitted, kind, message):
+    with pytest.raises(kind, match=message):
+        measurement_noise_from_residual(residual, n_fitted=n_fitted)

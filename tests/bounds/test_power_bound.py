@@ -1,0 +1,520 @@
+"""The power-constrained bound against a general optimiser, dense least squares, the KKT conditions and closed forms.
+
+No oracle here uses correlation matrices recursively made, eigenvalues or the package's root finder: they hold the
+delay lines as explicit rows.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.optimize
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy import noise_reduction_db
+from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
+from kfopc_filterpy.bounds.wiener import wiener_solution
+from kfopc_filterpy.paths import fir_path
+from kfopc_filterpy.paths.models import bandpass_path, path_taps
+
+FS = 200.0
+# The least penalty leaves the power within 1e-12 of the budget by its own sums; correlations of well-conditioned
+# signals and sums over the samples agree to some 1e-13 more.
+WELL = 1e-9
+
+
+def scene(n=1000, seed=0, noise=0.1, path=(0.0, 0.8, 0.3, -0.1)):
+    """Coloured reference of changing level, and a disturbance that it explains but for some noise."""
+    rng = np.random.default_rng(seed)
+    x = scipy.signal.lfilter([1.0], [1.0, -0.6], rng.standard_normal(n)) * (1 + 0.5 * np.sin(np.arange(n) / 150))
+    d = scipy.signal.lfilter([0, 0, 1.0, 0.5, -0.3], 1.0, x) + noise * rng.standard_normal(n)
+    return x, d, np.array(path)
+
+
+def delay_lines(signal, n_taps, start, stop):
+    """Rows of the real past, newest first, with zeros before the first sample."""
+    return np.array([[signal[n - j] if n >= j else 0.0 for j in range(n_taps)] for n in range(start, stop)])
+
+
+def dense(x, d, s, n_taps, start, stop):
+    """Rows of x', rows of x and the disturbance of a stretch."""
+    filtered = np.convolve(x, s)[: x.size]
+    return delay_lines(filtered, n_taps, start, stop), delay_lines(x, n_taps, start, stop), d[start:stop]
+
+
+def dense_bound(filtered, control, d, rated_power):
+    """Weights and penalty by least squares on stacked rows for each penalty tried, and a bracketed root."""
+
+    def solve(penalty):
+        rows = np.vstack([filtered, np.sqrt(penalty) * control])
+        return np.linalg.lstsq(rows, np.concatenate([d, np.zeros(len(control))]), rcond=1e-13)[0]
+
+    def excess(exponent):
+        return np.log(np.mean((control @ solve(10.0**exponent)) ** 2) / rated_power)
+
+    if np.mean((control @ solve(0.0)) ** 2) <= rated_power:
+        return solve(0.0), 0.0
+    penalty = 10.0 ** scipy.optimize.brentq(excess, -12, 12, xtol=1e-14)
+    return solve(penalty), penalty
+
+
+def asked_for(x, d, s, n_taps):
+    """Power of the filter without a budget."""
+    filtered, control, d = dense(x, d, s, n_taps, 0, x.size)
+    return np.mean((control @ np.linalg.lstsq(filtered, d, rcond=None)[0]) ** 2)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_no_general_optimiser_finds_less_error_within_the_power(share, seed):
+    x, d, s = scene(300, seed)
+    rated = share * asked_for(x, d, s, 3)
+    found = power_constrained_wiener(x, d, s, 3, rated, fs=100.0)
+    assert found.whole.penalty > 0
+    for part, (start, stop) in [(found.whole, (0, 300)), (found.per_second.segments[1], (100, 200))]:
+        filtered, control, own = dense(x, d, s, 3, start, stop)
+
+        def error(w, filtered=filtered, own=own):
+            return np.mean((own - filtered @ w) ** 2)
+
+        def slope(w, filtered=filtered, own=own):
+            return -2 * filtered.T @ (own - filtered @ w) / own.size
+
+        budget = {
+            "type": "ineq",
+            "fun": lambda w, control=control: rated - np.mean((control @ w) ** 2),
+            "jac": lambda w, control=control: -2 * control.T @ (control @ w) / len(control),
+        }
+        options = {"ftol": 1e-12, "maxiter": 500}
+        other = scipy.optimize.minimize(
+            error, np.zeros(3), jac=slope, method="SLSQP", constraints=budget, options=options
+        )
+        assert other.success
+        # SLSQP stops when the error changes by less than 1e-12 and its root, the weights, by some 1e-6.
+        assert part.error_power == pytest.approx(other.fun, rel=1e-8)
+        np.testing.assert_allclose(part.weights, other.x, atol=1e-5 * np.abs(other.x).max())
+
+
+@pytest.mark.parametrize(
+    ("n", "switch_on", "edges"),
+    [
+        (1000, 0, [0, 200, 400, 600, 800, 1000]),
+        (1099, 0, [0, 200, 400, 600, 800, 1099]),  # a rest of under half a second joins the last
+        (1100, 0, [0, 200, 400, 600, 800, 1000, 1100]),  # half a second is a segment of its own
+        (1000, 130, [130, 330, 530, 730, 1000]),
+        (150, 0, [0, 150]),  # less than a second in all, and less than half a second
+        (90, 0, [0, 90]),
+    ],
+)
+@pytest.mark.parametrize("share", [0.2, 0.8, 1.5])
+def test_record_and_segments_are_those_of_dense_least_squares(n, switch_on, edges, share):
+    n_taps = 6
+    x, d, s = scene(n)
+    rated = share * asked_for(x, d, s, n_taps)
+    found = power_constrained_wiener(x, d, s, n_taps, rated, fs=FS, switch_on_s=switch_on / FS)
+    stretches = [(switch_on, n), *pairwise(edges)]
+    parts = [found.whole, *found.per_second.segments]
+    assert len(parts) == len(stretches)
+    for part, (start, stop) in zip(parts, stretches, strict=True):
+        filtered, control, own = dense(x, d, s, n_taps, start, stop)
+        weights, penalty = dense_bound(filtered, control, own, rated)
+        # Condition numbers below 1e3 cost normal equations three digits of 16, and the root is good to 1e-12.
+        np.testing.assert_allclose(part.weights, weights, atol=WELL * np.abs(weights).max())
+        assert part.penalty == pytest.approx(penalty, rel=1e-8)
+        assert part.control_power <= rated * (1 + WELL)
+        assert part.control_power == pytest.approx(np.mean((control @ weights) ** 2), rel=WELL)
+        assert part.error_power == pytest.approx(np.mean((own - filtered @ weights) ** 2), rel=WELL)
+        assert part.disturbance_power == pytest.approx(np.mean(own**2), rel=1e-12)
+        assert (part.start_s, part.end_s) == pytest.approx(((start - switch_on) / FS, (stop - switch_on) / FS))
+        assert (part.penalty == 0) == (part.control_power < rated * (1 - WELL))
+    np.testing.assert_array_equal(found.disturbance, d[switch_on:])
+
+
+@st.composite
+def problems(draw):
+    seed, n_taps, n_path = draw(st.integers(0, 10_000)), draw(st.integers(1, 8)), draw(st.integers(1, 6))
+    rng = np.random.default_rng(seed)
+    n = draw(st.integers(2 * n_taps, 120))
+    x = scipy.signal.lfilter([1.0], [1.0, -draw(st.floats(-0.9, 0.9))], rng.standard_normal(n))
+    x, d = x * 10.0 ** draw(st.integers(-3, 3)), rng.standard_normal(n) * 10.0 ** draw(st.integers(-3, 3))
+    return x, d, rng.standard_normal(n_path), n_taps, 10.0 ** draw(st.floats(-6, 1))
+
+
+@given(problem=problems())
+@settings(max_examples=150, deadline=None)
+def test_karush_kuhn_tucker_conditions_hold(problem):
+    # The problem is convex: what satisfies them is the optimum.
+    x, d, s, n_taps, share = problem
+    filtered, control, _ = dense(x, d, s, n_taps, 0, x.size)
+    rated = share * max(asked_for(x, d, s, n_taps), 1e-12)
+    whole = power_constrained_wiener(x, d, s, n_taps, rated, fs=1.0, segment_s=x.size).whole
+    gradient = (filtered.T @ (filtered @ whole.weights - d) + whole.penalty * control.T @ (control @ whole.weights)) / (
+        x.size
+    )
+    # Against the terms it is the difference of. Conditions below 1e5 leave ten digits; eight are asked for.
+    terms = np.sqrt(np.mean(filtered**2) * np.mean(d**2)) + np.linalg.norm(
+        whole.penalty * control.T @ (control @ whole.weights) / x.size
+    )
+    assert np.linalg.norm(gradient) <= 1e-8 * terms
+    assert whole.penalty >= 0
+    power = np.mean((control @ whole.weights) ** 2)
+    assert power <= rated * (1 + 1e-6)
+    assert whole.penalty == 0 or power >= rated * (1 - 1e-6)
+
+
+def test_one_tap_in_closed_form():
+    x, d, _ = scene()
+    found = power_constrained_wiener(x, -d, [0.0, 2.0], 1, 0.01, fs=FS)
+    late = 2 * np.concatenate([[0.0], x[:-1]])
+    # All the budget, with the sign of the correlation: w = -sqrt(rated / E[x^2]); and r / w = R' + lambda R.
+    weight = -np.sqrt(0.01 / np.mean(x**2))
+    assert found.whole.weights[0] == pytest.approx(weight, rel=1e-12)
+    penalty = (np.mean(-d * late) / weight - np.mean(late**2)) / np.mean(x**2)
+    assert found.whole.penalty == pytest.approx(penalty, rel=1e-12)
+    assert found.scaled.weights[0] == pytest.approx(weight, rel=1e-12)  # one tap can only be scaled
+
+
+def tones(n, amplitudes, cycles, phases):
+    """Sines of whole periods a second of 200 samples, so that they are orthogonal over it."""
+    angles = 2 * np.pi * np.outer(cycles, np.arange(n)) / FS + np.array(phases)[:, None]
+    return np.sin(angles).T @ np.array(amplitudes)
+
+
+def test_tone_can_only_be_scaled():
+    x, d = tones(1000, [1.0], [20], [0.0]), tones(1000, [0.7], [20], [1.0])
+    s = np.array([0.0, 0.5, 0.4])
+    gain = abs(np.exp(-2j * np.pi * 20 / FS * np.arange(3)) @ s)
+    power = 0.7**2 / 2 / gain**2
+    for factor in (0.1, 0.5, 0.9):
+        found = power_constrained_wiener(x, d, s, 16, factor**2 * power, fs=FS, switch_on_s=1.0)
+        # R_x has rank two of 16. The delay lines are full from switch-on on: sines throughout, to rounding.
+        expected = -20 * np.log10(1 - factor)
+        for part in (found.whole, found.scaled, *found.per_second.segments, *found.scaled_per_second.segments):
+            assert part.noise_reduction_db == pytest.approx(expected, abs=1e-8)
+            assert part.control_power == pytest.approx(factor**2 * power, rel=1e-9)
+        assert found.scaled.constraint_factor == pytest.approx(factor, rel=1e-9)
+        # |S|^2 + lambda of the tone takes the weights to the factor.
+        assert found.whole.penalty == pytest.approx(gain**2 * (1 / factor - 1), rel=1e-8)
+        assert found.unconstrained.control_power == pytest.approx(power, rel=1e-9)
+
+
+def test_two_tones_share_the_power_by_the_gain_at_each():
+    cycles, amplitudes = np.array([15, 52]), np.array([1.0, 0.4])
+    x = tones(1000, [1.0, 0.5], cycles, [0.0, 0.0])
+    d = tones(1000, amplitudes, cycles, [1.0, -0.4])
+    s = np.array([0.0, 1.0, 0.7])
+    gains = np.abs(np.exp(-2j * np.pi * np.outer(cycles, np.arange(3)) / FS) @ s) ** 2
+
+    def powers(penalty):  # |y_k|^2 / 2 of y_k = conj(S_k) d_k / (|S_k|^2 + lambda)
+        return amplitudes**2 / 2 * gains / (gains + penalty) ** 2
+
+    rated = 0.3 * powers(0.0).sum()
+    penalty = scipy.optimize.brentq(lambda p: powers(p).sum() - rated, 0, 100, xtol=1e-14)
+    error = np.sum(amplitudes**2 / 2 * (penalty / (gains + penalty)) ** 2)
+    found = power_constrained_wiener(x, d, s, 12, rated, fs=FS, switch_on_s=1.0)
+    # R_x has rank four of 12; its smallest eigenvalue that is not zero is within 1e-3 of the largest.
+    for part in (found.whole, *found.per_second.segments):
+        assert part.penalty == pytest.approx(penalty, rel=1e-8)
+        assert part.error_power == pytest.approx(error, rel=1e-8)
+    assert found.scaled.error_power > 1.03 * error
+
+
+def test_path_that_mutes_a_tone_costs_it_no_power():
+    # S is zero at the second tone. The least-norm filter lets some of it into y nevertheless, the bound need not.
+    x = tones(1000, [1.0, 5.0], [20, 47], [0.0, 0.0])
+    d = tones(1000, [1.0], [20], [1.0]) + 0.1 * np.random.default_rng(0).standard_normal(1000)
+    s = np.array([1.0, -2 * np.cos(2 * np.pi * 47 / FS), 1.0])
+    gain = abs(np.exp(-2j * np.pi * 20 / FS * np.arange(3)) @ s) ** 2
+    free = power_constrained_wiener(x, d, s, 7, 1e3, fs=FS, switch_on_s=1.0)
+    needed = 1.05 * 0.5 / gain  # 5 % for what the noise adds to the tone
+    assert free.unconstrained.control_power > 1.5 * needed
+    found = power_constrained_wiener(x, d, s, 7, needed, fs=FS, switch_on_s=1.0)
+    assert found.whole.penalty == 0
+    assert found.whole.control_power <= needed
+    assert found.whole.error_power == pytest.approx(free.unconstrained.error_power, rel=1e-9)
+    assert found.scaled.error_power > 1.5 * found.whole.error_power
+
+
+def test_budget_that_is_not_reached_leaves_the_least_squares_filter():
+    x, d, s = scene()
+    found = power_constrained_wiener(x, d, s, 8, 1.01 * asked_for(x, d, s, 8), fs=FS)
+    filtered, _, own = dense(x, d, s, 8, 0, x.size)
+    expected = np.linalg.lstsq(filtered, own, rcond=None)[0]
+    for part in (found.whole, found.unconstrained, found.scaled):
+        np.testing.assert_allclose(part.weights, expected, atol=WELL)
+        assert (part.penalty, part.constraint_factor) == (0.0, 1.0)
+
+
+def test_more_power_never_means_more_error():
+    x, d, s = scene()
+    asked = asked_for(x, d, s, 8)
+    found = [power_constrained_wiener(x, d, s, 8, share * asked, fs=FS) for share in np.geomspace(1e-8, 2, 60)]
+    errors = np.array([[part.whole.error_power, *part.per_second.error_power] for part in found])
+    penalties = np.array([[part.whole.penalty, *part.per_second.penalty] for part in found])
+    # Errors come of sums of 1000 samples: to rounding. Penalties fall strictly until they are zero.
+    assert np.all(np.diff(errors, axis=0) <= 1e-12 * errors[:-1])
+    assert np.all((np.diff(penalties, axis=0) < 0) | (penalties[1:] == 0))
+    assert np.all(penalties[0] > 0)
+    assert np.all(penalties[-1, 0] == 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bound_lies_below_the_scaled_filter(seed):
+    x, d, s = scene(seed=seed)
+    found = power_constrained_wiener(x, d, s, 8, 0.25 * asked_for(x, d, s, 8), fs=FS)
+    # Both keep the budget, and the path is not flat: tenths of a per cent in the quietest second, not rounding.
+    assert found.whole.error_power < 0.985 * found.scaled.error_power
+    assert np.all(found.per_second.error_power < 0.998 * found.scaled_per_second.error_power)
+    for part in (found.scaled, *found.scaled_per_second.segments):
+        assert part.control_power == pytest.approx(found.rated_power, rel=1e-12)
+    np.testing.assert_allclose(found.scaled.weights, found.scaled.constraint_factor * found.unconstrained.weights)
+
+
+def test_flat_path_and_white_reference_leave_nothing_to_gain_over_scaling():
+    x = np.random.default_rng(0).standard_normal(20_000)
+    found = power_constrained_wiener(x, 3 * x, [2.0], 8, 0.5, fs=4000.0)
+    # x' = 2 x exactly, so that R_x' = 4 R_x whatever the sample.
+    np.testing.assert_allclose(found.whole.weights, found.scaled.weights, atol=1e-12)
+
+
+@pytest.mark.parametrize("gain", [1e-8, 1e7])
+def test_units_do_not_matter(gain):
+    x, d, s = scene()
+    rated = 0.2 * asked_for(x, d, s, 8)
+    one = power_constrained_wiener(x, d, s, 8, rated, fs=FS)
+    others = [
+        (power_constrained_wiener(gain * x, d, s, 8, rated, fs=FS), 1 / gain),  # the reference's unit
+        (power_constrained_wiener(x, gain * d, s, 8, gain**2 * rated, fs=FS), gain),  # the disturbance's
+        (power_constrained_wiener(x, d, gain * s, 8, rated / gain**2, fs=FS), 1 / gain),  # the path's
+    ]
+    for other, factor in others:
+        np.testing.assert_allclose(other.per_second.weights, factor * one.per_second.weights, rtol=1e-7)
+        assert other.whole.noise_reduction_db == pytest.approx(one.whole.noise_reduction_db, abs=1e-9)
+
+
+def test_silent_second_costs_and_needs_nothing():
+    x, d, s = scene()
+    x[150:600] = d[150:600] = 0.0
+    found = power_constrained_wiener(x, d, s, 8, 0.2 * asked_for(x, d, s, 8), fs=FS)
+    for part in (found.per_second, found.scaled_per_second):
+        np.testing.assert_array_equal(part.weights[1:3], 0.0)
+        np.testing.assert_array_equal(part.control_power[1:3], 0.0)
+        np.testing.assert_array_equal(part.error_power[1:3], 0.0)
+        assert np.isnan(part.segment_noise_reduction_db).tolist() == [False, True, True, False, False]
+        assert part.noise_reduction_db == pytest.approx(-10 * np.log10(np.sum(part.error**2) / np.sum(d**2)), abs=1e-9)
+    assert np.all(np.isnan(list(found.noise_reduction_over(1.0, 2.0).values())))
+    np.testing.assert_allclose(found.per_second.control_power[[0, 3, 4]], found.rated_power, rtol=WELL)
+
+
+def test_second_without_a_reference_is_left_as_it_is():
+    x, d, s = scene()
+    x[150:600] = 0.0
+    found = power_constrained_wiener(x, d, s, 8, 0.01, fs=FS)
+    np.testing.assert_array_equal(found.per_second.weights[1:3], 0.0)
+    assert found.per_second.segment_noise_reduction_db[1:3].tolist() == [0.0, 0.0]
+
+
+def test_anti_noise_still_on_its_way_costs_no_power():
+    # The reference stops before the second second; what a late path still delivers of it can be cancelled for nothing.
+    x, d, _ = scene(400)
+    x[190:] = 0.0
+    s = np.concatenate([np.zeros(40), [1.0]])
+    second = power_constrained_wiener(x, d, s, 4, 1e-6, fs=FS).per_second.segments[1]
+    filtered, _, own = dense(x, d, s, 4, 200, 400)
+    expected = np.linalg.lstsq(filtered, own, rcond=None)[0]
+    np.testing.assert_allclose(second.weights, expected, atol=WELL)
+    assert np.abs(expected).max() > 0.01
+    assert (second.control_power, second.penalty) == (0.0, 0.0)
+
+
+def test_band_limited_noise_of_numerical_rank_far_below_its_taps():
+    fs, n_taps = 16_000.0, 48
+    band = scipy.signal.butter(8, (400, 2000), "bandpass", fs=fs, output="sos")
+    rng = np.random.default_rng(0)
+    x = scipy.signal.sosfilt(band, rng.standard_normal(12_000))
+    d = np.convolve(x, path_taps(bandpass_path(96)))[: x.size]
+    d += 0.01 * d.std() * rng.standard_normal(x.size)
+    s = path_taps(bandpass_path(32))
+    free = power_constrained_wiener(x, d, s, n_taps, 1e9, fs=fs, segment_s=0.25)
+    assert np.linalg.cond(delay_lines(x, n_taps, 4000, 8000)) ** 2 > 1e12  # the condition number of R_x
+    for share in (0.01, 0.25, 0.9):
+        rated = share * free.unconstrained.control_power
+        found = power_constrained_wiener(x, d, s, n_taps, rated, fs=fs, segment_s=0.25)
+        part = found.per_second.segments[1]
+        assert found.whole.control_power == pytest.approx(rated, rel=1e-6)
+        np.testing.assert_allclose(found.per_second.control_power, rated, rtol=1e-6)
+        filtered, control, own = dense(x, d, s, n_taps, 4000, 8000)
+        # QR of all rows keeps their products, and directions of energies down to 1e-26, of which the bound keeps those
+        # down to 1e-11. What the others could remove is under 1e-3 of the error, 0.004 dB.
+        triangle = np.linalg.qr(np.column_stack([filtered, control, own]), mode="r") / np.sqrt(len(own) / 97)
+        weights, _ = dense_bound(triangle[:, :48], triangle[:, 48:96], triangle[:, 96], rated)
+        best = np.mean((own - filtered @ weights) ** 2)
+        assert best * (1 - 1e-6) <= part.error_power <= best * (1 + 1e-3)
+
+
+def test_weak_part_of_the_reference_counts_where_the_disturbance_is_made_of_it():
+    # Hum 70 dB above the noise that is heard: the noise lives in directions of 1e-8 of the largest eigenvalue.
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal(1000)
+    x = noise + tones(1000, [3000.0], [10], [0.3])
+    s = np.array([0.0, 1.0, 0.5])
+    d = np.convolve(noise, [0, 0, 0.5, 0.2])[:1000] + 0.05 * rng.standard_normal(1000)
+    filtered, control, own = dense(x, d, s, 8, 200, 1000)
+    power = np.mean((control @ np.linalg.lstsq(filtered, own, rcond=None)[0]) ** 2)
+    found = power_constrained_wiener(x, d, s, 8, power / 3, fs=FS, switch_on_s=1.0).whole
+    weights, _ = dense_bound(filtered, control, own, power / 3)
+    # Conditions of 1e8 cost correlations eight digits of 16; the error is stationary in what is lost.
+    assert found.control_power == pytest.approx(power / 3, rel=1e-6)
+    assert found.error_power == pytest.approx(np.mean((own - filtered @ weights) ** 2), rel=1e-7)
+    assert found.noise_reduction_db > 3
+
+
+def test_what_is_cancelled_wholly_is_300_db():
+    x = np.resize([1.0, -1.0, -1.0], 1000)  # powers of two: the error is zero, not rounding
+    found = power_constrained_wiener(x, 0.5 * x, [1.0], 1, 1.0, fs=FS)
+    assert found.whole.error_power == 0
+    assert found.whole.noise_reduction_db == found.per_second.noise_reduction_db == 300
+    assert found.noise_reduction_over(1.0)["per_second"] == 300
+
+
+def test_ridge_is_that_of_a_kalman_filter_without_state_noise():
+    x, d, s = scene(600)
+    n_taps, q, variance, on = 6, 0.04, 0.02, 130
+    filtered, _, own = dense(x, d, s, n_taps, on, 600)
+    w, p = np.zeros(n_taps), variance * np.eye(n_taps)
+    for row, value in zip(filtered, own, strict=True):
+        gain = p @ row / (row @ p @ row + q)
+        w, p = w + gain * (value - row @ w), p - np.outer(gain, row @ p)
+    ridge = q / (own.size * variance)
+    found = power_constrained_wiener(x, d, s, n_taps, 0.05, fs=FS, switch_on_s=on / FS, ridge=ridge)
+    plain = power_constrained_wiener(x, d, s, n_taps, 0.05, fs=FS, switch_on_s=on / FS)
+    # 470 steps of the recursion lose some digits; the ridge itself moves the weights by far more.
+    np.testing.assert_allclose(found.unconstrained.weights, w, atol=1e-10)
+    assert np.abs(plain.unconstrained.weights - w).max() > 1e-4
+    np.testing.assert_allclose(found.scaled.weights, found.scaled.constraint_factor * w, atol=1e-10)
+    # The bounds have none.
+    np.testing.assert_array_equal(found.whole.weights, plain.whole.weights)
+    np.testing.assert_array_equal(found.per_second.weights, plain.per_second.weights)
+    # `wiener_solution` has it relative to the filtered reference; it counts from full delay lines on.
+    full = power_constrained_wiener(x, d, s, n_taps, 0.05, fs=FS, switch_on_s=(n_taps + s.size - 2) / FS, ridge=ridge)
+    same = wiener_solution(x, d, s, n_taps, regularization=ridge / full.filtered_power)
+    np.testing.assert_allclose(full.unconstrained.weights, same.weights, atol=1e-12)
+
+
+def test_solution_over_full_delay_lines_is_the_same():
+    x, d, s = scene()
+    rated = 0.3 * asked_for(x, d, s, 8)
+    whole = power_constrained_wiener(x, d, s, 8, rated, fs=FS, switch_on_s=(8 + s.size - 2) / FS).whole
+    same = power_constrained_solution(x, d, s, 8, rated)
+    np.testing.assert_allclose(same.weights, whole.weights, atol=1e-12)
+    assert same.error_power == pytest.approx(whole.error_power, rel=1e-12)
+    penalised = wiener_solution(x, d, s, 8, control_penalty=whole.penalty)
+    np.testing.assert_allclose(penalised.weights, whole.weights, atol=1e-11)
+
+
+def test_signals_are_those_of_the_weights():
+    x, d, s = scene()
+    found = power_constrained_wiener(x, d, s, 8, 0.3 * asked_for(x, d, s, 8), fs=FS, switch_on_s=0.65)
+    filtered, control, own = dense(x, d, s, 8, 130, 1000)
+    np.testing.assert_allclose(found.whole.error, own - filtered @ found.whole.weights, atol=1e-12)
+    np.testing.assert_allclose(found.whole.control_signal, control @ found.whole.weights, atol=1e-12)
+    second = slice(200, 400)
+    weights = found.per_second.weights[1]
+    np.testing.assert_allclose(found.per_second.error[second], (own - filtered @ weights)[second], atol=1e-12)
+    np.testing.assert_allclose(found.per_second.control_signal[second], (control @ weights)[second], atol=1e-12)
+    assert found.per_second.start_s.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert found.per_second.error.size == found.disturbance.size == 870
+
+
+def test_noise_reduction_over_a_part_is_that_of_its_samples():
+    x, d, s = scene()
+    found = power_constrained_wiener(x, d, s, 8, 0.3 * asked_for(x, d, s, 8), fs=FS)
+    solutions = ("whole", "per_second", "unconstrained", "scaled", "scaled_per_second")
+    steady = found.noise_reduction_over(0.5 * found.whole.end_s)
+    part = found.noise_reduction_over(0.5, 1.75)
+    everything = found.noise_reduction_over()
+    assert tuple(part) == solutions
+    for name in solutions:
+        error = getattr(found, name).error
+        assert steady[name] == pytest.approx(noise_reduction_db(error, d), abs=1e-12)
+        ratio = np.sum(error[100:350] ** 2) / np.sum(d[100:350] ** 2)
+        assert part[name] == pytest.approx(-10 * np.log10(ratio), abs=1e-12)
+        assert everything[name] == pytest.approx(getattr(found, name).noise_reduction_db, abs=1e-12)
+
+
+def test_results_outlive_the_arrays_they_came_from():
+    x, d, s = scene()
+    found = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
+    before = found.per_second.error
+    x *= 2
+    d *= 3
+    np.testing.assert_array_equal(found.per_second.error, before)
+    for array in (found.disturbance, found.whole.weights, found.per_second.segments[0].weights):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1.0
+
+
+def test_system_and_taps_give_the_same_and_rates_must_agree():
+    x, d, s = scene()
+    with_taps = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
+    with_system = power_constrained_wiener(x, d, fir_path(s, FS), 8, 0.1, fs=FS)
+    np.testing.assert_allclose(with_system.whole.weights, with_taps.whole.weights, atol=1e-12)
+    with pytest.raises(ValueError, match="secondary_path is sampled at 400 Hz but fs is 200 Hz"):
+        power_constrained_wiener(x, d, fir_path(s, 400.0), 8, 0.1, fs=FS)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"d": np.ones(999)}, "disturbance must have 1000 values, got 999"),
+        ({"x": np.full(1000, np.nan)}, "reference must be finite"),
+        ({"x": np.zeros(1000)}, "reference through secondary_path must not be silent"),
+        ({"d": np.zeros(1000)}, "disturbance must not be silent"),
+        ({"x": np.r_[np.ones(100), np.zeros(900)], "switch_on_s": 1.0}, "reference through secondary_path must not be"),
+        ({"n_taps": 0}, "n_taps must be at least 1, got 0"),
+        ({"rated_power": 0.0}, "rated_power must be greater than 0, got 0"),
+        ({"rated_power": np.inf}, "rated_power must be finite"),
+        ({"fs": 0}, "fs must be greater than 0 Hz"),
+        ({"ridge": -1.0}, "ridge must not be negative"),
+        ({"switch_on_s": -1.0}, "switch_on_s must not be negative"),
+        ({"switch_on_s": 4.97}, "at least 8 samples from switch_on_s on for 8 taps, got 6; use a longer signal"),
+        ({"switch_on_s": 9.0}, "at least 8 samples from switch_on_s on for 8 taps, got 0"),
+        ({"segment_s": 0.075}, r"segment_s must be at least 0.08 s, twice the 8 taps, got 0.075 s: .* longer segments"),
+        ({"segment_s": 0.0}, "segment_s must be greater than 0 s"),
+        ({"s": np.zeros(3)}, "reference through secondary_path must not be silent|not all be zero"),
+    ],
+)
+def test_bad_input_is_refused(change, message):
+    x, d, s = scene()
+    arguments = {"x": x, "d": d, "s": s, "n_taps": 8, "rated_power": 0.1, "fs": FS} | change
+    positional = [arguments.pop(name) for name in ("x", "d", "s", "n_taps", "rated_power")]
+    with pytest.raises(ValueError, match=message):
+        power_constrained_wiener(*positional, **arguments)
+
+
+@pytest.mark.parametrize(
+    "change", [{"n_taps": 2.5}, {"rated_power": "much"}, {"reference": "noise"}, {"switch_on_s": [1.0, 2.0]}]
+)
+def test_wrong_types_are_refused_by_name(change):
+    x, d, s = scene()
+    arguments = {"reference": x, "disturbance": d, "secondary_path": s, "n_taps": 8, "rated_power": 0.1, "fs": FS}
+    with pytest.raises(TypeError, match=next(iter(change))):
+        power_constrained_wiener(**(arguments | change))
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "message"),
+    [
+        (5.0, None, "start_s and end_s must mark a part of the 5 s that count, got 5 s to 5 s"),
+        (2.0, 1.0, "got 2 s to 1 s"),
+        (0.0, 5.5, "got 0 s to 5.5 s"),
+        (-1.0, None, "start_s must not be negative"),
+    ],
+)
+def test_parts_outside_the_record_are_refused(start_s, end_s, message):
+    x, d, s = scene()
+    found = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
+    with pytest.raises(ValueError, match=message):
+        found.noise_reduction_over(start_s, end_s)

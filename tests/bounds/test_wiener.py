@@ -1,0 +1,166 @@
+"""Wiener filters against numpy.linalg.lstsq on the same data, closed forms and perturbed neighbours."""
+
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy.bounds.power_constrained import power_constrained_solution
+from kfopc_filterpy.bounds.wiener import coherence_bound, correlation_matrix, minimum_norm_solve, wiener_solution
+from kfopc_filterpy.paths.models import bandpass_path, path_taps
+
+FS = 16000.0
+
+
+def _scene(n=3000, seed=0):
+    rng = np.random.default_rng(seed)
+    x = scipy.signal.lfilter([1.0], [1.0, -0.7], rng.standard_normal(n))
+    d = scipy.signal.lfilter([0, 0, 0, 1.0, 0.5, -0.3], 1.0, x) + 0.1 * rng.standard_normal(n)
+    return x, d, np.array([0.0, 0.8, 0.3, -0.1])
+
+
+def _regressors(signal, n_taps, start):
+    return np.array([signal[n - n_taps + 1 : n + 1][::-1] for n in range(start, signal.size)])
+
+
+@pytest.mark.parametrize("n_taps", [1, 2, 7, 16])
+@pytest.mark.parametrize(("ridge", "penalty"), [(0.0, 0.0), (0.01, 0.0), (0.0, 0.5), (0.02, 0.3)])
+def test_weights_are_those_of_dense_least_squares(n_taps, ridge, penalty):
+    x, d, s = _scene()
+    start = n_taps + s.size - 2
+    filtered = scipy.signal.lfilter(s, 1.0, x)
+    rows, control_rows = _regressors(filtered, n_taps, start), _regressors(x, n_taps, start)
+    scale = np.sqrt(ridge * np.sum(filtered[start:] ** 2))
+    matrix = np.vstack([rows, np.sqrt(penalty) * control_rows, scale * np.eye(n_taps)])
+    right = np.concatenate([d[start:], np.zeros(len(control_rows) + n_taps)])
+    expected = np.linalg.lstsq(matrix, right, rcond=None)[0]
+    found = wiener_solution(x, d, s, n_taps, regularization=ridge, control_penalty=penalty)
+    # Normal equations of condition number below 1e4 lose 4 digits of 16.
+    np.testing.assert_allclose(found.weights, expected, rtol=1e-9, atol=1e-10)
+    y = scipy.signal.lfilter(expected, 1.0, x)
+    antinoise = scipy.signal.lfilter(s, 1.0, y)
+    assert found.control_power == pytest.approx(np.mean(y[start:] ** 2), rel=1e-9)
+    assert found.antinoise_power == pytest.approx(np.mean(antinoise[start:] ** 2), rel=1e-9)
+    assert found.disturbance_power == pytest.approx(np.mean(d[start:] ** 2), rel=1e-12)
+    residual = np.mean((d - antinoise)[start:] ** 2)
+    assert found.noise_reduction_db == pytest.approx(-10 * np.log10(residual / found.disturbance_power))
+
+
+@given(n_taps=st.integers(1, 12), extra=st.integers(0, 5), seed=st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_correlation_matrix_is_the_mean_of_outer_products(n_taps, extra, seed):
+    signal = np.random.default_rng(seed).standard_normal(60)
+    start = n_taps - 1 + extra
+    rows = _regressors(signal, n_taps, start)
+    expected = rows.T @ rows / len(rows)
+    np.testing.assert_allclose(correlation_matrix(signal, n_taps, start), expected, atol=1e-13)
+
+
+def test_antinoise_power_is_what_the_error_lacks():
+    # Normal equations: J = D - A without a penalty, on which the rated power needed rests.
+    x, d, s = _scene()
+    found = wiener_solution(x, d, s, 8)
+    remaining = found.disturbance_power * 10 ** (-found.noise_reduction_db / 10)
+    assert found.disturbance_power - found.antinoise_power == pytest.approx(remaining, rel=1e-9)
+
+
+def test_tone_has_the_minimum_norm_solution():
+    n = np.arange(8000)
+    x = np.sin(2 * np.pi * 400 * n / FS)
+    d = 0.7 * np.sin(2 * np.pi * 400 * n / FS + 1.0)
+    s = path_taps(bandpass_path(32))
+    found = wiener_solution(x, d, s, 64)
+    start = 64 + 32 - 2
+    steady_s = np.exp(-2j * np.pi * 400 / FS * np.arange(32)) @ s
+    # s*x without start-up, so that the oracle's matrix has rank two exactly as well.
+    filtered = np.imag(steady_s * np.exp(2j * np.pi * 400 * n / FS))
+    expected = np.linalg.lstsq(_regressors(filtered, 64, start), d[start:], rcond=1e-6)[0]
+    # The first rows of x' still hold start-up of up to 1e-3 in the filter's first 63 samples.
+    np.testing.assert_allclose(found.weights, expected, atol=2e-3)
+    assert np.linalg.norm(found.weights) < 1.05 * np.linalg.norm(expected)
+    assert found.noise_reduction_db > 40
+    assert found.control_power == pytest.approx(0.7**2 / 2 / np.abs(steady_s) ** 2, rel=1e-3)
+
+
+def test_exact_inverse_of_delays_is_found_to_rounding():
+    x = np.random.default_rng(0).standard_normal(4000)
+    d = np.concatenate([np.zeros(5), 0.5 * x[:-5]])
+    found = wiener_solution(x, d, [0.0, 0.0, -2.0], 8)
+    np.testing.assert_allclose(found.weights, [0, 0, 0, -0.25, 0, 0, 0, 0], atol=1e-12)
+    assert found.noise_reduction_db > 200
+    assert found.noise_reduction_db <= 300
+
+
+def test_minimum_norm_solve_leaves_out_empty_directions():
+    matrix = np.diag([2.0, 0.0, 1e-14])
+    np.testing.assert_allclose(minimum_norm_solve(matrix, np.array([1.0, 1.0, 1.0])), [0.5, 0.0, 0.0])
+
+
+def test_power_constrained_solution_is_the_optimum_within_the_power():
+    x, d, s = _scene()
+    free = wiener_solution(x, d, s, 8)
+    rated = free.control_power / 4
+    found = power_constrained_solution(x, d, s, 8, rated)
+    assert found.control_power == pytest.approx(rated, rel=1e-5)
+
+    def error(weights):
+        start = 8 + s.size - 2
+        return np.mean((d - scipy.signal.lfilter(np.convolve(s, weights), 1.0, x))[start:] ** 2)
+
+    best = error(found.weights)
+    assert best < error(free.weights / 2)  # KF-OPC's scaling at the same power cannot be better
+    rng = np.random.default_rng(5)
+    for _ in range(50):  # nor any neighbour scaled back to the power
+        other = found.weights + 0.05 * rng.standard_normal(8)
+        power = np.mean(scipy.signal.lfilter(other, 1.0, x)[8 + s.size - 2 :] ** 2)
+        assert error(other * np.sqrt(rated / power)) >= best * (1 - 1e-5)
+    same = power_constrained_solution(x, d, s, 8, 2 * free.control_power)
+    np.testing.assert_array_equal(same.weights, free.weights)
+
+
+def test_flat_paths_penalty_is_the_movs_scaling():
+    # For white noise and a flat path G_s / (G_s + gamma) scales the weights: eq. 13's alpha.
+    x = np.random.default_rng(0).standard_normal(20_000)
+    free = wiener_solution(x, 3 * x, [2.0], 1)
+    shrunk = wiener_solution(x, 3 * x, [2.0], 1, control_penalty=1.5)
+    assert shrunk.weights[0] / free.weights[0] == pytest.approx(4 / (4 + 1.5), rel=1e-12)
+
+
+def test_coherence_bound_is_the_incoherent_share():
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal(200_000)
+    d = scipy.signal.lfilter([0, 1.0, 0.5], 1.0, x)
+    noise = 0.2 * np.sqrt(np.mean(d**2)) * rng.standard_normal(x.size)
+    bound = coherence_bound(x, d + noise, FS, segment=512)
+    # 0.04 of the power is incoherent: 14.1 dB; 780 half-overlapping segments leave 0.1 dB.
+    assert bound.overall_db == pytest.approx(10 * np.log10(1.04 / 0.04), abs=0.15)
+    assert bound.frequencies_hz.shape == bound.noise_reduction_db.shape == (257,)
+    assert wiener_solution(x, d + noise, [1.0], 8).noise_reduction_db <= bound.overall_db + 0.15
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda x, d, s: wiener_solution(x, d[:-1], s, 4), "disturbance must have 3000 values, got 2999"),
+        (lambda x, d, s: wiener_solution(x[:9], d[:9], s, 4), "reference must have at least 10 samples"),
+        (
+            lambda x, d, s: wiener_solution(0 * x, d, s, 4),
+            "reference through secondary_path must not be silent",
+        ),
+        (lambda x, d, s: wiener_solution(x, 0 * d, s, 4), "disturbance must not be silent"),
+        (lambda x, d, s: wiener_solution(x, d, s, 0), "n_taps must be at least 1"),
+        (lambda x, d, s: wiener_solution(x * np.nan, d, s, 4), "reference must be finite"),
+        (
+            lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1),
+            "regularization must not be negative",
+        ),
+        (lambda x, d, s: wiener_solution(x, d, s, 4, control_penalty=-1), "control_penalty must not be neg"),
+        (lambda x, d, s: power_constrained_solution(x, d, s, 4, 0.0), "rated_power must be greater than 0"),
+        (lambda x, d, s: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),
+        (lambda x, d, s: coherence_bound(0 * x, d, FS, segment=64), "must not be silent"),
+    ],
+)
+def test_wiener_refuses(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(*_scene())

@@ -1,0 +1,172 @@
+"""The studies' own parts: the scene, the rule that tunes, the command; the figures they give are their own output."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from comparisons.__main__ import STUDIES, main
+from comparisons.studies import broadband, duct, tonal
+from kfopc_filterpy import bandpass_path, output_power
+from kfopc_filterpy.bench.registry import ALGORITHMS, grid, make_controller
+from kfopc_filterpy.bench.scene import Runs, figures_of_merit, make_scene
+from kfopc_filterpy.bench.tuning import Trial, _best, tune
+from kfopc_filterpy.bounds import wiener_solution
+from kfopc_filterpy.paths import path_taps
+from kfopc_filterpy.signals import tone
+
+
+@pytest.fixture(scope="module")
+def scene():
+    noise = np.random.default_rng(0).standard_normal(12000)
+    return make_scene(
+        {3: noise, 4: noise[::-1].copy()},
+        bandpass_path(64),
+        bandpass_path(16),
+        fs=16000.0,
+        rated_power=0.5,
+        power_multiple=4.0,
+        n_taps=64,
+        switch_on_s=0.1,
+    )
+
+
+def test_scene_needs_the_stated_multiple_of_the_rated_power(scene):
+    x, d = scene.references[0][1600:], scene.disturbances[0][1600:]
+    solution = wiener_solution(x, d, scene.secondary, scene.n_taps)
+    assert solution.control_power == pytest.approx(4.0 * 0.5, rel=1e-9)  # the same least squares, scaled
+    np.testing.assert_allclose(d, np.convolve(scene.references[0], path_taps(bandpass_path(64)))[1600 : 1600 + d.size])
+
+
+def test_scene_knows_its_measurement_noise(scene):
+    # What 64 taps leave of the disturbance, sensor noise included: never less than the sensor noise, to 3 of its
+    # standard errors, sqrt(2/n).
+    floor = scene.sensor_noise_std**2 * (1 - 3 * np.sqrt(2 / 10400))
+    assert scene.measurement_noise > floor
+
+
+def scaled(scene, wiener_control_power):
+    """The scene with all signals louder or softer, and another Wiener control power with them; same amplifier."""
+    ratio = wiener_control_power / scene.wiener_control_power
+    gain = float(np.sqrt(ratio))
+    return replace(
+        scene,
+        references=[gain * x for x in scene.references],
+        disturbances=[gain * d for d in scene.disturbances],
+        sensor_noise_std=gain * scene.sensor_noise_std,
+        measurement_noise=ratio * scene.measurement_noise,
+        wiener_control_power=wiener_control_power,
+    )
+
+
+def test_scaling_a_scene_scales_the_unconstrained_control_signal(scene):
+    quiet, loud = scene, scaled(scene, 4 * scene.wiener_control_power)
+    assert loud.amplitude_limit == quiet.amplitude_limit
+    results = [s.run(make_controller(s, "KF-ANC", 1e-6)) for s in (quiet, loud)]
+    # Every quantity of the filter scales by a power of two: equal but for the sensor noise's rounding.
+    np.testing.assert_allclose(results[1].control_signal, 2 * results[0].control_signal, rtol=1e-6, atol=1e-9)
+
+
+def test_every_algorithm_runs_from_every_end_of_its_grid(scene):
+    for name in ALGORITHMS:
+        for setting in (grid(name)[0], grid(name)[-1]):
+            result = scene.run(make_controller(scene, name, setting))
+            assert result.algorithm == name
+            assert result.error.size == 12000 - 1600
+
+
+def test_tuning_takes_the_lowest_error_that_keeps_the_budget():
+    trials = [
+        Trial(1.0, -9.0, 9.0, True),  # diverged
+        Trial(2.0, -8.0, 0.52, False),  # over the budget
+        Trial(3.0, -7.0, 0.505, False),
+        Trial(4.0, -6.0, 0.5, False),
+    ]
+    assert _best(trials, 0.5, "KF-OPC").setting == 3.0
+    assert _best(trials, np.inf, "KF-ANC").setting == 2.0
+    over = _best(trials[:2], 0.5, "KF-OPC")
+    assert (over.setting, over.within_budget) == (2.0, False)
+    with pytest.raises(RuntimeError, match="KF-OPC diverged at every setting"):
+        _best(trials[:1], 0.5, "KF-OPC")
+
+
+def test_tuned_setting_is_the_best_of_its_trials(scene):
+    tuned = tune(Runs(), scene, ["KF-OPC", "MOV-FxLMS"], seeds=2)
+    for name, best in tuned.items():
+        assert [t.setting for t in best.trials] == list(grid(name))
+        kept = [t for t in best.trials if not t.diverged and t.output_power <= 1.02 * scene.rated_power]
+        assert best.within_budget == bool(kept)
+        if kept:
+            assert best.setting == min(kept, key=lambda t: (round(t.mean_nse_db, 2), t.setting)).setting
+        result = scene.run(make_controller(scene, name, best.setting))
+        figures = figures_of_merit([result], scene)
+        assert figures["output_power"] == output_power(result.control_signal)
+
+
+def test_overdrives_where_the_order_flips():
+    levels = np.array([0.0, 1.0, 2.0, 3.0])
+    assert tonal.crossings_db(levels, np.array([-1.0, 1.0, 3.0, -1.0])) == [0.5, 2.75]
+    assert tonal.crossings_db(levels, np.ones(4)) == []
+
+
+def test_wiener_multiple_of_a_tone_is_its_overdrive():
+    scene = tonal._scene(bandpass_path(128), bandpass_path(32), 2.0)
+    x = scene.references[0]
+    gain = abs(np.exp(-2j * np.pi * 400 / 16000 * np.arange(32)) @ path_taps(bandpass_path(32))) ** 2
+    d = scene.disturbances[0][8000:]
+    # A tone is cancelled by a control signal of power E[d^2] over the path's power gain at its frequency.
+    assert np.mean(d**2) / gain == pytest.approx(2.0, rel=1e-3)
+    np.testing.assert_allclose(x / np.abs(x).max(), tone(400, 10.5, fs=16000.0), atol=1e-9)
+
+
+def test_measured_study_says_in_a_line_why_it_is_left_out(monkeypatch, tmp_path):
+    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
+    line = duct.main_measured(Runs())
+    assert isinstance(line, str)
+    assert line.startswith("duct-measured is left out: ")
+    assert "\n" not in line
+
+
+def test_studies_plan_the_runs_they_take(monkeypatch):
+    monkeypatch.setattr(broadband, "DURATION_S", 1.7)
+    monkeypatch.setattr(duct, "DURATION_S", 1.7)
+    monkeypatch.setattr(tonal, "DURATION_S", 0.7)
+    monkeypatch.setattr(tonal, "FILTERPY_SAMPLES", 160)
+    monkeypatch.setattr(tonal, "_figures_of", lambda *_: [])
+    monkeypatch.setattr(broadband, "_figures_of", lambda *_: [])
+    monkeypatch.setattr(duct, "_figures_of", lambda *_: [])
+    for study in (tonal, broadband, duct):
+        runs = Runs()
+        study.main(runs)
+        assert runs.done == study.planned_runs()
+
+
+def test_command_refuses_a_folder_it_cannot_write(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit):
+        main(["tonal", "--output", str(tmp_path / "file")])
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+def test_command_refuses_an_unknown_study(capsys):
+    with pytest.raises(SystemExit):
+        main(["tonal", "tidal"])
+    assert "no study called tidal" in capsys.readouterr().err
+
+
+def test_command_writes_report_and_results(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tonal, "DURATION_S", 1.5)
+    monkeypatch.setattr(tonal, "OVERDRIVES_DB", np.array([0.0, 3.0, 10.0]))
+    monkeypatch.setattr(tonal, "FILTERPY_SAMPLES", 320)
+    assert list(STUDIES) == ["tonal", "broadband", "duct", "duct-measured"]
+    assert main(["tonal", "--quiet", "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr().out
+    assert "KF-ANC run by filterpy's own KalmanFilter over the first 320 samples" in printed.replace("\n  ", " ")
+    study = json.loads((tmp_path / "out" / "results.json").read_text())["studies"]["tonal"]
+    assert set(study["algorithms"]) == set(ALGORITHMS)
+    assert study["extra"]["filterpy_largest_difference"]["weights"] < 1e-5  # S/R starts at 1e6: 1e-16 times that
+    assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
+    assert sorted(p.name for p in (tmp_path / "out" / "audio").iterdir())[0] == "tonal-disturbance.wav"

@@ -1,0 +1,151 @@
+"""The study of the power budget on a small scale, and its tables and verdicts from rows made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons.__main__ import FURTHER
+from comparisons.studies import constraint_cases, power_budget
+from comparisons.studies.constraint_cases import Setting, make_case, noises, paths
+from comparisons.studies.power_budget import BOUND, SCALED, Row, _claims, _needed, _sizing_table, mean_rows
+from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
+from kfopc_filterpy.bench import registry as algorithms
+from kfopc_filterpy.bench.registry import REGISTRY
+from kfopc_filterpy.bench.report import StudyReport, write_report
+from kfopc_filterpy.bench.scene import Runs
+from kfopc_filterpy.bench.tuning import run_setting
+
+TAPS, DURATION_S = 16, 1.0
+CASE = Setting("duct", "band noise")
+SHARES = (-10.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """One case, two rated powers, two seeds of a second, 16 taps, three of each setting; the measured data away."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KFOPC_DATA", "/no/such/folder")
+        constraint_cases.measured_data.cache_clear()
+        pairs = paths()
+        patch.setattr(power_budget, "paths", lambda: {"duct": tuple(path[:200] for path in pairs["duct"])})
+        for module in (power_budget, constraint_cases):
+            patch.setattr(module, "N_TAPS", TAPS)
+        patch.setattr(power_budget, "DURATION_S", DURATION_S)
+        patch.setattr(power_budget, "SHARES_DB", SHARES)
+        patch.setattr(power_budget, "SEEDS", (1, 2))
+        patch.setattr(power_budget, "CASES", (CASE, Setting("measured duct", "motor")))
+        for name, own in REGISTRY.items():
+            patch.setitem(algorithms.REGISTRY, name, replace(own, first=own.first[1:8:3], second=own.second[1:8:3]))
+        runs = Runs()
+        pair, noise = power_budget.paths()["duct"], noises()["band noise"]
+        first, scene = (make_case(pair, noise(DURATION_S + 0.5, seed)) for seed in (1, 2))
+        rated = replace(
+            first,
+            rated_power=0.1,
+            references=[first.references[0], scene.references[0]],
+            disturbances=[first.disturbances[0], scene.disturbances[0]],
+            seeds=[1, 2],
+        )
+        outcome = power_budget.main(runs), runs.done, power_budget.planned_runs()
+        settings = {cells[3]: cells for cells in outcome[0].tables[2].rows if cells[2] == -10.0}
+        again = {}
+        for name in ("KF-OPC", "leaky FxLMS", "FxLMS"):
+            one, two = settings[name][4:6]
+            again[name] = run_setting(rated, name, one if np.isnan(two) else (one, two), 1)
+        bound = power_constrained_wiener(
+            scene.references[0],
+            scene.disturbances[0],
+            scene.secondary,
+            TAPS,
+            0.1,
+            fs=16000.0,
+            switch_on_s=0.5,
+            ridge=scene.measurement_noise / (scene.settled[0].size * scene.initial_variance),
+        ).noise_reduction_over(0.5 * DURATION_S)
+    constraint_cases.measured_data.cache_clear()
+    return *outcome, again, bound
+
+
+def test_planned_runs_are_those_taken(small: Any) -> None:
+    assert small[1] == small[2]
+    assert FURTHER["power_budget"] == (power_budget.main, power_budget.planned_runs)
+
+
+def test_rows_are_what_plain_runs_give(small: Any) -> None:
+    """The second seed, in the units of the first: both were tuned on."""
+    rows = {(r["algorithm"], r["share_db"]): r for r in small[0].extra["rows"] if r["seed"] == 2}
+    for name, result in small[3].items():
+        row = rows[name, -10.0]
+        assert row["noise_reduction_db"] == pytest.approx(
+            noise_reduction_db(result.error, result.disturbance), rel=1e-9
+        )
+        assert row["power"] == pytest.approx(output_power(result.control_signal) / 0.1, rel=1e-9)
+    assert rows[BOUND, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["whole"], rel=1e-9)
+    assert rows[SCALED, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["scaled"], rel=1e-9)
+    assert set(rows) == {(name, share) for name in (*REGISTRY, BOUND, SCALED) for share in SHARES}
+    # without a constraint one run serves for all rated powers
+    assert rows["FxLMS", -10.0]["power"] == pytest.approx(10 * rows["FxLMS", 0.0]["power"], rel=1e-12)
+
+
+def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
+    report: StudyReport = small[0]
+    assert [table.stem for table in report.tables] == ["reduction", "sizing", "tuning"]
+    assert len(report.tables[0].rows) == len(REGISTRY) + 2
+    assert len(report.tables[2].rows) == len(REGISTRY) * len(SHARES)
+    assert [figure.stem for figure in report.figures] == ["duct-band-noise"]
+    assert len(report.verdicts) == 3
+    assert report.notes[0].startswith("The measured duct was not at hand")
+    write_report([report], tmp_path)
+    assert (tmp_path / "tables" / "power-budget-sizing.csv").stat().st_size > 0
+    assert (tmp_path / "figures" / "power-budget-duct-band-noise.png").stat().st_size > 10_000
+
+
+def rows_of(name: str, reductions: Any, powers: Any = (1.0, 1.0), seed: int = 1) -> list[Row]:
+    return [
+        Row(CASE, share, seed, name, reduction, power, 2.0)
+        for share, reduction, power in zip(SHARES, reductions, powers, strict=True)
+    ]
+
+
+def test_what_a_noise_reduction_needs_is_read_between_rated_powers() -> None:
+    rows = rows_of("KF-PB", (2.0, 12.0))
+    assert _needed(rows, 6.0) == pytest.approx(-6.0)
+    assert _needed(rows, 1.0) == "below -10"  # the least rated power of the study
+    assert _needed(rows, 13.0) == "not reached"
+    assert _needed(rows_of("KF-PB", (2.0, 12.0), (1.0, 1.03)), 6.0) == "not reached"  # its power is not kept there
+    assert _needed(rows_of("KF-PB", (np.nan, 12.0)), 6.0) == "not reached"
+    table = _sizing_table([*rows, *rows_of("FxLMS", (2.0, 12.0))])  # no constraint: no rated power to buy
+    assert [cells[2] for cells in table.rows] == ["KF-PB"]
+
+
+def test_means_are_over_seeds_and_the_worst_window_is_the_worst() -> None:
+    two = [
+        *rows_of("KF-PB", (2.0, 12.0)),
+        *(replace(r, worst_window=5.0) for r in rows_of("KF-PB", (4.0, np.nan), seed=2)),
+    ]
+    low, high = mean_rows(two)[CASE, "KF-PB"]
+    assert (low.noise_reduction_db, low.worst_window) == (3.0, 5.0)
+    assert np.isnan(high.noise_reduction_db)  # a seed that diverged is not left out
+
+
+@pytest.mark.parametrize(
+    ("own", "powers", "other", "other_powers", "expected"),
+    [
+        ((2.5, 11.5), (1.0, 1.0), (2.0, 11.0), (1.0, 1.0), [True, True, True]),
+        ((2.5, 11.5), (1.0, 1.03), (2.0, 11.0), (1.0, 1.0), [False, True, True]),
+        ((1.5, 11.5), (1.0, 1.0), (1.0, 11.0), (1.0, 1.0), [True, False, True]),
+        ((2.5, 11.5), (1.0, 1.0), (2.9, 11.0), (1.0, 1.0), [True, True, False]),
+        ((2.5, 11.5), (1.0, 1.0), (2.9, 11.0), (1.1, 1.0), [True, True, True]),  # that one kept no budget
+        ((2.5, np.nan), (1.0, np.nan), (2.0, 11.0), (1.0, 1.0), [False, False, False]),
+    ],
+)
+def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
+    rows = rows_of(BOUND, (3.0, 12.0)) + rows_of(SCALED, (2.0, 12.0)) + rows_of("KF-PB", own, powers)
+    for name, algorithm in REGISTRY.items():
+        if name != "KF-PB" and algorithm.keeps_budget:
+            rows += rows_of(name, other, other_powers)
+    assert [verdict.reproduced for verdict in _claims(rows)] == expected

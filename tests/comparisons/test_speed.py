@@ -1,0 +1,148 @@
+"""The speed study: its arithmetic and its files; the times themselves are the machine's."""
+
+from __future__ import annotations
+
+import json
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from comparisons.__main__ import main
+from comparisons.speed import study as speed
+from comparisons.speed import variants as speed_variants
+from kfopc_filterpy import MOVFxLMS, kf_opc, simulate, simulate_scenarios
+from kfopc_filterpy.power.constraint import OutputPowerConstraint, preview_constraint
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The study with few taps and samples, and no compilation timed."""
+    for name, value in {"TAPS": (128, 256), "ROUNDS": 1, "WORST_TAPS": (16,), "WORST_SAMPLES": 200}.items():
+        monkeypatch.setattr(speed, name, value)
+    monkeypatch.setattr(speed, "first_use_s", lambda name: 1.0)
+    monkeypatch.setattr(speed, "find_spec", lambda name: None)  # the same wherever it runs
+    monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
+
+
+def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
+    assert main(["speed", "--quiet", "--output", str(tmp_path)]) == 0
+    result = json.loads((tmp_path / "speed.json").read_text())
+    assert (tmp_path / "speed.png").stat().st_size > 10000
+    rows = {(row["variant"], row["taps"]): row for row in result["rows"]}
+    for name in speed_variants.OURS:
+        for taps in (128, 256):
+            row = rows[name, taps]
+            assert set(row) == {
+                "variant",
+                "taps",
+                "us_per_sample",
+                "limit_fraction",
+                "times_filterpy",
+                "times_numpy",
+            }
+            assert row["us_per_sample"] > 0
+            assert row["times_filterpy"] == pytest.approx(
+                rows["filterpy", taps]["us_per_sample"] / row["us_per_sample"]
+            )
+            assert row["times_numpy"] == pytest.approx(
+                rows["numpy rank-1", taps]["us_per_sample"] / row["us_per_sample"]
+            )
+    assert rows["filterpy", 256]["times_filterpy"] == rows["numpy rank-1", 256]["times_numpy"] == 1.0
+    # An O(L^3) filter is slower than an O(L^2) one at 256 taps on any machine.
+    assert rows["streaming kernel", 256]["times_filterpy"] > 5
+    printed = capsys.readouterr().out
+    assert "times as fast as filterpy" in printed
+    assert "16 taps, 200 samples" in printed
+    assert "1.0 s for `simulate`" in printed
+
+
+def test_rows_follow_from_the_measured_times():
+    best = {"mine": 2.0, "filterpy": 100.0, "numpy rank-1": 8.0}
+    mine, theirs, _ = speed.rows_of(100, 30.0, best)
+    # 3 * 100^2 flops at 30 GFLOP/s take 1 us.
+    expected = {"variant": "mine", "taps": 100, "us_per_sample": 2.0, "limit_fraction": 0.5}
+    assert mine == expected | {"times_filterpy": 50.0, "times_numpy": 4.0}
+    assert theirs["times_filterpy"] == 1.0
+
+
+def test_real_time_taps_are_the_most_that_are_done_before_the_next_sample():
+    rows = [{"variant": "a", "taps": n, "us_per_sample": us} for n, us in ((32, 1.0), (64, 20.0), (128, 21.0))]
+    assert speed.real_time_taps(rows, "a", 48000.0) == 64  # 20.8 us
+    assert speed.real_time_taps(rows, "a", 16000.0) == 128
+    assert speed.real_time_taps(rows, "a", 2e6) is None
+
+
+def test_a_filter_that_is_not_installed_is_left_out(monkeypatch):
+    monkeypatch.setattr(speed, "find_spec", lambda name: None)
+    assert set(speed.chosen_variants(64)) == {*speed_variants.OURS, "numpy rank-1", "filterpy"}
+
+
+def test_speed_runs_alone(capsys):
+    with pytest.raises(SystemExit):
+        main(["speed", "tonal"])
+    assert "speed runs alone" in capsys.readouterr().err
+
+
+def test_speed_without_its_extra_says_what_to_install(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("comparisons.__main__.find_spec", lambda name: None)
+    with pytest.raises(SystemExit):
+        main(["speed", "--output", str(tmp_path)])
+    assert '".[bench]"' in capsys.readouterr().err
+
+
+# ---- What a run needs beside what it returns
+
+
+def peak_beyond_the_result(make, n_samples, **options):
+    """Bytes allocated at the worst moment of a run, less those of the result."""
+    x = np.random.default_rng(0).standard_normal(n_samples)
+    paths = {"primary_path": np.ones(128) / 128, "secondary_path": np.ones(32) / 32, "fs": 48000.0}
+    simulate(make(), x[:10], **paths)  # compiled, imported
+    controller = make()
+    tracemalloc.start()
+    result = simulate(controller, x, sensor_noise_std=0.1, rng=1, **paths, **options)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak - sum(value.nbytes for value in vars(result).values() if isinstance(value, np.ndarray))
+
+
+def test_memory_of_a_minute_at_48_khz():
+    """60 s at 48 kHz with 1024 taps: within 50 MB of the returned signals. The LMS run has all of the loop's memory..."""
+    settings = {"rated_power": 1.0, "fs": 48000.0}
+    lms = peak_beyond_the_result(lambda: MOVFxLMS(1024, np.ones(32) / 32, step_size=1e-6, **settings), 60 * 48000)
+    assert 0 < lms < 30e6
+
+
+def test_memory_of_1024_taps():
+    """... and what the Kalman filter adds does not grow with the signal: P, 8.4 MB, which the controller brings along."""
+    kalman = {"state_noise": 1e-8, "measurement_noise": 1.0, "initial_variance": 1e-3}
+    settings = {"rated_power": 1.0, "fs": 48000.0}
+    run_alone = peak_beyond_the_result(lambda: kf_opc(1024, np.ones(32) / 32, **kalman, **settings), 500)
+    assert run_alone < 50e6 - 30e6 - 8.4e6
+
+
+# ---- Functions compiled into others
+
+
+def test_a_part_called_from_python_gives_what_it_gives_inside():
+    constraint = OutputPowerConstraint(0.5, secondary_path_gain=1.0)
+    inside = constraint.preview(2.0)
+    assert preview_constraint(constraint.state, 2.0, 0.0, np.nan)[0] == inside == pytest.approx(np.sqrt(0.5) / 2)
+
+
+# ---- Sweeps over budgets
+
+
+def test_a_louder_noise_is_a_smaller_amplifier_in_decibels():
+    """What the overdrive sweep rests on; powers of two, so that only the filter's rounding differs."""
+    rng = np.random.default_rng(3)
+    x, s = rng.standard_normal(4000), np.array([0.0, 0.5, 0.2])
+    d = np.convolve(x, [0.0, 0.0, 0.3, 0.4])[: x.size]
+    kalman = {"state_noise": 1e-8, "initial_variance": 0.1}
+    loud = kf_opc(8, s, rated_power=0.25, measurement_noise=4e-3, **kalman)
+    quiet = kf_opc(8, s, rated_power=0.0625, measurement_noise=1e-3, **kalman)
+    one = simulate(loud, 2 * x, disturbance=2 * d, secondary_path=s)
+    (other,) = simulate_scenarios([quiet], x, disturbance=d, secondary_path=s)
+    np.testing.assert_allclose(one.error, 2 * other.error, rtol=0, atol=1e-9 * np.abs(one.error).max())
+    np.testing.assert_allclose(one.control_signal, 2 * other.control_signal, rtol=0, atol=1e-9)

@@ -1,0 +1,283 @@
+"""The built-in scenario of a sweep: equal to plain runs, and the same whatever it shares with."""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from comparisons.__main__ import main
+from comparisons.studies.constraint_cases import FS, SWITCH_ON_S, make_case, measured_data, noises, paths
+from comparisons.sweep import scenario as sweep_scenario
+from comparisons.sweep.grid import built_in_grid
+from comparisons.sweep.run import ScenarioError, run_sweep
+from comparisons.sweep.scenario import middle, run_group, scene_of
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    SoftSaturationAmplifier,
+    noise_reduction_db,
+    output_power,
+    power_constrained_wiener,
+    simulate,
+)
+from kfopc_filterpy.bench.registry import REGISTRY, make_controller
+from kfopc_filterpy.bench.scene import SENSOR_NOISE_SEED, Runs, Scene
+from kfopc_filterpy.bench.tuning import AllDivergedError, tune
+from kfopc_filterpy.paths import path_taps, perturbed_path
+
+SMALL = {"duration_s": 0.5, "n_taps": 24}
+
+
+def swept(folder, grid, **options):
+    return run_sweep(SMALL | grid, folder, **({"seeds": 2, "jobs": 1, "quiet": True} | options))
+
+
+def plain_run(values, seed):
+    """The scenario as a user would write it, with `simulate`."""
+    scene = make_case(
+        paths()[values["path"]],
+        noises()[values["noise"]](values["duration_s"] + SWITCH_ON_S, seed),
+        n_taps=values["n_taps"],
+        sensor_noise_db=values["sensor_noise_db"],
+        seed=seed,
+    )
+    rated = 10 ** (values["rated_power_db"] / 10)
+    errors = {"gain_db": values["path_gain_db"], "delay_samples": values["path_delay"]}
+    estimate = path_taps(perturbed_path(scene.secondary, fs=FS, phase_deg=values["path_phase_deg"], **errors))
+    limit = math.sqrt(2 * rated) * 10 ** (values["amplifier_limit_db"] / 20)
+    amplifier = {"linear": None, "hard clip": HardClipAmplifier(limit), "soft": SoftSaturationAmplifier(limit)}
+    controller = make_controller(
+        replace(scene, secondary=estimate, rated_power=rated), values["algorithm"], values["setting"]
+    )
+    return simulate(
+        controller,
+        scene.references[0],
+        disturbance=scene.disturbances[0],
+        secondary_path=scene.secondary,
+        fs=FS,
+        amplifier=amplifier[values["amplifier"]],
+        rated_power=1.0,
+        sensor_noise_std=scene.sensor_noise_std,
+        rng=SENSOR_NOISE_SEED + seed,
+        switch_on_s=SWITCH_ON_S,
+    )
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    ["KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "diagonal KF-OPC", "FxLMS", "FxNLMS", "MOV-FxLMS", "MOV-MFxLMS"],
+)
+@pytest.mark.parametrize("amplifier", ["linear", "hard clip", "soft"])
+def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
+    grid = {
+        "algorithm": algorithm,
+        "amplifier": amplifier,
+        "amplifier_limit_db": -2.0,
+        "rated_power_db": [-12.0, -3.0],
+        "path_gain_db": 2.0,
+        "path_delay": 1,
+        "sensor_noise_db": -30.0,
+        "setting": middle(REGISTRY[algorithm].first),
+    }
+    sweep = swept(tmp_path, grid)
+    assert len(sweep.runs) == 4
+    for run in sweep.runs:
+        result = plain_run(run, run["seed"])
+        # Sharing gains changes the order of sums only; over 8000 samples that grows to less than 1e-8 of the figures.
+        expected = noise_reduction_db(result.error, result.disturbance)
+        assert run["noise_reduction_db"] == pytest.approx(expected, rel=1e-6, abs=1e-6)
+        power = output_power(result.control_signal)
+        assert run["output_power"] == pytest.approx(power, rel=1e-6)
+        assert run["output_power_db"] == pytest.approx(10 * math.log10(power), abs=1e-5)
+        assert run["power_over_rated"] == pytest.approx(power / 10 ** (run["rated_power_db"] / 10), rel=1e-6)
+
+
+def test_an_algorithm_of_two_settings_is_tuned_in_both(tmp_path):
+    (run,) = swept(tmp_path, {"algorithm": "leaky FxLMS", "setting": "tuned"}, seeds=1).runs
+    scene = replace(scene_of("duct", "band noise", 0.5, 24, -40.0, 1), rated_power=0.1)
+    best = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
+    assert (run["setting_used"], run["second_setting_used"]) == best
+
+
+def test_where_every_setting_diverges_the_run_counts_as_diverged(monkeypatch):
+    def diverged(*arguments, **options):
+        raise AllDivergedError("at every setting")
+
+    monkeypatch.setattr(sweep_scenario, "tune", diverged)
+    sweep_scenario._tuned.cache_clear()
+    scenario = built_in_grid(SMALL | {"algorithm": "FxLMS", "setting": "tuned"}, 1).cells()[0] | {"seed": 1}
+    (figures,) = run_group([scenario], 1)
+    sweep_scenario._tuned.cache_clear()
+    assert figures["diverged"]
+    assert math.isnan(figures["setting_used"])
+
+
+def test_a_bad_setting_is_an_error_and_no_divergence(tmp_path):
+    with pytest.raises(ScenarioError, match="forgetting must be"):
+        swept(tmp_path, {"algorithm": "FxRLS", "setting": 1.5}, seeds=1)
+
+
+def test_a_filter_that_refuses_to_go_on_counts_as_diverged(tmp_path, monkeypatch):
+    def refuse(*arguments, **options):
+        error = ValueError("P is not positive definite")
+        error.add_note("in sample 3 of the run")
+        raise error
+
+    monkeypatch.setattr(Scene, "run", refuse)
+    scenario = built_in_grid(SMALL | {"algorithm": "FxRLS"}, 1).cells()[0] | {"seed": 1}
+    (figures,) = run_group([scenario], 1)
+    assert figures["diverged"]
+    assert math.isnan(figures["diverged_at_s"])
+    assert math.isnan(figures["noise_reduction_db"])
+
+
+def test_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
+    scene = scene_of("duct", "band noise", 1.0, 32, -40.0, 3)
+    ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
+    bound = power_constrained_wiener(
+        scene.references[0],
+        scene.disturbances[0],
+        scene.secondary,
+        32,
+        1.0,
+        fs=FS,
+        switch_on_s=SWITCH_ON_S,
+        ridge=ridge,
+    )
+    assert bound.unconstrained.control_power == pytest.approx(1.0, rel=1e-6)  # least squares of 16000 samples
+
+
+def figures_alone(scenarios):
+    sweep_scenario.scene_of.cache_clear()
+    return [run_group([scenario], scenarios[0]["seed"])[0] for scenario in scenarios]
+
+
+def test_results_do_not_depend_on_what_runs_together():
+    grid = built_in_grid(
+        SMALL
+        | {
+            "algorithm": ["KF-ANC", "KF-OPC", "FxLMS", "KF-PB"],
+            "rated_power_db": list(range(-11, 0)),
+            "amplifier": ["linear", "hard clip"],
+        },
+        1,
+    )
+    scenarios = [run.scenario for run in grid.runs()]
+    together = run_group(scenarios, 1)
+    assert len(together) == 88
+    np.testing.assert_equal(together, figures_alone(scenarios))  # to the last bit
+    np.testing.assert_equal(together[::-1], run_group(scenarios[::-1], 1))
+
+
+def test_more_of_the_axes_change_what_they_should(tmp_path):
+    def power(**values):
+        (run,) = swept(tmp_path / str(values), values, seeds=1).runs
+        return run["output_power"], run["noise_reduction_db"]
+
+    usual = power()
+    for change in (
+        {"noise": "tone"},
+        {"path": "band-pass"},
+        {"n_taps": 48},
+        {"duration_s": 1.0},
+        {"sensor_noise_db": -10.0},
+        {"path_gain_db": 6.0},
+        {"path_delay": 3},
+        {"path_phase_deg": 60.0},
+        {"setting": 1e-4},
+        {"rated_power_db": -3.0},
+    ):
+        assert power(**change) != usual, change
+
+
+def test_diverged_runs_are_kept_and_counted(tmp_path):
+    sweep = swept(tmp_path, {"algorithm": "FxLMS", "setting": [1e-3, 100.0]})
+    kept, lost = sweep.cells
+    assert (kept["runs"], kept["diverged"], kept["noise_reduction_db_n"]) == (2, 0, 2)
+    assert (lost["runs"], lost["diverged"], lost["noise_reduction_db_n"]) == (2, 2, 0)
+    assert math.isnan(lost["noise_reduction_db_mean"])
+    assert 0.0 < lost["diverged_at_s_mean"] < 0.5
+    with open(tmp_path / "cells.csv", newline="") as file:
+        assert [row["noise_reduction_db_mean"] != "" for row in csv.DictReader(file)] == [True, False]
+
+
+def test_a_diverged_run_leaves_those_it_shares_gains_with_alone(tmp_path):
+    # An estimate of the wrong sign diverges; only where the rated power lets it.
+    grid = {"path_phase_deg": 180.0, "algorithm": ["KF-ANC", "KF-OPC"], "noise": "tone"}
+    anc, opc = swept(tmp_path / "both", grid, seeds=1).runs
+    (alone,) = swept(tmp_path / "alone", grid | {"algorithm": "KF-OPC"}, seeds=1).runs
+    assert anc["diverged"]
+    assert not opc["diverged"]
+    np.testing.assert_equal(opc, alone)
+
+
+def test_setting_tuned_is_the_winner_of_the_studies_rule(tmp_path):
+    (run, other) = swept(tmp_path, {"algorithm": "FxLMS", "setting": "tuned", "noise": "tone"}).runs
+    scene = replace(scene_of("duct", "tone", 0.5, 24, -40.0, 1), rated_power=0.1)
+    assert run["setting_used"] == tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting
+    assert run["setting_used"] != middle(REGISTRY["FxLMS"].first)  # else this test says nothing
+    assert other["setting_used"] == run["setting_used"]  # of the first seed, for all
+
+
+@pytest.mark.parametrize("algorithm", ["KF-OPC", "FxLMS"])
+def test_exception_names_the_scenario(tmp_path, algorithm):
+    grid = {"algorithm": algorithm, "rated_power_db": [-10, -5], "path_delay": [0, -200]}
+    with pytest.raises(ScenarioError, match=r"scenario path=duct.*path_delay=-200\.0.*seed=1: ValueError: .*causally"):
+        swept(tmp_path, grid)
+
+
+def test_shared_run_that_fails_is_found(monkeypatch):
+    scenarios = [run.scenario for run in built_in_grid(SMALL | {"rated_power_db": [-20, -10, -5]}, 1).runs()]
+    make = sweep_scenario.make_controller
+
+    def spoilt(bad, scene, *rest):
+        controller = make(scene, *rest)
+        if scene.rated_power == bad:
+            return make(replace(scene, measurement_noise=math.nan), *rest)
+        return controller
+
+    monkeypatch.setattr(sweep_scenario, "make_controller", partial(spoilt, 0.1))
+    with pytest.raises(ScenarioError, match=r"rated_power_db=-10\.0, .*ValueError: .*finite, got nan"):
+        run_group(scenarios, 1)
+
+
+def test_measured_paths_where_they_are_at_hand(tmp_path, shared_data, monkeypatch):
+    monkeypatch.setenv("KFOPC_DATA", str(shared_data))
+    measured_data.cache_clear()
+    (run,) = swept(tmp_path, {"path": "measured duct", "noise": "motor"}, seeds=1).runs
+    assert math.isfinite(run["noise_reduction_db"])
+    assert not run["diverged"]
+
+
+def test_measured_paths_are_refused_where_they_are_not(monkeypatch):
+    monkeypatch.setattr("comparisons.sweep.grid.measured_data", lambda: None)
+    with pytest.raises(ValueError, match="path 'measured duct' needs the measured data: set KFOPC_DATA"):
+        built_in_grid({"path": "measured-duct"}, 1)
+
+
+def test_command_end_to_end_and_the_same_in_one_process(tmp_path, capsys):
+    command = "sweep --rated-power-db -20,-10 --algorithm KF-OPC,FxLMS --duration-s 0.5 --n-taps 24 --seeds 2 --jobs 2"
+    out = tmp_path / "two"
+    assert main([*command.split(), "--output", str(out), "--quiet"]) == 0
+    printed = capsys.readouterr()
+    assert "8 runs, 4 cells" in printed.out
+    assert printed.err == ""  # no bar
+    with open(out / "cells.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["algorithm"], row["rated_power_db"]) for row in rows] == [
+        ("KF-OPC", "-20.0"),
+        ("KF-OPC", "-10.0"),
+        ("FxLMS", "-20.0"),
+        ("FxLMS", "-10.0"),
+    ]
+    for row in rows:
+        mean, low, high = (float(row[f"noise_reduction_db_{end}"]) for end in ("mean", "low", "high"))
+        assert low < mean < high
+    assert {path.name for path in (out / "figures").iterdir()} == {"rated_power_db.png", "rated_power_db.svg"}
+    swept(tmp_path / "one", {"algorithm": ["KF-OPC", "FxLMS"], "rated_power_db": [-20, -10]}, jobs=1)
+    for table in ("cells.csv", "runs.csv"):
+        assert (out / table).read_bytes() == (tmp_path / "one" / table).read_bytes()

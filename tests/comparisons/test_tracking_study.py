@@ -1,0 +1,244 @@
+"""The study of tracking on a small scale, its scenes against plain convolutions, its verdicts from rows made by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons import __main__ as command
+from comparisons.studies import cases, constraint_cases, tracking, tracking_runs
+from comparisons.studies.tracking_runs import (
+    CHIRP_HZ,
+    SWEEP_S,
+    Event,
+    Row,
+    change_scene,
+    jump_scene,
+    sweep,
+    sweep_scene,
+)
+from kfopc_filterpy import convergence_time_s, noise_reduction_db, simulate
+from kfopc_filterpy.bench.registry import make_controller
+from kfopc_filterpy.bench.report import StudyReport
+from kfopc_filterpy.bench.scene import Runs
+from kfopc_filterpy.metrics import overshoot
+
+FS = 16000.0
+TAPS = 16
+STUDIED = ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV-FxLMS")
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """Few taps, one pair of paths cut short, a jump, a change and a sweep, two seeds, short runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KFOPC_DATA", "/no/such/folder")
+        constraint_cases.measured_data.cache_clear()
+        short = {"duct": tuple(path[:200] for path in cases.paths()["duct"])}
+        patch.setattr(cases, "N_TAPS", TAPS)
+        patch.setattr(tracking, "paths", lambda: short)
+        for module in (tracking, tracking_runs):
+            patch.setattr(module, "ALGORITHMS", STUDIED)
+        for module in (tracking, tracking_runs):
+            patch.setattr(module, "SEEDS", (1, 2))
+            patch.setattr(module, "JUMP_S", (0.4, 0.8))
+            patch.setattr(module, "JUMP_RUN_S", 1.6)
+            patch.setattr(module, "CHANGE_S", 0.5)
+            patch.setattr(module, "CHANGE_RUN_S", 1.2)
+        chosen = [event for event in tracking_runs.events() if event.name in ("20 dB louder", "sign", "one sweep")]
+        for module in (tracking, tracking_runs):
+            patch.setattr(module, "events", lambda: chosen)
+        runs = Runs()
+        report = tracking.main(runs)
+        planned = tracking.planned_runs()
+        scenes = tracking_runs.scenes_of(chosen[1], short["duct"])
+    constraint_cases.measured_data.cache_clear()
+    return report, runs.done, planned, scenes
+
+
+def test_planned_runs_are_those_taken(small: Any) -> None:
+    _, done, planned, _ = small
+    # three events, three filters of 5 settings and two of 14, and each at its best; two starts of the sweep
+    assert planned == done == 3 * (3 * 5 + 2 * 14 + 5) + 2
+
+
+def test_the_report_is_complete(small: Any) -> None:
+    report: StudyReport = small[0]
+    assert (report.name, report.claims, len(report.verdicts)) == ("tracking", "Findings", 5)
+    assert [item.stem for item in report.figures] == ["20-db-louder", "sign", "one-sweep"]
+    assert [sound.stem for sound in report.sounds] == ["sign-disturbance", "sign-kf-anc", "sign-kf-pb", "sign-fxlms"]
+    assert [table.stem for table in report.tables] == ["reduction", "nse", "worst", "power", "settling"]
+    for table in report.tables[:4]:
+        assert list(table.headings) == ["event", "paths", *STUDIED]
+        assert [tuple(row[:2]) for row in table.rows] == [(n, "duct") for n in ("20 dB louder", "sign", "one sweep")]
+    settling = report.tables[4]
+    assert [tuple(row[:3]) for row in settling.rows] == [
+        ("20 dB louder", "louder", "duct"),
+        ("20 dB louder", "back", "duct"),
+        ("sign", "changed", "duct"),
+    ]
+    assert set(report.parameters["settings"].value) == {"20 dB louder, duct", "sign, duct", "one sweep, duct"}
+    assert len(report.extra["rows"]) == 3 * len(STUDIED)
+    usual, less = report.extra["one_sweep_from_less_initial_variance_db"]["duct"]
+    assert np.isfinite([usual, less]).all()
+    assert usual != less
+
+
+@pytest.mark.parametrize("algorithm", ["KF-PB", "FxLMS"])
+def test_a_row_is_that_of_plain_runs(small: Any, algorithm: str) -> None:
+    report, _, _, scenes = small
+    (row,) = (r for r in report.extra["rows"] if (r["event"], r["algorithm"]) == ("sign", algorithm))
+    results = [
+        simulate(
+            make_controller(scene, algorithm, row["setting"]),
+            scene.references[0],
+            disturbance=scene.disturbances[0],
+            secondary_path=scene.secondary,
+            fs=FS,
+            sensor_noise_std=scene.sensor_noise_std,
+            rng=1000 + seed,
+            switch_on_s=0.5,
+        )
+        for scene, seed in zip(scenes, (1, 2), strict=True)
+    ]
+    e, d, y = (np.array([getattr(r, name) for r in results]) for name in ("error", "disturbance", "control_signal"))
+    rated = scenes[0].rated_power
+    after = slice(round(0.5 * FS), round(1.2 * FS))
+    assert row["noise_reduction_db"] == pytest.approx(noise_reduction_db(e, d, steady=1.0), abs=1e-9)
+    assert row["worst_window"] == pytest.approx(overshoot(y, rated, FS, window_s=0.1), rel=1e-9)
+    time = convergence_time_s(e[:, after], d[:, after], FS, window_s=0.05)
+    assert row["settled_s"]["changed"] == (None if np.isnan(time) else pytest.approx(time))
+
+
+# ---- Scenes
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[np.ndarray, np.ndarray]:
+    """A delay with an echo, and a shorter delay."""
+    primary, secondary = np.zeros(30), np.zeros(10)
+    primary[[20, 25]] = 1.0, 0.5
+    secondary[5] = 1.0
+    return primary, secondary
+
+
+def test_a_sweep_has_the_frequencies_it_says() -> None:
+    """Half a period lies between two zeros; the mean frequency there is that at its middle, the rise being linear."""
+    x = sweep(CHIRP_HZ, SWEEP_S, FS)
+    assert x.size == 4000
+    assert x[0] == 0.0
+    before = np.flatnonzero(x[1:-1] * x[2:] < 0) + 1
+    zeros = (before + x[before] / (x[before] - x[before + 1])) / FS  # by linear interpolation
+    frequency, middle = 0.5 / np.diff(zeros), 0.5 * (zeros[1:] + zeros[:-1])
+    expected = CHIRP_HZ[0] + (CHIRP_HZ[1] - CHIRP_HZ[0]) * middle / SWEEP_S
+    assert frequency.size > 400
+    # Interpolation between samples a tenth of a period apart, at the worst: 1 % of half a period.
+    assert np.max(np.abs(frequency / expected - 1.0)) < 0.02
+
+
+def test_sweeps_start_from_silence(pair: Any) -> None:
+    scene = sweep_scene(pair, 3)
+    x = scene.references[0]
+    assert x.size == 8000 + 3 * 4000
+    assert not np.any(x[:8000])
+    assert np.array_equal(x[8000:12000], x[16000:])
+
+
+def test_a_path_changes_at_its_sample(pair: Any) -> None:
+    scene = change_scene(pair, 1, -pair[0])
+    x, d = scene.references[0], scene.disturbances[0]
+    at = round(2.5 * FS)
+    one = np.convolve(x, pair[0])[: x.size]
+    assert np.allclose(d[:at], one[:at], atol=1e-12)
+    assert np.allclose(d[at:], -one[at:], atol=1e-12)
+
+
+def test_a_jump_is_of_the_reference(pair: Any) -> None:
+    scene = jump_scene(pair, 1, 20.0)
+    x = scene.references[0]
+    louder = slice(round(2.0 * FS), round(3.5 * FS))
+    usual = np.concatenate([x[: louder.start], x[louder.stop :]])
+    # 1.5 s of 800 Hz of band: power known to 1 / sqrt(2400), 2 %
+    assert np.mean(x[louder] ** 2) / np.mean(usual**2) == pytest.approx(100.0, rel=0.15)
+    assert scene.rated_power == pytest.approx(10**-0.3)
+
+
+def test_events_say_where_they_happen() -> None:
+    found = {event.name: event for event in tracking_runs.events()}
+    assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
+    assert found["longer duct"].paths == ("duct",)
+    names = [(event.name, path) for event, path in tracking_runs.jobs({"duct": None, "measured duct": None})]
+    assert len(names) == 13
+    assert ("longer duct", "measured duct") not in names
+
+
+def test_an_algorithm_without_a_setting_is_lost() -> None:
+    event = Event("sign", lambda pair, seed: None, {"changed": (0.0, 1.0)})  # type: ignore[arg-type,return-value]
+    row, course, result = tracking_runs.run_event(event, "duct", [], "FxLMS", None)
+    assert (row.diverged_at_s, course, result) == (0.0, None, None)
+    assert np.isnan(row.noise_reduction_db)
+    assert row.settled_s == {"changed": None}
+
+
+# ---- Verdicts from rows made by hand
+
+
+def _row(event: str, algorithm: str, **more: Any) -> Row:
+    values: dict[str, Any] = {
+        "path": "duct",
+        "setting": 0.1,
+        "within_budget": True,
+        "mean_nse_db": -5.0,
+        "noise_reduction_db": 5.0,
+        "steady_noise_reduction_db": 6.0,
+        "power": 1.0,
+        "worst_window": 1.0,
+        "settled_s": {"changed": 0.1},
+        "stretch_worst_window": {"changed": 1.0},
+        "diverged_at_s": None,
+    }
+    return Row(event=event, algorithm=algorithm, **{**values, **more})
+
+
+@pytest.mark.parametrize(("nse", "met"), [(-5.1, True), (-4.9, False), (np.nan, False)])
+def test_mean_nse_is_compared_event_by_event(nse: float, met: bool) -> None:
+    rows = [_row("sign", "KF-ANC", mean_nse_db=-9.0), _row("sign", "FxLMS")]
+    rows += [_row("delay", "KF-ANC", mean_nse_db=nse), _row("delay", "FxLMS")]
+    assert tracking._mean_nse(rows).reproduced == met
+
+
+@pytest.mark.parametrize(("time", "met"), [(0.05, True), (0.1, False), (None, False)])
+def test_sooner_needs_every_change(time: float | None, met: bool) -> None:
+    rows = [_row("sign", "KF-ANC", settled_s={"changed": time}), _row("sign", "FxLMS")]
+    rows += [_row("sweeps", "KF-ANC", settled_s={}), _row("sweeps", "FxLMS", settled_s={})]
+    assert tracking._sooner(rows).reproduced == met
+
+
+@pytest.mark.parametrize(("worst", "met"), [(10.1, True), (9.9, False)])
+def test_a_jump_breaks_every_constraint(worst: float, met: bool) -> None:
+    rows = [_row("20 dB louder", name, worst_window=30.0) for name in tracking.CONSTRAINED[1:]]
+    rows.append(_row("20 dB louder", tracking.CONSTRAINED[0], worst_window=worst))
+    assert tracking._jump(rows).reproduced == met
+
+
+@pytest.mark.parametrize(("worst", "met"), [(1.9, True), (2.1, False)])
+def test_a_change_is_judged_by_its_stretch(worst: float, met: bool) -> None:
+    rows = [_row("delay", "KF-PB", worst_window=5.0, stretch_worst_window={"changed": worst})]
+    rows.append(_row("delay", "KF-ANC", stretch_worst_window={"changed": 9.0}))
+    assert tracking._change(rows).reproduced == met
+
+
+@pytest.mark.parametrize(
+    ("opc", "anc", "met"), [(1.2, 0.1, True), (0.9, 0.1, False), (1.2, 0.3, False), (None, 0.1, True)]
+)
+def test_back_after_a_loud_noise(opc: float | None, anc: float, met: bool) -> None:
+    times = {"KF-OPC": opc, "KF-PB": 1.3, "KF-ANC": anc}
+    rows = [_row("20 dB louder", name, settled_s={"louder": 0.0, "back": time}) for name, time in times.items()]
+    assert tracking._back(rows).reproduced == met
+
+
+def test_the_command_knows_the_study() -> None:
+    assert command.FURTHER["tracking"] == (tracking.main, tracking.planned_runs)
+    assert "tracking" not in command.STUDIES

@@ -1,0 +1,201 @@
+"""The fast-array Kalman filter against the O(L^2) filter, a dense recursion with its own start, and its limits."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy import FastArrayKalman, fx_rls, kf_anc, kf_opc, simulate
+from kfopc_filterpy.controllers.array_steps import BEHIND, ROOT
+from kfopc_filterpy.signals import band_limited_noise
+
+L = 6
+PATH = np.array([0.0, 0.8, -0.3])
+
+
+def signals(n: int = 400, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
+    x, other = np.random.default_rng(seed).standard_normal((2, n))
+    return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:n] + 0.1 * other
+
+
+def band_signals(n: int) -> tuple[np.ndarray, np.ndarray]:
+    x = band_limited_noise((100.0, 1000.0), n / 16000, fs=16000, rng=2)
+    x /= np.std(x)
+    return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[: x.size] + 0.01 * np.random.default_rng(3).standard_normal(x.size)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("constrained", [False, True])
+def test_without_forgetting_it_is_the_full_filter(constrained: bool, compiled: bool) -> None:
+    """Tolerance: rounding of two forms of one recursion, in a loop that contracts."""
+    x, d = signals()
+    noises: dict[str, Any] = {"measurement_noise": 0.02, "initial_variance": 0.7}
+    rated: dict[str, Any] = {"rated_power": 0.3, "power_memory": 0.01} if constrained else {}
+    fast = FastArrayKalman(L, PATH, **noises, **rated)
+    full: Any = kf_opc if constrained else kf_anc
+    result, expected = (
+        simulate(made, x, disturbance=d, secondary_path=PATH, record_weights_every=1, compiled=compiled)
+        for made in (fast, full(L, PATH, state_noise=0.0, **noises, **rated))
+    )
+    np.testing.assert_allclose(result.error, expected.error, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(result.constraint_factor, expected.constraint_factor, rtol=1e-11)
+    assert result.weights is not None
+    assert expected.weights is not None
+    np.testing.assert_allclose(result.weights, expected.weights, rtol=0, atol=1e-11)
+    assert result.algorithm == ("fast-array KF-OPC" if constrained else "fast-array KF")
+    assert fast.rated_power == (0.3 if constrained else None)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    taps=st.integers(1, 12),
+    forgetting=st.floats(0.95, 1.0),
+    variance=st.floats(1e-3, 1e3),
+    noise=st.floats(1e-3, 1e3),
+)
+def test_with_forgetting_it_is_the_dense_recursion_from_its_graded_start(
+    seed: int, taps: int, forgetting: float, variance: float, noise: float
+) -> None:
+    """RLS as in the textbook, P(-1) = (variance / (q lambda)) diag(lambda^2, ..., lambda^(L+1)), by dense products."""
+    x, d = signals(80, seed)
+    controller = FastArrayKalman(taps, PATH, measurement_noise=noise, initial_variance=variance, forgetting=forgetting)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    P = variance / (noise * forgetting) * np.diag(forgetting ** np.arange(2.0, taps + 2.0))
+    w, xf = np.zeros(taps), np.r_[np.zeros(taps - 1), np.convolve(x, PATH)[: x.size]]
+    for n in range(x.size):
+        h = xf[n : n + taps][::-1]
+        k = P @ h / (forgetting + h @ P @ h)
+        w = w + k * (d[n] - w @ h)
+        P = (P - np.outer(k, h @ P)) / forgetting
+        P = 0.5 * (P + P.T)
+    # Early solutions with less data than taps lie along directions that only rounding tells apart from nothing.
+    np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-6 * max(1.0, float(np.max(np.abs(w)))))
+
+
+@pytest.mark.parametrize("noise", ["white", "band"])
+def test_without_forgetting_it_stays_the_full_filter(noise: str) -> None:
+    """Over 200 000 samples, on a reference too that leaves most directions unexcited."""
+    x, d = signals(200_000) if noise == "white" else band_signals(200_000)
+    q = 1e-4
+    fast = FastArrayKalman(24, PATH, measurement_noise=q)
+    full = kf_anc(24, PATH, state_noise=0.0, measurement_noise=q)
+    for made in (fast, full):
+        simulate(made, x, disturbance=d, secondary_path=PATH)
+    assert np.max(np.abs(fast.weights - full.weights)) < 1e-8 * np.max(np.abs(full.weights))
+
+
+def test_with_forgetting_it_forgets_its_start_as_fxrls_does() -> None:
+    """Another start than that of `fx_rls`: after some memories it no longer counts."""
+    x, d = signals(3000)
+    fast = FastArrayKalman(L, PATH, measurement_noise=1.0, forgetting=0.99)
+    rls = fx_rls(L, PATH, forgetting=0.99)
+    for made in (fast, rls):
+        simulate(made, x[:1500], disturbance=d[:1500], secondary_path=PATH)
+    np.testing.assert_allclose(fast.weights, rls.weights, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_an_array_that_rounding_has_spoilt_is_refused_and_nothing_changed(compiled: bool) -> None:
+    """lambda = 0.95: an error of 1e-16 grows to 1 in 36 / 0.05 = 720 samples."""
+    x, d = signals(8000)
+    controller = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
+    with pytest.raises(ValueError, match="the fast array is lost to rounding") as caught:
+        simulate(controller, x, disturbance=d, secondary_path=PATH, compiled=compiled)
+    note = caught.value.__notes__[0]
+    assert note.startswith("in sample ")
+    lost_at = int(note.split()[2])
+    again = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
+    simulate(again, x[:lost_at], disturbance=d[:lost_at], secondary_path=PATH, compiled=compiled)
+    # the refused sample changed neither weights, array nor powers
+    np.testing.assert_array_equal(controller.weights, again.weights)
+    np.testing.assert_array_equal(controller.constraint.state.table, again.constraint.state.table)
+    for part in ("gain", "ahead", "behind"):
+        arrays = (getattr(made._state.fast_array, part) for made in (controller, again))
+        np.testing.assert_array_equal(*arrays, err_msg=part)
+    before = pickle.dumps(controller)
+    with pytest.raises(ValueError, match="lost to rounding"):
+        controller.update(1.0)
+    assert pickle.dumps(controller) == before
+    assert np.all(np.isfinite(controller.weights))
+
+
+def test_a_spoilt_array_is_told_from_a_good_one() -> None:
+    """gamma^-1 = 1 + u P u' / lambda is never below 1, and the hyperbolic rotation needs |t| < 1."""
+    controller = FastArrayKalman(L, PATH, measurement_noise=1.0)
+    x, d = signals(50)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    fast = controller._state.fast_array
+    assert fast is not None
+    assert fast.numbers[ROOT] >= 1.0
+    broken = copy.deepcopy(controller)
+    broken._state.fast_array.behind[:] = 10.0  # type: ignore[union-attr]
+    broken.control_signal(1.0)
+    with pytest.raises(ValueError, match="lost to rounding"):
+        broken.update(1.0)
+    assert abs(broken._state.fast_array.numbers[BEHIND]) > 1.0  # type: ignore[union-attr]
+
+
+def test_while_it_listens_it_learns() -> None:
+    """It is the filter that ran from the first sample with a silent loudspeaker: least squares over all it heard."""
+    x, d = signals(600)
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.01)
+    controller.listen(x[:300], d[:300])
+    xf = np.convolve(x, PATH)[: x.size]
+    H = np.array([np.r_[np.zeros(L - 1), xf][n : n + L][::-1] for n in range(300)])
+    expected = np.linalg.solve(H.T @ H / 0.01 + np.eye(L), H.T @ d[:300] / 0.01)
+    np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-10)
+    result = simulate(controller, x[300:], disturbance=d[300:], secondary_path=PATH)
+    assert np.mean(result.error[10:] ** 2) < 0.05  # from its first samples on: the noise is 0.01
+
+
+def test_an_array_that_is_lost_while_listening_is_refused() -> None:
+    x, d = signals(8000)
+    controller = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
+    with pytest.raises(ValueError, match="the fast array is lost to rounding") as caught:
+        controller.listen(x, d)
+    assert caught.value.__notes__[0].endswith("of those listened to")
+    assert controller.forgetting == 0.95
+
+
+def test_an_error_whose_square_overflows_is_refused_and_nothing_changed() -> None:
+    x, d = signals()
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, rated_power=0.3)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    controller.control_signal(0.3)
+    twin = pickle.loads(pickle.dumps(controller))
+    with pytest.raises(ValueError, match="must have finite squares"):
+        controller.update(1e200)
+    for made in (controller, twin):  # as if nothing had been
+        made.update(0.1)
+    np.testing.assert_array_equal(controller.weights, twin.weights)
+    assert controller.constraint_factor == twin.constraint_factor
+
+
+def test_a_copy_goes_on_alone() -> None:
+    x, d = signals()
+    controller = FastArrayKalman(L, [0.9], measurement_noise=0.01)
+    simulate(controller, x, disturbance=d, secondary_path=[0.9])
+    twin = pickle.loads(pickle.dumps(controller))
+    one, other = (simulate(c, x, disturbance=d, secondary_path=[0.9]) for c in (controller, twin))
+    np.testing.assert_array_equal(one.error, other.error)
+
+
+@pytest.mark.parametrize("name", ["measurement_noise", "initial_variance", "forgetting"])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+def test_bad_arguments_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        FastArrayKalman(L, PATH, **({"measurement_noise": 1.0} | {name: value}))
+
+
+def test_a_forgetting_factor_above_one_and_a_bad_rated_power_are_refused() -> None:
+    with pytest.raises(ValueError, match="forgetting must be 1 at most"):
+        FastArrayKalman(L, PATH, measurement_noise=1.0, forgetting=1.001)
+    with pytest.raises(ValueError, match="rated_power"):
+        FastArrayKalman(L, PATH, measurement_noise=1.0, rated_power=0.0)

@@ -1,0 +1,480 @@
+"""The LMS family against literal transcriptions of the published equations, and against what each must settle to."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy import (
+    ClippingFxLMS,
+    FxLMS,
+    FxNLMS,
+    HardClipAmplifier,
+    LeakyFxLMS,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    RescalingFxLMS,
+    TwoGradientFxLMS,
+    output_power,
+    simulate,
+)
+from kfopc_filterpy.controllers import leak_factor, penalty_factor
+
+L = 5
+PATH = np.array([0.0, 0.8, -0.3, 0.1])  # true secondary path
+ESTIMATE = np.array([0.0, 0.7, -0.25])  # what the controllers know of it
+MU = 0.02
+
+
+def noise(n: int = 400, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    x, other = np.random.default_rng(seed).standard_normal((2, n))
+    return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:n] + 0.1 * other
+
+
+def delayed(signal: Any, n: int, length: int) -> np.ndarray:
+    """The newest `length` samples of a signal at n, newest first, zeros before the first."""
+    return np.array([signal[n - k] if n >= k else 0.0 for k in range(length)])
+
+
+def transcribed(x: np.ndarray, d: np.ndarray, step: Any, held: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The loop of Fig. 4 sample by sample, with `step(w, at)` for the update and `held(w, y)` for what leaves the filter.
+
+    Returns errors, control signals and the last weights.
+    """
+    w, y, xf, e, d_hat = np.zeros(L), np.zeros(x.size), np.zeros(x.size), np.zeros(x.size), np.zeros(x.size)
+    for n in range(x.size):
+        row = delayed(x, n, L)
+        xf[n] = ESTIMATE @ delayed(x, n, ESTIMATE.size)
+        y[n] = w @ row
+        if held is not None:
+            w, y[n] = held(w, y[n])
+        e[n] = d[n] - PATH @ delayed(y, n, PATH.size)
+        d_hat[n] = e[n] + ESTIMATE @ delayed(y, n, ESTIMATE.size)
+        at = {"n": n, "e": e[n], "y": y[n], "x": row, "xf": delayed(xf, n, L), "d": d_hat, "signals": (x, xf)}
+        w = step(w, at)
+    return e, y, w
+
+
+def powers(at: dict[str, Any], memory: int) -> tuple[float, float, float]:
+    """Means of d^^2, x'^2, x^2: plain means until the window is full, then forgetting (eq. 10-11 as in the docs)."""
+    n, (x, xf) = at["n"], at["signals"]
+    means = []
+    for signal in (at["d"], xf, x):
+        mean = 0.0
+        for k in range(n + 1):
+            mean += max(-np.expm1(-1.0 / memory), 1.0 / (k + 1)) * (signal[k] ** 2 - mean)
+        means.append(mean)
+    return means[0], means[1], means[2]
+
+
+def rated_gamma(at: dict[str, Any], rated_power: float, memory: int) -> float:
+    """gamma = max(sqrt(G_s delta_d^2 / rho_o) - G_s, 0)."""
+    d2, xf2, x2 = powers(at, memory)
+    gain = xf2 / x2 if x2 > 0 else 0.0
+    return max(np.sqrt(gain * d2 / rated_power) - gain, 0.0)
+
+
+RATED, MEMORY, A = 0.3, 60, 0.6
+EVERY: dict[str, tuple[Any, Any, Any]] = {
+    "FxLMS": (
+        lambda **o: FxLMS(L, ESTIMATE, step_size=MU, **o),
+        lambda w, at: w + MU * at["e"] * at["xf"],
+        None,
+    ),
+    "FxNLMS": (
+        lambda **o: FxNLMS(L, ESTIMATE, step_size=0.1, regularization=1e-3, **o),
+        lambda w, at: w + 0.1 * at["e"] * at["xf"] / (1e-3 + at["xf"] @ at["xf"]),
+        None,
+    ),
+    "leaky FxLMS": (
+        lambda **o: LeakyFxLMS(L, ESTIMATE, step_size=MU, leak=0.4, **o),
+        lambda w, at: (1 - MU * 0.4) * w + MU * at["e"] * at["xf"],
+        None,
+    ),
+    "optimal leaky FxLMS": (
+        lambda **o: OptimalLeakyFxLMS(
+            L, ESTIMATE, step_size=MU, rated_power=RATED, fs=1000, power_memory=MEMORY / 1000, **o
+        ),
+        lambda w, at: (1 - MU * powers(at, MEMORY)[2] * rated_gamma(at, RATED, MEMORY)) * w + MU * at["e"] * at["xf"],
+        None,
+    ),
+    "MOV-FxLMS": (
+        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, rated_power=RATED, fs=1000, power_memory=MEMORY / 1000, **o),
+        lambda w, at: w + MU * (at["e"] * at["xf"] - rated_gamma(at, RATED, MEMORY) * at["y"] * at["x"]),
+        None,
+    ),
+    "MOV-FxLMS fixed": (
+        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, rated_power=RATED, penalty_factor=0.7, **o),
+        lambda w, at: w + MU * (at["e"] * at["xf"] - 0.7 * at["y"] * at["x"]),
+        None,
+    ),
+    "MOV-MFxLMS": (
+        lambda **o: MOVFxLMS(
+            L, ESTIMATE, step_size=MU, rated_power=RATED, fs=1000, power_memory=MEMORY / 1000, modified=True, **o
+        ),
+        lambda w, at: (
+            w + MU * ((at["d"][at["n"]] - w @ at["xf"]) * at["xf"] - rated_gamma(at, RATED, MEMORY) * at["y"] * at["x"])
+        ),
+        None,
+    ),
+    "two-gradient FxLMS": (
+        lambda **o: TwoGradientFxLMS(L, ESTIMATE, step_size=MU, amplitude_limit=A, output_step_size=0.05, **o),
+        lambda w, at: w + (MU * at["e"] * at["xf"] if abs(at["y"]) <= A else -0.05 * at["y"] * at["x"]),
+        None,
+    ),
+    "re-scaling FxLMS": (
+        lambda **o: RescalingFxLMS(L, ESTIMATE, step_size=MU, amplitude_limit=A, **o),
+        lambda w, at: w + MU * at["e"] * at["xf"],
+        lambda w, y: (w, y) if abs(y) <= A else (w * A / abs(y), np.sign(y) * A),
+    ),
+    "clipping FxLMS": (
+        lambda **o: ClippingFxLMS(L, ESTIMATE, step_size=MU, amplitude_limit=A, **o),
+        lambda w, at: w + MU * at["e"] * at["xf"],
+        lambda w, y: (w, np.clip(y, -A, A)),
+    ),
+}
+AMPLITUDE = {
+    "two-gradient FxLMS": TwoGradientFxLMS,
+    "re-scaling FxLMS": RescalingFxLMS,
+    "clipping FxLMS": ClippingFxLMS,
+}
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", EVERY)
+def test_a_run_is_the_published_equations(name: str, compiled: bool) -> None:
+    """To rounding: sums over a few taps in another order, in a loop that contracts."""
+    make, step, held = EVERY[name]
+    x, d = noise()
+    controller = make()
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH, fs=controller.constraint.fs, compiled=compiled)
+    e, y, w = transcribed(x, d, step, held)
+    np.testing.assert_allclose(result.error, e, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(result.control_signal, y, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-11)
+    assert result.algorithm == controller.name == name.removesuffix(" fixed")
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_the_rule_acts_in_that_run(name: str) -> None:
+    """The transcriptions above would agree as well where no constraint ever acted."""
+    x, d = noise()
+    controller = EVERY[name][0]()
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH, fs=controller.constraint.fs)
+    plain = simulate(FxLMS(L, ESTIMATE, step_size=MU), x, disturbance=d, secondary_path=PATH)
+    assert (name == "FxLMS") == bool(np.array_equal(result.error, plain.error))
+
+
+@pytest.mark.parametrize("switch_on_s", [0.0, 0.1])
+def test_rules_that_do_not_act_are_fxlms(switch_on_s: float) -> None:
+    x, d = noise()
+    options: Any = {"disturbance": d, "secondary_path": PATH, "fs": 1000, "switch_on_s": switch_on_s}
+    plain = simulate(FxLMS(L, ESTIMATE, step_size=MU), x, **options)
+    rated = {"rated_power": 1e6, "fs": 1000}
+    for controller in (
+        LeakyFxLMS(L, ESTIMATE, step_size=MU, leak=0.0),
+        OptimalLeakyFxLMS(L, ESTIMATE, step_size=MU, **rated),
+        MOVFxLMS(L, ESTIMATE, step_size=MU, **rated),
+        MOVFxLMS(L, ESTIMATE, step_size=MU, penalty_factor=0.0, **rated),
+        *(kind(L, ESTIMATE, step_size=MU, amplitude_limit=1e3) for kind in AMPLITUDE.values()),
+    ):
+        np.testing.assert_array_equal(simulate(controller, x, **options).error, plain.error, err_msg=controller.name)
+
+
+def test_the_modified_structure_is_lms_on_the_filtered_reference() -> None:
+    """With an exact path, d^ = d, so the delay of the path drops out: plain LMS of x' towards d, a textbook loop."""
+    x, d = noise()
+    controller = MOVFxLMS(L, PATH, step_size=MU, rated_power=1e6, modified=True)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    xf, w = np.convolve(x, PATH)[: x.size], np.zeros(L)
+    for n in range(x.size):
+        row = delayed(xf, n, L)
+        w = w + MU * (d[n] - w @ row) * row
+    np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-12)
+
+
+def test_the_modified_structure_stands_step_sizes_at_which_the_delay_makes_the_other_diverge() -> None:
+    x, _ = noise(4000)
+    path = np.zeros(30)
+    path[29] = 1.0
+    d = np.convolve(x, np.r_[np.zeros(31), 1.0])[: x.size]
+    one, other = (
+        simulate(
+            MOVFxLMS(8, path, step_size=0.1, rated_power=1e3, modified=modified),
+            x,
+            disturbance=d,
+            secondary_path=path,
+            rated_power=1.0,
+        )
+        for modified in (True, False)
+    )
+    assert one.diverged_at_s is None
+    assert np.mean(one.error[-500:] ** 2) < 1e-6
+    assert other.diverged_at_s is not None
+
+
+# ---- What they settle to
+
+
+def statistics(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A coloured reference of one period, disturbance, and R_x', R_x and r over that period, exact for a periodic signal."""
+    rng = np.random.default_rng(seed)
+    period = 64
+    x = np.convolve(np.tile(rng.standard_normal(period), 3), [1.0, 0.6, 0.2])[period : 2 * period]
+    d = sum(c * np.roll(x, k) for k, c in {2: 1.2, 4: 0.5}.items())
+    xf = sum(c * np.roll(x, k) for k, c in enumerate(PATH))
+    X, XF = (np.array([np.roll(signal, k) for k in range(L)]) for signal in (x, xf))
+    return x, d, XF @ XF.T / period, X @ X.T / period, XF @ d / period
+
+
+@pytest.mark.parametrize(
+    ("controller", "price"),
+    [
+        (lambda mu: LeakyFxLMS(L, PATH, step_size=mu, leak=0.5), lambda R_x: 0.5 * np.eye(L)),
+        (
+            lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6),
+            lambda R_x: 0.6 * R_x,
+        ),
+        (
+            lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6, modified=True),
+            lambda R_x: 0.6 * R_x,
+        ),
+    ],
+    ids=["leaky", "MOV", "MOV modified"],
+)
+def test_it_settles_at_the_regularised_wiener_solution(controller: Any, price: Any) -> None:
+    """(R_x' + price) w = r, by a dense solve; the distance is of the order of the step size, so halving it halves that.
+
+    Averaged over a period the recursion is exact gradient descent but for terms of order mu.
+    """
+    x, d, R_xf, R_x, r = statistics()
+    expected = np.linalg.solve(R_xf + price(R_x), r)
+    distances = []
+    for mu in (4e-3, 2e-3):
+        made = controller(mu)
+        repeats = round(400 / mu / x.size)
+        result = simulate(
+            made,
+            np.tile(x, repeats),
+            disturbance=np.tile(d, repeats),
+            secondary_path=PATH,
+            record_weights_every=1,
+        )
+        assert result.weights is not None
+        distances.append(np.max(np.abs(np.mean(result.weights[-x.size :], axis=0) - expected)))
+    assert distances[0] < 0.02 * np.max(np.abs(expected))
+    assert distances[1] < 0.75 * distances[0] or distances[1] < 1e-6
+    plain = np.linalg.solve(R_xf, r)
+    assert np.max(np.abs(plain - expected)) > 0.1 * np.max(np.abs(expected))  # the price does matter
+
+
+@pytest.mark.parametrize("kind", [MOVFxLMS, OptimalLeakyFxLMS])
+def test_a_white_reference_through_a_flat_path_is_held_to_the_rated_power(kind: Any) -> None:
+    """White noise and one delayed tap: what the penalty is derived for, exact but for the noise of the weights."""
+    rng = np.random.default_rng(8)
+    x = rng.standard_normal(60000)
+    d = np.convolve(x, [0.0, 0.0, 2.0])[: x.size]  # the full control power is (2 / 0.5)^2 = 16
+    made = kind(4, [0.0, 0.5], step_size=2e-3, rated_power=4.0)
+    result = simulate(made, x, disturbance=d, secondary_path=[0.0, 0.5])
+    assert output_power(result.control_signal) == pytest.approx(4.0, rel=0.03)
+    assert made.weights[1] == pytest.approx(2.0, rel=0.03)  # half of 4
+
+
+def test_penalty_and_leak_by_hand() -> None:
+    assert penalty_factor(1.0, disturbance_power=4.0, secondary_path_gain=0.25) == pytest.approx(1.0 - 0.25, rel=1e-15)
+    assert penalty_factor(20.0, disturbance_power=4.0, secondary_path_gain=0.25) == 0.0  # 16 would do
+    assert leak_factor(1.0, disturbance_power=4.0, secondary_path_gain=0.25, reference_power=3.0) == pytest.approx(2.25)
+
+
+@given(st.floats(1e-6, 1e6), st.floats(1e-6, 1e6), st.floats(1e-6, 1e6))
+def test_the_penalty_leaves_the_constraint_factor(rated: float, power: float, gain: float) -> None:
+    """G_s / (G_s + gamma) = min(sqrt(rho_o G_s / delta_d^2), 1), eq. 13."""
+    gamma = penalty_factor(rated, disturbance_power=power, secondary_path_gain=gain)
+    assert gain / (gain + gamma) == pytest.approx(min(np.sqrt(rated * gain / power), 1.0), rel=1e-9)
+
+
+# ---- Amplitude limits
+
+
+@pytest.mark.parametrize("name", ["re-scaling FxLMS", "clipping FxLMS"])
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), level=st.floats(0.01, 1e3), limit=st.floats(1e-3, 10.0))
+def test_the_amplitude_is_never_above_its_limit(name: str, seed: int, level: float, limit: float) -> None:
+    x, d = noise(100, seed)
+    controller = AMPLITUDE[name](L, ESTIMATE, step_size=0.01, amplitude_limit=limit)
+    result = simulate(controller, x, disturbance=level * d, secondary_path=PATH, rated_power=1e12)
+    assert np.nanmax(np.abs(result.control_signal)) <= limit
+
+
+def test_re_scaling_holds_a_tone_to_its_rated_power() -> None:
+    """A sine of amplitude sqrt(2 rated power), as far as its ripple."""
+    n = np.arange(40000)
+    x, d = np.sin(0.3 * n), 3.0 * np.sin(0.3 * n + 0.4)
+    controller = RescalingFxLMS(16, [0.0, 1.0], step_size=1e-4, amplitude_limit=np.sqrt(2 * 0.5))
+    result = simulate(controller, x, disturbance=d, secondary_path=[0.0, 1.0])
+    assert output_power(result.control_signal) == pytest.approx(0.5, rel=0.02)
+    assert np.mean(result.error[-2000:] ** 2) == pytest.approx((3.0 - 1.0) ** 2 / 2, rel=0.03)  # the rest of the sine
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.0, 10.0, 50.0])
+def test_two_gradients_settle_where_they_balance(ratio: float) -> None:
+    """For a tone d = D sin, y = a sin and a path of 1: mu (D - a) I = mu_y a (1/2 - I), I the mean of sin^2 within A.
+
+    Above the limit therefore, and the closer to it the larger mu_y / mu.
+    """
+    D, limit, mu = 3.0, 1.0, 2e-4
+
+    def balance(a: float) -> float:
+        theta = np.arcsin(limit / a)
+        within = (theta - np.sin(theta) * np.cos(theta)) / np.pi
+        return (D - a) * within - ratio * a * (0.5 - within)
+
+    expected = scipy.optimize.brentq(balance, limit + 1e-9, D)
+    n = np.arange(round(60000 * max(ratio / 10, 1)))  # ten time constants of the slower direction
+    x, d = np.sin(0.3 * n), D * np.sin(0.3 * n + 0.4)
+    controller = TwoGradientFxLMS(
+        16, [1.0], step_size=mu / max(ratio, 1), amplitude_limit=limit, output_step_size=mu * min(ratio, 1)
+    )
+    result = simulate(controller, x, disturbance=d, secondary_path=[1.0])
+    amplitude = np.sqrt(2 * np.mean(result.control_signal[-20000:] ** 2))
+    assert amplitude == pytest.approx(expected, rel=0.02)
+
+
+def test_clipping_lets_the_weights_grow() -> None:
+    """What the paper says of clipping: the control filter overruns."""
+    n = np.arange(40000)
+    x, d = np.sin(0.3 * n), 3.0 * np.sin(0.3 * n + 0.4)
+    clipping, scaling = (
+        kind(16, [0.0, 1.0], step_size=1e-3, amplitude_limit=1.0) for kind in (ClippingFxLMS, RescalingFxLMS)
+    )
+    for controller in (clipping, scaling):
+        simulate(controller, x, disturbance=d, secondary_path=[0.0, 1.0])
+    assert np.linalg.norm(clipping.weights) > 5 * np.linalg.norm(scaling.weights)
+
+
+@pytest.mark.parametrize("y", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["re-scaling FxLMS", "clipping FxLMS"])
+def test_a_divergence_is_not_hidden_by_the_limit(name: str, y: float) -> None:
+    controller = EVERY[name][0]()
+    controller._state.weights[0] = y
+    result = simulate(controller, np.ones(10), disturbance=np.ones(10), secondary_path=PATH)
+    assert result.diverged_at_s == 0.0
+
+
+# ---- Refusals
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("kind", AMPLITUDE.values())
+def test_bad_limits_and_steps_are_refused(kind: Any, value: float) -> None:
+    with pytest.raises(ValueError, match="amplitude_limit"):
+        kind(L, ESTIMATE, step_size=0.1, amplitude_limit=value)
+    with pytest.raises(ValueError, match="step_size"):
+        kind(L, ESTIMATE, step_size=value, amplitude_limit=1.0)
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_bad_factors_are_refused(value: float) -> None:
+    with pytest.raises(ValueError, match="leak"):
+        LeakyFxLMS(L, ESTIMATE, step_size=0.1, leak=value)
+    with pytest.raises(ValueError, match="penalty_factor"):
+        MOVFxLMS(L, ESTIMATE, step_size=0.1, rated_power=1.0, penalty_factor=value)
+    with pytest.raises(ValueError, match="regularization"):
+        FxNLMS(L, ESTIMATE, step_size=0.1, regularization=value)
+    with pytest.raises(ValueError, match="output_step_size"):
+        TwoGradientFxLMS(L, ESTIMATE, step_size=0.1, amplitude_limit=1.0, output_step_size=value)
+    with pytest.raises(ValueError, match="disturbance_power"):
+        penalty_factor(1.0, disturbance_power=value, secondary_path_gain=1.0)
+    with pytest.raises(ValueError, match="reference_power"):
+        leak_factor(1.0, disturbance_power=1.0, secondary_path_gain=1.0, reference_power=value)
+
+
+def test_a_leak_of_more_than_the_weight_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"step_size \* leak must be 1 at most, got 2"):
+        LeakyFxLMS(L, ESTIMATE, step_size=0.5, leak=4.0)
+
+
+def test_settings_can_be_read() -> None:
+    assert FxNLMS(L, ESTIMATE, step_size=0.1).regularization == 1e-10
+    assert LeakyFxLMS(L, ESTIMATE, step_size=0.1, leak=0.3).leak == 0.3
+    two = TwoGradientFxLMS(L, ESTIMATE, step_size=0.1, amplitude_limit=2.0)
+    assert (two.step_size, two.output_step_size, two.amplitude_limit) == (0.1, 0.1, 2.0)
+    assert MOVFxLMS(L, ESTIMATE, step_size=0.1, rated_power=1.0, modified=True).modified
+
+
+def test_a_known_amplifier_is_in_the_estimate_of_those_that_have_one() -> None:
+    """d^ = e + s^ * amplifier(y): with path and amplifier known exactly it is the disturbance itself."""
+    x, d = noise()
+    amplifier = HardClipAmplifier(0.2)
+    for kind in (MOVFxLMS, OptimalLeakyFxLMS):
+        controller = kind(L, PATH, step_size=MU, rated_power=0.1, fs=1000, power_memory=1e3, amplifier=amplifier)
+        result = simulate(
+            controller, x, disturbance=d, secondary_path=PATH, amplifier=amplifier, fs=1000, record_powers=True
+        )
+        assert result.disturbance_power is not None
+        means = np.cumsum(d**2) / np.arange(1, d.size + 1)  # within the memory: plain means
+        np.testing.assert_allclose(result.disturbance_power, means, rtol=1e-12)
+
+
+def test_toeplitz_statistics_are_those_of_the_signal() -> None:
+    """The oracle's own oracle: a stationary periodic signal has Toeplitz correlations."""
+    _, _, R_xf, R_x, _ = statistics()
+    for R in (R_xf, R_x):
+        np.testing.assert_allclose(R, scipy.linalg.toeplitz(R[0]), rtol=0, atol=1e-12)
+
+
+# ---- As controllers
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", EVERY)
+def test_a_controller_and_its_copy_go_on_from_its_state(name: str, compiled: bool) -> None:
+    """With nothing left in the true path, two parts of a signal are the whole."""
+    x, d = noise()
+    whole, parts = EVERY[name][0](), EVERY[name][0]()
+    options: Any = {"secondary_path": [0.9], "fs": whole.constraint.fs, "compiled": compiled}
+    all_of_it = simulate(whole, x, disturbance=d, **options)
+    first = simulate(parts, x[:150], disturbance=d[:150], **options)
+    twin = pickle.loads(pickle.dumps(parts))
+    for controller in (parts, twin):
+        second = simulate(controller, x[150:], disturbance=d[150:], **options)
+        np.testing.assert_array_equal(np.r_[first.error, second.error], all_of_it.error)
+        np.testing.assert_array_equal(controller.weights, whole.weights)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_refused_error_changes_nothing(name: str) -> None:
+    x, d = noise()
+    controller = EVERY[name][0]()
+    options: Any = {"secondary_path": PATH, "fs": controller.constraint.fs}
+    simulate(controller, x, disturbance=d, **options)
+    before = pickle.dumps(controller)
+    with pytest.raises(ValueError, match="error"):
+        controller.update(np.nan)
+    with pytest.raises(ValueError, match="must have finite squares"):
+        controller.update(1e200)
+    with pytest.raises(ValueError, match="reference"):
+        controller.control_signal(np.inf)
+    assert pickle.dumps(controller) == before
+    controller.update(0.1)  # and it goes on
+    assert np.all(np.isfinite(controller.weights))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_behind_a_limiter_no_window_is_above_the_rated_power(name: str) -> None:
+    x, d = noise(2000)
+    limiter = OutputLimiter(rated_power=0.1, fs=1000, window_s=0.05)
+    controller = EVERY[name][0](limiter=limiter)
+    if name.startswith(("optimal", "MOV")):
+        controller.constraint.fs = 1000.0
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH, fs=1000)
+    powers_50ms = np.convolve(result.control_signal**2, np.ones(50) / 50)[: x.size]
+    assert np.max(powers_50ms) <= 0.1 * (1 + 1e-9)

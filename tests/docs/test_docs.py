@@ -1,0 +1,214 @@
+"""The documentation: that its links into the code hold, that every public name and argument is described."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kfopc_filterpy
+from kfopc_filterpy import KFOPC
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+sys.path.insert(0, str(DOCS / "extensions"))
+
+import public_names  # noqa: E402
+import source_lines  # noqa: E402
+
+PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)
+TUTORIALS = sorted(page for page in (DOCS / "tutorials").glob("*.md") if page.stem != "index")
+LINE_ROLE = re.compile(r"\{line\}`([^`]+)`")
+PUBLIC = [(name, public_names.thing_of(name)) for name in public_names.public_names()]
+NAMES = [name for name, _ in PUBLIC]
+CLASSES = [(name, thing) for name, thing in PUBLIC if inspect.isclass(thing)]
+BUILT_OTHERWISE = (tuple, Exception)  # named tuples and errors: made by the package, not by its users
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+# Links into the code.
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_line_that_a_page_points_at_is_there_once(page):
+    for role in LINE_ROLE.findall(text_of(page)):
+        module, _, code = role.partition(": ")
+        assert source_lines.find_line(module, code) > 0
+
+
+def test_a_line_that_is_not_there_or_not_alone_is_refused():
+    with pytest.raises(ValueError, match="0 lines"):
+        source_lines.find_line("kernels.covariance", "no such line of code")
+    with pytest.raises(ValueError, match=r"lines of covariance\.py hold"):
+        source_lines.find_line("kernels.covariance", "return")
+
+
+@pytest.mark.parametrize("number", ["1a", "1b", *map(str, range(2, 14))])
+def test_the_theory_page_has_each_equation_of_the_paper_with_a_line_of_code(number):
+    theory = text_of(DOCS / "theory.md")
+    assert theory.count(rf"\tag{{{number}}}") == 1
+    after = theory.split(rf"\tag{{{number}}}")[1]
+    # The code comes before the next experiment or section; (12) is no line of its own, it becomes (13).
+    assert LINE_ROLE.search(re.split(r"\n#|```", after)[0]), f"no line of code follows equation {number}"
+
+
+# The reference.
+
+
+def test_every_public_name_has_a_page_and_a_line_in_the_table():
+    index = public_names.index_page()
+    for name, thing in PUBLIC:
+        page = public_names.name_page(name)
+        kind = "autoclass" if inspect.isclass(thing) else "autofunction"
+        assert f".. {kind}:: kfopc_filterpy.{name}\n" in page
+        assert f":doc:`{name.rpartition('.')[2]} <{name}>`" in index
+        assert f"\n   {name}\n" in index
+    assert "plot.plot_nse" in NAMES
+
+
+@pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=NAMES)
+def test_every_public_name_has_a_summary_and_an_example_or_is_made_by_one(name, thing):
+    doc = inspect.getdoc(thing) or ""
+    assert re.match(r"\S.*[.:]", doc), f"{name} has no summary"
+    made_by_the_package = inspect.isclass(thing) and (
+        hasattr(thing, "__dataclass_fields__")
+        or issubclass(thing, BUILT_OTHERWISE)
+        or thing is kfopc_filterpy.controllers.Controller
+    )
+    assert ">>>" in doc or made_by_the_package or name.startswith("plot."), f"{name} has no example"
+
+
+def described(doc: str | None) -> set[str]:
+    """Names in the sections Parameters and Attributes of a numpydoc docstring."""
+    names: set[str] = set()
+    for title in ("Parameters", "Attributes"):
+        section = re.search(rf"^{title}\n-+\n(.*?)(?=^\S[^\n]*\n-{{3,}}$|\Z)", inspect.cleandoc(doc or ""), re.M | re.S)
+        for line in section[1].splitlines() if section else ():
+            if line and not line[0].isspace():
+                names |= {name.strip().lstrip("*") for name in line.split(" : ")[0].split(",")}
+    return names
+
+
+def arguments(function: Any) -> list[str]:
+    return [name for name in inspect.signature(function).parameters if name not in ("self", "cls")]
+
+
+def test_the_reader_of_docstrings_finds_what_is_described_and_only_that():
+    doc = """Summary with other.
+
+    Parameters
+    ----------
+    a, b : float
+        Not c.
+    **more
+        Rest.
+
+    Returns
+    -------
+    d : float
+    """
+    assert described(doc) == {"a", "b", "more"}
+
+
+@pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=NAMES)
+def test_every_argument_of_a_public_name_is_described_in_its_docstring(name, thing):
+    if inspect.isclass(thing) and (
+        issubclass(thing, BUILT_OTHERWISE) or thing is kfopc_filterpy.controllers.Controller
+    ):
+        pytest.skip("not called by users")
+    missing = set(arguments(thing)) - described(thing.__doc__)
+    assert not missing, f"{name} leaves undescribed: {sorted(missing)}"
+
+
+def methods(kind: type) -> list[tuple[str, Any]]:
+    """Public methods that are this package's own."""
+    found = inspect.getmembers(kind, lambda member: inspect.isfunction(member) or inspect.ismethod(member))
+    mine = [(name, method) for name, method in found if method.__module__.startswith("kfopc_filterpy")]
+    return [(name, method) for name, method in mine if not name.startswith("_") or name == "__call__"]
+
+
+def full_text(kind: type, name: str, depth: int = 2) -> str:
+    """Docstrings of a method along its bases, filterpy's included, and of the methods that they refer to."""
+    own = [vars(base)[name] for base in kind.__mro__ if name in vars(base)]
+    text = "\n".join(getattr(method, "__doc__", None) or "" for method in own)
+    if depth:
+        for other in set(re.findall(r"`(?:\w+\.)?(\w+)`", text)) - {name}:
+            text += full_text(kind, other, depth - 1)
+    return text
+
+
+@pytest.mark.parametrize(("name", "kind"), CLASSES, ids=[name for name, _ in CLASSES])
+def test_every_argument_of_a_public_method_is_named_where_it_is_described(name, kind):
+    if issubclass(kind, BUILT_OTHERWISE):
+        pytest.skip("no methods of its own")
+    for method_name, method in methods(kind):
+        assert method.__doc__, f"{name}.{method_name} has no docstring"
+        text = full_text(kind, method_name)
+        missing = [argument for argument in arguments(method) if not re.search(rf"\b{argument}\b", text)]
+        assert not missing, f"{name}.{method_name} leaves undescribed: {missing}"
+
+
+# Tutorials.
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_every_tutorial_is_a_notebook_to_download_without_outputs(page):
+    text = text_of(page)
+    assert "format_name: myst" in text
+    assert f"{{nb-download}}`{page.stem}.ipynb`" in text
+    assert "assert " in text, "its claims are not checked when it is built"
+    assert f"\n{page.stem}\n" in text_of(DOCS / "tutorials" / "index.md")
+
+
+# The theory.
+
+
+def test_the_covariance_of_the_state_prediction_error_is_P():
+    """Eq. 3: what P(n|n-1) says of the error, against the errors of many random walks that were drawn by eq. 1.
+
+    Tolerances are five standard deviations: of the mean of a chi-square variable over its degrees of freedom, and of an
+    element of a sample covariance of Gaussians, sqrt((P_ii P_jj + P_ij^2) / M).
+    """
+    n_taps, n_walks, n_samples, r, q, p0 = 3, 1200, 25, 0.03, 0.4, 0.8
+    rng = np.random.default_rng(11)
+    x = np.convolve(rng.standard_normal(n_samples + n_taps), [1.0, 0.9], mode="same")
+    errors, P = np.empty((n_walks, n_samples, n_taps)), np.empty((n_samples, n_taps, n_taps))
+    for walk in range(n_walks):
+        kf = KFOPC.random_walk(n_taps, state_noise=r, measurement_noise=q, initial_variance=p0)
+        w = np.sqrt(p0) * rng.standard_normal(n_taps)
+        for n in range(n_samples):
+            w = w + np.sqrt(r) * rng.standard_normal(n_taps)
+            row = x[n : n + n_taps][::-1]
+            kf.predict()
+            errors[walk, n], P[n] = w - kf.x_prior[:, 0], kf.P_prior
+            kf.update(row @ w + np.sqrt(q) * rng.standard_normal(), H=row)
+    normalised = np.einsum("mni,nij,mnj->n", errors, np.linalg.inv(P), errors) / (n_walks * n_taps)
+    assert np.all(np.abs(normalised - 1) < 5 * np.sqrt(2 / (n_taps * n_walks)))
+    sampled = np.einsum("mni,mnj->nij", errors, errors) / n_walks
+    diagonal = np.einsum("nii->ni", P)
+    scatter = np.sqrt((diagonal[:, :, None] * diagonal[:, None, :] + P**2) / n_walks)
+    assert np.all(np.abs(sampled - P) < 5 * scatter)
+    assert np.abs(P[-1, 0, 1]) > 10 * scatter[-1, 0, 1]  # the elements off the diagonal were put to the test too
+
+
+@pytest.mark.parametrize("name", ["state_space_model", "kalman_anc", "kalman_opc"])
+def test_the_block_diagrams_are_drawn_with_the_sign_convention(name, monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    import diagrams
+    import matplotlib.pyplot as plt
+
+    figure = getattr(diagrams, name)()
+    figure.canvas.draw()  # a formula that cannot be set raises
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    plt.close(figure)
+    if name != "state_space_model":
+        assert texts.count("−") == 1  # e = d - y', the only difference
+        assert "$e(n) = d - y'$" in texts
+    assert (r"$\times\;\alpha$" in texts) == (name == "kalman_opc")

@@ -1,0 +1,365 @@
+"""The loop against the plain-Python one of `oracles.modified_anc`, and its compiled form against its steps."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from oracles import modified_anc as oracle
+
+from kfopc_filterpy import (
+    KFOPC,
+    FxLMS,
+    HardClipAmplifier,
+    KalmanController,
+    LinearAmplifier,
+    MOVFxLMS,
+    SoftSaturationAmplifier,
+    kf_anc,
+    kf_opc,
+    simulate,
+)
+from kfopc_filterpy.kernels.delay_lines import delay_line, newest, push
+
+N_TAPS, N = 10, 500
+S = np.array([0.0, 0.9, -0.4, 0.2, 0.1])
+S_HAT = np.array([0.1, 0.8, -0.3, 0.1])  # neither its taps nor its length are those of S
+FEEDBACK = np.array([0.0, 0.15, -0.1, 0.05, 0.0, 0.02, 0.01])  # longer than S
+R, Q, P0, MU = 1e-5, 1e-2, 0.5, 4e-3
+FS, MEMORY_S = 8000.0, 0.01  # 80 samples: forgetting is at work in a run of 500
+SIGNALS = (
+    "error",
+    "control_signal",
+    "amplifier_output",
+    "anti_noise",
+    "constraint_factor",
+    "disturbance_power",
+    "secondary_path_gain",
+    "weights",
+)
+
+AMPLIFIERS = {
+    "none": (None, oracle.linear),
+    "linear": (LinearAmplifier(), oracle.linear),
+    "hard": (HardClipAmplifier(0.7), oracle.hard_clip(0.7)),
+    "soft": (SoftSaturationAmplifier(0.7, 1.5), oracle.rapp(0.7, 1.5)),
+}
+
+
+def noises(n=N, seed=3):
+    """Reference, disturbance that a control filter explains in part, sensor noise."""
+    rng = np.random.default_rng(seed)
+    x, other, noise = rng.standard_normal((3, n))
+    return x, np.convolve(x, [0.0, 0.0, 1.2, -0.7, 0.5, 0.3])[:n] + 0.1 * other, 0.05 * noise
+
+
+def controller(name, *, rated_power=0.3, window="exponential", gain=None, known=None, n_taps=N_TAPS):
+    kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0, "amplifier": known}
+    powers = {"fs": FS, "power_memory": MEMORY_S, "power_window": window, "secondary_path_gain": gain}
+    if name == "KF-ANC":
+        return kf_anc(n_taps, S_HAT, **kalman)
+    if name == "KF-OPC":
+        return kf_opc(n_taps, S_HAT, rated_power=rated_power, **kalman, **powers)
+    if name == "FxLMS":
+        return FxLMS(n_taps, S_HAT, step_size=MU)
+    return MOVFxLMS(n_taps, S_HAT, step_size=MU, rated_power=rated_power, amplifier=known, **powers)
+
+
+def reference_algorithm(name, *, rated_power=0.3, window="exponential", gain=None):
+    if name in ("KF-ANC", "FxLMS"):  # they only follow the powers, as eq. 10-11 with the defaults
+        factor = oracle.Factor(None)
+    else:
+        factor = oracle.Factor(rated_power, gain, MEMORY_S, FS, window)
+    if name in ("KF-ANC", "KF-OPC"):
+        return oracle.Kalman(N_TAPS, factor, r=R, q=Q, p0=P0)
+    return oracle.LMS(N_TAPS, factor, mu=MU)
+
+
+NAMES = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
+
+
+def run(made, *, amplifier=None, feedback=None, on=0, n=N, **options):
+    x, d, _ = noises(n)
+    options = {"fs": FS, "record_weights_every": 1, "record_powers": True} | options
+    return simulate(
+        made,
+        x,
+        disturbance=d,
+        secondary_path=S,
+        feedback_path=feedback,
+        amplifier=amplifier,
+        sensor_noise_std=0.05,
+        rng=11,
+        switch_on_s=on / FS,
+        **options,
+    )
+
+
+def sensor_noise(n=N):
+    return 0.05 * np.random.default_rng(11).standard_normal(n)
+
+
+def assert_agrees(result, expected):
+    # Rounding of 500 steps in another order of summation. The loops contract, and where clipping makes weights grow
+    # they do so linearly; errors are some 1e-14 of the largest value, the Kalman covariance's some 1e-12.
+    for name in SIGNALS:
+        want, got = expected[name], getattr(result, name)
+        assert got.shape == want.shape, name
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-10 * np.nanmax(np.abs(want)), err_msg=name)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("feedback", [None, FEEDBACK], ids=["", "feedback"])
+@pytest.mark.parametrize("amplifier", AMPLIFIERS)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_controller_is_the_papers_loop(name, amplifier, feedback, compiled):
+    x, d, _ = noises()
+    ours, theirs = AMPLIFIERS[amplifier]
+    expected = oracle.modified_anc(
+        reference_algorithm(name),
+        x,
+        d,
+        S,
+        S_HAT,
+        noise=sensor_noise(),
+        amplifier=theirs,
+        feedback=(0.0,) if feedback is None else feedback,
+    )
+    result = run(controller(name), amplifier=ours, feedback=feedback, compiled=compiled)
+    assert_agrees(result, expected)
+    assert result.algorithm == name
+    assert (np.min(expected["constraint_factor"]) < 0.9) == (name in ("KF-OPC", "MOV-FxLMS"))  # it did act
+    if amplifier in ("hard", "soft"):
+        assert np.max(np.abs(expected["control_signal"])) > 0.7  # the amplifier did act
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("options", [{"window": "sliding"}, {"gain": 0.5}, {"rated_power": 30.0}], ids=str)
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
+def test_constraint_options(name, options, compiled):
+    x, d, _ = noises()
+    expected = oracle.modified_anc(reference_algorithm(name, **options), x, d, S, S_HAT, noise=sensor_noise())
+    assert_agrees(run(controller(name, **options), compiled=compiled), expected)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("amplifier", ["hard", "soft"])
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC", "MOV-FxLMS"])
+def test_known_amplifier_takes_the_saturation_out_of_the_disturbance_estimate(name, amplifier, compiled):
+    x, d, _ = noises()
+    ours, theirs = AMPLIFIERS[amplifier]
+    algorithm = reference_algorithm(name)
+    expected = oracle.modified_anc(
+        algorithm, x, d, S, S_HAT, noise=sensor_noise(), amplifier=theirs, known_amplifier=theirs
+    )
+    published = oracle.modified_anc(reference_algorithm(name), x, d, S, S_HAT, noise=sensor_noise(), amplifier=theirs)
+    assert np.max(np.abs(expected["weights"] - published["weights"])) > 1e-3
+    assert_agrees(run(controller(name, known=ours), amplifier=ours, compiled=compiled), expected)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", NAMES)
+def test_switched_on_late_it_has_listened(name, compiled):
+    """Until then the loudspeaker is silent, delay lines and powers follow the noise, the weights stay."""
+    x, d, _ = noises()
+    on = 123
+    expected = oracle.modified_anc(
+        reference_algorithm(name), x, d, S, S_HAT, noise=sensor_noise(), feedback=FEEDBACK, on=on
+    )
+    result = run(controller(name), feedback=FEEDBACK, on=on, compiled=compiled)
+    assert_agrees(result, expected)
+    np.testing.assert_array_equal(result.reference, x[on:])
+    np.testing.assert_array_equal(result.disturbance, d[on:])
+    assert result.time_s[0] == result.weights_time_s[0] == 0.0
+
+
+@pytest.mark.parametrize(("own", "rated_power"), [("filterpy", None), ("KFOPC", None), ("KFOPC", 0.3)])
+def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
+    """filterpy's own KalmanFilter and a KFOPC with filterpy's equations leave what the O(L^2) one leaves."""
+    name = "KF-ANC" if rated_power is None else "KF-OPC"
+    if own == "KFOPC":
+        powers = {"fs": FS, "power_memory": MEMORY_S} if rated_power else {}
+        estimator = KFOPC(dim_x=N_TAPS, dim_z=1, rated_power=rated_power, **powers)
+    else:
+        estimator = oracle.KalmanFilter(dim_x=N_TAPS, dim_z=1)
+    estimator.Q, estimator.R, estimator.P = R * np.eye(N_TAPS), np.array([[Q]]), P0 * np.eye(N_TAPS)
+    generic, fast = run(KalmanController(estimator, S_HAT)), run(controller(name))
+    assert generic.algorithm == name
+    for signal in SIGNALS:
+        want = getattr(fast, signal)
+        # filterpy's Joseph form of P and ours differ by rounding, 1e-12 of P after 500 steps at P0/R = 50
+        np.testing.assert_allclose(getattr(generic, signal), want, rtol=0, atol=1e-10 * np.nanmax(np.abs(want)))
+
+
+# ---- One definition of the equations, two ways to run them
+
+
+def assert_same_run(one, two):
+    for name in ("reference", "disturbance", *SIGNALS, "weights_time_s"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
+    assert (one.algorithm, one.fs, one.rated_power, one.diverged_at_s) == (
+        two.algorithm,
+        two.fs,
+        two.rated_power,
+        two.diverged_at_s,
+    )
+
+
+def assert_same_estimator(one, two):
+    for name in ("x", "x_post", "P", "P_prior", "P_post", "K", "S", "SI", "y", "z"):
+        a, b = getattr(one, name), getattr(two, name)
+        np.testing.assert_array_equal(a, b, err_msg=name)
+        assert (type(a), a.dtype) == (type(b), b.dtype), name
+    for name in ("log_likelihood", "likelihood", "mahalanobis"):
+        assert getattr(one, name) == getattr(two, name), name
+    assert one.constraint_factor == two.constraint_factor
+    assert one.disturbance_power == two.disturbance_power
+    assert one.secondary_path_gain == two.secondary_path_gain
+    # the compiled loop keeps x only: x_prior = x - K y to rounding
+    np.testing.assert_allclose(one.x_prior, two.x_prior, rtol=0, atol=1e-14 * np.max(np.abs(two.x)))
+
+
+@pytest.mark.parametrize("n_taps", [1, 2, 3, 4, 5, 7, 8, 13, 16, 31, 64, 129])
+@pytest.mark.parametrize("name", NAMES)
+def test_compiled_run_is_the_steps_bit_for_bit(name, n_taps):
+    fast, slow = controller(name, n_taps=n_taps), controller(name, n_taps=n_taps)
+    options = {"amplifier": AMPLIFIERS["soft"][0], "feedback": FEEDBACK, "on": 17, "n": 300}
+    assert_same_run(run(fast, **options), run(slow, compiled=False, **options))
+    np.testing.assert_array_equal(fast.weights, slow.weights)
+    for attribute in ("constraint_factor", "disturbance_power", "secondary_path_gain"):
+        assert getattr(fast, attribute) == getattr(slow, attribute)
+    if isinstance(fast, KalmanController):
+        assert_same_estimator(fast.estimator, slow.estimator)
+    assert_same_run(run(fast, n=50), run(slow, n=50, compiled=False))  # and they go on alike
+    assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
+
+
+def fading(made):
+    made.estimator.alpha = 1.001
+
+
+def held_factor(made):
+    made.estimator.constraint_factor = 0.5
+
+
+def large_start(made):
+    made.estimator.P = 1e6 * np.eye(N_TAPS)
+
+
+def edited(made):
+    made.estimator.P[0, 0] *= 3.0
+    made.estimator.x[1] = 0.25
+
+
+def full_state_noise(made):
+    made.estimator.Q = np.diag(np.linspace(1e-6, 1e-5, N_TAPS))
+
+
+@pytest.mark.parametrize("change", [fading, held_factor, large_start, edited, full_state_noise])
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+def test_compiled_run_takes_up_what_was_set_on_the_estimator(name, change):
+    fast, slow = controller(name), controller(name)
+    for made in (fast, slow):
+        run(made, n=40, compiled=False)
+        change(made)
+    assert_same_run(run(fast), run(slow, compiled=False))
+    assert_same_estimator(fast.estimator, slow.estimator)
+    untouched = run(controller(name))
+    assert not np.array_equal(untouched.weights, run(fast).weights)
+
+
+@pytest.mark.parametrize("step", [1, 7, 499, 500])
+@pytest.mark.parametrize("name", NAMES)
+def test_pieces_of_the_compiled_loop_do_not_show(name, step, monkeypatch):
+    whole = run(controller(name))
+    monkeypatch.setattr("kfopc_filterpy.loop.run.simulation.STEP", step)
+    done = []
+    assert_same_run(whole, run(controller(name), progress=done.append))
+    assert sum(done) == N
+    assert max(done) == step
+
+
+# ---- The delay line
+
+
+@given(
+    taps=st.integers(1, 40),
+    samples=st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60),
+    repeats=st.integers(1, 12),
+)
+@settings(max_examples=60)
+def test_newest_are_the_last_samples_pushed(taps, samples, repeats):
+    line, pushed = delay_line(taps), [0.0] * taps
+    for sample in samples * repeats:  # up to 720 samples: across several wraps of 4 * 40 + 64
+        push(line, sample)
+        pushed.append(sample)
+        for n in {1, (taps + 1) // 2, taps}:
+            np.testing.assert_array_equal(newest(line, n), pushed[: -n - 1 : -1])
+    assert newest(line, taps).flags.c_contiguous
+
+
+# ---- What must hold for any signal
+
+
+@given(exponent=st.integers(-20, 20), seed=st.integers(0, 1000))
+@settings(max_examples=25)
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
+def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
+    """x, d by c, rated power, q, and 1/mu by c^2: the weights stay and y, e, y_amp grow by c (exactly: c = 2^k)."""
+    c = 2.0**exponent
+    x, d, _ = noises(200, seed)
+    powers = {"fs": FS, "power_memory": MEMORY_S}
+
+    def at_scale(c):
+        if name == "KF-OPC":
+            made = kf_opc(N_TAPS, S_HAT, rated_power=0.3 * c**2, state_noise=R, measurement_noise=Q * c**2, **powers)
+        else:
+            made = MOVFxLMS(N_TAPS, S_HAT, step_size=MU / c**2, rated_power=0.3 * c**2, **powers)
+        return simulate(
+            made,
+            c * x,
+            disturbance=c * d,
+            secondary_path=S,
+            fs=FS,
+            amplifier=HardClipAmplifier(0.7 * c),
+            sensor_noise_std=0.05 * c,
+            rng=5,
+            record_weights_every=10,
+        )
+
+    one, scaled = at_scale(1.0), at_scale(c)
+    np.testing.assert_array_equal(scaled.control_signal, c * one.control_signal)
+    np.testing.assert_array_equal(scaled.error, c * one.error)
+    np.testing.assert_array_equal(scaled.weights, one.weights)
+    np.testing.assert_array_equal(scaled.constraint_factor, one.constraint_factor)
+
+
+@given(seed=st.integers(0, 1000), rated_power=st.floats(1e4, 1e8))
+@settings(max_examples=25)
+def test_with_rated_power_to_spare_the_constrained_are_the_unconstrained(seed, rated_power):
+    x, d, _ = noises(200, seed)
+    for constrained, free in (("KF-OPC", "KF-ANC"), ("MOV-FxLMS", "FxLMS")):
+        one, other = (
+            simulate(controller(name, rated_power=rated_power), x, disturbance=d, secondary_path=S, fs=FS)
+            for name in (constrained, free)
+        )
+        np.testing.assert_array_equal(one.constraint_factor, 1.0)
+        np.testing.assert_array_equal(one.control_signal, other.control_signal)
+        np.testing.assert_array_equal(one.error, other.error)
+
+
+@given(seed=st.integers(0, 1000), cut=st.integers(1, 199))
+@settings(max_examples=25)
+@pytest.mark.parametrize("name", NAMES)
+def test_the_future_does_not_show(name, seed, cut):
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(200)
+    primary = rng.standard_normal(7)
+    other = np.concatenate([x[:cut], rng.standard_normal(200 - cut)])
+    one, two = (
+        simulate(controller(name), signal, primary_path=primary, secondary_path=S, fs=FS, amplifier=math.tanh)
+        for signal in (x, other)
+    )
+    np.testing.assert_array_equal(one.error[:cut], two.error[:cut])
+    np.testing.assert_array_equal(one.control_signal[:cut], two.control_signal[:cut])

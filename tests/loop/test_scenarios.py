@@ -1,0 +1,469 @@
+"""`simulate_scenarios`: many runs on one gain sequence, each as `simulate` leaves it alone."""
+
+import copy
+import math
+
+import numpy as np
+import pytest
+from test_block import assert_close, assert_controller_close, assert_run_close
+from test_loop import AMPLIFIERS, S_HAT, S
+from test_simulation_refusals import state_of
+
+from kfopc_filterpy import FxLMS, HardClipAmplifier, KalmanController, kf_anc, kf_opc, simulate
+from kfopc_filterpy import simulate_scenarios as run_scenarios
+from kfopc_filterpy.kernels.block import Block
+from kfopc_filterpy.loop import scenarios
+from kfopc_filterpy.paths import fir_path
+
+FS = 8000.0
+KERNELS = ("streaming", "block", "pairs")
+BLOCK = scenarios.BLOCK
+
+
+def filters(count, n_taps=7, *, secondary=S_HAT, window="exponential", **options):
+    """KF-OPC of different rated powers, every third a KF-ANC (not with a sliding window); some know their amplifier."""
+    kalman = {"state_noise": 1e-5, "measurement_noise": 0.1, "initial_variance": 0.5} | options
+    known = [HardClipAmplifier(0.7) if i % 4 == 2 else None for i in range(count)]
+    powers = {"fs": FS, "power_memory": 0.01, "power_window": window}
+    return [
+        kf_anc(n_taps, secondary, amplifier=known[i], **kalman)
+        if i % 3 == 2 and window == "exponential"
+        else kf_opc(n_taps, secondary, rated_power=0.1 * 1.5**i, amplifier=known[i], **kalman, **powers)
+        for i in range(count)
+    ]
+
+
+def differing(count, n, seed=3):
+    """A reference, and what differs from one scenario to the next."""
+    x, *others = np.random.default_rng(seed).standard_normal((count + 1, n))
+    amplifiers = [ours for ours, _ in AMPLIFIERS.values()]
+    return x, {
+        "disturbance": np.array(
+            [np.convolve(x, [0.0, 0.0, 1.2, -0.7, 0.1 * i])[:n] + 0.1 * own for i, own in enumerate(others)]
+        ),
+        "amplifier": [amplifiers[i % 4] for i in range(count)],
+        "sensor_noise_std": [0.05 * (1 + i % 3) for i in range(count)],
+        "rng": [100 + i for i in range(count)],
+        "secondary_path": [(0.9 + 0.2 * i / count) * S * (np.arange(5) < 3 + i % 3) for i in range(count)],
+    }
+
+
+def one_by_one(made, x, own, **options):
+    """`simulate` for each, with its own of each list."""
+    each = [{name: values[i] for name, values in own.items()} for i in range(len(made))]
+    return [simulate(c, x, fs=FS, **mine, **options) for c, mine in zip(made, each, strict=True)]
+
+
+def up_to(n, own):
+    return own | {"disturbance": own["disturbance"][:, :n]}
+
+
+def assert_as_alone(results, expected, made=(), alone=()):
+    # The same equations, with sums in another order: the filtered reference of the whole run at once, w'x and w'x' in
+    # one pass, the block kernel's products. To the tolerance of `test_block`; errors were 1e-12 of the largest value.
+    for got, want in zip(results, expected, strict=True):
+        assert_run_close(got, want)
+        np.testing.assert_array_equal(got.reference, want.reference)
+        np.testing.assert_array_equal(got.disturbance, want.disturbance)
+    for one, other in zip(made, alone, strict=True):
+        assert_controller_close(one, other)
+
+
+def leaves(made):
+    if isinstance(made, KalmanController):  # what each run writes anew
+        made._state.last[:], made._state.settings[:] = 0.0, 0.0
+    return state_of(made) if not isinstance(made, str) else []
+
+
+def assert_untouched(made, fresh):
+    for one, other in zip(made, fresh, strict=True):
+        for now, then in zip(leaves(one), leaves(other), strict=True):
+            np.testing.assert_array_equal(now, then)
+
+
+def require_as_alone(count, n, n_taps=7, kernel="streaming", window="exponential", **options):
+    made, alone = (filters(count, n_taps, window=window) for _ in range(2))
+    x, own = differing(count, n)
+    results = run_scenarios(made, x, fs=FS, kernel=kernel, record_powers=True, **own, **options)
+    assert_as_alone(results, one_by_one(alone, x, own, record_powers=True, **options), made, alone)
+    return results
+
+
+# ---- As run one by one
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("n_taps", [1, 7, 40])
+@pytest.mark.parametrize("count", [1, 3, 9, 17, 35])  # groups of 32 inside
+def test_scenarios_are_their_runs_one_by_one(count, n_taps, kernel):
+    results = require_as_alone(count, 777, n_taps, kernel)
+    assert min(r.constraint_factor.min() for r in results) < 0.9  # it did act, and so did the amplifiers
+    saturated = {i % 4 for i, r in enumerate(results) if np.any(r.amplifier_output != r.control_signal)}
+    assert saturated == {2, 3} & set(range(count))
+    assert len({r.error.tobytes() for r in results}) == count
+    assert {r.algorithm for r in results} == ({"KF-OPC", "KF-ANC"} if count > 2 else {"KF-OPC"})
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("n", [1, 63, 64, 129, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 1])
+def test_any_length_of_a_run(n, kernel):
+    assert [r.error.shape for r in require_as_alone(3, n, kernel=kernel)] == [(n,)] * 3
+
+
+@pytest.mark.parametrize(("kernel", "other"), [("streaming", "advance"), ("block", "advance_by_steps")])
+def test_the_kernel_is_the_one_asked_for(kernel, other, monkeypatch):
+    monkeypatch.delattr(Block, other)
+    x, own = differing(3, 100)
+    assert len(run_scenarios(filters(3), x, fs=FS, kernel=kernel, **own)) == 3
+
+
+@pytest.mark.parametrize("block", [1, 50, 64, 300, 1000])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_length_of_the_blocks_does_not_show(kernel, block, monkeypatch):
+    """By steps not in a bit; in products the sums are others. Progress comes after each block."""
+    x, own = differing(9, 300)
+    whole, counts = run_scenarios(filters(9), x, fs=FS, kernel=kernel, **own), []
+    monkeypatch.setattr(scenarios, "BLOCK", block)
+    pieces = run_scenarios(filters(9), x, fs=FS, kernel=kernel, progress=counts.append, **own)
+    assert (counts[0], sum(counts), len(counts)) == (9 * min(block, 300), 9 * 300, -(-300 // block))
+    assert_as_alone(pieces, whole)
+    for one, other in zip(pieces, whole, strict=True):
+        assert kernel != "streaming" or np.array_equal(one.error, other.error)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_options_of_the_run(kernel):
+    late = require_as_alone(9, 400, kernel=kernel, switch_on_s=123 / FS)
+    np.testing.assert_array_equal(late[0].reference, differing(9, 400)[0][123:])
+    for result in require_as_alone(9, 400, kernel=kernel, window="sliding", switch_on_s=30 / FS):
+        assert 0.0 < result.constraint_factor.min() < 1.0
+    assert {r.rated_power for r in require_as_alone(3, 100, kernel=kernel, rated_power=2.0)} == {2.0}
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_what_was_set_on_the_estimators(kernel):
+    """Fading memory of all; weights, factor and gain of some."""
+    made, alone = filters(5), filters(5)
+    for each in (made, alone):
+        for c in each:
+            c.estimator.alpha = 1.001
+        each[1].estimator.x[:] = 0.1
+        each[3].estimator.constraint_factor, each[4].estimator.secondary_path_gain = 0.5, 0.7
+    x, own = differing(5, 500)
+    results = run_scenarios(made, x, fs=FS, kernel=kernel, **own)
+    assert_as_alone(results, one_by_one(alone, x, own), made, alone)
+    assert set(results[3].constraint_factor) == {0.5}
+
+
+@pytest.mark.parametrize("primary", [False, True])
+def test_what_is_one_for_all(primary):
+    """One amplifier, path, disturbance or primary path; and one seed: each hears the same noise."""
+    x, own = differing(1, 300)
+    options = {"amplifier": HardClipAmplifier(0.7), "sensor_noise_std": 0.1, "rng": 5, "secondary_path": S.tolist()}
+    options |= {"primary_path": [0.0, 0.0, 1.2, -0.7]} if primary else {"disturbance": own["disturbance"][0]}
+    made, alone = filters(9), filters(9)
+    results = run_scenarios(made, x, fs=FS, **options)
+    assert_as_alone(results, one_by_one(alone, x, {}, **options), made, alone)
+    noise = results[0].error - results[0].disturbance + results[0].anti_noise
+    np.testing.assert_allclose(noise, 0.1 * np.random.default_rng(5).standard_normal(300), rtol=0, atol=1e-14)
+
+
+def test_systems_generators_and_other_sequences_one_each():
+    x, own = differing(3, 200)
+    given = {
+        "secondary_path": [fir_path(s, FS) for s in own["secondary_path"]],
+        "sensor_noise_std": np.array(own["sensor_noise_std"]),
+        "rng": [np.random.default_rng(seed) for seed in own["rng"]],
+        "amplifier": tuple(own["amplifier"]),
+        "disturbance": own["disturbance"].tolist(),
+    }
+    results, plain = (run_scenarios(filters(3), x, fs=FS, **each) for each in (given, own))
+    x[:], own["disturbance"][:] = 0.0, 0.0  # the results are no views of what was given
+    for one, other in zip(results, plain, strict=True):
+        for name in ("reference", "disturbance", "error"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+            assert np.all(getattr(other, name))
+        with pytest.raises(ValueError, match="read-only"):
+            other.error[0] = 0.0
+
+
+# ---- The controllers afterwards
+
+
+@pytest.mark.parametrize("window", ["exponential", "sliding"])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_controllers_go_on(kernel, window):
+    """In scenarios again, alone, by hand; the one that did none of it as if nothing had been."""
+    made, alone = filters(4, window=window), filters(4, window=window)
+    for seed, n in ((3, 300), (4, 77)):
+        x, own = differing(4, n, seed)
+        results = run_scenarios(made, x, fs=FS, kernel=kernel, **own)
+        assert_as_alone(results, one_by_one(alone, x, own), made, alone)
+    for i in (2, 0):
+        mine = {name: values[i : i + 1] for name, values in own.items()}
+        assert_as_alone(*(one_by_one([c[i]], x, mine) for c in (made, alone)))
+    for c in (made[1], alone[1]):
+        for reference, error in zip(x[:5], own["disturbance"][1, :5], strict=True):
+            c.control_signal(reference)
+            c.update(error)
+    assert_as_alone((), (), made, alone)
+    mine = {name: values[3:] for name, values in own.items()}
+    results = run_scenarios(made[3:], x, fs=FS, kernel=kernel, **mine)
+    assert_as_alone(results, one_by_one(alone[3:], x, mine), made, alone)
+
+
+def stepped(c):
+    c.control_signal(1.0)
+    c.update(2.0)
+
+
+def edited(c):
+    c.estimator.P *= 2.0
+
+
+def run_alone(c):
+    x, own = differing(1, 100)
+    simulate(c, x, disturbance=own["disturbance"][0], secondary_path=S, fs=FS)
+
+
+def test_the_covariance_is_one_until_a_filter_steps():
+    """N filters of L taps hold one triangle of L^2: whoever goes on takes a copy, and the others stay as they are."""
+    made = filters(4)
+    x, own = differing(4, 300)
+    run_scenarios(made, x, fs=FS, **own)
+    arrays = [c.estimator._covariance.arrays for c in made]
+    assert all(a.triangle is arrays[0].triangle for a in arrays)
+    twin, before = copy.deepcopy(made[1]), state_of(made[1])
+    for goes_on, i in ((stepped, 0), (edited, 2), (run_alone, 3), (stepped, 0), (run_alone, 2)):
+        P = made[i].estimator.P.copy()
+        goes_on(made[i])
+        assert np.max(np.abs(made[i].estimator.P - P)) > 1e-7
+        assert made[i].estimator._covariance.arrays.triangle is not arrays[1].triangle
+        made[1].estimator._covariance._shown.clear()  # P is made anew, not as it was last read
+        for now, then in zip(state_of(made[1]), before, strict=True):
+            np.testing.assert_array_equal(now, then)
+    assert made[1].estimator._covariance.arrays.triangle is arrays[1].triangle
+    assert twin.estimator._covariance.arrays.triangle is not arrays[1].triangle
+    for c in (made[1], twin):
+        run_alone(c)
+    for mine, theirs in zip(state_of(made[1]), state_of(twin), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.parametrize("place", ["progress", "run_block"])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_an_interrupted_run_leaves_the_controllers_as_they_were(kernel, place, monkeypatch):
+    """All or nothing: a covariance a block ahead of the weights would be neither."""
+    x, own = differing(9, 3 * BLOCK)
+    made, alone, calls, compiled = filters(9), filters(9), [], scenarios.run_block
+
+    def interrupt(*arguments):
+        if place == "run_block":
+            compiled(*arguments)
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+
+    options = {"fs": FS, "kernel": kernel}
+    if place == "run_block":
+        monkeypatch.setattr(scenarios, "run_block", interrupt)
+    else:
+        options["progress"] = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        run_scenarios(made, x, **options, **own)
+    monkeypatch.undo()
+    assert_untouched(made, alone)
+    assert_as_alone(run_scenarios(made, x, fs=FS, **own), one_by_one(alone, x, own), made, alone)
+
+
+# ---- Divergence, and samples that are refused
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("cause", ["path", "disturbance"])
+def test_a_scenario_that_diverges_leaves_the_others_alone(cause, kernel):
+    """A true path of the wrong sign; or a disturbance a million times what the amplifier can cancel."""
+    count, bad, n = 11, 8, 1500
+    made, alone, healthy = (filters(count, state_noise=1e-2) for _ in range(3))
+    assert made[bad].rated_power is None
+    x, own = differing(count, n)
+    own |= {"amplifier": [HardClipAmplifier(5.0) if cause == "disturbance" else None] * count}
+    own |= {"secondary_path": [np.append(S_HAT, 0.0)] * count}
+    scale = np.where(np.arange(count) == bad, -1.0 if cause == "path" else 1e6, 1.0)[:, None]
+    wrong = "secondary_path" if cause == "path" else "disturbance"
+    given = own | {wrong: list(scale * own[wrong])}
+    options = {"record_powers": True, "rated_power": 1e-4 if cause == "path" else None}  # another limit, an earlier end
+    results = run_scenarios(made, x, fs=FS, kernel=kernel, **given, **options)
+    expected = one_by_one(alone, x, given, **options)
+    rest = [i for i in range(count) if i != bad]
+    assert_as_alone(results, expected, [made[i] for i in rest], [alone[i] for i in rest])
+    assert_close(made[bad].weights, alone[bad].weights)
+    np.testing.assert_array_equal(made[bad].estimator.P, made[0].estimator.P)  # that of the end of the run
+    end = round(results[bad].diverged_at_s * FS)
+    assert 0 < end < n
+    for name in ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor", "disturbance_power"):
+        np.testing.assert_array_equal(np.isnan(getattr(results[bad], name)), np.arange(n) >= end, err_msg=name)
+    undisturbed = run_scenarios(healthy, x, fs=FS, kernel=kernel, **own)
+    assert undisturbed[bad].diverged_at_s is None
+    for i in rest:
+        np.testing.assert_array_equal(results[i].error, undisturbed[i].error)
+        np.testing.assert_array_equal(made[i].weights, healthy[i].weights)
+    made[bad].estimator.x[:] = 0.0
+    assert all(r.diverged_at_s is None for r in run_scenarios(made, x, fs=FS, **own))  # they go on
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("heard", [0, 40, BLOCK + 10])
+def test_a_silent_reference_without_measurement_noise_names_the_sample(heard, kernel):
+    path, counts = [0.5, 0.9, -0.4], []  # x' begins with x, and ends two samples after it
+    silent_from = 0 if heard == 0 else heard + 2 + 7 - 1
+    x, own = differing(3, 600)
+    x = np.where(np.arange(600) < heard, x, 0.0)
+    made, untouched = (filters(3, secondary=path, measurement_noise=0.0) for _ in range(2))
+    with pytest.raises(ValueError, match=rf"silent reference .* tells nothing.* \(sample {silent_from} of the run\)"):
+        run_scenarios(made, x, fs=FS, kernel=kernel, progress=counts.append, **own)
+    assert sum(counts) == 3 * (silent_from // BLOCK) * BLOCK
+    assert_untouched(made, untouched)
+
+
+def test_a_disturbance_whose_square_overflows_names_the_scenario_and_the_sample():
+    x, own = differing(9, 300)
+    own["disturbance"][4, 50] = 1e200
+    made, untouched = filters(9), filters(9)
+    with pytest.raises(ValueError, match=r"controllers\[4\] would overflow in sample 50 of the run"):
+        run_scenarios(made, x, fs=FS, **own)
+    assert_untouched(made, untouched)
+
+
+def test_the_first_scenario_may_diverge_in_its_first_sample():
+    """It never updates, but goes on from the covariance of the others; stepping it leaves theirs alone."""
+    x, own = differing(3, 200)
+    made = filters(3)
+    made[0].estimator.x[0] = 1e9
+    assert made[0].estimator.P[0, 0] == 0.5  # reading it is no edit
+    assert run_scenarios(made, x, fs=FS, **own)[0].diverged_at_s == 0.0
+    np.testing.assert_array_equal(made[0].estimator.P, made[0].estimator.P_post)
+    np.testing.assert_array_equal(made[0].estimator.P, made[1].estimator.P)
+    before = made[1].estimator.P.copy()
+    made[0].control_signal(1.0)
+    made[0].update(1.0)
+    assert not np.array_equal(made[0].estimator.P, before)
+    np.testing.assert_array_equal(made[1].estimator._covariance.full(made[1].estimator._covariance.now), before)
+
+
+# ---- What each scenario may have of its own
+
+
+def test_true_paths_of_different_lengths():
+    x, own = differing(3, 200)
+    ragged = [np.trim_zeros(s, "b") for s in own["secondary_path"]]
+    assert len({s.size for s in ragged}) > 1
+    one, other = (
+        run_scenarios(filters(3), x, fs=FS, **own | {"secondary_path": s}) for s in (own["secondary_path"], ragged)
+    )
+    assert_as_alone(other, one)
+
+
+def test_sensor_noise_in_some_scenarios_only():
+    x, own = differing(3, 200)
+    own["sensor_noise_std"] = [0.0, 0.1, 0.0]
+    made, alone = filters(3), filters(3)
+    assert_as_alone(run_scenarios(made, x, fs=FS, **own), one_by_one(alone, x, own), made, alone)
+
+
+@pytest.mark.parametrize("several", [lambda one: one, lambda one: [one, 1, one]])
+def test_one_generator_for_several_scenarios_is_refused(several):
+    """They would draw from it in turns, and what each gets would depend on the length of the blocks."""
+    x, own = differing(3, 50)
+    with pytest.raises(ValueError, match="rng holds one Generator for several controllers"):
+        run_scenarios(filters(3), x, fs=FS, **own | {"rng": several(np.random.default_rng(0))})
+
+
+def test_one_controller_that_is_no_list_and_signals_of_different_lengths_are_refused():
+    x, own = differing(3, 50)
+    with pytest.raises(TypeError, match=r"controllers must be a sequence of controllers: \[controller\] for one"):
+        run_scenarios(filters(1)[0], x, fs=FS, **own)
+    with pytest.raises(ValueError, match="disturbance must have 50 values, got 49"):
+        run_scenarios(filters(3), x, fs=FS, **own | {"disturbance": [x, x[:-1], x]})
+
+
+@pytest.mark.parametrize("empty", [[], ()])
+def test_an_empty_path_is_refused(empty):
+    x, own = differing(3, 50)
+    with pytest.raises(ValueError, match="secondary_path must have at least 1 value"):
+        run_scenarios(filters(3), x, fs=FS, **own | {"secondary_path": empty})
+
+
+# ---- Refusals
+
+X, OWN = differing(3, 50)
+D = OWN["disturbance"]
+
+
+def one_of_three(alpha=1.0, Q=None, heard=(), **options):
+    """Three filters, the second of other options; or the last ones have heard X of one sign or the other."""
+    made = filters(3)
+    made[1] = filters(2, **options)[1]
+    made[1].estimator.alpha = alpha
+    if Q is not None:
+        made[1].estimator.Q = Q
+    for c, sign in zip(made[::-1], heard, strict=False):
+        simulate(c, sign * X, disturbance=D[0], secondary_path=S, fs=FS)
+    return made
+
+
+HEARD = r"controllers\[2\] must agree in the reference heard so far"
+TWICE = r"controllers\[1\] is in the list twice"
+AGREE = r"controllers\[0\] and controllers\[1\] must agree in "
+REFUSED = [
+    (lambda: [], ValueError, "controllers must hold one controller at least"),
+    (lambda: [*filters(2), FxLMS(7, S_HAT, step_size=0.1)], TypeError, r"controllers\[2\] must be a KalmanController"),
+    (lambda: [*filters(2), "KF-OPC"], TypeError, r"controllers\[2\] must be a KalmanController, got 'KF-OPC'"),
+    (lambda: filters(1) * 3, ValueError, TWICE),
+    (lambda: [KalmanController(k, S) for k in [filters(1)[0].estimator] * 3], ValueError, TWICE),
+    (lambda: one_of_three(n_taps=6), ValueError, AGREE + "n_taps"),
+    (lambda: one_of_three(state_noise=1e-6), ValueError, AGREE + "state noise"),
+    (lambda: one_of_three(measurement_noise=0.2), ValueError, AGREE + ".*measurement noise"),
+    (lambda: one_of_three(alpha=1.01), ValueError, AGREE + ".*fading memory"),
+    (lambda: one_of_three(initial_variance=1.0), ValueError, AGREE + "their covariance P"),
+    (lambda: one_of_three(secondary=0.9 * S_HAT), ValueError, AGREE + "their estimated secondary path"),
+    (lambda: one_of_three(secondary=S), ValueError, AGREE + "their estimated secondary path"),
+    (lambda: one_of_three(window="sliding"), ValueError, AGREE + "the length of the sliding windows of their powers"),
+    (lambda: one_of_three(heard=[1]), ValueError, HEARD),
+    (lambda: one_of_three(heard=[-1, 1, 1]), ValueError, HEARD),  # with the same covariance
+    (lambda: one_of_three(Q=np.diag(np.arange(7.0))), ValueError, r"controllers\[1\] takes filterpy's own equations"),
+    ({"amplifier": [None] * 2}, ValueError, "amplifier must be one value or 3, one for each controller, got 2"),
+    ({"rng": [1, 2], "sensor_noise_std": 0.1}, ValueError, "rng must be one value or 3"),
+    ({"sensor_noise_std": [0.1] * 4, "rng": 0}, ValueError, "sensor_noise_std must be one value or 3"),
+    ({"disturbance": D[:2]}, ValueError, "disturbance must be one value or 3"),
+    ({"disturbance": D[:, :-1]}, ValueError, "disturbance must have 50 values, got 49"),
+    ({"secondary_path": [S, S]}, ValueError, "secondary_path must be one value or 3"),
+    ({"secondary_path": [S, S, np.nan * S]}, ValueError, "secondary_path must be finite"),
+    ({"amplifier": math.tanh}, TypeError, "amplifier must be one of the package's models or None, .* use simulate"),
+    ({"amplifier": [None, None, abs]}, TypeError, "amplifier must be one of the package's models or None"),
+    ({"kernel": "fft"}, ValueError, "kernel must be one of 'streaming', 'block', 'pairs', got 'fft'"),
+    ({"primary_path": [1.0]}, ValueError, "either primary_path= or disturbance=, not both"),
+    ({"disturbance": None}, ValueError, "either primary_path= or disturbance=.* not neither"),
+    ({"reference": np.where(X > 1, np.nan, X)}, ValueError, "reference must be finite"),
+    ({"fs": 16000.0}, ValueError, "fs is 16000 Hz but the controller's power memory is for 8000 Hz"),
+    ({"rated_power": 0.0}, ValueError, "rated_power must be greater than 0"),
+    ({"sensor_noise_std": 0.1}, TypeError, "rng must be a seed or a numpy.random.Generator"),
+    ({"switch_on_s": 50 / FS}, ValueError, "switch_on_s must leave samples to control"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "kind", "message"), REFUSED, ids=[message[:60] for *_, message in REFUSED])
+def test_refused_with_nothing_changed(wrong, kind, message):
+    options = {"reference": X, "disturbance": D, "secondary_path": S, "fs": FS, "switch_on_s": 10 / FS}
+    made = wrong() if callable(wrong) else filters(3)
+    if not callable(wrong):  # with all in order they run, before and after
+        run_scenarios(made, **options)
+        options |= wrong
+    before = [leaves(c) for c in made]
+    with pytest.raises(kind, match=message):
+        run_scenarios(made, **options)
+    for c, state in zip(made, before, strict=True):
+        for now, then in zip(leaves(c), state, strict=True):
+            np.testing.assert_array_equal(now, then)
+    if not callable(wrong):
+        run_scenarios(made, X, disturbance=D, secondary_path=S, fs=FS)

@@ -1,0 +1,320 @@
+"""`simulate`: what it records, users' own controllers and amplifiers, divergence as a result."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import (
+    FxLMS,
+    HardClipAmplifier,
+    KalmanController,
+    MOVFxLMS,
+    SoftSaturationAmplifier,
+    kf_anc,
+    kf_opc,
+    simulate,
+)
+from kfopc_filterpy.filters import RandomWalkKFOPC
+from kfopc_filterpy.loop import simulation
+from kfopc_filterpy.paths import fir_path
+
+S = np.array([0.0, 0.9, -0.4])
+MAKERS = {
+    "KF-ANC": lambda s=S, **options: kf_anc(6, s, **{"state_noise": 1e-6, "measurement_noise": 0.01} | options),
+    "KF-OPC": lambda s=S, **options: kf_opc(
+        6, s, **{"rated_power": 0.2, "state_noise": 1e-6, "measurement_noise": 0.01} | options
+    ),
+    "FxLMS": lambda s=S, **options: FxLMS(6, s, **{"step_size": 0.01} | options),
+    "MOV-FxLMS": lambda s=S, **options: MOVFxLMS(6, s, **{"step_size": 0.01, "rated_power": 0.2} | options),
+}
+
+
+def noises(n=300, seed=0):
+    x, other = np.random.default_rng(seed).standard_normal((2, n))
+    return x, np.convolve(x, [0.0, 0.0, 1.0, 0.5])[:n] + 0.1 * other
+
+
+X, D = noises()
+
+
+def assert_same_run(one, two):
+    for field in dataclasses.fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
+
+
+# ---- What is recorded
+
+
+def test_the_result():
+    result = simulate(MAKERS["KF-OPC"](), X, disturbance=D, secondary_path=S, fs=16000)
+    for name in ("reference", "disturbance", "error", "control_signal", "amplifier_output", "anti_noise"):
+        assert getattr(result, name).shape == X.shape
+        assert np.all(np.isfinite(getattr(result, name)))
+    np.testing.assert_array_equal(result.error, D - result.anti_noise)
+    np.testing.assert_allclose(result.anti_noise, np.convolve(result.amplifier_output, S)[: X.size], atol=1e-14)
+    np.testing.assert_array_equal(result.time_s, np.arange(X.size) / 16000)
+    assert (result.algorithm, result.rated_power, result.diverged_at_s) == ("KF-OPC", 0.2, None)
+    for name in ("weights", "weights_time_s", "disturbance_power", "secondary_path_gain"):
+        assert getattr(result, name) is None  # not asked for
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        result.error = D
+
+
+def test_the_result_is_no_view_of_what_was_given():
+    x, d = X.copy(), D.copy()
+    result = simulate(MAKERS["FxLMS"](), x, disturbance=d, secondary_path=S)
+    x[:], d[:] = 0.0, 0.0
+    np.testing.assert_array_equal(result.reference, X)
+    np.testing.assert_array_equal(result.disturbance, D)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("every", [1, 7, 100, 299, 300, 1000])
+def test_weights_are_recorded_after_samples_0_k_2k(every, compiled):
+    whole = simulate(MAKERS["KF-OPC"](), X, disturbance=D, secondary_path=S, record_weights_every=1)
+    result = simulate(
+        MAKERS["KF-OPC"](), X, disturbance=D, secondary_path=S, record_weights_every=every, compiled=compiled
+    )
+    np.testing.assert_array_equal(result.weights, whole.weights[::every])
+    np.testing.assert_array_equal(result.weights_time_s, whole.time_s[::every])
+    np.testing.assert_array_equal(result.error, whole.error)
+
+
+@pytest.mark.parametrize("given", ["taps", "system"])
+def test_primary_path_makes_the_disturbance(given):
+    p = np.random.default_rng(5).standard_normal(40)
+    primary, secondary = (p, S) if given == "taps" else (fir_path(p, 16000.0), fir_path(S, 16000.0))
+    result = simulate(MAKERS["FxLMS"](), X, primary_path=primary, secondary_path=secondary)
+    expected = [sum(p[k] * X[n - k] for k in range(min(40, n + 1))) for n in range(X.size)]
+    np.testing.assert_allclose(result.disturbance, expected, rtol=0, atol=1e-13)
+
+
+def test_sensor_noise_is_in_the_error_alone():
+    rng = np.random.default_rng(8)
+    result = simulate(
+        MAKERS["FxLMS"](), X, disturbance=D, secondary_path=S, sensor_noise_std=0.3, rng=8, record_powers=True
+    )
+    noise = result.error - (result.disturbance - result.anti_noise)
+    np.testing.assert_allclose(noise, 0.3 * rng.standard_normal(X.size), rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(result.disturbance, D)
+    again = simulate(
+        MAKERS["FxLMS"](), X, disturbance=D, secondary_path=S, sensor_noise_std=0.3, rng=np.random.default_rng(8)
+    )
+    np.testing.assert_array_equal(result.error, again.error)
+
+
+def test_built_in_controllers_do_run_compiled(monkeypatch):
+    def steps(*arguments):
+        raise AssertionError("stepped")
+
+    monkeypatch.setattr(simulation, "_run_steps", steps)
+    for make in MAKERS.values():
+        for amplifier in (None, HardClipAmplifier(1.0), SoftSaturationAmplifier(1.0)):
+            simulate(make(), X, disturbance=D, secondary_path=S, amplifier=amplifier, progress=lambda n: None)
+    with pytest.raises(AssertionError, match="stepped"):
+        simulate(MAKERS["FxLMS"](), X, disturbance=D, secondary_path=S, compiled=False)
+
+
+# ---- Users' own parts
+
+
+class Integrator:
+    """A user's own controller: two methods, nothing else."""
+
+    def __init__(self):
+        self.gain, self.x = 0.0, 0.0
+
+    def control_signal(self, reference):
+        self.x = reference
+        return self.gain * reference
+
+    def update(self, error):
+        self.gain += 0.05 * error * self.x
+
+
+def test_a_users_own_controller_plugs_in():
+    result = simulate(Integrator(), X, disturbance=0.7 * X, secondary_path=[1.0], record_powers=True)
+    gain, expected = 0.0, []
+    for x in X:
+        expected.append((0.7 - gain) * x)
+        gain += 0.05 * expected[-1] * x
+    np.testing.assert_allclose(result.error, expected, rtol=0, atol=1e-14)
+    assert (result.algorithm, result.rated_power) == ("Integrator", None)
+    for name in ("constraint_factor", "disturbance_power", "secondary_path_gain"):
+        assert np.all(np.isnan(getattr(result, name)))  # it does not say
+
+
+def test_a_users_own_controller_may_say_more():
+    class Talkative(Integrator):
+        name, rated_power, constraint_factor, disturbance_power, secondary_path_gain = "mine", 4.0, 0.5, 2.0, None
+        heard = None
+
+        @property
+        def weights(self):
+            return [[self.gain], [-self.gain]]  # (2, 1), as filterpy's x
+
+        def listen(self, references, errors):
+            self.heard = references.copy(), errors.copy()
+
+    made = Talkative()
+    result = simulate(
+        made,
+        X,
+        disturbance=0.7 * X,
+        secondary_path=[1.0],
+        switch_on_s=100 / 16000,
+        record_weights_every=10,
+        record_powers=True,
+    )
+    np.testing.assert_array_equal(made.heard, (X[:100], 0.7 * X[:100]))
+    assert (result.algorithm, result.rated_power, result.error.size) == ("mine", 4.0, 200)
+    assert result.weights.shape == (20, 2)
+    np.testing.assert_array_equal(result.weights[:, 0], -result.weights[:, 1])
+    assert set(result.constraint_factor) == {0.5}
+    assert set(result.disturbance_power) == {2.0}
+    assert np.all(np.isnan(result.secondary_path_gain))
+
+
+def test_numpy_scalars_and_one_element_arrays_are_samples():
+    class Arrays(Integrator):
+        def control_signal(self, reference):
+            return np.array([[super().control_signal(reference)]])
+
+    one, other = (
+        simulate(made, X, disturbance=X, secondary_path=[1.0], amplifier=amplifier)
+        for made, amplifier in ((Integrator(), np.tanh), (Arrays(), lambda y: np.array([np.tanh(y)])))
+    )
+    np.testing.assert_array_equal(one.error, other.error)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_users_own_amplifier(name):
+    result = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=math.tanh)
+    np.testing.assert_array_equal(result.amplifier_output, [math.tanh(y) for y in result.control_signal])
+    clip = HardClipAmplifier(0.4)
+    own = simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=lambda y: clip(y))
+    assert_same_run(own, simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, amplifier=clip))
+
+
+@pytest.mark.parametrize("family", [FxLMS, KalmanController, RandomWalkKFOPC])
+def test_a_subclass_is_asked_not_its_parent(family):
+    """What a user's subclass overrides is called: the compiled loop knows the built-in equations only."""
+    calls = []
+
+    class Mine(family):
+        def update(self, *arguments, **keywords):
+            calls.append(arguments)
+            super().update(*arguments, **keywords)
+
+    if family is FxLMS:
+        made = Mine(6, S, step_size=0.01)
+    elif family is KalmanController:
+        made = Mine(RandomWalkKFOPC(6, state_noise=1e-6, measurement_noise=0.01), S)
+    else:
+        made = KalmanController(Mine(6, state_noise=1e-6, measurement_noise=0.01), S)
+    result = simulate(made, X, disturbance=D, secondary_path=S)
+    assert len(calls) == X.size
+    built_in = MAKERS["FxLMS" if family is FxLMS else "KF-ANC"]()
+    np.testing.assert_array_equal(result.error, simulate(built_in, X, disturbance=D, secondary_path=S).error)
+
+
+# ---- Divergence is a result
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", MAKERS)
+def test_divergence_is_a_result(name, compiled):
+    x, d = noises(3000)
+    options = {"step_size": 1.0} if "LMS" in name else {"state_noise": 1e-2}
+    made = MAKERS[name](-S, **options)  # the wrong sign: the loop feeds back positively
+    if name == "KF-OPC":
+        made.estimator.constraint_factor = 1.0  # left to eq. 13 it does not diverge, see test_controllers
+    run = {"disturbance": d, "secondary_path": S, "fs": 16000, "rated_power": 0.25, "compiled": compiled}
+    result = simulate(made, x, record_weights_every=10, record_powers=True, **run)
+    assert result.diverged_at_s is not None
+    end = round(result.diverged_at_s * 16000)
+    assert 0 < end < 3000
+    assert result.diverged_at_s == end / 16000
+    for signal in (
+        "error",
+        "control_signal",
+        "amplifier_output",
+        "anti_noise",
+        "constraint_factor",
+        "disturbance_power",
+        "secondary_path_gain",
+    ):
+        assert np.all(np.isfinite(getattr(result, signal)[:end])), signal
+        assert np.all(np.isnan(getattr(result, signal)[end:])), signal
+    rows = -(-end // 10)
+    assert np.all(np.isfinite(result.weights[:rows]))
+    assert np.all(np.isnan(result.weights[rows:]))
+    assert np.max(np.abs(result.control_signal[:end])) <= 0.5e6
+    np.testing.assert_array_equal(result.disturbance, d)  # what was given stays
+    assert simulate(made, x, **run).diverged_at_s is not None  # it goes on from where it is: no exception either
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", ["FxLMS", "MOV-FxLMS"])
+def test_weights_that_overflow_at_once_are_a_divergence_too(name, compiled):
+    d = np.where(np.arange(X.size) < 20, 0.0, D)  # the first step adapts every weight, to inf and -inf: y is NaN
+    made = MAKERS[name](step_size=1e308)
+    result = simulate(made, 100 * X, disturbance=100 * d, secondary_path=S, compiled=compiled)
+    assert result.diverged_at_s == 21 / 16000
+    assert np.isnan(made.control_signal(1.0))
+
+
+def test_divergence_comes_past_1e6_of_the_rated_amplitude():
+    class Ramp:
+        def __init__(self):
+            self.n = 0
+
+        def control_signal(self, reference):
+            self.n += 1
+            return (-10.0) ** (self.n - 1)
+
+        def update(self, error):
+            pass
+
+    def diverged_at(**options):
+        return simulate(Ramp(), X, disturbance=D, secondary_path=S, fs=8000, **options).diverged_at_s * 8000
+
+    assert diverged_at() == 7  # 1e6 itself is within
+    assert diverged_at(rated_power=1e-4) == 5
+    assert diverged_at(rated_power=1e4) == 9
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_users_controller_that_returns_no_number_has_diverged(bad):
+    class Broken(Integrator):
+        n = 0
+
+        def control_signal(self, reference):
+            self.n += 1
+            return 0.0 if self.n <= 5 else bad
+
+        def update(self, error):
+            assert math.isfinite(error)
+            assert self.n <= 5  # not told of a sample that was not played
+
+    result = simulate(Broken(), X, disturbance=D, secondary_path=S)
+    assert result.diverged_at_s == 5 / 16000
+    np.testing.assert_array_equal(np.isnan(result.error), np.arange(X.size) >= 5)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_divergence_at_the_first_sample(name):
+    made = MAKERS[name]()
+    if isinstance(made, KalmanController):
+        made.estimator.x[0] = 1e9
+        result = simulate(made, X, disturbance=D, secondary_path=S, record_weights_every=50)
+        assert result.diverged_at_s == 0.0
+        assert np.all(np.isnan(result.weights))
+
+
+def test_a_result_is_read_only() -> None:
+    result = simulate(FxLMS(2, [1.0], step_size=0.1), np.ones(5), secondary_path=[1.0], disturbance=np.ones(5))
+    with pytest.raises(ValueError, match="read-only"):
+        result.error[0] = 0.0

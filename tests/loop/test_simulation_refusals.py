@@ -1,0 +1,253 @@
+"""What `simulate` refuses, with nothing changed; silence, and updates without a solution."""
+
+import copy
+
+import control
+import numpy as np
+import pytest
+from test_simulation import MAKERS, D, Integrator, S, X
+
+from kfopc_filterpy import FxLMS, MOVFxLMS, kf_opc, simulate
+from kfopc_filterpy.paths import fir_path
+
+
+def state_of(made):
+    """Every number that a controller keeps."""
+    leaves = []
+
+    def collect(value):
+        if isinstance(value, np.ndarray):
+            leaves.append(value.copy())
+        elif isinstance(value, tuple):
+            for item in value:
+                collect(item)
+
+    collect(made._state)
+    collect(made.constraint.state)
+    if hasattr(made, "estimator"):
+        collect((made.estimator.x.copy(), made.estimator.P.copy(), made.estimator.K.copy()))
+    return leaves
+
+
+REFUSED = [
+    ({"reference": X[:0], "disturbance": D[:0]}, ValueError, "reference must have at least 1 value"),
+    ({"reference": X[:, None]}, ValueError, "reference must be one-dimensional"),
+    ({"reference": np.where(X > 2, np.nan, X)}, ValueError, "reference must be finite"),
+    ({"reference": ["a"] * 300}, TypeError, "reference must be a sequence of real numbers"),
+    ({"disturbance": np.where(D > 2, np.inf, D)}, ValueError, "disturbance must be finite"),
+    ({"disturbance": D[:-1]}, ValueError, "disturbance must have 300 values, got 299"),
+    ({"primary_path": [1.0]}, ValueError, "either primary_path= or disturbance=, not both"),
+    ({"disturbance": None}, ValueError, "either primary_path= or disturbance=.* not neither"),
+    ({"disturbance": None, "primary_path": [np.nan]}, ValueError, "primary_path must be finite"),
+    ({"secondary_path": []}, ValueError, "secondary_path must have at least 1 value"),
+    ({"secondary_path": [1.0, np.inf]}, ValueError, "secondary_path must be finite"),
+    ({"secondary_path": fir_path(S, 8000.0)}, ValueError, "secondary_path is sampled at 8000 Hz but fs is 16000 Hz"),
+    (
+        {"disturbance": None, "primary_path": fir_path(S, 44100.0)},
+        ValueError,
+        "primary_path is sampled at 44100 Hz but fs is 16000 Hz",
+    ),
+    ({"feedback_path": fir_path(S, 8000.0)}, ValueError, "feedback_path is sampled at 8000 Hz"),
+    ({"secondary_path": control.TransferFunction([1.0], [1.0, 2.0])}, ValueError, "must be a discrete-time system"),
+    ({"feedback_path": [0.1, 0.2]}, ValueError, "feedback_path must have a delay .* first tap is 0.1, not 0"),
+    ({"amplifier": 2.0}, TypeError, "amplifier must be a function of a sample, or None, got 2.0"),
+    ({"fs": 0.0}, ValueError, "fs must be greater than 0 Hz"),
+    ({"fs": np.nan}, ValueError, "fs must be finite"),
+    ({"rated_power": -1.0}, ValueError, "rated_power must be greater than 0"),
+    ({"sensor_noise_std": -0.1, "rng": 0}, ValueError, "sensor_noise_std must not be negative, got -0.1"),
+    ({"sensor_noise_std": 0.1}, TypeError, "rng must be a seed or a numpy.random.Generator"),
+    ({"switch_on_s": -1.0}, ValueError, "switch_on_s must not be negative"),
+    ({"switch_on_s": 300 / 16000}, ValueError, "switch_on_s must leave samples to control"),
+    ({"switch_on_s": 1.0}, ValueError, "switch_on_s must leave samples to control"),
+    ({"record_weights_every": 0}, ValueError, "record_weights_every must be at least 1"),
+    ({"record_weights_every": 0.5}, TypeError, "record_weights_every must be a whole number"),
+]
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(("wrong", "kind", "message"), REFUSED, ids=[message[:40] for _, _, message in REFUSED])
+def test_refused_with_nothing_changed(name, wrong, kind, message):
+    made = MAKERS[name]()
+    simulate(made, X, disturbance=D, secondary_path=S)
+    before = state_of(made)
+    arguments = {"reference": X, "disturbance": D, "secondary_path": S} | wrong
+    if "switch_on_s" not in arguments:
+        arguments["switch_on_s"] = 0.001  # it must be refused before it listens
+    with pytest.raises(kind, match=message):
+        simulate(made, arguments.pop("reference"), **arguments)
+    for one, other in zip(before, state_of(made), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("wrong", [None, 3.0, FxLMS, Integrator, object(), np.sin], ids=str)
+def test_refuses_what_is_no_controller(wrong):
+    with pytest.raises(TypeError, match=r"controller must have control_signal\(reference\) and update\(error\)"):
+        simulate(wrong, X, disturbance=D, secondary_path=S)
+
+
+def test_refuses_what_a_users_controller_cannot_do():
+    with pytest.raises(ValueError, match="switch_on_s needs a controller with a method listen"):
+        simulate(Integrator(), X, disturbance=D, secondary_path=S, switch_on_s=0.001)
+    with pytest.raises(ValueError, match="record_weights_every needs a controller with an attribute weights"):
+        simulate(Integrator(), X, disturbance=D, secondary_path=S, record_weights_every=1)
+
+
+@pytest.mark.parametrize("returned", [None, "loud", [1.0, 2.0]])
+def test_refuses_what_is_no_sample(returned):
+    class Wrong(Integrator):
+        def control_signal(self, reference):
+            return returned
+
+    with pytest.raises(TypeError, match="control_signal must return one number, got"):
+        simulate(Wrong(), X, disturbance=D, secondary_path=S)
+    with pytest.raises(TypeError, match="amplifier must return one number, got"):
+        simulate(Integrator(), X, disturbance=D, secondary_path=S, amplifier=lambda y: returned)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_refuses_an_amplifier_that_returns_nan(name):
+    made = MAKERS[name]()
+    with pytest.raises(ValueError, match=r"amplifier must return a finite number, got nan for 0\.0"):
+        simulate(made, X, disturbance=D, secondary_path=S, amplifier=lambda y: np.nan)
+    assert np.all(np.isfinite(made.weights))
+
+
+def test_errors_of_a_users_controller_pass_with_the_sample_named():
+    class Failing(Integrator):
+        def update(self, error):
+            raise KeyError("mine")
+
+    with pytest.raises(KeyError, match="mine") as caught:
+        simulate(Failing(), X, disturbance=D, secondary_path=S)
+    assert caught.value.__notes__ == ["in sample 0 of the run"]
+
+
+def test_refuses_a_controller_made_for_another_sample_rate():
+    message = "fs is 16000 Hz but the controller's {} is for 8000 Hz"
+    for make in MAKERS.values():
+        with pytest.raises(ValueError, match=message.format("secondary path")):
+            simulate(make(fir_path(S, 8000.0)), X, disturbance=D, secondary_path=S)
+        simulate(make(fir_path(S, 16000.0)), X, disturbance=D, secondary_path=S)
+    constrained = [
+        kf_opc(6, S, rated_power=0.2, state_noise=1e-6, measurement_noise=0.01, fs=8000),
+        MOVFxLMS(6, S, step_size=0.01, rated_power=0.2, fs=8000),
+    ]
+    for made in constrained:
+        with pytest.raises(ValueError, match=message.format("power memory")):
+            simulate(made, X, disturbance=D, secondary_path=S)
+        simulate(made, X, disturbance=D, secondary_path=S, fs=8000)
+    for name in ("KF-ANC", "FxLMS"):  # they know no seconds
+        simulate(MAKERS[name](), X, disturbance=D, secondary_path=S, fs=8000)
+
+
+# ---- Silence, and updates without a solution
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_silent_reference_leaves_everything_alone(name, compiled):
+    silent = np.zeros(100)
+    result = simulate(
+        MAKERS[name](), silent, disturbance=D[:100], secondary_path=S, record_powers=True, compiled=compiled
+    )
+    np.testing.assert_array_equal(result.control_signal, 0.0)
+    np.testing.assert_array_equal(result.error, D[:100])
+    np.testing.assert_array_equal(result.constraint_factor, 1.0)  # no gain known: alpha = 1
+    assert np.all(np.isnan(result.secondary_path_gain))
+    made = MAKERS[name]()
+    quiet = simulate(made, silent, disturbance=silent, secondary_path=S, compiled=compiled)
+    np.testing.assert_array_equal(quiet.constraint_factor, 1.0)  # no disturbance: alpha = 1
+    np.testing.assert_array_equal(made.weights, 0.0)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_noise_that_has_not_come_through_the_path_yet_does_no_harm(compiled):
+    """Disturbance and reference from the first sample on, filtered reference zero: G_s = 0 and alpha = 0."""
+    late = np.concatenate([np.zeros(5), [1.0]])
+    for name in ("KF-OPC", "MOV-FxLMS"):
+        result = simulate(
+            MAKERS[name](late), X, disturbance=D + 1.0, secondary_path=late, record_powers=True, compiled=compiled
+        )
+        assert result.diverged_at_s is None
+        np.testing.assert_array_equal(result.secondary_path_gain[:5], 0.0)
+        np.testing.assert_array_equal(result.constraint_factor[:5], 0.0)
+        assert np.all(np.isfinite(result.error))
+
+
+@pytest.mark.parametrize("heard", [0, 40])
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+def test_silent_reference_without_measurement_noise_is_a_clear_error(name, heard):
+    x = np.where(np.arange(X.size) < heard, X, 0.0)
+    path = [0.5, 0.9, -0.4]  # x' begins with x, and ends two samples after it
+    silent_from = 0 if heard == 0 else heard + 2 + 6 - 1
+    left = []
+    for compiled in (True, False):
+        made = MAKERS[name](path, measurement_noise=0.0)
+        with pytest.raises(ValueError, match=r"silent reference .* tells nothing: give R > 0") as caught:
+            simulate(made, x, disturbance=D, secondary_path=path, compiled=compiled)
+        assert caught.value.__notes__ == [f"in sample {silent_from} of the run"]
+        left.append(copy.deepcopy(made.estimator))
+        made.estimator.R = 0.01  # with the cure it goes on
+        assert np.all(np.isfinite(simulate(made, X, disturbance=D, secondary_path=path).error))
+    np.testing.assert_array_equal(left[0].x, left[1].x)
+    np.testing.assert_array_equal(left[0].K, left[1].K)
+    # the compiled step is taken back to rounding before the other refuses it
+    np.testing.assert_allclose(left[0].P, left[1].P, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(left[0].P_post, left[1].P_post, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_an_update_without_a_solution_leaves_the_samples_before_it(compiled):
+    """r = q = 0: after the first samples of a tone P is singular on x', S is rounding, and in the end not positive."""
+    x = np.cos(0.3 * np.arange(400))
+    made = MAKERS["KF-ANC"]([1.0], state_noise=0.0, measurement_noise=0.0)
+    with pytest.raises(ValueError, match=r"S = H P H' \+ R must be positive|update has no solution") as caught:
+        simulate(made, x, disturbance=x, secondary_path=[1.0], compiled=compiled)
+    refused = int(caught.value.__notes__[0].split()[2])
+    assert refused > 0
+    before = MAKERS["KF-ANC"]([1.0], state_noise=0.0, measurement_noise=0.0)
+    simulate(before, x[:refused], disturbance=x[:refused], secondary_path=[1.0], compiled=compiled)
+    for name in ("x", "K", "S", "y", "z"):
+        np.testing.assert_array_equal(getattr(made.estimator, name), getattr(before.estimator, name))
+    np.testing.assert_allclose(made.estimator.P_post, before.estimator.P_post, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("fading", [1.0, 1.01])
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+def test_a_refused_step_is_taken_back(name, fading):
+    """S overflows at sample 50, with a downdate owed: what the estimator has is what 50 samples left."""
+    x = X.copy()
+    x[50] = 1e153
+    quiet = np.zeros(X.size)  # the weights stay 0, or the control signal would diverge before S does
+    kalman = {"state_noise": 1e3, "measurement_noise": 1e6, "initial_variance": 1e4}
+    made, stepped, before = (MAKERS[name]([1.0, 0.5], **kalman) for _ in range(3))
+    for controller in (made, stepped, before):
+        controller.estimator.alpha = fading
+    for controller, compiled in ((made, True), (stepped, False)):
+        with pytest.raises(ValueError, match=r"S = H P H' \+ R must be positive, got inf") as caught:
+            simulate(controller, x, disturbance=quiet, secondary_path=[1.0, 0.5], compiled=compiled)
+        assert caught.value.__notes__ == ["in sample 50 of the run"]
+    simulate(before, x[:50], disturbance=quiet[:50], secondary_path=[1.0, 0.5])
+    kf, expected = made.estimator, before.estimator
+    for attribute in ("x", "K", "S", "y", "z", "log_likelihood", "disturbance_power", "secondary_path_gain"):
+        np.testing.assert_array_equal(getattr(kf, attribute), getattr(expected, attribute), err_msg=attribute)
+    np.testing.assert_allclose(kf.P_post, expected.P_post, rtol=0, atol=1e-14 * np.max(expected.P_post))
+    # as after any refused update, the prediction before it stands
+    np.testing.assert_allclose(kf.P, stepped.estimator.P, rtol=0, atol=1e-14 * np.max(kf.P))
+    expected.predict()
+    np.testing.assert_allclose(kf.P, expected.P, rtol=0, atol=1e-14 * np.max(kf.P))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+def test_a_sample_whose_square_overflows_is_refused(name, compiled):
+    d = D.copy()
+    d[50] = 1e200
+    made, before = MAKERS[name](), MAKERS[name]()
+    with pytest.raises(ValueError, match="measurement must have a finite square"):
+        simulate(made, X, disturbance=d, secondary_path=S, compiled=compiled)
+    simulate(before, X[:50], disturbance=D[:50], secondary_path=S)
+    np.testing.assert_array_equal(made.weights, before.weights)
+    assert made.disturbance_power == before.disturbance_power
+    with pytest.raises(ValueError, match="finite squares: those of sample 50 overflow"):
+        MAKERS[name]().listen(X, d)

@@ -1,0 +1,174 @@
+"""The duct against closed-form resonances, travel times and an image-source sum in the time domain."""
+
+import dataclasses
+
+import control
+import numpy as np
+import pytest
+import scipy.signal
+
+from kfopc_filterpy.bounds.wiener import wiener_solution
+from kfopc_filterpy.paths.analysis import frequency_response
+from kfopc_filterpy.paths.causality import causality_margin
+from kfopc_filterpy.paths.duct import duct_paths
+from kfopc_filterpy.paths.models import path_taps
+
+FS = 16000.0
+SPEED = 343.0
+# Loudspeaker in one end, microphone at the other: the response is then a constant over 1 - r0 rL g(2L).
+ENDS = {"source_m": 0.0, "reference_m": 0.0, "loudspeaker_m": 0.0, "loudspeaker_resonance_hz": None}
+
+
+def _peaks(path, count):
+    frequencies = np.arange(5.0, 1500.0, 0.05)
+    magnitude = np.abs(np.fft.rfft(path_taps(path), int(FS / 0.05)))[100:30000]
+    found = scipy.signal.find_peaks(magnitude, prominence=0.2 * magnitude.max())[0]
+    return frequencies[found][:count]
+
+
+@pytest.mark.parametrize(
+    ("reflection", "closed_form"),
+    [
+        ((0.7, 0.7), lambda n: n * SPEED / (2 * 2.0)),  # rigid-rigid: n c / 2L
+        ((-0.7, -0.7), lambda n: n * SPEED / (2 * 2.0)),  # open-open
+        ((0.7, -0.7), lambda n: (2 * n - 1) * SPEED / (4 * 2.0)),  # rigid-open: (2n - 1) c / 4L
+    ],
+)
+def test_lossless_resonances_are_the_closed_form(reflection, closed_form):
+    duct = duct_paths(
+        length_m=2.0,
+        error_m=2.0,
+        reflection=reflection,
+        attenuation_db_per_m=0.0,
+        **ENDS,
+    )
+    expected = closed_form(np.arange(1, 9))
+    np.testing.assert_allclose(duct.resonances_hz[:8], expected, rtol=1e-12)
+    # 0.1 Hz: two steps of the frequency grid; the cut of the tail at -54 dB moves a peak by less.
+    np.testing.assert_allclose(_peaks(duct.secondary, 8), expected, atol=0.1)
+
+
+def test_wall_loss_lowers_resonances_by_its_dispersion():
+    duct = duct_paths(length_m=2.0, error_m=2.0, reflection=(0.7, 0.7), **ENDS)
+    nepers = 1.0 / (20 * np.log10(np.e))
+    f = duct.resonances_hz[:8]
+    # Phase over a round trip: 2 pi f 2L/c + 2L a sqrt(f/1000) = 2 pi n, solved to first order.
+    expected = f - nepers * SPEED * np.sqrt(f / 1000) / (2 * np.pi)
+    # 2 %: second order of a shift of up to 2 %, and the loss itself, which tilts the peaks.
+    np.testing.assert_allclose(_peaks(duct.secondary, 8), expected, rtol=0.02)
+    assert np.all(_peaks(duct.secondary, 8) < f)
+
+
+def test_lossless_secondary_path_is_the_sum_of_its_images():
+    length, speaker, error, (r0, r1), latency = 2.0, 1.2, 1.7, (0.6, -0.5), 0.25e-3
+    duct = duct_paths(
+        length_m=length,
+        loudspeaker_m=speaker,
+        error_m=error,
+        reflection=(r0, r1),
+        attenuation_db_per_m=0.0,
+        loudspeaker_resonance_hz=None,
+    )
+    # Every image by itself, summed at frequencies in the flat part of the band limit.
+    f = np.linspace(50, 6000, 400)
+    total = np.zeros(f.size, complex)
+    for trip in range(60):
+        gain, travelled = (r0 * r1) ** trip, 2 * length * trip
+        for factor, distance in (
+            (1.0, error - speaker),
+            (r0, error + speaker),
+            (r1, 2 * length - error - speaker),
+            (r0 * r1, 2 * length - error + speaker),
+        ):
+            total += gain * factor * np.exp(-2j * np.pi * f * ((travelled + distance) / SPEED + latency))
+    # 1 %: what the cut leaves out, -40 dB.
+    error_rms = np.linalg.norm(frequency_response(duct.secondary, f) - total) / np.linalg.norm(total)
+    assert error_rms < 0.01
+
+
+def test_primary_path_is_the_ratio_of_two_microphones():
+    settings = {"attenuation_db_per_m": 2.0, "reflection": (0.5, -0.5), "source_m": 0.0}
+    at_error = duct_paths(reference_m=None, **settings).primary
+    at_reference = duct_paths(reference_m=None, loudspeaker_m=0.1, error_m=0.8, **settings).primary
+    primary = duct_paths(reference_m=0.8, **settings).primary
+    f = np.linspace(50, 6000, 400)
+    ratio = frequency_response(at_error, f) / frequency_response(at_reference, f)
+    # 1 %: the tails cut off.
+    np.testing.assert_allclose(frequency_response(primary, f), ratio, atol=0.01)
+
+
+def test_default_duct_is_causal_by_its_geometry():
+    duct = duct_paths()
+    assert isinstance(duct.primary, control.TransferFunction)
+    assert duct.primary.dt == duct.secondary.dt == 1 / FS
+    margin = causality_margin(duct.primary, duct.secondary)
+    assert margin.primary_onset_s == pytest.approx(1.65 / SPEED, abs=1 / FS)
+    assert margin.secondary_onset_s == pytest.approx(0.5 / SPEED + 0.25e-3, abs=2 / FS)
+    # (loudspeaker - reference) / c less the electronics: 49.6 samples; onsets are whole samples.
+    assert margin.margin_samples == pytest.approx(FS * (1.15 / SPEED - 0.25e-3), abs=2)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        duct.fs = 1.0
+
+
+def test_response_is_quiet_before_the_wave_arrives():
+    duct = duct_paths()
+    for path, arrival in ((duct.primary, 1.65 / SPEED), (duct.secondary, 0.5 / SPEED + 0.25e-3)):
+        taps = path_taps(path)
+        before = taps[: int(arrival * FS) - 8]
+        # The band limit rings around the arrival; eight samples ahead and earlier, below -30 dB.
+        assert np.sum(before**2) < 1e-3 * np.sum(taps**2)
+
+
+@pytest.mark.parametrize("fs", [8000.0, 16000.0, 48000.0])
+def test_loudspeaker_is_a_second_order_high_pass(fs):
+    ideal = duct_paths(fs=fs, loudspeaker_resonance_hz=None).secondary
+    real = duct_paths(fs=fs, loudspeaker_resonance_hz=100.0, loudspeaker_q=1.5).secondary
+    f = np.array([50.0, 100.0, 200.0, 400.0, 1000.0])
+    s = 1j * f / 100
+    expected = s**2 / (s**2 + s / 1.5 + 1)
+    ratio = frequency_response(real, f) / frequency_response(ideal, f)
+    np.testing.assert_allclose(ratio, expected, atol=0.02)  # tails cut
+
+
+def test_duct_is_controllable_with_256_taps():
+    # Harmonics of 49 Hz and broadband noise to 2 kHz, as of a compressor.
+    rng = np.random.default_rng(3)
+    t = np.arange(40_000) / FS
+    band = scipy.signal.butter(4, [100, 2000], "band", fs=FS, output="sos")
+    reference = 0.3 * scipy.signal.sosfilt(band, rng.standard_normal(t.size))
+    for k in range(1, 21):
+        reference += 0.5 / np.sqrt(k) * np.cos(2 * np.pi * 49 * k * t + rng.uniform(0, 2 * np.pi))
+    duct = duct_paths()
+    disturbance = scipy.signal.lfilter(path_taps(duct.primary), 1.0, reference)
+    solution = wiener_solution(reference, disturbance, duct.secondary, 256)
+    assert solution.noise_reduction_db > 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"error_m": 3.0}, r"positions must satisfy .* error_m = 3"),
+        ({"loudspeaker_m": 0.1}, "positions must satisfy"),
+        ({"loudspeaker_m": 1.9}, "loudspeaker_m < error_m"),
+        ({"source_m": -0.1}, "positions must satisfy"),
+        ({"reflection": (1.0, 0.5)}, "reflection must lie strictly between -1 and 1"),
+        ({"reflection": 0.5}, "reflection must be a pair"),
+        ({"attenuation_db_per_m": -1.0}, "attenuation_db_per_m must not be negative"),
+        ({"electronics_delay_s": -1.0}, "electronics_delay_s must not be negative"),
+        ({"loudspeaker_resonance_hz": 0.0}, "loudspeaker_resonance_hz must be greater than 0"),
+        ({"loudspeaker_q": 0.0}, "loudspeaker_q must be greater than 0"),
+        ({"speed_of_sound": 0.0}, "speed_of_sound must be greater than 0"),
+        ({"length_m": 0.0}, "length_m must be greater than 0"),
+        ({"secondary_taps": 128}, r"secondary_taps = 128 leaves out .* more than -40 dB; .* takes 640"),
+        ({"reflection": (0.999, 0.999), "attenuation_db_per_m": 0.0}, "the response rings too long"),
+        ({"error_m": 1.4001, "electronics_delay_s": 0.0}, "rings before time zero"),
+        ({"primary_taps": 0}, "primary_taps must be at least 1"),
+    ],
+)
+def test_duct_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        duct_paths(**arguments)
+
+
+def test_anechoic_end_leaves_no_resonance():
+    assert duct_paths(reflection=(0.5, 0.0)).resonances_hz.size == 0

@@ -1,0 +1,163 @@
+"""Identification: exact recovery, lstsq as the oracle, what noise and clipping do to it."""
+
+import control
+import numpy as np
+import pytest
+import scipy.signal
+
+from kfopc_filterpy.paths.identification import (
+    estimate_path,
+    identify_secondary_path,
+    misalignment_db,
+    modelling_error_db,
+)
+from kfopc_filterpy.paths.models import bandpass_path, path_taps
+
+FS = 16000.0
+PATH = bandpass_path(32)
+
+
+@pytest.mark.parametrize("excitation", ["white", "sweep"])
+def test_noiseless_identification_is_exact(excitation):
+    result = identify_secondary_path(PATH, n_taps=40, duration_s=1.0, rng=0, excitation=excitation, regularization=0.0)
+    # The sweep excites the lowest frequencies 500 times as much as the highest: digits lost.
+    assert result.misalignment_db < (-250 if excitation == "white" else -150)
+    assert np.all(result.modelling_error_db < -100)
+    assert isinstance(result.estimate, control.TransferFunction)
+    assert result.estimate.dt == 1 / FS
+    np.testing.assert_array_equal(path_taps(result.estimate), result.taps)
+
+
+def test_default_ridge_limits_the_accuracy_as_documented():
+    result = identify_secondary_path(PATH, n_taps=32, duration_s=1.0, rng=0)
+    assert result.misalignment_db == pytest.approx(-100, abs=1)
+
+
+def test_noise_gives_the_error_of_least_squares():
+    # Variance of each tap: noise power / (samples * excitation power).
+    taps, noise, level = path_taps(PATH), 0.1, 2.0
+    results = [
+        identify_secondary_path(taps, fs=FS, n_taps=32, duration_s=1.0, rng=seed, level=level, sensor_noise_std=noise)
+        for seed in range(20)
+    ]
+    error = np.mean([10 ** (result.misalignment_db / 10) for result in results])
+    expected = 32 * noise**2 / (FS * level**2) / np.sum(taps**2)
+    # 20 runs of 32 taps: a standard deviation of 6 %.
+    assert error == pytest.approx(expected, rel=0.25)
+    residual = np.mean([10 ** (result.residual_db / 10) for result in results])
+    assert residual == pytest.approx(noise**2 / (level**2 * np.sum(taps**2) + noise**2), rel=0.05)
+
+
+def test_estimate_of_a_recording_is_dense_least_squares():
+    rng = np.random.default_rng(3)
+    sent = scipy.signal.lfilter([1.0], [1.0, -0.5], rng.standard_normal(2000))
+    heard = scipy.signal.lfilter([0.0, 0.5, 0.2, -0.1], 1.0, sent) + 0.05 * rng.standard_normal(2000)
+    rows = np.array([sent[n - 5 : n + 1][::-1] for n in range(5, 2000)])
+    expected = np.linalg.lstsq(rows, heard[5:], rcond=None)[0]
+    found = estimate_path(sent, heard, 6, FS, regularization=0.0)
+    np.testing.assert_allclose(found.taps, expected, atol=1e-12)
+    residual = np.mean((heard[5:] - rows @ expected) ** 2) / np.mean(heard[5:] ** 2)
+    assert found.residual_db == pytest.approx(10 * np.log10(residual))
+
+
+def test_clipping_biases_the_gain_as_bussgang_says():
+    def clip(u):
+        return np.clip(u, -1.0, 1.0, out=u)  # in place: the excitation must not suffer
+
+    result = identify_secondary_path(PATH, n_taps=32, duration_s=4.0, rng=0, amplifier=clip)
+    # Gaussian noise of variance 1 clipped at 1 keeps erf(1/sqrt(2)) of its linear gain.
+    gain = result.taps @ path_taps(PATH) / np.sum(path_taps(PATH) ** 2)
+    assert gain == pytest.approx(0.682689, abs=0.005)
+    assert result.misalignment_db == pytest.approx(20 * np.log10(1 - 0.682689), abs=0.3)
+
+
+def test_ridge_keeps_what_the_excitation_lacks_from_noise():
+    rng = np.random.default_rng(0)
+    low = scipy.signal.firwin(129, 2000, fs=FS)
+    sent = scipy.signal.lfilter(low, 1.0, rng.standard_normal(16_000))
+    heard = scipy.signal.lfilter(path_taps(PATH), 1.0, sent) + 0.01 * rng.standard_normal(16_000)
+    plain = estimate_path(sent, heard, 32, FS, regularization=0.0)
+    ridge = estimate_path(sent, heard, 32, FS, regularization=1e-3)
+    assert np.linalg.norm(ridge.taps) < 2 * np.linalg.norm(path_taps(PATH)) < np.linalg.norm(plain.taps)
+    in_band = modelling_error_db(PATH, ridge.estimate, np.linspace(200, 1500, 50))
+    assert np.all(in_band < -20)
+
+
+def test_runs_repeat_with_their_seed():
+    first, second = (
+        identify_secondary_path(PATH, n_taps=32, duration_s=0.2, rng=7, sensor_noise_std=0.1) for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.taps, second.taps)
+
+
+def test_frequencies_of_the_error_can_be_chosen():
+    result = identify_secondary_path(PATH, n_taps=16, duration_s=0.2, rng=7, frequencies_hz=[100.0, 1000.0])
+    np.testing.assert_array_equal(result.frequencies_hz, [100.0, 1000.0])
+    omega = 2 * np.pi * np.array([100.0, 1000.0]) / FS
+    true = scipy.signal.freqz(path_taps(PATH), worN=omega)[1]
+    found = scipy.signal.freqz(result.taps, worN=omega)[1]
+    expected = 20 * np.log10(np.abs(found - true) / np.abs(true))
+    np.testing.assert_allclose(result.modelling_error_db, expected, rtol=1e-9)
+
+
+def test_error_measures_have_floors_and_lengths():
+    assert misalignment_db([1.0, 2.0], [1.0, 2.0, 0.0]) == pytest.approx(-300)
+    assert misalignment_db([3.0, 4.0], [3.0]) == pytest.approx(10 * np.log10(16 / 25))
+    np.testing.assert_array_equal(modelling_error_db(PATH, PATH, [100.0]), [-300.0])
+    np.testing.assert_array_equal(modelling_error_db([1.0, -1.0], [1.0, 1.0], [0.0], fs=FS), [300.0])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rng": 0, "excitation": "pink"}, "excitation must be one of 'white', 'sweep'"),
+        ({"rng": 0, "duration_s": 0.001}, "duration_s must be at least 0.00394 s for 32 taps"),
+        ({"rng": 0, "level": 0.0}, "level must be greater than 0"),
+        ({"rng": 0, "sensor_noise_std": -1.0}, "sensor_noise_std must not be negative"),
+        ({"rng": 0, "regularization": -1.0}, "regularization must not be negative"),
+        ({"rng": 0, "fs": 8000.0}, "secondary_path is sampled at 16000 Hz"),
+        ({"rng": 0, "amplifier": lambda u: u[:-1]}, r"amplifier\(excitation\) must have 1600 values"),
+        ({"rng": 0, "amplifier": lambda u: 0 * u}, "response must not be silent"),
+    ],
+)
+def test_identification_refuses(changes, message):
+    with pytest.raises(ValueError, match=message):
+        identify_secondary_path(PATH, **{"n_taps": 32, "duration_s": 0.1, **changes})
+
+
+def test_identification_wants_a_seed():
+    with pytest.raises(TypeError, match="rng must be a seed"):
+        identify_secondary_path(PATH, n_taps=32, duration_s=0.1, rng=None)
+
+
+@pytest.mark.parametrize(
+    ("sent", "heard", "message"),
+    [
+        (np.ones(10), np.ones(9), "response must have 10 values"),
+        (np.ones(4), np.ones(4), "excitation must have at least 7"),
+        (np.zeros(10), np.ones(10), "excitation must not be silent"),
+        (np.ones(10), np.zeros(10), "response must not be silent"),
+    ],
+)
+def test_estimate_refuses(sent, heard, message):
+    with pytest.raises(ValueError, match=message):
+        estimate_path(sent, heard, 4, FS)
+
+
+def test_misalignment_refuses_a_silent_path():
+    with pytest.raises(ValueError, match="path must not be all zeros"):
+        misalignment_db([0.0], [1.0])
+
+
+@pytest.mark.parametrize(("excitation", "peak"), [("white", 20.0), ("sweep", np.sqrt(2) * 2.0)])
+def test_level_is_the_root_mean_square_of_the_excitation(excitation, peak):
+    sent = []
+
+    def record(u):
+        sent.append(u)
+        return u
+
+    identify_secondary_path(PATH, n_taps=32, duration_s=2.0, rng=0, excitation=excitation, level=2.0, amplifier=record)
+    # 32000 samples: noise within 1 %; a sweep's first, partial period weighs about as much.
+    assert np.sqrt(np.mean(sent[0] ** 2)) == pytest.approx(2.0, rel=0.02)
+    assert np.abs(sent[0]).max() <= peak * (1 + 1e-12)

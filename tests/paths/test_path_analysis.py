@@ -1,0 +1,176 @@
+"""Responses, delays, gain and phase error. Oracles: numpy.fft, scipy.signal.group_delay, closed forms."""
+
+import control
+import numpy as np
+import pytest
+import scipy.signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from kfopc_filterpy.paths.analysis import (
+    STABILITY_BOUND_DEG,
+    achieved_band,
+    frequency_response,
+    group_delay,
+    phase_error,
+    secondary_path_gain,
+)
+from kfopc_filterpy.paths.causality import causality_margin
+from kfopc_filterpy.paths.models import bandpass_path, fir_path, perturbed_path
+
+FS = 16000.0
+TAPS = arrays(float, st.integers(1, 30), elements=st.floats(-1, 1)).filter(lambda h: np.abs(h).max() > 0.01)
+
+
+def _iir():
+    numerator, denominator = scipy.signal.butter(3, [500, 3000], "band", fs=FS)
+    return numerator, denominator, control.TransferFunction(numerator, denominator, 1 / FS)
+
+
+@given(taps=TAPS)
+@settings(max_examples=50, deadline=None)
+def test_frequency_response_is_the_dft(taps):
+    frequencies = np.arange(33) * FS / 64
+    expected = np.fft.rfft(taps, 64)
+    # Rounding of a polynomial of 30 terms of size 1.
+    np.testing.assert_allclose(frequency_response(taps, frequencies, fs=FS), expected, atol=1e-12)
+    np.testing.assert_allclose(frequency_response(fir_path(taps, FS), frequencies), expected, atol=1e-12)
+
+
+def test_frequency_response_of_an_infinite_response():
+    numerator, denominator, path = _iir()
+    frequencies = np.array([0.0, 100.0, 1000.0, 8000.0])
+    expected = scipy.signal.freqz(numerator, denominator, worN=frequencies, fs=FS, include_nyquist=True)[1]
+    np.testing.assert_allclose(frequency_response(path, frequencies), expected, atol=1e-12)
+
+
+def test_group_delay_agrees_with_scipy():
+    rng = np.random.default_rng(0)
+    taps = rng.standard_normal(20)
+    numerator, denominator, path = _iir()
+    frequencies = np.linspace(600, 2900, 50)
+    expected = scipy.signal.group_delay((taps, [1.0]), w=frequencies, fs=FS)[1] / FS
+    np.testing.assert_allclose(group_delay(taps, frequencies, fs=FS), expected, rtol=1e-9, atol=1e-13)
+    expected = scipy.signal.group_delay((numerator, denominator), w=frequencies, fs=FS)[1] / FS
+    # A central difference of step 1e-4 rad: 1e-6 samples.
+    np.testing.assert_allclose(group_delay(path, frequencies), expected, atol=1e-6 / FS)
+
+
+def test_group_delay_is_nan_at_a_zero_and_constant_for_linear_phase():
+    assert np.isnan(group_delay([1.0, 0.0, 1.0], [4000.0], fs=FS)[0])
+    delay = group_delay(bandpass_path(32), np.linspace(100, 4500, 50))
+    np.testing.assert_allclose(delay, 15.5 / FS, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: frequency_response([1.0], [9000.0], fs=FS), "frequencies_hz must lie within 0 to fs/2"),
+        (lambda: frequency_response([1.0], [-1.0], fs=FS), "frequencies_hz must lie within"),
+        (lambda: frequency_response([1.0], [100.0]), "fs must be given where path is a tap array"),
+        (lambda: group_delay([1.0], [], fs=FS), "frequencies_hz must have at least 1"),
+        (lambda: phase_error([1.0], bandpass_path(32), [100.0], fs=8000.0), "estimate is sampled at 16000"),
+        (lambda: achieved_band([1.0], 3.0, fs=FS), "level_db must be negative"),
+        (lambda: achieved_band([0.0], fs=FS), "path must not be all zeros"),
+        (lambda: secondary_path_gain([1.0], band=(1.0, 2.0), reference=[1.0]), "exclude each other"),
+        (lambda: secondary_path_gain([1.0], band=(1.0, 2.0)), "fs must be given"),
+        (lambda: secondary_path_gain([1.0, 1.0], reference=[1.0]), "reference must have at least 2"),
+        (lambda: secondary_path_gain([1.0], reference=[0.0, 0.0]), "reference must not be silent"),
+        (lambda: secondary_path_gain([1.0], band=(9.0, 1.0), fs=FS), "band must satisfy"),
+        (lambda: causality_margin([0.0], [1.0], fs=FS), "primary must not be all zeros"),
+        (lambda: causality_margin([1.0], [0.0], fs=FS), "secondary must not be all zeros"),
+        (lambda: causality_margin([1.0], [1.0], fs=FS, onset_share=1.0), "onset_share must be below 1"),
+        (lambda: causality_margin([1.0], bandpass_path(32), fs=8000.0), "secondary is sampled at 16000"),
+        (lambda: causality_margin(_iir()[2], [1.0], fs=FS), "primary has an infinite impulse response"),
+    ],
+)
+def test_analysis_refuses(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@given(primary=st.integers(0, 60), secondary=st.integers(0, 60), gain=st.floats(0.1, 10))
+@settings(max_examples=25, deadline=None)
+def test_causality_margin_of_delays_is_their_difference(primary, secondary, gain):
+    p, s = np.zeros(64), np.zeros(64)
+    p[primary], s[secondary] = gain, -1.0
+    margin = causality_margin(p, s, fs=FS)
+    assert margin.margin_samples == pytest.approx(primary - secondary, abs=1e-9)
+    assert margin.group_delay_margin_samples == pytest.approx(primary - secondary, abs=1e-9)
+    assert margin.margin_s == pytest.approx((primary - secondary) / FS, abs=1e-12)
+
+
+def test_mean_group_delay_over_all_frequencies_is_the_centre_of_energy():
+    taps = np.random.default_rng(1).standard_normal(40)
+    centre = np.sum(np.arange(40) * taps**2) / np.sum(taps**2)  # Parseval
+    margin = causality_margin(taps, [1.0], fs=FS)
+    assert margin.primary_delay_s * FS == pytest.approx(centre, rel=1e-12)
+
+
+def test_mean_group_delay_over_a_band_heeds_the_band():
+    # A low band that arrives at 10 samples and a high one at 50, both linear in phase.
+    low = np.pad(scipy.signal.firwin(65, 1000, fs=FS), (10, 50))
+    high = np.pad(scipy.signal.firwin(65, 6000, fs=FS, pass_zero=False), (50, 10))
+    for band, delay in (((0.0, 600.0), 42), ((6500.0, 8000.0), 82)):
+        margin = causality_margin(low + high, [1.0], fs=FS, band=band)
+        assert margin.primary_delay_s * FS == pytest.approx(delay, abs=0.1)
+
+
+@given(taps=TAPS, low=st.floats(0, 3000), width=st.floats(10, 5000))
+@settings(max_examples=30, deadline=None)
+def test_gain_over_a_band_is_the_mean_of_the_squared_response(taps, low, width):
+    n = 4000
+    frequencies = low + width * (np.arange(n) + 0.5) / n
+    mean = np.mean(np.abs(frequency_response(taps, frequencies, fs=FS)) ** 2)
+    gain = secondary_path_gain(taps, band=(low, low + width), fs=FS)
+    # Midpoint rule with 4000 points on a cosine series of 30 terms; the absolute part is rounding.
+    assert gain == pytest.approx(mean, rel=1e-4, abs=1e-9)
+
+
+def test_gain_for_a_reference_is_equation_11():
+    path = bandpass_path(32)
+    assert secondary_path_gain(path) == pytest.approx(secondary_path_gain(path, band=(0.0, FS / 2)), rel=1e-12)
+    # A tone of whole periods: |S|² at its frequency.
+    tone = np.sin(2 * np.pi * 400 * np.arange(4000 + 31) / FS)
+    expected = np.abs(frequency_response(path, [400.0])[0]) ** 2
+    assert secondary_path_gain(path, reference=tone) == pytest.approx(expected, rel=1e-9)
+    noise = np.random.default_rng(0).standard_normal(200_000)
+    # 200 000 samples of noise: a standard deviation of about 0.3 %.
+    assert secondary_path_gain(path, reference=noise) == pytest.approx(secondary_path_gain(path), rel=0.015)
+
+
+def test_phase_error_and_its_bound():
+    path = bandpass_path(32)
+    frequencies = np.linspace(500, 4500, 100)
+    for degrees in (60.0, -60.0, 120.0, -120.0):
+        error = phase_error(path, perturbed_path(path, phase_deg=degrees), frequencies)
+        np.testing.assert_allclose(error.error_deg, degrees, atol=1.5)  # perturbed_path's accuracy
+        assert np.all(error.within_bound) == (abs(degrees) < STABILITY_BOUND_DEG)
+    late = phase_error(path, perturbed_path(path, delay_samples=2), frequencies)
+    wrapped = (-720 * frequencies / FS + 180) % 360 - 180
+    np.testing.assert_allclose(late.error_deg, wrapped, atol=1e-6)
+    # Two samples late: 90 degrees at fs/8.
+    np.testing.assert_array_equal(late.within_bound, (frequencies < FS / 8) | (frequencies > 3 * FS / 8))
+
+
+def test_achieved_band_of_a_known_response():
+    # |1 + z^-1| / 2 = cos(pi f / fs): -3 dB at acos(10^(-3/20)) fs / pi.
+    band = achieved_band([0.5, 0.5], fs=FS)
+    assert band.low_hz == 0.0
+    assert band.high_hz == pytest.approx(np.arccos(10 ** (-3 / 20)) * FS / np.pi, abs=1e-3)
+    assert (band.peak_hz, band.peak_db) == (0.0, pytest.approx(0.0, abs=1e-12))
+    highpass = achieved_band([0.5, -0.5], fs=FS)
+    assert (highpass.low_hz + band.high_hz, highpass.high_hz) == (pytest.approx(FS / 2, abs=1e-3), FS / 2)
+
+
+def test_the_papers_short_paths_do_not_realise_20_hz():
+    # 32 taps lie 0.4 dB below the peak at 0 Hz, 128 taps 1.6 dB: both are low-passes in fact.
+    for n_taps, at_zero in ((32, -0.41), (128, -1.62)):
+        band = achieved_band(bandpass_path(n_taps))
+        assert band.low_hz == 0.0
+        assert 4700 < band.high_hz < 5000
+        level = 20 * np.log10(np.abs(frequency_response(bandpass_path(n_taps), [0.0])[0]))
+        assert level == pytest.approx(at_zero, abs=0.01)
+    long = achieved_band(bandpass_path(4097))
+    assert 15 < long.low_hz < 25

@@ -1,0 +1,187 @@
+"""Figures: what the curves hold, labels with units, given and new axes, refusals."""
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.signal
+
+from kfopc_filterpy.bounds.wiener import wiener_solution
+from kfopc_filterpy.paths.analysis import frequency_response
+from kfopc_filterpy.paths.identification import identify_secondary_path
+from kfopc_filterpy.paths.models import bandpass_path, path_taps, perturbed_path
+from kfopc_filterpy.plot.paths import (
+    plot_bode,
+    plot_causality_margin,
+    plot_group_delay,
+    plot_impulse_responses,
+    plot_modelling_error,
+    plot_phase_error,
+    plot_required_rated_power,
+    plot_secondary_path_gain,
+)
+
+FS = 16000.0
+P, S = bandpass_path(128), bandpass_path(32)
+
+
+@pytest.fixture(autouse=True)
+def _figures():
+    """Draw without a screen; close what a test has drawn."""
+    with mpl.rc_context({"backend": "agg"}):
+        yield
+        plt.close("all")
+
+
+def _solution():
+    x = np.random.default_rng(0).standard_normal(4000)
+    d = scipy.signal.lfilter(path_taps(P), 1.0, x) + 0.2 * np.random.default_rng(1).standard_normal(4000)
+    return wiener_solution(x, d, S, 64)
+
+
+def _labels(ax):
+    return ax.get_legend_handles_labels()[1]
+
+
+def test_bode_draws_magnitude_and_phase_in_hz():
+    magnitude, phase = plot_bode({"P": P, "S": S})
+    magnitude.figure.canvas.draw()
+    assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("Magnitude (dB)", "Phase less onset delay (degrees)")
+    assert phase.get_xlabel() == "Frequency (Hz)"
+    assert phase.get_xscale() == "log"
+    assert _labels(magnitude) == ["P", "S"]
+    line = magnitude.get_lines()[1]
+    expected = 20 * np.log10(np.abs(frequency_response(S, line.get_xdata())))
+    np.testing.assert_allclose(line.get_ydata(), expected, atol=1e-9)
+    # 15.5 samples of delay less an onset of 13: a straight line of 2.5 samples where sound passes.
+    line = phase.get_lines()[1]
+    f, angle = line.get_xdata(), line.get_ydata()
+    passed = f < 4500
+    np.testing.assert_allclose(angle[passed], -360 * 2.5 * f[passed] / FS, atol=1e-6)
+    assert np.isnan(angle[-1])  # no phase where the path passes nothing
+    assert _labels(phase)[1] == "S, less 0.81 ms"
+
+
+def test_impulse_responses_over_milliseconds():
+    ax = plot_impulse_responses({"S": S, "Ŝ": path_taps(S)}, fs=FS)
+    ax.figure.canvas.draw()
+    assert ax.get_xlabel() == "Time (ms)"
+    line = ax.get_lines()[0]
+    np.testing.assert_allclose(line.get_xdata(), np.arange(32) / 16)
+    np.testing.assert_array_equal(line.get_ydata(), path_taps(S))
+
+
+def test_group_delay_in_milliseconds_where_sound_passes():
+    ax = plot_group_delay(S)
+    ax.figure.canvas.draw()
+    assert ax.get_ylabel() == "Group delay (ms)"
+    delay = ax.get_lines()[0].get_ydata()
+    np.testing.assert_allclose(delay[~np.isnan(delay)], 15.5 / 16, rtol=1e-6)
+    assert np.isnan(delay[-1])
+
+
+@pytest.mark.parametrize(("primary", "secondary", "text"), [(P, S, "2.81 ms (45"), (S, P, "-2.81 ms (-45")])
+def test_causality_margin_is_written_out(primary, secondary, text):
+    ax = plot_causality_margin(primary, secondary)
+    ax.figure.canvas.draw()
+    assert any(text in label.get_text() for label in ax.texts)
+    assert _labels(ax) == ["Primary path P", "Secondary path S"]
+
+
+def test_secondary_path_gain_for_band_and_reference():
+    noise = np.random.default_rng(0).standard_normal(5000)
+    ax = plot_secondary_path_gain(S, band=(200.0, 2000.0), reference=noise)
+    ax.figure.canvas.draw()
+    assert ax.get_ylabel() == "Power gain (dB)"
+    assert _labels(ax)[1] == "$G_s$, 200 to 2000 Hz: -0.1 dB"
+    assert "reference" in _labels(ax)[2]
+    assert len(_labels(plot_secondary_path_gain(path_taps(S), fs=FS))) == 2
+
+
+def test_phase_error_with_both_bounds():
+    ax = plot_phase_error(S, {"late": perturbed_path(S, delay_samples=2)})
+    ax.figure.canvas.draw()
+    curve, *bounds = ax.get_lines()
+    assert sorted(line.get_ydata()[0] for line in bounds) == [-90, 90]
+    assert _labels(ax) == ["late", "Stability bound ±90°"]
+    f, error = curve.get_xdata(), curve.get_ydata()
+    below = f < 3500  # before the error wraps
+    np.testing.assert_allclose(error[below], -720 * f[below] / FS, atol=1e-6)
+    assert _labels(plot_phase_error(S, S))[0] == "Estimate"
+
+
+def test_required_rated_power_rises_to_the_wiener_filter():
+    solution = _solution()
+    ax = plot_required_rated_power(solution, rated_power=0.5)
+    ax.figure.canvas.draw()
+    assert ax.get_yscale() == "log"
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "Noise reduction (dB)",
+        "Rated power needed (mean square)",
+    )
+    power = ax.get_lines()[0].get_ydata()
+    assert np.all(np.diff(power) > 0)
+    assert 0.8 * solution.control_power < power[-1] < solution.control_power
+    assert _labels(ax)[2] == "Rated power 0.5"
+
+
+def test_required_rated_power_of_a_perfect_filter_stays_readable():
+    x = np.random.default_rng(0).standard_normal(1000)
+    ax = plot_required_rated_power(wiener_solution(x, 2 * x, [1.0], 2))
+    ax.figure.canvas.draw()
+    assert ax.get_xlim()[1] < 70
+
+
+def test_modelling_error_of_several_runs():
+    results = {
+        kind: identify_secondary_path(S, n_taps=32, duration_s=0.2, rng=0, excitation=kind)
+        for kind in ("white", "sweep")
+    }
+    ax = plot_modelling_error(results)
+    ax.figure.canvas.draw()
+    assert ax.get_ylabel() == "Modelling error (dB)"
+    np.testing.assert_array_equal(ax.get_lines()[0].get_ydata(), results["white"].modelling_error_db)
+    assert _labels(ax)[0].startswith("white: -")
+    assert len(plot_modelling_error(results["white"]).get_lines()) == 1
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda ax: plot_impulse_responses(S, ax=ax),
+        lambda ax: plot_group_delay(S, ax=ax),
+        lambda ax: plot_causality_margin(P, S, ax=ax),
+        lambda ax: plot_secondary_path_gain(S, ax=ax),
+        lambda ax: plot_phase_error(S, S, ax=ax),
+        lambda ax: plot_required_rated_power(_solution(), ax=ax),
+        lambda ax: plot_modelling_error(identify_secondary_path(S, n_taps=8, duration_s=0.1, rng=0), ax=ax),
+    ],
+)
+def test_given_axes_are_used_and_returned(draw):
+    ax = plt.subplots()[1]
+    assert draw(ax) is ax
+    assert plt.get_fignums() == [ax.figure.number]
+    assert not ax.get_title()
+
+
+def test_bode_into_given_axes():
+    figure, axes = plt.subplots(2, 1)
+    drawn = plot_bode(S, frequencies_hz=[100.0, 200.0], ax=axes)
+    assert drawn[0].figure is figure
+    np.testing.assert_array_equal(axes[0].get_lines()[0].get_xdata(), [100.0, 200.0])
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: plot_bode(S, ax=plt.subplots()[1]), ValueError, "ax must be 2 axes"),
+        (lambda: plot_bode({}), ValueError, "paths must name at least one"),
+        (lambda: plot_bode([1.0]), ValueError, "fs must be given where path is a tap array"),
+        (lambda: plot_bode({"a": S, "b": bandpass_path(8, (0, 1e3), fs=8e3)}), ValueError, "differing sampl"),
+        (lambda: plot_bode(S, frequencies_hz=[1.0]), ValueError, "frequencies_hz must have at least 2"),
+        (lambda: plot_modelling_error({"x": S}), TypeError, "results must hold IdentificationResult"),
+    ],
+)
+def test_plots_refuse(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,283 @@
+"""Figures of runs: what the curves hold, labels with units, one style per algorithm, files, refusals."""
+
+from dataclasses import replace
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from kfopc_filterpy.controllers import FxLMS, MOVFxLMS, kf_anc, kf_opc
+from kfopc_filterpy.loop.simulation import simulate
+from kfopc_filterpy.metrics import nse_db
+from kfopc_filterpy.paths.models import bandpass_path
+from kfopc_filterpy.plot import runs as plotting
+from kfopc_filterpy.power.amplifiers import HardClipAmplifier
+from kfopc_filterpy.signals.generators import band_limited_noise, scaled_to_power, tone
+from kfopc_filterpy.spectra import coherence_and_gain, power_spectrum_db
+
+FS = 16000.0
+P, S = bandpass_path(128), bandpass_path(32)
+LIMIT = np.sqrt(2)
+SPAN = (0.38, 0.39)
+
+
+def _controllers():
+    noise = {"state_noise": 1e-8, "measurement_noise": 1e-2}
+    return (
+        kf_anc(16, S, **noise),
+        kf_opc(16, S, rated_power=1.0, **noise),
+        FxLMS(16, S, step_size=1e-3),
+        MOVFxLMS(16, S, step_size=1e-3, rated_power=1.0),
+    )
+
+
+@pytest.fixture(scope="module")
+def tonal():
+    """Runs of a tone of twice the rated power into a clipping amplifier, by algorithm."""
+    x = scaled_to_power(tone(400.0, 0.4, fs=FS), 2.0)
+    plant = {"secondary_path": S, "primary_path": P, "amplifier": HardClipAmplifier(LIMIT), "rated_power": 1.0}
+    runs = [simulate(controller, x, record_weights_every=16, **plant) for controller in _controllers()]
+    return {run.algorithm: run for run in runs}
+
+
+@pytest.fixture(scope="module")
+def noise():
+    """Two seeds of a run of KF-OPC in noise."""
+    signals = [band_limited_noise((200.0, 2000.0), 1.2, fs=FS, power=4.0, rng=seed) for seed in (1, 2)]
+    return [simulate(_controllers()[1], x, secondary_path=S, primary_path=P) for x in signals]
+
+
+@pytest.fixture(autouse=True)
+def _figures():
+    """Draw without a screen; close what a test has drawn."""
+    with mpl.rc_context({"backend": "agg"}):
+        yield
+        plt.close("all")
+
+
+def _diverged(run):
+    blank = np.full_like(run.error, np.nan)
+    return replace(run, error=blank, control_signal=blank, amplifier_output=blank, diverged_at_s=0.25)
+
+
+def _labels(ax):
+    ax.figure.canvas.draw()
+    return ax.get_legend_handles_labels()[1]
+
+
+def _line(ax, label):
+    return next(line for line in ax.get_lines() if line.get_label() == label)
+
+
+def test_error_spectra_hold_the_disturbance_and_each_error(tonal):
+    ax = plotting.plot_error_spectra(list(tonal.values()), band=(100.0, 5000.0), segment_s=0.05, scaling="spectrum")
+    assert _labels(ax) == ["Disturbance", *tonal]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Power (dB)")
+    assert ax.get_xlim() == (100.0, 5000.0)
+    for name, run in tonal.items():
+        f, level = power_spectrum_db(run.error, FS, segment_s=0.05, scaling="spectrum")
+        np.testing.assert_array_equal(_line(ax, name).get_ydata(), level[(f >= 100) & (f <= 5000)])
+    assert plotting.plot_error_spectra(tonal["KF-OPC"]).get_ylabel() == "Power per Hz (dB)"
+
+
+def test_error_spectra_of_a_span_and_of_seeds(tonal, noise):
+    ax = plotting.plot_error_spectra(tonal["KF-ANC"], span_s=(0.1, 0.2))
+    _, level = power_spectrum_db(tonal["KF-ANC"].error[1600:3200], FS, steady=1.0)
+    np.testing.assert_array_equal(_line(ax, "KF-ANC").get_ydata(), level)
+    ax = plotting.plot_error_spectra({"KF-OPC": noise})
+    _, level = power_spectrum_db(np.stack([run.error for run in noise]), FS)
+    np.testing.assert_array_equal(_line(ax, "KF-OPC").get_ydata(), level)
+
+
+def test_an_algorithm_looks_the_same_in_every_figure(tonal):
+    forwards, backwards = list(tonal.values()), list(tonal.values())[::-1]
+    one = plotting.plot_error_spectra(forwards)
+    other = plotting.plot_anti_noise(backwards, span_s=SPAN)
+    nse = plotting.plot_nse(backwards)
+    looks = set()
+    for name in ["Disturbance", *tonal]:
+        line = _line(one, name)
+        assert line.get_color() == _line(other, name).get_color()
+        assert line.get_linestyle() == _line(other, name).get_linestyle()
+        looks.add((line.get_color(), str(line.get_linestyle()), line.get_linewidth()))
+        if name != "Disturbance":
+            assert line.get_color() == _line(nse, name).get_color()
+    assert len(looks) == 5
+    assert len({_line(nse, name).get_marker() for name in tonal}) == 4
+
+
+def test_runs_of_one_algorithm_under_two_names_differ(tonal):
+    run = tonal["KF-OPC"]
+    ax = plotting.plot_anti_noise({"KF-OPC": run, "KF-OPC, slow": run, "mine": run}, span_s=SPAN)
+    colours = [line.get_color() for line in ax.get_lines()]
+    assert len(set(colours)) == 4
+    assert _labels(ax) == ["Disturbance", "KF-OPC", "KF-OPC, slow", "mine"]
+
+
+def test_anti_noise_over_a_span_in_ms_or_s(tonal):
+    ax = plotting.plot_anti_noise(tonal["KF-OPC"], span_s=SPAN)
+    line = _line(ax, "KF-OPC")
+    np.testing.assert_allclose(line.get_xdata(), 380 + np.arange(160) / 16)
+    np.testing.assert_array_equal(line.get_ydata(), tonal["KF-OPC"].anti_noise[6080:6240])
+    np.testing.assert_array_equal(_line(ax, "Disturbance").get_ydata(), tonal["KF-OPC"].disturbance[6080:6240])
+    assert ax.get_xlabel() == "Time (ms)"
+    assert ax.get_ylabel() == "Sound at the error microphone"
+
+
+def test_amplifier_output_with_limit_and_the_signal_before_it(tonal):
+    y = np.clip(tonal["KF-OPC"].control_signal, -1.001 * LIMIT, 1.001 * LIMIT)  # what a line's width would hide
+    within = replace(tonal["KF-OPC"], control_signal=y)
+    ax = plotting.plot_amplifier_output([tonal["KF-ANC"], within], span_s=SPAN, limit=LIMIT)
+    assert _labels(ax) == ["KF-ANC", "KF-ANC before the amplifier", "KF-OPC", "Limit ±1.414"]
+    assert sorted(line.get_ydata()[0] for line in ax.get_lines() if len(line.get_ydata()) == 2) == [-LIMIT, LIMIT]
+    before, run = _line(ax, "KF-ANC before the amplifier").get_ydata(), tonal["KF-ANC"]
+    shown = ~np.isnan(before)
+    np.testing.assert_array_equal(before[shown], run.control_signal[6080:6240][shown])
+    assert np.all(shown[np.abs(run.control_signal[6080:6240]) > LIMIT])
+    assert not np.all(shown)
+    assert ax.get_ylim()[1] <= 2.75 * LIMIT + 1e-9
+    assert _labels(plotting.plot_amplifier_output(within, span_s=SPAN)) == ["KF-OPC"]
+
+
+def test_weight_history_is_logarithmic_where_one_grows(tonal):
+    ax = plotting.plot_weight_history(list(tonal.values()), tap=3)
+    run = tonal["FxLMS"]
+    np.testing.assert_array_equal(_line(ax, "FxLMS").get_ydata(), run.weights[:, 3])
+    np.testing.assert_array_equal(_line(ax, "FxLMS").get_xdata(), run.weights_time_s)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Time (s)", "Weight 3 of the control filter")
+    grown = replace(run, weights=1e4 * run.weights)
+    assert plotting.plot_weight_history({"a": run, "b": grown}, tap=3).get_yscale() == "symlog"
+    assert plotting.plot_weight_history({"a": run, "b": run}, tap=3).get_yscale() == "linear"
+
+
+def test_nse_pools_seeds_and_shows_the_start(noise):
+    ax = plotting.plot_nse({"KF-OPC": noise}, window_s=0.005)
+    curve = nse_db(np.stack([run.error for run in noise]), np.stack([run.disturbance for run in noise]), FS, 0.005)
+    line = _line(ax, "KF-OPC")
+    rows = np.round(line.get_xdata() * FS).astype(int) - 1
+    np.testing.assert_array_equal(line.get_ydata(), curve[rows])
+    assert np.max(np.diff(rows)) <= 20  # a quarter of the window
+    assert ax.get_ylabel() == "Normalised squared error (dB)"
+    log = plotting.plot_nse({"KF-OPC": noise}, time_axis="log")
+    log.figure.canvas.draw()
+    assert log.get_xscale() == "log"
+    assert _line(log, "KF-OPC").get_xdata()[0] == 1 / FS
+    assert _line(log, "KF-OPC").get_xdata()[-1] == noise[0].error.size / FS
+
+
+def test_disturbance_and_anti_noise_say_how_linear_they_are(noise):
+    ax = plotting.plot_disturbance_and_anti_noise(noise[0], span_s=(1.0, 1.02), band=(200.0, 2000.0))
+    coherence, gain = coherence_and_gain(noise[0].disturbance, noise[0].anti_noise, FS, (200.0, 2000.0))
+    text = ax.get_legend().get_title().get_text()
+    assert f"200 to 2000 Hz: coherence {coherence:.4f}, gain {gain:.3f}" in text
+    assert f"Output power {np.mean(noise[0].control_signal[9600:] ** 2):.5g}, rated power 1" in text
+    assert _labels(ax) == ["Disturbance", "Anti-noise, KF-OPC"]
+
+
+def test_output_power_against_the_rated_power(noise, tonal):
+    ax = plotting.plot_output_power({"KF-OPC": noise}, window_s=0.25)
+    assert _labels(ax) == ["KF-OPC", "Rated power 1"]
+    line = _line(ax, "KF-OPC")
+    expected = np.mean([np.mean(run.control_signal[-4000:] ** 2) for run in noise])
+    assert line.get_xdata()[-1] == pytest.approx(noise[0].error.size / FS, abs=1e-2)
+    assert line.get_ydata()[-1] == pytest.approx(expected, rel=0.05)
+    assert ax.get_yscale() == "linear"
+    ax = plotting.plot_output_power(list(tonal.values()), rated_power=0.01)
+    ax.figure.canvas.draw()
+    assert ax.get_yscale() == "log"
+    assert ax.get_ylabel() == "Output power (mean square)"
+
+
+def test_constraint_factor_leaves_out_controllers_that_say_none(tonal):
+    silent = replace(tonal["FxLMS"], constraint_factor=np.full_like(tonal["FxLMS"].error, np.nan))
+    ax = plotting.plot_constraint_factor([tonal["KF-OPC"], silent])
+    assert _labels(ax) == ["KF-OPC"]
+    assert _line(ax, "KF-OPC").get_ydata()[-1] == pytest.approx(tonal["KF-OPC"].constraint_factor[-1], abs=1e-3)
+    with pytest.raises(ValueError, match="no controller has said one"):
+        plotting.plot_constraint_factor(silent)
+
+
+def test_noise_reduction_against_overdrive_marks_the_flip():
+    levels = {"KF-ANC": [12.0, 7.5], "KF-OPC": [14.0, np.nan]}
+    ax = plotting.plot_noise_reduction_against_overdrive([3.0, 5.0], levels, flip_db=4.25)
+    assert _labels(ax) == ["KF-ANC", "KF-OPC", "Order flips at 4.2 dB"]
+    ax = plotting.plot_noise_reduction_against_overdrive([3.0, 5.0], levels, flip_db=[3.5, 4.5])
+    assert _labels(ax)[2:] == ["Order flips at 3.5, 4.5 dB"]
+    assert len(_labels(plotting.plot_noise_reduction_against_overdrive([3.0, 5.0], levels, flip_db=[]))) == 2
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Overdrive (dB)", "Noise reduction (dB)")
+    with pytest.raises(ValueError, match=r"noise_reduction_db of 'KF-OPC' must have 2 values, got 1"):
+        plotting.plot_noise_reduction_against_overdrive([3.0, 5.0], {"KF-OPC": [1.0]})
+    with pytest.raises(TypeError, match="noise_reduction_db must map"):
+        plotting.plot_noise_reduction_against_overdrive([3.0, 5.0], [1.0, 2.0])
+
+
+def test_a_divergence_is_written_in_the_legend(tonal):
+    run = _diverged(tonal["FxLMS"])
+    for ax in (
+        plotting.plot_error_spectra([run, tonal["KF-OPC"]]),
+        plotting.plot_error_spectra(run),
+        plotting.plot_nse(run),
+        plotting.plot_output_power(run),
+        plotting.plot_amplifier_output(run, span_s=SPAN),
+    ):
+        assert "FxLMS (diverged at 0.25 s)" in _labels(ax)
+    ax = plotting.plot_nse({"FxLMS": [run, tonal["FxLMS"]]})
+    assert _labels(ax) == ["FxLMS (1 of 2 runs diverged at 0.25 s)"]
+
+
+def test_axes_given_are_drawn_into(tonal):
+    figure, axes = plt.subplots(2, 2)
+    assert plotting.plot_nse(tonal["KF-OPC"], ax=axes[0, 0]) is axes[0, 0]
+    assert plotting.plot_weight_history(tonal["KF-OPC"], tap=0, ax=axes[1, 1]).figure is figure
+
+
+def test_files_are_the_same_for_the_same_figure_and_the_figure_is_closed(tonal, tmp_path):
+    files = []
+    for name in ("one", "two"):
+        ax = plotting.plot_nse(tonal["KF-OPC"])
+        png, svg = plotting.save_figure(ax.figure, tmp_path / "new" / f"{name}-0.5")
+        assert (png.name, svg.name) == (f"{name}-0.5.png", f"{name}-0.5.svg")
+        files.append((png.read_bytes(), svg.read_bytes()))
+    assert files[0] == files[1]
+    assert b"<dc:date>" not in files[0][1]
+    assert not plt.get_fignums()
+    with pytest.raises(ValueError, match="must leave out the suffix"):
+        plotting.save_figure(ax.figure, tmp_path / "nse.svg")
+
+
+def test_refusals_name_the_argument(tonal, noise):
+    run = tonal["KF-OPC"]
+    with pytest.raises(TypeError, match="results must be a SimulationResult or a sequence of them, got ndarray"):
+        plotting.plot_nse(run.error)
+    with pytest.raises(TypeError, match="results must hold SimulationResult, got ndarray under 'a'"):
+        plotting.plot_nse({"a": run.error})
+    with pytest.raises(ValueError, match="results must hold at least one SimulationResult"):
+        plotting.plot_nse([])
+    with pytest.raises(ValueError, match="results hold two runs of 'KF-OPC'; pass a mapping"):
+        plotting.plot_nse(noise)
+    with pytest.raises(ValueError, match="results 'a' must be runs of one length"):
+        plotting.plot_nse({"a": [run, noise[0]]})
+    with pytest.raises(ValueError, match="results must hold one run a name here, got 2 runs of 'KF-OPC'"):
+        plotting.plot_anti_noise({"KF-OPC": noise}, span_s=SPAN)
+    with pytest.raises(ValueError, match="results must have one disturbance"):
+        plotting.plot_error_spectra({"a": noise[0], "b": noise[1]})
+    with pytest.raises(ValueError, match="result must be one run, got 2"):
+        plotting.plot_disturbance_and_anti_noise([run, tonal["FxLMS"]], span_s=SPAN, band=(200.0, 2000.0))
+    with pytest.raises(ValueError, match=r"span_s must satisfy 0 <= start < end <= 0.4 s, got \(0.3, 0.5\) s"):
+        plotting.plot_anti_noise(run, span_s=(0.3, 0.5))
+    with pytest.raises(ValueError, match=r"span_s must be a pair \(start, end\) in seconds"):
+        plotting.plot_anti_noise(run, span_s=0.1)
+    with pytest.raises(ValueError, match="limit must be greater than 0"):
+        plotting.plot_amplifier_output(run, span_s=SPAN, limit=0.0)
+    with pytest.raises(ValueError, match="hold no weights; simulate with record_weights_every="):
+        plotting.plot_weight_history(noise[0], tap=0)
+    with pytest.raises(ValueError, match="tap must be below the 16 weights of 'KF-OPC', got 16"):
+        plotting.plot_weight_history(run, tap=16)
+    with pytest.raises(ValueError, match="time_axis must be one of 'linear', 'log'"):
+        plotting.plot_nse(run, time_axis="decades")
+    with pytest.raises(ValueError, match="window_s must be at least one sample"):
+        plotting.plot_nse(run, window_s=1e-6)
+    with pytest.raises(ValueError, match="rated_power must be greater than 0"):
+        plotting.plot_output_power(run, rated_power=0.0)
+    assert not plt.get_fignums()  # arguments are looked at before a figure is made

@@ -1,0 +1,158 @@
+"""Amplifier models against their closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier, clipped_fraction, simulate
+from kfopc_filterpy.controllers import FxLMS
+from kfopc_filterpy.power.amplifiers import compiled_parameters
+
+signals = st.floats(-1e9, 1e9)
+limits = st.floats(1e-3, 1e3)
+sharpnesses = st.floats(0.1, 100.0)
+
+
+def make(limit, sharpness):
+    return [LinearAmplifier(), HardClipAmplifier(limit), SoftSaturationAmplifier(limit, sharpness)]
+
+
+@given(signals)
+def test_linear_passes_the_signal(y):
+    assert LinearAmplifier()(y) == y
+
+
+@given(signals, limits)
+def test_hard_clip_is_the_nearest_value_within_the_limit(y, limit):
+    assert HardClipAmplifier(limit)(y) == float(np.clip(y, -limit, limit))
+
+
+@given(st.floats(-50.0, 50.0), limits, st.floats(0.1, 20.0))
+def test_soft_saturation_is_rapps_formula(ratio, limit, sharpness):
+    y = ratio * limit
+    expected = y / (1 + abs(y / limit) ** (2 * sharpness)) ** (1 / (2 * sharpness))
+    # 2p times the rounding of the ratio's logarithm: 40 * 4 * 2.2e-16
+    assert SoftSaturationAmplifier(limit, sharpness)(y) == pytest.approx(expected, rel=1e-13, abs=1e-300)
+
+
+def test_soft_saturation_known_values():
+    assert SoftSaturationAmplifier(1.0, 1.0)(1.0) == pytest.approx(1 / math.sqrt(2), rel=1e-15)  # y / sqrt(1 + y^2)
+    assert SoftSaturationAmplifier(2.0)(2.0) == pytest.approx(2 * 2**-0.25, rel=1e-15)
+
+
+@given(signals, limits, sharpnesses)
+def test_every_model_is_odd(y, limit, sharpness):
+    for amplifier in make(limit, sharpness):
+        assert amplifier(-y) == -amplifier(y)
+
+
+@given(signals, signals, limits, sharpnesses)
+def test_every_model_rises_and_never_amplifies(a, b, limit, sharpness):
+    low, high = sorted((a, b))
+    for amplifier in make(limit, sharpness):
+        assert amplifier(low) <= amplifier(high) + 1e-12 * abs(amplifier(high))  # pow is right to an ulp or two
+        assert abs(amplifier(a)) <= abs(a)
+
+
+@given(signals, limits, sharpnesses)
+def test_saturating_models_stay_within_their_limit(y, limit, sharpness):
+    assert abs(HardClipAmplifier(limit)(y)) <= limit
+    assert abs(SoftSaturationAmplifier(limit, sharpness)(y)) <= limit
+
+
+@pytest.mark.parametrize("sharpness", [0.5, 2.0, 50.0, 400.0])
+def test_soft_saturation_far_above_its_limit_is_the_limit(sharpness):
+    # the power in Rapp's formula overflows from a ratio of 1e6 on at sharpness 26: the output must not become 0
+    for y in (1e6, 1e100, 1e300):
+        assert SoftSaturationAmplifier(0.5, sharpness)(y) == pytest.approx(0.5, rel=1e-5)
+        assert SoftSaturationAmplifier(0.5, sharpness)(-y) == pytest.approx(-0.5, rel=1e-5)
+
+
+@given(st.floats(-3.0, 3.0))
+def test_soft_saturation_tends_to_the_hard_clip(y):
+    # largest at the limit itself, where it is 2 ** (-1 / 2p)
+    assert SoftSaturationAmplifier(1.0, 500.0)(y) == pytest.approx(HardClipAmplifier(1.0)(y), abs=1 - 2**-0.001 + 1e-12)
+
+
+def test_small_signals_pass_unchanged():
+    for amplifier in make(1.0, 2.0):
+        assert amplifier(1e-5) == pytest.approx(1e-5, rel=1e-15)
+
+
+@pytest.mark.parametrize("amplifier", make(0.7, 2.5))
+def test_numbers_and_arrays_of_any_shape(amplifier):
+    values = np.linspace(-3, 3, 12)
+    expected = np.array([amplifier(v) for v in values])
+    np.testing.assert_array_equal(amplifier(values), expected)
+    np.testing.assert_array_equal(amplifier(values.reshape(3, 4).T), expected.reshape(3, 4).T)
+    np.testing.assert_array_equal(amplifier(values[::2]), expected[::2])
+    np.testing.assert_array_equal(amplifier(list(values)), expected)
+    assert amplifier(np.empty((0, 3))).shape == (0, 3)
+    assert type(amplifier(1)) is float
+    assert type(amplifier(np.float32(1))) is float
+
+
+def test_gaussian_noise_at_rated_power_exceeds_a_sines_peak_15_7_percent_of_the_time():
+    rated_power = 0.8
+    limit = math.sqrt(2 * rated_power)
+    noise = np.random.default_rng(1).normal(scale=math.sqrt(rated_power), size=400_000)
+    share = float(np.mean(HardClipAmplifier(limit)(noise) != noise))
+    assert share == clipped_fraction(noise, limit, steady=1.0)
+    assert math.erfc(1.0) == pytest.approx(0.157, abs=5e-4)  # P(|z| > sqrt(2)), the figure of the documentation
+    assert share == pytest.approx(math.erfc(1.0), abs=4 * math.sqrt(0.157 * 0.843 / 400_000))  # 4 sigma
+
+
+def test_sine_at_rated_power_passes_unharmed():
+    rated_power = 0.8
+    sine = math.sqrt(2 * rated_power) * np.sin(2 * np.pi * 400 / 16000 * np.arange(1600))
+    assert np.mean(sine**2) == pytest.approx(rated_power, rel=1e-12)
+    np.testing.assert_array_equal(HardClipAmplifier(math.sqrt(2 * rated_power))(sine), sine)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_refuses_limits_and_sharpnesses(bad):
+    with pytest.raises(ValueError, match="limit must be"):
+        HardClipAmplifier(bad)
+    with pytest.raises(ValueError, match="limit must be"):
+        SoftSaturationAmplifier(bad)
+    with pytest.raises(ValueError, match="sharpness must be"):
+        SoftSaturationAmplifier(1.0, bad)
+
+
+@pytest.mark.parametrize("bad", ["1", None, [1.0, 2.0]])
+def test_refuses_what_is_no_number(bad):
+    with pytest.raises(TypeError, match="limit must be a single number"):
+        HardClipAmplifier(bad)
+
+
+def test_models_are_values():
+    assert SoftSaturationAmplifier(1) == SoftSaturationAmplifier(1.0, 2.0)
+    assert type(HardClipAmplifier(np.float32(1)).limit) is float
+    with pytest.raises(AttributeError, match="cannot assign"):
+        HardClipAmplifier(1.0).limit = 2.0
+
+
+def test_parameters_of_the_compiled_loop():
+    np.testing.assert_array_equal(compiled_parameters(None), LinearAmplifier().parameters)
+    assert compiled_parameters(HardClipAmplifier(2.0))[1] == 2.0
+    assert compiled_parameters(abs) is None
+
+
+def test_a_subclass_is_called_not_replaced_by_its_parents_equation():
+    class Weak(HardClipAmplifier):
+        def __call__(self, signal):
+            return 0.5 * super().__call__(signal)
+
+    x = np.random.default_rng(0).standard_normal(50)
+    result = simulate(FxLMS(4, [1.0], step_size=0.1), x, disturbance=x, secondary_path=[1.0], amplifier=Weak(1.0))
+    np.testing.assert_array_equal(result.amplifier_output, 0.5 * np.clip(result.control_signal, -1, 1))
+
+
+def test_a_class_is_no_amplifier() -> None:
+    with pytest.raises(
+        TypeError, match=r"amplifier must be an object, such as HardClipAmplifier\(limit=1\.0\), got the"
+    ):
+        compiled_parameters(HardClipAmplifier)

@@ -1,0 +1,348 @@
+"""Readers and writers of recordings, and the measured duct; no test reaches for the network."""
+
+import hashlib
+import logging
+import os
+import struct
+import sys
+import types
+import wave
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from kfopc_filterpy.signals import datasets
+from kfopc_filterpy.signals.datasets import (
+    DataUnavailableError,
+    MeasuredDuct,
+    load_measured_duct,
+    read_mat_vector,
+    read_wav,
+    write_wav,
+)
+
+FILES = {"duct/Pz1.mat": ("Pz1", 1024), "duct/Sz.mat": ("S", 512), "motor/Motor.mat": ("Motor_noise", 162001)}
+
+
+@pytest.fixture
+def no_folder(monkeypatch):
+    """No data folder in the environment."""
+    monkeypatch.delenv("KFOPC_DATA", raising=False)
+
+
+@pytest.fixture
+def measured_folder():
+    """The folder with the published files, or a skip."""
+    named = os.environ.get("KFOPC_DATA")
+    folder = Path(named) if named else Path(__file__).parents[3] / "shared" / "data"
+    if not (folder / "duct" / "Pz1.mat").is_file():
+        pytest.skip(f"the measured duct is not in {folder}; set KFOPC_DATA to a folder with it")
+    return folder
+
+
+@pytest.fixture
+def own_files(tmp_path, monkeypatch):
+    """A folder of small files in the published layout, which counts as the published one."""
+    for name, (variable, _) in FILES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        scipy.io.savemat(tmp_path / name, {variable: np.arange(1.0, 4.0)[:, None]})
+    for attribute, name in (
+        ("_PRIMARY", "duct/Pz1.mat"),
+        ("_SECONDARY", "duct/Sz.mat"),
+        ("_NOISE", "motor/Motor.mat"),
+    ):
+        digest = hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+        monkeypatch.setattr(datasets, attribute, getattr(datasets, attribute)._replace(sha256=digest))
+    return tmp_path
+
+
+def fake_pooch(retrieve, cache):
+    """Module with the part of pooch's interface that is used."""
+    return types.SimpleNamespace(
+        get_logger=lambda: logging.getLogger("pooch"),
+        retrieve=retrieve,
+        os_cache=lambda name: cache / name,
+        HTTPDownloader=lambda **kwargs: kwargs,
+    )
+
+
+# ---- the measured duct
+
+
+def test_published_duct_has_its_known_contents(measured_folder):
+    duct = load_measured_duct(measured_folder)
+    assert (duct.primary.shape, duct.secondary.shape, duct.noise.shape) == ((1024,), (512,), (162001,))
+    assert duct.fs == 16000
+    expected = scipy.io.loadmat(measured_folder / "duct" / "Sz.mat")["S"][:, 0]
+    np.testing.assert_array_equal(duct.secondary, expected)
+    # The secondary path gains 10 to 30 dB in the middle of 200 to 2000 Hz.
+    gain_db = 20 * np.log10(np.abs(np.fft.rfft(duct.secondary, 4096)))[52:513]
+    assert 10 < np.median(gain_db) < 30
+
+
+def test_folder_argument_comes_before_the_environment(own_files, monkeypatch, tmp_path):
+    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "elsewhere"))
+    assert load_measured_duct(own_files).primary.tolist() == [1.0, 2.0, 3.0]
+    with pytest.raises(DataUnavailableError, match=r"elsewhere.duct.Pz1\.mat is missing: put https"):
+        load_measured_duct()
+    monkeypatch.setenv("KFOPC_DATA", str(own_files))
+    assert load_measured_duct().noise.tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.usefixtures("no_folder")
+def test_without_folder_or_permission_the_error_names_every_way(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pooch", None)
+    with pytest.raises(DataUnavailableError, match=r"pass folder, set KFOPC_DATA, or pass allow_download=True"):
+        load_measured_duct()
+    with pytest.raises(FileNotFoundError):
+        load_measured_duct()
+
+
+def test_empty_environment_variable_names_no_folder(monkeypatch):
+    monkeypatch.setenv("KFOPC_DATA", "")
+    with pytest.raises(DataUnavailableError, match="no folder with the measured duct is named"):
+        load_measured_duct()
+
+
+def test_changed_file_is_refused_with_both_hashes(own_files):
+    path = own_files / "duct" / "Sz.mat"
+    path.write_bytes(path.read_bytes() + b"\0")
+    found = hashlib.sha256(path.read_bytes()).hexdigest()
+    with pytest.raises(DataUnavailableError, match=rf"Sz\.mat is not the published file, its SHA-256 is {found}"):
+        load_measured_duct(own_files)
+
+
+@pytest.mark.usefixtures("no_folder")
+def test_download_asks_pooch_once_for_each_pinned_and_hashed_file(own_files, monkeypatch):
+    asked = []
+
+    def retrieve(url, known_hash, fname, path, downloader):
+        asked.append((url, known_hash, str(path), downloader))
+        return str(own_files / path.name / fname)
+
+    monkeypatch.setitem(sys.modules, "pooch", fake_pooch(retrieve, own_files))
+    assert load_measured_duct(allow_download=True, timeout_s=2.5).secondary.tolist() == [1.0, 2.0, 3.0]
+    root = "https://raw.githubusercontent.com"
+    duct = f"{root}/Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
+    motor = f"{root}/Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst"
+    expected = [f"{duct}/Pz1.mat", f"{duct}/Sz.mat", f"{motor}/Noise_data/Motor.mat"]
+    assert [url for url, *_ in asked] == expected
+    for (_, known_hash, path, downloader), name in zip(asked, FILES, strict=True):
+        assert known_hash == "sha256:" + hashlib.sha256((own_files / name).read_bytes()).hexdigest()
+        assert Path(path) == own_files / "kfopc_filterpy" / Path(name).parent
+        assert downloader == {"timeout": 2.5}
+
+
+@pytest.mark.usefixtures("no_folder")
+@pytest.mark.parametrize("failure", [OSError("no route to host"), ValueError("hash does not match")])
+def test_failed_download_stops_at_the_first_file(failure, tmp_path, monkeypatch):
+    calls = []
+
+    def retrieve(url, **_):
+        calls.append(url)
+        raise failure
+
+    monkeypatch.setitem(sys.modules, "pooch", fake_pooch(retrieve, tmp_path))
+    with pytest.raises(DataUnavailableError, match=rf"Pz1\.mat could not be fetched \({failure}\): set KFOPC_DATA"):
+        load_measured_duct(allow_download=True)
+    assert len(calls) == 1
+
+
+@pytest.mark.usefixtures("no_folder")
+def test_real_pooch_accepts_the_call(own_files, monkeypatch):
+    pooch = pytest.importorskip("pooch")
+
+    class Copier:
+        def __init__(self, timeout):
+            assert timeout == 5.0
+
+        def __call__(self, url, output_file, _):
+            folder = "motor" if "Motor" in url else "duct"
+            Path(output_file).write_bytes((own_files / folder / url.rsplit("/", 1)[1]).read_bytes())
+
+    monkeypatch.setattr(pooch, "HTTPDownloader", Copier)
+    monkeypatch.setattr(pooch, "os_cache", lambda name: own_files / "cache" / name)
+    assert load_measured_duct(allow_download=True).primary.tolist() == [1.0, 2.0, 3.0]
+    assert (own_files / "cache" / "kfopc_filterpy" / "motor" / "Motor.mat").is_file()
+
+
+@pytest.mark.usefixtures("no_folder")
+def test_download_without_pooch_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pooch", None)
+    with pytest.raises(DataUnavailableError, match=r"pooch is not installed.*kfopc-filterpy\[studies\]"):
+        load_measured_duct(allow_download=True)
+
+
+def test_pinned_hashes_are_those_of_the_published_files(measured_folder):
+    for item in (datasets._PRIMARY, datasets._SECONDARY, datasets._NOISE):
+        assert hashlib.sha256((measured_folder / item.local).read_bytes()).hexdigest() == item.sha256
+        assert FILES[item.local][0] == item.variable
+
+
+def test_measured_duct_of_own_signals_is_checked():
+    duct = MeasuredDuct([0, 1], [1], [1, 2, 3], fs=8000)
+    assert duct.primary.dtype == np.float64
+    with pytest.raises(AttributeError):
+        duct.fs = 1
+    with pytest.raises(ValueError, match=r"secondary must be one-dimensional"):
+        MeasuredDuct([1], [[1]], [1])
+    with pytest.raises(ValueError, match=r"noise must be finite"):
+        MeasuredDuct([1], [1], [np.nan])
+    with pytest.raises(ValueError, match=r"fs must be greater than 0"):
+        MeasuredDuct([1], [1], [1], fs=0)
+
+
+# ---- MAT files
+
+
+@pytest.mark.parametrize("shape", [(5, 1), (1, 5), (5,)])
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16])
+def test_mat_vectors_of_any_shape_are_read_as_float64(tmp_path, shape, kind):
+    values = np.arange(5)
+    scipy.io.savemat(tmp_path / "x.mat", {"x": values.astype(kind).reshape(shape)}, oned_as="column")
+    read = read_mat_vector(tmp_path / "x.mat", "x")
+    assert read.dtype == np.float64
+    np.testing.assert_array_equal(read, values)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (np.ones((2, 3)), r"must be a vector with at least one value, got shape \(2, 3\)"),
+        (np.zeros((0, 0)), r"must be a vector with at least one value, got shape \(0, 0\)"),
+        (np.zeros((3, 0)), r"must be a vector with at least one value"),
+        (np.array([1.0, np.nan]), r"variable 'x' of .* must be finite.*index 1"),
+        (np.array([1j]), r"must hold real numbers, got complex128"),
+        ("text", r"must hold real numbers"),
+        ({"inner": 1.0}, r"must hold real numbers"),
+    ],
+)
+def test_mat_variables_that_are_no_vector_are_refused(tmp_path, value, message):
+    scipy.io.savemat(tmp_path / "x.mat", {"x": value})
+    with pytest.raises(ValueError, match=message):
+        read_mat_vector(tmp_path / "x.mat", "x")
+
+
+def test_missing_mat_file_and_variable(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.mat does not exist"):
+        read_mat_vector(tmp_path / "none.mat", "x")
+    scipy.io.savemat(tmp_path / "x.mat", {"b": 1.0, "a": 2.0})
+    with pytest.raises(ValueError, match=r"variable 'x' is not in .*; it holds: a, b"):
+        read_mat_vector(tmp_path / "x.mat", "x")
+
+
+def test_unreadable_mat_files(tmp_path):
+    path = tmp_path / "x.mat"
+    for content in (b"", b"not a mat file", bytes(range(256)) * 8):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"x\.mat cannot be read as a MAT file"):
+            read_mat_vector(path, "x")
+    scipy.io.savemat(path, {"x": np.arange(1000.0)}, do_compression=True)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(ValueError, match=r"x\.mat cannot be read as a MAT file"):
+        read_mat_vector(path, "x")
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + struct.pack("<H", 0x0200) + b"IM" + b"\x89HDF")
+    with pytest.raises(ValueError, match=r"version 7\.3; save it with MATLAB's -v7 option"):
+        read_mat_vector(path, "x")
+
+
+# ---- WAV files
+
+
+def test_wav_without_peak_keeps_single_precision_values(tmp_path):
+    x = np.random.default_rng(1).normal(0, 3, 1000)
+    write_wav(tmp_path / "x.wav", x, 16000)
+    read, fs = read_wav(tmp_path / "x.wav")
+    assert fs == 16000.0
+    np.testing.assert_array_equal(read, x.astype(np.float32))
+
+
+def test_wav_with_one_peak_shares_one_scale(tmp_path):
+    loud = np.array([4.0, -4.0, 1.0])
+    for name, signal in (("loud", loud), ("soft", loud / 10)):
+        write_wav(tmp_path / f"{name}.wav", signal, 16000, peak=4.0)
+        with wave.open(str(tmp_path / f"{name}.wav")) as file:
+            assert (file.getsampwidth(), file.getnchannels(), file.getframerate()) == (2, 1, 16000)
+            stored = np.frombuffer(file.readframes(3), "<i2")
+        np.testing.assert_array_equal(stored, np.round(signal / 4.0 * 32767))
+
+
+def test_wav_writes_the_tail_of_a_diverged_run_as_silence(tmp_path):
+    for peak in (None, 2.0):
+        write_wav(tmp_path / "x.wav", [1.0, -2.0, np.nan, np.nan], 16000, peak=peak)
+        assert read_wav(tmp_path / "x.wav")[0][2:].tolist() == [0.0, 0.0]
+    write_wav(tmp_path / "x.wav", [np.nan], 16000)
+    assert read_wav(tmp_path / "x.wav")[0].tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("width", "stored", "expected"),
+    [
+        (1, bytes([0, 128, 192]), [-1.0, 0.0, 0.5]),
+        (2, struct.pack("<3h", -32768, 0, 16384), [-1.0, 0.0, 0.5]),
+        (3, b"\x00\x00\x80" + b"\x00\x00\x00" + b"\x00\x00\x40", [-1.0, 0.0, 0.5]),
+        (4, struct.pack("<3i", -(2**31), 0, 2**30), [-1.0, 0.0, 0.5]),
+    ],
+)
+def test_wav_of_any_width_is_read_with_full_scale_one(tmp_path, width, stored, expected):
+    with wave.open(str(tmp_path / "x.wav"), "wb") as file:
+        file.setparams((1, width, 8000, 3, "NONE", ""))
+        file.writeframes(stored)
+    signal, fs = read_wav(tmp_path / "x.wav", 8000)
+    assert (signal.tolist(), fs) == (expected, 8000.0)
+
+
+def test_wav_channels_have_to_be_chosen(tmp_path):
+    with wave.open(str(tmp_path / "x.wav"), "wb") as file:
+        file.setparams((2, 2, 8000, 2, "NONE", ""))
+        file.writeframes(struct.pack("<4h", 16384, 0, -16384, 8192))
+    with pytest.raises(ValueError, match=r"has 2 channels; choose one with channel=0 to channel=1"):
+        read_wav(tmp_path / "x.wav")
+    assert read_wav(tmp_path / "x.wav", channel=0)[0].tolist() == [0.5, -0.5]
+    assert read_wav(tmp_path / "x.wav", channel=1)[0].tolist() == [0.0, 0.25]
+    with pytest.raises(ValueError, match=r"channel must be below the 2 channel"):
+        read_wav(tmp_path / "x.wav", channel=2)
+
+
+def test_wav_with_unknown_chunks_is_read_and_a_truncated_one_refused(tmp_path):
+    path = tmp_path / "x.wav"
+    write_wav(path, np.arange(100.0), 16000, peak=100.0)
+    content = path.read_bytes()
+    marked = content + b"cue " + struct.pack("<I", 4) + bytes(4)
+    marked = marked[:4] + struct.pack("<I", len(marked) - 8) + marked[8:]
+    path.write_bytes(marked)
+    assert read_wav(path)[0].size == 100
+    path.write_bytes(content[:-51])
+    with pytest.raises(ValueError, match=r"x\.wav cannot be read as a WAV file"):
+        read_wav(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"RIFF", b"no wave file at all"])
+def test_unreadable_wav_files(tmp_path, content):
+    (tmp_path / "x.wav").write_bytes(content)
+    with pytest.raises(ValueError, match=r"x\.wav cannot be read as a WAV file"):
+        read_wav(tmp_path / "x.wav")
+
+
+def test_wav_refusals(tmp_path):
+    path = tmp_path / "x.wav"
+    with pytest.raises(FileNotFoundError, match=r"x\.wav does not exist"):
+        read_wav(path)
+    for arguments, message in (
+        (([], 16000), r"signal must have at least 1 value"),
+        (([np.nan, 1.0], 16000), r"signal must be finite.*index 0"),
+        (([np.inf], 16000), r"signal must be finite"),
+        (([[1.0, 2.0]], 16000), r"signal must be one-dimensional"),
+        (([1.0], 16000.5), r"fs must be a whole number of Hz"),
+        (([1.0], 0), r"fs must be greater than 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write_wav(path, *arguments)
+    with pytest.raises(ValueError, match=r"signal reaches 2, beyond peak = 1; raise peak"):
+        write_wav(path, [2.0], 16000, peak=1.0)
+    assert not path.exists()
+    write_wav(path, [1.0], 16000)
+    with pytest.raises(ValueError, match=r"is sampled at 16000 Hz, expected fs = 8000 Hz"):
+        read_wav(path, 8000)

@@ -1,0 +1,240 @@
+"""Primary noises against closed forms and direct Fourier sums."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy.signals.generators import (
+    band_limited_noise,
+    compressor_noise,
+    level_jump,
+    scaled_to_power,
+    tone,
+)
+
+FS = 16000
+# Rounding of a sum of 1e5 squares: far below 1e-12 relative.
+EXACT = 1e-12
+
+
+def band_share(signal, low, high):
+    """Share of the power between two frequencies, from the plain Fourier transform."""
+    energy = np.abs(np.fft.rfft(signal)) ** 2
+    frequencies = np.fft.rfftfreq(signal.size, 1 / FS)
+    return np.sum(energy[(frequencies >= low) & (frequencies <= high)]) / np.sum(energy)
+
+
+def test_tone_is_the_sine_of_its_definition():
+    x = tone(400.0, 0.5, fs=FS, amplitude=3.0, phase_rad=0.25)
+    assert x.shape == (8000,)
+    assert x.dtype == np.float64
+    expected = [3.0 * np.sin(2 * np.pi * 400.0 * n / FS + 0.25) for n in range(8000)]
+    # The phase reaches 1257 rad, where one rounding is 2e-13.
+    np.testing.assert_allclose(x, expected, rtol=0, atol=1e-11)
+
+
+def test_tone_at_rated_power_peaks_at_the_root_of_twice_the_power():
+    x = tone(400.0, 1.0, fs=FS, amplitude=np.sqrt(2 * 0.8))
+    assert np.mean(x**2) == pytest.approx(0.8, rel=EXACT)
+    assert np.max(np.abs(x)) == pytest.approx(np.sqrt(1.6), rel=EXACT)
+
+
+@pytest.mark.parametrize(("duration", "samples"), [(1.0, 16000), (0.00006, 1), (0.99997, 16000), (10.1, 161600)])
+def test_durations_round_to_the_nearest_sample(duration, samples):
+    assert tone(100.0, duration, fs=FS).shape == (samples,)
+
+
+def test_band_limited_noise_has_its_power_in_its_band_only():
+    x = band_limited_noise((200.0, 2000.0), 4.0, fs=FS, power=0.8, rng=3)
+    assert np.mean(x**2) == pytest.approx(0.8, rel=EXACT)
+    # Bins outside are zero up to rounding.
+    assert band_share(x, 200.0, 2000.0) == pytest.approx(1.0, abs=1e-20 + 4e-16)
+    # Flat: 7200 bins per quarter hold a quarter of the power, to within 5 standard deviations (5 /
+    # sqrt(1800)).
+    for low in (200.0, 650.0, 1100.0, 1550.0):
+        assert band_share(x, low, low + 450.0) == pytest.approx(0.25, rel=0.12)
+
+
+def test_band_limited_noise_is_gaussian():
+    x = band_limited_noise((200.0, 2000.0), 20.0, fs=FS, rng=5)
+    # About 2 * 1800 * 20 = 72000 independent values: standard errors of skewness and kurtosis are
+    # sqrt(6/72000) = 0.009 and sqrt(24/72000) = 0.018; five of them.
+    assert np.mean(x**3) == pytest.approx(0.0, abs=0.046)
+    assert np.mean(x**4) == pytest.approx(3.0, abs=0.092)
+    # Noise at a power of one exceeds the peak of a sine of that power, sqrt(2), 15.73 % of the time
+    # (erfc(1)).
+    assert np.mean(np.abs(x) > np.sqrt(2)) == pytest.approx(0.15730, abs=0.007)
+
+
+def test_band_limited_noise_takes_the_whole_band():
+    x = band_limited_noise((0.0, FS / 2), 0.01, fs=FS, rng=1)
+    white = np.random.default_rng(1).standard_normal(160)
+    np.testing.assert_allclose(x, white / np.sqrt(np.mean(white**2)), rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda rng: band_limited_noise((200.0, 2000.0), 0.5, fs=FS, rng=rng),
+        lambda rng: compressor_noise(0.5, fs=FS, rng=rng),
+    ],
+)
+def test_a_seed_repeats_and_the_global_state_is_left_alone(make):
+    np.random.seed(0)  # noqa: NPY002 - the state that must not matter
+    before = np.random.get_state()[1].copy()  # noqa: NPY002
+    first = make(7)
+    np.testing.assert_array_equal(first, make(7))
+    np.testing.assert_array_equal(first, make(np.random.default_rng(7)))
+    assert not np.array_equal(first, make(8))
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+
+
+def test_compressor_with_steady_speed_and_levels_is_a_sum_of_exact_harmonics():
+    x = compressor_noise(
+        2.0,
+        fs=FS,
+        rng=1,
+        power=2.0,
+        shaft_hz=25.0,
+        n_harmonics=6,
+        speed_fluctuation=0.0,
+        level_fluctuation=0.0,
+        broadband_ratio=0.0,
+    )
+    assert np.mean(x**2) == pytest.approx(2.0, rel=EXACT)
+    # 25 Hz over 2 s lies on bin 50: the six lines hold all of the power, up to rounding.
+    energy = np.abs(np.fft.rfft(x)) ** 2
+    lines = energy[50 * np.arange(1, 7)]
+    assert np.all(lines > 1e-6 * energy.sum())
+    assert np.sum(lines) == pytest.approx(np.sum(energy), rel=1e-12)
+
+
+def test_compressor_lobe_lines_stand_out():
+    ratios = []
+    for seed in range(40):
+        x = compressor_noise(
+            2.0,
+            fs=FS,
+            rng=seed,
+            shaft_hz=25.0,
+            speed_fluctuation=0.0,
+            level_fluctuation=0.0,
+            broadband_ratio=0.0,
+        )
+        energy = np.abs(np.fft.rfft(x)) ** 2
+        # Orders 9 and 11 surround order 10, the peak of the envelope; 8 and 12 are lobe lines.
+        ratios.append(10 * np.log10(energy[50 * 12] * energy[50 * 8] / (energy[50 * 9] * energy[50 * 11])) / 2)
+    # 10 dB apart; four independent spreads of 3 dB, halved, over 40 seeds: standard error 0.5 dB.
+    assert np.mean(ratios) == pytest.approx(10.0, abs=2.0)
+
+
+def test_compressor_broadband_share_and_band():
+    x = compressor_noise(
+        8.0, fs=FS, rng=2, broadband_ratio=0.25, speed_fluctuation=0.0, level_fluctuation=0.0, shaft_hz=25.0
+    )
+    energy = np.abs(np.fft.rfft(x)) ** 2
+    energy[25 * 8 * np.arange(1, 41)] = 0.0
+    # The broadband part's own share of the 40 bins, and its correlation with the lines, are some 0.5 %.
+    assert np.sum(energy) / np.sum(np.abs(np.fft.rfft(x)) ** 2) == pytest.approx(0.25, rel=0.03)
+    assert band_share(x, 19.9, 2000.1) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_compressor_speed_and_levels_wander_as_stated():
+    steady = {"broadband_ratio": 0.0, "n_harmonics": 1, "shaft_hz": 100.0, "bandwidth_hz": 1000.0}
+    seconds = 60.0
+    x = compressor_noise(seconds, fs=2000, rng=4, speed_fluctuation=0.01, level_fluctuation=0.0, **steady)
+    # One line: its analytic signal's phase gives the momentary frequency.
+    spectrum = np.fft.fft(x)
+    spectrum[x.size // 2 :] = 0.0
+    frequency = np.diff(np.unwrap(np.angle(np.fft.ifft(spectrum))))[200:-200] * 2000 / (2 * np.pi)
+    # 60 s hold about 60 correlation times (2 * 0.5 s): 100 +- 1 Hz, mean within 5/sqrt(60), spread within 45
+    # %.
+    assert np.mean(frequency) == pytest.approx(100.0, abs=0.65)
+    assert np.std(frequency) == pytest.approx(1.0, rel=0.45)
+
+    x = compressor_noise(seconds, fs=2000, rng=4, speed_fluctuation=0.0, level_fluctuation=0.1, **steady)
+    spectrum = np.fft.fft(x)
+    spectrum[x.size // 2 :] = 0.0
+    level = np.log(np.abs(np.fft.ifft(spectrum)))[200:-200]
+    assert np.std(level) == pytest.approx(0.1, rel=0.45)
+
+
+def test_level_jump_scales_the_rest_and_leaves_its_input():
+    x = tone(400.0, 1.0, fs=FS)
+    kept = x.copy()
+    louder = level_jump(x, 0.25, 6.0, fs=FS)
+    np.testing.assert_array_equal(x, kept)
+    np.testing.assert_array_equal(louder[:4000], x[:4000])
+    np.testing.assert_allclose(louder[4000:], x[4000:] * 1.9952623149688795, rtol=1e-15, atol=0)
+
+
+@given(
+    st.lists(st.floats(-1e150, 1e150).filter(lambda v: abs(v) > 1e-150), min_size=1, max_size=30),
+    st.floats(1e-6, 1e6),
+)
+@settings(max_examples=100, deadline=None)
+def test_scaled_signal_has_the_power_and_the_shape(values, power):
+    scaled = scaled_to_power(values, power)
+    assert np.mean(scaled**2) == pytest.approx(power, rel=1e-12)
+    np.testing.assert_array_equal(np.sign(scaled[np.abs(scaled) > 0]), np.sign(np.array(values))[np.abs(scaled) > 0])
+    # Scaling again to the same power changes nothing but rounding.
+    np.testing.assert_allclose(scaled_to_power(scaled, power), scaled, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: tone(8000.0, 1.0, fs=FS), ValueError, r"frequency_hz must be below fs/2 = 8000 Hz"),
+        (lambda: tone(0.0, 1.0, fs=FS), ValueError, r"frequency_hz must be greater than 0"),
+        (lambda: tone(400.0, 1.0, fs=FS, amplitude=-1.0), ValueError, r"amplitude must not be negative"),
+        (lambda: tone(400.0, 1e-6, fs=FS), ValueError, r"duration_s must be at least one sample"),
+        (lambda: tone(400.0, 1.0, fs=0), ValueError, r"fs must be greater than 0"),
+        (lambda: tone(400.0, 1.0, fs=FS, phase_rad=np.nan), ValueError, r"phase_rad must be finite"),
+        (lambda: band_limited_noise((200, 9000), 1.0, fs=FS, rng=1), ValueError, r"band must satisfy"),
+        (
+            lambda: band_limited_noise((201, 210), 0.01, fs=FS, rng=1),
+            ValueError,
+            r"too short for the band 201 to",
+        ),
+        (lambda: band_limited_noise((200, 2000), 1.0, fs=FS, rng=None), TypeError, r"rng must be a seed"),
+        (
+            lambda: band_limited_noise((200, 2000), 1.0, fs=FS, power=0, rng=1),
+            ValueError,
+            r"power must be greater",
+        ),
+        (lambda: compressor_noise(1.0, fs=FS, rng=1, n_harmonics=400), ValueError, r"beyond fs/2 = 8000 Hz"),
+        (
+            lambda: compressor_noise(1.0, fs=FS, rng=1, n_harmonics=0),
+            ValueError,
+            r"n_harmonics must be at least 1",
+        ),
+        (
+            lambda: compressor_noise(1.0, fs=FS, rng=1, broadband_ratio=1.0),
+            ValueError,
+            r"broadband_ratio must be",
+        ),
+        (
+            lambda: compressor_noise(1.0, fs=FS, rng=1, bandwidth_hz=9e3),
+            ValueError,
+            r"bandwidth_hz must be above 20 Hz",
+        ),
+        (
+            lambda: compressor_noise(0.001, fs=FS, rng=1, bandwidth_hz=500),
+            ValueError,
+            r"too short for the broadband part, 20 to 500 Hz",
+        ),
+        (lambda: compressor_noise(1.0, fs=FS, rng=None), TypeError, r"rng must be a seed"),
+        (
+            lambda: level_jump([1.0, 2.0], 1.0, 6.0, fs=2),
+            ValueError,
+            r"at_s must lie within the signal of 1 s",
+        ),
+        (lambda: level_jump([1.0, 2.0], -1.0, 6.0, fs=2), ValueError, r"at_s must not be negative"),
+        (lambda: scaled_to_power([0.0, 0.0], 1.0), ValueError, r"signal must not be all zeros"),
+        (lambda: scaled_to_power([], 1.0), ValueError, r"signal must have at least 1 value"),
+    ],
+)
+def test_refusals_say_what_was_wrong(call, error, message):
+    with pytest.raises(error, match=message):
+        call()

@@ -1,0 +1,273 @@
+"""Noises whose level varies, against their description: statistics with their standard errors, levels by their own power."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy.signals import band_limited_noise, bursty_noise, looped, swelling
+
+FS = 1000.0
+EXACT = 1e-12  # rounding of a sum of 1e6 squares is far below it
+WIDE = (50.0, 450.0)  # of 500 Hz: the band's own ringing is a few samples
+
+# ---- Bursts
+
+
+def bursts(**options: Any) -> np.ndarray:
+    """Bursts of one level over next to no background."""
+    quiet = {"fs": FS, "rng": 5, "band": WIDE, "level_spread_db": 0.0, "background_db": -90.0, "decay_s": 0.02}
+    return bursty_noise(**{"duration_s": 1000.0, "rate_hz": 2.0} | quiet | options)
+
+
+def edges(x: np.ndarray, threshold: float, hold: int = 15) -> tuple[np.ndarray, np.ndarray]:
+    """Where bursts begin, and where the last overlapping one has ended: no larger sample for `hold` samples."""
+    loud = np.flatnonzero(np.abs(x) > threshold)
+    gaps = np.flatnonzero(np.diff(loud) > hold)
+    return loud[np.concatenate([[0], gaps + 1])], loud[np.concatenate([gaps, [loud.size - 1]])]
+
+
+@pytest.mark.parametrize("power", [1e-6, 1.0, 40.0])
+def test_bursts_have_their_power_exactly(power: float) -> None:
+    x = bursty_noise(3.0, fs=16000.0, rng=2, power=power)
+    assert x.shape == (48000,)
+    assert x.dtype == np.float64
+    assert np.mean(x**2) == pytest.approx(power, rel=EXACT)
+
+
+def test_a_seed_repeats_and_the_global_state_is_left_alone() -> None:
+    before = np.random.get_state()[1].copy()  # noqa: NPY002 - the state that must not matter
+    first = bursty_noise(1.0, fs=FS, rng=7, band=WIDE)
+    np.testing.assert_array_equal(first, bursty_noise(1.0, fs=FS, rng=7, band=WIDE))
+    np.testing.assert_array_equal(first, bursty_noise(1.0, fs=FS, rng=np.random.default_rng(7), band=WIDE))
+    assert not np.array_equal(first, bursty_noise(1.0, fs=FS, rng=8, band=WIDE))
+    np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.0, 5.0])
+def test_bursts_come_as_a_poisson_process(rate: float) -> None:
+    """However long bursts are and however they overlap: the pauses of such a process are exponential of mean 1/rate,
+    whatever of their beginning is cut off. So mean and standard deviation are one, to 5 standard errors."""
+    starts, ends = edges(bursts(rate_hz=rate), 0.01)
+    pauses = (starts[1:] - ends[:-1] - 15) / FS  # a pause is seen from 15 samples on
+    assert np.mean(pauses) == pytest.approx(1 / rate, rel=5 / np.sqrt(pauses.size))
+    # the standard deviation of an exponential distribution's estimate is sqrt(2/n) of it
+    assert np.std(pauses) == pytest.approx(1 / rate, rel=5 * np.sqrt(2 / pauses.size))
+    # and they come as often at the beginning as at the end
+    first_half = np.sum(starts < 500 * FS)
+    assert first_half == pytest.approx(starts.size / 2, abs=5 * np.sqrt(starts.size / 4))
+
+
+def lone(x: np.ndarray, decay: float, threshold: float = 0.01, rings_s: float = 0.03) -> np.ndarray:
+    """Where bursts begin that no other overlaps: an envelope ends after 6 tau, and the band rings a little."""
+    starts, ends = edges(x, threshold, hold=30)
+    return starts[(ends - starts < (6 * decay + rings_s) * FS) & (starts < x.size - 8 * decay * FS)]
+
+
+@pytest.mark.parametrize("decay", [0.05, 0.1, 0.2])
+def test_bursts_die_away_with_their_time_constant(decay: float) -> None:
+    """The mean power of n lone bursts falls as exp(-2 t/tau). A sample of it is off by sqrt(2/n), so the slope of its
+    logarithm over 2 tau, m samples of which the band leaves 0.8 independent, by sqrt(2/n) sqrt(12/(0.8 m))/(2 tau), of
+    2/tau; 5 of that. 3 % for the few that overlap in the first 30 ms unnoticed, which lengthens them."""
+    x = bursts(duration_s=2000.0, rate_hz=0.3, decay_s=decay)
+    starts = lone(x, decay)
+    first, m = 8, round(2 * decay * FS)  # samples of the band's onset, samples fitted
+    power = np.mean([x[s + first : s + first + m] ** 2 for s in starts], axis=0)
+    slope = np.polyfit(np.arange(m) / FS, np.log(power), 1)[0]
+    assert starts.size > 200
+    assert -2 / slope == pytest.approx(decay, rel=5 * np.sqrt(2 / starts.size) * np.sqrt(12 / (0.8 * m)) / 4 + 0.03)
+
+
+def test_bursts_differ_in_level_as_stated() -> None:
+    """Energies of lone bursts: 4 dB, and what else there is where all are of one level, added as squares: 0.7 dB of the
+    noise in a burst, of 80 degrees of freedom (tau fs, of the band 0.8), and the 2 % that overlap unnoticed, twice as
+    strong. 5 standard errors sqrt(1/(2 n)) of n bursts' deviation."""
+    deviation = {}
+    for spread in (0.0, 4.0):
+        x = bursts(duration_s=2000.0, rate_hz=0.4, decay_s=0.1, level_spread_db=spread)
+        starts = lone(x, 0.1, threshold=0.003, rings_s=0.06)  # 16 dB softer ones are seen to their ends, too
+        assert starts.size > 300
+        deviation[spread] = np.std([10 * np.log10(np.sum(x[s : s + 600] ** 2)) for s in starts])
+    assert deviation[0.0] < 1.5
+    errors = 5 / np.sqrt(2 * starts.size)
+    assert np.sqrt(deviation[4.0] ** 2 - deviation[0.0] ** 2) == pytest.approx(4.0, rel=errors)
+
+
+@pytest.mark.parametrize("background_db", [-30.0, -20.0, 0.0])
+def test_the_background_has_its_level(background_db: float) -> None:
+    """Between bursts, which the same seed without background shows. 800 s with 0.8 degrees of freedom a sample give it
+    to 5 sqrt(2/640000) = 0.9 %, and bursts and background together their sum of 1 to as much."""
+    starts, ends = edges(bursts(rate_hz=0.5, decay_s=0.01), 1e-3, hold=40)
+    x = bursts(rate_hz=0.5, decay_s=0.01, background_db=background_db)
+    pause = np.ones(x.size, dtype=bool)
+    for start, end in zip(starts, ends, strict=True):
+        pause[max(start - 5, 0) : end + 60] = False
+    ratio = 10 ** (background_db / 10)
+    assert np.sum(pause) > 800_000
+    assert np.mean(x[pause] ** 2) == pytest.approx(ratio / (1 + ratio), rel=0.025)
+
+
+def test_bursts_lie_in_their_band() -> None:
+    x = bursty_noise(20.0, fs=16000.0, rng=1, band=(500.0, 1000.0))
+    energy = np.abs(np.fft.rfft(x)) ** 2
+    frequency = np.fft.rfftfreq(x.size, 1 / 16000)
+    inside = (frequency > 500) & (frequency < 1000)
+    assert np.sum(energy[inside]) > 0.9 * np.sum(energy)
+    # fourth order, an octave off: 24 dB of each edge at the least
+    assert np.mean(energy[(frequency > 2000) & (frequency < 3000)]) < 10**-2.4 * np.mean(energy[inside])
+
+
+def test_bursts_take_the_whole_band() -> None:
+    x = bursty_noise(2.0, fs=FS, rng=1, band=(0.0, FS / 2))
+    assert np.all(np.isfinite(x))
+    assert np.mean(x**2) == pytest.approx(1.0, rel=EXACT)
+
+
+# ---- Swelling
+
+
+@given(
+    values=st.lists(st.floats(-1e3, 1e3).filter(lambda v: abs(v) > 1e-3), min_size=1, max_size=50),
+    swing=st.floats(0.0, 40.0),
+    period=st.floats(0.01, 100.0),
+    phase=st.floats(-10.0, 10.0),
+)
+@settings(max_examples=60)
+def test_swelling_keeps_the_mean_power_and_its_input(
+    values: list[float], swing: float, period: float, phase: float
+) -> None:
+    x = np.array(values)
+    y = swelling(x, fs=8.0, swing_db=swing, period_s=period, phase_rad=phase)
+    np.testing.assert_array_equal(x, values)
+    assert np.mean(y**2) == pytest.approx(np.mean(x**2), rel=EXACT)
+    gain_db = 20 * np.log10(y / x)  # no sign is turned
+    assert np.ptp(gain_db) <= 2 * swing + 1e-9
+    if swing == 0.0:
+        np.testing.assert_allclose(y, x, rtol=1e-14)
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.0, -2.5])
+@pytest.mark.parametrize(("swing", "period"), [(6.0, 4.0), (3.0, 1.6), (12.0, 8.0)])
+def test_the_level_swings_as_a_sine_of_its_period(swing: float, period: float, phase: float) -> None:
+    """Seen in the powers of noise over a 40th of a period, 0.04 s and more: some 80 degrees of freedom give 0.7 dB
+    each, which 400 of them bring to 0.7 sqrt(2/400) = 0.05 dB of the sine's amplitude; 5 of it."""
+    noise = band_limited_noise((50.0, 1000.0), 10 * period, fs=2000.0, rng=3)
+    y = swelling(noise, fs=2000.0, swing_db=swing, period_s=period, phase_rad=phase)
+    level = 10 * np.log10(np.mean(y.reshape(400, -1) ** 2, axis=1))
+    spectrum = np.fft.rfft(level - np.mean(level)) / 200
+    assert np.argmax(np.abs(spectrum)) == 10  # ten periods
+    assert np.abs(spectrum[10]) == pytest.approx(swing, abs=0.25 + 0.005 * swing)  # a 40th's mean flattens by 0.1 %
+    # a sine: phase less a quarter turn, at the middle of the first 40th
+    seen = np.angle(spectrum[10] * np.exp(-1j * np.pi / 40) * 1j * np.exp(-1j * phase))
+    assert seen == pytest.approx(0.0, abs=0.25 / swing + 0.01)
+
+
+# ---- Looped
+
+
+RECORDING = np.random.default_rng(4).standard_normal(5000)  # of 1 s at 5000 Hz: the fade takes 250
+RATE, FADE = 5000.0, 250
+TURN = 5000 - FADE
+
+
+def test_one_turn_is_the_recording_but_for_the_fade() -> None:
+    y = looped(RECORDING, TURN / RATE, fs=RATE)
+    np.testing.assert_array_equal(y[FADE:], RECORDING[FADE:TURN])
+    assert np.all(y[:FADE] != RECORDING[:FADE])
+    np.testing.assert_array_equal(looped(RECORDING, 0.5, fs=RATE), y[:2500])
+
+
+@given(turns=st.floats(0.01, 4.0), start=st.floats(0.0, 5.0))
+@settings(max_examples=40)
+def test_it_goes_round_and_begins_anywhere(turns: float, start: float) -> None:
+    """Sample n is that of n plus the start, in a loop of one turn."""
+    one = looped(RECORDING, TURN / RATE, fs=RATE)
+    y = looped(RECORDING, turns * TURN / RATE, fs=RATE, start_s=start)
+    assert y.size == round(turns * TURN / RATE * RATE)
+    np.testing.assert_array_equal(y, one[(round(start * RATE) + np.arange(y.size)) % TURN])
+
+
+@given(
+    frequency=st.floats(20.0, 400.0),
+    phase=st.floats(0.0, 6.28),
+    samples=st.integers(2001, 6000),
+    start=st.floats(0.0, 1.0),
+)
+@settings(max_examples=40)
+def test_a_tone_has_no_click(frequency: float, phase: float, samples: int, start: float) -> None:
+    """Steps between samples: those of the two tones under sin and cos, 1 at most together sqrt(2), and the fade's own."""
+    turn = 2 * np.pi * frequency / RATE
+    y = looped(np.sin(turn * np.arange(samples) + phase), 3.0, fs=RATE, start_s=start)
+    assert np.max(np.abs(np.diff(y))) <= np.sqrt(2) * (turn + np.pi / (2 * FADE))
+
+
+def test_a_cut_without_a_fade_does_click() -> None:
+    """So the test above could fail: a quarter period is missing where the loop begins again."""
+    tone = np.sin(2 * np.pi * 100.0 / RATE * np.arange(4000 - 13))
+    fast = np.sqrt(2) * (2 * np.pi * 100.0 / RATE + np.pi / (2 * FADE))
+    assert np.max(np.abs(np.diff(np.resize(tone, 15000)))) > 4 * fast
+    assert np.max(np.abs(np.diff(looped(tone, 3.0, fs=RATE)))) < fast
+
+
+def test_noise_keeps_its_power_through_the_fade() -> None:
+    """Of 400 recordings: each tenth of the fade has 10000 samples, 5 sqrt(2/10000) = 7 %. A linear fade would halve the
+    power in its middle."""
+    rng = np.random.default_rng(9)
+    power = np.mean([looped(rng.standard_normal(600), 0.05, fs=RATE) ** 2 for _ in range(400)], axis=0)
+    np.testing.assert_allclose(power.reshape(10, -1).mean(axis=1), 1.0, rtol=0, atol=0.07)
+
+
+@pytest.mark.parametrize(("samples", "fs"), [(501, 5000.0), (3, 1.0), (101, 1000.0)])
+def test_the_shortest_recording(samples: int, fs: float) -> None:
+    recording = np.arange(1.0, samples + 1)
+    fade = max(round(0.05 * fs), 1)
+    y = looped(recording, 10 * samples / fs, fs=fs)
+    assert y.size == 10 * samples
+    np.testing.assert_array_equal(y[fade : samples - fade], recording[fade : samples - fade])
+    with pytest.raises(ValueError, match=r"^recording must be longer than .* two cross-fades, got "):
+        looped(recording[1:], 1.0, fs=fs)
+
+
+# ---- Refusals
+
+
+BAD = [
+    (lambda: bursty_noise(0.0, fs=FS, rng=1), ValueError, r"duration_s must be greater than 0"),
+    (lambda: bursty_noise(1e-5, fs=FS, rng=1), ValueError, r"duration_s fs, in samples, must be at least 1"),
+    (lambda: bursty_noise(1.0, fs=0, rng=1), ValueError, r"fs must be greater than 0"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=None, band=WIDE), TypeError, r"rng must be a seed"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1), ValueError, r"band must satisfy .* fs/2 = 500 Hz, got \(100, 1500\)"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=(200, 100)), ValueError, r"band must satisfy"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, power=0.0), ValueError, r"power must be greater"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, rate_hz=0.0), ValueError, r"rate_hz must be greater"),
+    (
+        lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, rate_hz=1e-9),
+        ValueError,
+        r"^no burst fell into duration_s = 1 s: take a longer duration or a higher rate_hz$",
+    ),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, decay_s=0.0), ValueError, r"decay_s must be greater"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, level_spread_db=-1), ValueError, r"level_spread_db must not"),
+    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, background_db=np.nan), ValueError, r"background_db must be f"),
+    (lambda: swelling([0.0, 0.0], fs=FS), ValueError, r"power must be greater than 0|not be all zeros"),
+    (lambda: swelling([], fs=FS), ValueError, r"signal must have at least 1 value"),
+    (lambda: swelling([[1.0]], fs=FS), ValueError, r"signal must be one-dimensional"),
+    (lambda: swelling([1.0], fs=0.0), ValueError, r"fs must be greater than 0"),
+    (lambda: swelling([1.0], fs=FS, swing_db=-1.0), ValueError, r"swing_db must not be negative"),
+    (lambda: swelling([1.0], fs=FS, period_s=0.0), ValueError, r"period_s must be greater than 0"),
+    (lambda: swelling([1.0], fs=FS, phase_rad=np.inf), ValueError, r"phase_rad must be finite"),
+    (lambda: looped(RECORDING, 0.0, fs=RATE), ValueError, r"duration_s must be greater than 0"),
+    (lambda: looped(RECORDING, 1.0, fs=RATE, start_s=-1.0), ValueError, r"start_s must not be negative"),
+    (lambda: looped([np.nan] * 600, 1.0, fs=RATE), ValueError, r"recording must be finite"),
+    (lambda: looped([], 1.0, fs=RATE), ValueError, r"recording must have at least 1 value"),
+    (lambda: looped("hum", 1.0, fs=RATE), TypeError, r"recording must be a sequence of real numbers"),
+]
+
+
+@pytest.mark.parametrize(("call", "error", "message"), BAD)
+def test_refusals_say_what_was_wrong(call: Any, error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        call()
