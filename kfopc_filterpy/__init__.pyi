@@ -23,43 +23,23 @@ from . import (
     signals as signals,
 )
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
-from .controllers.amplitude_limited import (
-    ClippingFxLMS as ClippingFxLMS,
-)
-from .controllers.amplitude_limited import (
-    RescalingFxLMS as RescalingFxLMS,
-)
-from .controllers.amplitude_limited import (
-    TwoGradientFxLMS as TwoGradientFxLMS,
-)
+from .controllers.clipping import ClippingFxLMS as ClippingFxLMS
 from .controllers.diagonal import DiagonalKalman as DiagonalKalman
 from .controllers.fast_array import FastArrayKalman as FastArrayKalman
 from .controllers.fxlms import FxLMS as FxLMS
-from .controllers.fxlms import FxNLMS as FxNLMS
+from .controllers.fxnlms import FxNLMS as FxNLMS
 from .controllers.fxrls import fx_rls as fx_rls
-from .controllers.kalman import (
-    KalmanController as KalmanController,
-)
-from .controllers.kalman import (
-    kf_anc as kf_anc,
-)
-from .controllers.kalman import (
-    kf_opc as kf_opc,
-)
-from .controllers.kalman import (
-    kf_pb as kf_pb,
-)
+from .controllers.kalman import KalmanController as KalmanController
+from .controllers.kalman import kf_anc as kf_anc
+from .controllers.kalman import kf_opc as kf_opc
+from .controllers.leaky import LeakyFxLMS as LeakyFxLMS
+from .controllers.leaky import OptimalLeakyFxLMS as OptimalLeakyFxLMS
 from .controllers.limited import LimitedController as LimitedController
-from .controllers.penalized import (
-    LeakyFxLMS as LeakyFxLMS,
-)
-from .controllers.penalized import (
-    MOVFxLMS as MOVFxLMS,
-)
-from .controllers.penalized import (
-    OptimalLeakyFxLMS as OptimalLeakyFxLMS,
-)
+from .controllers.mov import MOVFxLMS as MOVFxLMS
+from .controllers.power_budget import kf_pb as kf_pb
 from .controllers.repaired import kf_opc_repaired as kf_opc_repaired
+from .controllers.rescaling import RescalingFxLMS as RescalingFxLMS
+from .controllers.two_gradient import TwoGradientFxLMS as TwoGradientFxLMS
 from .filters.kfopc import KFOPC as KFOPC
 from .loop.scenarios import simulate_scenarios as simulate_scenarios
 from .loop.simulation import SimulationResult as SimulationResult

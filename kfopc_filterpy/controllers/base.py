@@ -2,34 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from .._validate import as_count, as_number, as_signal
-from ..kernels.block import OpenBlock
-from ..kernels.covariance import new_covariance
 from ..kernels.delay_lines import delay_line, latest, newest
-from ..loop.run import (
-    DISTURBANCE_IN,
-    LISTENING,
-    REFERENCE_IN,
-    REFUSED,
-    ROWS,
-    STEP,
-    ControllerState,
-    Plant,
-    adapt_lms,
-    control_signal,
-    disturbance_estimate,
-    run,
-    squares_are_finite,
-)
 from ..paths.models import is_system, path_taps, sampling_rate
-from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_parameters
-from ..power.constraint import OutputPowerConstraint
+from ..power.amplifiers import Amplifier, compiled_model
+from ..power.constraint import ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
+from .step import Lines, adapt_once, emit_once, estimate_once, listen
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
@@ -61,12 +46,22 @@ class Controller(Protocol):
         ...
 
 
-def constraint_or_none(rated_power: float | None = None, **settings: Any) -> OutputPowerConstraint:
-    """Constraint of a rated power; without one the factor is held at 1, and the powers are still followed."""
-    constraint = OutputPowerConstraint(1.0 if rated_power is None else rated_power, **settings)
-    if rated_power is None:
-        constraint.factor = 1.0
-    return constraint
+def constraint_for(rated_power: float | None, constraint: OutputPowerConstraint | None) -> OutputPowerConstraint:
+    """Return a constraint of the controller's own: a copy of the one given, or one with the usual settings."""
+    if (rated_power is None) == (constraint is None):
+        raise ValueError("give either rated_power= or constraint=, an OutputPowerConstraint")
+    if constraint is None:
+        return OutputPowerConstraint(rated_power)  # type: ignore[arg-type]
+    if not isinstance(constraint, OutputPowerConstraint):
+        raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {constraint!r}")
+    return deepcopy(constraint)
+
+
+def constraint_or_none(
+    rated_power: float | None, constraint: OutputPowerConstraint | None
+) -> OutputPowerConstraint | None:
+    """Return `constraint_for`, or None if neither a rated power nor a constraint is given."""
+    return None if rated_power is None and constraint is None else constraint_for(rated_power, constraint)
 
 
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
@@ -79,12 +74,12 @@ def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
 
 
 class FilteredReferenceController:
-    """Delay lines and filtered reference that the built-in controllers share.
+    """Delay lines, powers and filtered reference that the built-in controllers share.
+
+    A subclass sets `_state`, which begins with `_common()`, and registers the step for its type (see `step`).
 
     Parameters
     ----------
-    kind : int
-        Family, `loop.KALMAN` or `loop.LMS`.
     n_taps : int
         Taps L of the control filter.
     secondary_path : array_like or control.TransferFunction
@@ -95,45 +90,48 @@ class FilteredReferenceController:
         What keeps the powers and the factor; by default the powers are followed with the factor held at 1.
     limiter : OutputLimiter, optional
         What the control signal goes through, see `limiter`.
+    filtered_taps : int, optional
+        Length of the filtered reference that is kept; by default `n_taps`.
     """
 
     name = "controller"
     _refusal = OVERFLOW  # why an update is refused whose numbers are finite
+    _state: Any
 
     def __init__(
         self,
-        kind: int,
         n_taps: int,
         secondary_path: Any,
-        settings: list[float],
+        *,
         amplifier: Amplifier | None = None,
         constraint: OutputPowerConstraint | None = None,
         limiter: OutputLimiter | None = None,
+        filtered_taps: int | None = None,
     ) -> None:
-        n_taps = as_count(n_taps, "n_taps")
+        self.n_taps = as_count(n_taps, "n_taps")
         secondary = path_taps(secondary_path, name="secondary_path")
-        parameters = compiled_parameters(amplifier)
-        if parameters is None:
+        model = compiled_model(amplifier)
+        if model is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
         self._path_fs = sampling_rate(secondary_path, name="secondary_path") if is_system(secondary_path) else None
-        self._own_constraint = constraint or constraint_or_none()
-        weights = np.zeros(n_taps)
-        self._state = ControllerState(
-            kind=kind,
-            weights=weights,
-            control_filter=weights,
+        self._constrained = constraint is not None
+        self._own_constraint = constraint or OutputPowerConstraint(1.0)
+        if constraint is None:
+            self._own_constraint.factor = 1.0
+        self._limiter = _checked_limiter(limiter)
+        self._lines = Lines(
             secondary_estimate=secondary,
-            reference=delay_line(max(n_taps, secondary.size)),
-            filtered=delay_line(n_taps),
+            reference=delay_line(max(self.n_taps, secondary.size)),
+            filtered=delay_line(filtered_taps or self.n_taps),
             output=delay_line(secondary.size),
-            amplifier=parameters,
-            settings=np.array(settings, dtype=np.float64),
-            covariance=new_covariance(np.zeros((1, 1))),
-            constraint=self._own_constraint.state,
-            last=np.zeros(3),
+            amplifier=model,
+            limiter=None if limiter is None else limiter.state,
         )
         self._y = 0.0
-        self.limiter = limiter
+
+    def _common(self) -> tuple[Lines, np.ndarray, ConstraintState]:
+        """Return the fields that every state begins with: lines, weights, constraint."""
+        return self._lines, np.zeros(self.n_taps), self._own_constraint.state
 
     @property
     def limiter(self) -> OutputLimiter | None:
@@ -145,10 +143,9 @@ class FilteredReferenceController:
 
     @limiter.setter
     def limiter(self, value: OutputLimiter | None) -> None:
-        if value is not None and not isinstance(value, OutputLimiter):
-            raise TypeError(f"limiter must be an OutputLimiter or None, got {value!r}")
-        self._limiter = value
-        self._state = self._state._replace(limiter=None if value is None else value.state)
+        self._limiter = _checked_limiter(value)
+        lines = self._state.lines._replace(limiter=None if value is None else value.state)
+        self._state = self._state._replace(lines=lines)
 
     @property
     def weights(self) -> np.ndarray:
@@ -158,12 +155,12 @@ class FilteredReferenceController:
     @property
     def control_filter(self) -> np.ndarray:
         """Control filter that makes y, (L,); a copy."""
-        return self._state.control_filter.copy()
+        return self.weights
 
     @property
     def rated_power(self) -> float | None:
-        """Rated output power that the controller keeps to; None where it has no constraint."""
-        return None
+        """Rated output power that the controller keeps to; None if it has no constraint."""
+        return self._own_constraint.rated_power if self._constrained else None
 
     @property
     def constraint(self) -> OutputPowerConstraint:
@@ -188,19 +185,21 @@ class FilteredReferenceController:
 
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        self._y = float(control_signal(self._state, as_number(reference, "reference")))
+        self._y = emit_once(self._state, as_number(reference, "reference"))
         return self._y
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""
         error = as_number(error, "error")
-        if not adapt_lms(self._state, error, self._y):
-            raise ValueError(self._refusal if self._squares_are_finite(error) else OVERFLOW)
+        if not adapt_once(self._state, error, self._y):
+            raise ValueError(self._reason(error))
 
-    def _squares_are_finite(self, error: float) -> bool:
-        state = self._state
-        d = disturbance_estimate(state, error)
-        return bool(squares_are_finite(d, latest(state.filtered), latest(state.reference)))
+    def _reason(self, error: float) -> str:
+        """Return why an update was refused."""
+        lines = self._state.lines
+        values = np.array([estimate_once(lines, error), latest(lines.filtered), latest(lines.reference)])
+        with np.errstate(over="ignore"):
+            return self._refusal if np.isfinite(values**2).all() else OVERFLOW
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
@@ -213,25 +212,14 @@ class FilteredReferenceController:
         x = as_signal(references, "references")
         e = as_signal(errors, "errors", length=x.size)
         self._require_finite_squares(x, e)
-        silent = self._silent_state()
-        nothing = Plant(np.zeros(1), np.zeros(0), delay_line(1), LinearAmplifier().parameters)
-        for first in range(0, x.size, STEP):
-            signals = np.zeros((ROWS, min(STEP, x.size - first)))
-            signals[REFERENCE_IN], signals[DISTURBANCE_IN] = x[first : first + STEP], e[first : first + STEP]
-            no_weights = np.empty((0, 0))
-            status, done = run(silent, self.open_block, nothing, signals, no_weights, np.inf, 1, 0, 0, signals.shape[1])
-            if status == REFUSED:
-                refused = ValueError(self._refusal)
-                refused.add_note(f"in sample {first + done} of those listened to")
-                raise refused
-
-    def _silent_state(self) -> ControllerState:
-        """State for the compiled loop to listen with."""
-        zeros = np.zeros(self._state.weights.size)
-        return self._state._replace(kind=LISTENING, weights=zeros, control_filter=zeros)
+        taken = listen(self._state, x, e)
+        if taken < x.size:
+            refused = ValueError(self._refusal)
+            refused.add_note(f"in sample {taken} of those listened to")
+            raise refused
 
     def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:
-        s, heard = self._state.secondary_estimate, self._state.reference
+        s, heard = self._lines.secondary_estimate, self._lines.reference
         before = newest(heard, s.size - 1)[::-1]
         with np.errstate(over="ignore", invalid="ignore"):
             filtered = np.convolve(np.concatenate((before, x)), s, mode="valid")
@@ -257,23 +245,20 @@ class FilteredReferenceController:
             },
         )
 
-    def steps_of(self, family: type) -> bool:
-        """Whether the two calls a sample are those of `family`, which the compiled loop knows, and not a subclass's."""
-        mine = type(self)
-        return mine.control_signal is family.control_signal and mine.update is family.update  # type: ignore[attr-defined]
+    def compiled_state(self) -> Any:
+        """Return the state for the compiled loop, which advances it; None if only the steps above can run."""
+        return self._state if calls_of(type(self)) == calls_of(FilteredReferenceController) else None
 
-    def compiled_state(self) -> ControllerState | None:
-        """State for the compiled loop, which advances it; None where only the steps above can run."""
-        return self._state if self.steps_of(FilteredReferenceController) else None
-
-    @property
-    def open_block(self) -> OpenBlock | None:
-        """Block under way, for the compiled loop; None for a controller that takes samples one by one."""
-        return None
-
-    def blocks(self, state: ControllerState, n_samples: int) -> Iterator[tuple[int, int]]:
-        """Begin and end of the blocks that the loop may run on `state` without a pause; here all `n_samples`."""
-        yield 0, n_samples
-
-    def after_compiled(self, state: ControllerState) -> None:
+    def after_compiled(self, state: Any) -> None:
         """Take back what the compiled loop advanced in `state`, however many samples it ran."""
+
+
+def calls_of(kind: type) -> tuple[Any, Any]:
+    """Return the two calls a sample of a class: those of a subclass are its own, and Python has to make them."""
+    return kind.control_signal, kind.update  # type: ignore[attr-defined]
+
+
+def _checked_limiter(limiter: OutputLimiter | None) -> OutputLimiter | None:
+    if limiter is not None and not isinstance(limiter, OutputLimiter):
+        raise TypeError(f"limiter must be an OutputLimiter or None, got {limiter!r}")
+    return limiter

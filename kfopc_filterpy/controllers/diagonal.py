@@ -2,17 +2,56 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_nonnegative
-from ..loop.run import LMS
+from ..kernels.compiling import part
+from ..kernels.delay_lines import newest
+from ..kernels.vectors import FAST
 from ..power.amplifiers import Amplifier
-from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S
+from ..power.constraint import ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController, constraint_or_none
-from .lms_rules import MEASUREMENT_NOISE, PLAIN, STATE_NOISE, lms_settings
+from .lms import advance_powers
+from .step import Lines, adapt
+
+
+class DiagonalState(NamedTuple):
+    """What the step of `DiagonalKalman` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    variances: np.ndarray  # (L,) of the weights
+    state_noise: float
+    measurement_noise: float
+
+
+@adapt.register(DiagonalState)
+def adapt_diagonal(state, error, control_signal):
+    """Take eq. 2-9 with P held to its diagonal."""
+    finite, d, factor = advance_powers(state, error)
+    if finite:
+        row = newest(state.lines.filtered, state.weights.size)
+        correct_diagonal(state.variances, state.weights, row, factor * d, state.state_noise, state.measurement_noise)
+    return finite
+
+
+@part(fastmath=FAST)
+def correct_diagonal(variances, w, row, d, state_noise, measurement_noise):
+    """Apply eq. 3-8 with P = diag(p): p += r, S = sum p x'^2 + q, K = p x' / S, w += K (d - w'x'), p -= K x' p."""
+    S, residual = measurement_noise, d
+    for i in range(w.size):
+        variances[i] += state_noise
+        S += variances[i] * row[i] * row[i]
+        residual -= w[i] * row[i]
+    if S > 0.0:  # q = 0 and a silent reference tell nothing
+        for i in range(w.size):
+            gain = variances[i] * row[i] / S
+            w[i] += gain * residual
+            variances[i] *= max(1.0 - gain * row[i], 0.0)  # rounding of S may put the share above 1
 
 
 class DiagonalKalman(FilteredReferenceController):
@@ -35,8 +74,8 @@ class DiagonalKalman(FilteredReferenceController):
     rated_power : float, optional
         Rated output power rho_o: the measurement is scaled by the constraint factor alpha of eq. 13. By default no
         constraint, alpha = 1.
-    fs, power_memory, power_window, secondary_path_gain
-        As `fs`, `memory`, `window`, `secondary_path_gain` of `OutputPowerConstraint`.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
@@ -50,8 +89,8 @@ class DiagonalKalman(FilteredReferenceController):
     Raises
     ------
     ValueError
-        A variance that is negative or not finite, a rated power, rate, memory or gain that is not positive and finite,
-        another window, fewer than one tap, a path that is no FIR path.
+        A variance that is negative or not finite, a rated power that is not positive and finite, both a rated power and
+        a constraint, fewer than one tap, a path that is no FIR path.
     TypeError
         An amplifier that is none of the amplifier models.
 
@@ -82,43 +121,29 @@ class DiagonalKalman(FilteredReferenceController):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
-        fs: float = DEFAULT_FS,
-        power_memory: float = DEFAULT_MEMORY_S,
-        power_window: str = "exponential",
-        secondary_path_gain: float | None = None,
+        constraint: OutputPowerConstraint | None = None,
         amplifier: Amplifier | None = None,
         limiter: OutputLimiter | None = None,
     ) -> None:
         r, q = as_nonnegative(state_noise, "state_noise"), as_nonnegative(measurement_noise, "measurement_noise")
         variance = as_nonnegative(initial_variance, "initial_variance")
-        constraint = constraint_or_none(
-            rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
-        )
-        self._constrained = rated_power is not None
-        if self._constrained:
+        own = constraint_or_none(rated_power, constraint)
+        super().__init__(n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter)
+        if own is not None:
             self.name = "diagonal KF-OPC"
-        settings = lms_settings(PLAIN, 0.0)
-        settings[STATE_NOISE], settings[MEASUREMENT_NOISE] = r, q
-        super().__init__(LMS, n_taps, secondary_path, settings, amplifier, constraint, limiter)
-        self._state = self._state._replace(variances=np.full(self._state.weights.size, variance))
+        self._state = DiagonalState(*self._common(), np.full(self.n_taps, variance), r, q)
 
     @property
     def state_noise(self) -> float:
         """State noise variance r."""
-        return float(self._state.settings[STATE_NOISE])
+        return self._state.state_noise
 
     @property
     def measurement_noise(self) -> float:
         """Measurement noise variance q."""
-        return float(self._state.settings[MEASUREMENT_NOISE])
-
-    @property
-    def rated_power(self) -> float | None:
-        """Rated output power; None without a constraint."""
-        return self.constraint.rated_power if self._constrained else None
+        return self._state.measurement_noise
 
     @property
     def variances(self) -> np.ndarray:
         """Diagonal of P, (L,); a copy."""
-        assert self._state.variances is not None
         return self._state.variances.copy()

@@ -1,20 +1,133 @@
-"""The Kalman filter without state noise, or with forgetting, at O(L) a sample."""
+r"""The Kalman filter without state noise, or with forgetting, in O(L): from how P changes while the row shifts by a sample.
+
+With P in units of the measurement noise, u(n) = x'(n)^T the row, lambda the forgetting factor and
+:math:`\gamma^{-1}(n) = 1 + \lambda^{-1} u(n) P(n-1) u(n)^T`, the rows share all but one sample, so
+
+.. math:: \lambda^{-1} \left( \begin{bmatrix} P(n) & 0 \\ 0 & 0 \end{bmatrix} -
+   \begin{bmatrix} 0 & 0 \\ 0 & P(n-1) \end{bmatrix} \right) = \bar L(n)\, \mathrm{diag}(1, -1)\, \bar L(n)^T
+
+keeps the rank two that it has at the start for P(-1) = eta diag(lambda^2, ..., lambda^{L+1}). One orthogonal and one
+hyperbolic rotation that zero the second and third entry of the first row below then step gain, gamma and L together:
+
+.. math:: \begin{bmatrix} \gamma^{-1/2}(n) & \bar u(n+1) \bar L(n) \\
+   \begin{bmatrix} 0 \\ g(n) \gamma^{-1/2}(n) \end{bmatrix} & \bar L(n) \end{bmatrix} \Theta =
+   \begin{bmatrix} \gamma^{-1/2}(n+1) & 0 \\
+   \begin{bmatrix} g(n+1) \gamma^{-1/2}(n+1) \\ 0 \end{bmatrix} & \lambda^{1/2} \bar L(n+1) \end{bmatrix}
+
+with :math:`\bar u(n+1)` the L + 1 newest samples. For forgetting rounding grows with the factor 1/lambda a sample,
+since what is forgotten of P is not forgotten of its errors.
+
+References: R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise
+control", Int. J. Adapt. Control Signal Process. 19, 2005; A. H. Sayed, Fundamentals of Adaptive Filtering, Wiley 2003,
+ch. 14 (fast array RLS), from which the above follows.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_positive
-from ..kernels.delay_lines import delay_line
-from ..loop.run import LMS, ControllerState
+from ..kernels.compiling import inlined, part
+from ..kernels.delay_lines import latest, newest
+from ..kernels.records import new_record
+from ..kernels.vectors import FAST
 from ..power.amplifiers import Amplifier
-from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S
+from ..power.constraint import ConstraintState, OutputPowerConstraint, advance_constraint, squares_are_finite
 from ..power.limiter import OutputLimiter
-from .array_steps import FORGETTING, new_fast_array
 from .base import FilteredReferenceController, constraint_or_none
-from .lms_rules import PLAIN, lms_settings
+from .step import Lines, adapt, disturbance_estimate, follow
+
+
+class FastArray(NamedTuple):
+    """The array that the rotations step."""
+
+    gain: np.ndarray  # (L + 1,) g gamma^(-1/2), and 0
+    first: np.ndarray  # (L + 1,) first column of L
+    second: np.ndarray  # (L + 1,) second column
+    numbers: (
+        np.ndarray
+    )  # record: root = gamma^(-1/2), ahead and behind = u_bar times the two columns, forgetting = lambda
+
+
+class FastArrayState(NamedTuple):
+    """What the step of `FastArrayKalman` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    array: FastArray
+
+
+def new_fast_array(n_taps: int, initial: float, forgetting: float) -> FastArray:
+    """Return the array before the first sample: P = initial diag(lambda^2, ..., lambda^(L+1)), all samples so far zero."""
+    gain, first, second = (np.zeros(n_taps + 1) for _ in range(3))
+    first[0] = np.sqrt(initial * forgetting)
+    second[-1] = first[0] * forgetting ** (n_taps / 2)
+    return FastArray(gain, first, second, new_record(root=1.0, ahead=0.0, behind=0.0, forgetting=forgetting))
+
+
+@adapt.register(FastArrayState)
+def adapt_fast_array(state, error, control_signal):
+    """Apply eq. 2-9 by the two rotations."""
+    return rotate(state, error)
+
+
+@follow.register(FastArrayState)
+def follow_fast_array(state, error):
+    """Learn while listening: the gains must follow the filtered reference from silence on."""
+    return rotate(state, error)
+
+
+@inlined
+def rotate(state, error):
+    """Apply eq. 2-9 by the two rotations; return False, with nothing changed, if rounding has spoilt the array."""
+    row = newest(state.lines.filtered, state.weights.size + 1)
+    if not array_holds(state.array, row):
+        return False
+    d, x = disturbance_estimate(state.lines, error), latest(state.lines.reference)
+    if not squares_are_finite(d, row[0], x):
+        return False
+    factor = advance_constraint(state.constraint, d, row[0], x)
+    correct_by_rotations(state.array, state.weights, row, factor * d)
+    return True
+
+
+@part(fastmath=FAST)
+def array_holds(array, row):
+    """Return whether the step for this row, the L + 1 newest samples, has a solution: rounding has not spoilt the array."""
+    ahead = behind = 0.0
+    for i in range(row.size):
+        ahead += row[i] * array.first[i]
+        behind += row[i] * array.second[i]
+    numbers = array.numbers[0]
+    numbers.ahead, numbers.behind = ahead, behind
+    root = numbers.root
+    return behind * behind < root * root + ahead * ahead < np.inf
+
+
+@part(fastmath=FAST)
+def correct_by_rotations(array, w, row, d):
+    """Apply the two rotations, then w += g (d - w' x'); `row` is the one that `array_holds` was called with."""
+    gain, first, second, numbers = array.gain, array.first, array.second, array.numbers[0]
+    root = np.sqrt(numbers.root**2 + numbers.ahead**2)
+    c, s, t = numbers.root / root, numbers.ahead / root, numbers.behind / root
+    h = 1.0 / np.sqrt(1.0 - t * t)
+    grow = 1.0 / np.sqrt(numbers.forgetting)
+    for i in range(gain.size - 1, -1, -1):
+        shifted = gain[i - 1] if i > 0 else 0.0
+        rotated = c * shifted + s * first[i]
+        first[i] = (c * first[i] - s * shifted) * grow
+        gain[i] = h * (rotated - t * second[i])
+        second[i] = h * (second[i] - t * rotated) * grow
+    numbers.root = root / h
+    residual = d
+    for i in range(w.size):
+        residual -= w[i] * row[i]
+    step = residual / numbers.root
+    for i in range(w.size):
+        w[i] += gain[i] * step
 
 
 class FastArrayKalman(FilteredReferenceController):
@@ -41,8 +154,8 @@ class FastArrayKalman(FilteredReferenceController):
         Forgetting factor lambda, above 0 and at most 1.
     rated_power : float, optional
         Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default no constraint.
-    fs, power_memory, power_window, secondary_path_gain
-        As `fs`, `memory`, `window`, `secondary_path_gain` of `OutputPowerConstraint`.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
@@ -51,8 +164,8 @@ class FastArrayKalman(FilteredReferenceController):
     Raises
     ------
     ValueError
-        A variance or forgetting factor out of range, a rated power, rate, memory or gain that is not positive and finite,
-        another window, fewer than one tap, a path that is no FIR path. In a run: an array that rounding has spoilt.
+        A variance or forgetting factor out of range, a rated power that is not positive and finite, both a rated power
+        and a constraint, fewer than one tap, a path that is no FIR path. In a run: an array that rounding has spoilt.
     TypeError
         An amplifier that is none of the amplifier models.
 
@@ -64,7 +177,7 @@ class FastArrayKalman(FilteredReferenceController):
     References
     ----------
     R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control",
-    Int. J. Adapt. Control Signal Process. 19, 2005; derived in `kfopc_filterpy.controllers.array_steps`.
+    Int. J. Adapt. Control Signal Process. 19, 2005; derived at the head of this module.
 
     Examples
     --------
@@ -92,10 +205,7 @@ class FastArrayKalman(FilteredReferenceController):
         initial_variance: float = 1.0,
         forgetting: float = 1.0,
         rated_power: float | None = None,
-        fs: float = DEFAULT_FS,
-        power_memory: float = DEFAULT_MEMORY_S,
-        power_window: str = "exponential",
-        secondary_path_gain: float | None = None,
+        constraint: OutputPowerConstraint | None = None,
         amplifier: Amplifier | None = None,
         limiter: OutputLimiter | None = None,
     ) -> None:
@@ -104,29 +214,16 @@ class FastArrayKalman(FilteredReferenceController):
         forgetting = as_positive(forgetting, "forgetting")
         if forgetting > 1.0:
             raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
-        constraint = constraint_or_none(
-            rated_power, secondary_path_gain=secondary_path_gain, fs=fs, memory=power_memory, window=power_window
+        own = constraint_or_none(rated_power, constraint)
+        super().__init__(
+            n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter, filtered_taps=n_taps + 1
         )
-        self._constrained = rated_power is not None
-        if self._constrained:
+        if own is not None:
             self.name = "fast-array KF-OPC"
-        super().__init__(LMS, n_taps, secondary_path, lms_settings(PLAIN, 0.0), amplifier, constraint, limiter)
-        taps = self._state.weights.size
-        self._state = self._state._replace(
-            filtered=delay_line(taps + 1), fast_array=new_fast_array(taps, variance / (q * forgetting), forgetting)
-        )
+        array = new_fast_array(self.n_taps, variance / (q * forgetting), forgetting)
+        self._state = FastArrayState(*self._common(), array)
 
     @property
     def forgetting(self) -> float:
         """Forgetting factor lambda."""
-        assert self._state.fast_array is not None
-        return float(self._state.fast_array.numbers[FORGETTING])
-
-    @property
-    def rated_power(self) -> float | None:
-        """Rated output power; None without a constraint."""
-        return self.constraint.rated_power if self._constrained else None
-
-    def _silent_state(self) -> ControllerState:
-        """While it listens only the loudspeaker is silent."""
-        return self._state._replace(control_filter=np.zeros(self._state.weights.size))
+        return float(self._state.array.numbers["forgetting"][0])

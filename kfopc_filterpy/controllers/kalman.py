@@ -2,57 +2,98 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_count, as_number
+from .._validate import as_number
 from ..filters.kfopc import KFOPC
 from ..filters.power_budget import PowerBudgetKalmanFilter
-from ..filters.random_walk import RandomWalkKFOPC
-from ..kernels.block import CausalBlock, OpenBlock
+from ..filters.random_walk import RandomWalkKFOPC, new_numbers
+from ..kernels.compiling import inlined
+from ..kernels.covariance import Covariance, kalman_step, new_covariance
 from ..kernels.delay_lines import latest, newest
-from ..loop.run import KALMAN, ControllerState, control_signal, disturbance_estimate
 from ..power.amplifiers import Amplifier
-from ..power.budget import PowerBudget
-from ..power.constraint import OutputPowerConstraint
+from ..power.constraint import (
+    ConstraintState,
+    OutputPowerConstraint,
+    commit_constraint,
+    preview_constraint,
+    squares_are_finite,
+)
 from ..power.limiter import OutputLimiter
-from .base import FilteredReferenceController
+from .base import NO_SOLUTION, FilteredReferenceController, calls_of, constraint_for
+from .step import Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
+
+
+class KalmanState(NamedTuple):
+    """What the step of KF-ANC and KF-OPC reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    gains: Covariance  # or another source of gains that `kalman_step` has a body for
+    numbers: np.ndarray  # record: the filter's variances, and what the last update left
+
+
+@adapt.register(KalmanState)
+def adapt_kalman(state, error, control_signal):
+    """Apply eq. 2-13."""
+    return correct_constrained(state, error)
+
+
+@inlined
+def correct_constrained(state, error):
+    """Apply eq. 2-9 with the factor of eq. 10-13."""
+    d, h0, x = disturbance_estimate(state.lines, error), latest(state.lines.filtered), latest(state.lines.reference)
+    if not squares_are_finite(d, h0, x):
+        return False
+    previewed = preview_constraint(state.constraint, d, h0, x)
+    if not correct(state, d, previewed[0] * d):
+        return False
+    commit_constraint(state.constraint, previewed, d, h0, x)
+    return True
+
+
+@inlined
+def correct(state, measurement, scaled):
+    """Correct the weights with the scaled measurement (eq. 2-9); return False, with nothing changed, if that fails."""
+    w, numbers = state.weights, state.numbers[0]
+    h = newest(state.lines.filtered, w.size)
+    y, S = kalman_step(state.gains, w, h, scaled, numbers.state_noise, numbers.measurement_noise, numbers.alpha_sq)
+    if not np.isfinite(y):
+        return False
+    numbers.measurement, numbers.residual, numbers.variance = measurement, y, S
+    return True
 
 
 class KalmanController(FilteredReferenceController):
     """The modified ANC structure around a Kalman filter: any filterpy `KalmanFilter` of one measurement.
 
     Each sample the estimator is given the disturbance estimate as z and the filtered reference as H. With a rated
-    power the estimator is KF-OPC or KF-PB, without one KF-ANC. `kf_anc`, `kf_opc` and `kf_pb` make the estimator too.
+    power the estimator is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` make the estimator too.
 
     Parameters
     ----------
     estimator : filterpy.kalman.KalmanFilter
         Filter whose state is the control filter, ``dim_z = 1``; a `KFOPC`, or filterpy's own. One from
-        `KFOPC.random_walk` runs whole signals at compiled speed.
+        `KFOPC.random_walk` runs at compiled speed.
     secondary_path : array_like or control.TransferFunction
         Estimated secondary path, taps or an FIR system.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     name : str, optional
-        Name in results and legends; by default KF-PB with a power budget, KF-OPC with a rated power, else KF-ANC.
-    block_size : int, optional
-        Samples to a block of the block kernel: the same filter to rounding, causal, its work on the covariance put off
-        to the block's end, a burst of 3 L^2 block_size flops. By default sample by sample. It counts in compiled runs
-        of a filter from `KFOPC.random_walk` without fading memory; whether it is faster is the machine's matter
-        (``python -m comparisons speed``).
+        Name in results and legends; by default KF-OPC with a rated power, else KF-ANC.
     limiter : OutputLimiter, optional
         Limiter of its own that the control signal goes through: no window of it passes the limiter's rated power.
 
     Raises
     ------
     TypeError
-        An estimator that is no filterpy KalmanFilter.
+        An estimator that is no filterpy KalmanFilter, or has a power budget (use `PowerBudgetController`).
     ValueError
-        An estimator of several measurements; a block size below 1, or one with a float32 estimator.
+        An estimator of several measurements.
 
     Examples
     --------
@@ -66,6 +107,8 @@ class KalmanController(FilteredReferenceController):
     1.3333333333333333
     """
 
+    _filter_type: Any = RandomWalkKFOPC  # of the filters whose steps are compiled
+
     def __init__(
         self,
         estimator: KalmanFilter,
@@ -73,29 +116,31 @@ class KalmanController(FilteredReferenceController):
         *,
         amplifier: Amplifier | None = None,
         name: str | None = None,
-        block_size: int | None = None,
         limiter: OutputLimiter | None = None,
     ) -> None:
+        self._require_filter(estimator)
+        super().__init__(estimator.dim_x, secondary_path, amplifier=amplifier, limiter=limiter)
+        self.estimator = estimator
+        self._state = self._new_state(new_covariance(np.zeros((1, 1))), new_numbers())
+        self._calls_are_ours = calls_of(type(self)) == calls_of(self._family())
+        self.name = name or self._usual_name()
+
+    def _require_filter(self, estimator: Any) -> None:
         if not isinstance(estimator, KalmanFilter):
             raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
         if estimator.dim_z != 1:
             raise ValueError(f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}")
-        super().__init__(KALMAN, estimator.dim_x, secondary_path, [0.0, 0.0, 1.0], amplifier, limiter=limiter)
-        self.estimator = estimator
-        self.name = name or self._usual_name()
-        size = None if block_size is None else as_count(block_size, "block_size")
-        if size is not None and getattr(estimator, "dtype", np.float64) != np.float64:
-            raise ValueError("block_size needs an estimator of dtype float64: its products cancel too much in float32")
-        self._block = None if size is None else CausalBlock(estimator.dim_x, size)
+        if isinstance(estimator, PowerBudgetKalmanFilter):
+            raise TypeError("estimator has a power budget: use PowerBudgetController, or kf_pb")
 
-    @property
-    def _budget(self) -> PowerBudget | None:
-        """The estimator's power budget, if it has one."""
-        return self.estimator.budget if isinstance(self.estimator, PowerBudgetKalmanFilter) else None
+    def _new_state(self, gains: Covariance, numbers: np.ndarray) -> Any:
+        return KalmanState(*self._common(), gains, numbers)
+
+    def _family(self) -> type[KalmanController]:
+        """Return the class whose two calls a sample the registered step stands for."""
+        return KalmanController
 
     def _usual_name(self) -> str:
-        if self._budget is not None:
-            return "KF-PB"
         return "KF-ANC" if self.rated_power is None else "KF-OPC"
 
     @property
@@ -105,22 +150,13 @@ class KalmanController(FilteredReferenceController):
 
     @property
     def weights(self) -> np.ndarray:
-        """Estimator's state w, (L,), the control filter but for a power budget; a copy."""
+        """Estimator's state w, (L,); a copy."""
         return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
 
     @property
     def control_filter(self) -> np.ndarray:
         """Control filter that makes y, (L,); a copy."""
-        return self.weights if self._budget is None else self._budget.control_filter
-
-    @property
-    def power_weight(self) -> float:
-        """Weight lambda of the control power in a power budget; NaN without one."""
-        return np.nan if self._budget is None else self._budget.power_weight
-
-    @property
-    def _powers_fs(self) -> float:
-        return self.constraint.fs if self._budget is None else self._budget.fs
+        return self.weights
 
     @property
     def constraint(self) -> OutputPowerConstraint:
@@ -128,7 +164,8 @@ class KalmanController(FilteredReferenceController):
         theirs = self.estimator.constraint if isinstance(self.estimator, KFOPC) else None
         if theirs is not None:
             return theirs
-        self._own_constraint.factor = self.constraint_factor
+        if self._own_constraint.factor != self.constraint_factor:
+            self._own_constraint.factor = self.constraint_factor
         return self._own_constraint
 
     @property
@@ -136,86 +173,83 @@ class KalmanController(FilteredReferenceController):
         """Constraint factor of the last sample."""
         return getattr(self.estimator, "constraint_factor", 1.0)
 
-    def control_signal(self, reference: float) -> float:
-        """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        reference = as_number(reference, "reference")
-        self._y = float(control_signal(self._state_with_estimator(), reference))
-        return self._y
+    # Two calls a sample. The step of a random-walk filter is the compiled one; any other filter goes filterpy's way.
 
-    def _state_with_estimator(self) -> ControllerState:
-        """State that sees what the estimator has now: its weights, and the arrays of its powers and budget."""
-        self._state.weights[:] = self.weights
-        state = self._state._replace(constraint=self.constraint.state)
-        if self._budget is not None:
-            budget = self._budget.state
-            state = state._replace(budget=budget, control_filter=budget.control_filter)
-        return state
+    def control_signal(self, reference: float) -> float:
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        reference = as_number(reference, "reference")
+        self._y = emit_once(self._state_with_estimator(), reference)
+        return self._y
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
-        d = disturbance_estimate(self._state, as_number(error, "error"))
-        h = newest(self._state.filtered, self.estimator.dim_x).reshape(1, -1).copy()
-        x, powers = latest(self._state.reference), self.constraint
+        error = as_number(error, "error")
+        state = self._steppable_state()
+        if state is None:
+            self._update_through_estimator(error)
+        elif adapt_once(state, error, self._y):
+            self.estimator.after_compiled(state.weights.copy())
+        else:
+            self._update_through_estimator(error)  # refused again, with the reason
+            raise ValueError(NO_SOLUTION)
+
+    def _update_through_estimator(self, error: float) -> None:
+        """Take the step by `predict` and `update` of the estimator."""
+        d = estimate_once(self._state.lines, error)
+        h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
+        x, powers = latest(self._state.lines.reference), self.constraint
         powers.preview(d, h[0, 0], x)  # refuses what would overflow before anything changes
         self.estimator.predict()
-        if self._budget is not None:
-            self.estimator.update(d, H=h, reference=x, control_signal=self._y)
-        elif isinstance(self.estimator, KFOPC):
-            self.estimator.update(d, H=h, reference=x)
+        if isinstance(self.estimator, KFOPC):
+            self._update_estimator(d, h, x)
         else:
             self.estimator.update(np.full((1,) * np.ndim(self.estimator.x), d), H=h)
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
 
-    def _family(self) -> type:
-        """Class whose two calls a sample the compiled loop knows."""
-        return KalmanController
+    def _update_estimator(self, d: float, h: np.ndarray, x: float) -> None:
+        self.estimator.update(d, H=h, reference=x)
 
-    def compiled_state(self, to_step: bool = True) -> ControllerState | None:
-        """State for the compiled loop, `to_step` it or to read only; None where filterpy's own equations step."""
-        estimator = self.estimator
-        if type(estimator) not in (RandomWalkKFOPC, PowerBudgetKalmanFilter) or not self.steps_of(self._family()):
+    def _state_with_estimator(self) -> Any:
+        """Return the state, which sees what the estimator has now: its weights, and the arrays of its powers."""
+        self._state.weights[:] = np.reshape(self.estimator.x, -1)
+        constraint = self.constraint.state
+        if constraint is not self._state.constraint:
+            self._state = self._state._replace(constraint=constraint)
+        return self._state
+
+    def _steppable_state(self, to_step: bool = True) -> Any:
+        """Return the state with the estimator's covariance, `to_step` it or to read; None if filterpy's way is taken."""
+        estimator: Any = self.estimator
+        if type(estimator) is not self._filter_type or not estimator.steps_compiled():
             return None
-        compiled = estimator.compiled_state(to_step)
-        if compiled is None:
-            return None
-        covariance, settings = compiled
-        self._state.settings[:] = settings
-        self._state.last[:] = np.nan
-        return self._state_with_estimator()._replace(covariance=covariance)
+        arrays, numbers = estimator.compiled_arrays(to_step)
+        state = self._state_with_estimator()
+        if arrays is not state.gains or numbers is not state.numbers:
+            self._state = state = state._replace(gains=arrays, numbers=numbers)
+        return state
+
+    # A whole signal at compiled speed.
+
+    def compiled_state(self, to_step: bool = True) -> Any:
+        """Return the state for the compiled loop, `to_step` it or to read; None if Python has to make the steps."""
+        state = self._steppable_state(to_step) if self._calls_are_ours else None
+        if state is not None:
+            state.numbers["variance"] = np.nan  # until a sample was taken
+        return state
+
+    def after_compiled(self, state: Any, shared: bool = False) -> None:
+        """Give the estimator what the last sample run left in `state`; `shared` if other filters go on from it too."""
+        arrays = state.gains if shared else None
+        if not np.isnan(state.numbers["variance"][0]):
+            self.estimator.after_compiled(state.weights.copy(), arrays)
+        elif arrays is not None:  # it diverged before its first update
+            self.estimator.go_on_from(arrays)
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
-        self._state = self._state_with_estimator()
+        self._state_with_estimator()
         super().listen(references, errors)
-
-    @property
-    def open_block(self) -> OpenBlock | None:
-        """Block under way, for the compiled loop; None without a block size."""
-        return None if self._block is None else self._block.state
-
-    def blocks(self, state: ControllerState, n_samples: int) -> Iterator[tuple[int, int]]:
-        """Begin and end of the blocks of `n_samples` that the loop may run on `state`, opened and closed around each."""
-        _, _, alpha_sq = state.settings
-        if self._block is None or alpha_sq != 1.0:
-            yield from super().blocks(state, n_samples)
-            return
-        self.estimator.settle_covariance()
-        for begin in range(0, n_samples, self._block.size):
-            self._block.open(state.covariance, newest(state.filtered, state.weights.size))
-            yield begin, min(begin + self._block.size, n_samples)
-            self._block.close(state.covariance, state.settings[0])
-
-    def after_compiled(self, state: ControllerState, shared: bool = False) -> None:
-        """Give the estimator what the last sample run left in `state`; `shared` where other filters go on from it too."""
-        if self._block is not None:
-            self._block.close(state.covariance, state.settings[0])
-        d, y, S = state.last.tolist()
-        arrays = state.covariance if shared else None
-        if not np.isnan(S):
-            self.estimator.after_compiled(state.weights, d, y, S, arrays)
-        elif arrays is not None:  # it diverged before its first update
-            self.estimator.go_on_from(arrays)
 
 
 def kf_anc(
@@ -226,7 +260,6 @@ def kf_anc(
     measurement_noise: float,
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
-    block_size: int | None = None,
     limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
 ) -> KalmanController:
@@ -241,7 +274,6 @@ def kf_anc(
     state_noise, measurement_noise, initial_variance
         r, q and P(0|0), see `KFOPC.random_walk`.
     amplifier : callable, optional
-    block_size : int, optional
     limiter : OutputLimiter, optional
         See `KalmanController`.
     dtype : {numpy.float64, numpy.float32}, default numpy.float64
@@ -265,33 +297,32 @@ def kf_anc(
         initial_variance=initial_variance,
         dtype=dtype,
     )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size, limiter=limiter)
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
 
 
 def kf_opc(
     n_taps: int,
     secondary_path: Any,
     *,
-    rated_power: float,
+    rated_power: float | None = None,
+    constraint: OutputPowerConstraint | None = None,
     state_noise: float,
     measurement_noise: float,
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
-    block_size: int | None = None,
     limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
-    **constraint: Any,
 ) -> KalmanController:
     """KF-OPC: the Kalman filter with output power constraint, eq. 9-13.
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, limiter, dtype
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter, dtype
         As for `kf_anc`.
-    rated_power : float
+    rated_power : float, optional
         Rated output power rho_o.
-    **constraint
-        `fs`, `power_memory`, `power_window`, `secondary_path_gain`, see `KFOPC`.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
 
     Returns
     -------
@@ -309,57 +340,7 @@ def kf_opc(
         state_noise=state_noise,
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
-        rated_power=rated_power,
+        constraint=constraint_for(rated_power, constraint),
         dtype=dtype,
-        **constraint,
     )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size, limiter=limiter)
-
-
-def kf_pb(
-    n_taps: int,
-    secondary_path: Any,
-    *,
-    rated_power: float,
-    state_noise: float,
-    measurement_noise: float,
-    initial_variance: float = 1.0,
-    amplifier: Amplifier | None = None,
-    block_size: int | None = None,
-    limiter: OutputLimiter | None = None,
-    dtype: Any = np.float64,
-    **budget: Any,
-) -> KalmanController:
-    """KF-PB: the power-budgeted Kalman filter, the least error within the rated power.
-
-    Parameters
-    ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, block_size, limiter, dtype
-        As for `kf_anc`.
-    rated_power : float
-        Rated output power.
-    **budget
-        `fs`, `memory_s`, `credit_s`, see `PowerBudget`.
-
-    Returns
-    -------
-    KalmanController
-        A controller named KF-PB; its `control_filter` makes the control signal, its `weights` are the estimate of the
-        unconstrained one.
-
-    Examples
-    --------
-    >>> from kfopc_filterpy import kf_pb
-    >>> kf_pb(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).name
-    'KF-PB'
-    """
-    estimator = PowerBudgetKalmanFilter(
-        n_taps,
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        rated_power=rated_power,
-        initial_variance=initial_variance,
-        dtype=dtype,
-        **budget,
-    )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, block_size=block_size, limiter=limiter)
+    return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)

@@ -1,21 +1,111 @@
-"""KF-OPC with the gain of its constraint repaired (see `repairs`)."""
+"""KF-OPC with the gain of its constraint repaired: three departures from eq. 11-13, each on its own or together.
+
+Eq. 13 keeps the rated power if the secondary path is flat over the noise and the disturbance can be cancelled
+wholly. On other paths the control signal's spectrum is not the reference's, so that
+
+- the gain `G_s` it sees is E[(s^ * y)^2] / E[y^2] and not E[x'^2] / E[x^2]: `of_control`;
+- whatever is still wrong shows in the output power measured, which can trim the factor: `trim_rate`;
+- the filter's memory delays what a factor on the measurement does to y; on the output it acts at once: `at_output`.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
-from .._validate import as_choice, as_number, as_positive
+import numpy as np
+
+from .._validate import as_choice, as_positive
 from ..filters.kfopc import KFOPC
 from ..filters.random_walk import RandomWalkKFOPC
+from ..kernels.compiling import inlined
+from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest, newest
-from ..loop.run import ControllerState, disturbance_estimate
+from ..kernels.records import new_record
+from ..kernels.vectors import dot
 from ..power.amplifiers import Amplifier
-from ..power.constraint import DEFAULT_FS, DEFAULT_MEMORY_S, OutputPowerConstraint
+from ..power.constraint import (
+    ConstraintState,
+    OutputPowerConstraint,
+    commit_constraint,
+    preview_constraint,
+    squares_are_finite,
+)
 from ..power.limiter import OutputLimiter
-from .kalman import KalmanController
-from .repairs import advance_repair, gain_samples, measurement_factor, new_repair
+from .base import constraint_for
+from .kalman import KalmanController, correct
+from .step import Lines, adapt, disturbance_estimate, estimate_once, output
 
+LARGEST_TRIM = math.log(10.0)
 DEFAULT_TRIM_S = 1.0
+
+
+class RepairedState(NamedTuple):
+    """What the step of the repaired KF-OPC reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    gains: Covariance
+    numbers: np.ndarray  # as of `KalmanState`
+    repair: np.ndarray  # record: of_control, trim_rate (0: none), at_output; log of the trim, factor at the output
+
+
+@output.register(RepairedState)
+def output_repaired(state):
+    """Return w'x times the factor at the output."""
+    w = state.weights
+    return state.repair[0].output_gain * dot(w, newest(state.lines.reference, w.size))
+
+
+@adapt.register(RepairedState)
+def adapt_repaired(state, error, control_signal):
+    """Apply eq. 2-9 with the repaired factor."""
+    d, h0, x = disturbance_estimate(state.lines, error), latest(state.lines.filtered), latest(state.lines.reference)
+    if not squares_are_finite(d, h0, x):
+        return False
+    filtered, reference = gain_samples(state.repair, h0, x, error, d, control_signal)
+    previewed = preview_constraint(state.constraint, d, filtered, reference)
+    if not correct(state, d, measurement_factor(state.repair, previewed[0]) * d):
+        return False
+    commit_constraint(state.constraint, previewed, d, filtered, reference)
+    advance_repair(state.repair, state.constraint, control_signal)
+    return True
+
+
+@inlined
+def gain_samples(repair, filtered, x, error, d, y):
+    """Return the samples whose powers give G_s: x' and x (eq. 11), or s^ * y = d^ - e and y."""
+    if repair[0].of_control == 0:
+        return filtered, x
+    return d - error, y
+
+
+@inlined
+def measurement_factor(repair, factor):
+    """Return what scales the measurement (eq. 9)."""
+    return 1.0 if repair[0].at_output != 0 else trimmed(repair, factor)
+
+
+@inlined
+def trimmed(repair, factor):
+    """Return the factor with the trim, at most 1."""
+    return min(factor * math.exp(repair[0].trim), 1.0)
+
+
+@inlined
+def advance_repair(repair, constraint, y):
+    """Note the factor used, and trim the next one by the power of y: up while it is below the rated, down above.
+
+    At a factor of 1 there is nothing to gain, and the trim does not wind up.
+    """
+    own, numbers = repair[0], constraint.numbers[0]
+    numbers.factor = trimmed(repair, numbers.factor)
+    change = own.trim_rate * (1.0 - y * y / numbers.rated_power)
+    if change < 0.0 or numbers.factor < 1.0:
+        own.trim = min(max(own.trim + change, -LARGEST_TRIM), LARGEST_TRIM)
+    if own.at_output != 0:
+        own.output_gain = numbers.factor
 
 
 class RepairedKFOPC(KalmanController):
@@ -62,28 +152,38 @@ class RepairedKFOPC(KalmanController):
         name: str | None = None,
         limiter: OutputLimiter | None = None,
     ) -> None:
-        if not isinstance(estimator, RandomWalkKFOPC) or estimator.rated_power is not None:
-            raise ValueError("estimator must be a filter of KFOPC.random_walk without a rated power of its own")
         self.gain_of = as_choice(gain_of, "gain_of", ("reference", "control"))
         self.trim_s = None if trim_s is None else as_positive(trim_s, "trim_s", unit="s")
         self.factor_at = as_choice(factor_at, "factor_at", ("measurement", "output"))
-        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
-        self._own_constraint = constraint
+        own = constraint_for(None, constraint)
         rate = 0.0 if self.trim_s is None else 1.0 / (self.trim_s * constraint.fs)
-        self._state = self._state._replace(
-            repair=new_repair(self.gain_of == "control", rate, self.factor_at == "output")
+        self._repair = new_record(
+            of_control=int(gain_of == "control"),
+            trim_rate=rate,
+            at_output=int(factor_at == "output"),
+            trim=0.0,
+            output_gain=1.0,
         )
+        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
+        self._own_constraint = own
+
+    def _require_filter(self, estimator: Any) -> None:
+        if not isinstance(estimator, RandomWalkKFOPC) or estimator.rated_power is not None:
+            raise ValueError("estimator must be a filter of KFOPC.random_walk without a rated power of its own")
+
+    def _new_state(self, gains: Covariance, numbers: np.ndarray) -> Any:
+        return RepairedState(*self._common(), gains, numbers, self._repair)
 
     def _usual_name(self) -> str:
         return "KF-OPC repaired"
 
-    def _family(self) -> type:
+    def _family(self) -> type[KalmanController]:
         return RepairedKFOPC
 
     @property
     def rated_power(self) -> float:
         """Rated output power."""
-        return self._own_constraint.rated_power
+        return self.constraint.rated_power
 
     @property
     def constraint(self) -> OutputPowerConstraint:
@@ -93,24 +193,30 @@ class RepairedKFOPC(KalmanController):
     @property
     def constraint_factor(self) -> float:
         """Constraint factor of the last sample, trimmed."""
-        return self._own_constraint.factor
+        return self.constraint.factor
 
-    def update(self, error: float) -> None:
-        """Adapt to the error e(n) that the last control signal left."""
-        error, repair = as_number(error, "error"), self._state.repair
-        d = float(disturbance_estimate(self._state, error))
-        h = newest(self._state.filtered, self.estimator.dim_x).reshape(1, -1).copy()
-        seen = gain_samples(repair, h[0, 0], latest(self._state.reference), error, d, self._y)
+    def _update_through_estimator(self, error: float) -> None:
+        d = estimate_once(self._state.lines, error)
+        h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
+        seen = gain_samples(self._repair, h[0, 0], latest(self._state.lines.reference), error, d, self._y)
         factor = self.constraint.preview(d, *seen)  # refuses what would overflow before anything changes
-        self.estimator.constraint_factor = measurement_factor(repair, factor)
+        self.estimator.constraint_factor = measurement_factor(self._repair, factor)
         self.estimator.predict()
         self.estimator.update(d, H=h)
         self.constraint.advance(d, *seen)
-        advance_repair(repair, self.constraint.state, self._y)
+        advance_repair(self._repair, self.constraint.state, self._y)
 
-    def after_compiled(self, state: ControllerState, shared: bool = False) -> None:
+    def after_compiled(self, state: Any, shared: bool = False) -> None:
         """See `KalmanController.after_compiled`, `state` and `shared`; the estimator holds the last sample's factor."""
         super().after_compiled(state, shared)
+        self._hold_factor()
+
+    def update(self, error: float) -> None:
+        """Adapt to the error e(n) that the last control signal left."""
+        super().update(error)
+        self._hold_factor()
+
+    def _hold_factor(self) -> None:
         self.estimator.constraint_factor = 1.0 if self.factor_at == "output" else self.constraint_factor
 
 
@@ -118,16 +224,14 @@ def kf_opc_repaired(
     n_taps: int,
     secondary_path: Any,
     *,
-    rated_power: float,
+    rated_power: float | None = None,
+    constraint: OutputPowerConstraint | None = None,
     state_noise: float,
     measurement_noise: float,
     initial_variance: float = 1.0,
     gain_of: str = "control",
     trim_s: float | None = DEFAULT_TRIM_S,
     factor_at: str = "output",
-    fs: float = DEFAULT_FS,
-    power_memory: float = DEFAULT_MEMORY_S,
-    power_window: str = "exponential",
     amplifier: Amplifier | None = None,
     limiter: OutputLimiter | None = None,
 ) -> RepairedKFOPC:
@@ -141,8 +245,10 @@ def kf_opc_repaired(
     ----------
     n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter
         As for `kf_anc`.
-    rated_power : float
+    rated_power : float, optional
         Rated output power.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
     gain_of : {"control", "reference"}, default "control"
         Signal whose gain through the secondary path is G_s: the control signal's, :math:`E[(\hat s * y)^2] / E[y^2]`,
         or the reference's, :math:`E[x'^2] / E[x^2]` (eq. 11).
@@ -152,8 +258,6 @@ def kf_opc_repaired(
     factor_at : {"output", "measurement"}, default "output"
         Where the factor is applied: to the control signal, where it acts at once, or to the measurement (eq. 9),
         where it acts as fast as the filter adapts.
-    fs, power_memory, power_window
-        As `fs`, `memory`, `window` of `OutputPowerConstraint`.
 
     Returns
     -------
@@ -177,11 +281,10 @@ def kf_opc_repaired(
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
     )
-    constraint = OutputPowerConstraint(rated_power, fs=fs, memory=power_memory, window=power_window)
     return RepairedKFOPC(
         estimator,
         secondary_path,
-        constraint,
+        constraint_for(rated_power, constraint),
         gain_of=gain_of,
         trim_s=trim_s,
         factor_at=factor_at,

@@ -7,16 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..kernels.covariance import (
-    INVERSE_S,
-    LAST_INVERSE_S,
-    Covariance,
-    copy_covariance,
-    full_covariance,
-    new_covariance,
-    predict_covariance,
-    project_covariance,
-)
+from ..kernels.covariance import Covariance, copy_covariance, full_covariance, new_covariance
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: what rounding leaves; more is a mistake
 
@@ -30,10 +21,10 @@ class Moment(NamedTuple):
 
 
 class RandomWalkCovariance:
-    """P, P_prior, P_post and the gain of a random-walk filter, each made full when read.
+    """P, P_prior and P_post of a random-walk filter, each made full when read.
 
     `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and P_post from it,
-    or are arrays where that is no longer possible.
+    or are arrays if that is no longer possible.
     """
 
     def __init__(self, P: np.ndarray, dtype: Any = np.float64) -> None:
@@ -57,7 +48,7 @@ class RandomWalkCovariance:
     @property
     def now(self) -> Moment:
         """P at present."""
-        scale, diagonal, inverse_S, _ = self.arrays.owed.tolist()
+        scale, diagonal, inverse_S, _ = self.arrays.owed.item()
         return Moment(scale, diagonal, -scale * inverse_S)
 
     def full(self, moment: Moment | np.ndarray) -> np.ndarray:
@@ -71,22 +62,18 @@ class RandomWalkCovariance:
         return full_covariance(self.arrays.triangle, self.arrays.gain_direction, *moment)
 
     def show(self) -> np.ndarray:
-        """P as a full array; what is written into it counts at the next step (`edited`)."""
-        if not self._shown:
-            self._shown.append(self.full(self.now))
+        """Return P as a full array of its own; what is written into it counts at the next step (`edited`)."""
+        self._shown.append(self._shown[-1].copy() if self._shown else self.full(self.now))
         return self._shown[-1]
 
     def edited(self) -> np.ndarray | None:
-        """The shown array that was written into, None where none was."""
+        """Return the newest shown array that was written into, None if none was."""
         if not self._shown:
             return None
         now = self.full(self.now)
         return next((array for array in reversed(self._shown) if not np.array_equal(array, now)), None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
-        """filterpy's `Saver` keeps the P it reads and deep-copies the rest: later edits go into another array."""
-        if self._shown:
-            self._shown.append(self._shown[-1].copy())
         other = memo[id(self)] = object.__new__(type(self))
         other.__dict__.update(deepcopy({k: v for k, v in vars(self).items() if k != "arrays"}, memo))
         other.arrays = copy_covariance(self.arrays)
@@ -99,40 +86,45 @@ class RandomWalkCovariance:
         return other
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
-        """Eq. 4."""
-        scale, diagonal, _ = self.now
+        """Apply eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I; the next pass over the triangle pays for it."""
+        owed = self.own().owed
+        scale, diagonal, inverse_S, _ = owed.item()
         if not alpha_sq * max(scale, diagonal) + state_noise < self._largest:
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
         self._shown = []
-        predict_covariance(self.own(), alpha_sq, state_noise)
-        self.prior = self.now
+        scale, diagonal = alpha_sq * scale, alpha_sq * diagonal + state_noise
+        owed["scale"], owed["diagonal"] = scale, diagonal
+        self.prior = Moment(scale, diagonal, -scale * inverse_S)
 
-    def project(self, h: np.ndarray) -> float:
-        """h' P h, with P h left in the arrays for the update; the value of P does not change."""
+    def begin_update(self) -> Covariance:
+        """Return the arrays for a compiled update, having kept what it will overwrite."""
         self._shown = []
         now = self.now
         if not isinstance(self.prior, np.ndarray) and self.prior != now:  # a second update since the prediction
             self.prior = self.full(self.prior)
-        hPh = float(project_covariance(self.own(), h))
-        if isinstance(self.prior, Moment):
-            self.prior = Moment(1.0, 0.0)
-        if isinstance(self.posterior, Moment):  # the same P_post, seen from the triangle as it is now
+        if isinstance(self.posterior, Moment):  # the same P_post, seen from the triangle once nothing is owed
             ratio = self.posterior.scale / now.scale
             self.posterior = Moment(ratio, self.posterior.diagonal - ratio * now.diagonal)
-        return hPh
+        return self.own()
+
+    def refused(self) -> None:
+        """Go on after an update that was refused: P is what it was, but nothing is owed any more."""
+        if isinstance(self.prior, Moment):
+            self.prior = Moment(1.0, 0.0)
 
     def updated(self) -> None:
-        """The arrays took an update after `project`: P_prior, where it was the triangle, is P + g g'/S; `settle` next."""
+        """Go on after an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""
+        _, _, inverse_S, last_inverse_S = self.arrays.owed.item()
         if isinstance(self.prior, Moment):
-            inverse_S, last_inverse_S = self.arrays.owed[[INVERSE_S, LAST_INVERSE_S]].tolist()
             self.prior = Moment(1.0, 0.0, last_inverse_S - inverse_S)
+        self.posterior = self.now
 
-    def settle(self) -> None:
-        """An update is over, or its sample was missed: P is P_post."""
+    def missed(self) -> None:
+        """Go on after a missed sample: P is P_post."""
         self.posterior = self.now
 
     def after_compiled(self) -> None:
-        """After the compiled loop advanced `arrays`: what is owed is one downdate at most."""
+        """Go on after the compiled loop advanced `arrays`: what is owed is one downdate at most."""
         self._shown = []
         self.prior = Moment(1.0, 0.0)
         self.updated()

@@ -17,6 +17,24 @@ SILENT_REFERENCE = (
 )
 
 
+State = tuple[dict[str, Any], dict[str, Any]]
+
+
+def state_of(kf: KalmanFilter) -> State:
+    """Return the attributes of a filter: those in its __dict__, and those in slots."""
+    slots = [name for kind in type(kf).__mro__ for name in vars(kind).get("__slots__", ())]
+    return dict(kf.__dict__), {name: getattr(kf, name) for name in slots if hasattr(kf, name)}
+
+
+def restore(kf: KalmanFilter, state: State) -> None:
+    """Give a filter back the attributes that `state_of` returned."""
+    attributes, private = state
+    kf.__dict__.clear()
+    kf.__dict__.update(attributes)
+    for name, value in private.items():
+        setattr(kf, name, value)
+
+
 @contextmanager
 def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[None]:
     """Around a step of `kf`: finite `arguments` go in, finite x and P come out, or an error, nothing changed.
@@ -26,14 +44,13 @@ def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[No
     for argument, value in arguments.items():
         if value is not None:
             require_finite(np.asarray(value, dtype=np.float64), argument)
-    before = dict(kf.__dict__)
+    before = state_of(kf)
     try:
         with np.errstate(all="ignore"):  # what overflows or divides by zero is found just below
             yield
         _require_sound(kf)
     except BaseException as error:
-        kf.__dict__.clear()
-        kf.__dict__.update(before)
+        restore(kf, before)
         if isinstance(error, np.linalg.LinAlgError):
             raise ValueError(f"{name}: S = H P H' + R cannot be inverted ({error}); {SILENT_REFERENCE}") from error
         if not isinstance(error, ValueError | TypeError):

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_number, as_signal, require_finite
-from .constrained import BatchReferences, ConstraintAttributes, constraint_settings
+from .._validate import as_nonnegative, as_number, as_signal, require_finite
 from .guards import (
     SILENT_REFERENCE,
     all_or_nothing,
@@ -20,13 +19,16 @@ from .guards import (
     require_matrix,
     require_measurement,
     require_variance,
+    restore,
+    state_of,
 )
 
 if TYPE_CHECKING:
+    from ..power.constraint import OutputPowerConstraint
     from .random_walk import RandomWalkKFOPC
 
 
-class KFOPC(KalmanFilter, ConstraintAttributes):
+class KFOPC(KalmanFilter):
     r"""Kalman filter with output power constraint, a drop-in `filterpy.kalman.KalmanFilter`.
 
     The measurement is scaled by the constraint factor before it corrects the state (eq. 9),
@@ -47,15 +49,10 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         Number of control inputs.
     rated_power : float, optional
         Rated output power (mean square of the control signal). None: no constraint.
-    secondary_path_gain : float, optional
-        Power gain G_s of the secondary path; by default it is estimated from the newest sample of H and the
-        `reference` given to `update` (eq. 11).
-    fs : float, default 16000
-        Sample rate in Hz, which turns `power_memory` into samples.
-    power_memory : float, default 0.5
-        Memory of the power estimates in seconds.
-    power_window : {"exponential", "sliding"}, default "exponential"
-        Window of the power estimates.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with its sample rate, the memory of its power estimates or a known
+        secondary-path gain. The filter keeps a copy. By default the gain is estimated from the newest sample of H and
+        the `reference` given to `update` (eq. 11).
 
     Attributes
     ----------
@@ -67,7 +64,8 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
     Raises
     ------
     ValueError
-        A dimension out of range, a rated power with ``dim_z > 1``, a power or gain that is not positive.
+        A dimension out of range, a rated power with ``dim_z > 1``, a power that is not positive, both a rated power and
+        a constraint.
 
     See Also
     --------
@@ -85,8 +83,8 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy import KFOPC
-    >>> kf = KFOPC(dim_x=2, rated_power=1.0, secondary_path_gain=1.0)
+    >>> from kfopc_filterpy import KFOPC, OutputPowerConstraint
+    >>> kf = KFOPC(dim_x=2, constraint=OutputPowerConstraint(rated_power=1.0, secondary_path_gain=1.0))
     >>> kf.predict()
     >>> kf.update(4.0, H=np.array([1.0, 0.5]))
     >>> kf.constraint_factor  # sqrt(1 * 1 / 4**2)
@@ -94,6 +92,9 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
     >>> kf.y  # 0.25 * 4 - 0
     array([[1.]])
     """
+
+    if not TYPE_CHECKING:  # Out of filterpy's `Saver`, which records what is in __dict__.
+        __slots__ = ("_batch_references", "_constraint", "_lifted", "_unconstrained_factor")
 
     x: Any  # assigned by filterpy, as the rest is
     y: Any
@@ -108,16 +109,19 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         dim_u: int = 0,
         *,
         rated_power: float | None = None,
-        secondary_path_gain: float | None = None,
-        fs: float | None = None,
-        power_memory: float | None = None,
-        power_window: str = "exponential",
+        constraint: OutputPowerConstraint | None = None,
     ) -> None:
-        self._constraint, self._unconstrained_factor = None, 1.0
+        self._constraint: OutputPowerConstraint | None = None
+        self._lifted: OutputPowerConstraint | None = None  # the constraint before it was lifted, for its settings
+        self._unconstrained_factor = 1.0
         self._batch_references: BatchReferences | None = None
-        self._constraint_settings = constraint_settings(fs, power_memory, power_window, secondary_path_gain)
         super().__init__(dim_x, dim_z, dim_u)
-        self.rated_power = rated_power
+        if constraint is not None:
+            if rated_power is not None:
+                raise ValueError("give either rated_power= or constraint=, which has a rated power, not both")
+            self.constraint = constraint
+        else:
+            self.rated_power = rated_power
 
     @classmethod
     def random_walk(
@@ -128,8 +132,8 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
+        constraint: OutputPowerConstraint | None = None,
         dtype: Any = np.float64,
-        **constraint: Any,
     ) -> RandomWalkKFOPC:
         """Filter of eq. 1-8 for a control filter that walks at random: F = I, Q = r I, R = q, in O(L^2).
 
@@ -145,12 +149,12 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
             Variance of each tap before the first sample: P(0|0) = initial_variance I.
         rated_power : float, optional
             Rated output power; None: the unconstrained filter, KF-ANC.
+        constraint : OutputPowerConstraint, optional
+            In place of `rated_power`, as for `KFOPC`.
         dtype : {numpy.float64, numpy.float32}, default numpy.float64
             Precision that P is kept and stepped in; the weights stay float64. float32 halves the memory and, at many
             taps, the time. It needs a state noise well above 6e-8 of the largest variance in P: below, rounding makes P
             indefinite within some thousand samples of a band-limited reference, and `update` then refuses.
-        **constraint
-            `secondary_path_gain`, `fs`, `power_memory`, `power_window`, as for `KFOPC`.
 
         Returns
         -------
@@ -180,9 +184,80 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
             measurement_noise=measurement_noise,
             initial_variance=initial_variance,
             rated_power=rated_power,
+            constraint=constraint,
             dtype=dtype,
-            **constraint,
         )
+
+    # The constraint: what can be read, and supplied by the caller instead.
+
+    @property
+    def rated_power(self) -> float | None:
+        """Rated output power; assign another, or None to lift the constraint."""
+        return None if self._constraint is None else self._constraint.rated_power
+
+    @rated_power.setter
+    def rated_power(self, value: float | None) -> None:
+        if value is None:
+            self._lifted, self._constraint = self._constraint or self._lifted, None
+        elif self._constraint is not None:
+            self._constraint.rated_power = value
+        else:
+            from ..power.constraint import OutputPowerConstraint  # numba, only if it is needed
+
+            self.constraint = OutputPowerConstraint(value) if self._lifted is None else self._lifted.fresh(value)
+
+    @property
+    def constraint(self) -> OutputPowerConstraint | None:
+        """The object that keeps the powers and the factor; None without a rated power. Assign one: a copy is kept."""
+        return self._constraint
+
+    @constraint.setter
+    def constraint(self, value: OutputPowerConstraint | None) -> None:
+        if value is None:
+            self.rated_power = None
+            return
+        from ..power.constraint import OutputPowerConstraint
+
+        if not isinstance(value, OutputPowerConstraint):
+            raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {value!r}")
+        if self.dim_z != 1:
+            raise ValueError(f"a rated power needs one measurement, dim_z = 1, got dim_z = {self.dim_z}")
+        self._constraint = deepcopy(value)
+
+    @property
+    def constraint_factor(self) -> float:
+        """Factor that scales the measurement; assign a value to hold it, None to follow eq. 13 again."""
+        return self._unconstrained_factor if self._constraint is None else self._constraint.factor
+
+    @constraint_factor.setter
+    def constraint_factor(self, value: float | None) -> None:
+        if self._constraint is not None:
+            self._constraint.factor = value
+        else:
+            self._unconstrained_factor = 1.0 if value is None else as_nonnegative(value, "constraint_factor")
+
+    @property
+    def disturbance_power(self) -> float | None:
+        """Disturbance power delta_d^2 last used (eq. 10), None without a rated power; can be supplied."""
+        return None if self._constraint is None else self._constraint.disturbance_power
+
+    @disturbance_power.setter
+    def disturbance_power(self, value: float | None) -> None:
+        self._require_constraint("disturbance_power").disturbance_power = value
+
+    @property
+    def secondary_path_gain(self) -> float | None:
+        """Secondary-path power gain G_s last used (eq. 11), None before any is known; can be supplied."""
+        return None if self._constraint is None else self._constraint.secondary_path_gain
+
+    @secondary_path_gain.setter
+    def secondary_path_gain(self, value: float | None) -> None:
+        self._require_constraint("secondary_path_gain").secondary_path_gain = value
+
+    def _require_constraint(self, name: str) -> OutputPowerConstraint:
+        if self._constraint is None:
+            raise ValueError(f"{name} takes part only in a constraint: set rated_power first")
+        return self._constraint
 
     # filterpy's steps.
 
@@ -319,8 +394,7 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
         try:
             result = super().batch_filter(zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
         except BaseException:
-            self.__dict__.clear()
-            self.__dict__.update(before)
+            restore(self, before)
             raise
         self._batch_references = None
         return result
@@ -354,9 +428,10 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
             self._mahalanobis = sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
         return self._mahalanobis
 
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy starts from; the powers advance in place, so that even a shallow copy needs its own."""
-        return self.__dict__ | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
+    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return what a copy starts from; the powers advance in place, so that even a shallow copy needs its own."""
+        attributes, private = state_of(self)
+        return attributes, private | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
 
     def __repr__(self) -> str:
         constraint = [
@@ -411,3 +486,13 @@ class KFOPC(KalmanFilter, ConstraintAttributes):
 
     def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
         return all_or_nothing(self, name, **arguments)
+
+
+class BatchReferences:
+    """Reference samples of a batch under way; a filter copied meanwhile (`Saver` does) is in no batch."""
+
+    def __init__(self, samples: np.ndarray) -> None:
+        self.next = iter(samples.tolist()).__next__
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> None:
+        return None

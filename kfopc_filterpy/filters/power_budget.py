@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -63,7 +63,8 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     array([0.9, 0.3])
     """
 
-    _budget: PowerBudget | None = None
+    if not TYPE_CHECKING:
+        __slots__ = ("_budget",)
 
     def __init__(
         self,
@@ -78,6 +79,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         credit_s: float = DEFAULT_CREDIT_S,
     ) -> None:
+        self._budget: PowerBudget | None = None
         super().__init__(
             n_taps,
             state_noise=state_noise,
@@ -214,6 +216,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     def _require_constraint(self, name: str) -> OutputPowerConstraint:
         raise ValueError(f"{name} has no part in a power budget, which goes by the signals' correlations")
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """A copy has a budget of its own."""
-        return super().__getstate__() | {"_budget": deepcopy(self._budget)}
+        attributes, private = super().__getstate__()
+        return attributes, private | {"_budget": deepcopy(self._budget)}

@@ -6,16 +6,69 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from math import isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, require_finite
-from ..kernels.covariance import Covariance, update_weights
+from ..kernels.compiling import compiled
+from ..kernels.covariance import Covariance, project_covariance, update_weights
+from ..kernels.records import new_record
+from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
 from .covariance import RandomWalkCovariance, require_covariance
 from .guards import SILENT_REFERENCE, checked_measurement
 from .kfopc import KFOPC
-from .read_only import ReadOnlyMatrix
+
+# What `correct_once` answers.
+CORRECTED, OVERFLOWING_SQUARE, SILENT, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE = range(6)
+
+
+@compiled()
+def correct_once(cov, constraint, weights, z, h, reference, noise, factor):
+    """Apply eq. 5-9 to `weights` and `cov`; return what became of it, the residual and S.
+
+    `constraint` is None in a filter without a rated power, which scales by `factor`. Nothing but the order of P's
+    arithmetic changes in an update that is refused.
+    """
+    nothing = 0.0 * z
+    for i in range(h.size):
+        nothing += 0.0 * h[i] + 0.0 * weights[i]
+    if nothing != 0.0:  # NaN
+        return NOT_FINITE, np.nan, np.nan
+    x = 0.0 if np.isnan(reference) else reference
+    if constraint is not None:
+        if not squares_are_finite(z, h[0], x):
+            return OVERFLOWING_SQUARE, np.nan, np.nan
+        previewed = preview_constraint(constraint, z, h[0], reference)
+        factor = previewed[0]
+    if noise == 0.0 and not np.any(h):
+        return SILENT, np.nan, np.nan
+    S = project_covariance(cov, h) + noise
+    if not 0.0 < S < np.inf:
+        return NO_VARIANCE, np.nan, S
+    y = update_weights(cov, weights, h, factor * z, S, noise)
+    if not np.isfinite(y):
+        return OVERFLOWING_WEIGHTS, y, S
+    if constraint is not None:
+        commit_constraint(constraint, previewed, z, h[0], reference)
+    return CORRECTED, y, S
+
+
+def new_numbers() -> np.ndarray:
+    """Return the record that a filter shares with the compiled loop: its variances, and what the last update left."""
+    return new_record(
+        state_noise=0.0, measurement_noise=0.0, alpha_sq=1.0, measurement=0.0, residual=0.0, variance=np.nan
+    )
+
+
+class _Identity:
+    """filterpy's `_I`: an identity that is made when it is used, since it is large at many taps."""
+
+    def __get__(self, kf: Any, owner: Any = None) -> Any:
+        return self if kf is None else np.eye(kf.dim_x)
+
+    def __set__(self, kf: Any, value: Any) -> None:
+        """Nothing to keep."""
 
 
 class RandomWalkKFOPC(KFOPC):
@@ -33,7 +86,7 @@ class RandomWalkKFOPC(KFOPC):
 
     Parameters
     ----------
-    n_taps, state_noise, measurement_noise, initial_variance, rated_power, dtype, **constraint
+    n_taps, state_noise, measurement_noise, initial_variance, rated_power, constraint, dtype
         As for `KFOPC.random_walk`.
 
     Examples
@@ -50,6 +103,21 @@ class RandomWalkKFOPC(KFOPC):
     array([[16.]])
     """
 
+    if not TYPE_CHECKING:  # Out of `Saver`'s records, filterpy's own private attributes included.
+        __slots__ = (
+            "_F",
+            "_K",
+            "_Q",
+            "_alpha_sq",
+            "_covariance",
+            "_delegating",
+            "_likelihood",
+            "_log_likelihood",
+            "_mahalanobis",
+            "_numbers",
+            "_views",
+        )
+
     def __init__(
         self,
         n_taps: int,
@@ -58,8 +126,8 @@ class RandomWalkKFOPC(KFOPC):
         measurement_noise: float,
         initial_variance: float = 1.0,
         rated_power: float | None = None,
+        constraint: OutputPowerConstraint | None = None,
         dtype: Any = np.float64,
-        **constraint: Any,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         self.dtype = _precision(dtype)
@@ -69,37 +137,40 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance = RandomWalkCovariance(np.eye(n_taps))
         self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
         self._delegating = False
-        super().__init__(n_taps, 1, rated_power=rated_power, **constraint)
+        self._numbers = new_numbers()
+        super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
         self.state_noise = state_noise
         self.measurement_noise = measurement_noise
         variance = as_nonnegative(initial_variance, "initial_variance")
         self._covariance = RandomWalkCovariance(variance * np.eye(n_taps), self.dtype)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """A copy makes its own read-only views (copied arrays are writeable) and steps its own covariance."""
-        return super().__getstate__() | {"_views": {}, "_covariance": deepcopy(self._covariance)}
+    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """A copy makes its own read-only views (copied arrays are writeable) and steps its own arrays."""
+        attributes, private = super().__getstate__()
+        own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
+        return attributes, private | own
 
     # F, Q, R: numbers, read as matrices.
 
     @property
     def state_noise(self) -> float | None:
         """State noise variance r of eq. 4; None where a full `Q` was assigned."""
-        return self._state_noise if self._Q is None else None
+        return float(self._numbers["state_noise"][0]) if self._Q is None else None
 
     @state_noise.setter
     def state_noise(self, value: float) -> None:
-        self._state_noise = as_nonnegative(value, "state_noise")
+        self._numbers["state_noise"] = as_nonnegative(value, "state_noise")
         self._Q = None
         self._views.pop("Q", None)
 
     @property
     def measurement_noise(self) -> float:
         """Measurement noise variance q of eq. 7."""
-        return self._measurement_noise
+        return float(self._numbers["measurement_noise"][0])
 
     @measurement_noise.setter
     def measurement_noise(self, value: float) -> None:
-        self._measurement_noise = as_nonnegative(value, "measurement_noise")
+        self._numbers["measurement_noise"] = as_nonnegative(value, "measurement_noise")
         self._views.pop("R", None)
 
     @property
@@ -115,7 +186,7 @@ class RandomWalkKFOPC(KFOPC):
     @property
     def Q(self) -> np.ndarray:
         """State noise covariance r I, read-only unless a full one was assigned; assign a number for r."""
-        return self._view("Q", self._state_noise) if self._Q is None else self._Q
+        return self._view("Q", self._numbers["state_noise"][0]) if self._Q is None else self._Q
 
     @Q.setter
     def Q(self, value: Any) -> None:
@@ -133,7 +204,7 @@ class RandomWalkKFOPC(KFOPC):
     @property
     def R(self) -> np.ndarray:
         """Measurement noise variance q as (1, 1), read-only; assign a number to change it."""
-        return self._view("R", self._measurement_noise, size=1)
+        return self._view("R", self._numbers["measurement_noise"][0], size=1)
 
     @R.setter
     def R(self, value: Any) -> None:
@@ -143,8 +214,8 @@ class RandomWalkKFOPC(KFOPC):
 
     def _view(self, name: str, value: float, size: int | None = None) -> np.ndarray:
         if name not in self._views:
-            array = value * np.eye(self.dim_x if size is None else size)
-            self._views[name] = ReadOnlyMatrix.of(array, name)
+            self._views[name] = value * np.eye(self.dim_x if size is None else size)
+            self._views[name].flags.writeable = False
         return self._views[name]
 
     def _matrix(self, value: Any, name: str) -> np.ndarray:
@@ -154,13 +225,7 @@ class RandomWalkKFOPC(KFOPC):
         require_finite(matrix, name)
         return matrix
 
-    @property
-    def _I(self) -> np.ndarray:
-        return np.eye(self.dim_x)
-
-    @_I.setter
-    def _I(self, value: np.ndarray) -> None:
-        """filterpy stores an identity; at many taps it is worth its memory only when used."""
+    _I = _Identity()
 
     # P and what follows from it, made full when read.
 
@@ -220,7 +285,7 @@ class RandomWalkKFOPC(KFOPC):
 
     @contextmanager
     def _all_or_nothing(self, name: str, **arguments: Any) -> Iterator[None]:
-        """Around filterpy's own equations, which see P, F, Q as full arrays."""
+        """Run filterpy's own equations, which see P, F, Q as full arrays."""
         self._take_in_edits()
         with super()._all_or_nothing(name, **arguments):
             self._replace_covariance(self._covariance.full(self._covariance.now))
@@ -229,25 +294,22 @@ class RandomWalkKFOPC(KFOPC):
             self._delegating = False
 
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
-        """Eq. 2 and 4; a full F or Q, or B with u, takes filterpy's own equations. See `KFOPC.predict`."""
+        """Apply eq. 2 and 4; a full F or Q, or B with u, takes filterpy's own equations. See `KFOPC.predict`."""
         # batch_filter passes F and Q as they are read
         F = self._F if F is None or F is self._views.get("F") else F
         Q = self._Q if Q is None or Q is self._views.get("Q") else Q
-        if Q is None:
-            Q = self._state_noise
         moved = u is not None and (self.B if B is None else B) is not None
         if moved or F is not None or np.ndim(Q) != 0:
-            super().predict(u, B, F, Q)
+            super().predict(u, B, F, self._numbers["state_noise"][0] if Q is None else Q)
             return
-        state_noise = Q if Q is self._state_noise else as_nonnegative(Q, "Q")
+        state_noise = self._numbers["state_noise"][0] if Q is None else as_nonnegative(Q, "Q")
         self._take_in_edits()
         x = self._weights().reshape(np.shape(self.x))
         self._covariance.predict(self._alpha_sq, state_noise)
-        self.x = x
-        self.x_prior = self.x.copy()
+        self.x, self.x_prior = x, x.copy()
 
     def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
-        """Eq. 5-9; an H of several rows, or another `inv`, takes filterpy's own equations. See `KFOPC.update`."""
+        """Apply eq. 5-9; an H of several rows, or another `inv`, takes filterpy's own equations. See `KFOPC.update`."""
         row = self.H if H is None else H
         own_inverse = self.inv is not np.linalg.inv
         if z is not None and (own_inverse or np.size(row) != self.dim_x):
@@ -256,95 +318,108 @@ class RandomWalkKFOPC(KFOPC):
         reference = self._next_reference(z, reference)
         self._take_in_edits()
         if z is None:
+            self._covariance.missed()
             self._record(self.x, np.zeros((1, 1)))
             self.z = np.array([[None]])
             return
-        R = None if R is self._views.get("R") else R
-        weights, y, S = self._corrected(*self._checked(z, R, row), reference)
-        self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
+        plain = R is None and type(z) is float and type(row) is np.ndarray and row.dtype == np.float64
+        if plain and row.shape in ((self.dim_x,), (1, self.dim_x)):  # as at every sample of a loop
+            measurement, noise, h = z, self._numbers["measurement_noise"][0], np.ascontiguousarray(row).reshape(-1)
+        else:
+            measurement, noise, h = self._checked(z, R, row)
+        weights, y = self._corrected(measurement, noise, h, reference)
         self._record(weights.reshape(np.shape(self.x)), np.full((1,) * np.ndim(self.x), y))
         self.z = np.array(z).reshape(self.y.shape)
 
     def _checked(self, z: Any, R: Any, row: Any) -> tuple[float, float, np.ndarray]:
-        """z, R and H as numbers and (n,), or a clear error. The plain case, of every sample, goes first."""
-        if R is None and isinstance(z, float) and isinstance(row, np.ndarray) and row.dtype == np.float64:
-            h = np.ascontiguousarray(row).reshape(-1)
-            if row.shape in ((self.dim_x,), (1, self.dim_x)) and isfinite(z) and isfinite(h @ h):
-                return float(z), self._measurement_noise, h
+        """Return z, R and H as numbers and (n,), or raise a clear error."""
+        R = None if R is self._views.get("R") else R
         z, _, _ = checked_measurement(self, z, R, row)
-        noise = self._measurement_noise if R is None else as_nonnegative(R, "R")
+        noise = self.measurement_noise if R is None else as_nonnegative(R, "R")
         return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
-    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> tuple[Any, float, float]:
-        """Eq. 5-9 on the arrays: the new weights, the residual and S. Refusals come before any change."""
+    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> tuple[np.ndarray, float]:
+        """Apply eq. 5-9 to the arrays; return the new weights and the residual. Refusals come before any change."""
         constraint = self._constraint
-        factor = self.constraint_factor if constraint is None else constraint.preview(z, h[0], reference)
-        weights = self._weights()
-        if noise == 0 and not h.any():
+        if constraint is None:
+            state, factor = None, self._unconstrained_factor
+        else:
+            if reference is None and constraint.needs_reference:
+                constraint.preview(z, h[0], reference)  # refused, with the reason
+            state, factor = constraint.state, 1.0
+        weights = np.array(self.x, dtype=np.float64).reshape(-1)
+        if weights.size != self.dim_x:
+            self._weights()  # refused, with the reason
+        arrays = self._covariance.begin_update()
+        x = np.nan if reference is None else reference
+        outcome, y, S = correct_once(arrays, state, weights, z, h, x, noise, factor)
+        if outcome != CORRECTED:
+            self._covariance.refused()
+            self._refuse(outcome, z, S, h, reference)
+        self._covariance.updated()
+        self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
+        return weights, y
+
+    def _refuse(self, outcome: int, z: float, S: float, h: np.ndarray, reference: float | None) -> None:
+        """Raise ValueError for an update that `correct_once` refused."""
+        if outcome == NOT_FINITE:
+            self._weights()
+            checked_measurement(self, z, None, h)
+        if outcome == OVERFLOWING_SQUARE and self._constraint is not None:
+            self._constraint.preview(z, h[0], reference)
+        if outcome == SILENT:
             raise ValueError(SILENT_REFERENCE)
-        S = self._covariance.project(h) + noise
-        if not 0 < S < np.inf:
+        if outcome == NO_VARIANCE:
             cause = "P is not positive definite on H" if S <= 0 else f"it overflows {self.dtype.name}"
             raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
-        y = float(update_weights(self._covariance.arrays, weights, h, factor * z, S, noise))
-        if not np.isfinite(y):
-            raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
-        self._covariance.updated()
-        if constraint is not None:
-            constraint.advance(z, h[0], reference)
-        return weights, y, S
+        raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
 
     def _weights(self) -> np.ndarray:
-        """x as an array of its own, (n,)."""
+        """Return x as an array of its own, (n,)."""
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
-        if weights.size != self.dim_x or not np.isfinite(weights).all():
+        # A finite sum of squares, quick to make, tells of finite weights; squares that overflow are looked at one by one.
+        if weights.size != self.dim_x or not (isfinite(weights @ weights) or np.isfinite(weights).all()):
             raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
         return weights
 
     def _record(self, x: np.ndarray, y: np.ndarray) -> None:
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        self.x, self.y = x, y
-        self.x_post = self.x.copy()
-        self._covariance.settle()
+        self.x, self.y, self.x_post = x, y, x.copy()
 
-    # A whole signal at compiled speed: the arrays go out, and come back advanced.
+    # A whole signal, or a sample, at compiled speed: the arrays go out, and come back advanced.
 
-    def compiled_state(self, to_step: bool = True) -> tuple[Covariance, tuple[float, float, float]] | None:
-        """The covariance arrays, `to_step` or to read, and (r, q, fading alpha squared); None where filterpy steps."""
-        if self._F is not None or self._Q is not None or self.inv is not np.linalg.inv:
-            return None
+    def steps_compiled(self) -> bool:
+        """Return whether the random walk's own equations step this filter, and not filterpy's."""
+        return self._F is None and self._Q is None and self.inv is np.linalg.inv
+
+    def compiled_arrays(self, to_step: bool = True) -> tuple[Covariance, np.ndarray]:
+        """Return the covariance arrays, `to_step` them or to read, and the variances of the filter."""
         self._take_in_edits()
-        arrays = self._covariance.own() if to_step else self._covariance.arrays
-        return arrays, (self._state_noise, self._measurement_noise, self._alpha_sq)
-
-    def settle_covariance(self) -> None:
-        """Make P the triangle, for a block; what `P_prior` and `P_post` show stays."""
-        self._K = self.K  # it may still be derived from the last update
-        self._covariance.project(np.zeros(self.dim_x))
+        self._numbers["alpha_sq"] = self._alpha_sq
+        return self._covariance.own() if to_step else self._covariance.arrays, self._numbers
 
     def go_on_from(self, shared: Covariance) -> None:
-        """Take the covariance `shared` with other filters without an update of one's own."""
+        """Take the covariance `shared` with other filters without an update of its own."""
         self._K, prior = self.K, self.P_prior
         self._covariance.share(shared)
         self._covariance.prior = prior
-        self._covariance.settle()
+        self._covariance.missed()
 
-    def after_compiled(
-        self, weights: np.ndarray, z: float, y: float, S: float, shared: Covariance | None = None
-    ) -> None:
-        """Take back the arrays after one sample or more: `weights`, the last measurement `z`, its residual `y`, and `S`.
+    def after_compiled(self, weights: np.ndarray, shared: Covariance | None = None) -> None:
+        """Take back the arrays after one compiled sample or more, which left `weights`, (n,), an array of its own.
 
-        `shared` are the arrays where other filters go on from them too.
+        `shared` are the arrays if other filters go on from them too.
         """
         if shared is not None:
             self._covariance.share(shared)
         self._covariance.after_compiled()
-        self._K = None
-        self.S, self.SI = np.array([[S]]), np.array([[1.0 / S]])
+        _, _, _, z, y, S = self._numbers.item()
+        self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
         shape = np.shape(self.x)
-        self._record(weights.reshape(shape).copy(), np.full((1,) * len(shape), y))
-        self.x_prior = self.x - (self.K * y).reshape(shape)
-        self.z = np.full((1,) * len(shape), z)
+        column = (1,) * len(shape)
+        before = weights - self._covariance.arrays.gain_direction * (y / S)
+        self._record(weights.reshape(shape), np.full(column, y))
+        self.x_prior, self.z = before.reshape(shape), np.full(column, z)
 
 
 def _precision(dtype: Any) -> np.dtype:

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from .compiling import part
+from .compiling import inlined, part
 
 START, TAPS, HEAD = 0, 1, 2  # a delay line's first two values, and where its samples begin
 
 
 def delay_line(taps: int) -> np.ndarray:
-    """A silent delay line of `taps` samples: the newest is at index line[START], where that of line[TAPS] follow."""
+    """Return a silent delay line of `taps` samples: the newest is at index line[START], where that of line[TAPS] follow."""
     line = np.zeros(HEAD + 4 * taps + 64)
     line[START], line[TAPS] = line.size - taps, taps
     return line
@@ -26,7 +26,7 @@ def refill(line: np.ndarray, samples: np.ndarray) -> None:
     line[line.size - taps :] = samples[:taps]
 
 
-@part(forceinline=True)
+@part()
 def push(line, sample):
     """Make `sample` the newest one."""
     start = np.int64(line[START]) - 1
@@ -39,14 +39,14 @@ def push(line, sample):
     line[START] = start
 
 
-@part(inline="always")
+@inlined
 def newest(line, taps):
-    """The newest `taps` samples, newest first, as a view: inlined as source, since compiled code may not return one."""
+    """Return the newest `taps` samples, newest first, as a view."""
     start = np.int64(line[START])
     return line[start : start + taps]
 
 
-@part(inline="always")
+@inlined
 def latest(line):
-    """The newest sample."""
+    """Return the newest sample."""
     return line[np.int64(line[START])]

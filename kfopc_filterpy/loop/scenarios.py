@@ -3,26 +3,104 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
-from .._validate import as_choice, as_positive, as_signal
+from .._validate import as_positive, as_signal
 from ..controllers.base import NO_SOLUTION
-from ..controllers.kalman import KalmanController
-from ..kernels.block import Block
-from ..kernels.covariance import INVERSE_S, aligned_zeros, copy_covariance, covariance_matrix
-from ..kernels.delay_lines import TAPS, newest, refill
+from ..controllers.kalman import KalmanController, KalmanState
+from ..controllers.power_budget import PowerBudgetController
+from ..controllers.repaired import RepairedKFOPC
+from ..kernels.compiling import compiled
+from ..kernels.covariance import (
+    CANCELLATION,
+    Covariance,
+    copy_covariance,
+    correct_weights,
+    covariance_matrix,
+    downdate_carefully,
+    downdate_covariance,
+    kalman_step,
+    predict_covariance,
+    project_covariance,
+)
+from ..kernels.delay_lines import TAPS, delay_line, newest
+from ..kernels.stacking import member, stacked, unstack
+from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
-from ..power.amplifiers import Amplifier, compiled_parameters
+from ..power.amplifiers import Amplifier, AmplifierModel, compiled_model
 from ..power.constraint import DEFAULT_FS
-from .lockstep import DONE, LANES, LAST_UPDATE, STATUS, TABLE, Scenarios, SharedBlock, of_lanes, run_block, stacked
-from .run import DIVERGED, REFUSED, ControllerState
-from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
+from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, run
+from .simulation import (
+    DIVERGENCE_LIMIT,
+    POWERS,
+    RECORDED,
+    SensorNoise,
+    SimulationResult,
+    disturbance_at_microphone,
+    switch_on_sample,
+)
 
-BLOCK = 256
-ADVANCE = {"streaming": "advance_by_steps", "block": "advance", "pairs": "advance_in_pairs"}
+BLOCK = 256  # samples for which the gains are kept
+VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
+SAFE = 1e290  # a correction below does not overflow weights that are finite
+
+
+class SharedGains(NamedTuple):
+    """The gains of a block of m samples, in place of a covariance."""
+
+    directions: np.ndarray  # (m, n) g_k = S_k K_k
+    norms: np.ndarray  # (m,) of g_k, which no magnitude in it exceeds
+    variances: np.ndarray  # (m,) S_k
+    taken: np.ndarray  # (1,) samples of the block that a scenario has taken
+
+
+@kalman_step.register(SharedGains)
+def shared_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
+    """Correct the weights with the gain of the sample (eq. 5, 9); the innovation is NaN if they would overflow."""
+    k = gains.taken[0]
+    S = gains.variances[k]
+    y = scaled_measurement - dot(h, w)
+    if not abs(y / S) * gains.norms[k] < SAFE:
+        return np.nan, S
+    correct_weights(w, gains.directions[k], y / S)
+    gains.taken[0] = k + 1
+    return y, S
+
+
+@compiled(nogil=True)
+def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
+    """Fill `gains` for the rows that end with each sample of a block; return how many have a solution.
+
+    `filtered` is the filtered reference, newest sample first: n - 1 + m of them.
+    """
+    n, m = cov.product.size, gains.variances.size
+    for k in range(m):
+        h = filtered[m - 1 - k : m - 1 - k + n]
+        predict_covariance(cov, alpha_sq, state_noise)
+        S = project_covariance(cov, h) + noise
+        if not 0.0 < S < np.inf:
+            return k
+        if S / noise > CANCELLATION and downdate_carefully(cov, h, noise):
+            S = 1.0 / cov.owed[0].last_inverse_S
+        else:
+            downdate_covariance(cov, S)
+        copy_into(gains.directions[k], cov.gain_direction)
+        gains.variances[k], gains.norms[k] = S, np.sqrt(dot(cov.gain_direction, cov.gain_direction))
+    return m
+
+
+@compiled(nogil=True)
+def run_scenarios(states, plants, signals, limits, status, done):
+    """Run each scenario over a block, unless it has ended; all but the gains is stacked."""
+    no_weights = np.empty((0, 0))
+    for i in range(limits.size):
+        if status[i] == RUNNING:
+            states.gains.taken[0] = 0
+            state, plant = member(states, i), member(plants, i)
+            status[i], taken = run(state, plant, member(signals, i), no_weights, limits[i], 1, 0)
+            done[i] += taken
 
 
 def simulate_scenarios(
@@ -40,7 +118,6 @@ def simulate_scenarios(
     switch_on_s: float = 0.0,
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,
-    kernel: str = "pairs",
 ) -> list[SimulationResult]:
     """Run Kalman controllers that share one gain sequence, as `simulate` would run each, to rounding.
 
@@ -82,10 +159,6 @@ def simulate_scenarios(
         See `simulate`.
     progress : callable, optional
         Called with the number of samples done since its last call.
-    kernel : {"pairs", "streaming", "block"}, default "pairs"
-        How the gains are made: two samples at a time, sample by sample (as float32 filters and fading memories are in
-        any case), or in matrix products. Equal to rounding; which is fastest is the machine's matter
-        (``python -m comparisons speed``).
 
     Returns
     -------
@@ -115,15 +188,12 @@ def simulate_scenarios(
     >>> [round(output_power(r.control_signal), 1) for r in results]
     [0.1, 0.2, 0.4]
     """
-    as_choice(kernel, "kernel", tuple(ADVANCE))
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
     if isinstance(controllers, KalmanController):
         raise TypeError("controllers must be a sequence of controllers: [controller] for one")
     controllers = list(controllers)
     states = _states_that_share(controllers, fs)
-    if kernel == "block" and states[0].covariance.triangle.dtype != np.float64:
-        raise ValueError('kernel="block" needs filters of dtype float64: its products cancel too much in float32')
     count = len(controllers)
     d = _disturbances(x, primary_path, disturbance, fs, count)
     noises = [
@@ -132,7 +202,7 @@ def simulate_scenarios(
     ]
     rated = [c.rated_power if rated_power is None else as_positive(rated_power, "rated_power") for c in controllers]
     paths = _stacked_paths(secondary_path, fs, count)
-    amplifiers = np.array([_parameters(a) for a in _each(amplifier, count, "amplifier")])
+    models = [_model(own) for own in _each(amplifier, count, "amplifier")]
     on = switch_on_sample(switch_on_s, fs, x.size)
     if on:
         for i, (controller, noise) in enumerate(zip(controllers, noises, strict=True)):
@@ -140,62 +210,48 @@ def simulate_scenarios(
         x, d = x[on:], np.ascontiguousarray(d[:, on:])
 
     limits = DIVERGENCE_LIMIT * np.sqrt([1.0 if p is None else p for p in rated])
-    scenarios = stacked(states, paths, amplifiers, limits, BLOCK)
-    gains = _SharedGains(states[0], x, kernel)
-    # An odd number of cache lines (8 values) to a row: at a power of two all rows would fall on the same places of the
-    # cache, which as many scenarios write in turn.
-    recorded = np.empty((count, 7 if record_powers else 5, (-(-x.size // 8) | 1) * 8))
-    noisy = any(noise.std for noise in noises)
-    for first, shared in gains.blocks():
-        length = len(shared.variances)
-        if noisy:
-            sensed = np.array([np.broadcast_to(noise.take(length), (length,)) for noise in noises])
-        else:
-            sensed = np.zeros((1, length))
-        solved = length if np.isfinite(shared.variances[-1]) else int(np.isnan(shared.variances).argmax())
-        run_block(scenarios, shared, d, sensed, recorded, first, solved)
-        _raise_where_refused(scenarios, first + solved if solved < length else None)
+    taps = paths.shape[1]
+    plants = stacked([Plant(s, np.zeros(0), delay_line(taps), model) for s, model in zip(paths, models, strict=True)])
+    gains = _GainSequence(states[0], x)
+    own: list[Any] = [state._replace(gains=None) for state in states]  # type: ignore[arg-type]
+    scenarios = stacked(own)
+    names = RECORDED + POWERS[:2] if record_powers else RECORDED
+    recorded = {name: np.full((count, x.size), np.nan) for name in names}
+    status, done = np.full(count, RUNNING), np.zeros(count, np.int64)
+    for first, shared, solved in gains.blocks():
+        signals = _block(x, d, noises, first, solved)
+        run_scenarios(scenarios._replace(gains=shared), plants, signals, limits, status, done)
+        for name, signal in recorded.items():
+            signal[:, first : first + solved] = getattr(signals, name)
+        _raise_if_refused(status, done, first + solved if solved < shared.variances.size else None)
         if progress:
-            progress(count * length)
-    gains.hand_back(controllers, states, scenarios)
-    diverged, done = of_lanes(scenarios, STATUS) == DIVERGED, of_lanes(scenarios, DONE).astype(int)
+            progress(count * solved)
+    for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
+        unstack(scenarios, i, own[i])
+        controller.after_compiled(state._replace(gains=gains.covariance), shared=True)
     return [
-        _result(c, fs, rated[i], x, d[i if len(d) > 1 else 0], recorded[i], int(done[i, 0]), bool(diverged[i, 0]))
-        for i, c in enumerate(controllers)
+        SimulationResult(
+            algorithm=controller.name,
+            fs=fs,
+            rated_power=rated[i],
+            reference=x,
+            disturbance=d[i if len(d) > 1 else 0],
+            **{name: signal[i] for name, signal in recorded.items()},
+            diverged_at_s=done[i] / fs if status[i] == DIVERGED else None,
+        )
+        for i, controller in enumerate(controllers)
     ]
 
 
-def _result(
-    controller: KalmanController,
-    fs: float,
-    rated_power: float | None,
-    x: np.ndarray,
-    d: np.ndarray,
-    recorded: np.ndarray,
-    end: int,
-    diverged: bool,
-) -> SimulationResult:
-    recorded = recorded[:, : x.size]
-    recorded[:, end:] = np.nan
-    e, y, y_amplified, a, factor, *powers = recorded
-    return SimulationResult(
-        algorithm=controller.name,
-        fs=fs,
-        rated_power=rated_power,
-        reference=x,
-        disturbance=d,
-        error=e,
-        control_signal=y,
-        amplifier_output=y_amplified,
-        anti_noise=a,
-        constraint_factor=factor,
-        disturbance_power=powers[0] if powers else None,
-        secondary_path_gain=powers[1] if powers else None,
-        diverged_at_s=end / fs if diverged else None,
-    )
+def _block(x: np.ndarray, d: np.ndarray, noises: list[SensorNoise], first: int, size: int) -> Stretch:
+    """Return the stacked signals of a block: what goes in, and room for what the loop leaves."""
+    shape, part = (len(noises), size), slice(first, first + size)
+    left = np.full((len(RECORDED + POWERS), *shape), np.nan)
+    reference, disturbance = (np.broadcast_to(signal, shape).copy() for signal in (x[part], d[:, part]))
+    return Stretch(reference, disturbance, np.array([np.zeros(size) + noise.take(size) for noise in noises]), *left)
 
 
-def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerState]:
+def _states_that_share(controllers: list[Any], fs: float) -> list[KalmanState]:
     """States of the controllers for the compiled loop, or an error that says which one differs in what."""
     if not controllers:
         raise ValueError("controllers must hold one controller at least")
@@ -212,9 +268,13 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerStat
                 f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
                 "KalmanControllers of filters from KFOPC.random_walk"
             )
-        own = {"power budget": state.budget, "repaired gain": state.repair, "limiter": state.limiter}
+        own = {
+            "power budget": isinstance(controller, PowerBudgetController),
+            "repaired gain": isinstance(controller, RepairedKFOPC),
+            "limiter": state.lines.limiter is not None,
+        }
         for what, present in own.items():
-            if present is not None:
+            if present:
                 raise ValueError(f"controllers[{i}] has a {what}, which scenarios do not run: use simulate for it")
         states.append(state)
     for i, state in enumerate(states[1:], 1):
@@ -224,27 +284,26 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[ControllerStat
     return states
 
 
-def _difference(one: ControllerState, other: ControllerState) -> str | None:
+def _difference(one: KalmanState, other: KalmanState) -> str | None:
     """In what two states do not share, in words."""
     if one.weights.size != other.weights.size:
         return "n_taps"
-    if one.covariance.triangle.dtype != other.covariance.triangle.dtype:
+    if one.gains.triangle.dtype != other.gains.triangle.dtype:
         return "dtype"
-    if not np.array_equal(one.secondary_estimate, other.secondary_estimate):
+    if not np.array_equal(one.lines.secondary_estimate, other.lines.secondary_estimate):
         return "their estimated secondary path"
-    if not np.array_equal(one.settings, other.settings):
+    if any(one.numbers[name][0] != other.numbers[name][0] for name in VARIANCES):
         return "state noise, measurement noise and fading memory"
     if one.constraint.window.shape != other.constraint.window.shape:
         return "the length of the sliding windows of their powers"
-    for mine, theirs in ((one.reference, other.reference), (one.filtered, other.filtered)):
+    for mine, theirs in ((one.lines.reference, other.lines.reference), (one.lines.filtered, other.lines.filtered)):
         if not np.array_equal(newest(mine, int(mine[TAPS])), newest(theirs, int(theirs[TAPS]))):
             return "the reference heard so far"
-    a, b = one.covariance, other.covariance
+    a, b = one.gains, other.gains
     if a.triangle is b.triangle:  # they ran together
         return None
-    if a.owed[INVERSE_S] == b.owed[INVERSE_S] == 0.0:
-        same = np.array_equal(a.owed[:2], b.owed[:2]) and np.array_equal(a.triangle, b.triangle)
-    else:
+    same = np.array_equal(a.triangle, b.triangle) and np.array_equal(a.owed, b.owed) and not a.owed["inverse_S"][0]
+    if not same:
         same = np.array_equal(covariance_matrix(a), covariance_matrix(b))
     return None if same else "their covariance P"
 
@@ -292,72 +351,42 @@ def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
     return stacked
 
 
-def _parameters(amplifier: Amplifier | None) -> np.ndarray:
-    parameters = compiled_parameters(amplifier)
-    if parameters is None:
+def _model(amplifier: Amplifier | None) -> AmplifierModel:
+    model = compiled_model(amplifier)
+    if model is None:
         raise TypeError(
             f"amplifier must be one of the package's models or None, got {amplifier!r}; use simulate for it"
         )
-    return parameters
+    return model
 
 
-class _SharedGains:
+class _GainSequence:
     """The gains of a run, a block at a time in the same arrays, from a copy of the covariance."""
 
-    def __init__(self, state: ControllerState, x: np.ndarray, kernel: str) -> None:
-        n, s = state.weights.size, state.secondary_estimate
-        self.state, self.kernel = state._replace(covariance=copy_covariance(state.covariance)), kernel
-        heard = newest(state.reference, int(state.reference[TAPS]))[::-1]
-        self.heard, self.n_samples = heard.size, x.size
-        self.reference = np.concatenate((heard, x))
-        self.filtered = np.convolve(self.reference, s)[: self.reference.size]
-        self.filtered[self.heard - n : self.heard] = newest(state.filtered, n)[::-1]
-        # Newest first, so that each row is a slice.
-        self.reference, self.filtered = self.reference[::-1].copy(), self.filtered[::-1].copy()
-        self._reference_rows, self._filtered_rows = (
-            sliding_window_view(signal, n)[::-1] for signal in (self.reference, self.filtered)
-        )
+    def __init__(self, state: KalmanState, x: np.ndarray) -> None:
+        self.covariance: Covariance = copy_covariance(state.gains)
+        self._settings = [float(state.numbers[name][0]) for name in VARIANCES]
+        n, lines = state.weights.size, state.lines
+        heard = newest(lines.reference, int(lines.reference[TAPS]))[::-1]
+        filtered = np.convolve(np.concatenate((heard, x)), lines.secondary_estimate)[heard.size : heard.size + x.size]
+        self.n_taps, self.n_samples = n, x.size
+        self._filtered = np.concatenate((newest(lines.filtered, n)[:0:-1], filtered))  # n - 1 samples before the first
 
-    def blocks(self) -> Iterator[tuple[int, SharedBlock]]:
-        """First sample and gains of each block."""
-        n = self.state.weights.size
+    def blocks(self) -> Iterator[tuple[int, SharedGains, int]]:
+        """Yield the first sample of each block, its gains, and how many of them have a solution."""
+        n = self.n_taps
         for first in range(0, self.n_samples, BLOCK):
-            size = min(BLOCK, self.n_samples - first)
-            if size < BLOCK or first == 0:
-                block, references = Block(n, size), aligned_zeros(size, n)
-            rows = slice(first + self.heard - n + 1, first + self.heard - n + 1 + size)
-            references[:, :n] = self._reference_rows[rows]
-            block.rows[:, :n] = self._filtered_rows[rows]
-            advance = getattr(block, ADVANCE[self.kernel])
-            variances = advance(self.state.covariance, *self.state.settings.tolist())
-            norms = np.sqrt(np.einsum("ij,ij->i", block.directions, block.directions))
-            yield first, SharedBlock(references, block.rows, block.directions, norms, variances)
-
-    def hand_back(
-        self, controllers: list[KalmanController], states: list[ControllerState], scenarios: Scenarios
-    ) -> None:
-        """Leave each controller as its scenario left it; all read one covariance until they step."""
-        last, tables = of_lanes(scenarios, LAST_UPDATE, 3), scenarios.table
-        if tables is None:
-            tables = of_lanes(scenarios, TABLE, 18).reshape(-1, 6, 3)
-        taps = scenarios.secondary_estimate.shape[1]  # past samples at the beginning of a line
-        heard = scenarios.output[:, taps - 1 :: -1].swapaxes(1, 2).reshape(-1, taps)
-        for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
-            refill(state.reference, self.reference)
-            refill(state.filtered, self.filtered)
-            refill(state.output, heard[i])
-            state.weights[:] = scenarios.weights[i, : state.weights.size]
-            state.constraint.table[:] = tables[i]
-            if scenarios.window is not None:
-                state.constraint.window[:] = scenarios.window[i]
-            state.last[:] = last[i]
-            controller.after_compiled(state._replace(covariance=self.state.covariance), shared=True)
+            m = min(BLOCK, self.n_samples - first)
+            if m < BLOCK or first == 0:
+                gains = SharedGains(np.zeros((m, n)), np.zeros(m), np.full(m, np.nan), np.zeros(1, np.int64))
+            rows = self._filtered[first : first + n - 1 + m][::-1].copy()
+            yield first, gains, advance_gains(self.covariance, rows, *self._settings, gains)
 
 
-def _raise_where_refused(scenarios: Scenarios, unsolved: int | None) -> None:
-    for i in np.flatnonzero(scenarios.lanes[:, STATUS : STATUS + LANES] == REFUSED):
+def _raise_if_refused(status: np.ndarray, done: np.ndarray, unsolved: int | None) -> None:
+    for i in np.flatnonzero(status == REFUSED):
         raise ValueError(
-            f"the weights of controllers[{i}] would overflow in sample {of_lanes(scenarios, DONE)[i, 0]:.0f} of the run: "
+            f"the weights of controllers[{i}] would overflow in sample {done[i]} of the run: "
             "its disturbance estimate or residual is too large"
         )
     if unsolved is not None:

@@ -15,34 +15,13 @@ from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceControl
 from ..controllers.limited import LimitedController
 from ..kernels.delay_lines import delay_line
 from ..paths.models import path_taps
-from ..power.amplifiers import Amplifier, compiled_parameters
+from ..power.amplifiers import Amplifier, AmplifierModel, compiled_model
 from ..power.constraint import DEFAULT_FS
-from .run import (
-    AMPLIFIED,
-    ANTI_NOISE,
-    CONTROL,
-    DISTURBANCE_IN,
-    DIVERGED,
-    ERROR,
-    REFERENCE_IN,
-    REFUSED,
-    ROWS,
-    RUNNING,
-    SENSOR_NOISE,
-    STEP,
-    USED_FACTOR,
-    USED_GAIN,
-    USED_POWER,
-    USED_WEIGHT,
-    ControllerState,
-    Plant,
-    anti_noise,
-    measured_reference,
-    run,
-)
+from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
 DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
-RECORDED = (ERROR, CONTROL, AMPLIFIED, ANTI_NOISE, USED_FACTOR)  # always; the powers where they are asked for
+RECORDED = ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor")
+POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request
 
 
 @dataclass(frozen=True)
@@ -214,43 +193,35 @@ def simulate(
         x, d = x[on:], d[on:]
 
     run_stretch = partial(_run_steps, controller, plant, amplifier)
-    if compiled and isinstance(controller, FilteredReferenceController) and compiled_parameters(amplifier) is not None:
+    if compiled and isinstance(controller, FilteredReferenceController) and compiled_model(amplifier) is not None:
         state = controller.compiled_state()
         if state is not None:
             run_stretch = partial(_run_compiled, controller, state, plant)
-    rows = (*RECORDED, USED_POWER, USED_GAIN, USED_WEIGHT) if record_powers else RECORDED
-    recorded = np.empty((len(rows), x.size))
+    names = RECORDED + POWERS if record_powers else RECORDED
+    recorded = {name: np.empty(x.size) for name in names}
     status, end = RUNNING, 0
     for first in range(0, x.size, STEP):
-        stretch = np.empty((ROWS, min(STEP, x.size - first)))
-        stretch[REFERENCE_IN] = x[first : first + STEP]
-        stretch[DISTURBANCE_IN] = d[first : first + STEP]
-        stretch[SENSOR_NOISE] = noise.take(stretch.shape[1])
-        stretch[USED_WEIGHT] = np.nan
+        stretch = _stretch(x[first : first + STEP], d[first : first + STEP], noise)
         status, done = run_stretch(stretch, weights, limit, every or 1, first, progress)
         end = first + done
-        recorded[:, first:end] = stretch[rows, :done]
+        for name, signal in recorded.items():
+            signal[first:end] = getattr(stretch, name)[:done]
         if status != RUNNING:
             break
-    recorded[:, end:] = np.nan
+    for signal in recorded.values():
+        signal[end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
-    e, y, y_amplified, a, factor, *powers = recorded
+    if not hasattr(controller, "power_weight"):
+        recorded.pop("power_weight", None)
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,
         rated_power=rated_power,
         reference=x.copy(),
         disturbance=d.copy(),
-        error=e,
-        control_signal=y,
-        amplifier_output=y_amplified,
-        anti_noise=a,
-        constraint_factor=factor,
+        **recorded,
         weights=weights if every else None,
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
-        disturbance_power=powers[0] if powers else None,
-        secondary_path_gain=powers[1] if powers else None,
-        power_weight=powers[2] if powers and hasattr(controller, "power_weight") else None,
         diverged_at_s=end / fs if status == DIVERGED else None,
     )
 
@@ -269,32 +240,33 @@ def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
     controller.listen(x, errors)
 
 
+def _stretch(x: np.ndarray, d: np.ndarray, noise: SensorNoise) -> Stretch:
+    """Return the signals of a stretch: what goes in, and room for what the loop leaves."""
+    left = np.full((len(RECORDED + POWERS), x.size), np.nan)
+    return Stretch(x, d, np.zeros(x.size) + noise.take(x.size), *left)
+
+
 def _run_compiled(
     controller: FilteredReferenceController,
-    state: ControllerState,
+    state: Any,
     plant: Plant,
-    stretch: np.ndarray,
+    stretch: Stretch,
     weights: np.ndarray,
     limit: float,
     every: int,
     first: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
-    """`loop.run`."""
-    status, done = RUNNING, 0
+    """Call `run.run`."""
     try:
-        for begin, end in controller.blocks(state, stretch.shape[1]):
-            block = controller.open_block
-            status, done = run(state, block, plant, stretch, weights, limit, every, first, begin, end)
-            if status != RUNNING:
-                break
+        status, done = run(state, plant, stretch, weights, limit, every, first)
     finally:  # interrupted or not, the controller is as its last sample left it
         controller.after_compiled(state)
     if progress:
         progress(done)
     if status == REFUSED:
         with _naming_sample(first + done):
-            controller.update(stretch[ERROR, done])  # refused again, with the reason
+            controller.update(float(stretch.error[done]))  # refused again, with the reason
             raise ValueError(NO_SOLUTION)
     return status, done
 
@@ -303,38 +275,36 @@ def _run_steps(
     controller: Controller,
     plant: Plant,
     amplifier: Amplifier | None,
-    stretch: np.ndarray,
+    stretch: Stretch,
     weights: np.ndarray,
     limit: float,
     every: int,
     first: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
-    """The loop of `loop.run`, one call of the controller at a time."""
-    for k in range(stretch.shape[1]):
+    """Make the loop of `run.run`, one call of the controller at a time."""
+    for k in range(stretch.reference.size):
         with _naming_sample(first + k):
-            x = measured_reference(plant, stretch[REFERENCE_IN, k])
-            y = _as_sample(controller.control_signal(float(x)), "control_signal")
+            x = reference_once(plant, stretch.reference[k])
+            y = _as_sample(controller.control_signal(x), "control_signal")
             if not abs(y) <= limit:
                 return DIVERGED, k
             y_amplified = y if amplifier is None else _as_sample(amplifier(y), "amplifier")
             if not np.isfinite(y_amplified):
                 raise ValueError(f"amplifier must return a finite number, got {y_amplified} for {y}")
-            a = anti_noise(plant, y_amplified)
-            e = stretch[DISTURBANCE_IN, k] - a + stretch[SENSOR_NOISE, k]
-            controller.update(float(e))
-        stretch[ERROR, k], stretch[CONTROL, k] = e, y
-        stretch[AMPLIFIED, k], stretch[ANTI_NOISE, k] = y_amplified, a
-        stretch[USED_FACTOR, k] = getattr(controller, "constraint_factor", np.nan)
-        stretch[USED_POWER, k] = getattr(controller, "disturbance_power", np.nan)
-        stretch[USED_GAIN, k] = getattr(controller, "secondary_path_gain", np.nan)
-        stretch[USED_WEIGHT, k] = getattr(controller, "power_weight", np.nan)
+            a = anti_noise_once(plant, y_amplified)
+            e = float(stretch.disturbance[k] - a + stretch.sensor_noise[k])
+            controller.update(e)
+        stretch.error[k], stretch.control_signal[k] = e, y
+        stretch.amplifier_output[k], stretch.anti_noise[k] = y_amplified, a
+        for name in ("constraint_factor", *POWERS):
+            getattr(stretch, name)[k] = getattr(controller, name, np.nan)
         if weights.shape[0] > 0 and (first + k) % every == 0:
             now = getattr(controller, "control_filter", getattr(controller, "weights", None))
             weights[(first + k) // every] = np.array(now, dtype=np.float64).reshape(-1)
         if progress:
             progress(1)
-    return RUNNING, stretch.shape[1]
+    return RUNNING, stretch.reference.size
 
 
 @contextmanager
@@ -385,11 +355,8 @@ def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None,
             raise ValueError(
                 f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0"
             )
-    parameters = compiled_parameters(amplifier)
-    if parameters is None:  # a user's own: applied in the loop of steps
-        parameters = compiled_parameters(None)
-    assert parameters is not None
-    return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), parameters)
+    model = compiled_model(amplifier) or AmplifierModel()  # a user's own is applied in the loop of steps
+    return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), model)
 
 
 def _weight_rows(n_samples: int, controller: Controller, every: int | None) -> np.ndarray:

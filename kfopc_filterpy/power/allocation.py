@@ -17,90 +17,18 @@ import math
 
 import numpy as np
 
-from ..kernels.compiling import compiled, part
-from ..kernels.covariance import FAST, copy_into, dot
+from ..kernels.compiling import part
+from ..kernels.toeplitz import solve_toeplitz, toeplitz_power, toeplitz_times
+from ..kernels.vectors import add_scaled, copy_into
 
 RIDGE = 1e-7  # of R_x'[0], on v - w: decides what no signal excites
 POWER_TOLERANCE = 0.005  # of the power that the filter is solved for
 TRIES = 20
 NEAR = 1e-6  # of E[x'^2]/E[x^2] to its inverse: where a search may start from
-# Rows of the work array: solution and right side; the predictors of Levinson's recursion, the backward one in two rows.
-RIGHT, TOTAL, REVERSED, FORWARD, BACKWARD = 0, 1, 2, 3, 4
-WORK_ROWS = 6
-
-
-@part(fastmath=FAST, forceinline=True)
-def add_scaled(target, factor, source, begin, end):
-    """target += factor source between two lags."""
-    for k in range(begin, end):
-        target[k] += factor * source[k]
-
-
-@part(fastmath=FAST)
-def toeplitz_times(t, w, out):
-    """out = T w with the symmetric Toeplitz matrix of first row t."""
-    n = w.size
-    for i in range(n):
-        out[i] = t[0] * w[i]
-    for k in range(1, n):
-        for i in range(n - k):
-            out[i] += t[k] * w[i + k]
-            out[i + k] += t[k] * w[i]
-
-
-@part(fastmath=FAST)
-def toeplitz_power(t, w):
-    """w' T w with the symmetric Toeplitz matrix of first row t: the correlation of w with itself costs half of T w."""
-    n = w.size
-    power = t[0] * dot(w, w)
-    for k in range(1, n):
-        lagged = 0.0
-        for i in range(n - k):
-            lagged += w[i] * w[i + k]
-        power += 2.0 * t[k] * lagged
-    return power
-
-
-@compiled(fastmath=FAST)
-def solve_toeplitz(work, v):
-    """Levinson's recursion: v with T v = b, for row TOTAL of `work` as t and row RIGHT as b; False: not definite.
-
-    The backward predictor is the forward one reversed; kept in an array of its own it is read in the order in which
-    it is used, and moves by one place an order without being copied.
-    """
-    n = v.size
-    t, b, reversed_t = work[TOTAL], work[RIGHT], work[REVERSED]
-    forward, backward = work[FORWARD], work[BACKWARD : BACKWARD + 2].reshape(-1)
-    for i in range(n):
-        reversed_t[i], forward[i], backward[i], backward[n + i] = t[n - 1 - i], 0.0, 0.0, 0.0
-    error = t[0]
-    if not error > 0.0:
-        return False
-    forward[0] = backward[n - 1] = 1.0
-    v[0] = b[0] / error
-    for m in range(1, n):
-        ahead = reversed_t[n - 1 - m :]  # t[m - i] at i
-        back = backward[n - 1 - m :]  # the backward predictor of the last order, one later
-        reflection, rest = 0.0, b[m]
-        for i in range(m):
-            reflection += forward[i] * ahead[i]
-            rest -= v[i] * ahead[i]
-        reflection /= -error
-        error *= 1.0 - reflection * reflection
-        if not error > 0.0:
-            return False
-        for i in range(m + 1):
-            f, g = forward[i], back[i]
-            forward[i], back[i] = f + reflection * g, g + reflection * f
-        v[m] = 0.0
-        step = rest / error
-        for i in range(m + 1):
-            v[i] += step * back[i]
-    return True
 
 
 @part()
-def constrained_filter(of_x, of_xf, w, power, weight, work, v):
+def constrained_filter(of_x, of_xf, w, power, weight, v):
     """Set v to the power-constrained filter and return lambda; the search starts from lambda = `weight`.
 
     `of_x`, `of_xf` are the first rows of R_x and R_x'. 1/sqrt(v' R_x v) grows with lambda and is nearly straight (for
@@ -119,16 +47,17 @@ def constrained_filter(of_x, of_xf, w, power, weight, work, v):
     gain = of_xf[0] / of_x[0]
     if not (gain > 0.0 and gain < np.inf):
         return scaled_filter(w, scale, v)
-    toeplitz_times(of_xf, w, work[RIGHT])
-    add_scaled(work[RIGHT], RIDGE * of_xf[0], w, 0, w.size)
+    right, total = np.empty(w.size), np.empty(w.size)
+    toeplitz_times(of_xf, w, right)
+    add_scaled(right, RIDGE * of_xf[0], w, 0, w.size)
     low, high, at_high, moved = 0.0, np.inf, np.inf, 0
     if not (weight > NEAR * gain and weight < gain / NEAR):
         weight = gain * (1.0 / scale - 1.0)  # exact for a flat path
     for _ in range(TRIES):
         for k in range(w.size):
-            work[TOTAL, k] = of_xf[k] + weight * of_x[k]
-        work[TOTAL, 0] += RIDGE * of_xf[0]
-        if not solve_toeplitz(work, v):
+            total[k] = of_xf[k] + weight * of_x[k]
+        total[0] += RIDGE * of_xf[0]
+        if not solve_toeplitz(total, right, v):
             break
         reached = toeplitz_power(of_x, v)
         if not reached > 0.0:

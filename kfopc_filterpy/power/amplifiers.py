@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -20,42 +20,49 @@ from ..kernels.compiling import compiled, part
 LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
 
 
-@part(forceinline=True)
-def amplify(kind, limit, sharpness, y):
-    """Output of one amplifier model for one sample."""
-    if kind == HARD_CLIP:
-        return min(max(y, -limit), limit)
-    if kind == SOFT_SATURATION:
-        ratio = abs(y) / limit
+class AmplifierModel(NamedTuple):
+    """What the compiled loop knows of an amplifier."""
+
+    kind: int = LINEAR
+    limit: float = math.inf
+    sharpness: float = 1.0
+
+
+@part()
+def amplify(model, y):
+    """Return the output of an amplifier model for one sample."""
+    if model.kind == HARD_CLIP:
+        return min(max(y, -model.limit), model.limit)
+    if model.kind == SOFT_SATURATION:
+        ratio, p = abs(y) / model.limit, model.sharpness
         if ratio <= 1.0:
-            return y / (1.0 + ratio ** (2.0 * sharpness)) ** (0.5 / sharpness)
-        return math.copysign(limit, y) / (1.0 + ratio ** (-2.0 * sharpness)) ** (0.5 / sharpness)  # no power overflows
+            return y / (1.0 + ratio ** (2.0 * p)) ** (0.5 / p)
+        return math.copysign(model.limit, y) / (1.0 + ratio ** (-2.0 * p)) ** (0.5 / p)  # no power overflows
     return y
 
 
 @compiled()
-def _amplify_all(kind, limit, sharpness, signal, out):
+def _amplify_all(model, signal, out):
     for n in range(signal.size):
-        out[n] = amplify(kind, limit, sharpness, signal[n])
+        out[n] = amplify(model, signal[n])
 
 
 @dataclass(frozen=True)
 class _Amplifier:
-    """Callable on numbers and arrays; `parameters` is what the compiled loop reads."""
+    """Callable on numbers and arrays; `model` is what the compiled loop reads."""
 
     kind: ClassVar[int] = LINEAR
 
     @property
-    def parameters(self) -> np.ndarray:
-        """(3,) kind, limit and sharpness."""
-        return np.array([self.kind, getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)])
+    def model(self) -> AmplifierModel:
+        """What the compiled loop reads."""
+        return AmplifierModel(self.kind, getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0))
 
     def __call__(self, signal: Any) -> Any:
-        """Output for `signal`, a number or an array of any shape."""
+        """Return the output for `signal`, a number or an array of any shape."""
         array = np.asarray(signal, dtype=np.float64)
         out = np.empty(array.size)
-        kind, limit, sharpness = self.parameters
-        _amplify_all(kind, limit, sharpness, array.reshape(-1), out)
+        _amplify_all(self.model, array.reshape(-1), out)
         return out.reshape(array.shape) if array.ndim else float(out[0])
 
 
@@ -128,13 +135,13 @@ class SoftSaturationAmplifier(_Amplifier):
 Amplifier = Callable[[Any], Any]  # a user's own may be any function of a sample
 
 
-def compiled_parameters(amplifier: Amplifier | None) -> np.ndarray | None:
-    """Parameters for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
+def compiled_model(amplifier: Amplifier | None) -> AmplifierModel | None:
+    """Return the model for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
     if amplifier is None:
-        return LinearAmplifier().parameters
+        return AmplifierModel()
     if isinstance(amplifier, type):
         raise TypeError(
             f"amplifier must be an object, such as HardClipAmplifier(limit=1.0), got the class {amplifier!r}"
         )
     models = (LinearAmplifier, HardClipAmplifier, SoftSaturationAmplifier)
-    return amplifier.parameters if isinstance(amplifier, models) and type(amplifier) in models else None
+    return amplifier.model if isinstance(amplifier, models) and type(amplifier) in models else None

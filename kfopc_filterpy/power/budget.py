@@ -13,9 +13,10 @@ import numpy as np
 
 from .._validate import as_count, as_number, as_positive, as_signal
 from ..kernels.compiling import compiled, part
-from ..kernels.covariance import FAST
 from ..kernels.delay_lines import delay_line, newest, push
-from .allocation import WORK_ROWS, add_scaled, constrained_filter
+from ..kernels.records import new_record
+from ..kernels.vectors import FAST, add_scaled
+from .allocation import constrained_filter
 from .constraint import DEFAULT_FS, SILENCE
 
 DEFAULT_CORRELATION_MEMORY_S = 1.25
@@ -34,23 +35,6 @@ STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its stan
 SHORTEST_PART = 0.25  # of a segment, for its power to count
 FORECAST_LEAST, FORECAST_MOST = 0.5, 4.0  # change of power that a trend may foretell; see choose_span for the lower
 
-# Rows of `correlations`: products of samples of one segment, and with samples before it; of x and of x'.
-OWN_X, OWN_XF, ACROSS_X, ACROSS_XF = range(4)
-(
-    RATED_POWER,
-    FS,
-    CREDIT,
-    SEGMENT,  # samples
-    CURRENT,  # segment that is being filled
-    TAKEN,  # samples since the control was switched on
-    WAITED,  # of these, since the last solution
-    ACCOUNT,  # seconds of rated power spent beyond what was due
-    WEIGHT,  # lambda
-    SPAN,  # segments in the window
-    CHANCE,  # seconds of rated power: standard deviation that the scatter of levels gives to the account in a second
-    SPENT,  # mean share of the rated power spent of late, of the time when the noise needed all of it
-) = range(12)
-
 
 class BudgetState(NamedTuple):
     """What the compiled functions below read and advance."""
@@ -58,10 +42,13 @@ class BudgetState(NamedTuple):
     control_filter: np.ndarray  # (L,) v, which makes the control signal
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x'
-    correlations: np.ndarray  # (LONG + 1, 4, L) sums of products at lags 0 ... L - 1
+    # (LONG + 1, L) sums of products at lags 0 ... L - 1: of samples of one segment, and with samples before it
+    own_x: np.ndarray
+    own_xf: np.ndarray
+    across_x: np.ndarray
+    across_xf: np.ndarray
     counts: np.ndarray  # (LONG + 1,) samples in each segment
-    table: np.ndarray  # (12,) numbers named above
-    work: np.ndarray  # (WORK_ROWS + 2, L)
+    numbers: np.ndarray  # record: rated power, account, lambda, ...; see `PowerBudget`
 
 
 @part()
@@ -73,24 +60,22 @@ def take_correlations(budget, x, xf):
     """
     push(budget.reference, x)
     push(budget.filtered, xf)
-    L, table = budget.control_filter.size, budget.table
-    current = int(table[CURRENT])
-    if budget.counts[current] >= table[SEGMENT]:
-        current = (current + 1) % len(budget.counts)
-        table[CURRENT], budget.counts[current] = current, 0.0
-        oldest = budget.correlations[current]
-        for row in range(4):
-            for k in range(L):
-                oldest[row, k] = 0.0
+    L, numbers = budget.control_filter.size, budget.numbers[0]
+    if budget.counts[numbers.current] >= numbers.segment:
+        numbers.current = (numbers.current + 1) % len(budget.counts)
+        budget.counts[numbers.current] = 0.0
+        for k in range(L):
+            budget.own_x[numbers.current, k] = budget.own_xf[numbers.current, k] = 0.0
+            budget.across_x[numbers.current, k] = budget.across_xf[numbers.current, k] = 0.0
+    current = numbers.current
     budget.counts[current] += 1.0
     own = min(int(budget.counts[current]), L)
-    rows = budget.correlations[current]
     before, filtered_before = newest(budget.reference, L), newest(budget.filtered, L)
-    add_scaled(rows[OWN_X], x, before, 0, own)
-    add_scaled(rows[OWN_XF], xf, filtered_before, 0, own)
+    add_scaled(budget.own_x[current], x, before, 0, own)
+    add_scaled(budget.own_xf[current], xf, filtered_before, 0, own)
     if own < L:
-        add_scaled(rows[ACROSS_X], x, before, own, L)
-        add_scaled(rows[ACROSS_XF], xf, filtered_before, own, L)
+        add_scaled(budget.across_x[current], x, before, own, L)
+        add_scaled(budget.across_xf[current], xf, filtered_before, own, L)
 
 
 @part()
@@ -102,20 +87,20 @@ def choose_span(budget):
     of intersecting confidence intervals, after Goldenshluger and Nemirovski.) That the noise has become softer is believed
     more slowly than that it has become louder: a pause between bursts is no reason to spend more on the next one.
     """
-    table = budget.table
-    table[SPAN], table[CHANCE] = USUAL, 0.0
+    numbers = budget.numbers[0]
+    numbers.span, numbers.chance = USUAL, 0.0
     usual, variance, _ = _mean_level(budget, USUAL)
     if not usual > SILENCE:
         return
     # Of a segment it is a dozen times that of the mean; at the start, with fewer segments, this errs towards patience.
-    chance = math.sqrt(2.0 * SHORT * variance * table[SEGMENT] / table[FS])
-    table[CHANCE] = min(chance, LARGEST_CHANCE_S)
+    chance = math.sqrt(2.0 * SHORT * variance * numbers.segment / numbers.fs)
+    numbers.chance = min(chance, LARGEST_CHANCE_S)
     short, short_variance, _ = _mean_level(budget, SHORT)
     long, long_variance, segments = _mean_level(budget, LONG)
     if short > usual and math.log(short / usual) ** 2 > AGREEMENT * (short_variance + variance):
-        table[SPAN] = SHORT
+        numbers.span = SHORT
     elif segments >= 0.8 * LONG and math.log(long / usual) ** 2 <= AGREEMENT * (long_variance + variance):
-        table[SPAN] = LONG
+        numbers.span = LONG
 
 
 @part()
@@ -145,17 +130,16 @@ def _mean_level(budget, span):
 @part()
 def sum_correlations(budget, of_x, of_xf):
     """First rows of R_x and R_x' over the window, as means."""
-    count, kept, span, current = 0.0, len(budget.counts), int(budget.table[SPAN]), int(budget.table[CURRENT])
+    count, kept, span, current = 0.0, len(budget.counts), budget.numbers[0].span, budget.numbers[0].current
     for k in range(of_x.size):
         of_x[k] = of_xf[k] = 0.0
     for j in range(span + 1):
         i = (current - j) % kept
-        rows = budget.correlations[i]
-        add_scaled(of_x, 1.0, rows[OWN_X], 0, of_x.size)
-        add_scaled(of_xf, 1.0, rows[OWN_XF], 0, of_x.size)
+        add_scaled(of_x, 1.0, budget.own_x[i], 0, of_x.size)
+        add_scaled(of_xf, 1.0, budget.own_xf[i], 0, of_x.size)
         if j < span:  # the oldest segment knows nothing before it
-            add_scaled(of_x, 1.0, rows[ACROSS_X], 0, of_x.size)
-            add_scaled(of_xf, 1.0, rows[ACROSS_XF], 0, of_x.size)
+            add_scaled(of_x, 1.0, budget.across_x[i], 0, of_x.size)
+            add_scaled(of_xf, 1.0, budget.across_xf[i], 0, of_x.size)
         count += budget.counts[i]
     for k in range(of_x.size):
         of_x[k] /= count
@@ -169,7 +153,7 @@ def level_forecast(budget, mean_power):
     A straight line through the logarithm of the segments' powers. Its slope is shrunk by what its scatter would make
     of a steady noise (James and Stein), so that bursts, which scatter, are averaged and a swelling noise is followed.
     """
-    floor, segments = 1e-12 * mean_power, int(budget.table[SPAN]) + 1
+    floor, segments = 1e-12 * mean_power, budget.numbers[0].span + 1
     weight = times = levels = 0.0
     for j in range(segments):
         share = _share(budget, j)
@@ -202,22 +186,22 @@ def level_forecast(budget, mean_power):
 @part(forceinline=True)
 def _share(budget, j):
     """How much of the j-th newest segment is there; the very beginning of one says too little to count."""
-    count = budget.counts[(int(budget.table[CURRENT]) - j) % len(budget.counts)] / budget.table[SEGMENT]
+    count = budget.counts[(budget.numbers[0].current - j) % len(budget.counts)] / budget.numbers[0].segment
     return count if count >= SHORTEST_PART else 0.0
 
 
 @part(forceinline=True)
 def _age(budget, j):
     """Middle of the j-th newest segment, in segments from now (negative)."""
-    newest_part = budget.counts[int(budget.table[CURRENT])] / budget.table[SEGMENT]
+    newest_part = budget.counts[budget.numbers[0].current] / budget.numbers[0].segment
     return -0.5 * newest_part if j == 0 else -newest_part - j + 0.5
 
 
 @part(forceinline=True)
 def _power(budget, j):
     """Power of x' in the j-th newest segment, of which some is there."""
-    i = (int(budget.table[CURRENT]) - j) % len(budget.counts)
-    return budget.correlations[i, OWN_XF, 0] / budget.counts[i]
+    i = (budget.numbers[0].current - j) % len(budget.counts)
+    return budget.own_xf[i, 0] / budget.counts[i]
 
 
 @part()
@@ -227,54 +211,56 @@ def target_power(budget, forecast):
     Debt is repaid at once, the more patiently the more of it chance makes; of credit, half of what chance makes in a
     second is left to even out by itself: to chase chance would cost noise reduction.
     """
-    table = budget.table
-    account, chance = table[ACCOUNT], table[CHANCE]
+    numbers = budget.numbers[0]
+    account, chance = numbers.account, numbers.chance
     excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
-    share = unspent(table) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
-    return table[RATED_POWER] * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
+    share = unspent(numbers) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
+    return numbers.rated_power * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
 
 
 @part()
-def unspent(table):
+def unspent(numbers):
     """Factor of the target for power that was left of late, beyond what chance makes of a mean over that time.
 
     Credit that could not be spent in time is lost to the account. For noise that swells that is a part of the power at
     each swell, since falls of the level are believed slowly; the noise's own past tells how large a part.
     """
-    left = 1.0 - table[SPENT] - table[CHANCE] / math.sqrt(2.0 * UNSPENT_S)
+    left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT_S)
     return min(1.0 + UNSPENT_GAIN * max(left, 0.0), UNSPENT_MOST)
 
 
 @compiled()
 def allocate(budget, w):
     """Set the control filter for the estimate w."""
-    of_x, of_xf, work = budget.work[WORK_ROWS], budget.work[WORK_ROWS + 1], budget.work[:WORK_ROWS]
+    of_x, of_xf = np.empty(budget.control_filter.size), np.empty(budget.control_filter.size)
     choose_span(budget)
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # nothing was heard: nothing to go by
         return
     power = target_power(budget, level_forecast(budget, of_xf[0]))
-    budget.table[WEIGHT] = constrained_filter(of_x, of_xf, w, power, budget.table[WEIGHT], work, budget.control_filter)
+    budget.numbers[0].weight = constrained_filter(
+        of_x, of_xf, w, power, budget.numbers[0].weight, budget.control_filter
+    )
 
 
 @part()
 def advance_budget(budget, w, x, xf, y):
     """Take a sample: reference, filtered reference and emitted control signal; solve anew where it is time to."""
-    table = budget.table
+    numbers = budget.numbers[0]
     take_correlations(budget, x, xf)
-    spent = table[ACCOUNT] + (y * y / table[RATED_POWER] - 1.0) / table[FS]
-    table[ACCOUNT] = min(max(spent, -table[CREDIT] - table[CHANCE]), DEBT_S)
-    if table[WEIGHT] > 0.0:
-        table[SPENT] += (y * y / table[RATED_POWER] - table[SPENT]) / (UNSPENT_S * table[FS])
-    table[TAKEN] += 1.0
-    table[WAITED] += 1.0
+    spent = numbers.account + (y * y / numbers.rated_power - 1.0) / numbers.fs
+    numbers.account = min(max(spent, -numbers.credit - numbers.chance), DEBT_S)
+    if numbers.weight > 0.0:
+        numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT_S * numbers.fs)
+    numbers.taken += 1.0
+    numbers.waited += 1.0
     # At the start, when the estimate grows fast, after every eighth part of the time so far.
-    if table[WAITED] >= min(float(INTERVAL), 1.0 + table[TAKEN] // 8.0):
-        table[WAITED] = 0.0
+    if numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
+        numbers.waited = 0.0
         allocate(budget, w)
 
 
-@part(fastmath=FAST)
+@compiled(fastmath=FAST)
 def control_sample(budget, x):
     """v' x(n) for a reference sample that the budget has not taken yet."""
     v, before = budget.control_filter, newest(budget.reference, budget.control_filter.size)
@@ -282,6 +268,18 @@ def control_sample(budget, x):
     for k in range(1, v.size):
         total += v[k] * before[k - 1]
     return total
+
+
+@compiled()
+def advance_sample(budget, w, x, xf, y):
+    """Call `advance_budget` from Python."""
+    advance_budget(budget, w, x, xf, y)
+
+
+@compiled()
+def listen_sample(budget, x, xf):
+    """Call `take_correlations` from Python."""
+    take_correlations(budget, x, xf)
 
 
 class PowerBudget:
@@ -366,19 +364,30 @@ class PowerBudget:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
-        table = np.zeros(12)
-        table[SPENT] = 1.0
-        table[RATED_POWER], table[FS], table[CREDIT] = rated_power, self.fs, self.credit_s
-        table[SEGMENT] = max(round(self.memory_s * self.fs / USUAL), n_taps)
-        table[SPAN] = USUAL
+        own_x, own_xf, across_x, across_xf = (np.zeros((LONG + 1, n_taps)) for _ in range(4))
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(n_taps),
             filtered=delay_line(n_taps),
-            correlations=np.zeros((LONG + 1, 4, n_taps)),
+            own_x=own_x,
+            own_xf=own_xf,
+            across_x=across_x,
+            across_xf=across_xf,
             counts=np.zeros(LONG + 1),
-            table=table,
-            work=np.zeros((WORK_ROWS + 2, n_taps)),
+            numbers=new_record(
+                rated_power=rated_power,
+                fs=self.fs,
+                credit=self.credit_s,
+                segment=float(max(round(self.memory_s * self.fs / USUAL), n_taps)),  # samples
+                current=0,  # segment that is being filled
+                taken=0.0,  # samples since the control was switched on
+                waited=0.0,  # of these, since the last solution
+                account=0.0,  # seconds of rated power spent beyond what was due
+                weight=0.0,  # lambda
+                span=USUAL,  # segments in the window
+                chance=0.0,  # s of rated power: what the scatter of levels does to the account in a second (std)
+                spent=1.0,  # mean share of the rated power spent of late, while the noise needed all of it
+            ),
         )
 
     @property
@@ -394,11 +403,11 @@ class PowerBudget:
     @property
     def rated_power(self) -> float:
         """Rated output power; can be assigned."""
-        return float(self._state.table[RATED_POWER])
+        return float(self._state.numbers["rated_power"][0])
 
     @rated_power.setter
     def rated_power(self, value: float) -> None:
-        self._state.table[RATED_POWER] = as_positive(value, "rated_power")
+        self._state.numbers["rated_power"] = as_positive(value, "rated_power")
 
     @property
     def control_filter(self) -> np.ndarray:
@@ -408,12 +417,12 @@ class PowerBudget:
     @property
     def power_weight(self) -> float:
         """Weight lambda of the control power; 0: the estimate fits the budget as it is, Inf: it was scaled to fit."""
-        return float(self._state.table[WEIGHT])
+        return float(self._state.numbers["weight"][0])
 
     @property
     def account_s(self) -> float:
         """Power spent beyond what was due, in seconds of rated power; negative: credit."""
-        return float(self._state.table[ACCOUNT])
+        return float(self._state.numbers["account"][0])
 
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the reference x(n); call it before `advance` with the same x(n)."""
@@ -440,7 +449,7 @@ class PowerBudget:
         """
         w = as_signal(weights, "weights", length=self.n_taps)
         y = self.checked_sample(reference, filtered_reference, control_signal)
-        advance_budget(self._state, w, float(reference), float(filtered_reference), y)
+        advance_sample(self._state, w, float(reference), float(filtered_reference), y)
 
     def checked_sample(self, reference: Any, filtered_reference: Any, control_signal: Any = None) -> float:
         """Control signal of a sample that `advance` would take, or the error it would raise."""
@@ -452,7 +461,7 @@ class PowerBudget:
     def listen(self, reference: float, filtered_reference: float) -> None:
         """Take one sample, `reference` x(n) and `filtered_reference` x'(n), while the control is switched off."""
         sample = self._sample(reference, "reference"), self._sample(filtered_reference, "filtered_reference")
-        take_correlations(self._state, *sample)
+        listen_sample(self._state, *sample)
 
     @staticmethod
     def _sample(value: Any, name: str) -> float:

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_choice, as_nonnegative, as_number, as_positive
-from ..kernels.compiling import part
+from ..kernels.compiling import compiled, inlined, part
+from ..kernels.records import new_record
 
 DEFAULT_FS = 16000.0
 DEFAULT_MEMORY_S = 0.5
@@ -16,36 +17,30 @@ DEFAULT_MEMORY_S = 0.5
 # Below the smallest normal number a ratio of powers has no digits left: such a reference counts as silent.
 SILENCE = float(np.finfo(np.float64).tiny)
 
-# Rows of the state's table, and what their three columns are.
-MEAN, LAP, TAKEN, SUPPLIED, LAST, SETTINGS = range(6)
-# of MEAN, LAP, TAKEN; numpy's integers, since numba compiles a function anew for each plain one it is called with
+# The running powers; numpy's integers, since numba compiles a function anew for each plain one it is called with.
 DISTURBANCE, FILTERED_REFERENCE, REFERENCE = np.arange(3)
-FACTOR, POWER, GAIN = range(3)  # of SUPPLIED, LAST
-RATED_POWER, FORGETTING = range(2)  # of SETTINGS
+POWER = np.dtype([("mean", np.float64), ("lap", np.float64), ("taken", np.float64)], align=True)
 
 
 class ConstraintState(NamedTuple):
-    """What the compiled functions below read and advance.
+    """What the compiled functions below read and advance."""
 
-    Few arrays, since each is an argument more to compile in every function. The table's rows: MEAN, mean squares
-    of disturbance, filtered reference and reference; LAP, their sums of squares since the sliding window last wrapped;
-    TAKEN, samples taken; SUPPLIED, factor, disturbance power and gain set by the caller, NaN where estimated; LAST, the
-    same as last used; SETTINGS, rated power and 1 - forgetting factor.
-    """
-
-    table: np.ndarray  # (6, 3)
-    window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential
+    powers: (
+        np.ndarray
+    )  # (3,) of POWER: mean square, sum of squares since the sliding window last wrapped, samples taken
+    window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential memory
+    numbers: np.ndarray  # record: settings; what the caller supplied (NaN: estimated); what was last used
 
 
-@part(forceinline=True)
-def forgetting_mean(mean, n, rate, square):
-    """Mean square with one more sample after n, of exponential memory and unbiased from the first sample on."""
-    return mean + max(rate, 1.0 / (n + 1)) * (square - mean)
+@part()
+def forgetting_mean(mean, taken, rate, square):
+    """Return the mean square with one more sample, of exponential memory and unbiased from the first sample on."""
+    return mean + max(rate, 1.0 / (taken + 1)) * (square - mean)
 
 
-@part(forceinline=True)
+@part()
 def power_gain(supplied, last, filtered_power, reference_power):
-    """Eq. 11, or the gain supplied, or the last one while the reference is silent."""
+    """Return the gain of eq. 11, or the one supplied, or the last one while the reference is silent."""
     if not np.isnan(supplied):
         return supplied
     if reference_power > SILENCE:
@@ -53,9 +48,9 @@ def power_gain(supplied, last, filtered_power, reference_power):
     return last
 
 
-@part(forceinline=True)
+@part()
 def constraint_factor(supplied, rated_power, disturbance_power, gain):
-    """Eq. 13; 1 where there is nothing to constrain (no disturbance, or no gain known yet)."""
+    """Return the factor of eq. 13; 1 if there is nothing to constrain (no disturbance, or no gain known yet)."""
     if not np.isnan(supplied):
         return supplied
     if disturbance_power <= SILENCE or np.isnan(gain):
@@ -63,38 +58,38 @@ def constraint_factor(supplied, rated_power, disturbance_power, gain):
     return min(math.sqrt(rated_power * gain / disturbance_power), 1.0)
 
 
-@part(forceinline=True)
-def _next_mean(state, row, square):
-    """Mean square with one more sample."""
-    n, m, mean = state.table[TAKEN, row], state.window.shape[1], state.table[MEAN, row]
+@inlined
+def _next_mean(state, signal, square):
+    """Return the mean square of a signal with one more sample."""
+    power, m = state.powers[signal], state.window.shape[1]
     if m == 0:
-        return forgetting_mean(mean, n, state.table[SETTINGS, FORGETTING], square)
-    position = np.int64(n) % m
-    rest = state.window[row, position + 1] if position + 1 < m else 0.0
-    total = state.table[LAP, row] + square + rest  # sums only, so that rounding never accumulates
-    return total / min(n + 1.0, float(m))
+        return forgetting_mean(power.mean, power.taken, state.numbers[0].rate, square)
+    position = np.int64(power.taken) % m
+    rest = state.window[signal, position + 1] if position + 1 < m else 0.0
+    total = power.lap + square + rest  # sums only, so that rounding never accumulates
+    return total / min(power.taken + 1.0, float(m))
 
 
-@part(forceinline=True)
+@inlined
 def preview_constraint(state, disturbance, filtered_reference, reference):
-    """Constraint factor with this sample included; nothing is changed.
+    """Return the constraint factor with this sample included; nothing is changed.
 
-    Returns the factor, the disturbance power and the gain it follows from, and the three mean squares. A NaN
-    `reference` (none given) leaves the powers of the reference and the filtered reference as they are.
+    Also returns the disturbance power and the gain it follows from, and the three mean squares. A NaN `reference`
+    (none given) leaves the powers of the reference and the filtered reference as they are.
     """
+    numbers = state.numbers[0]
     mean_d = _next_mean(state, DISTURBANCE, disturbance * disturbance)
-    mean_xf, mean_x = state.table[MEAN, FILTERED_REFERENCE], state.table[MEAN, REFERENCE]
+    mean_xf, mean_x = state.powers[FILTERED_REFERENCE].mean, state.powers[REFERENCE].mean
     if not np.isnan(reference):
         mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference * filtered_reference)
         mean_x = _next_mean(state, REFERENCE, reference * reference)
-    table = state.table
-    gain = power_gain(table[SUPPLIED, GAIN], table[LAST, GAIN], mean_xf, mean_x)
-    power = mean_d if np.isnan(table[SUPPLIED, POWER]) else table[SUPPLIED, POWER]
-    factor = constraint_factor(table[SUPPLIED, FACTOR], table[SETTINGS, RATED_POWER], power, gain)
+    gain = power_gain(numbers.supplied_gain, numbers.gain, mean_xf, mean_x)
+    power = mean_d if np.isnan(numbers.supplied_power) else numbers.supplied_power
+    factor = constraint_factor(numbers.supplied_factor, numbers.rated_power, power, gain)
     return factor, power, gain, mean_d, mean_xf, mean_x
 
 
-@part(forceinline=True)
+@inlined
 def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
     """Take the sample that `previewed` was made of into the running powers."""
     factor, power, gain, mean_d, mean_xf, mean_x = previewed
@@ -102,11 +97,11 @@ def commit_constraint(state, previewed, disturbance, filtered_reference, referen
     if not np.isnan(reference):
         _take(state, FILTERED_REFERENCE, filtered_reference, mean_xf)
         _take(state, REFERENCE, reference, mean_x)
-    table = state.table
-    table[LAST, FACTOR], table[LAST, POWER], table[LAST, GAIN] = factor, power, gain
+    numbers = state.numbers[0]
+    numbers.factor, numbers.power, numbers.gain = factor, power, gain
 
 
-@part(forceinline=True)
+@inlined
 def advance_constraint(state, disturbance, filtered_reference, reference):
     """Take this sample into the running powers and return the constraint factor."""
     previewed = preview_constraint(state, disturbance, filtered_reference, reference)
@@ -114,20 +109,38 @@ def advance_constraint(state, disturbance, filtered_reference, reference):
     return previewed[0]
 
 
-@part(forceinline=True)
-def _take(state, row, value, mean):
+@part()
+def squares_are_finite(d, filtered, x):
+    """Return whether the running powers can take this sample: an infinite power would never be forgotten."""
+    return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
+
+
+@inlined
+def _take(state, signal, value, mean):
     """Record one sample of one running power, whose new mean square is `mean`."""
-    state.table[MEAN, row] = mean
-    m = state.window.shape[1]
+    power, m = state.powers[signal], state.window.shape[1]
+    power.mean = mean
     if m > 0:
-        position = np.int64(state.table[TAKEN, row]) % m
-        state.table[LAP, row] += value * value
-        state.window[row, position] = value * value
+        position = np.int64(power.taken) % m
+        power.lap += value * value
+        state.window[signal, position] = value * value
         if position == m - 1:
-            state.table[LAP, row] = 0.0
+            power.lap = 0.0
             for i in range(m - 2, -1, -1):
-                state.window[row, i] += state.window[row, i + 1]
-    state.table[TAKEN, row] += 1
+                state.window[signal, i] += state.window[signal, i + 1]
+    power.taken += 1.0
+
+
+@compiled()
+def preview_sample(state, disturbance, filtered_reference, reference):
+    """Return `preview_constraint`'s factor, for Python."""
+    return preview_constraint(state, disturbance, filtered_reference, reference)[0]
+
+
+@compiled()
+def advance_sample(state, disturbance, filtered_reference, reference):
+    """Call `advance_constraint` from Python."""
+    return advance_constraint(state, disturbance, filtered_reference, reference)
 
 
 class OutputPowerConstraint:
@@ -143,7 +156,7 @@ class OutputPowerConstraint:
         Power gain :math:`G_s`; by default estimated as E[x'^2]/E[x^2] (eq. 11).
     fs : float, default 16000
         Sample rate in Hz.
-    memory : float, default 0.5
+    memory_s : float, default 0.5
         Memory of the power estimates in seconds: the time constant of the exponential window, or the length
         of the sliding one.
     window : {"exponential", "sliding"}, default "exponential"
@@ -170,21 +183,38 @@ class OutputPowerConstraint:
         *,
         secondary_path_gain: float | None = None,
         fs: float = DEFAULT_FS,
-        memory: float = DEFAULT_MEMORY_S,
+        memory_s: float = DEFAULT_MEMORY_S,
         window: str = "exponential",
     ) -> None:
         rated_power = as_positive(rated_power, "rated_power")
         self.fs = as_positive(fs, "fs", unit="Hz")
-        self.memory = as_positive(memory, "memory", unit="s")
+        self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.window = as_choice(window, "window", ("exponential", "sliding"))
-        samples = self.memory * self.fs
+        samples = self.memory_s * self.fs
         length = max(round(samples), 1) if window == "sliding" else 0
-        table = np.zeros((6, 3))
-        table[SUPPLIED] = np.nan
-        table[LAST] = 1.0, 0.0, np.nan
-        table[SETTINGS, :2] = rated_power, -math.expm1(-1.0 / samples)
-        self._state = ConstraintState(table, np.zeros((3, length)))
+        numbers = new_record(
+            rated_power=rated_power,
+            rate=-math.expm1(-1.0 / samples),
+            supplied_factor=math.nan,
+            supplied_power=math.nan,
+            supplied_gain=math.nan,
+            factor=1.0,
+            power=0.0,
+            gain=math.nan,
+        )
+        self._state = ConstraintState(np.zeros(3, POWER), np.zeros((3, length)), numbers)
+        self._given_gain = secondary_path_gain
         self.secondary_path_gain = secondary_path_gain
+
+    def fresh(self, rated_power: float | None = None) -> OutputPowerConstraint:
+        """Return a constraint of the same settings that has seen no sample, by default of the same rated power."""
+        return OutputPowerConstraint(
+            self.rated_power if rated_power is None else rated_power,
+            secondary_path_gain=self._given_gain,
+            fs=self.fs,
+            memory_s=self.memory_s,
+            window=self.window,
+        )
 
     @property
     def state(self) -> ConstraintState:
@@ -194,48 +224,49 @@ class OutputPowerConstraint:
     @property
     def rated_power(self) -> float:
         """Rated output power; can be assigned."""
-        return float(self._state.table[SETTINGS, RATED_POWER])
+        return float(self._state.numbers["rated_power"][0])
 
     @rated_power.setter
     def rated_power(self, value: float) -> None:
-        self._state.table[SETTINGS, RATED_POWER] = as_positive(value, "rated_power")
+        self._state.numbers["rated_power"] = as_positive(value, "rated_power")
 
     @property
     def factor(self) -> float:
         """Constraint factor last used; assign a value to hold it there, None to estimate it again."""
-        return self._read(FACTOR)
+        return self._read("factor")
 
     @factor.setter
     def factor(self, value: float | None) -> None:
-        self._supply(FACTOR, None if value is None else as_nonnegative(value, "constraint_factor"))
+        self._supply("factor", None if value is None else as_nonnegative(value, "constraint_factor"))
 
     @property
     def disturbance_power(self) -> float:
         """Disturbance power last used (eq. 10); assign a value to supply it, None to estimate it again."""
-        return self._read(POWER)
+        return self._read("power")
 
     @disturbance_power.setter
     def disturbance_power(self, value: float | None) -> None:
-        self._supply(POWER, None if value is None else as_nonnegative(value, "disturbance_power"))
+        self._supply("power", None if value is None else as_nonnegative(value, "disturbance_power"))
 
     @property
     def secondary_path_gain(self) -> float | None:
         """Power gain last used (eq. 11), None before any; assign to supply it, None to estimate it again."""
-        gain = self._read(GAIN)
+        gain = self._read("gain")
         return None if math.isnan(gain) else gain
 
     @secondary_path_gain.setter
     def secondary_path_gain(self, value: float | None) -> None:
-        self._supply(GAIN, None if value is None else as_positive(value, "secondary_path_gain"))
+        self._supply("gain", None if value is None else as_positive(value, "secondary_path_gain"))
 
     @property
     def needs_reference(self) -> bool:
         """Whether the gain has to come from the reference: neither it nor the factor was supplied."""
-        return bool(np.isnan(self._state.table[SUPPLIED, GAIN]) and np.isnan(self._state.table[SUPPLIED, FACTOR]))
+        numbers = self._state.numbers
+        return math.isnan(numbers["supplied_gain"][0]) and math.isnan(numbers["supplied_factor"][0])
 
     def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Constraint factor that `advance` would return for this sample; nothing is changed."""
-        return float(preview_constraint(self._state, *self._sample(disturbance, filtered_reference, reference))[0])
+        return float(preview_sample(self._state, *self._sample(disturbance, filtered_reference, reference)))
 
     def advance(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Take one sample into the powers and return the constraint factor.
@@ -259,7 +290,7 @@ class OutputPowerConstraint:
         ValueError
             NaN, Inf or a value whose square overflows; no reference and no gain.
         """
-        return float(advance_constraint(self._state, *self._sample(disturbance, filtered_reference, reference)))
+        return float(advance_sample(self._state, *self._sample(disturbance, filtered_reference, reference)))
 
     def _sample(self, disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float]:
         if reference is None and self.needs_reference:
@@ -274,12 +305,12 @@ class OutputPowerConstraint:
         )
         return values
 
-    def _read(self, row: int) -> float:
-        supplied = self._state.table[SUPPLIED, row]
-        return float(self._state.table[LAST, row] if math.isnan(supplied) else supplied)
+    def _read(self, name: str) -> float:
+        supplied = self._state.numbers[f"supplied_{name}"][0]
+        return float(self._state.numbers[name][0] if math.isnan(supplied) else supplied)
 
-    def _supply(self, row: int, value: float | None) -> None:
-        self._state.table[SUPPLIED, row] = math.nan if value is None else value
+    def _supply(self, name: str, value: float | None) -> None:
+        self._state.numbers[f"supplied_{name}"] = math.nan if value is None else value
 
 
 def _squarable(value: Any, name: str) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from .._validate import as_number, as_positive, as_signal
 from ..kernels.compiling import compiled, part
+from ..kernels.records import new_record
 from .constraint import DEFAULT_FS
 
 DEFAULT_WINDOW_S = 0.1
@@ -26,81 +27,73 @@ OVERSHOOT = 1.1  # the gain rises towards this much more than its aim and stops 
 LOUDEST = 100.0  # amplitude planned for, over the most that can leave: what is louder is clipped, and soon forgotten
 FLOOR = 1e-200  # of the budget: keeps estimates from denormal numbers, which are slow
 
-# Indices of the state's numbers: settings, then what the samples change.
-(
-    SCALE, PEAK, BUDGET, LIMIT, PLANNED, ATTACK, CALM, FADE, RELEASE,
-    POSITION, SPENT, ARRIVED, MEAN, LOUD, KNOWN, GAIN, CLIPPED,
-) = range(17)  # fmt: skip
-HELD, ROOM = range(2)  # rows of the plan
-OUTPUT, INPUT, SQUARE = range(3)  # rows of the laps
-
 
 class LimiterState(NamedTuple):
     """What `limit_sample` reads and advances.
 
-    A lap is N samples. At position i of it, row OUTPUT of `laps` holds minus this lap's energy up to k where k < i,
-    the last lap's energy from k on where k > i, and 0 at k = N: for any m <= N the energy of the last m samples is one
-    sum. INPUT holds the same of what comes in, SQUARE this lap's output energies. Of the numbers, SCALE is
-    1/sqrt(N rho_o), PEAK its inverse, LIMIT and PLANNED amplitudes; SPENT and ARRIVED are this lap's energies out and
-    in; MEAN is a running mean of the energies in, LOUD its slowly falling maximum; KNOWN is the largest energy of a
-    window as it was held when the lap began.
+    A lap is N samples. At position i of it, `laps_out` holds minus this lap's energy up to k for k < i, the last lap's
+    energy from k on for k > i, and 0 at k = N: for any m <= N the energy of the last m samples is one sum. `laps_in`
+    holds the same of what comes in.
     """
 
-    numbers: np.ndarray  # (17,)
+    numbers: np.ndarray  # record: settings, then what the samples change; see `_silent_state`
     horizons: np.ndarray  # (K,) samples, the last one N
-    plan: np.ndarray  # (2, K) for each horizon: largest energy that lately came in such a span, and the most allowed
-    laps: np.ndarray  # (3, N + 1)
+    held: np.ndarray  # (K,) largest energy that lately came in a span of each horizon
+    room: np.ndarray  # (K,) and the most that may leave in it
+    laps_out: np.ndarray  # (N + 1,)
+    laps_in: np.ndarray  # (N + 1,)
+    squares: np.ndarray  # (N + 1,) this lap's output energies
 
 
-@part(forceinline=True)
+@part()
 def _aim(state, i, size):
     """The largest constant gain with which every horizon fits, if what comes is as bad as foreseen.
 
     In the next h samples comes at most what lately came in any h samples; no more than h times what is loud now;
     and, while the window is none worse than those known, no more than keeps it so.
     """
-    numbers, plan, laps = state.numbers, state.plan, state.laps
-    known = (1.0 + RESERVE) * numbers[KNOWN]
-    if numbers[ARRIVED] + laps[INPUT, i + 1] > known:
+    numbers, held = state.numbers[0], state.held
+    known = (1.0 + RESERVE) * numbers.known
+    if numbers.arrived + state.laps_in[i + 1] > known:
         known = np.inf
     room = 1.0
-    for j in range(plan.shape[1]):
+    for j in range(held.size):
         h = state.horizons[j]
         before = i - h if i >= h else i - h + size + 1
-        plan[HELD, j] = max(plan[HELD, j] * numbers[FADE], numbers[ARRIVED] + laps[INPUT, before], FLOOR)
+        held[j] = max(held[j] * numbers.fade, numbers.arrived + state.laps_in[before], FLOOR)
         kept = i + h if i + h <= size else i + h - size - 1  # where the last N - h samples begin
-        coming = min(plan[HELD, j], h * numbers[LOUD], known - (numbers[ARRIVED] + laps[INPUT, kept]))
-        left = min(1.0 - (numbers[SPENT] + laps[OUTPUT, kept]), plan[ROOM, j])
+        coming = min(held[j], h * numbers.loud, known - (numbers.arrived + state.laps_in[kept]))
+        left = min(1.0 - (numbers.spent + state.laps_out[kept]), state.room[j])
         room = min(room, left / max(coming, FLOOR))
     return math.sqrt(max(room, 0.0))
 
 
-@part(forceinline=True)
+@part()
 def limit_sample(state, u):
     """Output y for the next input; NaN, with nothing changed, where u is not finite."""
     if not np.isfinite(u):
         return np.nan
-    numbers, laps = state.numbers, state.laps
-    size, i = laps.shape[1] - 1, int(numbers[POSITION])
-    energy = (min(abs(u), numbers[PLANNED]) * numbers[SCALE]) ** 2
-    numbers[ARRIVED] += energy
-    laps[INPUT, i] = -numbers[ARRIVED]
-    numbers[MEAN] = max(numbers[MEAN] + numbers[ATTACK] * (energy - numbers[MEAN]), FLOOR)
-    numbers[LOUD] = max(numbers[LOUD] * numbers[CALM], numbers[MEAN])
-    aim, gain = _aim(state, i, size), numbers[GAIN]
-    numbers[GAIN] = min(aim, gain + numbers[RELEASE] * max(OVERSHOOT * aim - gain, 0.0))
-    wanted = numbers[GAIN] * u
-    y = min(max(wanted, -numbers[LIMIT]), numbers[LIMIT])
-    square = (y * numbers[SCALE]) ** 2
-    left = numbers[BUDGET] - (numbers[SPENT] + laps[OUTPUT, i + 1])
+    numbers = state.numbers[0]
+    size, i = state.laps_out.size - 1, numbers.position
+    energy = (min(abs(u), numbers.planned) * numbers.scale) ** 2
+    numbers.arrived += energy
+    state.laps_in[i] = -numbers.arrived
+    numbers.mean = max(numbers.mean + numbers.attack * (energy - numbers.mean), FLOOR)
+    numbers.loud = max(numbers.loud * numbers.calm, numbers.mean)
+    aim, gain = _aim(state, i, size), numbers.gain
+    numbers.gain = min(aim, gain + numbers.release * max(OVERSHOOT * aim - gain, 0.0))
+    wanted = numbers.gain * u
+    y = min(max(wanted, -numbers.limit), numbers.limit)
+    square = (y * numbers.scale) ** 2
+    left = numbers.budget - (numbers.spent + state.laps_out[i + 1])
     if square > left:  # the guarantee; all before is there to make this rare
-        y = math.copysign(numbers[PEAK] * math.sqrt(max(left, 0.0)), u)
-        square = (y * numbers[SCALE]) ** 2
+        y = math.copysign(numbers.peak * math.sqrt(max(left, 0.0)), u)
+        square = (y * numbers.scale) ** 2
     if y != wanted:
-        numbers[CLIPPED] += 1.0
-    numbers[SPENT] += square
-    laps[OUTPUT, i], laps[SQUARE, i] = -numbers[SPENT], square
-    numbers[POSITION] = i + 1
+        numbers.clipped += 1
+    numbers.spent += square
+    state.laps_out[i], state.squares[i] = -numbers.spent, square
+    numbers.position = i + 1
     if i + 1 == size:
         _start_lap(state, size)
     return y
@@ -109,14 +102,20 @@ def limit_sample(state, u):
 @part()
 def _start_lap(state, size):
     """The lap just done becomes the last one."""
-    numbers, laps = state.numbers, state.laps
+    numbers = state.numbers[0]
     rest = 0.0
     for k in range(size - 1, 0, -1):
-        rest += laps[SQUARE, k]  # summed anew, no differences: the guarantee rests on it
-        laps[OUTPUT, k] = rest
-        laps[INPUT, k] = numbers[ARRIVED] + laps[INPUT, k - 1]
-    numbers[POSITION] = numbers[SPENT] = numbers[ARRIVED] = 0.0
-    numbers[KNOWN] = state.plan[HELD, -1]
+        rest += state.squares[k]  # summed anew, no differences: the guarantee rests on it
+        state.laps_out[k] = rest
+        state.laps_in[k] = numbers.arrived + state.laps_in[k - 1]
+    numbers.position = 0
+    numbers.spent = numbers.arrived = 0.0
+    numbers.known = state.held[-1]
+
+
+@compiled()
+def _limit_one(state, u):
+    return limit_sample(state, u)
 
 
 @compiled(nogil=True)
@@ -236,16 +235,16 @@ class OutputLimiter:
     @property
     def gain(self) -> float:
         """Gain last used, 0 to 1, before any clipping."""
-        return float(self._state.numbers[GAIN])
+        return float(self._state.numbers["gain"][0])
 
     @property
     def clipped(self) -> int:
         """Number of samples clipped since the start or the last `reset`."""
-        return int(self._state.numbers[CLIPPED])
+        return int(self._state.numbers["clipped"][0])
 
     def __call__(self, u: float) -> float:
         """Output for the next input sample `u`."""
-        return float(limit_sample(self._state, as_number(u, "u")))
+        return float(_limit_one(self._state, as_number(u, "u")))
 
     def process(self, signal: Any) -> np.ndarray:
         """Output (n,) for a whole signal (n,), or the next piece of one: as sample by sample, to the bit."""
@@ -256,31 +255,49 @@ class OutputLimiter:
 
     def reset(self) -> None:
         """Forget the past: what comes next is taken to follow zeros."""
-        numbers, _, plan, laps = self._state
-        numbers[POSITION:] = 0.0
-        numbers[[MEAN, LOUD, GAIN]] = FLOOR, FLOOR, 1.0
-        plan[HELD] = FLOOR
-        laps[:] = 0.0
+        fresh = dict(position=0, clipped=0, spent=0.0, arrived=0.0, known=0.0, mean=FLOOR, loud=FLOOR, gain=1.0)
+        for name, value in fresh.items():
+            self._state.numbers[name] = value
+        self._state.held[:] = FLOOR
+        for lap in (self._state.laps_out, self._state.laps_in, self._state.squares):
+            lap[:] = 0.0
 
 
 def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) -> LimiterState:
     """The settings of a limiter whose windows have `size` samples; the rest is left to `reset`."""
-    numbers = np.zeros(CLIPPED + 1)
     peak = math.sqrt(size) * math.sqrt(rated_power)  # two roots: their product does not overflow
     limit = 2.0 * peak if amplitude_limit is None else min(amplitude_limit, 2.0 * peak)  # finite, for finite squares
-    numbers[SCALE], numbers[LIMIT] = 1.0 / peak, limit
-    numbers[PEAK] = peak * (1.0 - 2.0**-50)  # so that a clipped sample's square, rounded, is within what was left
-    numbers[BUDGET] = 1.0 - (size + 16) * 2.0**-52
-    numbers[PLANNED] = LOUDEST * min(limit, peak)
-    for index, windows in ((ATTACK, MEAN_TIME), (CALM, LOUD_TIME), (FADE, MEMORY), (RELEASE, RELEASE_TIME)):
-        kept = math.exp(-1.0 / (windows * size))
-        numbers[index] = kept if index in (CALM, FADE) else 1.0 - kept
+    numbers = new_record(
+        scale=1.0 / peak,
+        peak=peak * (1.0 - 2.0**-50),  # so that a clipped sample's square, rounded, is within what was left
+        budget=1.0 - (size + 16) * 2.0**-52,
+        limit=limit,
+        planned=LOUDEST * min(limit, peak),
+        attack=1.0 - _kept(MEAN_TIME, size),
+        calm=_kept(LOUD_TIME, size),
+        fade=_kept(MEMORY, size),
+        release=1.0 - _kept(RELEASE_TIME, size),
+        position=0,
+        spent=0.0,  # this lap's energy out
+        arrived=0.0,  # and in
+        mean=0.0,  # running mean of the energies in
+        loud=0.0,  # its slowly falling maximum
+        known=0.0,  # the largest energy of a window as it was held when the lap began
+        gain=1.0,
+        clipped=0,
+    )
     spans = min(HORIZONS, size)
     horizons = np.arange(1, spans + 1) * size // spans
-    plan = np.ones((2, spans))
+    room = np.ones(spans)
     if amplitude_limit is not None:
         sine = (limit / peak) ** 2 / 2.0  # power of one that peaks at the limit; a short span may have more of it
-        plan[ROOM] = np.clip(sine * (horizons + size / 16), FLOOR, 1.0)
-        plan[ROOM, -1] = max(sine * size, FLOOR)
-    plan[ROOM, -1] = min(plan[ROOM, -1], 1.0 - RESERVE)
-    return LimiterState(numbers, horizons, plan, np.zeros((3, size + 1)))
+        room = np.clip(sine * (horizons + size / 16), FLOOR, 1.0)
+        room[-1] = max(sine * size, FLOOR)
+    room[-1] = min(room[-1], 1.0 - RESERVE)
+    laps_out, laps_in, squares = np.zeros((3, size + 1))
+    return LimiterState(numbers, horizons, np.zeros(spans), room, laps_out, laps_in, squares)
+
+
+def _kept(windows: float, size: int) -> float:
+    """Return the share that a time constant of so many windows keeps a sample."""
+    return math.exp(-1.0 / (windows * size))

@@ -1,0 +1,99 @@
+"""Clipping FxLMS: the control signal is clipped, the weights go on."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._validate import as_positive
+from ..kernels.delay_lines import newest
+from ..kernels.vectors import dot
+from ..power.constraint import ConstraintState
+from ..power.limiter import OutputLimiter
+from .lms import LMSController, advance_powers, change_weights
+from .step import Lines, adapt, output
+
+
+class ClippingState(NamedTuple):
+    """What the step of `ClippingFxLMS` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    step_size: float
+    amplitude_limit: float
+
+
+@output.register(ClippingState)
+def output_clipped(state):
+    """Return w'x held to the limit; Inf and NaN pass, for the loop to see a divergence."""
+    w, limit = state.weights, state.amplitude_limit
+    y = dot(w, newest(state.lines.reference, w.size))
+    if not limit < abs(y) < np.inf:
+        return y
+    return limit if y > 0.0 else -limit
+
+
+@adapt.register(ClippingState)
+def adapt_clipping(state, error, control_signal):
+    """Take the step of `FxLMS`."""
+    finite, _, _ = advance_powers(state, error)
+    if finite:
+        change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
+    return finite
+
+
+class ClippingFxLMS(LMSController):
+    r"""Clipping FxLMS: the control signal is held to the limit, the weights go on as in `FxLMS`.
+
+    The error then no longer falls with the weights, which keep growing while the noise asks for more than the limit:
+    the control signal turns into a square wave. What the paper's introduction warns of; here to compare with.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, step_size, limiter
+        As for `FxLMS`.
+    amplitude_limit : float
+        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+
+    Raises
+    ------
+    ValueError
+        A step size or limit that is not positive and finite, fewer than one tap, a path that is no FIR path.
+
+    References
+    ----------
+    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001:
+    the text was not at hand, the equations are those by which later papers describe it.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import ClippingFxLMS
+    >>> controller = ClippingFxLMS(1, secondary_path=[1.0], step_size=1.0, amplitude_limit=1.5)
+    >>> controller.control_signal(1.0)
+    0.0
+    >>> controller.update(2.0)
+    >>> controller.control_signal(1.0), float(controller.weights[0])
+    (1.5, 2.0)
+    """
+
+    name = "clipping FxLMS"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        amplitude_limit: float,
+        limiter: OutputLimiter | None = None,
+    ) -> None:
+        super().__init__(n_taps, secondary_path, limiter=limiter)
+        step, limit = as_positive(step_size, "step_size"), as_positive(amplitude_limit, "amplitude_limit")
+        self._state = ClippingState(*self._common(), step, limit)
+
+    @property
+    def amplitude_limit(self) -> float:
+        """Amplitude limit A of the control signal."""
+        return self._state.amplitude_limit

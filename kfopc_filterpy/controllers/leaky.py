@@ -1,0 +1,213 @@
+"""Leaky FxLMS: a price on the weights, chosen beforehand or followed for a rated power."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._validate import as_nonnegative, as_positive
+from ..power.amplifiers import Amplifier
+from ..power.constraint import REFERENCE, ConstraintState, OutputPowerConstraint
+from ..power.limiter import OutputLimiter
+from .base import constraint_for
+from .lms import LMSController, advance_powers, change_weights, penalty_of_constraint
+from .mov import penalty_factor
+from .step import Lines, adapt
+
+
+def leak_factor(
+    rated_power: float, *, disturbance_power: float, secondary_path_gain: float, reference_power: float
+) -> float:
+    r"""Leak of leaky FxLMS that a rated output power asks for, :math:`E[x^2]` times `penalty_factor`.
+
+    The leak is a price on :math:`w^T w`, and :math:`E[y^2] = E[x^2] w^T w` for a white reference. For a tone seen by L
+    taps the price that keeps the rated power is L/2 times as high: this one then spends more.
+
+    Parameters
+    ----------
+    rated_power, disturbance_power, secondary_path_gain
+        As for `penalty_factor`.
+    reference_power : float
+        Power of the reference.
+
+    Returns
+    -------
+    float
+        Leak gamma, in the unit of the squared reference; 0 where the rated power is enough.
+
+    Raises
+    ------
+    ValueError
+        As for `penalty_factor`; a reference power that is negative or not finite.
+
+    References
+    ----------
+    D. Shi, B. Lam, W.-S. Gan, S. Wen, "Optimal leak factor selection for the output-constrained leaky filtered-input
+    least mean square algorithm", IEEE Signal Processing Letters 26(5), 2019. Derived here from the fixed point
+    :math:`(R_{x'} + \gamma I) w = r` for a white reference.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.controllers import leak_factor
+    >>> leak_factor(0.25, disturbance_power=4.0, secondary_path_gain=1.0, reference_power=2.0)
+    6.0
+    """
+    gamma = penalty_factor(rated_power, disturbance_power=disturbance_power, secondary_path_gain=secondary_path_gain)
+    return as_nonnegative(reference_power, "reference_power") * gamma
+
+
+class LeakyState(NamedTuple):
+    """What the step of `LeakyFxLMS` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    step_size: float
+    leak: float
+
+
+@adapt.register(LeakyState)
+def adapt_leaky(state, error, control_signal):
+    """Set w(n+1) = (1 - mu gamma) w(n) + mu e(n) x'(n)."""
+    finite, _, _ = advance_powers(state, error)
+    if finite:
+        keep = 1.0 - state.step_size * state.leak
+        change_weights(state.weights, state.lines, keep, state.step_size * error, 0.0)
+    return finite
+
+
+class RatedLeakyState(NamedTuple):
+    """What the step of `OptimalLeakyFxLMS` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    step_size: float
+
+
+@adapt.register(RatedLeakyState)
+def adapt_rated_leaky(state, error, control_signal):
+    """Take the step of leaky FxLMS with gamma(n) = E[x^2] G_s (1/alpha - 1)."""
+    finite, _, factor = advance_powers(state, error)
+    if finite:
+        leak = penalty_of_constraint(state.constraint, factor) * state.constraint.powers[REFERENCE].mean
+        keep = 1.0 - state.step_size * leak
+        change_weights(state.weights, state.lines, keep, state.step_size * error, 0.0)
+    return finite
+
+
+class LeakyFxLMS(LMSController):
+    r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a leak chosen beforehand.
+
+    It settles about :math:`(R_{x'} + \gamma I) w = r`, the least :math:`E[e^2] + \gamma w^T w`.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, step_size, limiter
+        As for `FxLMS`.
+    leak : float
+        Leak gamma, zero or above, in the unit of the squared reference; `leak_factor` gives the one for a rated power.
+
+    Raises
+    ------
+    ValueError
+        A step size that is not positive and finite, a leak that is negative, not finite or takes more than the whole
+        weight in a sample, fewer than one tap, a path that is no FIR path.
+
+    References
+    ----------
+    O. J. Tobias, R. Seara, "Leaky-FXLMS algorithm: stochastic analysis for Gaussian data and secondary path modeling
+    error", IEEE Trans. Speech and Audio Processing 13(6), 2005.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import LeakyFxLMS
+    >>> controller = LeakyFxLMS(1, secondary_path=[1.0], step_size=0.1, leak=1.0)
+    >>> for _ in range(200):
+    ...     error = 2.0 - controller.control_signal(1.0)
+    ...     controller.update(error)
+    >>> round(float(controller.weights[0]), 6)  # (1 + leak) w = 2
+    1.0
+    """
+
+    name = "leaky FxLMS"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        leak: float,
+        limiter: OutputLimiter | None = None,
+    ) -> None:
+        step_size, leak = as_positive(step_size, "step_size"), as_nonnegative(leak, "leak")
+        if step_size * leak > 1.0:
+            raise ValueError(
+                f"step_size * leak must be 1 at most, got {step_size * leak:g}: a sample would take more than the weight"
+            )
+        super().__init__(n_taps, secondary_path, limiter=limiter)
+        self._state = LeakyState(*self._common(), step_size, leak)
+
+    @property
+    def leak(self) -> float:
+        """Leak gamma."""
+        return self._state.leak
+
+
+class OptimalLeakyFxLMS(LMSController):
+    r"""Leaky FxLMS with the leak that the rated power asks for, followed online.
+
+    .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
+
+    as `leak_factor`, from running powers as KF-OPC's.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, step_size
+        As for `FxLMS`.
+    rated_power : float, optional
+        Rated output power rho_o.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+    amplifier : callable, optional
+        Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
+    limiter : OutputLimiter, optional
+        As for `FxLMS`.
+
+    Raises
+    ------
+    ValueError
+        A step size or rated power that is not positive and finite, neither or both of `rated_power` and `constraint`,
+        fewer than one tap, a path that is no FIR path.
+    TypeError
+        An amplifier that is none of the amplifier models.
+
+    References
+    ----------
+    As for `leak_factor`; there it is known beforehand.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import OptimalLeakyFxLMS
+    >>> OptimalLeakyFxLMS(4, secondary_path=[1.0], step_size=0.1, rated_power=0.5).rated_power
+    0.5
+    """
+
+    name = "optimal leaky FxLMS"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        rated_power: float | None = None,
+        constraint: OutputPowerConstraint | None = None,
+        amplifier: Amplifier | None = None,
+        limiter: OutputLimiter | None = None,
+    ) -> None:
+        own = constraint_for(rated_power, constraint)
+        super().__init__(n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter)
+        self._state = RatedLeakyState(*self._common(), as_positive(step_size, "step_size"))

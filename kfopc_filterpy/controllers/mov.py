@@ -1,0 +1,167 @@
+"""MOV-FxLMS: FxLMS with a price on the control power, chosen beforehand or followed for a rated power."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._validate import as_nonnegative, as_positive
+from ..kernels.delay_lines import newest
+from ..kernels.vectors import dot
+from ..power.amplifiers import Amplifier
+from ..power.constraint import ConstraintState, OutputPowerConstraint
+from ..power.limiter import OutputLimiter
+from .base import constraint_for
+from .lms import LMSController, advance_powers, change_weights, penalty_of_constraint
+from .step import Lines, adapt
+
+
+def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
+    r"""Penalty factor of MOV-FxLMS that a rated output power asks for.
+
+    .. math:: \gamma = \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
+
+    With it the solution of MOV-FxLMS is the unconstrained one times :math:`G_s / (G_s + \gamma)`, which is the
+    constraint factor of eq. 13, where the secondary path has the same gain at all frequencies of the noise.
+
+    Parameters
+    ----------
+    rated_power : float
+        Rated output power rho_o, the mean square of the control signal.
+    disturbance_power : float
+        Power of the disturbance.
+    secondary_path_gain : float
+        Power gain G_s of the secondary path for the noise, E[x'^2]/E[x^2].
+
+    Returns
+    -------
+    float
+        Penalty factor, 0 where the rated power is enough.
+
+    Raises
+    ------
+    ValueError
+        A rated power or gain that is not positive and finite, a disturbance power that is negative or not finite.
+
+    References
+    ----------
+    D. Shi, W.-S. Gan, B. Lam, X. Shen, "Optimal penalty factor for the MOV-FxLMS algorithm in active noise control
+    system", IEEE Signal Processing Letters 29, 2022.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.controllers import penalty_factor
+    >>> penalty_factor(0.25, disturbance_power=4.0, secondary_path_gain=1.0)  # a quarter of the amplitude is left
+    3.0
+    """
+    rated_power = as_positive(rated_power, "rated_power")
+    gain = as_positive(secondary_path_gain, "secondary_path_gain")
+    power = as_nonnegative(disturbance_power, "disturbance_power")
+    return max(math.sqrt(gain) * math.sqrt(power / rated_power) - gain, 0.0)
+
+
+class MOVState(NamedTuple):
+    """What the step of `MOVFxLMS` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    step_size: float
+    penalty: float  # NaN: followed
+    modified: bool
+
+
+@adapt.register(MOVState)
+def adapt_mov(state, error, control_signal):
+    """Set w(n+1) = w(n) + mu [e(n) x'(n) - gamma y(n) x(n)], with gamma = G_s (1/alpha - 1) unless one is held."""
+    finite, d, factor = advance_powers(state, error)
+    if finite:
+        w, mu, gamma = state.weights, state.step_size, state.penalty
+        if np.isnan(gamma):
+            gamma = penalty_of_constraint(state.constraint, factor)
+        if state.modified:
+            error = d - dot(w, newest(state.lines.filtered, w.size))
+        change_weights(w, state.lines, 1.0, mu * error, mu * gamma * control_signal)
+    return finite
+
+
+class MOVFxLMS(LMSController):
+    r"""Minimum-output-variance FxLMS: FxLMS with a price on the control power that keeps it to its rated power.
+
+    .. math:: w(n+1) = w(n) + \mu [e(n) x'(n) - \gamma y(n) x(n)], \qquad
+       \gamma = \max\{G_s (\sqrt{\delta_d^2 / (\rho_o G_s)} - 1), 0\}
+
+    so that :math:`G_s / (G_s + \gamma)` is the constraint factor of eq. 13 for a flat path. The powers are estimated
+    as KF-OPC's are, so the penalty varies with the noise (Lai et al. 2023); `penalty_factor` holds one chosen
+    beforehand (Shi et al. 2021). It settles about :math:`(R_{x'} + \gamma R_x) w = r`.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, step_size
+        As for `FxLMS`.
+    rated_power : float, optional
+        Rated output power rho_o.
+    constraint : OutputPowerConstraint, optional
+        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+    amplifier : callable, optional
+        Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
+    limiter : OutputLimiter, optional
+        As for `FxLMS`.
+    penalty_factor : float, optional
+        Penalty factor gamma to hold, zero or above; the function `penalty_factor` gives the one for a rated power. By
+        default it follows the running powers.
+    modified : bool, default False
+        Adapt to ``d^ - w' x'`` in place of the error, the modified structure of Lai et al.: the delay of the secondary
+        path no longer bounds the step size. The controller is then named MOV-MFxLMS.
+
+    Raises
+    ------
+    ValueError
+        A step size or rated power that is not positive and finite, neither or both of `rated_power` and `constraint`,
+        a penalty factor that is negative or not finite, fewer than one tap, a path that is no FIR path.
+    TypeError
+        An amplifier that is none of the amplifier models.
+
+    References
+    ----------
+    D. Shi, W.-S. Gan, B. Lam, S. Wen, X. Shen, "Optimal output-constrained active noise control based on inverse
+    adaptive modeling leak factor estimate", IEEE/ACM TASLP 29, 2021. C. K. Lai, D. Shi, B. Lam, W.-S. Gan,
+    "MOV-modified-FxLMS algorithm with variable penalty factor in a practical power output constrained active control
+    system", IEEE Signal Processing Letters 30, 2023.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import MOVFxLMS
+    >>> controller = MOVFxLMS(4, secondary_path=[1.0], step_size=0.1, rated_power=0.5)
+    >>> controller.rated_power
+    0.5
+    """
+
+    name = "MOV-FxLMS"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        rated_power: float | None = None,
+        constraint: OutputPowerConstraint | None = None,
+        amplifier: Amplifier | None = None,
+        limiter: OutputLimiter | None = None,
+        penalty_factor: float | None = None,
+        modified: bool = False,
+    ) -> None:
+        own = constraint_for(rated_power, constraint)
+        super().__init__(n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter)
+        penalty = math.nan if penalty_factor is None else as_nonnegative(penalty_factor, "penalty_factor")
+        self._state = MOVState(*self._common(), as_positive(step_size, "step_size"), penalty, bool(modified))
+        if modified:
+            self.name = "MOV-MFxLMS"
+
+    @property
+    def modified(self) -> bool:
+        """Whether it adapts to ``d^ - w' x'`` in place of the error."""
+        return self._state.modified

@@ -1,0 +1,182 @@
+"""KF-PB: a Kalman filter, and the control filter of least error within the rated power."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from ..filters.power_budget import PowerBudgetKalmanFilter
+from ..kernels.covariance import Covariance
+from ..kernels.delay_lines import latest
+from ..power.amplifiers import Amplifier
+from ..power.budget import BudgetState, advance_budget, take_correlations
+from ..power.constraint import ConstraintState, advance_constraint
+from ..power.limiter import OutputLimiter
+from .kalman import KalmanController, correct_constrained
+from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
+
+
+class PowerBudgetState(NamedTuple):
+    """What the step of KF-PB reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState  # follows the powers; its factor is held at 1
+    gains: Covariance
+    numbers: np.ndarray  # as of `KalmanState`
+    budget: BudgetState
+
+
+@adapt.register(PowerBudgetState)
+def adapt_power_budget(state, error, control_signal):
+    """Apply eq. 2-8, and let the budget find the control filter for the estimate."""
+    if not correct_constrained(state, error):
+        return False
+    x, filtered = latest(state.lines.reference), latest(state.lines.filtered)
+    advance_budget(state.budget, state.weights, x, filtered, control_signal)
+    return True
+
+
+@follow.register(PowerBudgetState)
+def follow_power_budget(state, error):
+    """Take the sample into the powers and the correlations."""
+    d, filtered, x = (
+        disturbance_estimate(state.lines, error),
+        latest(state.lines.filtered),
+        latest(state.lines.reference),
+    )
+    advance_constraint(state.constraint, d, filtered, x)
+    take_correlations(state.budget, x, filtered)
+    return True
+
+
+@control_filter.register(PowerBudgetState)
+def filter_of_power_budget(state):
+    """Return the budget's control filter."""
+    return state.budget.control_filter
+
+
+@power_weight.register(PowerBudgetState)
+def weight_of_power_budget(state):
+    """Return lambda."""
+    return state.budget.numbers[0].weight
+
+
+class PowerBudgetController(KalmanController):
+    """The modified ANC structure around a filter with a power budget; `kf_pb` makes the filter too.
+
+    Parameters
+    ----------
+    estimator : PowerBudgetKalmanFilter
+        Filter whose state is the estimate of the unconstrained control filter.
+    secondary_path, amplifier, name, limiter
+        As for `KalmanController`; by default it is named KF-PB.
+
+    Raises
+    ------
+    TypeError
+        An estimator without a power budget.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.controllers import PowerBudgetController
+    >>> from kfopc_filterpy.filters import PowerBudgetKalmanFilter
+    >>> kf = PowerBudgetKalmanFilter(4, state_noise=1e-6, measurement_noise=0.1, rated_power=0.5)
+    >>> controller = PowerBudgetController(kf, secondary_path=[1.0])
+    >>> controller.name, controller.rated_power, controller.power_weight
+    ('KF-PB', 0.5, 0.0)
+    """
+
+    estimator: PowerBudgetKalmanFilter
+    _filter_type = PowerBudgetKalmanFilter
+
+    def __init__(
+        self,
+        estimator: PowerBudgetKalmanFilter,
+        secondary_path: Any,
+        *,
+        amplifier: Amplifier | None = None,
+        name: str | None = None,
+        limiter: OutputLimiter | None = None,
+    ) -> None:
+        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
+
+    def _require_filter(self, estimator: KalmanFilter) -> None:
+        if not isinstance(estimator, PowerBudgetKalmanFilter):
+            raise TypeError(f"estimator must be a PowerBudgetKalmanFilter, got {type(estimator).__name__}")
+
+    def _new_state(self, gains: Covariance, numbers: np.ndarray) -> Any:
+        return PowerBudgetState(*self._common(), gains, numbers, self.estimator.budget.state)
+
+    def _family(self) -> type[KalmanController]:
+        return PowerBudgetController
+
+    def _usual_name(self) -> str:
+        return "KF-PB"
+
+    @property
+    def control_filter(self) -> np.ndarray:
+        """Control filter within the rated power, which makes y, (L,); a copy."""
+        return self.estimator.control_filter
+
+    @property
+    def power_weight(self) -> float:
+        """Weight lambda of the control power."""
+        return self.estimator.power_weight
+
+    @property
+    def _powers_fs(self) -> float:
+        return self.estimator.budget.fs
+
+    def _update_estimator(self, d: float, h: np.ndarray, x: float) -> None:
+        self.estimator.update(d, H=h, reference=x, control_signal=self._y)
+
+
+def kf_pb(
+    n_taps: int,
+    secondary_path: Any,
+    *,
+    rated_power: float,
+    state_noise: float,
+    measurement_noise: float,
+    initial_variance: float = 1.0,
+    amplifier: Amplifier | None = None,
+    limiter: OutputLimiter | None = None,
+    dtype: Any = np.float64,
+    **budget: Any,
+) -> PowerBudgetController:
+    """KF-PB: the power-budgeted Kalman filter, the least error within the rated power.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter, dtype
+        As for `kf_anc`.
+    rated_power : float
+        Rated output power.
+    **budget
+        `fs`, `memory_s`, `credit_s`, see `PowerBudget`.
+
+    Returns
+    -------
+    PowerBudgetController
+        A controller named KF-PB; its `control_filter` makes the control signal, its `weights` are the estimate of the
+        unconstrained one.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import kf_pb
+    >>> kf_pb(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).name
+    'KF-PB'
+    """
+    estimator = PowerBudgetKalmanFilter(
+        n_taps,
+        state_noise=state_noise,
+        measurement_noise=measurement_noise,
+        rated_power=rated_power,
+        initial_variance=initial_variance,
+        dtype=dtype,
+        **budget,
+    )
+    return PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)

@@ -1,0 +1,146 @@
+"""One sample of a controller, compiled: the parts that all share, and the parts that the type of the state chooses.
+
+A controller's state is a NamedTuple with three fields at least,
+
+- `lines`: the signals it goes by (`Lines`),
+- `weights`: what it adapts,
+- `constraint`: the running powers (`power.constraint.ConstraintState`),
+
+and whatever else its algorithm keeps. `adapt` must have a body for its type; the others have
+one for all, which an algorithm can replace: ``adapt.register(MyState)(my_step)``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.borrowing import borrowed
+from ..kernels.compiling import by_type, compiled, inlined, part
+from ..kernels.delay_lines import latest, newest, push
+from ..kernels.vectors import dot
+from ..power.amplifiers import AmplifierModel, amplify
+from ..power.constraint import advance_constraint
+from ..power.limiter import LimiterState, limit_sample
+
+
+class Lines(NamedTuple):
+    """The signals that a controller goes by."""
+
+    secondary_estimate: np.ndarray  # taps of s^
+    reference: np.ndarray  # delay line of x
+    filtered: np.ndarray  # delay line of x' = s^ * x
+    output: np.ndarray  # delay line of y, through the amplifier model if one is known
+    amplifier: AmplifierModel  # that model; linear: d^ = e + s^ * y as published
+    limiter: LimiterState | None
+
+
+# What the type of the state chooses.
+
+
+@by_type
+def control_filter(state):
+    """Return what makes the control signal: the weights."""
+    return state.weights
+
+
+@by_type
+def output(state):
+    """Return w(n-1)' x(n), before any limiter."""
+    w = control_filter(state)
+    return dot(w, newest(state.lines.reference, w.size))
+
+
+@by_type
+def adapt(state, error, control_signal):
+    """Adapt to the error that the emitted control signal left; return False, with nothing changed, if that fails."""
+    raise NotImplementedError("no step is registered for this type of state: adapt.register(State)(step)")
+
+
+@by_type
+def follow(state, error):
+    """Take a sample heard while the loudspeaker is silent: the powers advance. Return False if that fails."""
+    d = disturbance_estimate(state.lines, error)
+    advance_constraint(state.constraint, d, latest(state.lines.filtered), latest(state.lines.reference))
+    return True
+
+
+@by_type
+def power_weight(state):
+    """Return the weight lambda of the control power; NaN for an algorithm without one."""
+    return np.nan
+
+
+# What all share.
+
+
+@inlined
+def emit(state, x):
+    """Return y(n) for the newest reference, limited if there is a limiter; x'(n) and y(n) enter their lines."""
+    take_reference(state.lines, x)
+    return emit_limited(state.lines, output(state))
+
+
+@inlined
+def take_reference(lines, x):
+    """Take x(n) into its delay line, and x'(n) = (s^ * x)(n) into the filtered one."""
+    push(lines.reference, x)
+    s = lines.secondary_estimate
+    push(lines.filtered, dot(s, newest(lines.reference, s.size)))
+
+
+@inlined
+def emit_limited(lines, y):
+    """Return y after the limiter, if there is one, and take it into its line."""
+    y = limited(lines.limiter, y)
+    push(lines.output, amplify(lines.amplifier, y))
+    return y
+
+
+@part()
+def limited(limiter, y):
+    """Return y after the limiter, if there is one."""
+    if limiter is None:
+        return y
+    return limit_sample(limiter, y)
+
+
+@inlined
+def disturbance_estimate(lines, error):
+    """Return d^(n) = e(n) + (s^ * y)(n)."""
+    s = lines.secondary_estimate
+    return error + dot(s, newest(lines.output, s.size))
+
+
+# From Python.
+
+
+@compiled()
+def emit_once(state, x):
+    """Call `emit`."""
+    return emit(state, x)
+
+
+@compiled()
+def adapt_once(state, error, control_signal):
+    """Call `adapt`."""
+    return adapt(state, error, control_signal)
+
+
+@compiled()
+def estimate_once(lines, error):
+    """Call `disturbance_estimate`."""
+    return disturbance_estimate(lines, error)
+
+
+@compiled(nogil=True)
+def listen(state, references, errors):
+    """Follow a signal while the loudspeaker is silent; return the number of samples taken, all if none was refused."""
+    state = borrowed(state)
+    for n in range(references.size):
+        take_reference(state.lines, references[n])
+        emit_limited(state.lines, 0.0)
+        if not follow(state, errors[n]):
+            return n
+    return references.size

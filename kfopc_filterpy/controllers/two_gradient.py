@@ -1,0 +1,104 @@
+"""Two-gradient FxLMS: down the control power beyond an amplitude limit."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._validate import as_positive
+from ..power.constraint import ConstraintState
+from ..power.limiter import OutputLimiter
+from .lms import LMSController, advance_powers, change_weights
+from .step import Lines, adapt
+
+
+class TwoGradientState(NamedTuple):
+    """What the step of `TwoGradientFxLMS` reads and advances."""
+
+    lines: Lines
+    weights: np.ndarray
+    constraint: ConstraintState
+    step_size: float
+    amplitude_limit: float
+    output_step_size: float
+
+
+@adapt.register(TwoGradientState)
+def adapt_two_gradient(state, error, control_signal):
+    """Go down the error within the limit, down the control power beyond it."""
+    finite, _, _ = advance_powers(state, error)
+    if finite:
+        if abs(control_signal) > state.amplitude_limit:
+            change_weights(state.weights, state.lines, 1.0, 0.0, state.output_step_size * control_signal)
+        else:
+            change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
+    return finite
+
+
+class TwoGradientFxLMS(LMSController):
+    r"""Two-gradient-direction FxLMS: down the error within the limit, down the control power beyond it.
+
+    .. math:: w(n+1) = w(n) + \begin{cases} \mu\, e(n)\, x'(n) & |y(n)| \le A \\
+       -\mu_y\, y(n)\, x(n) & |y(n)| > A \end{cases}
+
+    The control signal is not held: it settles where the two balance, above the limit, and the closer to it the larger
+    mu_y is against mu. For a tone that the limit holds to a third, equal step sizes leave an amplitude of 1.2 A.
+
+    Parameters
+    ----------
+    n_taps, secondary_path, step_size, limiter
+        As for `FxLMS`.
+    amplitude_limit : float
+        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    output_step_size : float, optional
+        Step size of the second direction, above zero; by default that of the first.
+
+    Raises
+    ------
+    ValueError
+        A step size or limit that is not positive and finite, fewer than one tap, a path that is no FIR path.
+
+    References
+    ----------
+    D. Shi, W.-S. Gan, B. Lam, C. Shi, "Two-gradient direction FXLMS: an adaptive active noise control algorithm with
+    output constraint", Mechanical Systems and Signal Processing 116, 2019: the text was not at hand, the equations are
+    those by which later papers describe it.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import TwoGradientFxLMS
+    >>> controller = TwoGradientFxLMS(1, secondary_path=[1.0], step_size=0.01, amplitude_limit=1.0)
+    >>> for _ in range(500):
+    ...     error = 2.0 - controller.control_signal(1.0)
+    ...     controller.update(error)
+    >>> round(controller.control_signal(1.0), 1)
+    1.0
+    """
+
+    name = "two-gradient FxLMS"
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        amplitude_limit: float,
+        output_step_size: float | None = None,
+        limiter: OutputLimiter | None = None,
+    ) -> None:
+        super().__init__(n_taps, secondary_path, limiter=limiter)
+        step, limit = as_positive(step_size, "step_size"), as_positive(amplitude_limit, "amplitude_limit")
+        second = step if output_step_size is None else as_positive(output_step_size, "output_step_size")
+        self._state = TwoGradientState(*self._common(), step, limit, second)
+
+    @property
+    def amplitude_limit(self) -> float:
+        """Amplitude limit A of the control signal."""
+        return self._state.amplitude_limit
+
+    @property
+    def output_step_size(self) -> float:
+        """Step size of the second direction."""
+        return self._state.output_step_size

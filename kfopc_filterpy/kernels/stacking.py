@@ -1,0 +1,54 @@
+"""NamedTuples stacked into one whose arrays have an axis more, for compiled loops over many of a kind."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.extending import overload
+
+from .compiling import OPTIONS
+
+
+def stacked(values: list[Any]) -> Any:
+    """Return one NamedTuple for several of a type: arrays and numbers get a leading axis, None stays None."""
+    first = values[0]
+    if isinstance(first, tuple):
+        return type(first)(*(stacked(list(field)) for field in zip(*values, strict=True)))
+    return None if first is None else np.array(values)
+
+
+def unstack(stack: Any, i: int, value: Any) -> None:
+    """Copy the arrays of the i-th of the stacked NamedTuples into `value`."""
+    for many, own in zip(stack, value, strict=True):
+        if isinstance(own, tuple):
+            unstack(many, i, own)
+        elif isinstance(own, np.ndarray):
+            own[...] = many[i]
+
+
+def member(stack: Any, i: int) -> Any:
+    """Return the i-th of stacked NamedTuples, its arrays as views; what has a field `taken` is shared by all."""
+    raise NotImplementedError("for compiled callers")
+
+
+@overload(member, jit_options=OPTIONS)
+def _member(stack, i):
+    if isinstance(stack, types.Array):
+        return lambda stack, i: stack[i]
+    if isinstance(stack, types.BaseNamedTuple) and not hasattr(stack.instance_class, "taken"):  # type: ignore[attr-defined]
+        kind = stack.instance_class  # type: ignore[attr-defined]
+        return lambda stack, i: kind(*_member_items(tuple(stack), i))
+    return lambda stack, i: stack
+
+
+def _member_items(items: Any, i: int) -> Any:
+    raise NotImplementedError("for compiled callers")
+
+
+@overload(_member_items, jit_options=OPTIONS)
+def _member_tuple(items, i):
+    if len(items) == 1:
+        return lambda items, i: (member(items[0], i),)
+    return lambda items, i: (member(items[0], i),) + _member_items(items[1:], i)  # noqa: RUF005

@@ -1,0 +1,31 @@
+"""Compiled arithmetic of vectors."""
+
+from __future__ import annotations
+
+from .compiling import part
+
+# No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
+FAST = {"reassoc", "contract", "nsz"}
+
+
+@part()
+def copy_into(target, source):
+    """Set target[:] = source (numba takes two seconds to compile the slice)."""
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@part(fastmath=FAST)
+def dot(a, b):
+    """Return the inner product of two vectors of the length of the first."""
+    total = 0.0
+    for i in range(a.size):
+        total += a[i] * b[i]
+    return total
+
+
+@part(fastmath=FAST)
+def add_scaled(target, factor, source, begin, end):
+    """Add factor * source to target between two indices."""
+    for k in range(begin, end):
+        target[k] += factor * source[k]
