@@ -4,7 +4,8 @@
 and fails where a page says something else. Figures of studies that are not in the folder are left out, and said to be.
 
 A `Quote` is the page's own words with a format field for each number, and what makes the numbers from the results. The
-examples' and tutorials' own figures need no list: they are executed.
+examples' and tutorials' own figures need no list: they are executed. Nor do the times in speed.txt: they are the output of
+``python -m comparisons speed --quiet``, and another machine has others.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 STUDIES, CONSTRAINT = "python -m comparisons", "python -m comparisons constraint"
-SPEED = "python -m comparisons speed"  # times of one machine: another has others, and nothing to hold them against
 FIELD = re.compile(r"\{:\.(\d)f\}")
 
 
@@ -386,14 +386,6 @@ def _further() -> Iterator[Quote]:
 
 
 QUOTES: tuple[Quote, ...] = (*_tonal(), *_broadband(), *_duct(), *_constraint(), *_algorithms(), *_further())
-# Times of one machine, which stand in speed.md: not held against anything.
-TIMED = (
-    "dgemm runs at 58 GFLOP/s",
-    "called as a filterpy filter is 117 times as fast as filterpy's own",
-    "costs 1.09 times its filter's update",
-    "64 scenarios at 256 taps cost 40.8 times less than 64 runs",
-    "`simulate`, 3.7 s for `simulate_scenarios`; the studies compile both at once, in two processes, in 4.3 s",
-)
 
 
 def table() -> str:
@@ -404,7 +396,6 @@ def table() -> str:
         for number in quote.found() or ():
             said = FIELD.sub(number, said, count=1)
         lines.append(f"| {quote.page} | {said.strip('| ').replace(' | ', '; ')} | `{quote.command}` |")
-    lines += [f"| speed.md | {words} | `{SPEED}` (one machine's) |" for words in TIMED]
     return "\n".join(lines)
 
 
