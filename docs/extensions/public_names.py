@@ -1,4 +1,4 @@
-"""Reference pages, written anew in every build: one for each public name, so that none is listed by hand."""
+"""Reference pages, written in every build: one for each public name, so that none is listed by hand."""
 
 from __future__ import annotations
 

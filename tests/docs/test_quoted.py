@@ -1,4 +1,4 @@
-"""Figures that the documentation quotes from the studies: that each is on the list, and the list on the pages."""
+"""Numbers that the documentation quotes from the studies: each is on the list, and each entry of the list on a page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ sys.path.insert(0, str(DOCS))
 
 import quoted  # noqa: E402
 
-# What stands in prose in dB and is no result: aims, settings, definitions, and what an example beside it prints.
+# Numbers in dB that are not results: aims, settings, definitions, and what an example on the page prints.
 DEFINITIONS = {
     "constraint.md": ["a second that is 20 dB louder"],
     "limits.md": ["settles to 3 dB of a steady value"],
