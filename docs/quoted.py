@@ -415,7 +415,9 @@ def check(folder: Path) -> tuple[list[str], int, set[str]]:
 if __name__ == "__main__":
     problems, held, lacking = check(Path(sys.argv[1] if len(sys.argv) > 1 else "studies"))
     print(
-        *problems, f"{held} of {len(QUOTES)} quotes compared with fresh results, {len(problems)} numbers wrong", sep="\n"
+        *problems,
+        f"{held} of {len(QUOTES)} quotes compared with fresh results, {len(problems)} numbers wrong",
+        sep="\n",
     )
     if lacking:
         print(f"not in the folder and not checked: {', '.join(sorted(lacking))}")
