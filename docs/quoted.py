@@ -145,7 +145,7 @@ def _tonal() -> Iterator[Quote]:
         lambda r: r.extra("tonal", "ordering_flips_at_overdrive_db"),
     )
     yield quote(
-        "FxLMS, overdriving the amplifier, reaches {:.1f} dB there, KF-OPC {:.1f} dB",
+        "At 3 dB of overdrive FxLMS reaches {:.1f} dB and KF-OPC {:.1f} dB",
         lambda r: [r.merit("tonal", "FxLMS"), r.merit("tonal", "KF-OPC")],
     )
     yield quote(
@@ -166,8 +166,8 @@ def _broadband() -> Iterator[Quote]:
     opc, known = "KF-OPC", "KF-OPC, known amplifier"
     yield Quote(
         "limits.md",
-        "its control signal goes up to {:.0f}, where the amplifier ends at 1.26, and over the first second the noise is reduced by "
-        "{:.1f} dB in place of the {:.1f} dB",
+        "its control signal goes up to {:.0f}, although the amplifier clips at 1.26, and over the first second the noise is "
+        "reduced by {:.1f} dB instead of the {:.1f} dB",
         ("broadband",),
         lambda r: [clipped(opc, peak)(r), clipped(opc, first)(r), clipped(opc, "noise_reduction_db")(r)],
     )
@@ -185,7 +185,7 @@ def _broadband() -> Iterator[Quote]:
     )
     yield Quote(
         "limits.md",
-        "-3 dB is passed for good after {:.1f} ms, by KF-ANC after {:.1f} ms",
+        "it passes -3 dB for good after {:.1f} ms, KF-ANC after {:.1f} ms",
         ("broadband",),
         lambda r: r.said("broadband", "The constraint factor does not slow")[-2:],
     )
@@ -283,7 +283,7 @@ def _constraint() -> Iterator[Quote]:
     yield quote("one run of bursts ({:.1f} dB)", lambda r: [_worst_loss(r, "bursts")])
     yield quote("the measured duct at 25 % (up to {:.1f} dB)", lambda r: [_worst_loss(r, "swelling band noise")])
     yield quote(
-        "KF-OPC's output power was {:.2f} to {:.2f} of the rated one in these runs, KF-PB's {:.2f} to {:.2f}",
+        "KF-OPC's output power was {:.2f} to {:.2f} of the rated power, KF-PB's {:.2f} to {:.2f}",
         lambda r: [
             f(x["power"] for k in (True, False) for x in r.rows(name, k))
             for name in ("KF-OPC", "KF-PB")
@@ -372,8 +372,8 @@ def _further() -> Iterator[Quote]:
         *(2, 3, 0, 1),
     )
     yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
-    yield quote("amplifier", "by {:.1f} dB at best", "KF-OPC reduces the noise more", 0)
-    yield quote("amplifier", "by {:.1f} dB less", "KF-OPC reduces the noise more", 1)
+    yield quote("amplifier", "its reduction is at best {:.1f} dB larger", "KF-OPC reduces the noise more", 0)
+    yield quote("amplifier", "it is {:.1f} dB smaller", "KF-OPC reduces the noise more", 1)
     yield quote(
         "amplifier",
         "KF-OPC and KF-PB keep {:.2f} to {:.2f} and {:.2f} to {:.2f} of",
