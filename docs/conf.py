@@ -1,4 +1,4 @@
-"""Sphinx's settings: `python -m sphinx -W docs docs/_build/html`. Nothing here needs the network."""
+"""Sphinx's settings: `python -m sphinx -W docs docs/_build/html`. The build does not need the network."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "extensions"))
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the kernels too: tutorials run beside each other
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the kernels too: tutorials run in parallel
+os.environ.pop("MPLBACKEND", None)  # notebooks draw inline; with another backend the pages would lack their figures
 os.environ["MATPLOTLIBRC"] = str(Path(__file__).parent / "matplotlibrc")
 
 project = "kfopc_filterpy"
@@ -23,7 +24,7 @@ extensions = [
     "numpydoc",
     "myst_nb",
     "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
-    "public_names",  # docs/extensions: a reference page for each of kfopc_filterpy.__all__
+    "public_names",  # docs/extensions: a reference page for each public name
 ]
 from source_lines import linkcode_resolve  # noqa: E402, F401
 
@@ -32,7 +33,7 @@ nb_execution_mode = "force"
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
-nb_output_stderr = "warn"  # a warning in a cell is a fault of the page
+nb_output_stderr = "warn"  # a warning in a cell is an error of the page
 nb_render_markdown_format = "gfm"
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
@@ -47,8 +48,8 @@ autodoc_preserve_defaults = True
 autodoc_typehints = "none"  # the docstrings say the types
 python_use_unqualified_type_names = True
 
-# `python -m sphinx -b linkcheck ...`: a missing network is no fault of the pages.
-linkcheck_ignore = [r"(\.\./)*source/.*"]  # the role line has found these
+# `python -m sphinx -b linkcheck ...`: a missing network is not an error of the pages.
+linkcheck_ignore = [r"(\.\./)*source/.*"]  # the role line has checked these
 linkcheck_timeout = 10
 linkcheck_anchors = False
 linkcheck_allow_unauthorized = True
@@ -63,7 +64,7 @@ html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
 
 
 def spread_notebooks(app, env, docnames):
-    """Spread the pages that are executed over the list: Sphinx hands its processes stretches of it."""
+    """Spread the executed pages over the list, because Sphinx gives each process a stretch of it."""
     executed = [name for name in docnames if name.startswith("tutorials/") or name in ("theory", "limits")]
     others = [name for name in docnames if name not in executed]
     step = -(-len(others) // max(len(executed), 1))
@@ -72,13 +73,13 @@ def spread_notebooks(app, env, docnames):
 
 
 def leave_links_offline(app):
-    """Check no links where there is no network, and say so."""
+    """If there is no network, check no external links and say so."""
     if app.builder.name != "linkcheck":
         return
     try:
         socket.getaddrinfo("github.com", 443)
     except OSError:
-        print("offline: links out of the documentation are not checked")
+        print("offline: external links are not checked")
         app.config.linkcheck_ignore.append("https?://.*")
 
 

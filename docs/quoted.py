@@ -1,10 +1,11 @@
-"""Every figure that the documentation quotes from the studies, where it stands, and the command that prints it.
+"""Every number that the documentation quotes from the studies, with its page and the command that prints it.
 
-``python docs/quoted.py studies`` holds the pages against the results in that folder, fresh from ``python -m comparisons``,
-and fails where a page says something else. Figures of studies that are not in the folder are left out, and said to be.
+``python docs/quoted.py studies`` compares the pages with the results in that folder, fresh from ``python -m comparisons``,
+and fails if a page says something else. It skips studies that are not in the folder, and names them.
 
-A `Quote` is the page's own words with a format field for each number, and what makes the numbers from the results. The
-examples' and tutorials' own figures need no list: they are executed.
+A `Quote` is a sentence of a page with a format field for each number, and a function that computes the numbers from the
+results. Numbers in examples and tutorials need no list, because they are executed. Nor do the times in speed.txt: they are
+the output of ``python -m comparisons speed --quiet`` and depend on the machine.
 """
 
 from __future__ import annotations
@@ -21,7 +22,6 @@ from typing import Any
 
 DOCS = Path(__file__).resolve().parent
 STUDIES, CONSTRAINT = "python -m comparisons", "python -m comparisons constraint"
-SPEED = "python -m comparisons speed"  # times of one machine: another has others, and nothing to hold them against
 FIELD = re.compile(r"\{:\.(\d)f\}")
 
 
@@ -41,32 +41,32 @@ class Results:
         return self.studies[study]["algorithms"][algorithm][figure]
 
     def rated(self, study: str, algorithm: str) -> float:
-        """Output power over the rated one."""
+        """Output power over the rated power."""
         return self.merit(study, algorithm, "output_power") / self.studies[study]["rated_power"]
 
     def extra(self, study: str, *keys: str) -> Any:
-        """What a study found beside the figures of merit."""
+        """What a study found in addition to the figures of merit."""
         value = self.studies[study]["extra"]
         for key in keys:
             value = value[key]
         return value
 
     def over_rated(self, study: str, key: str, algorithm: str) -> float:
-        """A power among the extras over the rated one."""
+        """A power among the extras over the rated power."""
         return self.extra(study, key, algorithm) / self.studies[study]["rated_power"]
 
     def said(self, study: str, claim: str) -> list[float]:
-        """Numbers in the verdict on the claim that begins so."""
+        """Numbers in the verdict on the claim that begins with these words."""
         verdict = next(v for v in self.studies[study]["verdicts"] if v["claim"].startswith(claim))
         return [float(number) for number in re.findall(r"[-+]?\d+(?:\.\d+)?", verdict["figure"])]
 
     def reproduced(self) -> tuple[int, int]:
-        """Claims of the paper's studies that were reproduced, and all."""
+        """How many claims of the paper's studies were reproduced, and how many there are."""
         verdicts = [v["reproduced"] for study in PAPER for v in self.studies[study]["verdicts"]]
         return sum(verdicts), len(verdicts)
 
     def rows(self, algorithm: str, stationary: bool) -> list[dict[str, Any]]:
-        """Runs of the constraint study of an algorithm on noise of one kind."""
+        """Runs of an algorithm in the constraint study, on stationary or on varying noise."""
         steady = ("tone", "compressor", "band noise")
         rows = self.extra("constraint", "rows")
         return [r for r in rows if r["algorithm"] == algorithm and (r["setting"]["noise"] in steady) == stationary]
@@ -109,7 +109,7 @@ class Quote:
     command: str = STUDIES
 
     def found(self) -> list[str] | None:
-        """Numbers as the page has them, or None where the words are not on the page."""
+        """Numbers on the page, or None if the words are not on it."""
         pattern = ""
         for k, piece in enumerate(re.split(r"(\{:\.\df\})", " ".join(self.words.split()))):
             field = FIELD.fullmatch(piece) if k % 2 else None
@@ -119,7 +119,7 @@ class Quote:
         return list(match.groups()) if match else None
 
     def wrong(self, results: Results) -> list[str]:
-        """What the page has otherwise than the results: beyond the last digit's rounding and 1 % for another machine."""
+        """Numbers that differ from the results by more than the rounding of the last digit plus 1 % for another machine."""
         quoted, fresh = self.found(), list(self.numbers(results))
         if quoted is None:
             return [f"{self.page} does not say: {self.words}"]
@@ -132,7 +132,7 @@ class Quote:
 
 
 def plain(page: str) -> str:
-    """Text of a page in one line, single spaces."""
+    """Text of a page in one line with single spaces."""
     return " ".join((DOCS / page).read_text(encoding="utf-8").split())
 
 
@@ -145,7 +145,7 @@ def _tonal() -> Iterator[Quote]:
         lambda r: r.extra("tonal", "ordering_flips_at_overdrive_db"),
     )
     yield quote(
-        "FxLMS, overdriving the amplifier, reaches {:.1f} dB there, KF-OPC {:.1f} dB",
+        "At 3 dB of overdrive FxLMS reaches {:.1f} dB and KF-OPC {:.1f} dB",
         lambda r: [r.merit("tonal", "FxLMS"), r.merit("tonal", "KF-OPC")],
     )
     yield quote(
@@ -166,8 +166,8 @@ def _broadband() -> Iterator[Quote]:
     opc, known = "KF-OPC", "KF-OPC, known amplifier"
     yield Quote(
         "limits.md",
-        "its control signal goes up to {:.0f}, where the amplifier ends at 1.26, and over the first second the noise is reduced by "
-        "{:.1f} dB in place of the {:.1f} dB",
+        "its control signal goes up to {:.0f}, although the amplifier clips at 1.26, and over the first second the noise is "
+        "reduced by {:.1f} dB instead of the {:.1f} dB",
         ("broadband",),
         lambda r: [clipped(opc, peak)(r), clipped(opc, first)(r), clipped(opc, "noise_reduction_db")(r)],
     )
@@ -185,7 +185,7 @@ def _broadband() -> Iterator[Quote]:
     )
     yield Quote(
         "limits.md",
-        "-3 dB is passed for good after {:.1f} ms, by KF-ANC after {:.1f} ms",
+        "it passes -3 dB for good after {:.1f} ms, KF-ANC after {:.1f} ms",
         ("broadband",),
         lambda r: r.said("broadband", "The constraint factor does not slow")[-2:],
     )
@@ -283,7 +283,7 @@ def _constraint() -> Iterator[Quote]:
     yield quote("one run of bursts ({:.1f} dB)", lambda r: [_worst_loss(r, "bursts")])
     yield quote("the measured duct at 25 % (up to {:.1f} dB)", lambda r: [_worst_loss(r, "swelling band noise")])
     yield quote(
-        "KF-OPC's output power was {:.2f} to {:.2f} of the rated one in these runs, KF-PB's {:.2f} to {:.2f}",
+        "KF-OPC's output power was {:.2f} to {:.2f} of the rated power, KF-PB's {:.2f} to {:.2f}",
         lambda r: [
             f(x["power"] for k in (True, False) for x in r.rows(name, k))
             for name in ("KF-OPC", "KF-PB")
@@ -294,7 +294,7 @@ def _constraint() -> Iterator[Quote]:
 
 
 def _worst_loss(results: Results, noise: str) -> float:
-    """Largest loss of KF-PB against the bound on a noise."""
+    """Largest loss of KF-PB compared with the bound, on one noise."""
     rows = [row for row in results.rows("KF-PB", False) if row["setting"]["noise"] == noise]
     return max(row["bound_db"] - row["noise_reduction_db"] for row in rows)
 
@@ -334,7 +334,7 @@ def _algorithms() -> Iterator[Quote]:
 
 
 def _budget_line(results: Results, algorithm: str) -> list[float]:
-    """Noise reduction and output power over the rated one in each case, means over seeds."""
+    """Noise reduction and output power over the rated power in each case, means over seeds."""
     rows = results.extra("power-budget", "rows")
     numbers = []
     for path, noise in CASES:
@@ -349,7 +349,7 @@ def _budget_line(results: Results, algorithm: str) -> list[float]:
 
 
 def _further() -> Iterator[Quote]:
-    """Figures of the studies of mismatch, tracking and amplifiers, out of their verdicts."""
+    """Numbers from the verdicts of the studies of mismatch, tracking and amplifiers."""
 
     def quote(study: str, words: str, claim: str, *which: int) -> Quote:
         def numbers(results: Results) -> list[float]:
@@ -372,8 +372,8 @@ def _further() -> Iterator[Quote]:
         *(2, 3, 0, 1),
     )
     yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
-    yield quote("amplifier", "by {:.1f} dB at best", "KF-OPC reduces the noise more", 0)
-    yield quote("amplifier", "by {:.1f} dB less", "KF-OPC reduces the noise more", 1)
+    yield quote("amplifier", "its reduction is at best {:.1f} dB larger", "KF-OPC reduces the noise more", 0)
+    yield quote("amplifier", "it is {:.1f} dB smaller", "KF-OPC reduces the noise more", 1)
     yield quote(
         "amplifier",
         "KF-OPC and KF-PB keep {:.2f} to {:.2f} and {:.2f} to {:.2f} of",
@@ -386,14 +386,6 @@ def _further() -> Iterator[Quote]:
 
 
 QUOTES: tuple[Quote, ...] = (*_tonal(), *_broadband(), *_duct(), *_constraint(), *_algorithms(), *_further())
-# Times of one machine, which stand in speed.md: not held against anything.
-TIMED = (
-    "dgemm runs at 58 GFLOP/s",
-    "called as a filterpy filter is 117 times as fast as filterpy's own",
-    "costs 1.09 times its filter's update",
-    "64 scenarios at 256 taps cost 40.8 times less than 64 runs",
-    "`simulate`, 3.7 s for `simulate_scenarios`; the studies compile both at once, in two processes, in 4.3 s",
-)
 
 
 def table() -> str:
@@ -404,12 +396,11 @@ def table() -> str:
         for number in quote.found() or ():
             said = FIELD.sub(number, said, count=1)
         lines.append(f"| {quote.page} | {said.strip('| ').replace(' | ', '; ')} | `{quote.command}` |")
-    lines += [f"| speed.md | {words} | `{SPEED}` (one machine's) |" for words in TIMED]
     return "\n".join(lines)
 
 
 def check(folder: Path) -> tuple[list[str], int, set[str]]:
-    """Disagreements with the results in a folder, how many quotes were held against them, and studies it lacks."""
+    """Disagreements with the results in a folder, how many quotes were compared, and which studies are missing."""
     results, wrong, held, lacking = Results(folder), [], 0, set()
     for quote in QUOTES:
         missing = set(quote.studies) - set(results.studies)
@@ -424,8 +415,10 @@ def check(folder: Path) -> tuple[list[str], int, set[str]]:
 if __name__ == "__main__":
     problems, held, lacking = check(Path(sys.argv[1] if len(sys.argv) > 1 else "studies"))
     print(
-        *problems, f"{held} of {len(QUOTES)} quotes held against fresh results, {len(problems)} figures wrong", sep="\n"
+        *problems,
+        f"{held} of {len(QUOTES)} quotes compared with fresh results, {len(problems)} numbers wrong",
+        sep="\n",
     )
     if lacking:
-        print(f"not in the folder, and not checked: {', '.join(sorted(lacking))}")
+        print(f"not in the folder and not checked: {', '.join(sorted(lacking))}")
     sys.exit(1 if problems or not held else 0)

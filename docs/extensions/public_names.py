@@ -1,4 +1,4 @@
-"""Reference pages, written anew in every build: one for each public name, so that none is listed by hand."""
+"""Reference pages, written in every build: one for each public name, so that none is listed by hand."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def name_page(name: str) -> str:
 
 def index_page() -> str:
     """Return the table of all public names, by namespace."""
-    title = "Every public name"
+    title = "API reference"
     lines = [title, "=" * len(title), ""]
     for space in NAMESPACES:
         full = f"kfopc_filterpy.{space}" if space else "kfopc_filterpy"

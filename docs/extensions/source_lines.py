@@ -1,7 +1,8 @@
-"""The package's source as pages with numbered lines, and links to lines that are found by what stands there.
+"""Pages that show the package's source with numbered lines, and links to lines, found by their text.
 
-The role ``{line}`kernels: S = x + q` `` links to the one line of ``kfopc_filterpy/kernels/covariance.py`` that holds the text. A
-text that is in no line, or in several, is a warning: a page cannot go on pointing at code that has moved or changed.
+The role ``{line}`kernels.covariance: S = x + q` `` links to the one line of ``kfopc_filterpy/kernels/covariance.py`` that
+contains the text. If no line contains it, or several do, that is a warning: a page cannot keep pointing at code that has
+moved or changed.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
 
 
 def find_line(module: str, text: str) -> int:
-    """Number, from 1, of the only line of a module that holds `text`; ValueError where there is not one."""
+    """Number, from 1, of the only line of a module that contains `text`; ValueError if there is none or more than one."""
     path = PACKAGE / f"{module.replace('.', '/')}.py"
     lines = path.read_text(encoding="utf-8").splitlines()
     found = [number for number, line in enumerate(lines, 1) if text in line]

@@ -1,4 +1,4 @@
-"""Figures that the documentation quotes from the studies: that each is on the list, and the list on the pages."""
+"""Numbers that the documentation quotes from the studies: each is on the list, and each entry of the list on a page."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ sys.path.insert(0, str(DOCS))
 
 import quoted  # noqa: E402
 
-# What stands in prose in dB and is no result: aims, settings, definitions, and what an example beside it prints.
+# Numbers in dB that are not results: aims, settings, definitions, and what an example on the page prints.
 DEFINITIONS = {
     "constraint.md": ["a second that is 20 dB louder"],
     "limits.md": ["settles to 3 dB of a steady value"],
@@ -27,9 +27,11 @@ def test_the_words_of_every_quote_stand_on_their_page(quote):
     assert quote.found() is not None, f"{quote.page} does not say: {quote.words}"
 
 
-@pytest.mark.parametrize("words", quoted.TIMED)
-def test_the_times_stand_in_the_page_on_speed(words):
-    assert words in quoted.plain("speed.md")
+def test_the_page_on_speed_shows_the_output_of_its_command():
+    assert "{literalinclude} speed.txt" in (DOCS / "speed.md").read_text(encoding="utf-8")
+    printed = (DOCS / "speed.txt").read_text(encoding="utf-8")
+    assert printed.startswith("µs a sample")
+    assert "dgemm, one thread: " in printed
 
 
 def test_no_page_waits_for_its_figures():
@@ -75,7 +77,7 @@ def test_a_quote_is_held_to_its_last_digit_and_a_missing_one_is_wrong():
 
 def test_the_table_of_quotes_names_a_command_for_each():
     lines = quoted.table().splitlines()[2:]
-    assert len(lines) == len(quoted.QUOTES) + len(quoted.TIMED)
+    assert len(lines) == len(quoted.QUOTES)
     assert all(line.count(" | ") == 2 and "`python -m comparisons" in line and "{:" not in line for line in lines)
 
 
