@@ -185,8 +185,12 @@ class FilteredReferenceController:
 
     def control_signal(self, reference: float) -> float:
         """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        self._y = emit_once(self._state, as_number(reference, "reference"))
+        self._y = emit_once(self._emitter(), as_number(reference, "reference"))
         return self._y
+
+    def _emitter(self) -> Any:
+        """Return the state, or the part of it that makes the control signal."""
+        return self._state
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""

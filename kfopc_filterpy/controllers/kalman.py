@@ -24,7 +24,7 @@ from ..power.constraint import (
 )
 from ..power.limiter import OutputLimiter
 from .base import NO_SOLUTION, FilteredReferenceController, calls_of, constraint_for
-from .step import Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
+from .step import Emitter, Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
 
 
 class KalmanState(NamedTuple):
@@ -122,6 +122,7 @@ class KalmanController(FilteredReferenceController):
         super().__init__(estimator.dim_x, secondary_path, amplifier=amplifier, limiter=limiter)
         self.estimator = estimator
         self._state = self._new_state(new_covariance(np.zeros((1, 1))), new_numbers())
+        self._emits: Emitter | None = None
         self._calls_are_ours = calls_of(type(self)) == calls_of(self._family())
         self.name = name or self._usual_name()
 
@@ -178,8 +179,22 @@ class KalmanController(FilteredReferenceController):
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         reference = as_number(reference, "reference")
-        self._y = emit_once(self._state_with_estimator(), reference)
+        self._see_weights()
+        self._y = emit_once(self._emitter(), reference)
         return self._y
+
+    def _emitter(self) -> Any:
+        if self._emits is None or self._emits.lines is not self._state.lines:
+            self._emits = Emitter(self._state.lines, self._emitting_filter())
+        return self._emits
+
+    def _emitting_filter(self) -> np.ndarray:
+        return self._state.weights
+
+    def _see_weights(self) -> None:
+        """Take the estimator's weights into the state."""
+        x = self.estimator.x
+        self._state.weights[:] = x.reshape(-1) if isinstance(x, np.ndarray) else np.reshape(x, -1)
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
@@ -212,7 +227,7 @@ class KalmanController(FilteredReferenceController):
 
     def _state_with_estimator(self) -> Any:
         """Return the state, which sees what the estimator has now: its weights, and the arrays of its powers."""
-        self._state.weights[:] = np.reshape(self.estimator.x, -1)
+        self._see_weights()
         constraint = self.constraint.state
         if constraint is not self._state.constraint:
             self._state = self._state._replace(constraint=constraint)

@@ -20,7 +20,7 @@ from ..kernels.borrowing import borrowed
 from ..kernels.compiling import by_type, compiled, inlined, part
 from ..kernels.delay_lines import latest, newest, push
 from ..kernels.vectors import dot
-from ..power.amplifiers import AmplifierModel, amplify
+from ..power.amplifiers import amplify
 from ..power.constraint import advance_constraint
 from ..power.limiter import LimiterState, limit_sample
 
@@ -32,8 +32,15 @@ class Lines(NamedTuple):
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x' = s^ * x
     output: np.ndarray  # delay line of y, through the amplifier model if one is known
-    amplifier: AmplifierModel  # that model; linear: d^ = e + s^ * y as published
+    amplifier: np.ndarray  # record of that model; linear: d^ = e + s^ * y as published
     limiter: LimiterState | None
+
+
+class Emitter(NamedTuple):
+    """What a control signal is made of, in the usual way: the little that a call from Python has to hand over."""
+
+    lines: Lines
+    weights: np.ndarray  # the control filter
 
 
 # What the type of the state chooses.

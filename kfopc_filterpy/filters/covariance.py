@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +12,9 @@ from ..kernels.covariance import Covariance, copy_covariance, full_covariance, n
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: what rounding leaves; more is a mistake
 
 
-class Moment(NamedTuple):
-    """P at a moment since the last pass over the triangle T: scale T + weight g g' + diagonal I."""
-
-    scale: float
-    diagonal: float
-    weight: float = 0.0
+# P at a moment since the last pass over the triangle T, as (scale, diagonal, weight): scale T + weight g g' + diagonal I.
+Moment = tuple[float, float, float]
+TRIANGLE: Moment = (1.0, 0.0, 0.0)  # P is T itself
 
 
 class RandomWalkCovariance:
@@ -29,8 +26,8 @@ class RandomWalkCovariance:
 
     def __init__(self, P: np.ndarray, dtype: Any = np.float64) -> None:
         self.arrays: Covariance = new_covariance(0.5 * (P + P.T), dtype)
-        self.prior: Moment | np.ndarray = Moment(1.0, 0.0)
-        self.posterior: Moment | np.ndarray = Moment(1.0, 0.0)
+        self.prior: Moment | np.ndarray = TRIANGLE
+        self.posterior: Moment | np.ndarray = TRIANGLE
         self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
         self._largest = float(np.finfo(dtype).max)
         self._others_read = False  # the arrays are another's too
@@ -49,13 +46,13 @@ class RandomWalkCovariance:
     def now(self) -> Moment:
         """P at present."""
         scale, diagonal, inverse_S, _ = self.arrays.owed.item()
-        return Moment(scale, diagonal, -scale * inverse_S)
+        return scale, diagonal, -scale * inverse_S
 
     def full(self, moment: Moment | np.ndarray) -> np.ndarray:
         """P at a moment, as a full symmetric array of its own."""
         if isinstance(moment, np.ndarray):
             return moment.copy()
-        if moment == (1.0, 0.0, 0.0):  # nothing owed, as when a filter is made: nothing to compile
+        if moment == TRIANGLE:  # nothing owed, as when a filter is made: nothing to compile
             n = self.arrays.product.size
             lower = np.tril(self.arrays.triangle[:n, :n].astype(np.float64))
             return lower + np.tril(lower, -1).T
@@ -94,7 +91,7 @@ class RandomWalkCovariance:
         self._shown = []
         scale, diagonal = alpha_sq * scale, alpha_sq * diagonal + state_noise
         owed["scale"], owed["diagonal"] = scale, diagonal
-        self.prior = Moment(scale, diagonal, -scale * inverse_S)
+        self.prior = scale, diagonal, -scale * inverse_S
 
     def begin_update(self) -> Covariance:
         """Return the arrays for a compiled update, having kept what it will overwrite."""
@@ -102,22 +99,23 @@ class RandomWalkCovariance:
         now = self.now
         if not isinstance(self.prior, np.ndarray) and self.prior != now:  # a second update since the prediction
             self.prior = self.full(self.prior)
-        if isinstance(self.posterior, Moment):  # the same P_post, seen from the triangle once nothing is owed
-            ratio = self.posterior.scale / now.scale
-            self.posterior = Moment(ratio, self.posterior.diagonal - ratio * now.diagonal)
+        if isinstance(self.posterior, tuple):  # the same P_post, seen from the triangle once nothing is owed
+            scale, diagonal, _ = self.posterior
+            ratio = scale / now[0]
+            self.posterior = ratio, diagonal - ratio * now[1], 0.0
         return self.own()
 
     def refused(self) -> None:
         """Go on after an update that was refused: P is what it was, but nothing is owed any more."""
-        if isinstance(self.prior, Moment):
-            self.prior = Moment(1.0, 0.0)
+        if isinstance(self.prior, tuple):
+            self.prior = TRIANGLE
 
     def updated(self) -> None:
         """Go on after an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""
-        _, _, inverse_S, last_inverse_S = self.arrays.owed.item()
-        if isinstance(self.prior, Moment):
-            self.prior = Moment(1.0, 0.0, last_inverse_S - inverse_S)
-        self.posterior = self.now
+        scale, diagonal, inverse_S, last_inverse_S = self.arrays.owed.item()
+        if isinstance(self.prior, tuple):
+            self.prior = 1.0, 0.0, last_inverse_S - inverse_S
+        self.posterior = scale, diagonal, -scale * inverse_S
 
     def missed(self) -> None:
         """Go on after a missed sample: P is P_post."""
@@ -126,7 +124,7 @@ class RandomWalkCovariance:
     def after_compiled(self) -> None:
         """Go on after the compiled loop advanced `arrays`: what is owed is one downdate at most."""
         self._shown = []
-        self.prior = Moment(1.0, 0.0)
+        self.prior = TRIANGLE
         self.updated()
 
 

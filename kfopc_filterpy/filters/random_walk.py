@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from math import isfinite
@@ -61,6 +61,20 @@ def new_numbers() -> np.ndarray:
     )
 
 
+def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: str) -> Any:
+    """Return a property that is made from what the last update left, unless it was assigned since."""
+
+    def get(kf: Any) -> Any:
+        if name not in kf._made:
+            kf._made[name] = make(kf)
+        return kf._made[name]
+
+    def assign(kf: Any, value: Any) -> None:
+        kf._made[name] = value
+
+    return property(get, assign, doc=description)
+
+
 class _Identity:
     """filterpy's `_I`: an identity that is made when it is used, since it is large at many taps."""
 
@@ -113,6 +127,7 @@ class RandomWalkKFOPC(KFOPC):
             "_delegating",
             "_likelihood",
             "_log_likelihood",
+            "_made",
             "_mahalanobis",
             "_numbers",
             "_views",
@@ -138,6 +153,7 @@ class RandomWalkKFOPC(KFOPC):
         self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
         self._delegating = False
         self._numbers = new_numbers()
+        self._made: dict[str, Any] = {}  # what was read or assigned of y, z, S, SI and x_prior since the last update
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
         self.state_noise = state_noise
         self.measurement_noise = measurement_noise
@@ -268,12 +284,24 @@ class RandomWalkKFOPC(KFOPC):
     def K(self) -> np.ndarray:
         """Kalman gain of the last update, (n, 1)."""
         if self._K is None:  # eq. 6, K = P x' / S
-            self._K = (self._covariance.arrays.gain_direction / self.S[0, 0]).reshape(-1, 1)
+            self._K = (self._covariance.arrays.gain_direction / self._numbers["variance"][0]).reshape(-1, 1)
         return self._K
 
     @K.setter
     def K(self, value: np.ndarray) -> None:
         self._K = value
+
+    y = _made_when_read("y", lambda kf: kf._as_measured("residual"), "Residual of the last update, alpha z - H x.")
+    z = _made_when_read("z", lambda kf: kf._as_measured("measurement"), "Measurement of the last update, unscaled.")
+    S = _made_when_read("S", lambda kf: np.array([[kf._numbers["variance"][0]]]), "Innovation variance, (1, 1).")
+    SI = _made_when_read("SI", lambda kf: 1.0 / kf.S, "Inverse of S.")
+    x_prior = _made_when_read("x_prior", lambda kf: kf._before_update(), "State before the last update.")
+
+    def _as_measured(self, name: str) -> np.ndarray:
+        return np.full((1,) * np.ndim(self.x), self._numbers[name][0])
+
+    def _before_update(self) -> np.ndarray:
+        return self.x_post - (self.K * self._numbers["residual"][0]).reshape(np.shape(self.x_post))
 
     def _take_in_edits(self) -> None:
         """Take in what was written into the array that `P` showed."""
@@ -319,17 +347,18 @@ class RandomWalkKFOPC(KFOPC):
         self._take_in_edits()
         if z is None:
             self._covariance.missed()
-            self._record(self.x, np.zeros((1, 1)))
-            self.z = np.array([[None]])
+            self._record(self.x)
+            self.y, self.z = np.zeros((1, 1)), np.array([[None]])
             return
         plain = R is None and type(z) is float and type(row) is np.ndarray and row.dtype == np.float64
         if plain and row.shape in ((self.dim_x,), (1, self.dim_x)):  # as at every sample of a loop
             measurement, noise, h = z, self._numbers["measurement_noise"][0], np.ascontiguousarray(row).reshape(-1)
         else:
             measurement, noise, h = self._checked(z, R, row)
-        weights, y = self._corrected(measurement, noise, h, reference)
-        self._record(weights.reshape(np.shape(self.x)), np.full((1,) * np.ndim(self.x), y))
-        self.z = np.array(z).reshape(self.y.shape)
+        weights = self._corrected(measurement, noise, h, reference)
+        self._record(weights.reshape(np.shape(self.x)))
+        if measurement is not z:
+            self.z = np.array(z).reshape(self.y.shape)
 
     def _checked(self, z: Any, R: Any, row: Any) -> tuple[float, float, np.ndarray]:
         """Return z, R and H as numbers and (n,), or raise a clear error."""
@@ -338,8 +367,8 @@ class RandomWalkKFOPC(KFOPC):
         noise = self.measurement_noise if R is None else as_nonnegative(R, "R")
         return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
-    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> tuple[np.ndarray, float]:
-        """Apply eq. 5-9 to the arrays; return the new weights and the residual. Refusals come before any change."""
+    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
+        """Apply eq. 5-9 to the arrays; return the new weights. Refusals come before any change."""
         constraint = self._constraint
         if constraint is None:
             state, factor = None, self._unconstrained_factor
@@ -357,8 +386,10 @@ class RandomWalkKFOPC(KFOPC):
             self._covariance.refused()
             self._refuse(outcome, z, S, h, reference)
         self._covariance.updated()
-        self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
-        return weights, y
+        prior = self._made.get("x_prior")
+        self._K, self._made = None, {} if prior is None else {"x_prior": prior}
+        self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
+        return weights
 
     def _refuse(self, outcome: int, z: float, S: float, h: np.ndarray, reference: float | None) -> None:
         """Raise ValueError for an update that `correct_once` refused."""
@@ -382,9 +413,9 @@ class RandomWalkKFOPC(KFOPC):
             raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
         return weights
 
-    def _record(self, x: np.ndarray, y: np.ndarray) -> None:
+    def _record(self, x: np.ndarray) -> None:
         self._log_likelihood = self._likelihood = self._mahalanobis = None
-        self.x, self.y, self.x_post = x, y, x.copy()
+        self.x, self.x_post = x, x.copy()
 
     # A whole signal, or a sample, at compiled speed: the arrays go out, and come back advanced.
 
@@ -413,13 +444,8 @@ class RandomWalkKFOPC(KFOPC):
         if shared is not None:
             self._covariance.share(shared)
         self._covariance.after_compiled()
-        _, _, _, z, y, S = self._numbers.item()
-        self.S, self.SI, self._K = np.array([[S]]), np.array([[1.0 / S]]), None
-        shape = np.shape(self.x)
-        column = (1,) * len(shape)
-        before = weights - self._covariance.arrays.gain_direction * (y / S)
-        self._record(weights.reshape(shape), np.full(column, y))
-        self.x_prior, self.z = before.reshape(shape), np.full(column, z)
+        self._K, self._made = None, {}
+        self._record(weights.reshape(np.shape(self.x)))
 
 
 def _precision(dtype: Any) -> np.dtype:

@@ -11,7 +11,7 @@ from ..kernels.borrowing import borrowed
 from ..kernels.compiling import compiled, inlined
 from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import copy_into, dot
-from ..power.amplifiers import AmplifierModel, amplify
+from ..power.amplifiers import amplify
 
 STEP = 16000  # samples between two reports of progress, or chances to interrupt a run
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
@@ -23,7 +23,7 @@ class Plant(NamedTuple):
     secondary: np.ndarray  # taps of s
     feedback: np.ndarray  # taps from the amplifier to the reference microphone; size 0: none
     output: np.ndarray  # delay line of y after the amplifier
-    amplifier: AmplifierModel
+    amplifier: np.ndarray  # record of kind, limit and sharpness
 
 
 class Stretch(NamedTuple):

@@ -29,7 +29,7 @@ from ..kernels.delay_lines import TAPS, delay_line, newest
 from ..kernels.stacking import member, stacked, unstack
 from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
-from ..power.amplifiers import Amplifier, AmplifierModel, compiled_model
+from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, run
 from .simulation import (
@@ -351,7 +351,7 @@ def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
     return stacked
 
 
-def _model(amplifier: Amplifier | None) -> AmplifierModel:
+def _model(amplifier: Amplifier | None) -> np.ndarray:
     model = compiled_model(amplifier)
     if model is None:
         raise TypeError(
@@ -370,7 +370,9 @@ class _GainSequence:
         heard = newest(lines.reference, int(lines.reference[TAPS]))[::-1]
         filtered = np.convolve(np.concatenate((heard, x)), lines.secondary_estimate)[heard.size : heard.size + x.size]
         self.n_taps, self.n_samples = n, x.size
-        self._filtered = np.concatenate((newest(lines.filtered, n)[:0:-1], filtered))  # n - 1 samples before the first
+        self._filtered = np.concatenate(
+            (newest(lines.filtered, n - 1)[::-1], filtered)
+        )  # n - 1 samples before the first
 
     def blocks(self) -> Iterator[tuple[int, SharedGains, int]]:
         """Yield the first sample of each block, its gains, and how many of them have a solution."""

@@ -15,7 +15,7 @@ from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceControl
 from ..controllers.limited import LimitedController
 from ..kernels.delay_lines import delay_line
 from ..paths.models import path_taps
-from ..power.amplifiers import Amplifier, AmplifierModel, compiled_model
+from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
@@ -355,7 +355,9 @@ def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None,
             raise ValueError(
                 f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0"
             )
-    model = compiled_model(amplifier) or AmplifierModel()  # a user's own is applied in the loop of steps
+    model = compiled_model(amplifier)
+    if model is None:  # a user's own: applied in the loop of steps
+        model = LinearAmplifier().model
     return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), model)
 
 

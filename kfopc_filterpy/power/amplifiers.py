@@ -10,27 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .._validate import as_positive
 from ..kernels.compiling import compiled, part
+from ..kernels.records import new_record
 
 LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
 
 
-class AmplifierModel(NamedTuple):
-    """What the compiled loop knows of an amplifier."""
-
-    kind: int = LINEAR
-    limit: float = math.inf
-    sharpness: float = 1.0
-
-
 @part()
-def amplify(model, y):
-    """Return the output of an amplifier model for one sample."""
+def amplify(amplifier, y):
+    """Return the output for one sample of an amplifier given by its record."""
+    model = amplifier[0]
     if model.kind == HARD_CLIP:
         return min(max(y, -model.limit), model.limit)
     if model.kind == SOFT_SATURATION:
@@ -49,14 +43,15 @@ def _amplify_all(model, signal, out):
 
 @dataclass(frozen=True)
 class _Amplifier:
-    """Callable on numbers and arrays; `model` is what the compiled loop reads."""
+    """Callable on numbers and arrays."""
 
     kind: ClassVar[int] = LINEAR
 
     @property
-    def model(self) -> AmplifierModel:
-        """What the compiled loop reads."""
-        return AmplifierModel(self.kind, getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0))
+    def model(self) -> np.ndarray:
+        """Record of kind, limit and sharpness, which the compiled loop reads."""
+        limit, sharpness = getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)
+        return new_record(kind=self.kind, limit=limit, sharpness=sharpness)
 
     def __call__(self, signal: Any) -> Any:
         """Return the output for `signal`, a number or an array of any shape."""
@@ -135,10 +130,10 @@ class SoftSaturationAmplifier(_Amplifier):
 Amplifier = Callable[[Any], Any]  # a user's own may be any function of a sample
 
 
-def compiled_model(amplifier: Amplifier | None) -> AmplifierModel | None:
+def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
     """Return the model for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
     if amplifier is None:
-        return AmplifierModel()
+        return LinearAmplifier().model
     if isinstance(amplifier, type):
         raise TypeError(
             f"amplifier must be an object, such as HardClipAmplifier(limit=1.0), got the class {amplifier!r}"

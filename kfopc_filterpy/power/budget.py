@@ -33,6 +33,7 @@ TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
 INTERVAL = 128  # samples between two solutions; fewer at the start
 STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its standard error
 SHORTEST_PART = 0.25  # of a segment, for its power to count
+X, XF = 0, 1  # the reference and the filtered reference, in the correlations
 FORECAST_LEAST, FORECAST_MOST = 0.5, 4.0  # change of power that a trend may foretell; see choose_span for the lower
 
 
@@ -42,11 +43,8 @@ class BudgetState(NamedTuple):
     control_filter: np.ndarray  # (L,) v, which makes the control signal
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x'
-    # (LONG + 1, L) sums of products at lags 0 ... L - 1: of samples of one segment, and with samples before it
-    own_x: np.ndarray
-    own_xf: np.ndarray
-    across_x: np.ndarray
-    across_xf: np.ndarray
+    own: np.ndarray  # (2, LONG + 1, L) sums of products of a segment's samples at lags 0 ... L - 1: of x, and of x'
+    across: np.ndarray  # (2, LONG + 1, L) the same of its samples with samples before it
     counts: np.ndarray  # (LONG + 1,) samples in each segment
     numbers: np.ndarray  # record: rated power, account, lambda, ...; see `PowerBudget`
 
@@ -64,18 +62,18 @@ def take_correlations(budget, x, xf):
     if budget.counts[numbers.current] >= numbers.segment:
         numbers.current = (numbers.current + 1) % len(budget.counts)
         budget.counts[numbers.current] = 0.0
-        for k in range(L):
-            budget.own_x[numbers.current, k] = budget.own_xf[numbers.current, k] = 0.0
-            budget.across_x[numbers.current, k] = budget.across_xf[numbers.current, k] = 0.0
+        for signal in (X, XF):
+            for k in range(L):
+                budget.own[signal, numbers.current, k] = budget.across[signal, numbers.current, k] = 0.0
     current = numbers.current
     budget.counts[current] += 1.0
     own = min(int(budget.counts[current]), L)
     before, filtered_before = newest(budget.reference, L), newest(budget.filtered, L)
-    add_scaled(budget.own_x[current], x, before, 0, own)
-    add_scaled(budget.own_xf[current], xf, filtered_before, 0, own)
+    add_scaled(budget.own[X, current], x, before, 0, own)
+    add_scaled(budget.own[XF, current], xf, filtered_before, 0, own)
     if own < L:
-        add_scaled(budget.across_x[current], x, before, own, L)
-        add_scaled(budget.across_xf[current], xf, filtered_before, own, L)
+        add_scaled(budget.across[X, current], x, before, own, L)
+        add_scaled(budget.across[XF, current], xf, filtered_before, own, L)
 
 
 @part()
@@ -135,11 +133,11 @@ def sum_correlations(budget, of_x, of_xf):
         of_x[k] = of_xf[k] = 0.0
     for j in range(span + 1):
         i = (current - j) % kept
-        add_scaled(of_x, 1.0, budget.own_x[i], 0, of_x.size)
-        add_scaled(of_xf, 1.0, budget.own_xf[i], 0, of_x.size)
+        add_scaled(of_x, 1.0, budget.own[X, i], 0, of_x.size)
+        add_scaled(of_xf, 1.0, budget.own[XF, i], 0, of_x.size)
         if j < span:  # the oldest segment knows nothing before it
-            add_scaled(of_x, 1.0, budget.across_x[i], 0, of_x.size)
-            add_scaled(of_xf, 1.0, budget.across_xf[i], 0, of_x.size)
+            add_scaled(of_x, 1.0, budget.across[X, i], 0, of_x.size)
+            add_scaled(of_xf, 1.0, budget.across[XF, i], 0, of_x.size)
         count += budget.counts[i]
     for k in range(of_x.size):
         of_x[k] /= count
@@ -201,7 +199,7 @@ def _age(budget, j):
 def _power(budget, j):
     """Power of x' in the j-th newest segment, of which some is there."""
     i = (budget.numbers[0].current - j) % len(budget.counts)
-    return budget.own_xf[i, 0] / budget.counts[i]
+    return budget.own[XF, i, 0] / budget.counts[i]
 
 
 @part()
@@ -364,15 +362,12 @@ class PowerBudget:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
-        own_x, own_xf, across_x, across_xf = (np.zeros((LONG + 1, n_taps)) for _ in range(4))
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(n_taps),
             filtered=delay_line(n_taps),
-            own_x=own_x,
-            own_xf=own_xf,
-            across_x=across_x,
-            across_xf=across_xf,
+            own=np.zeros((2, LONG + 1, n_taps)),
+            across=np.zeros((2, LONG + 1, n_taps)),
             counts=np.zeros(LONG + 1),
             numbers=new_record(
                 rated_power=rated_power,
