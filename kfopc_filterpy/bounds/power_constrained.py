@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .._runs import window_length
-from .._validate import as_count, as_nonnegative, as_positive, as_signal
+from .._validate import as_count, as_nonnegative, as_positive, as_signal, window_length
 from ..paths.models import path_taps
 from .wiener import Stretch, WienerSolution, constrained_weights, full_stretch, mean_square, reduction_db, require_sound
 

@@ -18,8 +18,9 @@ from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_parameters
 from ..power.constraint import DEFAULT_FS
 from .lockstep import DONE, LANES, LAST_UPDATE, STATUS, TABLE, Scenarios, SharedBlock, of_lanes, run_block, stacked
+from .result import SimulationResult
 from .run import DIVERGED, REFUSED, ControllerState
-from .simulation import DIVERGENCE_LIMIT, SensorNoise, SimulationResult, disturbance_at_microphone, switch_on_sample
+from .simulation import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
 
 BLOCK = 256
 ADVANCE = {"streaming": "advance_by_steps", "block": "advance", "pairs": "advance_in_pairs"}

@@ -7,14 +7,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from kfopc_filterpy.controllers import FxLMS, MOVFxLMS, kf_anc, kf_opc
-from kfopc_filterpy.loop.simulation import simulate
-from kfopc_filterpy.metrics import nse_db
+from kfopc_filterpy import FxLMS, MOVFxLMS, kf_anc, kf_opc, simulate
+from kfopc_filterpy import plot as plotting
+from kfopc_filterpy.metrics import coherence_and_gain, nse_db, power_spectrum_db
 from kfopc_filterpy.paths.models import bandpass_path
-from kfopc_filterpy.plot import runs as plotting
 from kfopc_filterpy.power.amplifiers import HardClipAmplifier
 from kfopc_filterpy.signals.generators import band_limited_noise, scaled_to_power, tone
-from kfopc_filterpy.spectra import coherence_and_gain, power_spectrum_db
 
 FS = 16000.0
 P, S = bandpass_path(128), bandpass_path(32)
@@ -86,7 +84,7 @@ def test_error_spectra_of_a_span_and_of_seeds(tonal, noise):
     _, level = power_spectrum_db(tonal["KF-ANC"].error[1600:3200], FS, steady=1.0)
     np.testing.assert_array_equal(_line(ax, "KF-ANC").get_ydata(), level)
     ax = plotting.plot_error_spectra({"KF-OPC": noise})
-    _, level = power_spectrum_db(np.stack([run.error for run in noise]), FS)
+    _, level = power_spectrum_db(np.stack([run.error for run in noise]), FS, runs=True)
     np.testing.assert_array_equal(_line(ax, "KF-OPC").get_ydata(), level)
 
 
@@ -153,7 +151,9 @@ def test_weight_history_is_logarithmic_where_one_grows(tonal):
 
 def test_nse_pools_seeds_and_shows_the_start(noise):
     ax = plotting.plot_nse({"KF-OPC": noise}, window_s=0.005)
-    curve = nse_db(np.stack([run.error for run in noise]), np.stack([run.disturbance for run in noise]), FS, 0.005)
+    curve = nse_db(
+        np.stack([run.error for run in noise]), np.stack([run.disturbance for run in noise]), FS, 0.005, runs=True
+    )
     line = _line(ax, "KF-OPC")
     rows = np.round(line.get_xdata() * FS).astype(int) - 1
     np.testing.assert_array_equal(line.get_ydata(), curve[rows])
@@ -194,7 +194,7 @@ def test_constraint_factor_leaves_out_controllers_that_say_none(tonal):
     ax = plotting.plot_constraint_factor([tonal["KF-OPC"], silent])
     assert _labels(ax) == ["KF-OPC"]
     assert _line(ax, "KF-OPC").get_ydata()[-1] == pytest.approx(tonal["KF-OPC"].constraint_factor[-1], abs=1e-3)
-    with pytest.raises(ValueError, match="no controller has said one"):
+    with pytest.raises(ValueError, match="no controller has told one"):
         plotting.plot_constraint_factor(silent)
 
 
@@ -258,7 +258,7 @@ def test_refusals_name_the_argument(tonal, noise):
         plotting.plot_nse(noise)
     with pytest.raises(ValueError, match="results 'a' must be runs of one length"):
         plotting.plot_nse({"a": [run, noise[0]]})
-    with pytest.raises(ValueError, match="results must hold one run a name here, got 2 runs of 'KF-OPC'"):
+    with pytest.raises(ValueError, match="results must hold one run per name here, got 2 runs of 'KF-OPC'"):
         plotting.plot_anti_noise({"KF-OPC": noise}, span_s=SPAN)
     with pytest.raises(ValueError, match="results must have one disturbance"):
         plotting.plot_error_spectra({"a": noise[0], "b": noise[1]})
