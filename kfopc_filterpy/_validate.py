@@ -135,13 +135,14 @@ def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
     return low, high
 
 
-def window_length(window_s: float, fs: float, name: str = "window_s") -> int:
-    """Return the length of a window in samples, at least one."""
+def as_sample_count(duration_s: Any, fs: Any, name: str) -> int:
+    """Return a duration in seconds as a number of samples, at least one."""
     rate = as_positive(fs, "fs", unit="Hz")
-    length = round(as_positive(window_s, name, unit="s") * rate)
-    if length < 1:
-        raise ValueError(f"{name} must be at least one sample, {1 / rate:g} s, got {window_s:g} s")
-    return length
+    duration = as_positive(duration_s, name, unit="s")
+    count = round(duration * rate)
+    if count < 1:
+        raise ValueError(f"{name} must be at least one sample, {1 / rate:g} s, got {duration:g} s")
+    return count
 
 
 def as_generator(rng: Any) -> np.random.Generator:

@@ -30,9 +30,9 @@ from ._validate import (
     as_number,
     as_positive,
     as_real_array,
+    as_sample_count,
     as_signal,
     require_channels_lead,
-    window_length,
 )
 
 __all__ = [
@@ -92,7 +92,7 @@ def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005, *, 
     [0.0, 0.0, -20.0, -20.0]
     """
     e, d = _as_pair(error, "error", disturbance, "disturbance", runs)
-    width = window_length(window_s, fs)
+    width = as_sample_count(window_s, fs, "window_s")
     return _ratio_db(_sliding_sum(_energy(e), width), _sliding_sum(_energy(d), width))
 
 
@@ -197,7 +197,7 @@ def short_time_power(signal: Any, fs: float, window_s: float, *, runs: bool = Fa
     [4.0, 2.0, 0.0, 8.0]
     """
     power = np.mean(_as_runs(signal, "signal", runs) ** 2, axis=0)
-    width = window_length(window_s, fs)
+    width = as_sample_count(window_s, fs, "window_s")
     return _sliding_sum(power, width) / np.minimum(np.arange(1, power.shape[-1] + 1), width)
 
 
@@ -235,7 +235,7 @@ def overshoot(control_signal: Any, rated_power: Any, fs: float, *, window_s: flo
     """
     y = _as_runs(control_signal, "control_signal", runs)
     rated = _as_limits(rated_power, "rated_power", y)
-    width = min(window_length(window_s, fs), y.shape[-1])
+    width = min(as_sample_count(window_s, fs, "window_s"), y.shape[-1])
     peak = np.max(_sliding_sum(y**2, width)[..., width - 1 :], axis=(0, -1)) / width
     return _figure(peak / rated)
 
@@ -506,7 +506,7 @@ def coherence_and_gain(
 
     d, a = _as_pair(disturbance, "disturbance", anti_noise, "anti_noise", runs)
     d, a = _steady_part(d, steady), _steady_part(a, steady)
-    segment = window_length(segment_s, fs, "segment_s")
+    segment = as_sample_count(segment_s, fs, "segment_s")
     if d.shape[-1] < 8 * segment:
         raise ValueError(
             f"disturbance and anti_noise must hold at least 8 segments of {segment} samples in the "
@@ -578,7 +578,7 @@ def power_spectrum_db(
     from scipy.signal import welch
 
     part = _steady_part(_as_runs(signal, "signal", runs), steady)
-    segment = min(window_length(segment_s, fs, "segment_s"), part.shape[-1])
+    segment = min(as_sample_count(segment_s, fs, "segment_s"), part.shape[-1])
     kind = as_choice(scaling, "scaling", ("density", "spectrum"))
     frequencies, power = welch(part, fs, nperseg=segment, detrend=False, scaling=kind)
     return frequencies, _ratio_db(power.mean(axis=0), 1.0)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_positive, as_signal, window_length
+from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal
 from ..paths.models import path_taps
 from .wiener import Stretch, WienerSolution, constrained_weights, full_stretch, mean_square, reduction_db, require_sound
 
@@ -291,7 +291,7 @@ def power_constrained_wiener(
             f"reference must have at least {record.n_taps} samples from switch_on_s on for {record.n_taps} taps, "
             f"got {max(n_samples - first, 0)}; use a longer signal, an earlier switch_on_s or fewer taps"
         )
-    length = window_length(segment_s, fs, "segment_s")
+    length = as_sample_count(segment_s, fs, "segment_s")
     if length < 2 * record.n_taps:
         raise ValueError(
             f"segment_s must be at least {2 * record.n_taps / fs:g} s, twice the {record.n_taps} taps, got "

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_choice, as_count, as_number, as_positive, as_signal, window_length
+from .._validate import as_choice, as_count, as_number, as_positive, as_sample_count, as_signal
 from ..metrics import nse_db, short_time_power
 from .results import DISTURBANCE, RATED, Curve, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
@@ -147,7 +147,7 @@ def plot_nse(
     """
     shown = curves(results)
     scale = as_choice(time_axis, "time_axis", ("linear", "log"))
-    width = window_length(window_s, shown[0].run.fs)
+    width = as_sample_count(window_s, shown[0].run.fs, "window_s")
     levels = []
     for curve in shown:
         e, d = (curve.stack(name, channel=channel) for name in ("error", "disturbance"))

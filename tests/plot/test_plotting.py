@@ -12,7 +12,7 @@ from kfopc_filterpy import plot as plotting
 from kfopc_filterpy.metrics import coherence_and_gain, nse_db, power_spectrum_db
 from kfopc_filterpy.paths.models import bandpass_path
 from kfopc_filterpy.power.amplifiers import HardClipAmplifier
-from kfopc_filterpy.signals.generators import band_limited_noise, scaled_to_power, tone
+from kfopc_filterpy.signals import band_limited_noise, scaled_to_power, tone
 
 FS = 16000.0
 P, S = bandpass_path(128), bandpass_path(32)

@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy.signals import band_limited_noise, bursty_noise, looped, swelling
+from kfopc_filterpy.signals import (
+    Bursts,
+    band_limited_noise,
+    bursty_noise,
+    level_jump,
+    looped,
+    scaled_to_power,
+    swelling,
+)
 
 FS = 1000.0
 EXACT = 1e-12  # rounding of a sum of 1e6 squares is far below it
@@ -18,10 +26,10 @@ WIDE = (50.0, 450.0)  # of 500 Hz: the band's own ringing is a few samples
 # ---- Bursts
 
 
-def bursts(**options: Any) -> np.ndarray:
+def bursts(duration_s: float = 1000.0, **options: Any) -> np.ndarray:
     """Bursts of one level over next to no background."""
-    quiet = {"fs": FS, "rng": 5, "band": WIDE, "level_spread_db": 0.0, "background_db": -90.0, "decay_s": 0.02}
-    return bursty_noise(**{"duration_s": 1000.0, "rate_hz": 2.0} | quiet | options)
+    quiet = {"rate_hz": 2.0, "band": WIDE, "level_spread_db": 0.0, "background_db": -90.0, "decay_s": 0.02}
+    return bursty_noise(duration_s, Bursts(**quiet | options), fs=FS, rng=5)
 
 
 def edges(x: np.ndarray, threshold: float, hold: int = 15) -> tuple[np.ndarray, np.ndarray]:
@@ -41,10 +49,10 @@ def test_bursts_have_their_power_exactly(power: float) -> None:
 
 def test_a_seed_repeats_and_the_global_state_is_left_alone() -> None:
     before = np.random.get_state()[1].copy()  # noqa: NPY002 - the state that must not matter
-    first = bursty_noise(1.0, fs=FS, rng=7, band=WIDE)
-    np.testing.assert_array_equal(first, bursty_noise(1.0, fs=FS, rng=7, band=WIDE))
-    np.testing.assert_array_equal(first, bursty_noise(1.0, fs=FS, rng=np.random.default_rng(7), band=WIDE))
-    assert not np.array_equal(first, bursty_noise(1.0, fs=FS, rng=8, band=WIDE))
+    first = bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=7)
+    np.testing.assert_array_equal(first, bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=7))
+    np.testing.assert_array_equal(first, bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=np.random.default_rng(7)))
+    assert not np.array_equal(first, bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=8))
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
@@ -112,7 +120,7 @@ def test_the_background_has_its_level(background_db: float) -> None:
 
 
 def test_bursts_lie_in_their_band() -> None:
-    x = bursty_noise(20.0, fs=16000.0, rng=1, band=(500.0, 1000.0))
+    x = bursty_noise(20.0, Bursts(band=(500.0, 1000.0)), fs=16000.0, rng=1)
     energy = np.abs(np.fft.rfft(x)) ** 2
     frequency = np.fft.rfftfreq(x.size, 1 / 16000)
     inside = (frequency > 500) & (frequency < 1000)
@@ -122,7 +130,7 @@ def test_bursts_lie_in_their_band() -> None:
 
 
 def test_bursts_take_the_whole_band() -> None:
-    x = bursty_noise(2.0, fs=FS, rng=1, band=(0.0, FS / 2))
+    x = bursty_noise(2.0, Bursts(band=(0.0, FS / 2)), fs=FS, rng=1)
     assert np.all(np.isfinite(x))
     assert np.mean(x**2) == pytest.approx(1.0, rel=EXACT)
 
@@ -232,29 +240,61 @@ def test_the_shortest_recording(samples: int, fs: float) -> None:
         looped(recording[1:], 1.0, fs=fs)
 
 
+# ---- Channels
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x: level_jump(x, 0.1, 6.0, fs=RATE),
+        lambda x: looped(x, 3.0, fs=RATE, start_s=0.3),
+    ],
+)
+def test_channels_are_changed_as_each_alone(change: Any) -> None:
+    x = np.random.default_rng(2).standard_normal((3, 1000))
+    np.testing.assert_array_equal(change(x), [change(channel) for channel in x])
+
+
+@pytest.mark.parametrize("change", [lambda x: scaled_to_power(x, 3.0), lambda x: swelling(x, fs=RATE, period_s=0.07)])
+def test_channels_share_one_gain_and_one_power(change: Any) -> None:
+    x = np.random.default_rng(2).standard_normal((3, 1000)) * [[1.0], [2.0], [3.0]]
+    y = change(x)
+    gain = y / x
+    np.testing.assert_allclose(gain, np.tile(gain[0], (3, 1)), rtol=1e-12)
+    assert np.mean(y**2) == pytest.approx(np.mean(change(x.ravel()) ** 2), rel=EXACT)
+
+
 # ---- Refusals
 
 
 BAD = [
     (lambda: bursty_noise(0.0, fs=FS, rng=1), ValueError, r"duration_s must be greater than 0"),
-    (lambda: bursty_noise(1e-5, fs=FS, rng=1), ValueError, r"duration_s fs, in samples, must be at least 1"),
+    (lambda: bursty_noise(1e-5, fs=FS, rng=1), ValueError, r"duration_s must be at least one sample"),
     (lambda: bursty_noise(1.0, fs=0, rng=1), ValueError, r"fs must be greater than 0"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=None, band=WIDE), TypeError, r"rng must be a seed"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=None), TypeError, r"rng must be a seed"),
     (lambda: bursty_noise(1.0, fs=FS, rng=1), ValueError, r"band must satisfy .* fs/2 = 500 Hz, got \(100, 1500\)"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=(200, 100)), ValueError, r"band must satisfy"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, power=0.0), ValueError, r"power must be greater"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, rate_hz=0.0), ValueError, r"rate_hz must be greater"),
+    (lambda: bursty_noise(1.0, Bursts(band=(200, 100)), fs=FS, rng=1), ValueError, r"band must satisfy"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=1, power=0.0), ValueError, r"power must be greater"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE, rate_hz=0.0), fs=FS, rng=1), ValueError, r"rate_hz must be greater"),
     (
-        lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, rate_hz=1e-9),
+        lambda: bursty_noise(1.0, Bursts(band=WIDE, rate_hz=1e-9), fs=FS, rng=1),
         ValueError,
         r"^no burst fell into duration_s = 1 s: take a longer duration or a higher rate_hz$",
     ),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, decay_s=0.0), ValueError, r"decay_s must be greater"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, level_spread_db=-1), ValueError, r"level_spread_db must not"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, background_db=np.nan), ValueError, r"background_db must be f"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE, decay_s=0.0), fs=FS, rng=1), ValueError, r"decay_s must be greater"),
+    (
+        lambda: bursty_noise(1.0, Bursts(band=WIDE, level_spread_db=-1), fs=FS, rng=1),
+        ValueError,
+        r"level_spread_db must not",
+    ),
+    (
+        lambda: bursty_noise(1.0, Bursts(band=WIDE, background_db=np.nan), fs=FS, rng=1),
+        ValueError,
+        r"background_db must be f",
+    ),
     (lambda: swelling([0.0, 0.0], fs=FS), ValueError, r"power must be greater than 0|not be all zeros"),
     (lambda: swelling([], fs=FS), ValueError, r"signal must have at least 1 value"),
-    (lambda: swelling([[1.0]], fs=FS), ValueError, r"signal must be one-dimensional"),
+    (lambda: swelling([[[1.0]]], fs=FS), ValueError, r"signal must be \(n_samples,\) or \(n_channels, n_samples\)"),
     (lambda: swelling([1.0], fs=0.0), ValueError, r"fs must be greater than 0"),
     (lambda: swelling([1.0], fs=FS, swing_db=-1.0), ValueError, r"swing_db must not be negative"),
     (lambda: swelling([1.0], fs=FS, period_s=0.0), ValueError, r"period_s must be greater than 0"),
@@ -263,7 +303,7 @@ BAD = [
     (lambda: looped(RECORDING, 1.0, fs=RATE, start_s=-1.0), ValueError, r"start_s must not be negative"),
     (lambda: looped([np.nan] * 600, 1.0, fs=RATE), ValueError, r"recording must be finite"),
     (lambda: looped([], 1.0, fs=RATE), ValueError, r"recording must have at least 1 value"),
-    (lambda: looped("hum", 1.0, fs=RATE), TypeError, r"recording must be a sequence of real numbers"),
+    (lambda: looped("hum", 1.0, fs=RATE), TypeError, r"recording must be an array of real numbers"),
 ]
 
 
