@@ -13,7 +13,7 @@ from kfopc_filterpy.bench.registry import REGISTRY
 from kfopc_filterpy.bench.scene import Runs, Scene
 from kfopc_filterpy.bench.tuning import Tuned, run_setting, went_through
 from kfopc_filterpy.metrics import overshoot, short_time_power
-from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 
 from .cases import FS, SEED, SWITCH_ON_S, WORST_WINDOW_S, grids, make_case, noise_of, tune_all
 from .constraint_cases import with_jump
@@ -98,7 +98,7 @@ def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndar
 
 
 def _longer_duct() -> np.ndarray:
-    return path_taps(duct_paths(fs=FS, length_m=OTHER_LENGTH_M).primary)
+    return path_taps(duct_paths(Duct(length_m=OTHER_LENGTH_M), fs=FS).primary)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
+from .analysis import CausalityMargin as CausalityMargin
 from .analysis import (
     achieved_band as achieved_band,
 )
+from .analysis import causality_margin as causality_margin
 from .analysis import (
     frequency_response as frequency_response,
 )
@@ -13,8 +15,7 @@ from .analysis import (
 from .analysis import (
     secondary_path_gain as secondary_path_gain,
 )
-from .causality import CausalityMargin as CausalityMargin
-from .causality import causality_margin as causality_margin
+from .duct import Duct as Duct
 from .duct import DuctPaths as DuctPaths
 from .duct import duct_paths as duct_paths
 from .identification import (
