@@ -1,7 +1,6 @@
 """Readers and writers of recordings, and the measured duct; no test reaches for the network."""
 
 import hashlib
-import os
 import struct
 import sys
 import wave
@@ -29,16 +28,6 @@ FILES = {"duct/Pz1.mat": ("Pz1", 1024), "duct/Sz.mat": ("S", 512), "motor/Motor.
 def no_folder(monkeypatch):
     """No data folder in the environment."""
     monkeypatch.delenv("KFOPC_DATA", raising=False)
-
-
-@pytest.fixture
-def measured_folder():
-    """The folder with the published files, or a skip."""
-    named = os.environ.get("KFOPC_DATA")
-    folder = Path(named) if named else Path(__file__).parents[3] / "shared" / "data"
-    if not (folder / "duct" / "Pz1.mat").is_file():
-        pytest.skip(f"the measured duct is not in {folder}; set KFOPC_DATA to a folder with it")
-    return folder
 
 
 @pytest.fixture
@@ -76,11 +65,11 @@ def network(own_files, monkeypatch):
 # ---- the measured duct
 
 
-def test_published_duct_has_its_known_contents(measured_folder):
-    duct = load_measured_duct(measured_folder)
+def test_published_duct_has_its_known_contents(shared_data):
+    duct = load_measured_duct(shared_data)
     assert (duct.primary.shape, duct.secondary.shape, duct.noise.shape) == ((1024,), (512,), (162001,))
     assert duct.fs == 16000
-    expected = scipy.io.loadmat(measured_folder / "duct" / "Sz.mat")["S"][:, 0]
+    expected = scipy.io.loadmat(shared_data / "duct" / "Sz.mat")["S"][:, 0]
     np.testing.assert_array_equal(duct.secondary, expected)
     # The secondary path gains 10 to 30 dB in the middle of 200 to 2000 Hz.
     gain_db = 20 * np.log10(np.abs(np.fft.rfft(duct.secondary, 4096)))[52:513]
@@ -165,10 +154,10 @@ def test_download_without_pooch_says_what_to_install(monkeypatch):
         load_measured_duct(allow_download=True)
 
 
-def test_pinned_hashes_are_those_of_the_published_files(measured_folder):
+def test_pinned_hashes_are_those_of_the_published_files(shared_data):
     assert set(datasets._HASHES) == set(datasets._URLS) == set(FILES)
     for name, expected in datasets._HASHES.items():
-        assert hashlib.sha256((measured_folder / name).read_bytes()).hexdigest() == expected
+        assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == expected
 
 
 def test_measured_duct_of_own_signals_is_checked():
