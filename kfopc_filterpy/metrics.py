@@ -380,7 +380,7 @@ def harmonics_db(
     """Return the error's power at 2 to 10 times the fundamental over the disturbance's power at the fundamental.
 
     A line's power is the sum over the main lobe (4 bins to each side) of a Blackman-Harris-windowed Fourier transform
-    of the steady portion, so it is also right between bins. What leaks from the error's fundamental into its harmonics
+    of the steady portion, so it is also right between bins. Leakage from the error's fundamental into its harmonics
     stays below -100 dB of that fundamental, which is the floor of this figure. Broadband noise within the lobes
     counts as well. Harmonics that do not fit below fs/2 are left out.
 

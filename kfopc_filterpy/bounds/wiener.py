@@ -309,7 +309,7 @@ def constrained_weights(stretch: Stretch, correlations: Correlations, rated_powe
 
 
 def _least_penalty(correlations: Correlations, balance: float, rated_power: float) -> tuple[np.ndarray, float]:
-    """Return the weights that solve (R_x' + λ R_x) w = r, with the least λ >= 0 that keeps their power within the rated.
+    """Return the weights that solve (R_x' + λ R_x) w = r with the smallest λ >= 0 that keeps within the power, and it.
 
     In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), each λ costs a sum over the taps
     instead of the solution of a system. Both matrices may be singular.

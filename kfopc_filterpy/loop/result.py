@@ -1,4 +1,4 @@
-"""The record of a run: what `simulate` returns, and what figures of merit and figures are made of."""
+"""The record of a run: `simulate` returns it, figures of merit and figures are computed from it."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ def duct_paths(
     fs : float, default 16000
         Sampling rate in Hz.
     primary_taps, secondary_taps : int, optional
-        Lengths of the impulse responses; by default the least multiples of 64 that leave out no more than -50 dB of
+        Lengths of the impulse responses; by default the smallest multiples of 64 that leave out no more than -50 dB of
         their energy: 832 and 640 for the default duct. Given lengths may leave out -40 dB.
 
     Returns

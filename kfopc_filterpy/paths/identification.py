@@ -1,4 +1,4 @@
-"""Secondary-path identification: excite the loudspeaker, record the microphone, fit an impulse response."""
+"""Identification of the secondary path: excite the loudspeaker, record the microphone, fit an impulse response."""
 
 from __future__ import annotations
 
@@ -38,17 +38,13 @@ class PathEstimate:
 
 
 @dataclass(frozen=True)
-class IdentificationResult:
-    """Outcome of a simulated identification, in which the true path is known.
+class IdentificationResult(PathEstimate):
+    """Result of a simulated identification, in which the true path is known.
 
     Attributes
     ----------
-    estimate : control.TransferFunction
-        The estimated secondary path, with ``dt = 1/fs``.
-    taps : numpy.ndarray, shape (n_taps,)
-        Its impulse response.
-    residual_db : float
-        Share of the response's power that the fit leaves unexplained, in dB.
+    estimate, taps, residual_db
+        As in `PathEstimate`.
     frequencies_hz : numpy.ndarray, shape (n_frequencies,)
         Frequencies of the modelling error in Hz.
     modelling_error_db : numpy.ndarray, shape (n_frequencies,)
@@ -57,9 +53,6 @@ class IdentificationResult:
         ``10 log10(sum (s_est - s)^2 / sum s^2)``, the error of the whole impulse response.
     """
 
-    estimate: control.TransferFunction
-    taps: np.ndarray
-    residual_db: float
     frequencies_hz: np.ndarray
     modelling_error_db: np.ndarray
     misalignment_db: float

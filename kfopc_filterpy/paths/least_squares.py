@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 # Eigenvalues of a correlation matrix below this share of the largest count as zero. Such directions of the weights
-# (for a tone all but two) get no weight, which is the solution of minimum norm.
+# get no weight, which is the solution of minimum norm; for a tone only two directions remain.
 RANK_TOLERANCE = 1e-11
 
 

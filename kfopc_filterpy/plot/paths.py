@@ -1,4 +1,4 @@
-"""Figures of paths, and of what follows from them.
+"""Figures of paths, their identification, and the rated power they ask for.
 
 Each function draws into `ax`, or into new axes, and returns the axes. Paths are python-control systems, which know their
 sampling rate, or arrays of taps, which need `fs`.

@@ -52,7 +52,7 @@ class Curve(NamedTuple):
         return {"label": _label(self), **self.style, "marker": ""}
 
     def draw(self, ax: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
-        """Draw `y`, (n,) or (n_loudspeakers, n), thin, solid and with sparse markers: dashes are lost in what wanders.
+        """Draw `y`, (n,) or (n_loudspeakers, n), thin, solid and with sparse markers: dashes are lost in a noisy curve.
 
         The markers of the i-th curve lie between those of the others. The loudspeakers of a run look alike.
         """

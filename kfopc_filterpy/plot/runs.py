@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_choice, as_count, as_number, as_positive, as_sample_count, as_signal
+from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
 from ..metrics import nse_db, short_time_power
 from .results import DISTURBANCE, RATED, Curve, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
@@ -334,7 +334,8 @@ def plot_noise_reduction_against_overdrive(
     if not isinstance(noise_reduction_db, Mapping) or not noise_reduction_db:
         raise TypeError("noise_reduction_db must map at least one algorithm's name to its noise reduction in dB")
     levels = {
-        str(name): np.atleast_1d(np.asarray(value, dtype=np.float64)) for name, value in noise_reduction_db.items()
+        str(name): np.atleast_1d(as_real_array(value, "noise_reduction_db"))
+        for name, value in noise_reduction_db.items()
     }
     for name, level in levels.items():
         if level.shape != overdrive.shape:

@@ -40,7 +40,7 @@ def plot_error_spectra(
     band : (float, float), optional
         Band to show in Hz, by default 0 to fs/2.
     span_s : (float, float), optional
-        Start and end in seconds of what is analysed, by default the second half.
+        Start and end in seconds of the part to analyse, by default the second half.
     segment_s, scaling
         As for `power_spectrum_db`.
     channel : int, optional
@@ -91,7 +91,7 @@ def plot_error_spectra(
     levels = [level[np.isfinite(level)] for _, level, _ in spectra]
     top = np.max(np.concatenate(levels), initial=-np.inf)
     if np.isfinite(top):
-        # As deep as the errors: what the disturbance lacks outside its band is of no interest.
+        # The errors set the depth of the axis: the floor of the disturbance outside its band is of no interest.
         ax.set_ylim(max(np.min(np.concatenate(levels[1:]), initial=top) - 5, top - _DEPTH_DB), top + 5)
     ax.set_xlim(low, high)
     ax.set_xlabel("Frequency (Hz)")
