@@ -12,10 +12,7 @@ import numpy as np
 
 def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None = None) -> np.ndarray:
     """Return `value` as a contiguous, finite, one-dimensional float64 array, or raise a clear error."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}") from error
+    array = as_real_array(value, name)
     if array.ndim != 1:
         raise ValueError(
             f"{name} must be one-dimensional, (n,), got shape {array.shape}; "
@@ -35,11 +32,10 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
         array = np.asarray(value)
         real = array.astype(np.float64, copy=False) if array.dtype.kind != "c" else None
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} must be an array of real numbers, got {type(value).__name__}; channels and runs need one length"
-        ) from error
-    if real is None:
-        raise TypeError(f"{name} must be an array of real numbers, got complex ones")
+        ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
+        raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
+    if real is None:  # numpy would drop the imaginary part with no more than a warning
+        raise TypeError(f"{name} must be a sequence of real numbers, got complex ones")
     return real
 
 

@@ -14,8 +14,8 @@ These rules hold for every function here:
   by default 0.5, the steady second half; 1.0 is the whole run.
 - A diverged run ends in NaN. A figure that looks at NaN samples is NaN, without a warning.
 - If the disturbance has no power, a ratio to it is undefined: NaN. A residual of exactly zero is -inf dB.
-- ValueError is raised for an empty signal, Inf, shapes that differ or have the wrong number of axes, and settings out
-  of range; TypeError for values that are not real numbers. The message names the argument.
+- Every function raises ValueError for an empty signal, Inf, shapes that differ or have the wrong number of axes, and
+  settings out of range; TypeError for values that are not real numbers. The message names the argument.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005, *, 
 
     Raises
     ------
-    ValueError, TypeError
-        If the window is shorter than a sample, or a signal or a setting is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     References
     ----------
@@ -113,11 +113,6 @@ def noise_reduction_db(error: Any, disturbance: Any, *, steady: float = 0.5, run
     float
         Noise reduction in dB, positive if the error is the weaker.
 
-    Raises
-    ------
-    ValueError, TypeError
-        If a signal or a setting is not as described.
-
     Examples
     --------
     >>> noise_reduction_db([1.0, 1.0, 0.1, 0.1], [1.0, 1.0, 1.0, 1.0])
@@ -148,11 +143,6 @@ def output_power(control_signal: Any, *, steady: float = 0.5, runs: bool = False
     -------
     float, or ndarray of shape (n_loudspeakers,)
         Mean square, in the square of the signal's unit.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a signal or a setting is not as described.
 
     Examples
     --------
@@ -188,8 +178,8 @@ def short_time_power(signal: Any, fs: float, window_s: float, *, runs: bool = Fa
 
     Raises
     ------
-    ValueError, TypeError
-        If the window is shorter than a sample, or a signal or a setting is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     Examples
     --------
@@ -225,8 +215,8 @@ def overshoot(control_signal: Any, rated_power: Any, fs: float, *, window_s: flo
 
     Raises
     ------
-    ValueError, TypeError
-        If the rated power is not above 0, or a signal or a setting is not as described.
+    ValueError
+        If the rated power is not above 0.
 
     Examples
     --------
@@ -261,8 +251,8 @@ def clipped_fraction(control_signal: Any, limit: Any, *, steady: float = 0.5, ru
 
     Raises
     ------
-    ValueError, TypeError
-        If the limit is not above 0, or a signal or a setting is not as described.
+    ValueError
+        If the limit is not above 0.
 
     Examples
     --------
@@ -290,11 +280,6 @@ def peak_control_signal(control_signal: Any, *, steady: float = 0.5, runs: bool 
     -------
     float, or ndarray of shape (n_loudspeakers,)
         Peak, in the signal's unit.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a signal or a setting is not as described.
 
     Examples
     --------
@@ -347,8 +332,8 @@ def convergence_time_s(
 
     Raises
     ------
-    ValueError, TypeError
-        If the window is shorter than a sample, or a signal or a setting is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     See Also
     --------
@@ -404,9 +389,8 @@ def harmonics_db(
 
     Raises
     ------
-    ValueError, TypeError
-        If the steady portion is shorter than 16 periods, the second harmonic does not fit below fs/2, or a signal or a
-        setting is not as described.
+    ValueError
+        If the steady portion is shorter than 16 periods, or the second harmonic does not fit below fs/2.
 
     References
     ----------
@@ -490,9 +474,8 @@ def coherence_and_gain(
 
     Raises
     ------
-    ValueError, TypeError
-        If the steady portion is shorter than 8 segments, the band holds no frequency bin, or a signal or a setting is
-        not as described.
+    ValueError
+        If the steady portion is shorter than 8 segments, or the band holds no frequency bin.
 
     Examples
     --------
@@ -564,8 +547,8 @@ def power_spectrum_db(
 
     Raises
     ------
-    ValueError, TypeError
-        If `scaling` is unknown, or a signal or a setting is not as described.
+    ValueError
+        If `scaling` is unknown.
 
     Examples
     --------

@@ -394,7 +394,7 @@ def test_runs_are_never_guessed_from_an_axis(figure):
     for shape, runs in (((8, 3), False), ((2, 8, 3), True)):
         with pytest.raises(ValueError, match=r"must have its channels first.*got 8 channels of 3 sample.*transpose it"):
             figure(np.ones(shape), runs=runs)
-    with pytest.raises(TypeError, match="channels and runs need one length"):
+    with pytest.raises(TypeError, match="got list, whose rows differ in length"):
         figure([[1.0], [1.0, 2.0]])
 
 
@@ -439,8 +439,8 @@ def test_silent_disturbance_gives_nan_without_a_warning():
         (lambda: nse_db([1.0], [1.0], FS, 1e-6), ValueError, r"window_s must be at least one sample"),
         (lambda: nse_db([1.0], [1.0], 0.0), ValueError, r"fs must be greater than 0"),
         (lambda: nse_db([np.inf], [1.0], FS), ValueError, r"error must hold finite numbers"),
-        (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be an array of real numbers, got list"),
-        (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be an array of real numbers, got complex"),
+        (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got list"),
+        (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got complex"),
         (lambda: nse_db(np.ones((1, 1, 1)), [1.0], FS), ValueError, r"error must be \(n_samples,\) or"),
         (
             lambda: noise_reduction_db([1.0], [1.0], steady=0.0),

@@ -232,6 +232,8 @@ def test_scaled_signal_has_the_power_and_the_shape(values, power):
         (lambda: level_jump([1.0, 2.0], -1.0, 6.0, fs=2), ValueError, r"at_s must not be negative"),
         (lambda: scaled_to_power([0.0, 0.0], 1.0), ValueError, r"signal must not be all zeros"),
         (lambda: scaled_to_power([], 1.0), ValueError, r"signal must have at least 1 value"),
+        (lambda: scaled_to_power([1j], 1.0), TypeError, r"signal must be a sequence of real numbers, got complex"),
+        (lambda: scaled_to_power([[1.0], [1.0, 2.0]], 1.0), TypeError, r"got list, whose rows differ in length"),
     ],
 )
 def test_refusals_say_what_was_wrong(call, error, message):

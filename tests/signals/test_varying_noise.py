@@ -303,7 +303,7 @@ BAD = [
     (lambda: looped(RECORDING, 1.0, fs=RATE, start_s=-1.0), ValueError, r"start_s must not be negative"),
     (lambda: looped([np.nan] * 600, 1.0, fs=RATE), ValueError, r"recording must be finite"),
     (lambda: looped([], 1.0, fs=RATE), ValueError, r"recording must have at least 1 value"),
-    (lambda: looped("hum", 1.0, fs=RATE), TypeError, r"recording must be an array of real numbers"),
+    (lambda: looped("hum", 1.0, fs=RATE), TypeError, r"recording must be a sequence of real numbers"),
 ]
 
 
