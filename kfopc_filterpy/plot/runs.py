@@ -55,8 +55,8 @@ def plot_weight_history(results: Any, *, tap: int | tuple[int, int, int], ax: Ax
 
     Raises
     ------
-    ValueError, TypeError
-        If the weights were not recorded, a filter does not have the tap, or an argument is not as described.
+    ValueError
+        If the weights were not recorded, or a filter does not have the tap.
 
     Examples
     --------
@@ -130,8 +130,8 @@ def plot_nse(
 
     Raises
     ------
-    ValueError, TypeError
-        If the window is shorter than a sample, or an argument is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     Examples
     --------
@@ -201,8 +201,8 @@ def plot_output_power(
 
     Raises
     ------
-    ValueError, TypeError
-        If the window is shorter than a sample, or an argument is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     Examples
     --------
@@ -263,8 +263,8 @@ def plot_constraint_factor(results: Any, *, channel: int | None = None, ax: Axes
 
     Raises
     ------
-    ValueError, TypeError
-        If no controller tells its factor, or an argument is not as described.
+    ValueError
+        If no controller tells its factor.
 
     Examples
     --------
@@ -319,7 +319,7 @@ def plot_noise_reduction_against_overdrive(
     Raises
     ------
     ValueError, TypeError
-        If arrays differ in length, no algorithm is given, or an argument is not as described.
+        If arrays differ in length, or no algorithm is given.
 
     Examples
     --------

@@ -55,8 +55,8 @@ def plot_error_spectra(
 
     Raises
     ------
-    ValueError, TypeError
-        If the disturbances differ, or an argument is not as described.
+    ValueError
+        If the disturbances differ.
 
     Examples
     --------
@@ -124,8 +124,8 @@ def plot_anti_noise(
 
     Raises
     ------
-    ValueError, TypeError
-        If the disturbances differ, or an argument is not as described.
+    ValueError
+        If the disturbances differ.
 
     Examples
     --------
@@ -182,11 +182,6 @@ def plot_amplifier_output(
     -------
     matplotlib.axes.Axes
         The axes drawn into.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If an argument is not as described.
 
     Examples
     --------
@@ -265,8 +260,8 @@ def plot_disturbance_and_anti_noise(
 
     Raises
     ------
-    ValueError, TypeError
-        If the run is too short for the coherence, there are several runs, or an argument is not as described.
+    ValueError
+        If the run is too short for the coherence, or there are several runs.
 
     Examples
     --------
