@@ -58,7 +58,7 @@ def test_bode_draws_magnitude_and_phase_in_hz():
     f, angle = line.get_xdata(), line.get_ydata()
     passed = f < 4500
     np.testing.assert_allclose(angle[passed], -360 * 2.5 * f[passed] / FS, atol=1e-6)
-    assert np.isnan(angle[-1])  # no phase where the path passes nothing
+    assert np.isnan(angle[-1])  # no phase where the path is silent
     assert _labels(phase)[1] == "S, less 0.81 ms"
 
 

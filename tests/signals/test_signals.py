@@ -129,7 +129,7 @@ def test_compressor_broadband_share_and_band():
     )
     energy = np.abs(np.fft.rfft(x)) ** 2
     energy[25 * 8 * np.arange(1, 41)] = 0.0
-    # The broadband part's own share of the 40 bins, and its correlation with the lines, are some 0.5 %.
+    # The broadband part's own share of the 40 bins, and its correlation with the lines, are about 0.5 %.
     assert np.sum(energy) / np.sum(np.abs(np.fft.rfft(x)) ** 2) == pytest.approx(0.25, rel=0.03)
     assert band_share(x, 19.9, 2000.1) == pytest.approx(1.0, abs=1e-12)
 
