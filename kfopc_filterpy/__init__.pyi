@@ -41,8 +41,8 @@ from .controllers.repaired import kf_opc_repaired as kf_opc_repaired
 from .controllers.rescaling import RescalingFxLMS as RescalingFxLMS
 from .controllers.two_gradient import TwoGradientFxLMS as TwoGradientFxLMS
 from .filters.kfopc import KFOPC as KFOPC
+from .loop.result import SimulationResult as SimulationResult
 from .loop.scenarios import simulate_scenarios as simulate_scenarios
-from .loop.simulation import SimulationResult as SimulationResult
 from .loop.simulation import simulate as simulate
 from .metrics import (
     clipped_fraction as clipped_fraction,

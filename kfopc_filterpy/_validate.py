@@ -12,14 +12,11 @@ import numpy as np
 
 def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None = None) -> np.ndarray:
     """Return `value` as a contiguous, finite, one-dimensional float64 array, or raise a clear error."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}") from error
+    array = as_real_array(value, name)
     if array.ndim != 1:
         raise ValueError(
             f"{name} must be one-dimensional, (n,), got shape {array.shape}; "
-            f"pass one channel, e.g. {name}[:, 0] or {name}.ravel()"
+            f"pass one channel, e.g. {name}[0] or {name}.ravel()"
         )
     if length is not None and array.size != length:
         raise ValueError(f"{name} must have {length} values, got {array.size}")
@@ -29,8 +26,44 @@ def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None 
     return np.ascontiguousarray(array)
 
 
+def as_real_array(value: Any, name: str) -> np.ndarray:
+    """Return `value` as a float64 array of any shape, NaN and Inf included."""
+    try:
+        array = np.asarray(value)
+        real = array.astype(np.float64, copy=False) if array.dtype.kind != "c" else None
+    except (TypeError, ValueError) as error:
+        ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
+        raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
+    if real is None:  # numpy would drop the imaginary part with no more than a warning
+        raise TypeError(f"{name} must be a sequence of real numbers, got complex ones")
+    return real
+
+
+def as_channels(value: Any, name: str) -> np.ndarray:
+    """Return `value` as a contiguous, finite float64 array, (n_samples,) or (n_channels, n_samples)."""
+    array = as_real_array(value, name)
+    if array.ndim not in (1, 2):
+        raise ValueError(f"{name} must be (n_samples,) or (n_channels, n_samples), got shape {array.shape}")
+    if array.size == 0:
+        raise ValueError(f"{name} must have at least 1 value(s), got shape {array.shape}")
+    if array.ndim == 2:
+        require_channels_lead(array, name)
+    require_finite(array, name)
+    return np.ascontiguousarray(array)
+
+
+def require_channels_lead(array: np.ndarray, name: str) -> None:
+    """Raise ValueError if the last two axes hold more channels than samples: samples were put first."""
+    n_channels, n_samples = array.shape[-2:]
+    if n_channels > n_samples:
+        raise ValueError(
+            f"{name} must have its channels first, (n_channels, n_samples), got {n_channels} channels of "
+            f"{n_samples} sample(s); transpose it, {name}.T"
+        )
+
+
 def require_finite(array: Any, name: str) -> None:
-    """Raise ValueError where `array` holds NaN or Inf, saying where the first one stands."""
+    """Raise ValueError if `array` holds NaN or Inf, saying where the first one stands."""
     finite = np.isfinite(array)
     if not np.all(finite):
         where = tuple(int(i) for i in np.argwhere(~np.atleast_1d(finite))[0])
@@ -98,6 +131,16 @@ def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
     if not 0 <= low < high <= fs / 2:
         raise ValueError(f"{name} must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz")
     return low, high
+
+
+def as_sample_count(duration_s: Any, fs: Any, name: str) -> int:
+    """Return a duration in seconds as a number of samples, at least one."""
+    rate = as_positive(fs, "fs", unit="Hz")
+    duration = as_positive(duration_s, name, unit="s")
+    count = round(duration * rate)
+    if count < 1:
+        raise ValueError(f"{name} must be at least one sample, {1 / rate:g} s, got {duration:g} s")
+    return count
 
 
 def as_generator(rng: Any) -> np.random.Generator:

@@ -1,26 +1,39 @@
-"""Figures of merit of a run: noise reduction, output power, saturation, distortion, convergence, spectra.
+"""Figures of merit of a run: noise reduction, powers, saturation, convergence, harmonics, coherence, spectra.
 
-Common to all functions here:
+These rules hold for every function here:
 
-- A signal is (n_samples,), or (n_runs, n_samples) for several runs of one experiment with different seeds;
-  powers are then averaged over the runs before any ratio or logarithm is taken.
+- A signal is (n_samples,), or (n_channels, n_samples). Error, disturbance and anti-noise have one channel per
+  microphone, the control signal has one per loudspeaker.
+- `nse_db`, `noise_reduction_db`, `convergence_time_s` and `harmonics_db` rate all microphones together: energies are
+  summed over the microphones before the ratio is taken. The other figures come back one per channel, or as a single
+  figure if the signal came without a channel axis.
+- ``runs=True`` says that the leading axis counts runs of one experiment, for example with different seeds:
+  (n_runs, n_samples) or (n_runs, n_channels, n_samples). Powers are then averaged over the runs before any ratio or
+  logarithm is taken; peaks are the highest of all runs. A leading axis never means runs by itself.
 - Power is the mean square. `steady` is the portion of the run, counted from its end, that a figure looks at:
-  0.5, the steady second half, unless told otherwise; 1.0 is the whole run.
+  by default 0.5, the steady second half; 1.0 is the whole run.
 - A diverged run ends in NaN. A figure that looks at NaN samples is NaN, without a warning.
-- A disturbance of zero power leaves a ratio undefined: NaN. A residual of exactly zero is -inf dB.
-- An empty signal, Inf, shapes that differ or more than two dimensions raise ValueError; values that are not
-  real numbers raise TypeError. Both name the argument.
+- If the disturbance has no power, a ratio to it is undefined: NaN. A residual of exactly zero is -inf dB.
+- Every function raises ValueError for an empty signal, Inf, shapes that differ or have the wrong number of axes, and
+  settings out of range; TypeError for values that are not real numbers. The message names the argument.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ._runs import as_pair, as_runs, ratio_db, steady_part, window_length
-from ._validate import as_positive
-from .spectra import CoherenceAndGain, coherence_and_gain, harmonics_db, power_spectrum_db
+from ._validate import (
+    as_band,
+    as_choice,
+    as_number,
+    as_positive,
+    as_real_array,
+    as_sample_count,
+    as_signal,
+    require_channels_lead,
+)
 
 __all__ = [
     "CoherenceAndGain",
@@ -34,23 +47,29 @@ __all__ = [
     "overshoot",
     "peak_control_signal",
     "power_spectrum_db",
+    "short_time_power",
 ]
 
+# Half the main lobe of the four-term Blackman-Harris window, in Fourier bins.
+_LOBE_BINS = 4
 
-def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005) -> np.ndarray:
-    """Normalised squared error: 10 log10(sum e² / sum d²) over a sliding window.
 
-    Sample n looks at the window that ends with n, so it never sees the future; the first samples look at the
-    samples there are, without padding.
+def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005, *, runs: bool = False) -> np.ndarray:
+    """Return the normalised squared error, 10 log10(sum e² / sum d²) over a sliding window.
+
+    Sample n looks at the window that ends with n, so it never sees the future. The first samples look at the samples
+    there are, without padding.
 
     Parameters
     ----------
-    error, disturbance : array_like, shape (n_samples,) or (n_runs, n_samples)
-        Residual error and disturbance; squares are summed over the runs as well as the window.
+    error, disturbance : array_like, shape (n_samples,) or (n_microphones, n_samples)
+        Residual error and disturbance; squares are summed over the microphones.
     fs : float
         Sampling frequency in Hz.
     window_s : float, default 0.005
         Length of the window in seconds, at least one sample.
+    runs : bool, default False
+        The leading axis counts runs; squares are summed over them too.
 
     Returns
     -------
@@ -59,8 +78,8 @@ def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005) -> 
 
     Raises
     ------
-    ValueError, TypeError
-        Where the window is shorter than a sample, or a signal or a setting is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     References
     ----------
@@ -72,164 +91,203 @@ def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005) -> 
     >>> nse_db([1.0, 1.0, 0.1, 0.1], [1.0, 1.0, 1.0, 1.0], fs=1000, window_s=0.001).round(6).tolist()
     [0.0, 0.0, -20.0, -20.0]
     """
-    e, d = as_pair(error, "error", disturbance, "disturbance")
-    width = window_length(window_s, fs)
-    return ratio_db(_sliding_sum(_sum_over_runs(e), width), _sliding_sum(_sum_over_runs(d), width))
+    e, d = _as_pair(error, "error", disturbance, "disturbance", runs)
+    width = as_sample_count(window_s, fs, "window_s")
+    return _ratio_db(_sliding_sum(_energy(e), width), _sliding_sum(_energy(d), width))
 
 
-def noise_reduction_db(error: Any, disturbance: Any, *, steady: float = 0.5) -> float:
-    """Noise reduction, -10 log10(sum e² / sum d²) over the steady portion.
+def noise_reduction_db(error: Any, disturbance: Any, *, steady: float = 0.5, runs: bool = False) -> float:
+    """Return the noise reduction, -10 log10(sum e² / sum d²) over the steady portion.
 
     Parameters
     ----------
-    error, disturbance : array_like, shape (n_samples,) or (n_runs, n_samples)
-        Residual error and disturbance.
+    error, disturbance : array_like, shape (n_samples,) or (n_microphones, n_samples)
+        Residual error and disturbance; squares are summed over the microphones.
     steady : float, default 0.5
         Portion of the run, from its end.
+    runs : bool, default False
+        The leading axis counts runs; squares are summed over them too.
 
     Returns
     -------
     float
-        Noise reduction in dB, positive where the error is the weaker.
-
-    Raises
-    ------
-    ValueError, TypeError
-        Where a signal or a setting is not as described.
+        Noise reduction in dB, positive if the error is the weaker.
 
     Examples
     --------
     >>> noise_reduction_db([1.0, 1.0, 0.1, 0.1], [1.0, 1.0, 1.0, 1.0])
     20.0
+
+    Two microphones, one silenced and one left as it was: half the energy is gone.
+
+    >>> round(noise_reduction_db([[0.0, 0.0], [1.0, 1.0]], [[1.0, 1.0], [1.0, 1.0]]), 2)
+    3.01
     """
-    e, d = as_pair(error, "error", disturbance, "disturbance")
-    e, d = steady_part(e, steady), steady_part(d, steady)
-    return -float(ratio_db(np.sum(e**2), np.sum(d**2)))
+    e, d = _as_pair(error, "error", disturbance, "disturbance", runs)
+    return -float(_ratio_db(np.sum(_steady_part(e, steady) ** 2), np.sum(_steady_part(d, steady) ** 2)))
 
 
-def output_power(control_signal: Any, *, steady: float = 0.5) -> float:
-    """Output power: mean square of the control signal before the amplifier, over the steady portion.
+def output_power(control_signal: Any, *, steady: float = 0.5, runs: bool = False) -> Any:
+    """Return the output power, the mean square of the control signal before the amplifier, over the steady portion.
 
     Parameters
     ----------
-    control_signal : array_like, shape (n_samples,) or (n_runs, n_samples)
+    control_signal : array_like, shape (n_samples,) or (n_loudspeakers, n_samples)
         Control signal y.
     steady : float, default 0.5
         Portion of the run, from its end.
+    runs : bool, default False
+        The leading axis counts runs; their powers are averaged.
 
     Returns
     -------
-    float
-        Mean square, in the square of the signal's unit; over several runs, the mean of their powers.
-
-    Raises
-    ------
-    ValueError, TypeError
-        Where a signal or a setting is not as described.
+    float, or ndarray of shape (n_loudspeakers,)
+        Mean square, in the square of the signal's unit.
 
     Examples
     --------
     >>> output_power([5.0, 5.0, 1.0, -1.0])
     1.0
+    >>> output_power([[5.0, 5.0, 1.0, -1.0], [5.0, 5.0, 2.0, -2.0]])  # one power per loudspeaker
+    array([1., 4.])
     """
-    return float(np.mean(steady_part(as_runs(control_signal, "control_signal"), steady) ** 2))
+    y = _steady_part(_as_runs(control_signal, "control_signal", runs), steady)
+    return _figure(np.mean(y**2, axis=(0, -1)))
 
 
-def overshoot(control_signal: Any, rated_power: float, fs: float, *, window_s: float = 0.05) -> float:
-    """Peak of the short-time output power over the whole run, divided by the rated power.
+def short_time_power(signal: Any, fs: float, window_s: float, *, runs: bool = False) -> np.ndarray:
+    """Return the mean square of a signal over a sliding window.
+
+    Sample n looks at the window that ends with n. The first samples look at the samples there are, without padding.
 
     Parameters
     ----------
-    control_signal : array_like, shape (n_samples,) or (n_runs, n_samples)
-        Control signal y; of several runs, the highest peak counts.
-    rated_power : float
-        Rated output power, above 0.
+    signal : array_like, shape (n_samples,) or (n_channels, n_samples)
+        Signal.
     fs : float
         Sampling frequency in Hz.
-    window_s : float, default 0.05
-        Length of the power's sliding window in seconds; windows that would stand out of the run are left out,
-        and a longer one than the run is the run.
+    window_s : float
+        Length of the window in seconds, at least one sample.
+    runs : bool, default False
+        The leading axis counts runs; their powers are averaged.
 
     Returns
     -------
-    float
-        Ratio of powers: 1.0 is just at the rated power, 2.0 twice (3 dB) above.
+    ndarray, shape (n_samples,) or (n_channels, n_samples)
+        Power, in the square of the signal's unit; NaN where the window holds NaN.
 
     Raises
     ------
-    ValueError, TypeError
-        Where the rated power is not above 0, or a signal or a setting is not as described.
+    ValueError
+        If the window is shorter than a sample.
+
+    Examples
+    --------
+    >>> short_time_power([2.0, 0.0, 0.0, 4.0], fs=1000, window_s=0.002).tolist()
+    [4.0, 2.0, 0.0, 8.0]
+    """
+    power = np.mean(_as_runs(signal, "signal", runs) ** 2, axis=0)
+    width = as_sample_count(window_s, fs, "window_s")
+    return _sliding_sum(power, width) / np.minimum(np.arange(1, power.shape[-1] + 1), width)
+
+
+def overshoot(control_signal: Any, rated_power: Any, fs: float, *, window_s: float = 0.05, runs: bool = False) -> Any:
+    """Return the peak of the short-time output power over the whole run, divided by the rated power.
+
+    Parameters
+    ----------
+    control_signal : array_like, shape (n_samples,) or (n_loudspeakers, n_samples)
+        Control signal y.
+    rated_power : float or array_like, shape (n_loudspeakers,)
+        Rated output power, above 0: one for all loudspeakers, or one each.
+    fs : float
+        Sampling frequency in Hz.
+    window_s : float, default 0.05
+        Length of the power's sliding window in seconds. Only windows that lie wholly in the run count; a window longer
+        than the run is cut to the run.
+    runs : bool, default False
+        The leading axis counts runs; the highest peak counts.
+
+    Returns
+    -------
+    float, or ndarray of shape (n_loudspeakers,)
+        Ratio of powers: 1.0 is just at the rated power, 2.0 is twice it (3 dB above).
+
+    Raises
+    ------
+    ValueError
+        If the rated power is not above 0.
 
     Examples
     --------
     >>> overshoot([1.0, 2.0, 2.0, 1.0], 2.0, fs=1000, window_s=0.002)
     2.0
     """
-    runs = as_runs(control_signal, "control_signal")
-    rated = as_positive(rated_power, "rated_power")
-    width = min(window_length(window_s, fs), runs.shape[1])
-    peaks = [np.max(_sliding_sum(run**2, width)[width - 1 :]) for run in runs]
-    return float(np.max(peaks) / width / rated)
+    y = _as_runs(control_signal, "control_signal", runs)
+    rated = _as_limits(rated_power, "rated_power", y)
+    width = min(as_sample_count(window_s, fs, "window_s"), y.shape[-1])
+    peak = np.max(_sliding_sum(y**2, width)[..., width - 1 :], axis=(0, -1)) / width
+    return _figure(peak / rated)
 
 
-def clipped_fraction(control_signal: Any, limit: float, *, steady: float = 0.5) -> float:
-    """Share of the samples of the control signal beyond the amplifier's limit, in the steady portion.
+def clipped_fraction(control_signal: Any, limit: Any, *, steady: float = 0.5, runs: bool = False) -> Any:
+    """Return the share of the samples of the control signal beyond the amplifier's limit, in the steady portion.
 
     Parameters
     ----------
-    control_signal : array_like, shape (n_samples,) or (n_runs, n_samples)
+    control_signal : array_like, shape (n_samples,) or (n_loudspeakers, n_samples)
         Control signal y before the amplifier (after it, nothing lies beyond the limit).
-    limit : float
-        Amplitude limit, above 0; a sample counts where abs(y) > limit.
+    limit : float or array_like, shape (n_loudspeakers,)
+        Amplitude limit, above 0: one for all loudspeakers, or one each. A sample counts if abs(y) > limit.
     steady : float, default 0.5
         Portion of the run, from its end.
+    runs : bool, default False
+        The leading axis counts runs; the share is that of all their samples.
 
     Returns
     -------
-    float
+    float, or ndarray of shape (n_loudspeakers,)
         Between 0 and 1.
 
     Raises
     ------
-    ValueError, TypeError
-        Where the limit is not above 0, or a signal or a setting is not as described.
+    ValueError
+        If the limit is not above 0.
 
     Examples
     --------
     >>> clipped_fraction([0.5, 2.0, -2.0, 1.0], 1.0, steady=1.0)
     0.5
     """
-    y = steady_part(as_runs(control_signal, "control_signal"), steady)
-    beyond = np.abs(y) > as_positive(limit, "limit")
-    return float(np.mean(np.where(np.isnan(y), np.nan, beyond)))
+    y = _steady_part(_as_runs(control_signal, "control_signal", runs), steady)
+    beyond = np.abs(y) > _as_limits(limit, "limit", y)[..., None]
+    return _figure(np.mean(np.where(np.isnan(y), np.nan, beyond), axis=(0, -1)))
 
 
-def peak_control_signal(control_signal: Any, *, steady: float = 0.5) -> float:
-    """Largest magnitude of the control signal in the steady portion.
+def peak_control_signal(control_signal: Any, *, steady: float = 0.5, runs: bool = False) -> Any:
+    """Return the largest magnitude of the control signal in the steady portion.
 
     Parameters
     ----------
-    control_signal : array_like, shape (n_samples,) or (n_runs, n_samples)
+    control_signal : array_like, shape (n_samples,) or (n_loudspeakers, n_samples)
         Control signal y.
     steady : float, default 0.5
-        Portion of the run, from its end; 1.0 takes the start with its overshoot in.
+        Portion of the run, from its end; 1.0 includes the start and its overshoot.
+    runs : bool, default False
+        The leading axis counts runs; the highest peak counts.
 
     Returns
     -------
-    float
+    float, or ndarray of shape (n_loudspeakers,)
         Peak, in the signal's unit.
-
-    Raises
-    ------
-    ValueError, TypeError
-        Where a signal or a setting is not as described.
 
     Examples
     --------
     >>> peak_control_signal([9.0, 0.0, 1.0, -3.0])
     3.0
     """
-    return float(np.max(np.abs(steady_part(as_runs(control_signal, "control_signal"), steady))))
+    y = _steady_part(_as_runs(control_signal, "control_signal", runs), steady)
+    return _figure(np.max(np.abs(y), axis=(0, -1)))
 
 
 def convergence_time_s(
@@ -240,20 +298,22 @@ def convergence_time_s(
     window_s: float = 0.005,
     tolerance_db: float = 3.0,
     steady: float = 0.5,
+    runs: bool = False,
 ) -> float:
-    """First time from which the NSE stays within 3 dB of its steady value.
+    """Return the first time from which the NSE stays within 3 dB of its steady value.
 
-    The steady value is the NSE of the whole steady portion; the NSE has to stay within the tolerance, above
-    and below, to the end of the run. The NSE over 5 ms of a random signal never settles so closely: a band of
-    width B leaves about 2 B window_s independent values in a window, whose ratio wanders by several dB where
-    the residual is unlike the disturbance. For noise from 200 to 2000 Hz, 0.05 s settle for one run and 0.02
-    s for eight runs together. Compare only figures of one window: a window delays the figure, by up to its
-    own length.
+    The steady value is the NSE of the whole steady portion. From the time returned to the end of the run, the NSE stays
+    within the tolerance, above and below.
+
+    The NSE of a random signal over 5 ms never settles that closely. A band of width B leaves about 2 B window_s
+    independent values in a window, and their ratio wanders by several dB if the residual is unlike the disturbance. For
+    noise from 200 to 2000 Hz, one run settles with a window of 0.05 s, eight runs together with 0.02 s. Compare only
+    figures with the same window: a window delays the figure by up to its own length.
 
     Parameters
     ----------
-    error, disturbance : array_like, shape (n_samples,) or (n_runs, n_samples)
-        Residual error and disturbance; squares are summed over runs.
+    error, disturbance : array_like, shape (n_samples,) or (n_microphones, n_samples)
+        Residual error and disturbance; squares are summed over the microphones.
     fs : float
         Sampling frequency in Hz.
     window_s : float, default 0.005
@@ -262,16 +322,18 @@ def convergence_time_s(
         Allowed distance from the steady value in dB.
     steady : float, default 0.5
         Portion of the run, from its end, that gives the steady value.
+    runs : bool, default False
+        The leading axis counts runs; squares are summed over them too.
 
     Returns
     -------
     float
-        Time in seconds, 0.0 where the NSE is never outside; NaN where it does not settle before the end.
+        Time in seconds: 0.0 if the NSE is never outside, NaN if it does not settle before the end.
 
     Raises
     ------
-    ValueError, TypeError
-        Where the window is shorter than a sample, or a signal or a setting is not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     See Also
     --------
@@ -284,10 +346,10 @@ def convergence_time_s(
     >>> convergence_time_s(e, np.ones(1000), fs=1000, window_s=0.001)
     0.25
     """
-    curve = nse_db(error, disturbance, fs, window_s)
-    steady_value = -noise_reduction_db(error, disturbance, steady=steady)
+    curve = nse_db(error, disturbance, fs, window_s, runs=runs)
+    steady_value = -noise_reduction_db(error, disturbance, steady=steady, runs=runs)
     tolerance = as_positive(tolerance_db, "tolerance_db", unit="dB")
-    # -inf less -inf, a perfect residual, is on its steady value although the difference is NaN.
+    # A perfect residual is at its steady value, but -inf less -inf is NaN.
     with np.errstate(invalid="ignore"):
         settled = (np.abs(curve - steady_value) <= tolerance) | (curve == steady_value)
     if not settled[-1]:
@@ -297,23 +359,312 @@ def convergence_time_s(
     return float(first_settled / fs)
 
 
-def _sum_over_runs(runs: np.ndarray) -> np.ndarray:
-    return np.sum(runs**2, axis=0)
+def harmonics_db(
+    error: Any, disturbance: Any, fundamental_hz: float, fs: float, *, steady: float = 0.5, runs: bool = False
+) -> float:
+    """Return the error's power at 2 to 10 times the fundamental over the disturbance's power at the fundamental.
+
+    A line's power is the sum over the main lobe (4 bins to each side) of a Blackman-Harris-windowed Fourier transform
+    of the steady portion, so it is also right between bins. Leakage from the error's fundamental into its harmonics
+    stays below -100 dB of that fundamental, which is the floor of this figure. Broadband noise within the lobes
+    counts as well. Harmonics that do not fit below fs/2 are left out.
+
+    Parameters
+    ----------
+    error, disturbance : array_like, shape (n_samples,) or (n_microphones, n_samples)
+        Residual error and tonal disturbance; powers are summed over the microphones.
+    fundamental_hz : float
+        Frequency of the tone in Hz; twice it must lie below fs/2.
+    fs : float
+        Sampling frequency in Hz.
+    steady : float, default 0.5
+        Portion of the run, from its end; at least 16 periods of the tone.
+    runs : bool, default False
+        The leading axis counts runs; powers are averaged over them.
+
+    Returns
+    -------
+    float
+        Level in dB.
+
+    Raises
+    ------
+    ValueError
+        If the steady portion is shorter than 16 periods, or the second harmonic does not fit below fs/2.
+
+    References
+    ----------
+    F. J. Harris, "On the use of windows for harmonic analysis with the discrete Fourier transform", Proc.
+    IEEE 66(1), 51-83, 1978.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> angle = 2 * np.pi * 400 / 16000 * np.arange(16000)
+    >>> level = harmonics_db(np.sin(angle) + 0.01 * np.sin(3 * angle), np.sin(angle), 400.0, fs=16000)
+    >>> round(level, 6)
+    -40.0
+    """
+    e, d = _as_pair(error, "error", disturbance, "disturbance", runs)
+    e, d = _steady_part(e, steady), _steady_part(d, steady)
+    n_samples, rate = e.shape[-1], as_positive(fs, "fs", unit="Hz")
+    bins_per_harmonic = as_positive(fundamental_hz, "fundamental_hz", unit="Hz") * n_samples / rate
+    if bins_per_harmonic < 16:
+        raise ValueError(
+            f"error and disturbance must hold at least 16 periods of fundamental_hz = {fundamental_hz:g} Hz "
+            f"in the steady portion, got {bins_per_harmonic:g}; make the run longer"
+        )
+    centres = np.round(np.arange(2, 11) * bins_per_harmonic).astype(int)
+    centres = centres[centres + _LOBE_BINS <= (n_samples - 1) // 2]
+    if centres.size == 0:
+        raise ValueError(
+            f"fundamental_hz must leave its second harmonic below fs/2 = {rate / 2:g} Hz, got {fundamental_hz:g} Hz"
+        )
+    harmonics = np.sum(_line_powers(e, centres))
+    fundamental = _line_powers(d, np.array([round(bins_per_harmonic)]))[0]
+    return float(_ratio_db(harmonics, fundamental))
+
+
+class CoherenceAndGain(NamedTuple):
+    """Mean magnitude-squared coherence (0 to 1) and linear gain of the anti-noise over the disturbance.
+
+    Both are floats, or arrays of shape (n_microphones,).
+    """
+
+    coherence: Any
+    gain: Any
+
+
+def coherence_and_gain(
+    disturbance: Any,
+    anti_noise: Any,
+    fs: float,
+    band: tuple[float, float],
+    *,
+    steady: float = 0.5,
+    segment_s: float = 0.064,
+    runs: bool = False,
+) -> CoherenceAndGain:
+    """Return how linear the anti-noise is in the disturbance: mean coherence over a band, and the gain between them.
+
+    The coherence is ``|S_da|² / (S_dd S_aa)``, averaged over the bins in the band. The gain is the least-squares gain
+    of the band, ``Re(sum S_da) / sum S_dd``; for an output-constrained controller that is otherwise perfect it is the
+    constraint factor. Spectra are Welch's, with a Hann window and half overlap. Unrelated signals read about
+    1 / (number of independent segments), not 0.
+
+    Parameters
+    ----------
+    disturbance, anti_noise : array_like, shape (n_samples,) or (n_microphones, n_samples)
+        Disturbance d and anti-noise y' at the error microphones, error = d - y'.
+    fs : float
+        Sampling frequency in Hz.
+    band : (float, float)
+        Lowest and highest frequency in Hz.
+    steady : float, default 0.5
+        Portion of the run, from its end; at least 8 segments.
+    segment_s : float, default 0.064
+        Length of a segment in seconds; its inverse is the resolution in Hz.
+    runs : bool, default False
+        The leading axis counts runs; spectra are averaged over them.
+
+    Returns
+    -------
+    CoherenceAndGain
+        (coherence, gain), one of each per microphone.
+
+    Raises
+    ------
+    ValueError
+        If the steady portion is shorter than 8 segments, or the band holds no frequency bin.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> d = np.random.default_rng(1).standard_normal(32000)
+    >>> coherence, gain = coherence_and_gain(d, 0.5 * d, 16000, (200.0, 2000.0))
+    >>> round(coherence, 9), round(gain, 9)
+    (1.0, 0.5)
+    """
+    from scipy.signal import csd
+
+    d, a = _as_pair(disturbance, "disturbance", anti_noise, "anti_noise", runs)
+    d, a = _steady_part(d, steady), _steady_part(a, steady)
+    segment = as_sample_count(segment_s, fs, "segment_s")
+    if d.shape[-1] < 8 * segment:
+        raise ValueError(
+            f"disturbance and anti_noise must hold at least 8 segments of {segment} samples in the "
+            f"steady portion, got {d.shape[-1]} samples; make the run longer or segment_s shorter"
+        )
+    low, high = as_band(band, fs)
+    frequencies = np.fft.rfftfreq(segment, 1 / fs)
+    inside = (frequencies >= low) & (frequencies <= high)
+    if not np.any(inside):
+        raise ValueError(
+            f"band {low:g} to {high:g} Hz holds no frequency bin, {fs / segment:g} Hz apart; raise segment_s"
+        )
+
+    def cross(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return csd(x, y, fs, nperseg=segment, detrend=False)[1].mean(axis=0)[..., inside]
+
+    s_dd, s_aa, s_da = cross(d, d).real, cross(a, a).real, cross(d, a)
+    coherence = np.mean(_ratio(np.abs(s_da) ** 2, s_dd * s_aa), axis=-1)
+    return CoherenceAndGain(_figure(coherence), _figure(_ratio(np.sum(s_da.real, axis=-1), np.sum(s_dd, axis=-1))))
+
+
+def power_spectrum_db(
+    signal: Any,
+    fs: float,
+    *,
+    steady: float = 0.5,
+    segment_s: float = 0.128,
+    scaling: str = "density",
+    runs: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the power spectrum by Welch's method, with a Hann window and half overlap.
+
+    Parameters
+    ----------
+    signal : array_like, shape (n_samples,) or (n_channels, n_samples)
+        Signal.
+    fs : float
+        Sampling frequency in Hz.
+    steady : float, default 0.5
+        Portion of the run, from its end.
+    segment_s : float, default 0.128
+        Length of a segment in seconds, cut to the portion if that is shorter; its inverse is the resolution in Hz.
+    scaling : {"density", "spectrum"}, default "density"
+        "density": dB of power per Hz, for noise. "spectrum": dB of power, in which a tone that lies on a bin
+        reads its own power.
+    runs : bool, default False
+        The leading axis counts runs; powers are averaged over them.
+
+    Returns
+    -------
+    frequencies : ndarray, shape (n_bins,)
+        Frequencies in Hz, from 0 to fs/2.
+    level : ndarray, shape (n_bins,) or (n_channels, n_bins)
+        Level in dB.
+
+    Raises
+    ------
+    ValueError
+        If `scaling` is unknown.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> x = np.sqrt(2) * np.sin(2 * np.pi * 1000 / 16000 * np.arange(16000))
+    >>> f, level = power_spectrum_db(x, 16000, segment_s=0.1, scaling="spectrum")
+    >>> float(f[np.argmax(level)]), abs(round(float(np.max(level)), 6))
+    (1000.0, 0.0)
+    """
+    from scipy.signal import welch
+
+    part = _steady_part(_as_runs(signal, "signal", runs), steady)
+    segment = min(as_sample_count(segment_s, fs, "segment_s"), part.shape[-1])
+    kind = as_choice(scaling, "scaling", ("density", "spectrum"))
+    frequencies, power = welch(part, fs, nperseg=segment, detrend=False, scaling=kind)
+    return frequencies, _ratio_db(power.mean(axis=0), 1.0)
+
+
+def _as_runs(value: Any, name: str, runs: bool) -> np.ndarray:
+    """Return `value` as float64, (n_runs, n_samples) or (n_runs, n_channels, n_samples).
+
+    NaN is let through, because diverged runs end in it.
+    """
+    array = as_real_array(value, name)
+    if array.ndim - bool(runs) not in (1, 2):
+        expected = (
+            "with runs=True (n_runs, n_samples) or (n_runs, n_channels, n_samples)"
+            if runs
+            else "(n_samples,) or (n_channels, n_samples)"
+        )
+        hint = "" if runs or array.ndim < 3 else "; pass runs=True if the leading axis counts runs"
+        raise ValueError(f"{name} must be {expected}, got shape {array.shape}{hint}")
+    if array.size == 0:
+        raise ValueError(f"{name} must have at least one sample, got shape {array.shape}")
+    if array.ndim - bool(runs) == 2:
+        require_channels_lead(array, name)
+    if np.any(np.isinf(array)):
+        raise ValueError(f"{name} must hold finite numbers, or NaN after a divergence, but holds Inf")
+    return array if runs else array[None]
+
+
+def _as_pair(first: Any, first_name: str, second: Any, second_name: str, runs: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return two signals of the same runs as `_as_runs` does, checked to have one shape."""
+    one, two = _as_runs(first, first_name, runs), _as_runs(second, second_name, runs)
+    if one.shape != two.shape:
+        shapes = f"{np.shape(first)} and {np.shape(second)}"
+        raise ValueError(f"{first_name} and {second_name} must have one shape, got {shapes}")
+    return one, two
+
+
+def _as_limits(value: Any, name: str, signal: np.ndarray) -> np.ndarray:
+    """Return a positive limit, shape (), or one per channel of `signal`, shape (n_channels,)."""
+    if np.ndim(value) == 0:
+        return np.asarray(as_positive(value, name))
+    if signal.ndim < 3:
+        raise ValueError(f"{name} must be a single number for a signal without a channel axis, got {value!r}")
+    return np.array([as_positive(limit, name) for limit in as_signal(value, name, length=signal.shape[1])])
+
+
+def _steady_part(signal: np.ndarray, steady: float) -> np.ndarray:
+    """Return the last `steady` portion of each channel, at least one sample."""
+    portion = as_number(steady, "steady")
+    if not 0 < portion <= 1:
+        raise ValueError(f"steady must be a portion above 0 and at most 1, got {portion:g}")
+    n_samples = signal.shape[-1]
+    return signal[..., min(int(n_samples * (1 - portion)), n_samples - 1) :]
+
+
+def _figure(value: Any) -> Any:
+    """Return a figure as a float, or as an array if there is one per channel."""
+    return float(value) if np.ndim(value) == 0 else value
+
+
+def _energy(signal: np.ndarray) -> np.ndarray:
+    """Return the squares, summed over all axes but the samples."""
+    return np.sum(signal**2, axis=tuple(range(signal.ndim - 1)))
+
+
+def _ratio(numerator: Any, denominator: Any) -> np.ndarray:
+    """Return the quotient, NaN where the denominator is zero, without warnings."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(np.asarray(denominator) == 0, np.nan, np.divide(numerator, denominator))
+
+
+def _ratio_db(numerator: Any, denominator: Any) -> np.ndarray:
+    """Return a ratio of powers in dB, NaN where the denominator is zero, without warnings."""
+    with np.errstate(divide="ignore"):
+        return 10 * np.log10(_ratio(numerator, denominator))
 
 
 def _sliding_sum(values: np.ndarray, width: int) -> np.ndarray:
-    """Sum of the last `width` values at each sample, fewer at the start.
+    """Return the sum of the last `width` values at each sample of the last axis, of fewer at the start.
 
-    Each window is the end of one block plus the start of the next: no subtraction of running sums, which
-    would lose a small residual after a large transient, and would carry NaN on for good.
+    Each window is the end of one block plus the start of the next. Subtracting running sums instead would lose a small
+    residual after a large transient, and would carry NaN on for good.
     """
-    n = values.size
+    *channels, n = values.shape
     width = min(width, n)
-    padded = np.zeros(-(-(n + width - 1) // width) * width)
-    padded[width - 1 : width - 1 + n] = values
-    blocks = padded.reshape(-1, width)
-    from_block_start = np.cumsum(blocks, axis=1).ravel()
-    to_block_end = np.cumsum(blocks[:, ::-1], axis=1)[:, ::-1].ravel()
-    first = np.arange(n)
-    # A window that is a whole block is in the first sum already.
-    return from_block_start[first + width - 1] + np.where(first % width == 0, 0.0, to_block_end[first])
+    n_blocks = -(-(n + width - 1) // width)
+    blocks = np.zeros((*channels, n_blocks * width))
+    blocks[..., width - 1 : width - 1 + n] = values
+    blocks = blocks.reshape(*channels, n_blocks, width)
+    from_block_start = np.cumsum(blocks, axis=-1).reshape(*channels, -1)
+    to_block_end = np.cumsum(blocks[..., ::-1], axis=-1)[..., ::-1].reshape(*channels, -1)
+    # A window that is a whole block is already in the first sum.
+    whole_block = np.arange(n) % width == 0
+    return from_block_start[..., width - 1 : width - 1 + n] + np.where(whole_block, 0.0, to_block_end[..., :n])
+
+
+def _line_powers(signal: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Return the power of the spectral lines around the Fourier bins `centres`, mean over runs and channels."""
+    from scipy.signal.windows import blackmanharris
+
+    n_samples = signal.shape[-1]
+    window = blackmanharris(n_samples, sym=False)
+    spectrum = np.mean(np.abs(np.fft.rfft(signal * window)) ** 2, axis=tuple(range(signal.ndim - 1)))
+    lobes = centres[:, None] + np.arange(-_LOBE_BINS, _LOBE_BINS + 1)
+    # Parseval: the positive-frequency lobe of a line holds half its energy.
+    return 2 * np.sum(spectrum[lobes], axis=1) / (n_samples * np.sum(window**2))

@@ -19,6 +19,7 @@ from kfopc_filterpy.metrics import (
     overshoot,
     peak_control_signal,
     power_spectrum_db,
+    short_time_power,
 )
 
 FS = 16000
@@ -57,10 +58,11 @@ def test_nse_keeps_a_small_residual_after_a_huge_transient():
     np.testing.assert_allclose(nse_db(e, np.ones(1000), FS)[580:], -120.0, rtol=0, atol=1e-9)
 
 
-def test_nse_of_several_runs_sums_over_runs():
+@pytest.mark.parametrize("runs", [False, True])
+def test_nse_sums_over_microphones_and_over_runs(runs):
     e, d = noise((3, 200), 1), noise((3, 200), 2)
     pooled_e, pooled_d = np.sqrt(np.sum(e**2, axis=0)), np.sqrt(np.sum(d**2, axis=0))
-    np.testing.assert_allclose(nse_db(e, d, FS), nse_db(pooled_e, pooled_d, FS), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(nse_db(e, d, FS, runs=runs), nse_db(pooled_e, pooled_d, FS), rtol=0, atol=1e-10)
 
 
 def test_nse_is_nan_exactly_where_its_window_sees_nan_or_silence():
@@ -107,7 +109,7 @@ def test_output_power_is_the_mean_square_of_the_steady_portion():
     assert output_power(y) == pytest.approx(math.fsum(y[500:] ** 2) / 500, rel=1e-13)
     assert output_power(y, steady=0.25) == pytest.approx(math.fsum(y[750:] ** 2) / 250, rel=1e-13)
     runs = np.array([y, 2 * y])
-    assert output_power(runs) == pytest.approx(2.5 * output_power(y), rel=1e-13)
+    assert output_power(runs, runs=True) == pytest.approx(2.5 * output_power(y), rel=1e-13)
 
 
 def test_a_single_sample_is_its_own_steady_portion():
@@ -119,7 +121,7 @@ def test_overshoot_is_the_highest_full_window():
     y = np.concatenate([sine(400, 1600, 2.0), sine(400, 14400, 1.0)])
     # Whole periods fill the window, so its power is 2.0 at the start, 0.5 after.
     assert overshoot(y, 0.5, FS) == pytest.approx(4.0, rel=1e-12)
-    assert overshoot(np.array([y, 3 * y]), 0.5, FS) == pytest.approx(36.0, rel=1e-12)
+    assert overshoot(np.array([y, 3 * y]), 0.5, FS, runs=True) == pytest.approx(36.0, rel=1e-12)
     # One sample of a burst at the very start must not count as a window of its own.
     burst = np.concatenate([[10.0], np.zeros(1599)])
     assert overshoot(burst, 1.0, FS, window_s=0.05) == pytest.approx(100 / 800, rel=1e-12)
@@ -184,7 +186,7 @@ def test_harmonics_average_power_over_runs():
     d = sine(400, 16000)
     e = np.array([sine(800, 16000, 0.1), sine(800, 16000, 0.3)])
     expected = 10 * math.log10((0.1**2 + 0.3**2) / 2)
-    assert harmonics_db(e, np.array([d, d]), 400.0, FS) == pytest.approx(expected, abs=1e-6)
+    assert harmonics_db(e, np.array([d, d]), 400.0, FS, runs=True) == pytest.approx(expected, abs=1e-6)
 
 
 # ---- convergence time
@@ -225,7 +227,7 @@ def test_convergence_of_noise_needs_runs_or_a_window():
     # exp(-2 t / tau) + 0.01 is 3 dB above 0.01.
     true_time = -tau / 2 * math.log(0.01 * (10**0.3 - 1))
     # A window delays by at most its length; eight runs leave a spread of about 0.02 s.
-    measured = convergence_time_s(e, d, FS, window_s=0.02)
+    measured = convergence_time_s(e, d, FS, window_s=0.02, runs=True)
     assert true_time - 0.02 < measured < true_time + 0.04
     measured = convergence_time_s(e[0], d[0], FS, window_s=0.1)
     assert true_time - 0.05 < measured < true_time + 0.15
@@ -254,7 +256,7 @@ def test_coherence_gain_is_that_of_the_band_only():
 
 def test_coherence_of_unrelated_signals_is_near_zero():
     d, a = noise((2, 10 * FS), 1), noise((2, 10 * FS), 2)
-    coherence, gain = coherence_and_gain(d, a, FS, (200.0, 2000.0))
+    coherence, gain = coherence_and_gain(d, a, FS, (200.0, 2000.0), runs=True)
     assert coherence < 0.01
     assert abs(gain) < 0.02
 
@@ -272,6 +274,128 @@ def test_spectrum_of_silence_and_of_short_signals():
     assert np.all(power_spectrum_db(np.zeros(4000), FS)[1] == -np.inf)
     f, level = power_spectrum_db(noise(60), FS)
     assert f.shape == level.shape == (16,)
+
+
+# ---- short-time power
+
+
+@pytest.mark.parametrize("window", [1, 7, 80, 500])
+def test_short_time_power_is_the_direct_mean_of_the_samples_there_are(window):
+    x = noise(101)
+    expected = [np.mean(x[max(0, n - window + 1) : n + 1] ** 2) for n in range(101)]
+    np.testing.assert_allclose(short_time_power(x, FS, window / FS), expected, rtol=1e-12)
+
+
+def test_short_time_power_ends_at_the_output_power_and_its_peak_is_the_overshoot():
+    y = noise(1000)
+    assert short_time_power(y, FS, 500 / FS)[-1] == pytest.approx(output_power(y), rel=1e-12)
+    assert short_time_power(y, FS, 0.005)[79:].max() / 0.5 == overshoot(y, 0.5, FS, window_s=0.005)
+
+
+# ---- channels and runs
+
+K, R, N = 3, 4, 4000
+OF_A_SIGNAL = {
+    "output_power": output_power,
+    "short_time_power": lambda y, **runs: short_time_power(y, FS, 0.01, **runs),
+    "overshoot": lambda y, **runs: overshoot(y, 0.5, FS, **runs),
+    "clipped_fraction": lambda y, **runs: clipped_fraction(y, 1.0, **runs),
+    "peak_control_signal": peak_control_signal,
+    "power_spectrum_db": lambda y, **runs: power_spectrum_db(y, FS, segment_s=0.01, **runs)[1],
+}
+OF_A_PAIR = {
+    "nse_db": lambda e, d, **runs: nse_db(e, d, FS, **runs),
+    "noise_reduction_db": noise_reduction_db,
+    "convergence_time_s": lambda e, d, **runs: convergence_time_s(e, d, FS, window_s=0.01, tolerance_db=9.0, **runs),
+    "harmonics_db": lambda e, d, **runs: harmonics_db(e, d, 400.0, FS, **runs),
+}
+
+
+def coherence_of(d, a, **runs):
+    return coherence_and_gain(d, a, FS, (200.0, 2000.0), segment_s=0.01, **runs)
+
+
+@pytest.mark.parametrize("name", OF_A_SIGNAL)
+def test_a_figure_of_several_channels_is_that_of_each(name):
+    figure, y = OF_A_SIGNAL[name], noise((K, N))
+    found = figure(y)
+    np.testing.assert_allclose(found, [figure(channel) for channel in y], rtol=1e-12)
+    np.testing.assert_allclose(figure(y[:1]), found[:1], rtol=1e-12)  # one channel may keep its axis
+
+
+@pytest.mark.parametrize("name", OF_A_SIGNAL)
+def test_pooling_several_channels_over_runs_is_pooling_each(name):
+    figure, y = OF_A_SIGNAL[name], noise((R, K, N)) * np.arange(1, R + 1)[:, None, None]
+    pooled = figure(y, runs=True)
+    np.testing.assert_allclose(pooled, [figure(y[:, k], runs=True) for k in range(K)], rtol=1e-12)
+    largest = name in ("overshoot", "peak_control_signal")
+    each = np.array([figure(run) for run in y])
+    if name == "power_spectrum_db":
+        each, pooled = 10 ** (each / 10), 10 ** (pooled / 10)
+    np.testing.assert_allclose(pooled, each.max(axis=0) if largest else each.mean(axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", OF_A_PAIR)
+def test_a_figure_of_the_sound_field_takes_all_microphones_and_runs_together(name):
+    figure = OF_A_PAIR[name]
+    d = np.tile(sine(400, N), (R, K, 1)) + 0.1 * noise((R, K, N), 1)
+    e = d * np.linspace(0.1, 0.3, R * K).reshape(R, K, 1)
+    # All of these see the same energies: microphones of several runs, or as many runs or microphones in a row.
+    in_a_row = figure(e.reshape(-1, N), d.reshape(-1, N))
+    np.testing.assert_allclose(figure(e, d, runs=True), in_a_row, rtol=1e-10)
+    np.testing.assert_allclose(figure(e.reshape(-1, N), d.reshape(-1, N), runs=True), in_a_row, rtol=1e-10)
+    one = figure(e[0, 0], d[0, 0])
+    np.testing.assert_allclose(figure(e[0, :1], d[0, :1]), one, rtol=1e-12)
+    assert np.shape(in_a_row) == np.shape(one)
+
+
+def test_noise_reduction_of_microphones_weighs_them_by_their_energy():
+    d = np.array([noise(N, 1), 10 * noise(N, 2)])
+    e = d * [[1.0], [0.1]]
+    expected = 10 * math.log10(np.sum(d[:, N // 2 :] ** 2) / np.sum(e[:, N // 2 :] ** 2))
+    assert noise_reduction_db(e, d) == pytest.approx(expected, abs=1e-10)
+
+
+def test_coherence_and_gain_are_of_each_microphone():
+    d, other = noise((R, K, N), 1), noise((R, K, N), 2)
+    a = 0.5 * d + np.array([0.0, 0.1, 1.0])[:, None] * other
+    found, pooled = coherence_of(d[0], a[0]), coherence_of(d, a, runs=True)
+    for k in range(K):
+        assert (found.coherence[k], found.gain[k]) == pytest.approx(coherence_of(d[0, k], a[0, k]), rel=1e-12)
+        assert (pooled.coherence[k], pooled.gain[k]) == pytest.approx(
+            coherence_of(d[:, k], a[:, k], runs=True), rel=1e-12
+        )
+
+
+def test_loudspeakers_may_have_limits_of_their_own():
+    y = noise((K, N))
+    rated, limits = [0.5, 1.0, 2.0], [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(overshoot(y, rated, FS), [overshoot(y[k], rated[k], FS) for k in range(K)])
+    np.testing.assert_array_equal(clipped_fraction(y, limits), [clipped_fraction(y[k], limits[k]) for k in range(K)])
+    with pytest.raises(ValueError, match="rated_power must have 3 values, got 2"):
+        overshoot(y, [1.0, 2.0], FS)
+    with pytest.raises(ValueError, match="limit must be a single number"):
+        clipped_fraction(y[0], [1.0, 2.0])
+    with pytest.raises(ValueError, match="limit must be greater than 0"):
+        clipped_fraction(y, [1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "figure",
+    [*OF_A_SIGNAL.values(), *(lambda x, f=f, **runs: f(x, x, **runs) for f in (*OF_A_PAIR.values(), coherence_of))],
+)
+def test_runs_are_never_guessed_from_an_axis(figure):
+    with pytest.raises(ValueError, match=r"got shape \(2, 3, 8\); pass runs=True if the leading axis counts runs"):
+        figure(np.ones((2, 3, 8)))
+    with pytest.raises(ValueError, match=r"with runs=True \(n_runs, n_samples\) or .*, got shape \(8,\)"):
+        figure(np.ones(8), runs=True)
+    with pytest.raises(ValueError, match=r"got shape \(2, 2, 3, 8\)$"):
+        figure(np.ones((2, 2, 3, 8)), runs=True)
+    for shape, runs in (((8, 3), False), ((2, 8, 3), True)):
+        with pytest.raises(ValueError, match=r"must have its channels first.*got 8 channels of 3 sample.*transpose it"):
+            figure(np.ones(shape), runs=runs)
+    with pytest.raises(TypeError, match="got list, whose rows differ in length"):
+        figure([[1.0], [1.0, 2.0]])
 
 
 # ---- divergence, silence, refusals
@@ -315,8 +439,8 @@ def test_silent_disturbance_gives_nan_without_a_warning():
         (lambda: nse_db([1.0], [1.0], FS, 1e-6), ValueError, r"window_s must be at least one sample"),
         (lambda: nse_db([1.0], [1.0], 0.0), ValueError, r"fs must be greater than 0"),
         (lambda: nse_db([np.inf], [1.0], FS), ValueError, r"error must hold finite numbers"),
-        (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be an array of real numbers, got list"),
-        (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be an array of real numbers, got complex"),
+        (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got list"),
+        (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got complex"),
         (lambda: nse_db(np.ones((1, 1, 1)), [1.0], FS), ValueError, r"error must be \(n_samples,\) or"),
         (
             lambda: noise_reduction_db([1.0], [1.0], steady=0.0),

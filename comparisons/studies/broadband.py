@@ -183,7 +183,7 @@ def _verdicts(results: Results, algorithms: dict[str, dict[str, Any]], coherence
 
 def _time_below(results: Sequence[SimulationResult], level_db: float) -> float:
     """Time from which the NSE, pooled over seeds, stays below a level."""
-    curve = nse_db([r.error for r in results], [r.disturbance for r in results], FS)
+    curve = nse_db([r.error for r in results], [r.disturbance for r in results], FS, runs=True)
     above = np.flatnonzero(curve > level_db)
     return (above[-1] + 1) / FS if above.size else 0.0
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy.bench.report import FigureItem
-from kfopc_filterpy.plot.runs import _short_time_power
+from kfopc_filterpy.metrics import short_time_power
 from kfopc_filterpy.plot.style import MARK, decibels, legend_above, line_style
 
 from .constraint_cases import FS
@@ -106,7 +106,7 @@ def _by_case(
 
 def _mean_power(signal: np.ndarray, window_s: float) -> np.ndarray:
     """Mean square over the window that ends at each sample."""
-    return _short_time_power(np.asarray(signal)[None], round(window_s * FS))
+    return short_time_power(signal, FS, window_s)
 
 
 def _course(course: Course) -> FigureItem:

@@ -109,7 +109,7 @@ def convergence_times(
     times: dict[str, float | None] = {}
     for name in ("KF-ANC", "KF-PB"):
         errors, disturbances = (np.array([one[name][i] for one in kept]) for i in (0, 1))
-        times[name] = convergence_time_s(errors, disturbances, FS, window_s=0.05)
+        times[name] = convergence_time_s(errors, disturbances, FS, window_s=0.05, runs=True)
     return times
 
 

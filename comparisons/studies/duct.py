@@ -52,9 +52,9 @@ def main(runs: Runs) -> StudyReport:
     noise = compressor_noise(DURATION_S, fs=FS, rng=SEED)
     parameters = {
         "noise": Parameter("compressor-like: shaft harmonics that fluctuate, and broadband noise", "seeded stand-in"),
-        "primary_path": Parameter(f"modelled duct, {duct.length_m:g} m", "defaults of duct_paths"),
+        "primary_path": Parameter(f"modelled duct, {duct.model.length_m:g} m", "defaults of duct_paths"),
         "secondary_path": Parameter(
-            f"modelled duct, loudspeaker at {duct.loudspeaker_m:g} m", "defaults of duct_paths"
+            f"modelled duct, loudspeaker at {duct.model.loudspeaker_m:g} m", "defaults of duct_paths"
         ),
     }
     summary = (

@@ -12,9 +12,8 @@ from kfopc_filterpy import SimulationResult, convergence_time_s, noise_reduction
 from kfopc_filterpy.bench.registry import REGISTRY
 from kfopc_filterpy.bench.scene import Runs, Scene
 from kfopc_filterpy.bench.tuning import Tuned, run_setting, went_through
-from kfopc_filterpy.metrics import overshoot
-from kfopc_filterpy.paths import duct_paths, path_taps
-from kfopc_filterpy.plot.runs import _short_time_power
+from kfopc_filterpy.metrics import overshoot, short_time_power
+from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 
 from .cases import FS, SEED, SWITCH_ON_S, WORST_WINDOW_S, grids, make_case, noise_of, tune_all
 from .constraint_cases import with_jump
@@ -99,7 +98,7 @@ def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndar
 
 
 def _longer_duct() -> np.ndarray:
-    return path_taps(duct_paths(fs=FS, length_m=OTHER_LENGTH_M).primary)
+    return path_taps(duct_paths(Duct(length_m=OTHER_LENGTH_M), fs=FS).primary)
 
 
 @dataclass(frozen=True)
@@ -150,27 +149,27 @@ def run_event(
         algorithm,
         best.setting,
         best.within_budget,
-        float(np.nanmean(nse_db(e, d, FS, event.nse_window_s))),
-        noise_reduction_db(e, d, steady=1.0),
-        noise_reduction_db(e, d),
-        output_power(y) / rated,
-        overshoot(y, rated, FS, window_s=WORST_WINDOW_S),
+        float(np.nanmean(nse_db(e, d, FS, event.nse_window_s, runs=True))),
+        noise_reduction_db(e, d, steady=1.0, runs=True),
+        noise_reduction_db(e, d, runs=True),
+        output_power(y, runs=True) / rated,
+        overshoot(y, rated, FS, window_s=WORST_WINDOW_S, runs=True),
         {name: _settled(e[:, part], d[:, part], event.nse_window_s) for name, part in parts.items()},
-        {name: overshoot(y[:, part], rated, FS, window_s=WORST_WINDOW_S) for name, part in parts.items()},
+        {name: overshoot(y[:, part], rated, FS, window_s=WORST_WINDOW_S, runs=True) for name, part in parts.items()},
         min(at) if at else None,
     )
     return row, _course(e, d, y, rated, event), kept[0]
 
 
 def _settled(e: np.ndarray, d: np.ndarray, window_s: float) -> float | None:
-    time = convergence_time_s(e, d, FS, window_s=window_s)
+    time = convergence_time_s(e, d, FS, window_s=window_s, runs=True)
     return None if np.isnan(time) else time
 
 
 def _course(e: np.ndarray, d: np.ndarray, y: np.ndarray, rated_power: float, event: Event) -> Course:
     every = max(1, round(FS / POINTS_A_SECOND * min(1.0, e.shape[1] / FS)))
-    nse = nse_db(e, d, FS, event.shown_window_s)
-    power = _short_time_power(y, round(min(WORST_WINDOW_S, 0.1 * e.shape[1] / FS) * FS)) / rated_power
+    nse = nse_db(e, d, FS, event.shown_window_s, runs=True)
+    power = short_time_power(y, FS, min(WORST_WINDOW_S, 0.1 * e.shape[1] / FS), runs=True) / rated_power
     points = np.arange(every - 1, nse.size, every)
     return Course((points + 1) / FS, nse[points], power[points])
 

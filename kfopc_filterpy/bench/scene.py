@@ -195,6 +195,8 @@ def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[
             np.mean([clipped_fraction(r.control_signal, scene.amplitude_limit) for r in results])
         ),
         "harmonics_db": None,
-        "convergence_time_s": convergence_time_s(errors, disturbances, scene.fs, window_s=scene.nse_window_s),
+        "convergence_time_s": convergence_time_s(
+            errors, disturbances, scene.fs, window_s=scene.nse_window_s, runs=True
+        ),
         "diverged_at_s": min(diverged) if diverged else None,
     }

@@ -1,4 +1,4 @@
-"""Limits that no control filter of its length passes: Wiener solutions, free and within a rated power, and what they need."""
+"""Bounds on what a control filter of a given length can do: Wiener filters with and without a rated power."""
 
 import lazy_loader
 

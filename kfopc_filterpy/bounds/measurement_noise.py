@@ -1,4 +1,4 @@
-"""The measurement noise variance q = E[e_o^2] of eq. 7, for those who do not know theirs."""
+"""Estimates of the measurement noise variance q = E[e_o^2] of eq. 7, from recordings."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from .wiener import wiener_solution
 
 
 def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> float:
-    r"""Measurement noise variance from a run without control.
+    r"""Estimate the measurement noise variance from a run without control.
 
-    With the loudspeaker silent the error microphone records the disturbance d. What no control filter of `n_taps`
-    taps explains of it is e_o of eq. 1b: the batch least-squares residual of d on the filtered reference.
+    With the loudspeaker silent, the error microphone records the disturbance d. The part of it that no control filter of
+    `n_taps` taps explains is e_o of eq. 1b: the batch least-squares residual of d on the filtered reference.
 
     Parameters
     ----------
     reference : array_like, shape (n_samples,)
         Reference x of the run.
     disturbance : array_like, shape (n_samples,)
-        Error microphone's signal, the disturbance d; not its start-up transient, which counts as unexplained.
+        Signal of the error microphone, the disturbance d. Leave out its start-up transient, which would count as
+        unexplained.
     secondary_path : array_like or control.TransferFunction
         Estimated secondary path.
     n_taps : int
-        Taps L of the control filter.
+        Number of taps L of the control filter.
 
     Returns
     -------
@@ -36,12 +37,11 @@ def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path:
     Raises
     ------
     ValueError
-        Signals too short for the fit, of different lengths, silent or not finite.
+        If the signals are too short for the fit, of different lengths, silent or not finite.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy.bounds import measurement_noise_from_run
     >>> rng = np.random.default_rng(0)
     >>> x = rng.standard_normal(20000)
     >>> d = 0.5 * x + 0.1 * rng.standard_normal(20000)  # q = 0.01
@@ -64,14 +64,14 @@ def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path:
 
 
 def measurement_noise_from_residual(residual: Any, *, n_fitted: int = 0) -> float:
-    """Measurement noise variance from the residual of a batch fit.
+    """Estimate the measurement noise variance from the residual of a batch fit.
 
     Parameters
     ----------
     residual : array_like, shape (n_samples,)
-        What the fitted control filter leaves of the disturbance.
+        Part of the disturbance that the fitted control filter leaves.
     n_fitted : int, default 0
-        Weights fitted to these very samples, which took that many degrees of freedom.
+        Number of weights fitted to these samples; each takes a degree of freedom.
 
     Returns
     -------
@@ -81,11 +81,10 @@ def measurement_noise_from_residual(residual: Any, *, n_fitted: int = 0) -> floa
     Raises
     ------
     ValueError
-        A residual that is no longer than `n_fitted`, or not finite.
+        If the residual is not longer than `n_fitted`, or not finite.
 
     Examples
     --------
-    >>> from kfopc_filterpy.bounds import measurement_noise_from_residual
     >>> measurement_noise_from_residual([0.5, -0.5, 0.5, -0.5], n_fitted=2)  # 4 squares of 0.25, 2 degrees of freedom
     0.5
     """

@@ -1,7 +1,7 @@
-"""The bound: the least error that a control filter of a length can reach within a power budget.
+"""The bound: the least error that a control filter of a given length can reach within a power budget.
 
-Minimum of E[e^2] subject to E[y^2] <= ρ_o, for recorded signals and known paths: over a whole record by one filter,
-and in each second by a filter of its own. Sign convention and delay lines as in `wiener`.
+This is the minimum of E[e^2] subject to E[y^2] <= ρ_o, for recorded signals and known paths: over a whole record by one
+filter, and in each second by a filter of its own. Sign convention and delay lines are those of `wiener`.
 """
 
 from __future__ import annotations
@@ -11,30 +11,29 @@ from typing import Any
 
 import numpy as np
 
-from .._runs import window_length
-from .._validate import as_count, as_nonnegative, as_positive, as_signal
+from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal
 from ..paths.models import path_taps
 from .wiener import Stretch, WienerSolution, constrained_weights, full_stretch, mean_square, reduction_db, require_sound
 
 
 @dataclass(frozen=True)
 class ControlFilter(WienerSolution):
-    r"""A fixed control filter over a stretch of a record: a `wiener.WienerSolution` that knows how it was made.
+    r"""A fixed control filter over a stretch of a record: a `WienerSolution` with how it was computed.
 
     Its weights solve :math:`(R_{x'} + λ R_x + \mathrm{ridge}\, I)\, w = α r`.
 
     Attributes
     ----------
     weights, control_power, antinoise_power, disturbance_power, error_power, noise_reduction_db
-        As in `wiener.WienerSolution`; the powers are mean squares over the stretch.
+        As in `WienerSolution`; the powers are mean squares over the stretch.
     penalty : float
-        λ; 0 where the budget leaves the filter free.
+        λ; 0 if the budget does not constrain the filter.
     constraint_factor : float
-        α, as KF-OPC's; 1 but for scaled filters.
+        α, as in KF-OPC; 1 for filters that are not scaled.
     start_s, end_s : float
-        Stretch in seconds from the first sample that counts.
+        Start and end of the stretch in seconds from the first sample that counts.
     stretch : Stretch
-        Its samples.
+        Samples of the stretch.
     """
 
     penalty: float
@@ -45,12 +44,12 @@ class ControlFilter(WienerSolution):
 
     @property
     def control_signal(self) -> np.ndarray:
-        """(n_samples,) control signal y = w*x of the stretch."""
+        """Control signal y = w*x of the stretch, shape (n_samples,)."""
         return self.stretch.control_signal(self.weights)
 
     @property
     def error(self) -> np.ndarray:
-        """(n_samples,) error e = d - s*y of the stretch."""
+        """Error e = d - s*y of the stretch, shape (n_samples,)."""
         return self.stretch.d - self.stretch.antinoise(self.weights)
 
 
@@ -68,32 +67,32 @@ class ControlFilters:
 
     @property
     def weights(self) -> np.ndarray:
-        """(n_segments, n_taps) weights."""
+        """Weights of each segment, shape (n_segments, n_taps)."""
         return np.array([segment.weights for segment in self.segments])
 
     @property
     def penalty(self) -> np.ndarray:
-        """(n_segments,) λ of each segment."""
+        """λ of each segment, shape (n_segments,)."""
         return self._each("penalty")
 
     @property
     def control_power(self) -> np.ndarray:
-        """(n_segments,) mean square of y in each segment."""
+        """Mean square of y in each segment, shape (n_segments,)."""
         return self._each("control_power")
 
     @property
     def error_power(self) -> np.ndarray:
-        """(n_segments,) mean square of e in each segment."""
+        """Mean square of e in each segment, shape (n_segments,)."""
         return self._each("error_power")
 
     @property
     def segment_noise_reduction_db(self) -> np.ndarray:
-        """(n_segments,) noise reduction of each segment in dB; NaN without a disturbance."""
+        """Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."""
         return self._each("noise_reduction_db")
 
     @property
     def start_s(self) -> np.ndarray:
-        """(n_segments,) start of each segment in seconds from the first sample that counts."""
+        """Start of each segment in seconds from the first sample that counts, shape (n_segments,)."""
         return self._each("start_s")
 
     @property
@@ -104,12 +103,12 @@ class ControlFilters:
 
     @property
     def control_signal(self) -> np.ndarray:
-        """(n_samples,) control signal, each segment with its own weights."""
+        """Control signal, each segment with its own weights, shape (n_samples,)."""
         return np.concatenate([segment.control_signal for segment in self.segments])
 
     @property
     def error(self) -> np.ndarray:
-        """(n_samples,) error, each segment with its own weights."""
+        """Error, each segment with its own weights, shape (n_samples,)."""
         return np.concatenate([segment.error for segment in self.segments])
 
     def _each(self, name: str) -> np.ndarray:
@@ -118,23 +117,23 @@ class ControlFilters:
 
 @dataclass(frozen=True)
 class PowerConstrainedWiener:
-    """What fixed control filters reach on a record within a power budget.
+    """Least errors that fixed control filters reach on a record within a power budget.
 
-    Signals and times begin with the first sample that counts, as those of a `SimulationResult` with the same
-    `switch_on_s`, so that its figures of merit apply: ``nse_db(bound.per_second.error, bound.disturbance, fs)``.
+    Signals and times begin with the first sample that counts, like those of a `SimulationResult` with the same
+    `switch_on_s`, so the same figures of merit apply: ``nse_db(bound.per_second.error, bound.disturbance, fs)``.
 
     Attributes
     ----------
     whole : ControlFilter
-        The bound over the whole record: one filter, the budget met on average over the record.
+        The bound over the whole record: one filter that meets the budget on average over the record.
     per_second : ControlFilters
-        The bound of each segment: filters of their own, the budget met in each.
+        The bound of each segment: a filter for each, which meets the budget in it.
     unconstrained : ControlFilter
-        One filter without a budget; its `control_power` is what the noise asks for.
+        One filter without a budget; its `control_power` is the power that full control needs.
     scaled : ControlFilter
-        The unconstrained filter times a factor of at most 1 that meets the budget: what KF-OPC steers to.
+        The unconstrained filter times the factor of at most 1 that meets the budget: KF-OPC steers to it.
     scaled_per_second : ControlFilters
-        The same of each segment: its own unconstrained filter, scaled.
+        The same for each segment: its own unconstrained filter, scaled.
     rated_power : float
         Budget ρ_o, mean square of the control signal.
     filtered_power : float
@@ -156,25 +155,25 @@ class PowerConstrainedWiener:
     fs: float
 
     def noise_reduction_over(self, start_s: float = 0.0, end_s: float | None = None) -> dict[str, float]:
-        """Noise reduction of each solution over a part of the record, -10 log10(sum e^2 / sum d^2) in dB.
+        """Return the noise reduction of each solution over a part of the record, -10 log10(sum e^2 / sum d^2) in dB.
 
         The steady half is ``noise_reduction_over(0.5 * bound.whole.end_s)``.
 
         Parameters
         ----------
         start_s, end_s : float
-            Part in seconds from the first sample that counts; to the end by default.
+            Start and end of the part in seconds from the first sample that counts; by default all of it.
 
         Returns
         -------
         dict
             Noise reduction in dB, at most 300, of `whole`, `per_second`, `unconstrained`, `scaled` and
-            `scaled_per_second`; NaN where the disturbance is silent.
+            `scaled_per_second`; NaN if the disturbance is silent.
 
         Raises
         ------
         TypeError, ValueError
-            No sample lies in the part, or it ends after the record.
+            If no sample lies in the part, or it ends after the record.
         """
         n_samples = self.disturbance.size
         start = round(as_nonnegative(start_s, "start_s", unit="s") * self.fs)
@@ -202,28 +201,28 @@ def power_constrained_wiener(
     switch_on_s: float = 0.0,
     ridge: float = 0.0,
 ) -> PowerConstrainedWiener:
-    r"""Least error within a power budget, over a record and in each second of it.
+    r"""Return the least error within a power budget, over a record and in each second of it.
 
     Minimises :math:`E[(d - w^T x')^2]` subject to :math:`E[(w^T x)^2] ≤ ρ_o`. The problem is convex, and its solution
 
     .. math:: (R_{x'} + λ R_x)\, w = r, \qquad λ ≥ 0, \qquad λ\,(E[y^2] - ρ_o) = 0
 
-    a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power; one that adapts
-    may, where the noise changes within it. The bound knows the stretch beforehand: of what the reference does not
-    explain, chance alone lets it remove some ``n_taps / fs`` in a second. That of each second keeps the budget in each,
-    that of the record on average over all; which of the two is the better depends on the noise.
+    is a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power. A filter that
+    adapts may do better if the noise changes within the stretch. The bound is fitted to the stretch it is judged on, so
+    by chance alone it removes about ``n_taps / fs`` per second of what the reference does not explain. The bound of each
+    second meets the budget in each second, that of the record on average; which of them is better depends on the noise.
 
-    Delay lines hold the record's past, at the edge of a segment too, and zeros before its first sample: nothing
-    starts up but the record itself, and the anti-noise at an edge is that of weights which have been there before.
-    Directions in which reference and filtered reference have less than 1e-11 of the energy of the strongest get no
-    weight: float64 correlations tell no more.
+    Delay lines hold the past of the record, also at the edges of segments, and zeros before its first sample. So only
+    the record itself starts up, and the anti-noise at an edge is that of weights that have been there before. Directions
+    in which reference and filtered reference have less than 1e-11 of the energy of the strongest get no weight, because
+    float64 correlations do not resolve them.
 
     Parameters
     ----------
     reference : array_like, shape (n_samples,)
         Reference signal x.
     disturbance : array_like, shape (n_samples,)
-        Disturbance d at the error microphone; its sensor noise included, if the error is to include it.
+        Disturbance d at the error microphone, with its sensor noise if the error is to include it.
     secondary_path : control.TransferFunction or array_like, shape (n_path,)
         Secondary path s with a finite response, at the signals' sampling rate.
     n_taps : int
@@ -233,26 +232,26 @@ def power_constrained_wiener(
     fs : float
         Sampling rate in Hz.
     segment_s : float, default 1.0
-        Length of a segment in seconds, at least ``2 n_taps`` samples. What is left at the end is a segment of its
-        own, or, if it is shorter than half a segment, part of the one before.
+        Length of a segment in seconds, at least ``2 n_taps`` samples. The rest at the end is a segment of its own, or
+        part of the one before if it is shorter than half a segment.
     switch_on_s : float, default 0
         Time in seconds of the first sample that counts, as in `simulate`.
     ridge : float, default 0
-        For `unconstrained` and the scaled filters only: they solve :math:`(R_{x'} + \mathrm{ridge}\, I) w = r`. With
-        ``ridge = q / (N P0)``, N being the samples that count, these are the weights that a Kalman filter without
-        state noise, with measurement noise q and initial variance P0, ends with. `wiener_solution` takes it relative
-        to the filtered reference's power: ``regularization = ridge / filtered_power``.
+        Used for `unconstrained` and the scaled filters only, which solve :math:`(R_{x'} + \mathrm{ridge}\, I) w = r`.
+        With ``ridge = q / (N P0)``, where N is the number of samples that count, a Kalman filter without state noise,
+        with measurement noise q and initial variance P0, ends with these weights. `wiener_solution` takes the ridge
+        relative to the power of the filtered reference: ``regularization = ridge / filtered_power``.
 
     Returns
     -------
     PowerConstrainedWiener
-        Both bounds, and beside them the unconstrained filter and KF-OPC's scaled ones.
+        Both bounds, the unconstrained filter, and the scaled filters of KF-OPC.
 
     Raises
     ------
     TypeError, ValueError
-        Signals of differing lengths, with fewer than `n_taps` samples that count, silent from there on, or not
-        finite; an argument out of range, or `fs` not that of `secondary_path`. A silent segment is no error: it
+        If the signals differ in length, have fewer than `n_taps` samples that count, are silent in them, or are not
+        finite; if an argument is out of range, or `fs` is not that of `secondary_path`. A silent segment is no error: it
         needs no power and gets zero weights.
 
     See Also
@@ -292,11 +291,11 @@ def power_constrained_wiener(
             f"reference must have at least {record.n_taps} samples from switch_on_s on for {record.n_taps} taps, "
             f"got {max(n_samples - first, 0)}; use a longer signal, an earlier switch_on_s or fewer taps"
         )
-    length = window_length(segment_s, fs, "segment_s")
+    length = as_sample_count(segment_s, fs, "segment_s")
     if length < 2 * record.n_taps:
         raise ValueError(
             f"segment_s must be at least {2 * record.n_taps / fs:g} s, twice the {record.n_taps} taps, got "
-            f"{length / fs:g} s: a filter can learn shorter ones by heart; use longer segments or fewer taps"
+            f"{length / fs:g} s: a filter overfits shorter ones; use longer segments or fewer taps"
         )
     counted = require_sound(record.part(first, n_samples))
     edges = list(range(first, n_samples, length))
@@ -324,11 +323,11 @@ def power_constrained_wiener(
 def power_constrained_solution(
     reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, rated_power: float
 ) -> WienerSolution:
-    """Least-squares control filter whose control power does not exceed the rated power.
+    """Return the least-squares control filter whose control power does not exceed the rated power.
 
-    Finds the penalty γ of `wiener_solution` at which the control power is `rated_power`; γ is zero where the filter
-    needs less. No filter of this length has a smaller error within the power. As in `wiener_solution`, the samples
-    count at which the delay lines of control filter and secondary path are full.
+    The penalty γ of `wiener_solution` is chosen so that the control power is `rated_power`, or zero if the filter needs
+    less. No filter of this length has a smaller error within the power. As in `wiener_solution`, only samples at which
+    the delay lines of control filter and secondary path are full count.
 
     Parameters
     ----------
@@ -345,7 +344,7 @@ def power_constrained_solution(
     Raises
     ------
     TypeError, ValueError
-        As `wiener_solution`, or `rated_power` is not positive.
+        As for `wiener_solution`, or if `rated_power` is not positive.
 
     See Also
     --------
@@ -364,7 +363,7 @@ def power_constrained_solution(
 
 
 def _record(reference: Any, disturbance: Any, taps: np.ndarray, n_taps: int) -> Stretch:
-    """The whole record in copies of its own, zeros for its past."""
+    """Return the whole record as copies, with zeros for its past."""
     from scipy.signal import lfilter
 
     x = as_signal(reference, "reference")
@@ -380,7 +379,7 @@ def _record(reference: Any, disturbance: Any, taps: np.ndarray, n_taps: int) -> 
 def _solve(
     stretch: Stretch, rated_power: float, ridge: float, start_s: float, end_s: float
 ) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
-    """The filter within the power, the one without a budget, and the latter scaled."""
+    """Return the filter within the power, the one without a budget, and the latter scaled."""
 
     def control_filter(weights: np.ndarray, penalty: float = 0.0, constraint_factor: float = 1.0) -> ControlFilter:
         solution = stretch.solution(weights)

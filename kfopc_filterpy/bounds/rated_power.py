@@ -1,4 +1,4 @@
-"""The rated power that KF-OPC needs for a wanted noise reduction."""
+"""Rated power that KF-OPC needs for a given noise reduction."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from .._validate import as_choice, as_positive, require_finite
 
 @dataclass(frozen=True)
 class RatedPower:
-    """Rated power needed for wanted noise reductions.
+    """Rated power needed for given noise reductions.
 
     Attributes
     ----------
     noise_reduction_db : numpy.ndarray
         Noise reductions wanted, in dB.
     constraint_factor : numpy.ndarray
-        Scaling α of the Wiener filter that reaches each; 1 where out of reach.
+        Scaling α of the Wiener filter that reaches each; 1 if it is out of reach.
     rated_power : numpy.ndarray
-        Rated power (mean square) it takes; infinite where out of reach.
+        Rated power (mean square) that it takes; infinite if it is out of reach.
     """
 
     noise_reduction_db: np.ndarray
@@ -37,10 +37,10 @@ def required_rated_power(
     control_power: float,
     beyond: str = "raise",
 ) -> RatedPower:
-    r"""Rated power that KF-OPC needs to reach a noise reduction.
+    r"""Return the rated power that KF-OPC needs to reach a noise reduction.
 
-    KF-OPC scales the measurement by α (eq. 9), hence in the steady state the Wiener filter, whose control
-    power is :math:`P_w`, by α. With disturbance power D and anti-noise power A of the Wiener filter
+    KF-OPC scales the measurement by α (eq. 9), and so in the steady state scales the Wiener filter by α. With control
+    power :math:`P_w` and anti-noise power A of the Wiener filter, and disturbance power D,
 
     .. math:: J(α) = D - (2α - α^2) A, \qquad ρ_o = α^2 P_w.
 
@@ -49,9 +49,9 @@ def required_rated_power(
     noise_reduction_db : float or array_like
         Noise reductions wanted in dB, zero or above.
     disturbance_power, antinoise_power, control_power : float
-        D, A and P_w: the attributes of a `wiener.WienerSolution` made without a penalty.
-    beyond : {"raise", "inf"}
-        What to do with noise reductions that the Wiener filter itself does not attain.
+        D, A and P_w: the attributes of a `WienerSolution` computed without a penalty.
+    beyond : {"raise", "inf"}, default "raise"
+        Whether noise reductions that the Wiener filter itself does not attain raise an error or need infinite power.
 
     Returns
     -------
@@ -61,7 +61,7 @@ def required_rated_power(
     Raises
     ------
     TypeError, ValueError
-        A noise reduction is negative or out of reach, or a power is not positive.
+        If a noise reduction is negative or out of reach, or a power is not positive.
 
     Examples
     --------
@@ -78,16 +78,16 @@ def required_rated_power(
     if antinoise > disturbance * (1 + 1e-9):
         raise ValueError(
             f"antinoise_power must not exceed disturbance_power, got {antinoise:g} and {disturbance:g}: "
-            "these are not the powers of a Wiener filter made without a penalty"
+            "these are not the powers of a Wiener filter computed without a penalty"
         )
     wanted = np.asarray(noise_reduction_db, dtype=np.float64)
     require_finite(wanted, "noise_reduction_db")
     if np.any(wanted < 0):
         raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
 
-    # 2α - α² = (D - J)/A, of which the smaller root is α = 1 - sqrt(1 - (D - J)/A).
+    # 2α - α² = (D - J)/A has the smaller root α = 1 - sqrt(1 - (D - J)/A).
     share = disturbance * (1 - 10 ** (-wanted / 10)) / antinoise
-    # The Wiener filter's own noise reduction is in reach, its last digit rounded either way.
+    # The Wiener filter's own noise reduction is in reach, whichever way its last digit was rounded.
     attainable = share <= 1 + 1e-9
     if beyond == "raise" and not np.all(attainable):
         remaining = max(1 - antinoise / disturbance, 1e-30)

@@ -1,4 +1,4 @@
-"""The Wiener control filter of recorded signals: the best a fixed causal filter of a length can do.
+"""The Wiener control filter of recorded signals: the best that a fixed causal filter of a given length can do.
 
 Sign convention: ``e = d - s*y``, ``y = w*x`` with the newest sample first, filtered reference ``x' = s*x``.
 """
@@ -12,18 +12,16 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_positive, as_signal
+from ..paths.least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
 from ..paths.models import path_taps
 
-# Eigenvalues of the correlation matrix below this share of the largest count as zero: such directions of
-# the weights (every one but two for a tone) get no weight, which is the minimum-norm solution.
-RANK_TOLERANCE = 1e-11
-# A control power that exceeds the rated one by no more than this share of it keeps within it.
+# A control power that exceeds the rated one by no more than this share of it counts as within it.
 BUDGET_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True)
 class WienerSolution:
-    """A fixed control filter and what it does to the signals it was made of.
+    """A fixed control filter, and what it does to the signals it was computed from.
 
     All powers are mean squares over the samples the filter was fitted to.
 
@@ -60,13 +58,13 @@ def wiener_solution(
     regularization: float = 0.0,
     control_penalty: float = 0.0,
 ) -> WienerSolution:
-    r"""Least-squares control filter of a reference and a disturbance.
+    r"""Return the least-squares control filter of a reference and a disturbance.
 
-    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2] + \lambda E[x'^2] \|w\|^2` over the samples at
-    which the delay lines of control filter and secondary path are full: exact least squares on the data at
-    hand, not the biased autocorrelation. Leave out the disturbance's own start-up transient if it should
-    not count. Where the data leave weights open (a tone fixes two numbers
-    only), the solution of minimum norm is taken: eigenvalues below 1e-11 of the largest count as zero.
+    Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2] + \lambda E[x'^2] \|w\|^2` over the samples at which the
+    delay lines of control filter and secondary path are full: exact least squares on the data at hand, not the biased
+    autocorrelation. Leave out the start-up transient of the disturbance if it should not count. If the data leave
+    weights undetermined (a tone determines only two numbers), the solution of minimum norm is taken; eigenvalues below
+    1e-11 of the largest count as zero.
 
     Parameters
     ----------
@@ -78,11 +76,11 @@ def wiener_solution(
         Secondary path s with a finite response, at the signals' sampling rate.
     n_taps : int
         Length of the control filter.
-    regularization : float
+    regularization : float, default 0.0
         Ridge λ, relative to the power of the filtered reference.
-    control_penalty : float
-        Penalty γ on the control power, the optimum that MOV-FxLMS steers to. With the γ at which
-        `control_power` equals the rated power, it is the least error any filter of the length reaches within it.
+    control_penalty : float, default 0.0
+        Penalty γ on the control power; MOV-FxLMS steers to this optimum. With the γ at which `control_power` equals the
+        rated power, no filter of the length has a smaller error within that power.
 
     Returns
     -------
@@ -92,11 +90,11 @@ def wiener_solution(
     Raises
     ------
     TypeError, ValueError
-        Signals of differing lengths, shorter than the delay lines, silent, or not finite.
+        If the signals differ in length, are shorter than the delay lines, silent, or not finite.
 
     See Also
     --------
-    kfopc_filterpy.bounds.power_constrained.power_constrained_solution : finds the γ for a rated power.
+    power_constrained_solution : finds the γ for a rated power.
 
     References
     ----------
@@ -120,7 +118,7 @@ def wiener_solution(
 
 @dataclass(frozen=True)
 class CoherenceBound:
-    """The noise reduction that the coherence of reference and disturbance allows.
+    """Noise reduction that the coherence of reference and disturbance allows.
 
     Attributes
     ----------
@@ -138,10 +136,10 @@ class CoherenceBound:
 
 
 def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int = 1024) -> CoherenceBound:
-    """Noise reduction of a non-causal filter of any length: ``-10 log10(1 - coherence)``.
+    """Return the noise reduction of a non-causal filter of any length, ``-10 log10(1 - coherence)``.
 
-    What a microphone's own noise or a second source leaves out of the reference no control filter can
-    reach. Spectra are averaged by Welch's method; with few segments the coherence comes out too high.
+    No control filter can cancel the part of the disturbance that the reference does not contain, such as a second
+    source. Spectra are averaged by Welch's method; with few segments the coherence comes out too high.
 
     Parameters
     ----------
@@ -149,8 +147,8 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
         Reference signal and disturbance.
     fs : float
         Sampling rate in Hz.
-    segment : int
-        Samples in a segment; the signals must hold at least eight.
+    segment : int, default 1024
+        Samples in a segment; the signals must hold at least eight segments.
 
     Returns
     -------
@@ -160,7 +158,7 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
     Raises
     ------
     TypeError, ValueError
-        Signals of differing lengths, too short, or silent.
+        If the signals differ in length, are too short, or silent.
 
     References
     ----------
@@ -193,14 +191,14 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
 
 @dataclass(frozen=True)
 class Correlations:
-    """Correlations of a stretch of signals: R_x', R_x and r, from which it is solved for any penalty."""
+    """Correlations R_x', R_x and r of a stretch of signals, from which its filter follows for any penalty."""
 
     filtered: np.ndarray
     reference: np.ndarray
     cross: np.ndarray
 
     def weights(self, penalty: float = 0.0, ridge: float = 0.0) -> np.ndarray:
-        """Minimum-norm solution of (R_x' + penalty R_x + ridge I) w = r."""
+        """Return the minimum-norm solution of (R_x' + penalty R_x + ridge I) w = r."""
         matrix = self.filtered + penalty * self.reference
         matrix.flat[:: self.cross.size + 1] += ridge
         return minimum_norm_solve(matrix, self.cross)
@@ -208,7 +206,7 @@ class Correlations:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Samples that a control filter is fitted to. x and x' begin `n_taps` - 1 samples early: the delay line's past."""
+    """Samples that a control filter is fitted to. x and x' begin `n_taps` - 1 samples early, to fill the delay line."""
 
     x: np.ndarray
     filtered: np.ndarray
@@ -221,11 +219,12 @@ class Stretch:
         return mean_square(self.filtered[self.n_taps - 1 :])
 
     def part(self, start: int, stop: int) -> Stretch:
-        """The samples from `start` to before `stop`, with the past they really have."""
+        """Return the samples from `start` to before `stop`, with their true past."""
         with_past = slice(start, stop + self.n_taps - 1)
         return Stretch(self.x[with_past], self.filtered[with_past], self.d[start:stop], self.n_taps)
 
     def correlations(self) -> Correlations:
+        """Return the correlations of the stretch."""
         start = self.n_taps - 1
         return Correlations(
             correlation_matrix(self.filtered, self.n_taps, start),
@@ -234,13 +233,15 @@ class Stretch:
         )
 
     def control_signal(self, weights: np.ndarray) -> np.ndarray:
+        """Return the control signal y = w*x."""
         return np.convolve(self.x, weights, mode="valid")
 
     def antinoise(self, weights: np.ndarray) -> np.ndarray:
+        """Return the anti-noise w*x'."""
         return np.convolve(self.filtered, weights, mode="valid")
 
     def solution(self, weights: np.ndarray) -> WienerSolution:
-        """What the weights do. The powers are those of the signals, not of the matrices, which keep fewer digits."""
+        """Return the weights with their powers, those of the signals: the matrices have fewer correct digits."""
         antinoise = self.antinoise(weights)
         error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
         return WienerSolution(
@@ -254,7 +255,7 @@ class Stretch:
 
 
 def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> Stretch:
-    """Check the signals and take the samples at which the delay lines of w and s are full."""
+    """Check the signals and return the samples at which the delay lines of w and s are full."""
     from scipy.signal import lfilter
 
     x = as_signal(reference, "reference")
@@ -272,7 +273,7 @@ def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: 
 
 
 def require_sound(stretch: Stretch) -> Stretch:
-    """Return the stretch, or raise ValueError where nothing is to be heard of x' or d."""
+    """Return the stretch, or raise ValueError if x' or d is silent."""
     filtered_power = stretch.filtered_power
     if filtered_power == 0 or mean_square(stretch.d) == 0:
         silent = "disturbance" if filtered_power else "reference through secondary_path"
@@ -281,54 +282,26 @@ def require_sound(stretch: Stretch) -> Stretch:
 
 
 def mean_square(signal: np.ndarray) -> float:
-    """Power of a signal."""
+    """Return the power of a signal."""
     return float(np.mean(signal**2))
 
 
 def reduction_db(error_power: float, disturbance_power: float) -> float:
-    """Noise reduction in dB, at most 300; NaN where there is no disturbance to reduce."""
+    """Return the noise reduction in dB, at most 300; NaN if there is no disturbance to reduce."""
     if disturbance_power == 0:
         return float("nan")
     return float(-10 * np.log10(max(error_power / disturbance_power, 1e-30)))
 
 
-def cross_correlation(output: np.ndarray, regressor: np.ndarray) -> np.ndarray:
-    """Mean of the products of `output` and each delay of `regressor`, which begins that many samples early."""
-    return np.correlate(regressor, output, mode="valid")[::-1] / output.size
-
-
-def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarray:
-    """Mean of ``signal[n - i] * signal[n - j]`` over n >= start: the covariance method's matrix.
-
-    Each row follows from the one above by the products that enter and leave the window.
-    """
-    count = signal.size - start
-    matrix = np.zeros((n_taps, n_taps))
-    matrix[0] = cross_correlation(signal[start:], signal[start - n_taps + 1 :])
-    entering = signal[start - n_taps + 1 : start][::-1]  # signal[start - 1], signal[start - 2], ...
-    leaving = signal[::-1][: n_taps - 1]  # signal[-1], signal[-2], ...
-    for i in range(n_taps - 1):
-        change = entering[i] * entering[i:] - leaving[i] * leaving[i:]
-        matrix[i + 1, i + 1 :] = matrix[i, i:-1] + change / count
-    return np.triu(matrix) + np.triu(matrix, 1).T
-
-
-def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a symmetric positive semidefinite system, leaving out directions without energy."""
-    values, vectors = np.linalg.eigh(matrix)
-    kept = values > RANK_TOLERANCE * values[-1]
-    return vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
-
-
 def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
-    """Weights of the least error within the power, and their λ."""
+    """Return the weights of the least error within the power, and their λ."""
     energies = float(np.trace(correlations.filtered)), float(np.trace(correlations.reference))
     weights, penalty = np.zeros(stretch.n_taps), 0.0
     if min(energies) > 0:
         weights, penalty = _least_penalty(correlations, energies[0] / energies[1], rated_power)
     if penalty == 0:
-        # Of the filters without a penalty, the one of least norm is `wiener_solution`'s. Where the path lets nothing
-        # through it may need more power than is needed, and more than there is.
+        # Without a penalty, `wiener_solution` takes the filter of least norm. In directions that the path does not pass
+        # that filter may waste power, and so exceed the rated power.
         free = correlations.weights()
         if mean_square(stretch.control_signal(free)) <= rated_power:
             weights = free
@@ -336,21 +309,21 @@ def constrained_weights(stretch: Stretch, correlations: Correlations, rated_powe
 
 
 def _least_penalty(correlations: Correlations, balance: float, rated_power: float) -> tuple[np.ndarray, float]:
-    """Weights that solve (R_x' + λ R_x) w = r, and the least λ >= 0 that brings their power down to the rated one.
+    """Return the weights that solve (R_x' + λ R_x) w = r with the smallest λ >= 0 that keeps within the power, and it.
 
-    In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), where both matrices may be
-    singular, each λ costs a sum over the taps instead of the solution of a system.
+    In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), each λ costs a sum over the taps
+    instead of the solution of a system. Both matrices may be singular.
     """
     values, vectors = np.linalg.eigh(correlations.filtered + balance * correlations.reference)
     kept = values > RANK_TOLERANCE * values[-1]
     whitened = vectors[:, kept] / np.sqrt(values[kept])
     share, turn = np.linalg.eigh(whitened.T @ correlations.filtered @ whitened)
-    heard = share > RANK_TOLERANCE  # of the others the path lets nothing through: they cost power for nothing
+    heard = share > RANK_TOLERANCE  # the path does not pass the others, which would cost power for nothing
     basis, share = whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
     cross = basis.T @ correlations.cross
 
-    # Newton's method on 1/sqrt(power), which rises with λ, is concave and all but a straight line: from λ = 0 the steps
-    # approach the root from below, a dozen at most where the eigenvalues span twelve decades (Moré and Sorensen).
+    # Newton's method on 1/sqrt(power), which rises with λ and is concave and nearly straight: from λ = 0 the steps
+    # approach the root from below, in at most a dozen steps if the eigenvalues span twelve decades (Moré and Sorensen).
     penalty = 0.0
     while True:
         stiffness = share + penalty * (1 - share)

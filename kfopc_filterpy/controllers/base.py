@@ -95,6 +95,8 @@ class FilteredReferenceController:
     """
 
     name = "controller"
+    has_gains = False  # whether it has Kalman gains, which scenarios can share
+    unshared = ""  # and what keeps it from sharing them
     _refusal = OVERFLOW  # why an update is refused whose numbers are finite
     _state: Any
 

@@ -107,6 +107,7 @@ class KalmanController(FilteredReferenceController):
     1.3333333333333333
     """
 
+    has_gains = True
     _filter_type: Any = RandomWalkKFOPC  # of the filters whose steps are compiled
 
     def __init__(

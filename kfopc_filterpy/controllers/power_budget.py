@@ -90,6 +90,7 @@ class PowerBudgetController(KalmanController):
     """
 
     estimator: PowerBudgetKalmanFilter
+    unshared = "power budget"
     _filter_type = PowerBudgetKalmanFilter
 
     def __init__(

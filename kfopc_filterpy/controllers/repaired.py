@@ -147,6 +147,7 @@ class RepairedKFOPC(KalmanController):
     """
 
     estimator: RandomWalkKFOPC
+    unshared = "repaired gain"
 
     def __init__(
         self,

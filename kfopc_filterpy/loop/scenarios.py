@@ -8,10 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_positive, as_signal
-from ..controllers.base import NO_SOLUTION
-from ..controllers.kalman import KalmanController, KalmanState
-from ..controllers.power_budget import PowerBudgetController
-from ..controllers.repaired import RepairedKFOPC
+from ..controllers.base import NO_SOLUTION, FilteredReferenceController
 from ..kernels.compiling import compiled
 from ..kernels.covariance import (
     CANCELLATION,
@@ -31,13 +28,13 @@ from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
+from .result import SimulationResult
 from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, run
 from .simulation import (
     DIVERGENCE_LIMIT,
     POWERS,
     RECORDED,
     SensorNoise,
-    SimulationResult,
     disturbance_at_microphone,
     switch_on_sample,
 )
@@ -104,7 +101,7 @@ def run_scenarios(states, plants, signals, limits, status, done):
 
 
 def simulate_scenarios(
-    controllers: Sequence[KalmanController],
+    controllers: Sequence[Any],
     reference: Any,
     *,
     secondary_path: Any,
@@ -190,7 +187,7 @@ def simulate_scenarios(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
-    if isinstance(controllers, KalmanController):
+    if isinstance(controllers, FilteredReferenceController):
         raise TypeError("controllers must be a sequence of controllers: [controller] for one")
     controllers = list(controllers)
     states = _states_that_share(controllers, fs)
@@ -251,13 +248,13 @@ def _block(x: np.ndarray, d: np.ndarray, noises: list[SensorNoise], first: int, 
     return Stretch(reference, disturbance, np.array([np.zeros(size) + noise.take(size) for noise in noises]), *left)
 
 
-def _states_that_share(controllers: list[Any], fs: float) -> list[KalmanState]:
+def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
     """States of the controllers for the compiled loop, or an error that says which one differs in what."""
     if not controllers:
         raise ValueError("controllers must hold one controller at least")
     states = []
     for i, controller in enumerate(controllers):
-        if not isinstance(controller, KalmanController):
+        if not isinstance(controller, FilteredReferenceController) or not controller.has_gains:
             raise TypeError(f"controllers[{i}] must be a KalmanController, got {controller!r}")
         if any(controller is other or controller.estimator is other.estimator for other in controllers[:i]):
             raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs a controller of its own")
@@ -268,13 +265,8 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[KalmanState]:
                 f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
                 "KalmanControllers of filters from KFOPC.random_walk"
             )
-        own = {
-            "power budget": isinstance(controller, PowerBudgetController),
-            "repaired gain": isinstance(controller, RepairedKFOPC),
-            "limiter": state.lines.limiter is not None,
-        }
-        for what, present in own.items():
-            if present:
+        for what in (controller.unshared, "limiter" if state.lines.limiter is not None else ""):
+            if what:
                 raise ValueError(f"controllers[{i}] has a {what}, which scenarios do not run: use simulate for it")
         states.append(state)
     for i, state in enumerate(states[1:], 1):
@@ -284,7 +276,7 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[KalmanState]:
     return states
 
 
-def _difference(one: KalmanState, other: KalmanState) -> str | None:
+def _difference(one: Any, other: Any) -> str | None:
     """In what two states do not share, in words."""
     if one.weights.size != other.weights.size:
         return "n_taps"
@@ -363,7 +355,7 @@ def _model(amplifier: Amplifier | None) -> np.ndarray:
 class _GainSequence:
     """The gains of a run, a block at a time in the same arrays, from a copy of the covariance."""
 
-    def __init__(self, state: KalmanState, x: np.ndarray) -> None:
+    def __init__(self, state: Any, x: np.ndarray) -> None:
         self.covariance: Covariance = copy_covariance(state.gains)
         self._settings = [float(state.numbers[name][0]) for name in VARIANCES]
         n, lines = state.weights.size, state.lines

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,73 +16,12 @@ from ..kernels.delay_lines import delay_line
 from ..paths.models import path_taps
 from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
+from .result import SimulationResult
 from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
 DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
 RECORDED = ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor")
 POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request
-
-
-@dataclass(frozen=True)
-class SimulationResult:
-    """What a run left. Signals are (n_samples,), read-only; after a divergence they are NaN.
-
-    Attributes
-    ----------
-    algorithm : str
-        Name of the controller.
-    fs : float
-        Sample rate in Hz.
-    rated_power : float or None
-        Rated output power of the controller, or the one given to `simulate`.
-    reference, disturbance : ndarray
-        Reference x and disturbance d of the run.
-    error : ndarray
-        Error e = d - s*y_amp at the error microphone, sensor noise included.
-    control_signal, amplifier_output : ndarray
-        Control signal y before, and y_amp after the amplifier.
-    anti_noise : ndarray
-        Anti-noise s*y_amp at the error microphone.
-    constraint_factor : ndarray
-        Constraint factor; 1 for a controller without a constraint, NaN for one that does not say.
-    weights : ndarray or None
-        (n_rows, L) control filter after samples 0, k, 2k, ..., where it was asked for.
-    weights_time_s : ndarray or None
-        (n_rows,) their times in seconds.
-    disturbance_power, secondary_path_gain : ndarray or None
-        Power histories (eq. 10, 11), where they were asked for.
-    power_weight : ndarray or None
-        Weight lambda of the control power of a power budget (NaN without one), where powers were asked for.
-    diverged_at_s : float or None
-        Time at which the control signal passed 1e6 sqrt(rated power); None: it did not.
-    """
-
-    algorithm: str
-    fs: float
-    rated_power: float | None
-    reference: np.ndarray
-    disturbance: np.ndarray
-    error: np.ndarray
-    control_signal: np.ndarray
-    amplifier_output: np.ndarray
-    anti_noise: np.ndarray
-    constraint_factor: np.ndarray
-    weights: np.ndarray | None = None
-    weights_time_s: np.ndarray | None = None
-    disturbance_power: np.ndarray | None = None
-    secondary_path_gain: np.ndarray | None = None
-    power_weight: np.ndarray | None = None
-    diverged_at_s: float | None = None
-
-    def __post_init__(self) -> None:
-        for value in vars(self).values():
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
-
-    @property
-    def time_s(self) -> np.ndarray:
-        """(n_samples,) time in seconds."""
-        return np.arange(self.error.size) / self.fs
 
 
 def simulate(

@@ -1,4 +1,4 @@
-"""Analysis of paths: responses in Hz, group delay, gain (eq. 11), phase error, the band achieved."""
+"""Analysis of paths: responses in Hz, group delay, gain (eq. 11), phase error, achieved band, causality margin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_band, as_number, as_signal
+from .._validate import as_band, as_number, as_positive, as_signal
 from .models import finite_taps, is_system, path_taps, sampling_rate
 
 STABILITY_BOUND_DEG = 90.0
@@ -15,7 +15,7 @@ STABILITY_BOUND_DEG = 90.0
 
 
 def frequency_response(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
-    """Complex frequency response of a path.
+    """Return the complex frequency response of a path.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def frequency_response(path: Any, frequencies_hz: Any, *, fs: float | None = Non
     Raises
     ------
     TypeError, ValueError
-        The path is not a discrete-time single-channel one, or a frequency is out of range.
+        If the path is not a discrete-time system with one channel, or a frequency is out of range.
 
     Examples
     --------
@@ -47,7 +47,7 @@ def frequency_response(path: Any, frequencies_hz: Any, *, fs: float | None = Non
 
 
 def _response(path: Any, omega: np.ndarray) -> np.ndarray:
-    """Response at frequencies in rad/sample."""
+    """Return the response at frequencies in rad/sample."""
     taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
     if taps is None:
         return np.asarray(path(np.exp(1j * omega)))
@@ -67,12 +67,12 @@ def _frequencies(frequencies_hz: Any, fs: float) -> np.ndarray:
 
 
 def group_delay(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
-    """Group delay of a path, ``-d(phase)/d(omega)``, in seconds.
+    """Return the group delay of a path, ``-d(phase)/d(omega)``, in seconds.
 
     Parameters
     ----------
     path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
-        As `frequency_response`; an infinite response is differentiated numerically, to some 1e-6 samples.
+        As for `frequency_response`; an infinite response is differentiated numerically, to about 1e-6 samples.
     frequencies_hz : array_like, shape (n_frequencies,)
         Frequencies in Hz, within 0 to fs/2.
     fs : float, optional
@@ -86,7 +86,7 @@ def group_delay(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> n
     Raises
     ------
     TypeError, ValueError
-        As `frequency_response`.
+        As for `frequency_response`.
 
     Examples
     --------
@@ -111,17 +111,17 @@ def group_delay(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> n
 def secondary_path_gain(
     path: Any, *, band: tuple[float, float] | None = None, reference: Any = None, fs: float | None = None
 ) -> float:
-    """Secondary-path gain ``G_s = E[x'^2] / E[x^2]`` (eq. 11), a power gain.
+    """Return the secondary-path gain ``G_s = E[x'^2] / E[x^2]`` (eq. 11), a power gain.
 
     Parameters
     ----------
     path : control.TransferFunction or array_like, shape (n_taps,)
         Secondary path with a finite impulse response.
     band : (float, float), optional
-        For noise white within this band in Hz; from 0 to fs/2 by default. Computed in closed form.
+        Band in Hz of a white reference, by default 0 to fs/2; the gain is computed in closed form.
     reference : array_like, shape (n_samples,), optional
-        For this reference signal instead of noise; the first ``n_taps - 1`` samples, while the delay line
-        fills, do not count.
+        Reference signal to use instead of white noise; the first ``n_taps - 1`` samples, while the delay line fills, do
+        not count.
     fs : float, optional
         Sampling rate in Hz, needed for a tap array with a `band`.
 
@@ -133,7 +133,7 @@ def secondary_path_gain(
     Raises
     ------
     TypeError, ValueError
-        Both `band` and `reference` given, or a silent or too short reference.
+        If both `band` and `reference` are given, or the reference is silent or too short.
 
     References
     ----------
@@ -173,16 +173,16 @@ def _gain_for_reference(taps: np.ndarray, reference: Any) -> float:
 
 @dataclass(frozen=True)
 class PhaseError:
-    """Phase of a path's estimate against the path.
+    """Phase of an estimate of a path relative to the path.
 
     Attributes
     ----------
     frequencies_hz : numpy.ndarray, shape (n_frequencies,)
         Frequencies in Hz.
     error_deg : numpy.ndarray, shape (n_frequencies,)
-        Phase of estimate less that of path in degrees, within -180 to 180.
+        Phase of the estimate minus that of the path in degrees, within -180 to 180.
     bound_deg : float
-        Stability bound: adaptation diverges at frequencies where the error's magnitude exceeds it.
+        Stability bound in degrees: adaptation diverges at frequencies where the magnitude of the error exceeds it.
     """
 
     frequencies_hz: np.ndarray
@@ -191,12 +191,12 @@ class PhaseError:
 
     @property
     def within_bound(self) -> np.ndarray:
-        """Whether each frequency lies within the stability bound."""
+        """Tell for each frequency whether it lies within the stability bound, shape (n_frequencies,)."""
         return np.abs(self.error_deg) < self.bound_deg
 
 
 def phase_error(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> PhaseError:
-    """Phase error of a secondary-path estimate, with the 90 degree stability bound.
+    """Return the phase error of a secondary-path estimate, with the 90 degree stability bound.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def phase_error(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | No
     Raises
     ------
     TypeError, ValueError
-        As `frequency_response`, or the paths differ in sampling rate.
+        As for `frequency_response`, or if the paths differ in sampling rate.
 
     References
     ----------
@@ -237,13 +237,13 @@ def phase_error(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | No
 
 @dataclass(frozen=True)
 class AchievedBand:
-    """The band that a path really passes.
+    """Band that a path really passes.
 
     Attributes
     ----------
     low_hz, high_hz : float
-        Outermost frequencies at which the response is `level_db` below its peak; 0 or fs/2 where it does
-        not fall so low.
+        Outermost frequencies at which the response is at `level_db` relative to its peak; 0 or fs/2 if it does not fall
+        that low.
     peak_hz : float
         Frequency of the peak.
     peak_db : float
@@ -260,13 +260,13 @@ class AchievedBand:
 
 
 def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None) -> AchievedBand:
-    """Band within which a path's response stays above a level, to see what its taps really realise.
+    """Return the band within which the response of a path stays above a level: what its taps really pass.
 
     Parameters
     ----------
     path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
         Discrete-time system or impulse response.
-    level_db : float
+    level_db : float, default -3.0
         Level that marks the edges, in dB relative to the peak; negative.
     fs : float, optional
         Sampling rate in Hz, needed for a tap array.
@@ -279,11 +279,11 @@ def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None)
     Raises
     ------
     TypeError, ValueError
-        `level_db` is not negative, or the path is silent.
+        If `level_db` is not negative, or the path is silent.
 
     Examples
     --------
-    >>> from kfopc_filterpy.paths.models import bandpass_path
+    >>> from kfopc_filterpy import bandpass_path
     >>> band = achieved_band(bandpass_path(32), level_db=-6.0)  # designed for 20 to 5000 Hz
     >>> band.low_hz, round(band.high_hz)
     (0.0, 4997)
@@ -309,8 +309,120 @@ def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None)
 
 
 def _crossing(frequencies: np.ndarray, magnitude: np.ndarray, level: float, inside: int, outside: int) -> float:
-    """Frequency between two grid points at which the magnitude crosses a level."""
+    """Return the frequency between two grid points at which the magnitude crosses a level."""
     if not 0 <= outside < frequencies.size:
         return float(frequencies[inside])
     share = (magnitude[inside] - level) / (magnitude[inside] - magnitude[outside])
     return float(frequencies[inside] + share * (frequencies[outside] - frequencies[inside]))
+
+
+@dataclass(frozen=True)
+class CausalityMargin:
+    """Delay of the primary path over that of the secondary path.
+
+    Attributes
+    ----------
+    primary_onset_s, secondary_onset_s : float
+        Energy onset of each path in s: the time by which its impulse response has delivered `onset_share` of its energy.
+    primary_delay_s, secondary_delay_s : float
+        Group delay of each path in s, averaged over the band with the weight ``|H|^2``. In a reverberant path it includes
+        the reverberation, so the onset is the safer measure.
+    fs : float
+        Sampling rate in Hz.
+    """
+
+    primary_onset_s: float
+    secondary_onset_s: float
+    primary_delay_s: float
+    secondary_delay_s: float
+    fs: float
+
+    @property
+    def margin_s(self) -> float:
+        """Margin by energy onset in s, primary minus secondary; a negative one is not causal."""
+        return self.primary_onset_s - self.secondary_onset_s
+
+    @property
+    def margin_samples(self) -> float:
+        """Margin by energy onset in samples."""
+        return self.margin_s * self.fs
+
+    @property
+    def group_delay_margin_s(self) -> float:
+        """Margin by mean group delay in s."""
+        return self.primary_delay_s - self.secondary_delay_s
+
+    @property
+    def group_delay_margin_samples(self) -> float:
+        """Margin by mean group delay in samples."""
+        return self.group_delay_margin_s * self.fs
+
+
+def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
+    """Return the sample by which an impulse response has delivered `share` of its energy."""
+    energy = np.cumsum(taps**2)
+    return int(np.searchsorted(energy, share * energy[-1]))
+
+
+def causality_margin(
+    primary: Any,
+    secondary: Any,
+    *,
+    fs: float | None = None,
+    band: tuple[float, float] | None = None,
+    onset_share: float = 0.01,
+) -> CausalityMargin:
+    """Return the causality margin, the delay of the primary path over that of the secondary path.
+
+    The control filter has this much time to act. Without any it must predict the noise, which works for tones only.
+
+    Parameters
+    ----------
+    primary, secondary : control.TransferFunction or array_like, shape (n_taps,)
+        Paths with finite impulse responses.
+    fs : float, optional
+        Sampling rate in Hz, needed for tap arrays.
+    band : (float, float), optional
+        Band in Hz over which the group delay is averaged, by default all frequencies.
+    onset_share : float, default 0.01
+        Share of the energy that marks the onset, above 0 and below 1. The default of 1 % ignores the ringing before a
+        band-limited arrival.
+
+    Returns
+    -------
+    CausalityMargin
+        Onsets, mean group delays and margins.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the paths differ in sampling rate or are silent, or an argument is out of range.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy import bandpass_path
+    >>> margin = causality_margin(bandpass_path(128), bandpass_path(32))
+    >>> round(margin.margin_samples), round(margin.group_delay_margin_samples)
+    (45, 48)
+    """
+    fs = sampling_rate(primary, fs, name="primary")
+    sampling_rate(secondary, fs, name="secondary")
+    share = as_positive(onset_share, "onset_share")
+    if share >= 1:
+        raise ValueError(f"onset_share must be below 1, got {share:g}")
+    low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
+    responses = (path_taps(primary, name="primary"), path_taps(secondary, name="secondary"))
+    for name, taps in zip(("primary", "secondary"), responses, strict=True):
+        if not np.any(taps):
+            raise ValueError(f"{name} must not be all zeros: a silent path has no delay")
+    onsets = [energy_onset(h, share) / fs for h in responses]
+    delays = [_mean_group_delay(h, low, high, fs) for h in responses]
+    return CausalityMargin(onsets[0], onsets[1], delays[0], delays[1], fs)
+
+
+def _mean_group_delay(taps: np.ndarray, low: float, high: float, fs: float) -> float:
+    """Return the group delay weighted by |H|²: mean of Re(conj(H) FT{n h}) over mean of |H|² in the band, in s."""
+    frequencies = low + (high - low) * (np.arange(4 * taps.size) + 0.5) / (4 * taps.size)
+    response = frequency_response(taps, frequencies, fs=fs)
+    ramped = frequency_response(taps * np.arange(taps.size), frequencies, fs=fs)  # transform of n h[n]
+    return float(np.sum(np.real(np.conj(response) * ramped)) / np.sum(np.abs(response) ** 2) / fs)

@@ -13,16 +13,128 @@ from .models import fir_path
 if TYPE_CHECKING:
     import control
 
-# Share of a response's energy that is cut off where the number of taps is chosen here (-50 dB), and that
-# may be cut off by a given number (-40 dB).
+# Share of a response's energy that may be cut off: -50 dB if the number of taps is chosen here, -40 dB if it is given.
 _CHOSEN_CUT, _ALLOWED_CUT = 1e-5, 1e-4
 # Length of the synthesis. A response that has not decayed by half of it is refused, so it does not alias.
 _N_FFT = 2**16
 
 
 @dataclass(frozen=True)
+class Duct:
+    """Geometry and acoustics of a duct with its loudspeaker, from which `duct_paths` computes the paths.
+
+    Positions count from the end near the noise source, in the order source, reference microphone, loudspeaker, error
+    microphone.
+
+    Attributes
+    ----------
+    length_m : float, default 2.2
+        Length L of the duct in m.
+    source_m : float, default 0.05
+        Position of the noise source in m.
+    reference_m : float or None, default 0.25
+        Position of the reference microphone in m. None takes the source's own signal (a tachometer, say) as the
+        reference.
+    loudspeaker_m : float, default 1.4
+        Position of the loudspeaker in m.
+    error_m : float, default 1.9
+        Position of the error microphone in m.
+    reflection : (float, float), default (0.6, -0.4)
+        Reflection coefficients of sound pressure at 0 and L, between -1 (open) and 1 (rigid).
+    attenuation_db_per_m : float, default 1.0
+        Loss at the walls at 1 kHz in dB/m; it grows with the square root of frequency.
+    loudspeaker_resonance_hz : float or None, default 70.0
+        Resonance of the loudspeaker in Hz; None for an ideal one.
+    loudspeaker_q : float, default 0.8
+        Quality factor of that resonance.
+    electronics_delay_s : float, default 0.25e-3
+        Delay of converters and filters in the secondary path in s.
+    speed_of_sound : float, default 343.0
+        Speed of sound c in m/s.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If positions are out of order, or a value is out of range.
+
+    Examples
+    --------
+    >>> Duct(length_m=2.6).resonances_hz(250.0).round(1)
+    array([ 33. ,  98.9, 164.9, 230.9])
+    """
+
+    length_m: float = 2.2
+    source_m: float = 0.05
+    reference_m: float | None = 0.25
+    loudspeaker_m: float = 1.4
+    error_m: float = 1.9
+    reflection: tuple[float, float] = (0.6, -0.4)
+    attenuation_db_per_m: float = 1.0
+    loudspeaker_resonance_hz: float | None = 70.0
+    loudspeaker_q: float = 0.8
+    electronics_delay_s: float = 0.25e-3
+    speed_of_sound: float = 343.0
+
+    def __post_init__(self) -> None:
+        as_positive(self.length_m, "length_m", unit="m")
+        as_positive(self.speed_of_sound, "speed_of_sound", unit="m/s")
+        as_nonnegative(self.attenuation_db_per_m, "attenuation_db_per_m", unit="dB/m")
+        as_nonnegative(self.electronics_delay_s, "electronics_delay_s", unit="s")
+        as_positive(self.loudspeaker_q, "loudspeaker_q")
+        if self.loudspeaker_resonance_hz is not None:
+            as_positive(self.loudspeaker_resonance_hz, "loudspeaker_resonance_hz", unit="Hz")
+        self._check_positions()
+        self._check_reflection()
+
+    def resonances_hz(self, highest_hz: float) -> np.ndarray:
+        """Return the resonances of the lossless duct up to a frequency, in Hz.
+
+        They lie at ``n c / 2L`` if both ends reflect with the same sign, at ``(2n - 1) c / 4L`` if with opposite signs.
+
+        Parameters
+        ----------
+        highest_hz : float
+            Frequency up to which to list them, in Hz.
+
+        Returns
+        -------
+        numpy.ndarray, shape (n_resonances,)
+            Resonances in Hz; empty if an end does not reflect.
+        """
+        round_trip, spacing_hz = self.reflection[0] * self.reflection[1], self.speed_of_sound / self.length_m
+        if round_trip == 0:
+            return np.array([])
+        orders = np.arange(1, int(2 * highest_hz / spacing_hz) + 2)
+        resonances = orders * spacing_hz / 2 if round_trip > 0 else (2 * orders - 1) * spacing_hz / 4
+        return resonances[resonances <= highest_hz]
+
+    def _check_positions(self) -> None:
+        positions = {name: getattr(self, name) for name in ("source_m", "reference_m", "loudspeaker_m", "error_m")}
+        placed = {name: as_number(x, name, unit="m") for name, x in positions.items() if x is not None}
+        x = list(placed.values())
+        # The reference microphone may be at the source; only the error microphone must be apart from the loudspeaker.
+        if not (x[0] >= 0 and x[-1] <= self.length_m and np.all(np.diff(x) >= 0) and x[-2] < x[-1]):
+            found = ", ".join(f"{name} = {value:g}" for name, value in placed.items())
+            raise ValueError(
+                f"positions must satisfy 0 <= source_m <= reference_m <= loudspeaker_m < error_m <= length_m "
+                f"= {self.length_m:g} m, got {found}"
+            )
+
+    def _check_reflection(self) -> None:
+        try:
+            near, far = (as_number(r, "reflection") for r in self.reflection)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"reflection must be a pair of numbers (at 0, at L), got {self.reflection!r}") from error
+        if max(abs(near), abs(far)) >= 1:
+            raise ValueError(
+                f"reflection must lie strictly between -1 and 1 at both ends, got ({near:g}, {far:g}): "
+                "without any loss the response never decays"
+            )
+
+
+@dataclass(frozen=True)
 class DuctPaths:
-    """A duct's primary and secondary path with its geometry; made by `duct_paths`.
+    """Primary and secondary path of a duct; made by `duct_paths`.
 
     Attributes
     ----------
@@ -32,93 +144,54 @@ class DuctPaths:
         From the control signal, through the loudspeaker, to the error microphone.
     fs : float
         Sampling rate in Hz.
-    length_m, source_m, loudspeaker_m, error_m : float
-        Length of the duct and positions along it, in m.
-    reference_m : float or None
-        Position of the reference microphone; None where the reference is the source's own signal.
-    resonances_hz : numpy.ndarray
-        Resonances of the lossless duct up to fs/2, in Hz: ``n c / 2L`` where both ends reflect with the same
-        sign, ``(2n - 1) c / 4L`` where with opposite signs; empty where an end does not reflect.
+    model : Duct
+        The duct that they were computed from.
     """
 
     primary: control.TransferFunction
     secondary: control.TransferFunction
     fs: float
-    length_m: float
-    source_m: float
-    reference_m: float | None
-    loudspeaker_m: float
-    error_m: float
-    resonances_hz: np.ndarray
+    model: Duct
 
 
 def duct_paths(
-    *,
-    fs: float = 16000.0,
-    length_m: float = 2.2,
-    source_m: float = 0.05,
-    reference_m: float | None = 0.25,
-    loudspeaker_m: float = 1.4,
-    error_m: float = 1.9,
-    reflection: tuple[float, float] = (0.6, -0.4),
-    attenuation_db_per_m: float = 1.0,
-    loudspeaker_resonance_hz: float | None = 70.0,
-    loudspeaker_q: float = 0.8,
-    electronics_delay_s: float = 0.25e-3,
-    speed_of_sound: float = 343.0,
-    primary_taps: int | None = None,
-    secondary_taps: int | None = None,
+    duct: Duct | None = None, *, fs: float = 16000.0, primary_taps: int | None = None, secondary_taps: int | None = None
 ) -> DuctPaths:
-    r"""Model a duct with reflecting ends in which plane waves travel, and return its two paths.
+    r"""Compute the two paths of a duct with reflecting ends, in which plane waves travel.
 
     All images of a source at :math:`x_s` sum up, at a microphone at :math:`x > x_s`, to
 
     .. math:: G(x, x_s) = \frac{(g(x - x_s) + r_0 g(x + x_s)) (1 + r_L g(2L - 2x))}{1 - r_0 r_L g(2L)},
               \quad g(l) = e^{-j 2\pi f l / c - (1 + j) a l \sqrt{f / 1\,\mathrm{kHz}}},
 
-    where `g` carries the wave over a length: its delay, which need not be whole samples, and the loss at the
-    walls with the dispersion that keeps it causal. The secondary path is G from the loudspeaker, times a
-    second-order high-pass (the loudspeaker) and the delay of the electronics. The primary path is the ratio
-    of G at the error and at the reference microphone; in it the source's position and the duct's own
-    resonances cancel, and those of the section beyond the reference microphone stay. The responses are
-    sampled with a band limit from 0.4 fs to 0.5 fs.
+    where `g` carries the wave over a length: its delay, which need not be whole samples, and the loss at the walls with
+    the dispersion that keeps it causal. The secondary path is G from the loudspeaker, times a second-order high-pass
+    (the loudspeaker) and the delay of the electronics. The primary path is the ratio of G at the error microphone to G
+    at the reference microphone; the source's position and the duct's own resonances cancel in it, and those of the
+    section beyond the reference microphone stay. Without a reference microphone it is G from the source. The responses
+    are sampled with a band limit from 0.4 fs to 0.5 fs.
 
     Not modelled: cross modes (above ``0.586 c / diameter``) and feedback to the reference microphone.
 
     Parameters
     ----------
-    fs : float
+    duct : Duct, optional
+        The duct, by default ``Duct()``.
+    fs : float, default 16000
         Sampling rate in Hz.
-    length_m : float
-        Length L of the duct in m; positions count from the end near the noise source.
-    source_m, reference_m, loudspeaker_m, error_m : float
-        Positions in m, in this order along the duct. ``reference_m=None`` takes the source's own signal
-        (a tachometer, say) as the reference: the primary path is then G from the source.
-    reflection : (float, float)
-        Reflection coefficients of sound pressure at 0 and L, between -1 (open) and 1 (rigid).
-    attenuation_db_per_m : float
-        Loss at the walls at 1 kHz in dB/m; it grows with the square root of frequency.
-    loudspeaker_resonance_hz : float or None
-        Resonance of the loudspeaker in Hz; None for an ideal one.
-    loudspeaker_q : float
-        Quality factor of that resonance.
-    electronics_delay_s : float
-        Delay of converters and filters in the secondary path in s.
-    speed_of_sound : float
-        Speed of sound c in m/s.
     primary_taps, secondary_taps : int, optional
-        Lengths of the impulse responses; by default the least multiples of 64 that leave out no more than
-        -50 dB of their energy: 832 and 640 for the default duct. Given lengths may leave out -40 dB.
+        Lengths of the impulse responses; by default the smallest multiples of 64 that leave out no more than -50 dB of
+        their energy: 832 and 640 for the default duct. Given lengths may leave out -40 dB.
 
     Returns
     -------
     DuctPaths
-        Both paths as python-control systems, and the geometry.
+        Both paths as python-control systems.
 
     Raises
     ------
     TypeError, ValueError
-        Positions out of order, coefficients out of range, or responses that have not decayed.
+        If an argument is out of range, or a response does not decay within the taps.
 
     References
     ----------
@@ -127,88 +200,49 @@ def duct_paths(
 
     Examples
     --------
-    >>> from kfopc_filterpy.paths.models import path_taps
-    >>> duct = duct_paths()
-    >>> path_taps(duct.primary).size, path_taps(duct.secondary).size
+    >>> from kfopc_filterpy.paths import path_taps
+    >>> paths = duct_paths()
+    >>> path_taps(paths.primary).size, path_taps(paths.secondary).size
     (832, 640)
-    >>> duct.resonances_hz[:3].round(1)
-    array([ 39. , 116.9, 194.9])
     """
     fs = as_positive(fs, "fs", unit="Hz")
-    length = as_positive(length_m, "length_m", unit="m")
-    _check_positions(length, source_m, reference_m, loudspeaker_m, error_m)
-    r0, r1 = _check_reflection(reflection)
-    speed = as_positive(speed_of_sound, "speed_of_sound", unit="m/s")
-    loss = as_nonnegative(attenuation_db_per_m, "attenuation_db_per_m", unit="dB/m") / (20 * np.log10(np.e))
-    latency = as_nonnegative(electronics_delay_s, "electronics_delay_s", unit="s")
+    duct = Duct() if duct is None else duct
+    length, (r0, r1) = duct.length_m, duct.reflection
+    loss = duct.attenuation_db_per_m / (20 * np.log10(np.e))
     f = np.fft.rfftfreq(_N_FFT, 1 / fs)
 
     def travel(distance: float) -> np.ndarray:
-        return np.exp(-2j * np.pi * f * distance / speed - (1 + 1j) * loss * distance * np.sqrt(f / 1000))
+        return np.exp(-2j * np.pi * f * distance / duct.speed_of_sound - (1 + 1j) * loss * distance * np.sqrt(f / 1000))
 
     def pressure(x: float, source: float) -> np.ndarray:
         outgoing = travel(x - source) + r0 * travel(x + source)
         return outgoing * (1 + r1 * travel(2 * (length - x))) / (1 - r0 * r1 * travel(2 * length))
 
-    if reference_m is None:
-        primary = pressure(error_m, source_m)
+    if duct.reference_m is None:
+        primary = pressure(duct.error_m, duct.source_m)
     else:
-        at_error, at_reference = (1 + r1 * travel(2 * (length - x)) for x in (error_m, reference_m))
-        primary = travel(error_m - reference_m) * at_error / at_reference
-    secondary = pressure(error_m, loudspeaker_m) * np.exp(-2j * np.pi * f * latency)
-    if loudspeaker_resonance_hz is not None:
-        relative = f / as_positive(loudspeaker_resonance_hz, "loudspeaker_resonance_hz", unit="Hz")
-        secondary *= -(relative**2) / (1 - relative**2 + 1j * relative / as_positive(loudspeaker_q, "loudspeaker_q"))
-
+        at_error, at_reference = (1 + r1 * travel(2 * (length - x)) for x in (duct.error_m, duct.reference_m))
+        primary = travel(duct.error_m - duct.reference_m) * at_error / at_reference
+    secondary = pressure(duct.error_m, duct.loudspeaker_m) * np.exp(-2j * np.pi * f * duct.electronics_delay_s)
+    if duct.loudspeaker_resonance_hz is not None:
+        relative = f / duct.loudspeaker_resonance_hz
+        secondary *= -(relative**2) / (1 - relative**2 + 1j * relative / duct.loudspeaker_q)
     return DuctPaths(
         primary=fir_path(_sampled(primary, primary_taps, "primary_taps"), fs, "primary"),
         secondary=fir_path(_sampled(secondary, secondary_taps, "secondary_taps"), fs, "secondary"),
         fs=fs,
-        length_m=length,
-        source_m=source_m,
-        reference_m=reference_m,
-        loudspeaker_m=loudspeaker_m,
-        error_m=error_m,
-        resonances_hz=_resonances(r0 * r1, speed / length, fs),
+        model=duct,
     )
 
 
-def _check_positions(length: float, source: float, reference: float | None, loudspeaker: float, error: float) -> None:
-    """Check that source, reference, loudspeaker and error microphone follow each other along the duct."""
-    positions = {"source_m": source, "reference_m": reference, "loudspeaker_m": loudspeaker, "error_m": error}
-    placed = {name: as_number(x, name, unit="m") for name, x in positions.items() if x is not None}
-    x = list(placed.values())
-    # A reference microphone at the source is in order; only the error microphone must stand off.
-    if not (x[0] >= 0 and x[-1] <= length and np.all(np.diff(x) >= 0) and x[-2] < x[-1]):
-        found = ", ".join(f"{name} = {value:g}" for name, value in placed.items())
-        raise ValueError(
-            f"positions must satisfy 0 <= source_m <= reference_m <= loudspeaker_m < error_m <= length_m "
-            f"= {length:g} m, got {found}"
-        )
-
-
-def _check_reflection(reflection: tuple[float, float]) -> tuple[float, float]:
-    """Return both reflection coefficients, each strictly between -1 and 1."""
-    try:
-        near, far = (as_number(r, "reflection") for r in reflection)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"reflection must be a pair of numbers (at 0, at L), got {reflection!r}") from error
-    if max(abs(near), abs(far)) >= 1:
-        raise ValueError(
-            f"reflection must lie strictly between -1 and 1 at both ends, got ({near:g}, {far:g}): "
-            "without any loss the response never decays"
-        )
-    return near, far
-
-
 def _sampled(response: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
-    """Impulse response of a frequency response on the grid of `rfft`, band-limited and cut to `n_taps`."""
+    """Return the impulse response of a response on the grid of `rfft`, band-limited and cut to `n_taps`."""
     position = np.linspace(0.0, 1.0, response.size)
-    # Half a cosine from 0.4 fs to 0.5 fs: fractional delays then ring only briefly.
+    # With half a cosine from 0.4 fs to 0.5 fs, fractional delays ring only briefly.
     band_limit = np.where(position < 0.8, 1.0, 0.5 + 0.5 * np.cos(np.pi * (position - 0.8) / 0.2))
     taps = np.fft.irfft(response * band_limit, _N_FFT)
-    # Share of the energy from each sample on. What rings before time zero stands, by the circularity of
-    # the FFT, at the end of `taps`, and so counts as left out.
+    # Share of the energy from each sample on. Ringing before time zero wraps around to the end of `taps`, and so counts
+    # as left out.
     left_out = np.cumsum(taps[::-1] ** 2)[::-1] / np.sum(taps**2)
     enough = 64 * -(-int(np.count_nonzero(left_out > _CHOSEN_CUT)) // 64)
     chosen = enough if n_taps is None else as_count(n_taps, name)
@@ -221,15 +255,6 @@ def _sampled(response: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
         lost_db, allowed_db = 10 * np.log10(left_out[chosen]), 10 * np.log10(_ALLOWED_CUT)
         raise ValueError(
             f"{name} = {chosen} leaves out {lost_db:.1f} dB of the response's energy, more than "
-            f"{allowed_db:.0f} dB; leave it to the default, which takes {enough}"
+            f"{allowed_db:.0f} dB; leave it out for the default, which takes {enough}"
         )
     return taps[:chosen]
-
-
-def _resonances(round_trip: float, spacing_hz: float, fs: float) -> np.ndarray:
-    """Closed-form resonances of the lossless duct up to fs/2; `spacing_hz` is c / L."""
-    if round_trip == 0:
-        return np.array([])
-    orders = np.arange(1, int(fs / spacing_hz) + 2)
-    resonances = orders * spacing_hz / 2 if round_trip > 0 else (2 * orders - 1) * spacing_hz / 4
-    return resonances[resonances <= fs / 2]

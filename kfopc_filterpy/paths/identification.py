@@ -1,4 +1,4 @@
-"""Secondary-path identification: excite the loudspeaker, record the microphone, fit an impulse response."""
+"""Identification of the secondary path: excite the loudspeaker, record the microphone, fit an impulse response."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._validate import as_choice, as_count, as_generator, as_nonnegative, as_positive, as_signal
-from ..bounds.wiener import wiener_solution
 from .analysis import frequency_response
+from .least_squares import correlation_matrix, cross_correlation, minimum_norm_solve
 from .models import fir_path, path_taps, sampling_rate
 
 if TYPE_CHECKING:
     import control
-
-Amplifier = Callable[[np.ndarray], np.ndarray]
-"""An amplifier model: the signal after the amplifier from the signal before it, sample by sample."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +28,8 @@ class PathEstimate:
     taps : numpy.ndarray, shape (n_taps,)
         Its impulse response.
     residual_db : float
-        Part of the response's power that the fit leaves unexplained, in dB: noise, distortion by the
-        amplifier, and what of the path lies beyond `n_taps`. At least -300 dB.
+        Share of the response's power that the fit leaves unexplained, in dB: noise, distortion by the amplifier, and the
+        part of the path beyond `n_taps`. At least -300 dB.
     """
 
     estimate: control.TransferFunction
@@ -41,17 +38,13 @@ class PathEstimate:
 
 
 @dataclass(frozen=True)
-class IdentificationResult:
-    """Outcome of a simulated identification, in which the true path is known.
+class IdentificationResult(PathEstimate):
+    """Result of a simulated identification, in which the true path is known.
 
     Attributes
     ----------
-    estimate : control.TransferFunction
-        The estimated secondary path, with ``dt = 1/fs``.
-    taps : numpy.ndarray, shape (n_taps,)
-        Its impulse response.
-    residual_db : float
-        Part of the response's power that the fit leaves unexplained, in dB.
+    estimate, taps, residual_db
+        As in `PathEstimate`.
     frequencies_hz : numpy.ndarray, shape (n_frequencies,)
         Frequencies of the modelling error in Hz.
     modelling_error_db : numpy.ndarray, shape (n_frequencies,)
@@ -60,9 +53,6 @@ class IdentificationResult:
         ``10 log10(sum (s_est - s)^2 / sum s^2)``, the error of the whole impulse response.
     """
 
-    estimate: control.TransferFunction
-    taps: np.ndarray
-    residual_db: float
     frequencies_hz: np.ndarray
     modelling_error_db: np.ndarray
     misalignment_db: float
@@ -82,12 +72,12 @@ def estimate_path(
     response : array_like, shape (n_samples,)
         Signal of the error microphone, recorded at the same time.
     n_taps : int
-        Length of the impulse response; the path's delay included.
+        Length of the impulse response, including the delay of the path.
     fs : float
         Sampling rate in Hz.
-    regularization : float
-        Ridge relative to the excitation's power. It keeps frequencies that the excitation hardly holds
-        from being fitted to noise; the default limits the accuracy to some -100 dB. 0 is plain least squares.
+    regularization : float, default 1e-5
+        Ridge relative to the excitation's power. It keeps frequencies that the excitation hardly contains from being
+        fitted to noise; the default limits the accuracy to about -100 dB. 0 is plain least squares.
 
     Returns
     -------
@@ -97,7 +87,7 @@ def estimate_path(
     Raises
     ------
     TypeError, ValueError
-        Signals of differing lengths, shorter than ``2 n_taps - 1``, silent or not finite.
+        If the signals differ in length, are shorter than ``2 n_taps - 1``, silent or not finite.
 
     Examples
     --------
@@ -112,10 +102,15 @@ def estimate_path(
     response = as_signal(response, "response", length=excitation.size)
     for name, signal in (("excitation", excitation), ("response", response)):
         if not np.any(signal[n_taps - 1 :]):
-            raise ValueError(f"{name} must not be silent: the path cannot be told from it")
-    # A path's fit is a Wiener filter with nothing between its output and the microphone.
-    fit = wiener_solution(excitation, response, [1.0], n_taps, regularization=regularization)
-    return PathEstimate(fir_path(fit.weights, fs), fit.weights, -fit.noise_reduction_db)
+            raise ValueError(f"{name} must not be silent: it does not reveal the path")
+    heard = response[n_taps - 1 :]
+    matrix = correlation_matrix(excitation, n_taps, n_taps - 1)
+    ridge = as_nonnegative(regularization, "regularization") * float(np.mean(excitation[n_taps - 1 :] ** 2))
+    matrix.flat[:: n_taps + 1] += ridge
+    taps = minimum_norm_solve(matrix, cross_correlation(heard, excitation))
+    left = heard - np.convolve(excitation, taps, mode="valid")
+    residual_db = 10 * np.log10(max(np.mean(left**2) / np.mean(heard**2), 1e-30))
+    return PathEstimate(fir_path(taps, fs), taps, float(residual_db))
 
 
 def identify_secondary_path(
@@ -127,15 +122,15 @@ def identify_secondary_path(
     fs: float | None = None,
     excitation: str = "white",
     level: float = 1.0,
-    amplifier: Amplifier | None = None,
+    amplifier: Callable[[np.ndarray], np.ndarray] | None = None,
     sensor_noise_std: float = 0.0,
     regularization: float = 1e-5,
     frequencies_hz: Any = None,
 ) -> IdentificationResult:
-    """Simulate the identification of a secondary path, as done before the control starts.
+    """Simulate the identification of a secondary path, as it is done before the control starts.
 
-    The excitation runs through the amplifier and the true path; sensor noise is added; `estimate_path` fits
-    the taps to excitation and response.
+    The excitation runs through the amplifier and the true path, sensor noise is added, and `estimate_path` fits the taps
+    to excitation and response.
 
     Parameters
     ----------
@@ -149,19 +144,19 @@ def identify_secondary_path(
         Seed or generator of excitation and sensor noise.
     fs : float, optional
         Sampling rate in Hz, needed for a tap array.
-    excitation : {"white", "sweep"}
-        Gaussian white noise, or a sine with exponentially rising frequency from fs/1000 to fs/2.
-    level : float
+    excitation : {"white", "sweep"}, default "white"
+        Gaussian white noise, or a sine whose frequency rises exponentially from fs/1000 to fs/2.
+    level : float, default 1.0
         Root mean square of the excitation. A sweep peaks at ``sqrt(2) * level``.
     amplifier : callable, optional
-        Maps the signal before the amplifier, (n,), to that after it; None is a linear one.
-    sensor_noise_std : float
-        Standard deviation of the microphone's noise.
-    regularization : float
+        Maps the signal before the amplifier, (n,), to that after it; by default linear.
+    sensor_noise_std : float, default 0.0
+        Standard deviation of the noise of the microphone.
+    regularization : float, default 1e-5
         As in `estimate_path`.
     frequencies_hz : array_like, shape (n_frequencies,), optional
-        Frequencies of the modelling error in Hz; by default 256, evenly up to 0.45 fs, beyond
-        which converters pass little.
+        Frequencies of the modelling error in Hz; by default 256, evenly spaced up to 0.45 fs, above which converters
+        pass little.
 
     Returns
     -------
@@ -171,11 +166,11 @@ def identify_secondary_path(
     Raises
     ------
     TypeError, ValueError
-        An argument is out of range, the run is too short, or the amplifier changes the signal's shape.
+        If an argument is out of range, the run is too short, or the amplifier changes the shape of the signal.
 
     Examples
     --------
-    >>> from kfopc_filterpy.paths.models import bandpass_path
+    >>> from kfopc_filterpy import bandpass_path
     >>> result = identify_secondary_path(
     ...     bandpass_path(32), n_taps=32, duration_s=1.0, rng=1, sensor_noise_std=0.01
     ... )
@@ -217,8 +212,8 @@ def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.rand
     return np.sqrt(2) * level * chirp(t, fs / 1000, n_samples / fs, fs / 2, method="logarithmic", phi=-90)
 
 
-def _through(sent: np.ndarray, amplifier: Amplifier | None, taps: np.ndarray) -> np.ndarray:
-    """Run a signal through amplifier and path."""
+def _through(sent: np.ndarray, amplifier: Callable[[np.ndarray], np.ndarray] | None, taps: np.ndarray) -> np.ndarray:
+    """Run a signal through the amplifier and the path."""
     from scipy.signal import lfilter
 
     amplified = sent
@@ -229,7 +224,7 @@ def _through(sent: np.ndarray, amplifier: Amplifier | None, taps: np.ndarray) ->
 
 
 def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
-    """Modelling error of an estimate over frequency, ``20 log10(|S_est - S| / |S|)``.
+    """Return the modelling error of an estimate over frequency, ``20 log10(|S_est - S| / |S|)``.
 
     Parameters
     ----------
@@ -248,7 +243,7 @@ def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: flo
     Raises
     ------
     TypeError, ValueError
-        The paths differ in sampling rate, or a frequency is out of range.
+        If the paths differ in sampling rate, or a frequency is out of range.
 
     Examples
     --------
@@ -265,12 +260,12 @@ def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: flo
 
 
 def misalignment_db(path: Any, estimate: Any) -> float:
-    """Error of a whole impulse response, ``10 log10(sum (s_est - s)^2 / sum s^2)``.
+    """Return the error of a whole impulse response, ``10 log10(sum (s_est - s)^2 / sum s^2)``.
 
     Parameters
     ----------
     path, estimate : control.TransferFunction or array_like, shape (n_taps,)
-        True path and its estimate; the shorter is taken to go on with zeros.
+        True path and its estimate; the shorter is padded with zeros.
 
     Returns
     -------
@@ -280,7 +275,7 @@ def misalignment_db(path: Any, estimate: Any) -> float:
     Raises
     ------
     TypeError, ValueError
-        The path is silent, or not a finite impulse response.
+        If the path is silent, or its impulse response is not finite.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Models of the primary and secondary path: band-pass filters, user taps and perturbed copies of them.
+"""Models of the primary and secondary path: band-pass filters, user taps, and perturbed copies of them.
 
-Systems are single-channel python-control systems in discrete time with `dt = 1/fs`; `path_taps` gives the
-finite impulse response that a sample-by-sample loop runs. Tap arrays are accepted wherever a system is.
+Systems are python-control systems with one input and one output, in discrete time with `dt = 1/fs`; `path_taps` gives
+the finite impulse response that a sample-by-sample loop runs. Tap arrays are accepted wherever a system is.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ def bandpass_path(
 ) -> control.TransferFunction:
     """Design a linear-phase band-pass path, the path model of the paper's simulations.
 
-    The paper uses 20-5000 Hz with 128 taps (primary) and 32 taps (secondary). So few taps cannot
-    realise an edge of 20 Hz: `path_analysis.achieved_band` shows what they do realise.
+    The paper uses 20-5000 Hz with 128 taps (primary) and 32 taps (secondary). So few taps cannot realise an edge of
+    20 Hz; `achieved_band` shows what they do realise.
 
     Parameters
     ----------
     n_taps : int
         Length of the impulse response, at least 3. Its delay is ``(n_taps - 1) / 2`` samples.
-    band : (float, float)
-        Pass band (low, high) in Hz. ``low = 0`` gives a low-pass, ``high = fs/2`` a high-pass, which
-        needs an odd `n_taps`.
-    fs : float
+    band : (float, float), default (20.0, 5000.0)
+        Pass band (low, high) in Hz. ``low = 0`` gives a low-pass; ``high = fs/2`` gives a high-pass, which needs an odd
+        `n_taps`.
+    fs : float, default 16000
         Sampling rate in Hz.
-    window : str or tuple
+    window : str or tuple, default "hamming"
         Any window that `scipy.signal.get_window` knows.
 
     Returns
@@ -51,10 +51,11 @@ def bandpass_path(
     Raises
     ------
     TypeError, ValueError
-        An argument is out of range; the message names it.
+        If an argument is out of range.
 
     Examples
     --------
+    >>> from kfopc_filterpy.paths import path_taps
     >>> path = bandpass_path(32)
     >>> path.dt, path_taps(path).size
     (6.25e-05, 32)
@@ -79,7 +80,7 @@ def bandpass_path(
 
 
 def fir_path(taps: Any, fs: float, name: str | None = None) -> control.TransferFunction:
-    """Make a python-control system of an impulse response.
+    """Make a python-control system from an impulse response.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def fir_path(taps: Any, fs: float, name: str | None = None) -> control.TransferF
     Raises
     ------
     TypeError, ValueError
-        The taps are not a finite one-dimensional array, or are all zero, or `fs` is not positive.
+        If the taps are not a finite one-dimensional array or are all zero, or `fs` is not positive.
 
     Examples
     --------
@@ -118,7 +119,7 @@ def fir_path(taps: Any, fs: float, name: str | None = None) -> control.TransferF
 
 
 def is_system(path: Any) -> bool:
-    """Whether `path` is a python-control system (told by its attributes, so that control is not imported)."""
+    """Tell whether `path` is a python-control system, by its attributes, so that control need not be imported."""
     return hasattr(path, "dt") and hasattr(path, "ninputs")
 
 
@@ -130,8 +131,8 @@ def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> 
     path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
         A discrete-time single-channel system, or an impulse response.
     fs : float, optional
-        Sampling rate in Hz: needed for a tap array; for a system it must agree with the system's ``dt``.
-    name : str
+        Sampling rate in Hz: needed for a tap array; for a system it must agree with its ``dt``.
+    name : str, default "path"
         The argument's name in error messages.
 
     Returns
@@ -142,7 +143,7 @@ def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> 
     Raises
     ------
     TypeError, ValueError
-        The system is continuous or has several channels, its rate differs from `fs`, or `fs` is missing.
+        If the system is continuous or has several channels, its rate differs from `fs`, or `fs` is missing.
 
     Examples
     --------
@@ -153,7 +154,7 @@ def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> 
         fs = as_positive(fs, "fs", unit="Hz")
     if not is_system(path):
         if fs is None:
-            raise ValueError(f"fs must be given where {name} is a tap array: it carries no sampling rate")
+            raise ValueError(f"fs must be given if {name} is a tap array, which carries no sampling rate")
         return fs
     if (path.ninputs, path.noutputs) != (1, 1):
         raise ValueError(
@@ -172,13 +173,13 @@ def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> 
 
 
 def finite_taps(system: Any) -> np.ndarray | None:
-    """Return the exact taps of a transfer function with a finite impulse response, None for other systems."""
+    """Return the exact taps of a transfer function with a finite impulse response, or None for other systems."""
     if not hasattr(system, "num_array"):
         return None
     numerator, denominator = system.num_array[0, 0], system.den_array[0, 0]
     if np.any(denominator[1:]):
         return None
-    # python-control strips leading zeros of the numerator: they are the path's delay.
+    # python-control strips the leading zeros of the numerator, which are the delay of the path.
     return np.concatenate([np.zeros(denominator.size - numerator.size), numerator / denominator[0]])
 
 
@@ -192,9 +193,9 @@ def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, 
     fs : float, optional
         Sampling rate in Hz that a system must have.
     n_taps : int, optional
-        Length wanted. A finite response keeps its own length by default, is padded with zeros if
-        shorter and cut if longer. A system with an infinite response (IIR) must be given a length.
-    name : str
+        Number of taps wanted; a shorter response is padded with zeros, a longer one cut. By default a finite response
+        keeps its length; a system with an infinite response (IIR) needs a number.
+    name : str, default "path"
         The argument's name in error messages.
 
     Returns
@@ -205,8 +206,8 @@ def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, 
     Raises
     ------
     TypeError, ValueError
-        Another sampling rate, a continuous, non-causal, unstable or multi-channel system, an infinite
-        response without `n_taps`, or one that holds more than -60 dB of its energy beyond `n_taps`.
+        If the system has another sampling rate, is continuous, non-causal, unstable or multi-channel, has an infinite
+        response and `n_taps` is not given, or has more than -60 dB of its energy beyond `n_taps`.
 
     Examples
     --------
@@ -227,7 +228,7 @@ def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, 
         if n_taps is None:
             raise ValueError(
                 f"n_taps must be given: {name} has an infinite impulse response; pass path_taps(system, n_taps=...) "
-                "where only taps or FIR systems are taken"
+                "to functions that take only taps or FIR systems"
             )
         taps = _infinite_response(path, 2 * n_taps, name)
     if not np.all(np.isfinite(taps)):
@@ -236,7 +237,7 @@ def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, 
 
 
 def _cut(taps: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
-    """Pad or cut `taps` to `n_taps`, refusing to cut off what matters."""
+    """Pad or cut `taps` to `n_taps`; refuse to cut off more than -60 dB of the energy."""
     if n_taps is None or n_taps == taps.size:
         return taps
     lost, energy = np.sum(taps[n_taps:] ** 2), np.sum(taps**2)
@@ -249,14 +250,14 @@ def _cut(taps: np.ndarray, n_taps: int | None, name: str) -> np.ndarray:
 
 
 def _infinite_response(system: Any, length: int, name: str) -> np.ndarray:
-    """Impulse response of a stable IIR system."""
+    """Return the impulse response of a stable IIR system."""
     poles = np.abs(system.poles()) if hasattr(system, "poles") else None
     if poles is None:
         raise TypeError(f"{name} must be a TransferFunction or StateSpace, got {type(system).__name__}")
     if np.max(poles, initial=0.0) >= 1:
         raise ValueError(
             f"{name} must be stable, but has a pole of magnitude {poles.max():.6g}; a filter of high order "
-            "loses its stability as a transfer function: design it as second-order sections and pass its taps"
+            "is easily unstable as a transfer function: design it as second-order sections and pass its taps"
         )
     if hasattr(system, "num_array"):
         from scipy.signal import lfilter
@@ -280,24 +281,24 @@ def perturbed_path(
     delay_samples: float = 0.0,
     fs: float | None = None,
 ) -> control.TransferFunction:
-    """Copy a path with another gain, phase and delay, to study a mismatched estimate.
+    """Return a copy of a path with another gain, phase and delay, to study a mismatched estimate.
 
-    The response wanted is ``H(f) * 10^(gain_db/20) * exp(j phase) * exp(-j 2 pi f delay)``. Gains, whole
-    samples of delay and multiples of 180 degrees are exact. Any other phase (the same at all frequencies, a
-    Hilbert-type rotation) and fraction of a sample are fitted by least squares over 0.01 fs to 0.45 fs
-    with 64 further taps. Accuracy for 90 degrees on the paper's 32-tap path at 16 kHz: 2.5 degrees and
-    0.4 dB over 300-4500 Hz, 1.5 degrees over 500-4500 Hz; for fractional delays better than 0.1 degree.
+    The response wanted is ``H(f) * 10^(gain_db/20) * exp(j phase) * exp(-j 2 pi f delay)``. Gains, whole samples of
+    delay and multiples of 180 degrees are exact. Any other phase (the same at all frequencies, a Hilbert-type rotation)
+    and fractions of a sample are fitted by least squares over 0.01 fs to 0.45 fs with 64 additional taps. For 90 degrees
+    on the paper's 32-tap path at 16 kHz the fit is accurate to 2.5 degrees and 0.4 dB over 300-4500 Hz, and to
+    1.5 degrees over 500-4500 Hz; for fractional delays it is better than 0.1 degree.
 
     Parameters
     ----------
     path : control.TransferFunction or array_like, shape (n_taps,)
         The path to copy (finite impulse response).
-    gain_db : float
+    gain_db : float, default 0.0
         Gain in dB.
-    phase_deg : float
+    phase_deg : float, default 0.0
         Phase in degrees, positive for a lead; 90 is the stability bound of filtered-reference control.
-    delay_samples : float
-        Delay in samples. A negative one advances the path, as far as its own delay allows.
+    delay_samples : float, default 0.0
+        Delay in samples. A negative delay advances the path, as far as its own delay allows.
     fs : float, optional
         Sampling rate in Hz, needed for a tap array.
 
@@ -309,7 +310,7 @@ def perturbed_path(
     Raises
     ------
     ValueError
-        No causal filter comes within -20 dB of the response wanted: the path's own delay is too short.
+        If no causal filter comes within -20 dB of the response wanted, because the delay of the path is too short.
 
     Examples
     --------
@@ -329,13 +330,13 @@ def perturbed_path(
 
 
 def _rotated(taps: np.ndarray, phase: float, delay: float) -> np.ndarray:
-    """Fit causal taps to `taps` with a constant phase (rad) and a delay (samples) added."""
+    """Return causal taps, fitted to `taps` with a constant phase (rad) and a delay (samples) added."""
     n = taps.size + max(int(np.ceil(delay)), 0) + 64
     omega = np.linspace(0.0, np.pi, 4 * n)
     basis = np.exp(-1j * np.outer(omega, np.arange(n)))
     wanted = (basis[:, : taps.size] @ taps) * np.exp(1j * (phase - omega * delay))
     band = (omega >= 0.02 * np.pi) & (omega <= 0.9 * np.pi)
-    # A real filter cannot rotate 0 Hz and fs/2. A small weight there keeps the gain from running off.
+    # A real filter cannot rotate 0 Hz and fs/2. A small weight there keeps the gain from growing without bound.
     weight = np.where(band, 1.0, 0.1)[:, None]
     system = np.vstack([weight * basis.real, weight * basis.imag])
     target = np.concatenate([weight[:, 0] * wanted.real, weight[:, 0] * wanted.imag])

@@ -1,15 +1,7 @@
-"""Figures of paths and of what follows from them.
+"""Figures of paths, their identification, and the rated power they ask for.
 
-Each function draws into `ax`, or into a new figure, and returns the axes.
-
-Examples
---------
->>> import matplotlib.pyplot as plt
->>> from kfopc_filterpy.paths.models import bandpass_path
->>> magnitude, phase = plot_bode({"P": bandpass_path(128), "S": bandpass_path(32)})
->>> magnitude.get_ylabel(), phase.get_xlabel()
-('Magnitude (dB)', 'Frequency (Hz)')
->>> plt.close(magnitude.figure)
+Each function draws into `ax`, or into new axes, and returns the axes. Paths are python-control systems, which know their
+sampling rate, or arrays of taps, which need `fs`.
 """
 
 from __future__ import annotations
@@ -24,12 +16,13 @@ from ..bounds.rated_power import required_rated_power
 from ..bounds.wiener import WienerSolution
 from ..paths.analysis import (
     STABILITY_BOUND_DEG,
+    causality_margin,
+    energy_onset,
     frequency_response,
     group_delay,
     phase_error,
     secondary_path_gain,
 )
-from ..paths.causality import causality_margin, energy_onset
 from ..paths.identification import IdentificationResult
 from ..paths.models import finite_taps, is_system, path_taps, sampling_rate
 from .style import MARK, audible, decibels, frequency_axis, legend_above, level_axis, line_style, new_axes
@@ -39,7 +32,7 @@ if TYPE_CHECKING:
 
 
 def _named(paths: Any) -> dict[str, Any]:
-    """Return paths by name, a single one under its own or a general name."""
+    """Return paths by name; a single one is called "path"."""
     if isinstance(paths, Mapping):
         if not paths:
             raise ValueError("paths must name at least one path, got an empty mapping")
@@ -48,28 +41,28 @@ def _named(paths: Any) -> dict[str, Any]:
 
 
 def _grid(frequencies_hz: Any, paths: Mapping[str, Any], fs: float | None) -> np.ndarray:
-    """Return the frequencies to draw: those given, or 2000 on a logarithmic scale from 20 Hz."""
+    """Return the frequencies to draw: those given, or 2000 on a logarithmic scale from 20 Hz to fs/2."""
     rates = {sampling_rate(path, fs, name=name) for name, path in paths.items()}
     if frequencies_hz is not None:
         return as_signal(frequencies_hz, "frequencies_hz", min_length=2)
     if len(rates) > 1:
-        raise ValueError(f"frequencies_hz must be given for paths of differing sampling rates {sorted(rates)} Hz")
+        raise ValueError(f"frequencies_hz must be given for paths of differing sampling rates, {sorted(rates)} Hz")
     nyquist = rates.pop() / 2
     return np.geomspace(min(20.0, nyquist / 400), 0.999 * nyquist, 2000)
 
 
 def plot_bode(paths: Any, *, frequencies_hz: Any = None, fs: float | None = None, ax: Any = None) -> Any:
-    """Magnitude and phase of paths over frequency in Hz.
+    """Draw the magnitude and phase of paths over frequency in Hz.
 
-    The phase is unwrapped, and each path's own delay (its energy onset, named in the phase's legend) is
-    taken out, for otherwise its slope hides all else; an infinite response keeps its delay. Where a path
-    lies more than 40 dB below its peak no phase is drawn.
+    The phase is unwrapped. The delay of each path (its energy onset, stated in the legend of the phase) is removed,
+    because its slope would hide everything else; an infinite response keeps its delay. No phase is drawn at frequencies
+    where a path is more than 40 dB below its peak.
 
     Parameters
     ----------
     paths : path, or mapping of str to path
-        What to draw, by legend entry: ``{"P": primary, "S": secondary, "Ŝ": estimate}``. A path is a
-        python-control system or an impulse response.
+        Paths by legend entry: ``{"P": primary, "S": secondary, "Ŝ": estimate}``. A path is a python-control system or an
+        impulse response.
     frequencies_hz : array_like, optional
         Frequencies in Hz; by default 2000 from 20 Hz to fs/2.
     fs : float, optional
@@ -85,7 +78,17 @@ def plot_bode(paths: Any, *, frequencies_hz: Any = None, fs: float | None = None
     Raises
     ------
     TypeError, ValueError
-        As `path_analysis.frequency_response`, or `ax` is not two axes.
+        As for `frequency_response`, or if `ax` is not two axes.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> magnitude, phase = plot_bode({"P": primary, "S": secondary})
+    >>> magnitude.get_ylabel(), phase.get_xlabel()
+    ('Magnitude (dB)', 'Frequency (Hz)')
+    >>> plt.close(magnitude.figure)
     """
     named = _named(paths)
     frequencies = _grid(frequencies_hz, named, fs)
@@ -109,22 +112,22 @@ def plot_bode(paths: Any, *, frequencies_hz: Any = None, fs: float | None = None
 
 
 def _onset_s(path: Any, fs: float | None) -> float:
-    """Energy onset of a path in s; 0 for an infinite response."""
+    """Return the energy onset of a path in s, 0 for an infinite response."""
     taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
     return 0.0 if taps is None else energy_onset(taps) / sampling_rate(path, fs)
 
 
 def plot_impulse_responses(paths: Any, *, fs: float | None = None, ax: Axes | None = None) -> Axes:
-    """Impulse responses of paths over time in ms.
+    """Draw the impulse responses of paths over time in ms.
 
     Parameters
     ----------
     paths : path, or mapping of str to path
-        As `plot_bode`; finite impulse responses.
+        As for `plot_bode`, with finite impulse responses.
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -134,7 +137,17 @@ def plot_impulse_responses(paths: Any, *, fs: float | None = None, ax: Axes | No
     Raises
     ------
     TypeError, ValueError
-        As `paths.path_taps`.
+        As for `path_taps`.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> ax = plot_impulse_responses({"P": primary, "S": secondary})
+    >>> ax.get_xlabel(), ax.get_legend_handles_labels()[1]
+    ('Time (ms)', ['P', 'S'])
+    >>> plt.close(ax.figure)
     """
     ax = new_axes(ax)
     for i, (label, path) in enumerate(_named(paths).items()):
@@ -150,14 +163,14 @@ def plot_impulse_responses(paths: Any, *, fs: float | None = None, ax: Axes | No
 def plot_group_delay(
     paths: Any, *, frequencies_hz: Any = None, fs: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Group delay of paths in ms over frequency in Hz, where they lie within 40 dB of their peak.
+    """Draw the group delay of paths in ms over frequency in Hz, where they are within 40 dB of their peak.
 
     Parameters
     ----------
     paths, frequencies_hz, fs
-        As `plot_bode`.
+        As for `plot_bode`.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -167,7 +180,17 @@ def plot_group_delay(
     Raises
     ------
     TypeError, ValueError
-        As `path_analysis.group_delay`.
+        As for `group_delay`.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> ax = plot_group_delay({"P": primary, "S": secondary})
+    >>> ax.get_ylabel()
+    'Group delay (ms)'
+    >>> plt.close(ax.figure)
     """
     named = _named(paths)
     frequencies = _grid(frequencies_hz, named, fs)
@@ -183,7 +206,7 @@ def plot_group_delay(
 
 
 def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = None, ax: Axes | None = None) -> Axes:
-    """Impulse responses of both paths with their energy onsets and the margin between them.
+    """Draw the impulse responses of both paths, with their energy onsets and the margin between them.
 
     Parameters
     ----------
@@ -192,7 +215,7 @@ def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = No
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -202,7 +225,17 @@ def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = No
     Raises
     ------
     TypeError, ValueError
-        As `path_analysis.causality_margin`.
+        As for `causality_margin`.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> primary, secondary = bandpass_path(128), bandpass_path(32)
+    >>> ax = plot_causality_margin(primary, secondary)
+    >>> ax.texts[-1].get_text().strip()
+    'margin 2.81 ms (45 samples)'
+    >>> plt.close(ax.figure)
     """
     margin = causality_margin(primary, secondary, fs=fs)
     onsets = (1e3 * margin.primary_onset_s, 1e3 * margin.secondary_onset_s)
@@ -219,7 +252,7 @@ def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = No
         va="center",
         bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
     )
-    # The onsets and what follows shortly; the late reverberation does not bear on the margin.
+    # The late reverberation does not affect the margin.
     ax.set_xlim(0, 2 * max(*onsets, 1e3 * margin.primary_delay_s, 1e3 * margin.secondary_delay_s))
     ax.set_ylim(-1.4, 1.15)
     ax.set(xlabel="Time (ms)", ylabel="Impulse response / peak")
@@ -237,20 +270,20 @@ def plot_secondary_path_gain(
     fs: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Power gain of a secondary path over frequency, with G_s (eq. 11) for a band and for a reference.
+    """Draw the power gain of a secondary path over frequency, with G_s (eq. 11) for a band and for a reference.
 
     Parameters
     ----------
     path : control.TransferFunction or array_like, shape (n_taps,)
         Secondary path with a finite impulse response.
     band : (float, float), optional
-        Band of white noise in Hz; from 0 to fs/2 by default.
+        Band of white noise in Hz, by default 0 to fs/2.
     reference : array_like, shape (n_samples,), optional
-        Reference signal to show G_s for as well.
+        Reference signal, to show G_s for it as well.
     frequencies_hz, fs
-        As `plot_bode`.
+        As for `plot_bode`.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -260,7 +293,16 @@ def plot_secondary_path_gain(
     Raises
     ------
     TypeError, ValueError
-        As `path_analysis.secondary_path_gain`.
+        As for `secondary_path_gain`.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> ax = plot_secondary_path_gain(bandpass_path(32), band=(200.0, 2000.0))
+    >>> ax.get_legend_handles_labels()[1][1]
+    '$G_s$, 200 to 2000 Hz: -0.1 dB'
+    >>> plt.close(ax.figure)
     """
     frequencies = _grid(frequencies_hz, {"path": path}, fs)
     low, high = (0.0, sampling_rate(path, fs) / 2) if band is None else band
@@ -288,20 +330,20 @@ def plot_phase_error(
     fs: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Phase error of one or several estimates against the path, with the stability bound at ±90 degrees.
+    """Draw the phase error of estimates of a path, with the stability bound at ±90 degrees.
 
-    Frequencies at which the path lies more than 40 dB below its peak are left out.
+    Frequencies at which the path is more than 40 dB below its peak are left out.
 
     Parameters
     ----------
     path : control.TransferFunction, control.StateSpace or array_like, shape (n_taps,)
         True secondary path.
     estimates : path, or mapping of str to path
-        Its estimates, by legend entry.
+        Estimates of it, by legend entry.
     frequencies_hz, fs
-        As `plot_bode`.
+        As for `plot_bode`.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -311,7 +353,18 @@ def plot_phase_error(
     Raises
     ------
     TypeError, ValueError
-        As `path_analysis.phase_error`.
+        As for `phase_error`.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> from kfopc_filterpy.paths import perturbed_path
+    >>> path = bandpass_path(32)
+    >>> ax = plot_phase_error(path, {"one sample late": perturbed_path(path, delay_samples=1)})
+    >>> ax.get_legend_handles_labels()[1]
+    ['one sample late', 'Stability bound ±90°']
+    >>> plt.close(ax.figure)
     """
     frequencies = _grid(frequencies_hz, {"path": path}, fs)
     named = estimates if isinstance(estimates, Mapping) else {"Estimate": estimates}
@@ -319,7 +372,7 @@ def plot_phase_error(
     ax = new_axes(ax)
     for i, (label, estimate) in enumerate(_named(named).items()):
         error = phase_error(path, estimate, frequencies, fs=fs).error_deg
-        # Break the curve where it wraps from 180 to -180 degrees, and where the path passes nothing.
+        # Break the curve where it wraps from 180 to -180 degrees, and where the path is silent.
         wrapped = np.append(np.abs(np.diff(error)) > 180, False)
         ax.plot(frequencies, np.where(wrapped | silent, np.nan, error), label=label, **line_style(i))
     for sign in (-1, 1):
@@ -337,16 +390,16 @@ def plot_phase_error(
 def plot_required_rated_power(
     solution: WienerSolution, *, rated_power: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Rated power that KF-OPC needs over the noise reduction wanted, up to what the Wiener filter attains.
+    """Draw the rated power that KF-OPC needs over the noise reduction, up to what the Wiener filter attains.
 
     Parameters
     ----------
     solution : WienerSolution
-        Wiener filter of the reference and disturbance at hand, made without a penalty.
+        Wiener filter of the reference and disturbance at hand, computed without a penalty.
     rated_power : float, optional
         A rated power to mark.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -356,7 +409,20 @@ def plot_required_rated_power(
     Raises
     ------
     TypeError, ValueError
-        As `rated_power.required_rated_power`.
+        As for `required_rated_power`.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> import numpy as np
+    >>> from kfopc_filterpy.bounds import wiener_solution
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal(4000)
+    >>> solution = wiener_solution(x, 0.5 * x + 0.05 * rng.standard_normal(4000), [1.0], n_taps=4)
+    >>> ax = plot_required_rated_power(solution, rated_power=0.1)
+    >>> ax.get_legend_handles_labels()[1][1:]
+    ['Wiener filter unconstrained: 20.0 dB', 'Rated power 0.1']
+    >>> plt.close(ax.figure)
     """
     powers = {
         "disturbance_power": solution.disturbance_power,
@@ -380,14 +446,14 @@ def plot_required_rated_power(
 
 
 def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
-    """Modelling error of one or several identifications over frequency.
+    """Draw the modelling error of one or several identifications over frequency.
 
     Parameters
     ----------
     results : IdentificationResult, or mapping of str to IdentificationResult
-        What to draw, by legend entry.
+        Identifications by legend entry.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -397,7 +463,18 @@ def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
     Raises
     ------
     TypeError
-        A value is not an IdentificationResult.
+        If a value is not an IdentificationResult.
+
+    Examples
+    --------
+    >>> import matplotlib.pyplot as plt
+    >>> from kfopc_filterpy import bandpass_path
+    >>> from kfopc_filterpy.paths import identify_secondary_path
+    >>> result = identify_secondary_path(bandpass_path(32), n_taps=32, duration_s=1.0, rng=1, sensor_noise_std=0.01)
+    >>> ax = plot_modelling_error({"32 taps": result})
+    >>> ax.get_ylabel()
+    'Modelling error (dB)'
+    >>> plt.close(ax.figure)
     """
     named = results if isinstance(results, Mapping) else {"Estimate": results}
     ax = new_axes(ax)

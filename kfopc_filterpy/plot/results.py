@@ -1,4 +1,4 @@
-"""What the figures of runs share: results by name, a fixed style per algorithm, spans of time."""
+"""Parts that the figures of runs share: results by name, a fixed style per algorithm, channels, spans of time."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_number
-from ..loop.simulation import SimulationResult
+from .._validate import as_count, as_number
+from ..loop.result import SimulationResult
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,27 +42,45 @@ class Curve(NamedTuple):
         """The first run."""
         return self.runs[0]
 
-    def stack(self, name: str, part: slice = slice(None)) -> np.ndarray:
-        """(n_runs, n_samples) signals `name` of the runs."""
-        return np.stack([getattr(run, name)[part] for run in self.runs])
+    def stack(self, name: str, part: slice = slice(None), channel: int | None = None) -> np.ndarray:
+        """Return the signals `name` of the runs, (n_runs, n_samples) or, with all of several channels, 3-D."""
+        signals = (getattr(run, name) for run in self.runs)
+        return np.stack([(x if channel is None else one_channel(x, channel))[..., part] for x in signals])
 
     def line(self) -> dict[str, Any]:
-        """Label, with the time of a divergence, and line style of a smooth curve."""
+        """Return the label, with the time of a divergence, and the line style of a smooth curve."""
         return {"label": _label(self), **self.style, "marker": ""}
 
     def draw(self, ax: Axes, x: np.ndarray, y: np.ndarray, i: int) -> None:
-        """Draw a curve thin, solid and with sparse markers: dashes are lost in one that wanders.
+        """Draw `y`, (n,) or (n_loudspeakers, n), thin, solid and with sparse markers: dashes are lost in a noisy curve.
 
-        The markers of the i-th curve lie between those of the others.
+        The markers of the i-th curve lie between those of the others. The loudspeakers of a run look alike.
         """
         style = {**self.line(), "linestyle": "-", "linewidth": 1.0, "markersize": 4.5}
-        if np.any(np.isfinite(y) & (y != 0)):  # matplotlib cannot place markers along a curve without points
-            style |= {"marker": self.style["marker"], "markevery": (0.02 + 0.025 * (i % 4), 0.1)}
-        ax.plot(x, y, **style)
+        rows = np.atleast_2d(y)
+        if len(rows) > 1:
+            style["label"] += f", {len(rows)} loudspeakers"
+        for row in rows:
+            drawn = style
+            if np.any(np.isfinite(row) & (row != 0)):  # matplotlib cannot place markers along a curve without points
+                drawn = style | {"marker": self.style["marker"], "markevery": (0.02 + 0.025 * (i % 4), 0.1)}
+            ax.plot(x, row, **drawn)
+            style = style | {"label": None}
+
+
+def one_channel(signal: np.ndarray, channel: int | None) -> np.ndarray:
+    """Return one channel of a run's signal, (n_samples,); of several it has to be chosen."""
+    n_channels = 1 if signal.ndim == 1 else len(signal)
+    if channel is None and n_channels > 1:
+        raise ValueError(f"results hold {n_channels} channels; choose one with channel=0 to channel={n_channels - 1}")
+    index = as_count(channel or 0, "channel", minimum=0)
+    if index >= n_channels:
+        raise ValueError(f"channel must be below the {n_channels} channel(s) of the results, got {index}")
+    return np.atleast_2d(signal)[index]
 
 
 def named_styles(labels: list[str], algorithms: list[str]) -> list[dict[str, Any]]:
-    """Styles of curves, by algorithm where its style is free, else by label, else one of the others."""
+    """Return the styles of curves: that of the label or the algorithm if it is free, else one of the others."""
     taken: list[dict[str, Any]] = []
     for label, algorithm in zip(labels, algorithms, strict=True):
         others = [style for style in _OTHERS if style not in taken] or _OTHERS
@@ -72,7 +90,7 @@ def named_styles(labels: list[str], algorithms: list[str]) -> list[dict[str, Any
 
 
 def curves(results: Any, *, single: bool = False) -> list[Curve]:
-    """Results as curves: one result, a sequence of them, or a mapping of name to result or to several."""
+    """Return results as curves; they come as one result, a sequence, or a mapping of name to one or several."""
     named = _grouped(results)
     if not named or not all(named.values()):
         raise ValueError("results must hold at least one SimulationResult for each name, got none")
@@ -80,10 +98,10 @@ def curves(results: Any, *, single: bool = False) -> list[Curve]:
         for run in runs:
             if not isinstance(run, SimulationResult):
                 raise TypeError(f"results must hold SimulationResult, got {type(run).__name__} under {label!r}")
-        if len({(run.fs, run.error.size) for run in runs}) > 1:
-            raise ValueError(f"results {label!r} must be runs of one length and one fs")
+        if len({(run.fs, run.error.shape, run.control_signal.shape) for run in runs}) > 1:
+            raise ValueError(f"results {label!r} must be runs of one length and one fs, with the same channels")
         if single and len(runs) > 1:
-            raise ValueError(f"results must hold one run a name here, got {len(runs)} runs of {label!r}")
+            raise ValueError(f"results must hold one run per name here, got {len(runs)} runs of {label!r}")
     styles = named_styles(list(named), [runs[0].algorithm for runs in named.values()])
     return [Curve(label, runs, style) for (label, runs), style in zip(named.items(), styles, strict=True)]
 
@@ -106,31 +124,31 @@ def _grouped(results: Any) -> dict[str, list[Any]]:
 
 
 def require_common_disturbance(shown: list[Curve]) -> None:
-    """Raise ValueError where runs whose disturbance is drawn once have different ones."""
+    """Raise ValueError if the runs have different disturbances, which these figures draw once."""
     first = shown[0].stack("disturbance")
     for curve in shown[1:]:
         if curve.run.fs != shown[0].run.fs or not np.array_equal(curve.stack("disturbance"), first):
             raise ValueError(
-                f"results must have one disturbance, for it is drawn once: {curve.label!r} and "
+                f"results must have one disturbance, because it is drawn once: those of {curve.label!r} and "
                 f"{shown[0].label!r} differ; draw them in two axes"
             )
 
 
 def span_of(run: SimulationResult, span_s: Any) -> slice:
-    """Samples of a run between two times in seconds."""
-    duration = run.error.size / run.fs
+    """Return the samples of a run between two times in seconds."""
+    duration = run.n_samples / run.fs
     try:
         start, end = (as_number(time, "span_s", unit="s") for time in span_s)
     except (TypeError, ValueError) as error:
         raise ValueError(f"span_s must be a pair (start, end) in seconds, got {span_s!r}") from error
     part = slice(round(start * run.fs), round(end * run.fs))
-    if not 0 <= part.start < part.stop <= run.error.size:
+    if not 0 <= part.start < part.stop <= run.n_samples:
         raise ValueError(f"span_s must satisfy 0 <= start < end <= {duration:g} s, got ({start:g}, {end:g}) s")
     return part
 
 
 def span_axis(ax: Axes, span_s: Any) -> float:
-    """Time axis over a span, in ms where it is short; returns its units in a second."""
+    """Set the time axis to a span, in ms if it is short; return its units in a second."""
     start, end = span_s
     per_second, unit = (1e3, "ms") if end - start < 0.5 else (1.0, "s")
     ax.set_xlim(start * per_second, end * per_second)
@@ -140,12 +158,12 @@ def span_axis(ax: Axes, span_s: Any) -> float:
 
 
 def times(run: SimulationResult, part: slice, per_second: float) -> np.ndarray:
-    """Times of the samples of `part`."""
+    """Return the times of the samples of `part`."""
     return np.arange(part.start, part.stop) / run.fs * per_second
 
 
 def thinned(n_samples: int, step: int = 1, most: int = 4000) -> np.ndarray:
-    """Indices of every step-th sample, fewer where that would be more than `most`."""
+    """Return the indices of every step-th sample, of fewer if these are more than `most`."""
     return np.arange(0, n_samples, max(1, step, -(-n_samples // most)))
 
 

@@ -1,16 +1,18 @@
-"""Figures of runs: spectra, waveforms, weights, convergence, output power.
+"""Figures of runs over time: convergence, output power, constraint factor, weights; and figures of a study.
 
-Common to the functions here:
+These rules hold for the functions here and in `kfopc_filterpy.plot.signals`:
 
 - `results` is one `SimulationResult`, a sequence of them, named in the legend by their `algorithm`, or a mapping of
   legend entry to result. Each algorithm has one colour, line style and marker in every figure.
-- Where a function says so, a mapping may hold several runs (seeds) under one name, of one length; powers are then
+- If a function says so, a mapping may hold a list of several runs (seeds) of one length under a name; powers are then
   averaged over them before any ratio or logarithm is taken.
-- `ax` is where to draw; None makes a new figure. The axes drawn into are returned, their figure is `ax.figure`.
-- What a run that diverged did not reach is left out; its legend entry says when it diverged.
-- Signals are in the unit of the results' signals, powers are mean squares in that unit squared; times in s, frequencies
-  in Hz, levels in dB.
-- Results or settings that are not as described raise TypeError or ValueError naming the argument.
+- `channel` picks one microphone or loudspeaker of runs with several, counted from 0. Each function says what it shows
+  without it; for runs with one channel it is not needed.
+- `ax` is where to draw; None makes a new figure. The axes drawn into are returned; their figure is `ax.figure`.
+- The part of a run after its divergence is left out; its legend entry says when it diverged.
+- Signals are in the unit of the results' signals, powers are mean squares in that unit squared; times are in s,
+  frequencies in Hz, levels in dB.
+- Results or settings that are not as described raise TypeError or ValueError, and the message names the argument.
 """
 
 from __future__ import annotations
@@ -22,49 +24,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._runs import as_runs, window_length
-from .._validate import as_choice, as_count, as_number, as_positive, as_signal
-from ..metrics import nse_db
-from .results import DISTURBANCE, RATED, Curve, curves, named_styles, thinned
-from .signals import (
-    plot_amplifier_output,
-    plot_anti_noise,
-    plot_disturbance_and_anti_noise,
-    plot_error_spectra,
-)
+from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
+from ..metrics import nse_db, short_time_power
+from .results import DISTURBANCE, RATED, Curve, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "plot_amplifier_output",
-    "plot_anti_noise",
-    "plot_constraint_factor",
-    "plot_disturbance_and_anti_noise",
-    "plot_error_spectra",
-    "plot_noise_reduction_against_overdrive",
-    "plot_nse",
-    "plot_output_power",
-    "plot_weight_history",
-    "save_figure",
-]
 
+def plot_weight_history(results: Any, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:
+    """Draw the history of one weight of each control filter (the paper's Fig. 5 d).
 
-def plot_weight_history(results: Any, *, tap: int, ax: Axes | None = None) -> Axes:
-    """History of one weight of each control filter (the paper's Fig. 5 d).
-
-    The axis is logarithmic beyond the smallest curve where another grows to more than 100 times it.
+    If one curve grows to more than 100 times the smallest, the axis is logarithmic beyond the smallest.
 
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
-        Runs with their weights recorded, one a name.
-    tap : int
-        Index of the weight, from 0.
+        Runs with their weights recorded, one per name.
+    tap : int or (int, int, int)
+        Index of the weight, from 0; with several channels (loudspeaker, reference, tap).
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -73,8 +55,8 @@ def plot_weight_history(results: Any, *, tap: int, ax: Axes | None = None) -> Ax
 
     Raises
     ------
-    ValueError, TypeError
-        Weights that were not recorded, a tap that a filter does not have, or another argument not as described.
+    ValueError
+        If the weights were not recorded, or a filter does not have the tap.
 
     Examples
     --------
@@ -89,7 +71,7 @@ def plot_weight_history(results: Any, *, tap: int, ax: Axes | None = None) -> Ax
     >>> plt.close(ax.figure)
     """
     shown = curves(results, single=True)
-    index = as_count(tap, "tap", minimum=0)
+    index: tuple[Any, ...] = tuple(as_count(i, "tap", minimum=0) for i in np.atleast_1d(np.asarray(tap, dtype=object)))
     histories = []
     for curve in shown:
         weights = curve.run.weights
@@ -97,9 +79,13 @@ def plot_weight_history(results: Any, *, tap: int, ax: Axes | None = None) -> Ax
             raise ValueError(
                 f"results {curve.label!r} hold no weights; simulate with record_weights_every=, such as 16"
             )
-        if index >= weights.shape[1]:
-            raise ValueError(f"tap must be below the {weights.shape[1]} weights of {curve.label!r}, got {index}")
-        histories.append(weights[:, index])
+        if len(index) != weights.ndim - 1:
+            expected = "an index" if weights.ndim == 2 else "(loudspeaker, reference, tap)"
+            raise ValueError(f"tap must be {expected} for the weights of {curve.label!r}, got {tap!r}")
+        if any(i >= n for i, n in zip(index, weights.shape[1:], strict=True)):
+            held = weights.shape[1] if weights.ndim == 2 else weights.shape[1:]
+            raise ValueError(f"tap must be below the {held} weights of {curve.label!r}, got {tap}")
+        histories.append(weights[(slice(None), *index)])
     ax = new_axes(ax)
     for curve, history in zip(shown, histories, strict=True):
         rows = thinned(history.size)
@@ -109,24 +95,33 @@ def plot_weight_history(results: Any, *, tap: int, ax: Axes | None = None) -> Ax
     if max(peaks) > 100 * smallest:
         ax.set_yscale("symlog", linthresh=smallest)
     _whole_time_axis(ax, shown)
-    ax.set_ylabel(f"Weight {index} of the control filter")
+    ax.set_ylabel(f"Weight {tap} of the control filter")
     legend_above(ax)
     return ax
 
 
-def plot_nse(results: Any, *, window_s: float = 0.005, time_axis: str = "linear", ax: Axes | None = None) -> Axes:
-    """Normalised squared error over time (the paper's Fig. 6 a and 7 a).
+def plot_nse(
+    results: Any,
+    *,
+    window_s: float = 0.005,
+    time_axis: str = "linear",
+    channel: int | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the normalised squared error over time (the paper's Fig. 6 a and 7 a).
 
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
-        Runs; squares are pooled over several under a name.
+        Runs; squares are summed over several under a name.
     window_s : float, default 0.005
         Sliding window in seconds.
     time_axis : {"linear", "log"}, default "linear"
         "log" shows the start.
+    channel : int, optional
+        Microphone to show, from 0; by default all together, as `nse_db` takes them.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -135,8 +130,8 @@ def plot_nse(results: Any, *, window_s: float = 0.005, time_axis: str = "linear"
 
     Raises
     ------
-    ValueError, TypeError
-        A window shorter than a sample, or another argument not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     Examples
     --------
@@ -152,15 +147,18 @@ def plot_nse(results: Any, *, window_s: float = 0.005, time_axis: str = "linear"
     """
     shown = curves(results)
     scale = as_choice(time_axis, "time_axis", ("linear", "log"))
-    width = window_length(window_s, shown[0].run.fs)
+    width = as_sample_count(window_s, shown[0].run.fs, "window_s")
+    levels = []
+    for curve in shown:
+        e, d = (curve.stack(name, channel=channel) for name in ("error", "disturbance"))
+        levels.append(nse_db(e, d, curve.run.fs, window_s, runs=True))
     ax = new_axes(ax)
-    for i, curve in enumerate(shown):
-        nse, fs = nse_db(curve.stack("error"), curve.stack("disturbance"), curve.run.fs, window_s), curve.run.fs
+    for i, (curve, nse) in enumerate(zip(shown, levels, strict=True)):
         # Neighbouring values share their window.
         rows = thinned(nse.size, width // 4, most=8000)
         if scale == "log":
             rows = np.unique(np.geomspace(1, nse.size, 2000).astype(int)) - 1
-        curve.draw(ax, (rows + 1) / fs, nse[rows], i)
+        curve.draw(ax, (rows + 1) / curve.run.fs, nse[rows], i)
     ax.axhline(0.0, color=DISTURBANCE["color"], linewidth=1.0, zorder=1.5)
     _whole_time_axis(ax, shown)
     if scale == "log":
@@ -172,11 +170,16 @@ def plot_nse(results: Any, *, window_s: float = 0.005, time_axis: str = "linear"
 
 
 def plot_output_power(
-    results: Any, *, rated_power: float | None = None, window_s: float = 0.25, ax: Axes | None = None
+    results: Any,
+    *,
+    rated_power: float | None = None,
+    window_s: float = 0.25,
+    channel: int | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
-    """Short-time output power, the mean square of the control signal before the amplifier, over time.
+    """Draw the short-time output power, the mean square of the control signal before the amplifier, over time.
 
-    The axis is logarithmic where a power exceeds ten times the rated power.
+    The axis is logarithmic if a power exceeds ten times the rated power.
 
     Parameters
     ----------
@@ -186,8 +189,10 @@ def plot_output_power(
         Rated output power to mark, above 0; by default those of the results.
     window_s : float, default 0.25
         Sliding window in seconds; the first values look at the samples there are.
+    channel : int, optional
+        Loudspeaker to show, from 0; by default a curve for each.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -196,8 +201,8 @@ def plot_output_power(
 
     Raises
     ------
-    ValueError, TypeError
-        A window shorter than a sample, or another argument not as described.
+    ValueError
+        If the window is shorter than a sample.
 
     Examples
     --------
@@ -216,13 +221,15 @@ def plot_output_power(
         rated = sorted({curve.run.rated_power for curve in shown if curve.run.rated_power is not None})
     else:
         rated = [as_positive(rated_power, "rated_power")]
-    widths = [window_length(window_s, curve.run.fs) for curve in shown]
+    powers = [
+        short_time_power(curve.stack("control_signal", channel=channel), curve.run.fs, window_s, runs=True)
+        for curve in shown
+    ]
     ax = new_axes(ax)
     highest = 0.0
-    for i, (curve, width) in enumerate(zip(shown, widths, strict=True)):
-        power = _short_time_power(curve.stack("control_signal"), width)
-        rows = thinned(power.size)
-        curve.draw(ax, (rows + 1) / curve.run.fs, power[rows], i)
+    for i, (curve, power) in enumerate(zip(shown, powers, strict=True)):
+        rows = thinned(curve.run.n_samples)
+        curve.draw(ax, (rows + 1) / curve.run.fs, power[..., rows], i)
         highest = max(highest, np.max(power, initial=0.0, where=~np.isnan(power)))
     for value in rated:
         ax.axhline(value, label=f"Rated power {value:g}", **RATED)
@@ -237,15 +244,17 @@ def plot_output_power(
     return ax
 
 
-def plot_constraint_factor(results: Any, *, ax: Axes | None = None) -> Axes:
-    """Constraint factor over time; 1 is no constraint.
+def plot_constraint_factor(results: Any, *, channel: int | None = None, ax: Axes | None = None) -> Axes:
+    """Draw the constraint factor over time; 1 is no constraint.
 
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
-        Runs, one a name. Controllers that do not say their factor are left out.
+        Runs, one per name. Controllers that do not tell their factor are left out.
+    channel : int, optional
+        Loudspeaker to show, from 0; by default a curve for each that has a factor of its own.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -254,8 +263,8 @@ def plot_constraint_factor(results: Any, *, ax: Axes | None = None) -> Axes:
 
     Raises
     ------
-    ValueError, TypeError
-        No controller says its factor, or an argument is not as described.
+    ValueError
+        If no controller tells its factor.
 
     Examples
     --------
@@ -271,11 +280,14 @@ def plot_constraint_factor(results: Any, *, ax: Axes | None = None) -> Axes:
     """
     shown = [curve for curve in curves(results, single=True) if not np.all(np.isnan(curve.run.constraint_factor))]
     if not shown:
-        raise ValueError("results must hold a constraint factor, but no controller has said one")
+        raise ValueError("results must hold a constraint factor, but no controller has told one")
+    factors = [curve.run.constraint_factor for curve in shown]
+    if channel is not None:
+        factors = [one_channel(factor, channel) for factor in factors]
     ax = new_axes(ax)
-    for i, curve in enumerate(shown):
-        rows = thinned(curve.run.constraint_factor.size)
-        curve.draw(ax, (rows + 1) / curve.run.fs, curve.run.constraint_factor[rows], i)
+    for i, (curve, factor) in enumerate(zip(shown, factors, strict=True)):
+        rows = thinned(curve.run.n_samples)
+        curve.draw(ax, (rows + 1) / curve.run.fs, factor[..., rows], i)
     ax.set_ylim(0, 1.05)
     _whole_time_axis(ax, shown)
     ax.set_ylabel("Constraint factor α")
@@ -286,7 +298,7 @@ def plot_constraint_factor(results: Any, *, ax: Axes | None = None) -> Axes:
 def plot_noise_reduction_against_overdrive(
     overdrive_db: Any, noise_reduction_db: Mapping[str, Any], *, flip_db: Any = None, ax: Axes | None = None
 ) -> Axes:
-    """Noise reduction over the overdrive, the power that full control needs over the rated power.
+    """Draw the noise reduction over the overdrive, the power that full control needs over the rated power.
 
     Parameters
     ----------
@@ -295,9 +307,9 @@ def plot_noise_reduction_against_overdrive(
     noise_reduction_db : mapping of str to array_like, shape (n,)
         Noise reduction in dB by algorithm; NaN where it diverged.
     flip_db : float or sequence of float, optional
-        Overdrive in dB to mark at which the order flips; none where empty.
+        Overdrive in dB at which the order of the algorithms flips, to mark.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -307,7 +319,7 @@ def plot_noise_reduction_against_overdrive(
     Raises
     ------
     ValueError, TypeError
-        Arrays that differ in length, no algorithm, or another argument not as described.
+        If arrays differ in length, or no algorithm is given.
 
     Examples
     --------
@@ -321,9 +333,12 @@ def plot_noise_reduction_against_overdrive(
     flips = [] if flip_db is None else [as_number(flip, "flip_db", unit="dB") for flip in np.atleast_1d(flip_db)]
     if not isinstance(noise_reduction_db, Mapping) or not noise_reduction_db:
         raise TypeError("noise_reduction_db must map at least one algorithm's name to its noise reduction in dB")
-    levels = {str(name): as_runs(value, "noise_reduction_db")[0] for name, value in noise_reduction_db.items()}
+    levels = {
+        str(name): np.atleast_1d(as_real_array(value, "noise_reduction_db"))
+        for name, value in noise_reduction_db.items()
+    }
     for name, level in levels.items():
-        if level.size != overdrive.size:
+        if level.shape != overdrive.shape:
             raise ValueError(f"noise_reduction_db of {name!r} must have {overdrive.size} values, got {level.size}")
     ax = new_axes(ax)
     for (name, level), style in zip(levels.items(), named_styles(list(levels), list(levels)), strict=True):
@@ -347,17 +362,17 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
     figure : matplotlib.figure.Figure
         The figure.
     path_without_suffix : path
-        Where to write, without ".png" or ".svg"; folders that are missing are made, files that are there replaced.
+        Where to write, without ".png" or ".svg"; missing folders are made, existing files replaced.
 
     Returns
     -------
     (pathlib.Path, pathlib.Path)
-        The PNG, of 160 pixels an inch, and the SVG.
+        The PNG, with 160 pixels per inch, and the SVG.
 
     Raises
     ------
     ValueError
-        The path ends in ".png" or ".svg".
+        If the path ends in ".png" or ".svg".
 
     Examples
     --------
@@ -372,7 +387,9 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
 
     path = Path(path_without_suffix)
     if path.suffix.lower() in (".png", ".svg"):
-        raise ValueError(f"path_without_suffix must leave out the suffix, for both are written: got {str(path)!r}")
+        raise ValueError(
+            f"path_without_suffix must leave out the suffix, because both files are written; got {str(path)!r}"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     png, svg = (path.with_name(path.name + suffix) for suffix in (".png", ".svg"))
     with mpl.rc_context({"svg.hashsalt": "kfopc_filterpy"}):
@@ -382,13 +399,7 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
     return png, svg
 
 
-def _short_time_power(runs: np.ndarray, width: int) -> np.ndarray:
-    """Mean square over the last `width` samples, fewer at the start, and over the runs."""
-    # The NSE against a disturbance of 1 is this power in dB.
-    return 10 ** (nse_db(runs, np.ones_like(runs), fs=1.0, window_s=width) / 10)
-
-
 def _whole_time_axis(ax: Axes, shown: list[Curve]) -> None:
-    ax.set_xlim(0, max(curve.run.error.size / curve.run.fs for curve in shown))
+    ax.set_xlim(0, max(curve.run.n_samples / curve.run.fs for curve in shown))
     ax.set_xlabel("Time (s)")
     ax.grid(True, alpha=0.3)

@@ -1,5 +1,6 @@
-"""Figures of the signals of runs: spectra and waveforms. `kfopc_filterpy.plot.runs`, whose conventions on results, axes,
-units and errors they follow, hands them out as well.
+"""Figures of the signals of runs: spectra and waveforms.
+
+The conventions on results, axes, units and errors are those of `kfopc_filterpy.plot.runs`.
 """
 
 from __future__ import annotations
@@ -9,17 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._validate import as_band, as_positive
-from ..metrics import output_power
-from ..spectra import coherence_and_gain, power_spectrum_db
-from .results import DISTURBANCE, RATED, curves, require_common_disturbance, span_axis, span_of, times
+from ..metrics import coherence_and_gain, output_power, power_spectrum_db
+from .results import DISTURBANCE, RATED, curves, one_channel, require_common_disturbance, span_axis, span_of, times
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["plot_amplifier_output", "plot_anti_noise", "plot_disturbance_and_anti_noise", "plot_error_spectra"]
-
-_DEPTH_DB = 120.0  # range of a spectrum's axis at most: numerical floors beneath would take all the room
+_DEPTH_DB = 120.0  # largest range of a spectrum's axis: numerical floors beneath would take all the room
 _VISIBLE = 0.005  # difference of waveforms, over their peak, that a line's width does not hide
 
 
@@ -30,22 +28,25 @@ def plot_error_spectra(
     span_s: tuple[float, float] | None = None,
     segment_s: float = 0.128,
     scaling: str = "density",
+    channel: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Power spectra of the disturbance and of each error (the paper's Fig. 5 a, 6 b, 7 b).
+    """Draw the power spectra of the disturbance and of each error (the paper's Fig. 5 a, 6 b, 7 b).
 
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
-        Runs with one disturbance; several under a name are averaged.
+        Runs with one disturbance; powers are averaged over several under a name.
     band : (float, float), optional
         Band to show in Hz, by default 0 to fs/2.
     span_s : (float, float), optional
-        Start and end in seconds of what is analysed, by default the second half.
+        Start and end in seconds of the part to analyse, by default the second half.
     segment_s, scaling
         As for `power_spectrum_db`.
+    channel : int, optional
+        Microphone to show, from 0; by default the mean power over all.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -54,8 +55,8 @@ def plot_error_spectra(
 
     Raises
     ------
-    ValueError, TypeError
-        Disturbances that differ, or an argument that is not as described.
+    ValueError
+        If the disturbances differ.
 
     Examples
     --------
@@ -74,19 +75,23 @@ def plot_error_spectra(
     fs = shown[0].run.fs
     low, high = as_band((0.0, fs / 2) if band is None else band, fs)
     part, steady = (slice(None), 0.5) if span_s is None else (span_of(shown[0].run, span_s), 1.0)
-    ax = new_axes(ax)
-    levels = []
+    spectra = []
     for curve, name in [(shown[0], "disturbance"), *((curve, "error") for curve in shown)]:
+        signals = curve.stack(name, part, channel)
+        signals = signals.reshape(-1, signals.shape[-1])  # microphones are averaged like runs
         frequencies, level = power_spectrum_db(
-            curve.stack(name, part), fs, steady=steady, segment_s=segment_s, scaling=scaling
+            signals, fs, steady=steady, segment_s=segment_s, scaling=scaling, runs=True
         )
         inside = (frequencies >= low) & (frequencies <= high)
         style = {"label": "Disturbance", **DISTURBANCE} if name == "disturbance" else curve.line()
-        ax.plot(frequencies[inside], level[inside], **style)
-        levels.append(level[inside][np.isfinite(level[inside])])
+        spectra.append((frequencies[inside], level[inside], style))
+    ax = new_axes(ax)
+    for frequencies, level, style in spectra:
+        ax.plot(frequencies, level, **style)
+    levels = [level[np.isfinite(level)] for _, level, _ in spectra]
     top = np.max(np.concatenate(levels), initial=-np.inf)
     if np.isfinite(top):
-        # As deep as the errors: what the disturbance lacks outside its band is of no interest.
+        # The errors set the depth of the axis: the floor of the disturbance outside its band is of no interest.
         ax.set_ylim(max(np.min(np.concatenate(levels[1:]), initial=top) - 5, top - _DEPTH_DB), top + 5)
     ax.set_xlim(low, high)
     ax.set_xlabel("Frequency (Hz)")
@@ -96,17 +101,21 @@ def plot_error_spectra(
     return ax
 
 
-def plot_anti_noise(results: Any, *, span_s: tuple[float, float], ax: Axes | None = None) -> Axes:
-    """Waveforms of the disturbance and of each anti-noise (the paper's Fig. 5 b).
+def plot_anti_noise(
+    results: Any, *, span_s: tuple[float, float], channel: int | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the waveforms of the disturbance and of each anti-noise (the paper's Fig. 5 b).
 
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
-        Runs with one disturbance, one a name.
+        Runs with one disturbance, one per name.
     span_s : (float, float)
         Start and end in seconds.
+    channel : int, optional
+        Microphone to show, from 0; needed if there are several.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -115,8 +124,8 @@ def plot_anti_noise(results: Any, *, span_s: tuple[float, float], ax: Axes | Non
 
     Raises
     ------
-    ValueError, TypeError
-        Disturbances that differ, or an argument that is not as described.
+    ValueError
+        If the disturbances differ.
 
     Examples
     --------
@@ -133,42 +142,46 @@ def plot_anti_noise(results: Any, *, span_s: tuple[float, float], ax: Axes | Non
     shown = curves(results, single=True)
     require_common_disturbance(shown)
     run, part = shown[0].run, span_of(shown[0].run, span_s)
+    disturbance = one_channel(run.disturbance, channel)
+    waves = [one_channel(curve.run.anti_noise, channel) for curve in shown]
     ax = new_axes(ax)
     time = times(run, part, span_axis(ax, span_s))
-    ax.plot(time, run.disturbance[part], label="Disturbance", **DISTURBANCE)
-    for curve in shown:
-        ax.plot(time, curve.run.anti_noise[part], **curve.line())
+    ax.plot(time, disturbance[part], label="Disturbance", **DISTURBANCE)
+    for curve, wave in zip(shown, waves, strict=True):
+        ax.plot(time, wave[part], **curve.line())
     ax.set_ylabel("Sound at the error microphone")
     legend_above(ax)
     return ax
 
 
 def plot_amplifier_output(
-    results: Any, *, span_s: tuple[float, float], limit: float | None = None, ax: Axes | None = None
+    results: Any,
+    *,
+    span_s: tuple[float, float],
+    limit: float | None = None,
+    channel: int | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
-    """Waveforms of the amplifier's output, and of the control signal where the amplifier changed it (Fig. 5 c).
+    """Draw the waveforms of the amplifier's output, and of the control signal if the amplifier changed it (Fig. 5 c).
 
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
-        Runs, one a name. The control signal is drawn where it differs by more than 0.5 % of the output's peak; beyond
+        Runs, one per name. The control signal is drawn where it differs by more than 0.5 % of the output's peak; beyond
         2.5 times the highest output it leaves the axes.
     span_s : (float, float)
         Start and end in seconds.
     limit : float, optional
         Amplitude limit of the amplifier, above 0, to mark.
+    channel : int, optional
+        Loudspeaker to show, from 0; needed if there are several.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
     matplotlib.axes.Axes
         The axes drawn into.
-
-    Raises
-    ------
-    ValueError, TypeError
-        An argument that is not as described.
 
     Examples
     --------
@@ -186,19 +199,19 @@ def plot_amplifier_output(
     shown = curves(results, single=True)
     peaks = [] if limit is None else [as_positive(limit, "limit")]
     parts = [span_of(curve.run, span_s) for curve in shown]
+    signals = [
+        (one_channel(curve.run.control_signal, channel)[part], one_channel(curve.run.amplifier_output, channel)[part])
+        for curve, part in zip(shown, parts, strict=True)
+    ]
     ax = new_axes(ax)
     per_second = span_axis(ax, span_s)
     before = []
-    for curve, part in zip(shown, parts, strict=True):
-        time, y, out = (
-            times(curve.run, part, per_second),
-            curve.run.control_signal[part],
-            curve.run.amplifier_output[part],
-        )
+    for curve, part, (y, out) in zip(shown, parts, signals, strict=True):
+        time = times(curve.run, part, per_second)
         ax.plot(time, out, **curve.line())
         if np.any(changed := np.abs(y - out) > _VISIBLE * _peak(out)):
             dashed = {"color": curve.style["color"], "linestyle": (0, (2, 1.5)), "linewidth": 0.9}
-            # A sample to each side joins the dashes to the curve.
+            # One more sample to each side joins the dashes to the curve.
             beside = np.convolve(changed, np.ones(3), mode="same") > 0
             ax.plot(time, np.where(beside, y, np.nan), label=f"{curve.label} before the amplifier", **dashed)
             before.append(np.nanmax(np.abs(y)))
@@ -215,12 +228,17 @@ def plot_amplifier_output(
 
 
 def plot_disturbance_and_anti_noise(
-    result: Any, *, span_s: tuple[float, float], band: tuple[float, float], ax: Axes | None = None
+    result: Any,
+    *,
+    span_s: tuple[float, float],
+    band: tuple[float, float],
+    channel: int | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
-    """Waveforms of the disturbance and the anti-noise of one run, with how linear they are (the paper's Fig. 6 c).
+    """Draw the disturbance and the anti-noise of one run, and state how linear they are (the paper's Fig. 6 c).
 
-    Coherence and gain in the band, and the output power, are those of the run's second half; the legend's title
-    states them.
+    The title of the legend states the coherence and gain in the band, and the output power, over the second half of the
+    run.
 
     Parameters
     ----------
@@ -230,8 +248,10 @@ def plot_disturbance_and_anti_noise(
         Start and end in seconds of the waveforms.
     band : (float, float)
         Band of the noise in Hz.
+    channel : int, optional
+        Microphone to show, from 0; needed if there are several.
     ax : matplotlib.axes.Axes, optional
-        Where to draw.
+        Axes to draw into, by default new ones.
 
     Returns
     -------
@@ -240,8 +260,8 @@ def plot_disturbance_and_anti_noise(
 
     Raises
     ------
-    ValueError, TypeError
-        A run too short for the coherence, several runs, or an argument that is not as described.
+    ValueError
+        If the run is too short for the coherence, or there are several runs.
 
     Examples
     --------
@@ -263,18 +283,20 @@ def plot_disturbance_and_anti_noise(
     run = shown[0].run
     part = span_of(run, span_s)
     low, high = as_band(band, run.fs)
-    coherence, gain = coherence_and_gain(run.disturbance, run.anti_noise, run.fs, (low, high))
+    disturbance, anti_noise = one_channel(run.disturbance, channel), one_channel(run.anti_noise, channel)
+    coherence, gain = coherence_and_gain(disturbance, anti_noise, run.fs, (low, high))
+    powers = ", ".join(f"{power:.5g}" for power in np.atleast_1d(output_power(run.control_signal)))
     text = (
         f"Anti-noise over disturbance, {low:g} to {high:g} Hz: coherence {coherence:.4f}, gain {gain:.3f}\n"
-        f"Output power {output_power(run.control_signal):.5g}"
+        f"Output power {powers}"
     )
     if run.rated_power is not None:
         text += f", rated power {run.rated_power:g}"
     ax = new_axes(ax)
     time = times(run, part, span_axis(ax, span_s))
-    ax.plot(time, run.disturbance[part], label="Disturbance", **{**DISTURBANCE, "linewidth": 1.6})
+    ax.plot(time, disturbance[part], label="Disturbance", **{**DISTURBANCE, "linewidth": 1.6})
     line = shown[0].line()
-    ax.plot(time, run.anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
+    ax.plot(time, anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
     ax.set_ylabel("Sound at the error microphone")
     legend_above(ax)
     legend = ax.get_legend()
@@ -284,5 +306,5 @@ def plot_disturbance_and_anti_noise(
 
 
 def _peak(signal: np.ndarray) -> float:
-    """Largest magnitude, 0 where all is NaN."""
+    """Return the largest magnitude, 0 if all is NaN."""
     return float(np.max(np.abs(signal), initial=0.0, where=~np.isnan(signal)))

@@ -1,8 +1,7 @@
-"""Measured paths and recordings: readers of MAT and WAV files, and the public measured duct.
+"""The public measured duct and motor noise.
 
-The measured duct and the motor noise are third-party data without a stated licence: they are not part of this
-package. They are read from a folder of the user's, or fetched from their public sources, and checked by
-SHA-256.
+These are third-party data without a stated licence, so they are not part of this package. They are read from a folder
+of the user's, or fetched from their public sources, and checked by SHA-256.
 """
 
 from __future__ import annotations
@@ -11,28 +10,31 @@ import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
-from urllib.parse import quote
 
 import numpy as np
 
 from .._validate import as_positive, as_signal
-from .recordings import read_mat_vector, read_wav, write_wav
-
-__all__ = [
-    "DataUnavailableError",
-    "MeasuredDuct",
-    "load_measured_duct",
-    "read_mat_vector",
-    "read_wav",
-    "write_wav",
-]
+from .recordings import read_mat_vector
 
 _FOLDER_VARIABLE = "KFOPC_DATA"
 
+# Where each file lies in a data folder, its SHA-256, and its public source at a fixed commit.
+_HASHES = {
+    "duct/Pz1.mat": "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
+    "duct/Sz.mat": "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
+    "motor/Motor.mat": "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
+}
+_DUCT = "Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
+_MOTOR = "Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst/Noise_data"
+_URLS = {
+    "duct/Pz1.mat": f"https://raw.githubusercontent.com/{_DUCT}/Pz1.mat",
+    "duct/Sz.mat": f"https://raw.githubusercontent.com/{_DUCT}/Sz.mat",
+    "motor/Motor.mat": f"https://raw.githubusercontent.com/{_MOTOR}/Motor.mat",
+}
+
 
 class DataUnavailableError(FileNotFoundError):
-    """The measured duct cannot be had, or is not the published one; the message says how to get it."""
+    """The measured duct cannot be read or fetched, or is not the published one; the message says what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +57,7 @@ class MeasuredDuct:
     Raises
     ------
     ValueError, TypeError
-        Where a signal is empty, not one-dimensional or not finite, or fs is not above 0.
+        If a signal is empty, not one-dimensional or not finite, or fs is not above 0.
 
     Examples
     --------
@@ -75,65 +77,22 @@ class MeasuredDuct:
         object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
 
 
-class _PublicFile(NamedTuple):
-    """One published file: where it lies in a data folder, which variable it holds, where it comes from."""
-
-    local: str
-    variable: str
-    repository: str
-    commit: str
-    path: str
-    sha256: str
-
-    @property
-    def url(self) -> str:
-        return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/{quote(self.path)}"
-
-
-_PRIMARY = _PublicFile(
-    "duct/Pz1.mat",
-    "Pz1",
-    "Luo-Zhengding/GFANC-Kalman",
-    "06badd525411571402e83212e7f00b2345cde62d",
-    "Pz and Sz/Duct_Path/Pz1.mat",
-    "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
-)
-_SECONDARY = _PublicFile(
-    "duct/Sz.mat",
-    "S",
-    "Luo-Zhengding/GFANC-Kalman",
-    "06badd525411571402e83212e7f00b2345cde62d",
-    "Pz and Sz/Duct_Path/Sz.mat",
-    "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
-)
-_NOISE = _PublicFile(
-    "motor/Motor.mat",
-    "Motor_noise",
-    "Ji-Junwei/PriPathEst_MOVFxLMS_ANC",
-    "84bcdae3aaba5c7410898dcb20ba14f5d417c0d8",
-    "MOVFxLMS_PriEst/Noise_data/Motor.mat",
-    "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
-)
-
-
 def load_measured_duct(
     folder: str | os.PathLike[str] | None = None, *, allow_download: bool = False, timeout_s: float = 5.0
 ) -> MeasuredDuct:
-    """Measured duct paths and recorded motor noise at 16 kHz, in place of the paper's, which are not public.
+    """Load measured duct paths and recorded motor noise at 16 kHz, in place of the paper's, which are not public.
 
-    The first of these that is given is used, and no other is tried after it: `folder`; the folder named by
-    the environment variable KFOPC_DATA; the public sources, where `allow_download` is true and pooch is
-    installed. A folder holds duct/Pz1.mat, duct/Sz.mat and motor/Motor.mat. Whatever the source, every file's
-    SHA-256 must be the published one; for paths of your own, build a `MeasuredDuct`. Units are arbitrary: the
-    secondary path gains 10 to 30 dB.
+    The first of these that is given is used, and no other is tried after it: `folder`; the folder that the environment
+    variable KFOPC_DATA names; the public sources, if `allow_download` is true and pooch is installed. A folder holds
+    duct/Pz1.mat, duct/Sz.mat and motor/Motor.mat. From any source, every file must have the published SHA-256; for
+    paths of your own, build a `MeasuredDuct`. Units are arbitrary: the secondary path gains 10 to 30 dB.
 
     Parameters
     ----------
     folder : path, optional
         Folder with the files.
     allow_download : bool, default False
-        Fetch the files, one try each, into pooch's cache of the operating system; later calls find them
-        there.
+        Fetch the files, one try each, into pooch's cache of the operating system; later calls find them there.
     timeout_s : float, default 5.0
         How long to wait for the network's next answer, in seconds; the first failure ends the call.
 
@@ -145,9 +104,9 @@ def load_measured_duct(
     Raises
     ------
     DataUnavailableError
-        Where a file is missing, differs from the published one or cannot be fetched.
+        If a file is missing, differs from the published one or cannot be fetched.
     ValueError, TypeError
-        Where `timeout_s` is not above 0.
+        If `timeout_s` is not above 0.
 
     References
     ----------
@@ -165,41 +124,42 @@ def load_measured_duct(
     """
     timeout = as_positive(timeout_s, "timeout_s", unit="s")
     chosen = folder if folder is not None else os.environ.get(_FOLDER_VARIABLE) or None
+    if chosen is None and not allow_download:
+        raise DataUnavailableError(
+            f"no folder with the measured duct is named: pass folder, set {_FOLDER_VARIABLE}, or pass "
+            "allow_download=True to fetch it from its public sources"
+        )
 
-    def taps(item: _PublicFile) -> np.ndarray:
-        if chosen is not None:
-            path = _checked_file(Path(chosen), item)
-        elif allow_download:
-            path = _fetched_file(item, timeout)
-        else:
-            raise DataUnavailableError(
-                f"no folder with the measured duct is named: pass folder, set {_FOLDER_VARIABLE}, or pass "
-                "allow_download=True to fetch it from its public sources"
-            )
-        return read_mat_vector(path, item.variable)
+    def vector(name: str, variable: str) -> np.ndarray:
+        path = _fetched_file(name, timeout) if chosen is None else _checked_file(Path(chosen), name)
+        return read_mat_vector(path, variable)
 
-    return MeasuredDuct(primary=taps(_PRIMARY), secondary=taps(_SECONDARY), noise=taps(_NOISE))
+    return MeasuredDuct(
+        primary=vector("duct/Pz1.mat", "Pz1"),
+        secondary=vector("duct/Sz.mat", "S"),
+        noise=vector("motor/Motor.mat", "Motor_noise"),
+    )
 
 
-def _checked_file(folder: Path, item: _PublicFile) -> Path:
-    """Path of a published file in `folder`, its content verified."""
-    path = folder / item.local
+def _checked_file(folder: Path, name: str) -> Path:
+    """Return the path of a published file in `folder`, its content verified."""
+    path = folder / name
     if not path.is_file():
         raise DataUnavailableError(
-            f"{path} is missing: put {item.url} there, or name another folder (argument folder, or the "
+            f"{path} is missing: put {_URLS[name]} there, or name another folder (argument folder, or the "
             f"environment variable {_FOLDER_VARIABLE})"
         )
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if digest != item.sha256:
+    if digest != _HASHES[name]:
         raise DataUnavailableError(
-            f"{path} is not the published file, its SHA-256 is {digest}, expected {item.sha256}: "
-            f"fetch it again from {item.url}, or build a MeasuredDuct from files of your own"
+            f"{path} is not the published file, its SHA-256 is {digest}, expected {_HASHES[name]}: "
+            f"fetch it again from {_URLS[name]}, or build a MeasuredDuct from files of your own"
         )
     return path
 
 
-def _fetched_file(item: _PublicFile, timeout_s: float) -> Path:
-    """Path of a published file in pooch's cache, fetched on first use, its content verified."""
+def _fetched_file(name: str, timeout_s: float) -> Path:
+    """Return the path of a published file in pooch's cache, fetched on first use, its content verified."""
     try:
         import pooch
     except ImportError as error:
@@ -207,21 +167,13 @@ def _fetched_file(item: _PublicFile, timeout_s: float) -> Path:
             "pooch is not installed, so nothing was fetched: install kfopc-filterpy[studies], or set "
             f"{_FOLDER_VARIABLE} to a folder with the files"
         ) from error
-    local = Path(item.local)
     pooch.get_logger().setLevel("WARNING")  # its announcements would run into a progress bar
+    cache = pooch.create(pooch.os_cache("kfopc_filterpy"), base_url="", registry=_HASHES, urls=_URLS)
     try:
-        fetched = pooch.retrieve(
-            item.url,
-            known_hash=f"sha256:{item.sha256}",
-            fname=local.name,
-            # The cache has the layout of a data folder.
-            path=Path(pooch.os_cache("kfopc_filterpy")) / local.parent,
-            downloader=pooch.HTTPDownloader(timeout=timeout_s),
-        )
+        return Path(cache.fetch(name, downloader=pooch.HTTPDownloader(timeout=timeout_s)))
     # No network and a cache that cannot be written are OSErrors, a wrong hash is a ValueError.
     except (OSError, ValueError) as error:
         raise DataUnavailableError(
-            f"{item.url} could not be fetched ({error}): set {_FOLDER_VARIABLE} to a folder with the file as "
-            f"{item.local}, or try again with a network"
+            f"{_URLS[name]} could not be fetched ({error}): set {_FOLDER_VARIABLE} to a folder with the file as "
+            f"{name}, or try again with a network"
         ) from error
-    return Path(fetched)

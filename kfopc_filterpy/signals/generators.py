@@ -1,12 +1,13 @@
-"""Seeded primary noises: tone, band-limited noise, compressor-like machine noise, level jumps.
+"""Seeded primary noises: tone, band-limited noise, compressor-like machine noise, bursts.
 
-Every generator returns a float64 array (n_samples,) with n_samples = round(duration_s * fs) >= 1, and takes
-its randomness from `rng` only (a seed or a numpy.random.Generator), so that the same call gives the same
-samples. Power is the mean square over the whole signal.
+Every generator returns one channel, a float64 array (n_samples,) with n_samples = round(duration_s * fs) >= 1, and
+draws its randomness only from `rng` (a seed or a numpy.random.Generator), so that the same call gives the same samples.
+Power is the mean square over the whole signal. For several channels, stack calls with different seeds.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,9 @@ from .._validate import (
     as_nonnegative,
     as_number,
     as_positive,
-    as_signal,
+    as_sample_count,
 )
-
-__all__ = ["band_limited_noise", "compressor_noise", "level_jump", "scaled_to_power", "tone"]
+from .shaping import scaled_to_power
 
 # The compressor's spectral envelope: a small shell radiates poorly below its peak, and forces fall above it.
 _ENVELOPE_PEAK_HZ = 250.0
@@ -36,7 +36,7 @@ _BROADBAND_FROM_HZ = 20.0
 def tone(
     frequency_hz: float, duration_s: float, *, fs: float, amplitude: float = 1.0, phase_rad: float = 0.0
 ) -> np.ndarray:
-    """Sine of one frequency, the primary noise of the paper's tonal study.
+    """Make a sine of one frequency, the primary noise of the paper's tonal study.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def tone(
     fs : float
         Sampling frequency in Hz.
     amplitude : float, default 1.0
-        Peak value; the power is amplitude**2 / 2, so sqrt(2 * power) gives a wanted power.
+        Peak value. The power is amplitude**2 / 2; for a given power, pass sqrt(2 * power).
     phase_rad : float, default 0.0
         Phase at the first sample: amplitude * sin(2 pi f n / fs + phase).
 
@@ -59,7 +59,7 @@ def tone(
     Raises
     ------
     ValueError, TypeError
-        Where an argument is not a number in its range.
+        If an argument is not a number in its range.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def tone(
     >>> x.shape, round(float(np.mean(x**2)), 12)
     ((16000,), 1.0)
     """
-    n_samples = _sample_count(duration_s, fs)
+    n_samples = as_sample_count(duration_s, fs, "duration_s")
     frequency = as_positive(frequency_hz, "frequency_hz", unit="Hz")
     if frequency >= fs / 2:
         raise ValueError(f"frequency_hz must be below fs/2 = {fs / 2:g} Hz, got {frequency:g} Hz; raise fs or lower it")
@@ -80,18 +80,18 @@ def tone(
 def band_limited_noise(
     band: tuple[float, float], duration_s: float, *, fs: float, power: float = 1.0, rng: Any
 ) -> np.ndarray:
-    """Gaussian noise with a flat spectrum inside `band` and none outside, the paper's broadband noise.
+    """Make Gaussian noise with a flat spectrum inside `band` and none outside, the paper's broadband noise.
 
-    White Gaussian noise whose discrete Fourier bins outside the band are set to zero: the edges are as sharp
-    as the duration allows (1 / duration_s in Hz). The samples are scaled to `power` exactly, so that runs
-    with different seeds are equally loud.
+    The discrete Fourier bins of white Gaussian noise outside the band are set to zero, so the edges are as sharp as the
+    duration allows (1 / duration_s in Hz). The samples are scaled to `power` exactly, so that runs with different seeds
+    are equally loud.
 
     Parameters
     ----------
     band : (float, float)
         Lowest and highest frequency in Hz, 0 <= low < high <= fs/2.
     duration_s : float
-        Duration in seconds; at least 1 / (high - low), or no Fourier bin may fall inside the band.
+        Duration in seconds; below 1 / (high - low) there may be no Fourier bin inside the band.
     fs : float
         Sampling frequency in Hz.
     power : float, default 1.0
@@ -107,7 +107,7 @@ def band_limited_noise(
     Raises
     ------
     ValueError, TypeError
-        Where an argument is not in its range, no Fourier bin falls inside the band, or `rng` is None.
+        If an argument is not in its range, no Fourier bin falls inside the band, or `rng` is None.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def band_limited_noise(
     >>> round(float(np.mean(x**2)), 12)
     0.5
     """
-    n_samples = _sample_count(duration_s, fs)
+    n_samples = as_sample_count(duration_s, fs, "duration_s")
     low, high = as_band(band, fs)
 
     def inside(frequencies: np.ndarray) -> np.ndarray:
@@ -131,40 +131,14 @@ def band_limited_noise(
     return scaled_to_power(shaped, power)
 
 
-def compressor_noise(
-    duration_s: float,
-    *,
-    fs: float,
-    rng: Any,
-    power: float = 1.0,
-    shaft_hz: float = 24.5,
-    n_harmonics: int = 40,
-    lobe_count: int = 4,
-    speed_fluctuation: float = 0.003,
-    level_fluctuation: float = 0.1,
-    broadband_ratio: float = 0.1,
-    bandwidth_hz: float = 2000.0,
-) -> np.ndarray:
-    """Compressor-like noise: harmonics of a slowly wandering shaft speed, and broadband flow noise.
+@dataclass(frozen=True)
+class Compressor:
+    """Machine whose noise `compressor_noise` makes.
 
-    The built-in stand-in for a recorded compressor. Line k lies at k times the shaft's frequency; all lines
-    follow the same speed, each has a level of its own that wanders. Lines and broadband share a spectral
-    envelope that peaks at 250 Hz and falls by 6 dB per octave to both sides; every `lobe_count`-th line
-    stands 10 dB higher, as pocket-passing lines do; single lines differ by 3 dB (standard deviation). Speed
-    and levels wander as first-order Gauss-Markov processes with a time constant of 0.5 s.
-
-    Parameters
+    Attributes
     ----------
-    duration_s : float
-        Duration in seconds.
-    fs : float
-        Sampling frequency in Hz.
-    rng : int or numpy.random.Generator
-        Seed or generator.
-    power : float, default 1.0
-        Mean square of the signal, met exactly.
     shaft_hz : float, default 24.5
-        Mean shaft frequency: a four-pole induction motor on 50 Hz with 2 % slip.
+        Mean shaft frequency: by default that of a four-pole induction motor on 50 Hz with 2 % slip.
     n_harmonics : int, default 40
         Number of shaft harmonics; all must stay below fs/2.
     lobe_count : int, default 4
@@ -178,6 +152,64 @@ def compressor_noise(
     bandwidth_hz : float, default 2000.0
         Upper edge of the broadband part in Hz, at most fs/2; its lower edge is 20 Hz.
 
+    Raises
+    ------
+    ValueError, TypeError
+        If a value is not a number in its range.
+
+    Examples
+    --------
+    >>> Compressor(shaft_hz=25.0).lobe_count
+    4
+    """
+
+    shaft_hz: float = 24.5
+    n_harmonics: int = 40
+    lobe_count: int = 4
+    speed_fluctuation: float = 0.003
+    level_fluctuation: float = 0.1
+    broadband_ratio: float = 0.1
+    bandwidth_hz: float = 2000.0
+
+    def __post_init__(self) -> None:
+        as_positive(self.shaft_hz, "shaft_hz", unit="Hz")
+        as_count(self.n_harmonics, "n_harmonics")
+        as_count(self.lobe_count, "lobe_count")
+        as_nonnegative(self.speed_fluctuation, "speed_fluctuation")
+        as_nonnegative(self.level_fluctuation, "level_fluctuation")
+        if as_nonnegative(self.broadband_ratio, "broadband_ratio") >= 1:
+            raise ValueError(
+                f"broadband_ratio must be below 1, got {self.broadband_ratio:g}; "
+                "band_limited_noise makes noise without lines"
+            )
+        if as_positive(self.bandwidth_hz, "bandwidth_hz", unit="Hz") <= _BROADBAND_FROM_HZ:
+            raise ValueError(f"bandwidth_hz must be above {_BROADBAND_FROM_HZ:g} Hz, got {self.bandwidth_hz:g} Hz")
+
+
+def compressor_noise(
+    duration_s: float, machine: Compressor | None = None, *, fs: float, rng: Any, power: float = 1.0
+) -> np.ndarray:
+    """Make compressor-like noise: harmonics of a slowly wandering shaft speed, and broadband flow noise.
+
+    This is the built-in stand-in for a recorded compressor. Line k lies at k times the shaft's frequency; all lines
+    follow the same speed, and each has a level of its own that wanders. Lines and broadband share a spectral envelope
+    that peaks at 250 Hz and falls by 6 dB per octave to both sides. Every `lobe_count`-th line stands 10 dB higher, as
+    pocket-passing lines do; single lines differ by 3 dB (standard deviation). Speed and levels wander as first-order
+    Gauss-Markov processes with a time constant of 0.5 s.
+
+    Parameters
+    ----------
+    duration_s : float
+        Duration in seconds.
+    machine : Compressor, optional
+        Speed, lines and broadband part, by default those of ``Compressor()``.
+    fs : float
+        Sampling frequency in Hz.
+    rng : int or numpy.random.Generator
+        Seed or generator.
+    power : float, default 1.0
+        Mean square of the signal, met exactly.
+
     Returns
     -------
     ndarray, shape (n_samples,)
@@ -186,174 +218,167 @@ def compressor_noise(
     Raises
     ------
     ValueError, TypeError
-        Where an argument is not in its range, a harmonic would alias, the duration is too short for the
-        broadband part, or `rng` is None.
+        If an argument is not in its range, a harmonic would alias, the duration is too short for the broadband part,
+        or `rng` is None.
 
     Examples
     --------
     >>> import numpy as np
-    >>> x = compressor_noise(2.0, fs=16000, rng=1)
+    >>> x = compressor_noise(2.0, Compressor(shaft_hz=25.0), fs=16000, rng=1)
     >>> x.shape, round(float(np.mean(x**2)), 12)
     ((32000,), 1.0)
     """
-    n_samples = _sample_count(duration_s, fs)
+    n_samples = as_sample_count(duration_s, fs, "duration_s")
     generator = as_generator(rng)
-    lobes = as_count(lobe_count, "lobe_count")
-    level_std = as_nonnegative(level_fluctuation, "level_fluctuation")
-    share = as_nonnegative(broadband_ratio, "broadband_ratio")
-    if share >= 1:
-        raise ValueError(
-            f"broadband_ratio must be below 1, got {share:g}; band_limited_noise makes noise without lines"
-        )
-    upper = as_positive(bandwidth_hz, "bandwidth_hz", unit="Hz")
-    if not _BROADBAND_FROM_HZ < upper <= fs / 2:
-        raise ValueError(
-            f"bandwidth_hz must be above {_BROADBAND_FROM_HZ:g} Hz and at most fs/2 = {fs / 2:g} Hz, got {upper:g} Hz"
-        )
-
-    orders = np.arange(1, as_count(n_harmonics, "n_harmonics") + 1)
-    shaft = as_positive(shaft_hz, "shaft_hz", unit="Hz")
-    speed_std = as_nonnegative(speed_fluctuation, "speed_fluctuation")
-    # Five standard deviations: a Gaussian speed goes beyond that once in two million correlation times.
-    highest = orders[-1] * shaft * (1 + 5 * speed_std)
+    machine = Compressor() if machine is None else machine
+    if machine.bandwidth_hz > fs / 2:
+        raise ValueError(f"bandwidth_hz must be at most fs/2 = {fs / 2:g} Hz, got {machine.bandwidth_hz:g} Hz")
+    # Five standard deviations: a Gaussian speed exceeds them once in two million correlation times.
+    highest = machine.n_harmonics * machine.shaft_hz * (1 + 5 * machine.speed_fluctuation)
     if highest >= fs / 2:
         raise ValueError(
-            f"n_harmonics = {orders[-1]} lines of shaft_hz = {shaft:g} Hz reach {highest:g} Hz with the "
-            f"speed's fluctuation, beyond fs/2 = {fs / 2:g} Hz; lower n_harmonics or raise fs"
+            f"n_harmonics = {machine.n_harmonics} lines of shaft_hz = {machine.shaft_hz:g} Hz reach {highest:g} Hz "
+            f"with the speed's fluctuation, beyond fs/2 = {fs / 2:g} Hz; lower n_harmonics or raise fs"
         )
-
-    levels = _line_amplitudes(orders, shaft, lobes, generator)
-    speed = shaft * (1 + speed_std * _slow_process(n_samples, fs, generator))
-    lines = _modulated_lines(orders, levels, speed, level_std, fs, generator)
-    signal = scaled_to_power(lines, 1 - share)
+    share = machine.broadband_ratio
+    signal = scaled_to_power(_lines(machine, n_samples, fs, generator), 1 - share)
     if share > 0:
-        signal = signal + scaled_to_power(_broadband(upper, n_samples, fs, generator), share)
+        signal = signal + scaled_to_power(_broadband(machine.bandwidth_hz, n_samples, fs, generator), share)
     return scaled_to_power(signal, power)
 
 
-def level_jump(signal: Any, at_s: float, gain_db: float, *, fs: float) -> np.ndarray:
-    """Copy of `signal` that is `gain_db` louder (or softer) from the time `at_s` on.
+@dataclass(frozen=True)
+class Bursts:
+    """Bursts and background that `bursty_noise` makes.
+
+    Attributes
+    ----------
+    rate_hz : float, default 10.0
+        Mean number of bursts per second; they come as a Poisson process.
+    decay_s : float, default 0.012
+        Time constant of a burst's amplitude in seconds.
+    band : (float, float), default (100.0, 1500.0)
+        Band in Hz of bursts and background (Butterworth, four poles at either edge).
+    level_spread_db : float, default 4.0
+        Standard deviation of the bursts' levels in dB.
+    background_db : float, default -20.0
+        Power of the background over that of the bursts in dB.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If a value is not a number in its range.
+
+    Examples
+    --------
+    >>> Bursts(rate_hz=2.0).band
+    (100.0, 1500.0)
+    """
+
+    rate_hz: float = 10.0
+    decay_s: float = 0.012
+    band: tuple[float, float] = (100.0, 1500.0)
+    level_spread_db: float = 4.0
+    background_db: float = -20.0
+
+    def __post_init__(self) -> None:
+        as_positive(self.rate_hz, "rate_hz", unit="Hz")
+        as_positive(self.decay_s, "decay_s", unit="s")
+        as_nonnegative(self.level_spread_db, "level_spread_db", unit="dB")
+        as_number(self.background_db, "background_db", unit="dB")
+
+
+def bursty_noise(
+    duration_s: float, bursts: Bursts | None = None, *, fs: float, rng: Any, power: float = 1.0
+) -> np.ndarray:
+    """Make impulsive noise, as of presses or rivets: bursts at random times that die away, over a steady background.
 
     Parameters
     ----------
-    signal : array_like, shape (n_samples,)
-        The signal.
-    at_s : float
-        Time of the jump in seconds, within the signal; the sample round(at_s * fs) is the first changed.
-    gain_db : float
-        Change of level in dB: 6.02 doubles the amplitude.
+    duration_s : float
+        Duration in seconds.
+    bursts : Bursts, optional
+        Rate, decay, band and levels, by default those of ``Bursts()``.
     fs : float
         Sampling frequency in Hz.
+    rng : int or numpy.random.Generator
+        Seed or generator.
+    power : float, default 1.0
+        Mean square of the signal, met exactly.
 
     Returns
     -------
     ndarray, shape (n_samples,)
-        The signal with the jump; the input is left as it is.
+        The noise.
 
     Raises
     ------
     ValueError, TypeError
-        Where the jump lies outside the signal, or an argument is not in its range.
+        If an argument is not in its range, no burst falls into the duration, or `rng` is None.
 
     Examples
     --------
-    >>> level_jump([1.0, 1.0, 1.0, 1.0], 0.5, 20.0, fs=4).tolist()
-    [1.0, 1.0, 10.0, 10.0]
+    >>> import numpy as np
+    >>> x = bursty_noise(2.0, fs=16000, rng=1)
+    >>> round(float(np.mean(x**2)), 12), bool(np.max(np.abs(x)) > 6.0)  # Gaussian noise stays below 5
+    (1.0, True)
     """
-    jumped = as_signal(signal, "signal").copy()
-    rate = as_positive(fs, "fs", unit="Hz")
-    first = round(as_nonnegative(at_s, "at_s", unit="s") * rate)
-    if first >= jumped.size:
+    from scipy.signal import butter, oaconvolve, sosfilt
+
+    n_samples = as_sample_count(duration_s, fs, "duration_s")
+    bursts = Bursts() if bursts is None else bursts
+    low, high = as_band(bursts.band, fs)
+    generator = as_generator(rng)
+    count = generator.poisson(bursts.rate_hz * n_samples / fs)
+    if count == 0:
         raise ValueError(
-            f"at_s must lie within the signal of {jumped.size / rate:g} s, got {at_s:g} s; make the signal longer"
+            f"no burst fell into duration_s = {duration_s:g} s: take a longer duration or a higher rate_hz"
         )
-    jumped[first:] *= 10 ** (as_number(gain_db, "gain_db", unit="dB") / 20)
-    return jumped
-
-
-def scaled_to_power(signal: Any, power: float) -> np.ndarray:
-    """Copy of `signal` scaled so that its mean square is `power`.
-
-    Parameters
-    ----------
-    signal : array_like, shape (n_samples,)
-        The signal, not all zeros.
-    power : float
-        Wanted mean square, above 0.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,)
-        The scaled signal.
-
-    Raises
-    ------
-    ValueError, TypeError
-        Where the signal is silent or not finite, or the power is not above 0.
-
-    Examples
-    --------
-    >>> scaled_to_power([3.0, -4.0], 50.0).tolist()
-    [6.0, -8.0]
-    """
-    samples = as_signal(signal, "signal")
-    wanted = as_positive(power, "power")
-    peak = np.max(np.abs(samples))
-    if peak == 0:
-        raise ValueError("signal must not be all zeros: no scale gives silence a power")
-    # Dividing by the peak first keeps the squares of very small or large samples within range.
-    unit = samples / peak
-    return unit * np.sqrt(wanted / np.mean(unit**2))
-
-
-def _sample_count(duration_s: float, fs: float) -> int:
-    """Number of samples in `duration_s`, at least one."""
-    rate = as_positive(fs, "fs", unit="Hz")
-    duration = as_positive(duration_s, "duration_s", unit="s")
-    n_samples = round(duration * rate)
-    if n_samples < 1:
-        raise ValueError(f"duration_s must be at least one sample, {1 / rate:g} s, got {duration:g} s")
-    return n_samples
+    decay = bursts.decay_s * fs
+    levels = np.zeros(n_samples)
+    times, levels_db = (
+        generator.integers(0, n_samples, count),
+        bursts.level_spread_db * generator.standard_normal(count),
+    )
+    np.add.at(levels, times, 10 ** (levels_db / 20))
+    envelope = oaconvolve(levels, np.exp(-np.arange(max(round(6 * decay), 1)) / decay))[:n_samples]
+    sos = butter(4, (max(low, 1e-6 * fs), min(high, 0.499999 * fs)), "bandpass", fs=fs, output="sos")
+    impulsive = sosfilt(sos, np.maximum(envelope, 0.0) * generator.standard_normal(n_samples))
+    steady = sosfilt(sos, generator.standard_normal(n_samples))
+    background = 10 ** (bursts.background_db / 20)
+    return scaled_to_power(scaled_to_power(impulsive, 1.0) + scaled_to_power(steady, 1.0) * background, power)
 
 
 def _shaped_noise(gain: Any, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
-    """White Gaussian noise whose Fourier bins are multiplied by gain(frequencies in Hz)."""
+    """Return white Gaussian noise whose Fourier bins are multiplied by gain(frequencies in Hz)."""
     spectrum = np.fft.rfft(generator.standard_normal(n_samples))
     return np.fft.irfft(spectrum * gain(np.fft.rfftfreq(n_samples, 1 / fs)), n_samples)
 
 
 def _envelope(frequencies: np.ndarray) -> np.ndarray:
-    """Amplitude envelope of the compressor: 1 at its peak, falling by 6 dB per octave to both sides."""
+    """Return the amplitude envelope of the compressor: 1 at its peak, falling by 6 dB per octave to both sides."""
     relative = frequencies / _ENVELOPE_PEAK_HZ
     return 2 * relative / (1 + relative**2)
 
 
-def _line_amplitudes(orders: np.ndarray, shaft: float, lobes: int, generator: np.random.Generator) -> np.ndarray:
-    """Mean amplitude of each shaft harmonic."""
-    gain_db = _LOBE_GAIN_DB * (orders % lobes == 0) + _LINE_SPREAD_DB * generator.standard_normal(orders.size)
-    return _envelope(orders * shaft) * 10 ** (gain_db / 20)
-
-
-def _modulated_lines(
-    orders: np.ndarray,
-    amplitudes: np.ndarray,
-    speed: np.ndarray,
-    level_std: float,
-    fs: float,
-    generator: np.random.Generator,
-) -> np.ndarray:
-    """Sum of the lines at `orders` times the momentary `speed` in Hz, each with a wandering level."""
+def _lines(machine: Compressor, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
+    """Return the sum of the lines at the orders of the momentary speed, each with a wandering level."""
+    orders = np.arange(1, machine.n_harmonics + 1)
+    gain_db = _LOBE_GAIN_DB * (orders % machine.lobe_count == 0)
+    gain_db = gain_db + _LINE_SPREAD_DB * generator.standard_normal(orders.size)
+    amplitudes = _envelope(orders * machine.shaft_hz) * 10 ** (gain_db / 20)
+    speed = machine.shaft_hz * (1 + machine.speed_fluctuation * _slow_process(n_samples, fs, generator))
     shaft_phase = 2 * np.pi / fs * np.cumsum(speed)
     start = generator.uniform(0, 2 * np.pi, orders.size)
-    total = np.zeros(speed.size)
+    total = np.zeros(n_samples)
     for order, amplitude, phase in zip(orders, amplitudes, start, strict=True):
-        level = np.exp(level_std * _slow_process(speed.size, fs, generator))
+        level = np.exp(machine.level_fluctuation * _slow_process(n_samples, fs, generator))
         total += amplitude * level * np.sin(order * shaft_phase + phase)
     return total
 
 
 def _slow_process(n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
-    """Stationary first-order Gauss-Markov process of unit variance, time constant 0.5 s."""
+    """Return a stationary first-order Gauss-Markov process of unit variance, with a time constant of 0.5 s."""
     from scipy.signal import lfilter
 
     pole = np.exp(-1 / (_FLUCTUATION_TIME_S * fs))
@@ -364,7 +389,7 @@ def _slow_process(n_samples: int, fs: float, generator: np.random.Generator) -> 
 
 
 def _broadband(upper: float, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
-    """Noise from 20 Hz to `upper` with the compressor's envelope."""
+    """Return noise from 20 Hz to `upper` with the compressor's envelope."""
 
     def gain(frequencies: np.ndarray) -> np.ndarray:
         return _envelope(frequencies) * ((frequencies >= _BROADBAND_FROM_HZ) & (frequencies <= upper))

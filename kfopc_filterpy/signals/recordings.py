@@ -1,21 +1,21 @@
-"""Recordings as files: vectors out of MATLAB files, WAV files in and out."""
+"""Recordings as files: vectors in MATLAB files, signals in audio files."""
 
 from __future__ import annotations
 
 import os
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_positive, as_signal, require_finite
+from .._validate import as_channels, as_count, as_positive, as_real_array, as_signal
 
-__all__ = ["read_mat_vector", "read_wav", "write_wav"]
+# A size that a WAV file's header states if its writer could not know it, because it wrote to a pipe.
+_SIZE_UNKNOWN = 0xFFFFFFFF
 
 
 def read_mat_vector(path: str | os.PathLike[str], variable: str) -> np.ndarray:
-    """One real vector out of a MATLAB file (version 4 to 7.2).
+    """Read one real vector from a MATLAB file (version 4 to 7.2).
 
     Parameters
     ----------
@@ -32,9 +32,9 @@ def read_mat_vector(path: str | os.PathLike[str], variable: str) -> np.ndarray:
     Raises
     ------
     FileNotFoundError
-        Where there is no such file.
+        If there is no such file.
     ValueError
-        Where the file cannot be read, the variable is not in it (the message lists those that are), or it is
+        If the file cannot be read, does not hold the variable (the message lists those it holds), or the variable is
         empty, complex, not numeric, not a vector, or holds NaN or Inf.
 
     Examples
@@ -70,83 +70,86 @@ def read_mat_vector(path: str | os.PathLike[str], variable: str) -> np.ndarray:
 def read_wav(
     path: str | os.PathLike[str], fs: float | None = None, *, channel: int | None = None
 ) -> tuple[np.ndarray, float]:
-    """One channel of a WAV file; whole-number samples are scaled so that full scale is 1.
+    """Read an audio file: WAV, or any other format that libsndfile reads, such as FLAC or AIFF.
+
+    Whole-number samples are scaled so that full scale is 1.
 
     Parameters
     ----------
     path : path
-        The WAV file: 8 to 32-bit PCM, or floating point.
+        The audio file.
     fs : float, optional
-        The sampling frequency it has to have, in Hz. None takes any.
+        Sampling frequency in Hz that the file must have. By default any is taken.
     channel : int, optional
-        Channel to take, from 0; needed where the file has several.
+        Channel to read, from 0. By default all are read.
 
     Returns
     -------
-    signal : ndarray, shape (n_samples,)
-        The samples as float64.
+    signal : ndarray, shape (n_samples,) or (n_channels, n_samples)
+        The samples as float64. A file with several channels gives (n_channels, n_samples) unless one is chosen.
     fs : float
-        The file's sampling frequency in Hz.
+        Sampling frequency of the file in Hz.
 
     Raises
     ------
     FileNotFoundError
-        Where there is no such file.
+        If there is no such file.
     ValueError
-        Where the file is not a WAV file, is cut short, empty or not finite, has another sampling frequency
-        than `fs`, or has several channels and none is chosen.
+        If the file is not an audio file, is cut short, is empty or holds NaN or Inf, has another sampling frequency
+        than `fs`, or does not have the channel.
 
     Examples
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_wav(folder + "/noise.wav", [0.0, 0.5, -0.25], 16000)
+    ...     write_wav(folder + "/noise.wav", [[0.0, 0.5, -0.25], [1.0, 0.0, 0.0]], 16000)
     ...     signal, fs = read_wav(folder + "/noise.wav", 16000)
     >>> signal.tolist(), fs
-    ([0.0, 0.5, -0.25], 16000.0)
+    ([[0.0, 0.5, -0.25], [1.0, 0.0, 0.0]], 16000.0)
     """
-    from scipy.io import wavfile
+    import soundfile
 
     _require_file(path)
+    _require_whole(path)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", wavfile.WavFileWarning)
-            # Chunks with titles, markers and the like are no part of the sound.
-            warnings.filterwarnings("ignore", message="Chunk", category=wavfile.WavFileWarning)
-            file_fs, samples = wavfile.read(path)
-    # A damaged header can also run into struct.error or a division by zero.
-    except Exception as error:
-        raise ValueError(f"{path} cannot be read as a WAV file: {error}") from error
+        frames, file_fs = soundfile.read(path, dtype="float64", always_2d=True)
+    except soundfile.SoundFileError as error:
+        raise ValueError(f"{path} cannot be read as an audio file: {error}") from error
     if fs is not None and file_fs != as_positive(fs, "fs", unit="Hz"):
         raise ValueError(
             f"{path} is sampled at {file_fs} Hz, expected fs = {fs:g} Hz; resample it (scipy.signal.resample_poly)"
         )
-    return as_signal(_full_scale(_one_channel(samples, channel, path)), f"the signal of {path}"), float(file_fs)
+    name, channels = f"the signal of {path}", frames.T
+    if channel is not None:
+        index = as_count(channel, "channel", minimum=0)
+        if index >= len(channels):
+            raise ValueError(f"channel must be below the {len(channels)} channel(s) of {path}, got {index}")
+        return as_signal(channels[index], name), float(file_fs)
+    return as_channels(channels[0] if len(channels) == 1 else channels, name), float(file_fs)
 
 
 def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: float | None = None) -> None:
-    """Write a signal as a WAV file, by default as it is, in 32-bit floating point.
+    """Write a signal as a WAV file, by default unscaled in 32-bit floating point.
 
-    Files that are to be compared by ear need one scale: pass the same `peak`, the largest magnitude among all
-    of them, to each.
+    Files that are to be compared by ear need one scale: pass the same `peak`, the largest magnitude among all of them,
+    to each.
 
     Parameters
     ----------
     path : path
-        The file to write; one that is there is replaced.
-    signal : array_like, shape (n_samples,)
-        The signal. NaN at its end, as a diverged run has it, becomes silence.
+        The file to write; an existing one is replaced.
+    signal : array_like, shape (n_samples,) or (n_channels, n_samples)
+        The signal. NaN at its end, as in a diverged run, becomes silence.
     fs : float
         Sampling frequency in Hz, a whole number.
     peak : float, optional
-        The signal value that becomes full scale of a 16-bit file. None writes the values unscaled, in 32-bit
+        Signal value that becomes full scale of a 16-bit file. By default the values are written unscaled in 32-bit
         floating point; players clip those beyond 1.
 
     Raises
     ------
     ValueError, TypeError
-        Where the signal is empty, exceeds `peak`, or holds Inf, or NaN before its end; where fs is not a
-        whole number.
+        If the signal is empty, exceeds `peak`, or holds Inf, or NaN before its end; if fs is not a whole number.
 
     Examples
     --------
@@ -157,6 +160,7 @@ def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: flo
     >>> signal.round(3).tolist()
     [1.0, -0.5, 0.0]
     """
+    # Not soundfile, which puts the time of writing into floating-point files: the same signal gives the same bytes.
     from scipy.io import wavfile
 
     samples = _silent_tail(signal)
@@ -164,7 +168,7 @@ def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: flo
     if rate != round(rate):
         raise ValueError(f"fs must be a whole number of Hz in a WAV file, got {rate:g} Hz")
     if peak is None:
-        wavfile.write(path, round(rate), samples.astype(np.float32))
+        wavfile.write(path, round(rate), samples.T.astype(np.float32))
         return
     full_scale = as_positive(peak, "peak")
     largest = np.max(np.abs(samples))
@@ -172,7 +176,7 @@ def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: flo
         raise ValueError(
             f"signal reaches {largest:g}, beyond peak = {full_scale:g}; raise peak, or limit the signal with np.clip"
         )
-    wavfile.write(path, round(rate), np.round(samples / full_scale * 32767).astype(np.int16))
+    wavfile.write(path, round(rate), np.round(samples.T / full_scale * 32767).astype(np.int16))
 
 
 def _require_file(path: str | os.PathLike[str]) -> None:
@@ -180,33 +184,19 @@ def _require_file(path: str | os.PathLike[str]) -> None:
         raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
 
 
-def _one_channel(samples: np.ndarray, channel: int | None, path: str | os.PathLike[str]) -> np.ndarray:
-    channels = samples.reshape(len(samples), -1)
-    count = channels.shape[1]
-    if channel is None and count > 1:
-        raise ValueError(f"{path} has {count} channels; choose one with channel=0 to channel={count - 1}")
-    index = as_count(channel or 0, "channel", minimum=0)
-    if index >= count:
-        raise ValueError(f"channel must be below the {count} channel(s) of {path}, got {index}")
-    return channels[:, index]
-
-
-def _full_scale(samples: np.ndarray) -> np.ndarray:
-    """Samples as float64, whole numbers scaled to full scale 1."""
-    if samples.dtype.kind == "f":
-        return samples.astype(np.float64)
-    if samples.dtype == np.uint8:
-        # 8-bit WAV samples are unsigned, silence at 128.
-        return (samples.astype(np.float64) - 128) / 128
-    return samples.astype(np.float64) / (np.iinfo(samples.dtype).max + 1.0)
+def _require_whole(path: str | os.PathLike[str]) -> None:
+    """Raise ValueError if a WAV file is shorter than its header says: libsndfile would read what is left of it."""
+    with open(path, "rb") as file:
+        riff, size, kind = file.read(4), int.from_bytes(file.read(4), "little"), file.read(4)
+    held = Path(path).stat().st_size - 8
+    if (riff, kind) == (b"RIFF", b"WAVE") and held < size != _SIZE_UNKNOWN:
+        raise ValueError(f"{path} cannot be read as an audio file: it is cut short, at {held} of {size} bytes")
 
 
 def _silent_tail(signal: Any) -> np.ndarray:
-    """Signal with the NaN at its end replaced by zeros."""
-    samples = np.array(signal, dtype=np.float64)
-    numbers = np.flatnonzero(~np.isnan(samples.ravel()))
-    end = numbers[-1] + 1 if numbers.size else 0
-    if samples.ndim == 1:
-        samples[end:] = 0.0
-    require_finite(samples, "signal")
-    return as_signal(samples, "signal")
+    """Return the signal with the NaN at the end of each channel replaced by zeros."""
+    samples = as_real_array(signal, "signal").copy()
+    for channel in np.atleast_2d(samples) if samples.ndim < 3 else ():
+        numbers = np.flatnonzero(~np.isnan(channel))
+        channel[numbers[-1] + 1 if numbers.size else 0 :] = 0.0
+    return as_channels(samples, "signal")

@@ -1,4 +1,4 @@
-"""Estimates of q = E[e_o^2] (eq. 7) against what was put in, and against an independent least-squares fit."""
+"""Estimates of q = E[e_o^2] (eq. 7) against the variance put in, and against an independent least-squares fit."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ S = np.array([0.0, 0.9, -0.4, 0.2])
 
 
 def recording(n, n_taps, q, seed, coloured=True):
-    """Reference, and d = w' x' + e_o of eq. 1b with white e_o of variance q."""
+    """Return a reference, and d = w' x' + e_o of eq. 1b with white e_o of variance q."""
     rng = np.random.default_rng(seed)
     x = rng.standard_normal(n)
     if coloured:
@@ -63,7 +63,7 @@ def test_is_the_residual_of_least_squares(n_taps):
 
 
 def test_what_the_filter_cannot_explain_counts():
-    """A disturbance of another source is all measurement error; one too early for the secondary path nearly all."""
+    """A disturbance from another source is all measurement error; one too early for the secondary path is nearly so."""
     rng = np.random.default_rng(2)
     x, other = rng.standard_normal((2, 20_000))
     assert measurement_noise_from_run(x, other, S, 16) == pytest.approx(np.var(other), rel=0.01)

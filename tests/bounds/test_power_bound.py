@@ -1,7 +1,7 @@
 """The power-constrained bound against a general optimiser, dense least squares, the KKT conditions and closed forms.
 
-No oracle here uses correlation matrices recursively made, eigenvalues or the package's root finder: they hold the
-delay lines as explicit rows.
+The oracles use no recursive correlation matrices, no eigenvalues and not the package's root finder: they hold the delay
+lines as explicit rows.
 """
 
 from itertools import pairwise
@@ -21,12 +21,12 @@ from kfopc_filterpy.paths.models import bandpass_path, path_taps
 
 FS = 200.0
 # The least penalty leaves the power within 1e-12 of the budget by its own sums; correlations of well-conditioned
-# signals and sums over the samples agree to some 1e-13 more.
+# signals and sums over the samples agree to about 1e-13 more.
 WELL = 1e-9
 
 
 def scene(n=1000, seed=0, noise=0.1, path=(0.0, 0.8, 0.3, -0.1)):
-    """Coloured reference of changing level, and a disturbance that it explains but for some noise."""
+    """Return a coloured reference of changing level, and a disturbance that it explains except for some noise."""
     rng = np.random.default_rng(seed)
     x = scipy.signal.lfilter([1.0], [1.0, -0.6], rng.standard_normal(n)) * (1 + 0.5 * np.sin(np.arange(n) / 150))
     d = scipy.signal.lfilter([0, 0, 1.0, 0.5, -0.3], 1.0, x) + noise * rng.standard_normal(n)
@@ -34,18 +34,18 @@ def scene(n=1000, seed=0, noise=0.1, path=(0.0, 0.8, 0.3, -0.1)):
 
 
 def delay_lines(signal, n_taps, start, stop):
-    """Rows of the real past, newest first, with zeros before the first sample."""
+    """Return rows of the true past, newest first, with zeros before the first sample."""
     return np.array([[signal[n - j] if n >= j else 0.0 for j in range(n_taps)] for n in range(start, stop)])
 
 
 def dense(x, d, s, n_taps, start, stop):
-    """Rows of x', rows of x and the disturbance of a stretch."""
+    """Return the rows of x', the rows of x and the disturbance of a stretch."""
     filtered = np.convolve(x, s)[: x.size]
     return delay_lines(filtered, n_taps, start, stop), delay_lines(x, n_taps, start, stop), d[start:stop]
 
 
 def dense_bound(filtered, control, d, rated_power):
-    """Weights and penalty by least squares on stacked rows for each penalty tried, and a bracketed root."""
+    """Return weights and penalty, by least squares on stacked rows for each penalty tried and a bracketed root."""
 
     def solve(penalty):
         rows = np.vstack([filtered, np.sqrt(penalty) * control])
@@ -61,7 +61,7 @@ def dense_bound(filtered, control, d, rated_power):
 
 
 def asked_for(x, d, s, n_taps):
-    """Power of the filter without a budget."""
+    """Return the power of the filter without a budget."""
     filtered, control, d = dense(x, d, s, n_taps, 0, x.size)
     return np.mean((control @ np.linalg.lstsq(filtered, d, rcond=None)[0]) ** 2)
 
@@ -92,7 +92,7 @@ def test_no_general_optimiser_finds_less_error_within_the_power(share, seed):
             error, np.zeros(3), jac=slope, method="SLSQP", constraints=budget, options=options
         )
         assert other.success
-        # SLSQP stops when the error changes by less than 1e-12 and its root, the weights, by some 1e-6.
+        # SLSQP stops when the error changes by less than 1e-12 and its root, the weights, by about 1e-6.
         assert part.error_power == pytest.approx(other.fun, rel=1e-8)
         np.testing.assert_allclose(part.weights, other.x, atol=1e-5 * np.abs(other.x).max())
 
@@ -145,7 +145,7 @@ def problems(draw):
 @given(problem=problems())
 @settings(max_examples=150, deadline=None)
 def test_karush_kuhn_tucker_conditions_hold(problem):
-    # The problem is convex: what satisfies them is the optimum.
+    # The problem is convex: whatever satisfies the conditions is the optimum.
     x, d, s, n_taps, share = problem
     filtered, control, _ = dense(x, d, s, n_taps, 0, x.size)
     rated = share * max(asked_for(x, d, s, n_taps), 1e-12)
@@ -177,7 +177,7 @@ def test_one_tap_in_closed_form():
 
 
 def tones(n, amplitudes, cycles, phases):
-    """Sines of whole periods a second of 200 samples, so that they are orthogonal over it."""
+    """Return sines with whole periods in a second of 200 samples, which makes them orthogonal over it."""
     angles = 2 * np.pi * np.outer(cycles, np.arange(n)) / FS + np.array(phases)[:, None]
     return np.sin(angles).T @ np.array(amplitudes)
 
@@ -222,7 +222,7 @@ def test_two_tones_share_the_power_by_the_gain_at_each():
 
 
 def test_path_that_mutes_a_tone_costs_it_no_power():
-    # S is zero at the second tone. The least-norm filter lets some of it into y nevertheless, the bound need not.
+    # S is zero at the second tone. The least-norm filter still lets some of it into y; the bound need not.
     x = tones(1000, [1.0, 5.0], [20, 47], [0.0, 0.0])
     d = tones(1000, [1.0], [20], [1.0]) + 0.1 * np.random.default_rng(0).standard_normal(1000)
     s = np.array([1.0, -2 * np.cos(2 * np.pi * 47 / FS), 1.0])
@@ -317,7 +317,7 @@ def test_second_without_a_reference_is_left_as_it_is():
 
 
 def test_anti_noise_still_on_its_way_costs_no_power():
-    # The reference stops before the second second; what a late path still delivers of it can be cancelled for nothing.
+    # The reference stops before the second second; the late part of the path's response can be cancelled without power.
     x, d, _ = scene(400)
     x[190:] = 0.0
     s = np.concatenate([np.zeros(40), [1.0]])
@@ -365,7 +365,7 @@ def test_weak_part_of_the_reference_counts_where_the_disturbance_is_made_of_it()
     power = np.mean((control @ np.linalg.lstsq(filtered, own, rcond=None)[0]) ** 2)
     found = power_constrained_wiener(x, d, s, 8, power / 3, fs=FS, switch_on_s=1.0).whole
     weights, _ = dense_bound(filtered, control, own, power / 3)
-    # Conditions of 1e8 cost correlations eight digits of 16; the error is stationary in what is lost.
+    # A condition number of 1e8 costs the correlations eight of 16 digits; the error is stationary in those directions.
     assert found.control_power == pytest.approx(power / 3, rel=1e-6)
     assert found.error_power == pytest.approx(np.mean((own - filtered @ weights) ** 2), rel=1e-7)
     assert found.noise_reduction_db > 3

@@ -6,8 +6,9 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kfopc_filterpy.bounds import coherence_bound, wiener_solution
 from kfopc_filterpy.bounds.power_constrained import power_constrained_solution
-from kfopc_filterpy.bounds.wiener import coherence_bound, correlation_matrix, minimum_norm_solve, wiener_solution
+from kfopc_filterpy.paths.least_squares import correlation_matrix, minimum_norm_solve
 from kfopc_filterpy.paths.models import bandpass_path, path_taps
 
 FS = 16000.0

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import scipy.signal
 from filterpy.kalman import KalmanFilter
-from test_simulation import MAKERS, D, X, assert_same_run
+from helpers.comparing import assert_same_run
+from helpers.simulation import MAKERS, D, X, constraint
 
 from kfopc_filterpy import (
     KFOPC,
@@ -119,7 +120,7 @@ def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, place, monkey
 @pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
 def test_listening_after_a_run_hears_the_loudspeaker_fall_silent(name):
     """Three samples of y are still in s^ * y; then the disturbance is what the microphone hears."""
-    made = MAKERS[name](power_memory=4 / FS, power_window="sliding")
+    made = MAKERS[name](constraint=constraint(memory_s=4 / FS, window="sliding"))
     simulate(made, X, disturbance=D, secondary_path=S)
     made.listen(X[:7], D[:7])
     assert made.disturbance_power == pytest.approx(np.mean(D[3:7] ** 2), rel=1e-14)
@@ -175,7 +176,11 @@ KALMAN = {"state_noise": 1e-6, "measurement_noise": 0.01}
         (lambda: FxLMS(4, S, step_size=np.inf), ValueError, "step_size must be finite"),
         (lambda: MOVFxLMS(4, S, step_size=0.1, rated_power=-1), ValueError, "rated_power must be greater than 0"),
         (lambda: MOVFxLMS(4, S, step_size=0.1, rated_power=1, amplifier=abs), TypeError, "amplifier models"),
-        (lambda: MOVFxLMS(4, S, step_size=0.1, rated_power=1, power_window="x"), ValueError, "window must be one of"),
+        (lambda: MOVFxLMS(4, S, step_size=0.1, constraint=constraint(window="x")), ValueError, "window must be one of"),
+        (lambda: MOVFxLMS(4, S, step_size=0.1), ValueError, "give either rated_power= or constraint="),
+        (lambda: kf_opc(4, S, **KALMAN), ValueError, "give either rated_power= or constraint="),
+        (lambda: kf_opc(4, S, rated_power=1, constraint=constraint(), **KALMAN), ValueError, "give either rated_power="),
+        (lambda: kf_opc(4, S, constraint=1.0, **KALMAN), TypeError, "constraint must be an OutputPowerConstraint"),
     ],
 )
 def test_refuses(make, kind, message):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import DiagonalKalman, HardClipAmplifier, kf_anc, kf_opc, simulate
+from kfopc_filterpy import DiagonalKalman, HardClipAmplifier, OutputPowerConstraint, kf_anc, kf_opc, simulate
 
 L = 6
 PATH = np.array([0.0, 0.8, -0.3])
@@ -30,7 +30,7 @@ def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool, compil
     Known path: d^ = d. Tolerance: rounding of filterpy's Joseph form.
     """
     x, d = signals()
-    rated: dict[str, Any] = {"rated_power": 0.3, "power_memory": 0.01} if constrained else {}
+    rated: dict[str, Any] = {"constraint": OutputPowerConstraint(0.3, memory_s=0.01)} if constrained else {}
     controller = DiagonalKalman(L, PATH, **NOISES, **rated)
     result = simulate(controller, x, disturbance=d, secondary_path=PATH, record_weights_every=1, compiled=compiled)
     factors = np.ones(x.size)
@@ -127,5 +127,5 @@ def test_bad_variances_are_refused(name: str, value: float) -> None:
 def test_a_bad_rated_power_is_refused() -> None:
     with pytest.raises(ValueError, match="rated_power"):
         DiagonalKalman(L, PATH, rated_power=0.0, **NOISES)
-    with pytest.raises(ValueError, match="memory"):  # without a rated power too
-        DiagonalKalman(L, PATH, power_memory=0.0, **NOISES)
+    with pytest.raises(ValueError, match="give either rated_power= or constraint="):
+        DiagonalKalman(L, PATH, rated_power=1.0, constraint=OutputPowerConstraint(1.0), **NOISES)

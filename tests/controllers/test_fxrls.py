@@ -68,7 +68,7 @@ def test_it_forgets() -> None:
 def test_a_known_amplifier_and_a_limiter_are_passed_on() -> None:
     controller = fx_rls(L, PATH, amplifier=HardClipAmplifier(0.5), dtype=np.float32)
     assert controller.estimator.dtype == np.float32
-    np.testing.assert_array_equal(controller._state.amplifier, HardClipAmplifier(0.5).parameters)
+    assert controller._state.lines.amplifier == HardClipAmplifier(0.5).model
 
 
 @pytest.mark.parametrize("value", [0.0, -0.5, 1.1, np.nan, np.inf])

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.comparing import assert_same_estimator, assert_same_run
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, P0, Q, R, S, noises
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, P0, Q, R, S, assert_same_estimator, noises
-from test_simulation import assert_same_run
 
 from kfopc_filterpy import (
     FxLMS,
@@ -21,6 +21,7 @@ from kfopc_filterpy import (
     LimitedController,
     MOVFxLMS,
     OutputLimiter,
+    OutputPowerConstraint,
     kf_anc,
     kf_opc,
     kf_opc_repaired,
@@ -46,16 +47,16 @@ def controller(name: str, path: Any = S, **options: Any) -> FilteredReferenceCon
     """A controller; the estimated path is the true one unless another is given."""
     if name == "FxLMS":
         return FxLMS(N_TAPS, path, step_size=MU, **options)
-    powers = {"rated_power": RATED_POWER, "fs": FS}
+    constraint = OutputPowerConstraint(RATED_POWER, fs=FS, memory_s=MEMORY_S)
     if name == "MOV-FxLMS":
-        return MOVFxLMS(N_TAPS, path, step_size=MU, power_memory=MEMORY_S, **powers, **options)
+        return MOVFxLMS(N_TAPS, path, step_size=MU, constraint=constraint, **options)
     kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0, **options}
     if name == "KF-ANC":
         return kf_anc(N_TAPS, path, **kalman)
     if name == "KF-PB":
-        return kf_pb(N_TAPS, path, memory_s=0.05, credit_s=0.05, **powers, **kalman)
+        return kf_pb(N_TAPS, path, rated_power=RATED_POWER, fs=FS, memory_s=0.05, credit_s=0.05, **kalman)
     make = kf_opc if name == "KF-OPC" else kf_opc_repaired
-    return make(N_TAPS, path, power_memory=MEMORY_S, **powers, **kalman)
+    return make(N_TAPS, path, constraint=constraint, **kalman)
 
 
 def run(made: Any, *, n: int = N, seed: int = 3, **options: Any) -> Any:
@@ -103,15 +104,6 @@ def test_what_fits_passes_as_if_there_were_no_limiter(name: str) -> None:
     free = run(controller(name), **options)
     limited = run(controller(name, limiter=limiter(100.0 * worst_window(free.control_signal))), **options)
     assert_same_run(free, limited)
-
-
-@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
-def test_blocks_do_not_show(name: str) -> None:
-    """The block kernel is the same filter to rounding: 1e-10 of the largest value after 500 steps that contract."""
-    one, other = controller(name, limiter=limiter()), controller(name, limiter=limiter(), block_size=16)
-    want, got = run(one).control_signal, run(other).control_signal
-    np.testing.assert_allclose(got, want, rtol=0, atol=1e-10 * np.max(np.abs(want)))
-    assert_kept(got)
 
 
 # ---- The bound
@@ -246,7 +238,7 @@ def test_the_disturbance_power_is_the_true_one(name: str) -> None:
     made = controller(name, limiter=limiter())
     x, d, _ = noises()
     result = run(made, record_powers=True)
-    fresh = 1 - math.exp(-1 / (made.constraint.memory * made.constraint.fs))
+    fresh = 1 - math.exp(-1 / (made.constraint.memory_s * made.constraint.fs))
     power, expected = 0.0, []
     for n, value in enumerate(d):
         share = max(fresh, 1 / (n + 1))

@@ -21,6 +21,7 @@ from kfopc_filterpy import (
     MOVFxLMS,
     OptimalLeakyFxLMS,
     OutputLimiter,
+    OutputPowerConstraint,
     RescalingFxLMS,
     TwoGradientFxLMS,
     output_power,
@@ -83,6 +84,13 @@ def rated_gamma(at: dict[str, Any], rated_power: float, memory: int) -> float:
 
 
 RATED, MEMORY, A = 0.3, 60, 0.6
+
+
+def constraint() -> OutputPowerConstraint:
+    """The rated power at 1 kHz, the powers with a memory of `MEMORY` samples."""
+    return OutputPowerConstraint(RATED, fs=1000, memory_s=MEMORY / 1000)
+
+
 EVERY: dict[str, tuple[Any, Any, Any]] = {
     "FxLMS": (
         lambda **o: FxLMS(L, ESTIMATE, step_size=MU, **o),
@@ -100,14 +108,12 @@ EVERY: dict[str, tuple[Any, Any, Any]] = {
         None,
     ),
     "optimal leaky FxLMS": (
-        lambda **o: OptimalLeakyFxLMS(
-            L, ESTIMATE, step_size=MU, rated_power=RATED, fs=1000, power_memory=MEMORY / 1000, **o
-        ),
+        lambda **o: OptimalLeakyFxLMS(L, ESTIMATE, step_size=MU, constraint=constraint(), **o),
         lambda w, at: (1 - MU * powers(at, MEMORY)[2] * rated_gamma(at, RATED, MEMORY)) * w + MU * at["e"] * at["xf"],
         None,
     ),
     "MOV-FxLMS": (
-        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, rated_power=RATED, fs=1000, power_memory=MEMORY / 1000, **o),
+        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, constraint=constraint(), **o),
         lambda w, at: w + MU * (at["e"] * at["xf"] - rated_gamma(at, RATED, MEMORY) * at["y"] * at["x"]),
         None,
     ),
@@ -117,9 +123,7 @@ EVERY: dict[str, tuple[Any, Any, Any]] = {
         None,
     ),
     "MOV-MFxLMS": (
-        lambda **o: MOVFxLMS(
-            L, ESTIMATE, step_size=MU, rated_power=RATED, fs=1000, power_memory=MEMORY / 1000, modified=True, **o
-        ),
+        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, constraint=constraint(), modified=True, **o),
         lambda w, at: (
             w + MU * ((at["d"][at["n"]] - w @ at["xf"]) * at["xf"] - rated_gamma(at, RATED, MEMORY) * at["y"] * at["x"])
         ),
@@ -415,7 +419,8 @@ def test_a_known_amplifier_is_in_the_estimate_of_those_that_have_one() -> None:
     x, d = noise()
     amplifier = HardClipAmplifier(0.2)
     for kind in (MOVFxLMS, OptimalLeakyFxLMS):
-        controller = kind(L, PATH, step_size=MU, rated_power=0.1, fs=1000, power_memory=1e3, amplifier=amplifier)
+        long = OutputPowerConstraint(0.1, fs=1000, memory_s=1e3)
+        controller = kind(L, PATH, step_size=MU, constraint=long, amplifier=amplifier)
         result = simulate(
             controller, x, disturbance=d, secondary_path=PATH, amplifier=amplifier, fs=1000, record_powers=True
         )

@@ -11,24 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from helpers.comparing import SIGNALS, assert_same_estimator, assert_same_run
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, P0, S_HAT, Q, R, S, noises, run, sensor_noise
 from oracles import modified_anc as oracle
-from test_loop import (
-    AMPLIFIERS,
-    FEEDBACK,
-    FS,
-    MEMORY_S,
-    P0,
-    S_HAT,
-    SIGNALS,
-    Q,
-    R,
-    S,
-    assert_same_estimator,
-    noises,
-    run,
-    sensor_noise,
-)
-from test_simulation import assert_same_run
 
 from kfopc_filterpy import (
     KFOPC,
@@ -54,9 +39,12 @@ REPAIRS = [
 PUBLISHED = REPAIRS[0]
 
 
-def made(n_taps: int = N_TAPS, **options: Any) -> RepairedKFOPC:
-    settings = {"rated_power": RATED_POWER, "state_noise": R, "measurement_noise": Q, "initial_variance": P0}
-    return kf_opc_repaired(n_taps, S_HAT, **settings | {"fs": FS, "power_memory": MEMORY_S} | options)
+def made(
+    n_taps: int = N_TAPS, *, rated_power: float = RATED_POWER, window: str = "exponential", **options: Any
+) -> RepairedKFOPC:
+    constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S, window=window)
+    settings = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+    return kf_opc_repaired(n_taps, S_HAT, constraint=constraint, **settings | options)
 
 
 class WrittenOut:
@@ -101,7 +89,7 @@ class WrittenOut:
 
 
 def assert_agrees(result: Any, expected: dict) -> None:
-    """500 steps of a loop that contracts, in another order of summation; see `test_loop`."""
+    """500 steps of a loop that contracts, in another order of summation; see `loop/test_loop.py`."""
     for name in SIGNALS:
         if name != "weights":  # of the oracle with the factor at the output
             want = expected[name]
@@ -150,7 +138,7 @@ def test_amplifiers_feedback_a_sliding_window_and_a_late_start(amplifier: str, g
         on=123,
     )
     options = {"amplifier": ours, "feedback": FEEDBACK, "on": 123, "compiled": compiled}
-    assert_agrees(run(made(**repairs, power_window="sliding"), **options), expected)
+    assert_agrees(run(made(**repairs, window="sliding"), **options), expected)
 
 
 @pytest.mark.parametrize("compiled", [True, False])
@@ -169,7 +157,8 @@ def test_the_trimmed_factor_stops_at_1(compiled: bool) -> None:
 def test_without_a_repair_it_is_kf_opc_bit_for_bit(compiled: bool) -> None:
     """The same equations in the same order; a trim of 0 multiplies by exp(0) = 1."""
     settings = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
-    published = kf_opc(N_TAPS, S_HAT, rated_power=RATED_POWER, fs=FS, power_memory=MEMORY_S, **settings)
+    constraint = OutputPowerConstraint(RATED_POWER, fs=FS, memory_s=MEMORY_S)
+    published = kf_opc(N_TAPS, S_HAT, constraint=constraint, **settings)
     ours = made(**PUBLISHED)
     one, two = (run(c, compiled=compiled, feedback=FEEDBACK, on=50) for c in (ours, published))
     for name in SIGNALS:
@@ -273,9 +262,9 @@ ESTIMATOR: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
         ({"trim_s": 0.0}, ValueError, "trim_s must be greater than 0 s"),
         ({"trim_s": math.nan}, ValueError, "trim_s must be finite"),
         ({"rated_power": 0.0}, ValueError, "rated_power must be greater than 0"),
-        ({"fs": -1.0}, ValueError, "fs must be greater than 0"),
-        ({"power_memory": 0.0}, ValueError, "memory must be greater than 0"),
-        ({"power_window": "hann"}, ValueError, "window must be one of"),
+        ({"rated_power": None}, ValueError, "give either rated_power= or constraint="),
+        ({"constraint": OutputPowerConstraint(1.0)}, ValueError, "give either rated_power= or constraint="),
+        ({"constraint": 1.0, "rated_power": None}, TypeError, "constraint must be an OutputPowerConstraint"),
         ({"n_taps": 0}, ValueError, "n_taps must be at least 1"),
         ({"state_noise": -1.0}, ValueError, "state_noise must not be negative"),
         ({"amplifier": abs}, TypeError, "one of kfopc_filterpy's amplifier models"),

@@ -82,7 +82,7 @@ def test_every_public_name_has_a_summary_and_an_example_or_is_made_by_one(name, 
         or issubclass(thing, BUILT_OTHERWISE)
         or thing is kfopc_filterpy.controllers.Controller
     )
-    assert ">>>" in doc or made_by_the_package or name.startswith("plot."), f"{name} has no example"
+    assert ">>>" in doc or made_by_the_package, f"{name} has no example"
 
 
 def described(doc: str | None) -> set[str]:

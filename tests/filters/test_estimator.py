@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +19,8 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import KFOPC
+from kfopc_filterpy import KFOPC, OutputPowerConstraint
+from kfopc_filterpy.filters import guards
 
 TAPS, STATE_NOISE, NOISE = 5, 1e-4, 0.3
 NAN, INF = math.nan, math.inf
@@ -30,13 +32,15 @@ both_kinds = pytest.mark.parametrize("kind", KINDS)
 rated_or_not = pytest.mark.parametrize("rated_power", [None, 0.5])
 
 
-def make(kind: str, rated_power: float | None = None, **kwargs: Any) -> KFOPC:
+def make(kind: str, rated_power: float | None = None, **settings: Any) -> KFOPC:
+    """A filter; `settings` are those of its constraint."""
+    own: dict[str, Any] = {"rated_power": rated_power}
+    if rated_power is not None and settings:
+        own = {"constraint": OutputPowerConstraint(rated_power, **settings)}
     if kind == "random walk":
-        kf = KFOPC.random_walk(
-            TAPS, state_noise=STATE_NOISE, measurement_noise=NOISE, rated_power=rated_power, **kwargs
-        )
+        kf: KFOPC = KFOPC.random_walk(TAPS, state_noise=STATE_NOISE, measurement_noise=NOISE, **own)
     else:
-        kf = KFOPC(TAPS, rated_power=rated_power, **kwargs)
+        kf = KFOPC(TAPS, **own)
         kf.Q, kf.R = STATE_NOISE * np.eye(TAPS), np.array([[NOISE]])
     kf.M = np.zeros((TAPS, 1))  # 1.4.5 makes it (1, 1), which its own update_correlated cannot use
     return kf
@@ -80,7 +84,7 @@ def plain_kf_opc(x: Any, rows: Any, d: Any, rated_power: float, forgetting: floa
 @both_kinds
 def test_eq_2_to_13_against_plain_python(kind: str) -> None:
     x, rows, d = scene(400)
-    kf = make(kind, 0.5, fs=1000.0, power_memory=0.1)
+    kf = make(kind, 0.5, fs=1000.0, memory_s=0.1)
     factors = []
     for k, (w, P, S, factor) in enumerate(plain_kf_opc(x, rows, d, 0.5, math.exp(-1 / 100))):
         kf.predict()
@@ -286,8 +290,9 @@ def test_without_a_rated_power() -> None:
 
 
 def test_the_rated_power_may_come_and_go() -> None:
-    kf = make("general", secondary_path_gain=1.0)
-    kf.rated_power = 1.0
+    kf = make("general", 3.0, secondary_path_gain=1.0)
+    kf.rated_power = None
+    kf.rated_power = 1.0  # the settings are those that the constraint was given
     kf.update(4.0, H=np.ones(TAPS))
     assert kf.constraint_factor == 0.25
     kf.rated_power = 4.0  # the powers stay
@@ -337,7 +342,8 @@ def deep_equal(a: Any, b: Any) -> bool:
 
 def state(kf: KFOPC) -> dict:
     """All that a filter holds; the random-walk filter's read-only views are made when read."""
-    return {key: value for key, value in vars(kf).items() if key != "_views"}
+    attributes, private = guards.state_of(kf)
+    return {key: value for key, value in (attributes | private).items() if key != "_views"}
 
 
 def require_equal_state(kf: KFOPC, other: KFOPC) -> bool:
@@ -569,21 +575,35 @@ def test_two_measurements_and_a_rated_power_do_not_go_together() -> None:
         kf.update([1.0, 2.0], R=np.eye(2), H=np.ones((2, TAPS)))
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"fs": -1.0}, "fs must be greater than 0"),
-        ({"power_memory": 0.0}, "power_memory must be greater than 0"),
-        ({"power_window": "hann"}, "power_window must be one of 'exponential', 'sliding'"),
-        ({"secondary_path_gain": np.nan}, "secondary_path_gain must be finite"),
-    ],
-)
-@pytest.mark.parametrize("rated_power", [None, 1.0])
-def test_settings_of_the_constraint_are_checked_at_once(
-    settings: dict, message: str, rated_power: float | None
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        KFOPC(3, rated_power=rated_power, **settings)
+@pytest.mark.parametrize("make", [KFOPC, lambda n, **own: KFOPC.random_walk(n, state_noise=0, measurement_noise=1, **own)])
+def test_a_constraint_that_is_none_or_one_too_many_is_refused(make: Callable) -> None:
+    with pytest.raises(ValueError, match=r"give either rated_power= or constraint=.*, not both"):
+        make(3, rated_power=1.0, constraint=OutputPowerConstraint(1.0))
+    with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None, got 1.0"):
+        make(3, constraint=1.0)
+    kf = make(3)
+    with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None, got 'tight'"):
+        kf.constraint = "tight"
+    assert kf.constraint is None
+
+
+@both_kinds
+def test_a_filter_keeps_a_constraint_of_its_own(kind: str) -> None:
+    """The one given may serve other filters, and is not advanced."""
+    given = OutputPowerConstraint(0.5, fs=1000.0, memory_s=0.1, window="sliding", secondary_path_gain=2.0)
+    before = pickle.dumps(given)
+    one, other = make(kind), make(kind)
+    for kf in (one, other):
+        kf.constraint = given
+        assert kf.constraint is not given
+    one.update(4.0, H=ROW)
+    assert (one.disturbance_power, other.disturbance_power) == (16.0, 0.0)
+    assert pickle.dumps(given) == before
+    assert (one.constraint.window, one.constraint.memory_s, one.constraint.fs) == ("sliding", 0.1, 1000.0)
+    one.constraint = None
+    assert (one.rated_power, one.constraint_factor) == (None, 1.0)
+    with pytest.raises(ValueError, match="set rated_power first"):
+        one.disturbance_power = 1.0
 
 
 @pytest.mark.parametrize("name", ["Fs", "Qs", "Hs", "Rs", "us"])

@@ -13,13 +13,13 @@ import scipy.linalg
 import scipy.optimize
 from filterpy.common import Saver
 from filterpy.kalman import KalmanFilter
-from test_loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, S_HAT, run
-from test_simulation import assert_same_run
+from helpers.comparing import assert_same_run
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, S_HAT, run
+from helpers.power_budget import N_TAPS, SETTINGS, made, signals, step
 
 from kfopc_filterpy import (
     KFOPC,
     HardClipAmplifier,
-    KalmanController,
     bandpass_path,
     clipped_fraction,
     kf_anc,
@@ -29,33 +29,10 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
+from kfopc_filterpy.controllers import PowerBudgetController
 from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import band_limited_noise, tone
-
-N_TAPS = 8
-SETTINGS: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.05}
-SECONDARY = np.array([0.0, 0.8, 0.3])
-
-
-def made(n_taps: int = N_TAPS, **options: Any) -> PowerBudgetKalmanFilter:
-    return PowerBudgetKalmanFilter(n_taps, **SETTINGS | {"rated_power": 0.3, "fs": 1000.0, "memory_s": 0.3} | options)
-
-
-def signals(n: int, n_taps: int = N_TAPS, silent: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Reference, its rows, rows of the filtered reference, disturbance; the reference falls silent at the end."""
-    rng = np.random.default_rng(0)
-    x = np.convolve(rng.standard_normal(n), [1.0, 0.5])[:n]
-    x[n - silent :] = 0.0
-    d = np.convolve(x, [0.0, 0.0, 0.0, 1.2, -0.7, 0.4])[:n] + 0.1 * rng.standard_normal(n)
-    rows, filtered = (scipy.linalg.toeplitz(u, np.zeros(n_taps)) for u in (x, np.convolve(x, SECONDARY)[:n]))
-    return x, rows, filtered, d
-
-
-def step(kf: KalmanFilter, z: Any, h: np.ndarray, **options: Any) -> None:
-    kf.predict()
-    kf.update(z, H=h, **options)
-
 
 # ---- A filterpy filter, whose estimate is the unconstrained one
 
@@ -236,8 +213,8 @@ SETTINGS_IN_LOOP = {
 }  # fmt: skip
 
 
-def controller(n_taps: int = 10, **options: Any) -> KalmanController:
-    """As those of `test_loop`; a usual window of 80 samples, or ten times the taps."""
+def controller(n_taps: int = 10, **options: Any) -> PowerBudgetController:
+    """As those of `loop/test_loop.py`; a usual window of 80 samples, or ten times the taps."""
     return kf_pb(n_taps, S_HAT, **SETTINGS_IN_LOOP | options)
 
 
@@ -265,30 +242,20 @@ def test_compiled_run_is_the_steps_whatever_the_taps(n_taps: int, known: str | N
     assert_same_controller(fast, slow)
 
 
-def assert_same_controller(one: KalmanController, other: KalmanController) -> None:
+def assert_same_controller(one: PowerBudgetController, other: PowerBudgetController) -> None:
     for name in ("weights", "control_filter", "power_weight", "disturbance_power"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
     for name in ("x", "P", "K", "S", "y"):
         np.testing.assert_array_equal(getattr(one.estimator, name), getattr(other.estimator, name), err_msg=name)
     for mine, theirs in zip(one.estimator.budget.state, other.estimator.budget.state, strict=True):
-        if mine is not one.estimator.budget.state.work:
-            np.testing.assert_array_equal(mine, theirs)
+        np.testing.assert_array_equal(mine, theirs)
 
 
 def test_pieces_of_the_compiled_loop_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = run(controller())
     for step in (1, 7, 128, 499):
-        monkeypatch.setattr("kfopc_filterpy.loop.run.simulation.STEP", step)
+        monkeypatch.setattr("kfopc_filterpy.loop.simulation.STEP", step)
         assert_same_run(whole, run(controller()))
-
-
-@pytest.mark.parametrize("block_size", [1, 16, 100])
-def test_blocks_give_the_same_run_to_rounding(block_size: int) -> None:
-    """The block's sums are in another order, 1e-12 of P as in the other filters' tests."""
-    whole, blocks = run(controller()), run(controller(block_size=block_size))
-    for name in ("error", "control_signal", "weights", "power_weight"):
-        want = getattr(whole, name)
-        np.testing.assert_allclose(getattr(blocks, name), want, rtol=0, atol=1e-9 * np.max(np.abs(want)), err_msg=name)
 
 
 def test_it_goes_on_from_where_it_was() -> None:
@@ -309,9 +276,10 @@ def test_while_it_listens_the_budget_hears() -> None:
     made_one.listen(x, x)
     for samples in zip(x, np.convolve(x, S_HAT)[:150], strict=True):
         budget.listen(*samples)
-    for name in ("correlations", "counts", "table"):
-        theirs = getattr(budget.state, name)
-        np.testing.assert_allclose(getattr(made_one.estimator.budget.state, name), theirs, rtol=0, atol=1e-12)
+    mine = made_one.estimator.budget.state
+    for name in ("own_x", "own_xf", "across_x", "across_xf", "counts"):
+        np.testing.assert_allclose(getattr(mine, name), getattr(budget.state, name), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mine.numbers.item(), budget.state.numbers.item(), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(made_one.control_filter, 0.0)
 
 
@@ -328,7 +296,7 @@ def test_what_is_recorded_is_the_control_filter_and_its_lambda() -> None:
 
 
 def test_a_controller_around_the_filter_is_kf_pb() -> None:
-    own = KalmanController(PowerBudgetKalmanFilter(10, **SETTINGS_IN_LOOP), S_HAT)
+    own = PowerBudgetController(PowerBudgetKalmanFilter(10, **SETTINGS_IN_LOOP), S_HAT)
     assert (own.name, own.rated_power) == ("KF-PB", 0.2)
     assert_same_run(run(own), run(controller()))
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from filterpy.common import Saver
 from filterpy.kalman import IMMEstimator, KalmanFilter
+from helpers.rows import rows_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -37,18 +38,6 @@ def pair(n: int, r: float = 1e-4, q: float = 0.5, P0: float = 1.0, x_ndim: int =
         f.x = np.zeros((n, 1)[:x_ndim])
         f.M = np.full((n, 1), 0.01)  # 1.4.5 makes it (1, 1), which its own update_correlated cannot use
     return kf, ours
-
-
-def rows_of(kind: str, n: int, steps: int, rng: np.random.Generator) -> np.ndarray:
-    """Observation rows (steps, n): unrelated ones, or a delay line fed with a signal, newest sample first."""
-    if kind == "unrelated":
-        return rng.normal(size=(steps, n))
-    signal = rng.normal(size=steps + n)
-    if kind == "low-passed line":
-        signal = np.convolve(signal, np.hanning(12))[: steps + n]
-    if kind == "tonal line":
-        signal = np.sin(0.2 * np.arange(steps + n)) + 1e-4 * signal
-    return np.array([signal[k + n - 1 :: -1][:n] for k in range(steps)])
 
 
 def require_close(kf: KalmanFilter, ours: KalmanFilter, names: tuple[str, ...] = READ) -> None:
@@ -376,9 +365,9 @@ WRITES: dict[str, Callable[[np.ndarray], Any]] = {
 
 @pytest.mark.parametrize("name", ["F", "Q", "R"])
 @pytest.mark.parametrize("write", WRITES)
-def test_a_write_into_F_Q_R_names_the_assignment(name: str, write: str) -> None:
+def test_a_write_into_F_Q_R_is_refused(name: str, write: str) -> None:
     _, ours = pair(3)
-    with pytest.raises(ValueError, match=rf"{name} .*read-only.*kf\.{name} = "):
+    with pytest.raises(ValueError, match="read-only"):
         WRITES[write](getattr(ours, name))
     assert np.array_equal(ours.F, np.eye(3))
     assert np.array_equal(ours.Q, 1e-4 * np.eye(3))
@@ -510,6 +499,47 @@ def test_a_saver_keeps_P_as_it_was_when_saved() -> None:
     np.testing.assert_array_equal(saver.P[0], saved)
     np.testing.assert_array_equal(saver.P[1], 10 * saved)
     assert ours.P[0, 0] == 99.0
+
+
+def test_a_saver_keeps_public_names_only() -> None:
+    """And what it kept stays, whatever is written into the filter's arrays afterwards."""
+    _, ours = pair(3)
+    ours.rated_power, ours.secondary_path_gain = 0.5, 1.0
+    saver = Saver(ours)
+    for z in (1.0, 2.0):
+        ours.predict()
+        ours.update(z, H=np.ones(3))
+        saver.save()
+    assert not [key for key in saver.keys if key.startswith("_")]
+    assert {"x", "P", "K", "S", "rated_power", "constraint_factor", "disturbance_power"} <= set(saver.keys)
+    kept = {key: copy.deepcopy(getattr(saver, key)) for key in saver.keys if key not in ("inv", "constraint")}
+    ours.P *= 10.0
+    ours.P[0, 0] = 99.0
+    ours.x[:] = 7.0
+    ours.update(3.0, H=np.ones(3))
+    for key, values in kept.items():
+        for value, now in zip(values, getattr(saver, key), strict=True):
+            np.testing.assert_array_equal(now, value, err_msg=key)
+
+
+def test_P_read_twice_is_two_arrays_and_the_newest_that_was_edited_counts() -> None:
+    _, ours = pair(3)
+    ours.predict()
+    first, second, third = ours.P, ours.P, ours.P
+    assert not np.shares_memory(first, second)
+    before = first.copy()
+    first *= 2.0
+    np.testing.assert_array_equal(second, before)
+    np.testing.assert_array_equal(third, before)
+    second *= 3.0
+    ours.update(1.0, H=np.ones(3))
+    np.testing.assert_allclose(ours.S, np.ones(3) @ (3.0 * before) @ np.ones((3, 1)) + 0.5, rtol=1e-14)
+    left = ours.P.copy()
+    for edited in (first, second, third):  # they were of an earlier step
+        edited[:] = 1e6
+    np.testing.assert_array_equal(ours.P, left)
+    ours.update(1.0, H=np.ones(3))
+    np.testing.assert_allclose(ours.S, np.ones(3) @ left @ np.ones((3, 1)) + 0.5, rtol=1e-12)
 
 
 def test_an_imm_bank_of_random_walks() -> None:

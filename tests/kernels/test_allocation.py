@@ -9,29 +9,16 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
+from helpers.power_budget import correlation, within
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy.power.allocation import (
-    POWER_TOLERANCE,
-    RIDGE,
-    RIGHT,
-    TOTAL,
-    WORK_ROWS,
-    constrained_filter,
-    solve_toeplitz,
-    toeplitz_power,
-    toeplitz_times,
-)
+from kfopc_filterpy.kernels.toeplitz import solve_toeplitz, toeplitz_power, toeplitz_times
+from kfopc_filterpy.power.allocation import POWER_TOLERANCE, RIDGE
 
 EPS = np.finfo(np.float64).eps
 toeplitz = scipy.linalg.toeplitz
 seeds = st.integers(0, 10_000)
-
-
-def correlation(x: np.ndarray, n: int) -> np.ndarray:
-    """Lags 0 to n - 1 of a stretch with zeros around it: a definite Toeplitz matrix's first row."""
-    return np.correlate(x, x, mode="full")[x.size - 1 :][:n] / x.size
 
 
 def coloured(n: int, seed: int, samples: int = 2000) -> tuple[np.ndarray, np.ndarray]:
@@ -42,17 +29,8 @@ def coloured(n: int, seed: int, samples: int = 2000) -> tuple[np.ndarray, np.nda
 
 
 def solution(t: np.ndarray, b: np.ndarray) -> tuple[bool, np.ndarray]:
-    work, v = np.full((WORK_ROWS, t.size), np.nan), np.full(t.size, np.nan)
-    work[TOTAL], work[RIGHT] = t, b
-    return bool(solve_toeplitz(work, v)), v
-
-
-def within(
-    of_x: np.ndarray, of_xf: np.ndarray, w: np.ndarray, power: float, weight: float = 0.0
-) -> tuple[float, np.ndarray]:
-    """lambda and the control filter."""
-    work, v = np.full((WORK_ROWS, w.size), np.nan), np.full(w.size, np.nan)
-    return constrained_filter(of_x, of_xf, w, power, weight, work, v), v
+    v = np.full(t.size, np.nan)
+    return bool(solve_toeplitz(t, b, v)), v
 
 
 def dense(of_x: np.ndarray, of_xf: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -6,6 +6,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from helpers.comparing import SIGNALS, assert_same_estimator, assert_same_run
+from helpers.loop import (
+    AMPLIFIERS,
+    FEEDBACK,
+    FS,
+    MEMORY_S,
+    MU,
+    N_TAPS,
+    P0,
+    S_HAT,
+    N,
+    Q,
+    R,
+    S,
+    noises,
+    run,
+    sensor_noise,
+)
 from oracles import modified_anc as oracle
 
 from kfopc_filterpy import (
@@ -13,57 +31,26 @@ from kfopc_filterpy import (
     FxLMS,
     HardClipAmplifier,
     KalmanController,
-    LinearAmplifier,
     MOVFxLMS,
-    SoftSaturationAmplifier,
+    OutputPowerConstraint,
     kf_anc,
     kf_opc,
     simulate,
 )
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest, push
 
-N_TAPS, N = 10, 500
-S = np.array([0.0, 0.9, -0.4, 0.2, 0.1])
-S_HAT = np.array([0.1, 0.8, -0.3, 0.1])  # neither its taps nor its length are those of S
-FEEDBACK = np.array([0.0, 0.15, -0.1, 0.05, 0.0, 0.02, 0.01])  # longer than S
-R, Q, P0, MU = 1e-5, 1e-2, 0.5, 4e-3
-FS, MEMORY_S = 8000.0, 0.01  # 80 samples: forgetting is at work in a run of 500
-SIGNALS = (
-    "error",
-    "control_signal",
-    "amplifier_output",
-    "anti_noise",
-    "constraint_factor",
-    "disturbance_power",
-    "secondary_path_gain",
-    "weights",
-)
-
-AMPLIFIERS = {
-    "none": (None, oracle.linear),
-    "linear": (LinearAmplifier(), oracle.linear),
-    "hard": (HardClipAmplifier(0.7), oracle.hard_clip(0.7)),
-    "soft": (SoftSaturationAmplifier(0.7, 1.5), oracle.rapp(0.7, 1.5)),
-}
-
-
-def noises(n=N, seed=3):
-    """Reference, disturbance that a control filter explains in part, sensor noise."""
-    rng = np.random.default_rng(seed)
-    x, other, noise = rng.standard_normal((3, n))
-    return x, np.convolve(x, [0.0, 0.0, 1.2, -0.7, 0.5, 0.3])[:n] + 0.1 * other, 0.05 * noise
-
-
 def controller(name, *, rated_power=0.3, window="exponential", gain=None, known=None, n_taps=N_TAPS):
     kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0, "amplifier": known}
-    powers = {"fs": FS, "power_memory": MEMORY_S, "power_window": window, "secondary_path_gain": gain}
+    constraint = OutputPowerConstraint(
+        rated_power, fs=FS, memory_s=MEMORY_S, window=window, secondary_path_gain=gain
+    )
     if name == "KF-ANC":
         return kf_anc(n_taps, S_HAT, **kalman)
     if name == "KF-OPC":
-        return kf_opc(n_taps, S_HAT, rated_power=rated_power, **kalman, **powers)
+        return kf_opc(n_taps, S_HAT, constraint=constraint, **kalman)
     if name == "FxLMS":
         return FxLMS(n_taps, S_HAT, step_size=MU)
-    return MOVFxLMS(n_taps, S_HAT, step_size=MU, rated_power=rated_power, amplifier=known, **powers)
+    return MOVFxLMS(n_taps, S_HAT, step_size=MU, constraint=constraint, amplifier=known)
 
 
 def reference_algorithm(name, *, rated_power=0.3, window="exponential", gain=None):
@@ -77,27 +64,6 @@ def reference_algorithm(name, *, rated_power=0.3, window="exponential", gain=Non
 
 
 NAMES = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")
-
-
-def run(made, *, amplifier=None, feedback=None, on=0, n=N, **options):
-    x, d, _ = noises(n)
-    options = {"fs": FS, "record_weights_every": 1, "record_powers": True} | options
-    return simulate(
-        made,
-        x,
-        disturbance=d,
-        secondary_path=S,
-        feedback_path=feedback,
-        amplifier=amplifier,
-        sensor_noise_std=0.05,
-        rng=11,
-        switch_on_s=on / FS,
-        **options,
-    )
-
-
-def sensor_noise(n=N):
-    return 0.05 * np.random.default_rng(11).standard_normal(n)
 
 
 def assert_agrees(result, expected):
@@ -179,8 +145,8 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
     """filterpy's own KalmanFilter and a KFOPC with filterpy's equations leave what the O(L^2) one leaves."""
     name = "KF-ANC" if rated_power is None else "KF-OPC"
     if own == "KFOPC":
-        powers = {"fs": FS, "power_memory": MEMORY_S} if rated_power else {}
-        estimator = KFOPC(dim_x=N_TAPS, dim_z=1, rated_power=rated_power, **powers)
+        constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S) if rated_power else None
+        estimator = KFOPC(dim_x=N_TAPS, dim_z=1, constraint=constraint)
     else:
         estimator = oracle.KalmanFilter(dim_x=N_TAPS, dim_z=1)
     estimator.Q, estimator.R, estimator.P = R * np.eye(N_TAPS), np.array([[Q]]), P0 * np.eye(N_TAPS)
@@ -193,31 +159,6 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
 
 
 # ---- One definition of the equations, two ways to run them
-
-
-def assert_same_run(one, two):
-    for name in ("reference", "disturbance", *SIGNALS, "weights_time_s"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name), err_msg=name)
-    assert (one.algorithm, one.fs, one.rated_power, one.diverged_at_s) == (
-        two.algorithm,
-        two.fs,
-        two.rated_power,
-        two.diverged_at_s,
-    )
-
-
-def assert_same_estimator(one, two):
-    for name in ("x", "x_post", "P", "P_prior", "P_post", "K", "S", "SI", "y", "z"):
-        a, b = getattr(one, name), getattr(two, name)
-        np.testing.assert_array_equal(a, b, err_msg=name)
-        assert (type(a), a.dtype) == (type(b), b.dtype), name
-    for name in ("log_likelihood", "likelihood", "mahalanobis"):
-        assert getattr(one, name) == getattr(two, name), name
-    assert one.constraint_factor == two.constraint_factor
-    assert one.disturbance_power == two.disturbance_power
-    assert one.secondary_path_gain == two.secondary_path_gain
-    # the compiled loop keeps x only: x_prior = x - K y to rounding
-    np.testing.assert_allclose(one.x_prior, two.x_prior, rtol=0, atol=1e-14 * np.max(np.abs(two.x)))
 
 
 @pytest.mark.parametrize("n_taps", [1, 2, 3, 4, 5, 7, 8, 13, 16, 31, 64, 129])
@@ -273,7 +214,7 @@ def test_compiled_run_takes_up_what_was_set_on_the_estimator(name, change):
 @pytest.mark.parametrize("name", NAMES)
 def test_pieces_of_the_compiled_loop_do_not_show(name, step, monkeypatch):
     whole = run(controller(name))
-    monkeypatch.setattr("kfopc_filterpy.loop.run.simulation.STEP", step)
+    monkeypatch.setattr("kfopc_filterpy.loop.simulation.STEP", step)
     done = []
     assert_same_run(whole, run(controller(name), progress=done.append))
     assert sum(done) == N
@@ -309,13 +250,13 @@ def test_scaled_noise_and_rated_power_scale_the_control(name, exponent, seed):
     """x, d by c, rated power, q, and 1/mu by c^2: the weights stay and y, e, y_amp grow by c (exactly: c = 2^k)."""
     c = 2.0**exponent
     x, d, _ = noises(200, seed)
-    powers = {"fs": FS, "power_memory": MEMORY_S}
 
     def at_scale(c):
+        constraint = OutputPowerConstraint(0.3 * c**2, fs=FS, memory_s=MEMORY_S)
         if name == "KF-OPC":
-            made = kf_opc(N_TAPS, S_HAT, rated_power=0.3 * c**2, state_noise=R, measurement_noise=Q * c**2, **powers)
+            made = kf_opc(N_TAPS, S_HAT, constraint=constraint, state_noise=R, measurement_noise=Q * c**2)
         else:
-            made = MOVFxLMS(N_TAPS, S_HAT, step_size=MU / c**2, rated_power=0.3 * c**2, **powers)
+            made = MOVFxLMS(N_TAPS, S_HAT, step_size=MU / c**2, constraint=constraint)
         return simulate(
             made,
             c * x,

@@ -5,18 +5,23 @@ import math
 
 import numpy as np
 import pytest
-from test_block import assert_close, assert_controller_close, assert_run_close
-from test_loop import AMPLIFIERS, S_HAT, S
-from test_simulation_refusals import state_of
+from helpers.comparing import assert_close, assert_controller_close, assert_run_close, state_of
+from helpers.loop import AMPLIFIERS, S_HAT, S
 
-from kfopc_filterpy import FxLMS, HardClipAmplifier, KalmanController, kf_anc, kf_opc, simulate
+from kfopc_filterpy import (
+    FxLMS,
+    HardClipAmplifier,
+    KalmanController,
+    OutputPowerConstraint,
+    kf_anc,
+    kf_opc,
+    simulate,
+)
 from kfopc_filterpy import simulate_scenarios as run_scenarios
-from kfopc_filterpy.kernels.block import Block
 from kfopc_filterpy.loop import scenarios
 from kfopc_filterpy.paths import fir_path
 
 FS = 8000.0
-KERNELS = ("streaming", "block", "pairs")
 BLOCK = scenarios.BLOCK
 
 
@@ -24,11 +29,11 @@ def filters(count, n_taps=7, *, secondary=S_HAT, window="exponential", **options
     """KF-OPC of different rated powers, every third a KF-ANC (not with a sliding window); some know their amplifier."""
     kalman = {"state_noise": 1e-5, "measurement_noise": 0.1, "initial_variance": 0.5} | options
     known = [HardClipAmplifier(0.7) if i % 4 == 2 else None for i in range(count)]
-    powers = {"fs": FS, "power_memory": 0.01, "power_window": window}
+    constraints = [OutputPowerConstraint(0.1 * 1.5**i, fs=FS, memory_s=0.01, window=window) for i in range(count)]
     return [
         kf_anc(n_taps, secondary, amplifier=known[i], **kalman)
         if i % 3 == 2 and window == "exponential"
-        else kf_opc(n_taps, secondary, rated_power=0.1 * 1.5**i, amplifier=known[i], **kalman, **powers)
+        else kf_opc(n_taps, secondary, constraint=constraints[i], amplifier=known[i], **kalman)
         for i in range(count)
     ]
 
@@ -59,8 +64,7 @@ def up_to(n, own):
 
 
 def assert_as_alone(results, expected, made=(), alone=()):
-    # The same equations, with sums in another order: the filtered reference of the whole run at once, w'x and w'x' in
-    # one pass, the block kernel's products. To the tolerance of `test_block`; errors were 1e-12 of the largest value.
+    # The same equations, with sums in another order: the filtered reference of the whole run at once.
     for got, want in zip(results, expected, strict=True):
         assert_run_close(got, want)
         np.testing.assert_array_equal(got.reference, want.reference)
@@ -70,8 +74,9 @@ def assert_as_alone(results, expected, made=(), alone=()):
 
 
 def leaves(made):
-    if isinstance(made, KalmanController):  # what each run writes anew
-        made._state.last[:], made._state.settings[:] = 0.0, 0.0
+    """The numbers of a controller, which has its filter's arrays in its state as from the first run on."""
+    if isinstance(made, KalmanController):
+        made.compiled_state(to_step=False)
     return state_of(made) if not isinstance(made, str) else []
 
 
@@ -81,10 +86,10 @@ def assert_untouched(made, fresh):
             np.testing.assert_array_equal(now, then)
 
 
-def require_as_alone(count, n, n_taps=7, kernel="streaming", window="exponential", **options):
+def require_as_alone(count, n, n_taps=7, window="exponential", **options):
     made, alone = (filters(count, n_taps, window=window) for _ in range(2))
     x, own = differing(count, n)
-    results = run_scenarios(made, x, fs=FS, kernel=kernel, record_powers=True, **own, **options)
+    results = run_scenarios(made, x, fs=FS, record_powers=True, **own, **options)
     assert_as_alone(results, one_by_one(alone, x, own, record_powers=True, **options), made, alone)
     return results
 
@@ -92,11 +97,10 @@ def require_as_alone(count, n, n_taps=7, kernel="streaming", window="exponential
 # ---- As run one by one
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("n_taps", [1, 7, 40])
 @pytest.mark.parametrize("count", [1, 3, 9, 17, 35])  # groups of 32 inside
-def test_scenarios_are_their_runs_one_by_one(count, n_taps, kernel):
-    results = require_as_alone(count, 777, n_taps, kernel)
+def test_scenarios_are_their_runs_one_by_one(count, n_taps):
+    results = require_as_alone(count, 777, n_taps)
     assert min(r.constraint_factor.min() for r in results) < 0.9  # it did act, and so did the amplifiers
     saturated = {i % 4 for i, r in enumerate(results) if np.any(r.amplifier_output != r.control_signal)}
     assert saturated == {2, 3} & set(range(count))
@@ -104,44 +108,33 @@ def test_scenarios_are_their_runs_one_by_one(count, n_taps, kernel):
     assert {r.algorithm for r in results} == ({"KF-OPC", "KF-ANC"} if count > 2 else {"KF-OPC"})
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("n", [1, 63, 64, 129, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 1])
-def test_any_length_of_a_run(n, kernel):
-    assert [r.error.shape for r in require_as_alone(3, n, kernel=kernel)] == [(n,)] * 3
-
-
-@pytest.mark.parametrize(("kernel", "other"), [("streaming", "advance"), ("block", "advance_by_steps")])
-def test_the_kernel_is_the_one_asked_for(kernel, other, monkeypatch):
-    monkeypatch.delattr(Block, other)
-    x, own = differing(3, 100)
-    assert len(run_scenarios(filters(3), x, fs=FS, kernel=kernel, **own)) == 3
+def test_any_length_of_a_run(n):
+    assert [r.error.shape for r in require_as_alone(3, n)] == [(n,)] * 3
 
 
 @pytest.mark.parametrize("block", [1, 50, 64, 300, 1000])
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_the_length_of_the_blocks_does_not_show(kernel, block, monkeypatch):
-    """By steps not in a bit; in products the sums are others. Progress comes after each block."""
+def test_the_length_of_the_blocks_does_not_show(block, monkeypatch):
+    """Not in a bit. Progress comes after each block."""
     x, own = differing(9, 300)
-    whole, counts = run_scenarios(filters(9), x, fs=FS, kernel=kernel, **own), []
+    whole, counts = run_scenarios(filters(9), x, fs=FS, **own), []
     monkeypatch.setattr(scenarios, "BLOCK", block)
-    pieces = run_scenarios(filters(9), x, fs=FS, kernel=kernel, progress=counts.append, **own)
+    pieces = run_scenarios(filters(9), x, fs=FS, progress=counts.append, **own)
     assert (counts[0], sum(counts), len(counts)) == (9 * min(block, 300), 9 * 300, -(-300 // block))
     assert_as_alone(pieces, whole)
     for one, other in zip(pieces, whole, strict=True):
-        assert kernel != "streaming" or np.array_equal(one.error, other.error)
+        np.testing.assert_array_equal(one.error, other.error)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_options_of_the_run(kernel):
-    late = require_as_alone(9, 400, kernel=kernel, switch_on_s=123 / FS)
+def test_options_of_the_run():
+    late = require_as_alone(9, 400, switch_on_s=123 / FS)
     np.testing.assert_array_equal(late[0].reference, differing(9, 400)[0][123:])
-    for result in require_as_alone(9, 400, kernel=kernel, window="sliding", switch_on_s=30 / FS):
+    for result in require_as_alone(9, 400, window="sliding", switch_on_s=30 / FS):
         assert 0.0 < result.constraint_factor.min() < 1.0
-    assert {r.rated_power for r in require_as_alone(3, 100, kernel=kernel, rated_power=2.0)} == {2.0}
+    assert {r.rated_power for r in require_as_alone(3, 100, rated_power=2.0)} == {2.0}
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_what_was_set_on_the_estimators(kernel):
+def test_what_was_set_on_the_estimators():
     """Fading memory of all; weights, factor and gain of some."""
     made, alone = filters(5), filters(5)
     for each in (made, alone):
@@ -150,7 +143,7 @@ def test_what_was_set_on_the_estimators(kernel):
         each[1].estimator.x[:] = 0.1
         each[3].estimator.constraint_factor, each[4].estimator.secondary_path_gain = 0.5, 0.7
     x, own = differing(5, 500)
-    results = run_scenarios(made, x, fs=FS, kernel=kernel, **own)
+    results = run_scenarios(made, x, fs=FS, **own)
     assert_as_alone(results, one_by_one(alone, x, own), made, alone)
     assert set(results[3].constraint_factor) == {0.5}
 
@@ -191,13 +184,12 @@ def test_systems_generators_and_other_sequences_one_each():
 
 
 @pytest.mark.parametrize("window", ["exponential", "sliding"])
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_controllers_go_on(kernel, window):
+def test_controllers_go_on(window):
     """In scenarios again, alone, by hand; the one that did none of it as if nothing had been."""
     made, alone = filters(4, window=window), filters(4, window=window)
     for seed, n in ((3, 300), (4, 77)):
         x, own = differing(4, n, seed)
-        results = run_scenarios(made, x, fs=FS, kernel=kernel, **own)
+        results = run_scenarios(made, x, fs=FS, **own)
         assert_as_alone(results, one_by_one(alone, x, own), made, alone)
     for i in (2, 0):
         mine = {name: values[i : i + 1] for name, values in own.items()}
@@ -208,7 +200,7 @@ def test_controllers_go_on(kernel, window):
             c.update(error)
     assert_as_alone((), (), made, alone)
     mine = {name: values[3:] for name, values in own.items()}
-    results = run_scenarios(made[3:], x, fs=FS, kernel=kernel, **mine)
+    results = run_scenarios(made[3:], x, fs=FS, **mine)
     assert_as_alone(results, one_by_one(alone[3:], x, mine), made, alone)
 
 
@@ -250,23 +242,22 @@ def test_the_covariance_is_one_until_a_filter_steps():
         np.testing.assert_array_equal(mine, theirs)
 
 
-@pytest.mark.parametrize("place", ["progress", "run_block"])
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_an_interrupted_run_leaves_the_controllers_as_they_were(kernel, place, monkeypatch):
+@pytest.mark.parametrize("place", ["progress", "run_scenarios"])
+def test_an_interrupted_run_leaves_the_controllers_as_they_were(place, monkeypatch):
     """All or nothing: a covariance a block ahead of the weights would be neither."""
     x, own = differing(9, 3 * BLOCK)
-    made, alone, calls, compiled = filters(9), filters(9), [], scenarios.run_block
+    made, alone, calls, compiled = filters(9), filters(9), [], scenarios.run_scenarios
 
     def interrupt(*arguments):
-        if place == "run_block":
+        if place == "run_scenarios":
             compiled(*arguments)
         calls.append(arguments)
         if len(calls) == 2:
             raise KeyboardInterrupt
 
-    options = {"fs": FS, "kernel": kernel}
-    if place == "run_block":
-        monkeypatch.setattr(scenarios, "run_block", interrupt)
+    options = {"fs": FS}
+    if place == "run_scenarios":
+        monkeypatch.setattr(scenarios, "run_scenarios", interrupt)
     else:
         options["progress"] = interrupt
     with pytest.raises(KeyboardInterrupt):
@@ -279,9 +270,8 @@ def test_an_interrupted_run_leaves_the_controllers_as_they_were(kernel, place, m
 # ---- Divergence, and samples that are refused
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("cause", ["path", "disturbance"])
-def test_a_scenario_that_diverges_leaves_the_others_alone(cause, kernel):
+def test_a_scenario_that_diverges_leaves_the_others_alone(cause):
     """A true path of the wrong sign; or a disturbance a million times what the amplifier can cancel."""
     count, bad, n = 11, 8, 1500
     made, alone, healthy = (filters(count, state_noise=1e-2) for _ in range(3))
@@ -293,7 +283,7 @@ def test_a_scenario_that_diverges_leaves_the_others_alone(cause, kernel):
     wrong = "secondary_path" if cause == "path" else "disturbance"
     given = own | {wrong: list(scale * own[wrong])}
     options = {"record_powers": True, "rated_power": 1e-4 if cause == "path" else None}  # another limit, an earlier end
-    results = run_scenarios(made, x, fs=FS, kernel=kernel, **given, **options)
+    results = run_scenarios(made, x, fs=FS, **given, **options)
     expected = one_by_one(alone, x, given, **options)
     rest = [i for i in range(count) if i != bad]
     assert_as_alone(results, expected, [made[i] for i in rest], [alone[i] for i in rest])
@@ -303,7 +293,7 @@ def test_a_scenario_that_diverges_leaves_the_others_alone(cause, kernel):
     assert 0 < end < n
     for name in ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor", "disturbance_power"):
         np.testing.assert_array_equal(np.isnan(getattr(results[bad], name)), np.arange(n) >= end, err_msg=name)
-    undisturbed = run_scenarios(healthy, x, fs=FS, kernel=kernel, **own)
+    undisturbed = run_scenarios(healthy, x, fs=FS, **own)
     assert undisturbed[bad].diverged_at_s is None
     for i in rest:
         np.testing.assert_array_equal(results[i].error, undisturbed[i].error)
@@ -312,16 +302,15 @@ def test_a_scenario_that_diverges_leaves_the_others_alone(cause, kernel):
     assert all(r.diverged_at_s is None for r in run_scenarios(made, x, fs=FS, **own))  # they go on
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("heard", [0, 40, BLOCK + 10])
-def test_a_silent_reference_without_measurement_noise_names_the_sample(heard, kernel):
+def test_a_silent_reference_without_measurement_noise_names_the_sample(heard):
     path, counts = [0.5, 0.9, -0.4], []  # x' begins with x, and ends two samples after it
     silent_from = 0 if heard == 0 else heard + 2 + 7 - 1
     x, own = differing(3, 600)
     x = np.where(np.arange(600) < heard, x, 0.0)
     made, untouched = (filters(3, secondary=path, measurement_noise=0.0) for _ in range(2))
     with pytest.raises(ValueError, match=rf"silent reference .* tells nothing.* \(sample {silent_from} of the run\)"):
-        run_scenarios(made, x, fs=FS, kernel=kernel, progress=counts.append, **own)
+        run_scenarios(made, x, fs=FS, progress=counts.append, **own)
     assert sum(counts) == 3 * (silent_from // BLOCK) * BLOCK
     assert_untouched(made, untouched)
 
@@ -441,7 +430,6 @@ REFUSED = [
     ({"secondary_path": [S, S, np.nan * S]}, ValueError, "secondary_path must be finite"),
     ({"amplifier": math.tanh}, TypeError, "amplifier must be one of the package's models or None, .* use simulate"),
     ({"amplifier": [None, None, abs]}, TypeError, "amplifier must be one of the package's models or None"),
-    ({"kernel": "fft"}, ValueError, "kernel must be one of 'streaming', 'block', 'pairs', got 'fft'"),
     ({"primary_path": [1.0]}, ValueError, "either primary_path= or disturbance=, not both"),
     ({"disturbance": None}, ValueError, "either primary_path= or disturbance=.* not neither"),
     ({"reference": np.where(X > 1, np.nan, X)}, ValueError, "reference must be finite"),

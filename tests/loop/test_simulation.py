@@ -5,44 +5,19 @@ import math
 
 import numpy as np
 import pytest
+from helpers.comparing import assert_same_run
+from helpers.simulation import MAKERS, D, Integrator, S, X, noises
 
 from kfopc_filterpy import (
     FxLMS,
     HardClipAmplifier,
     KalmanController,
-    MOVFxLMS,
     SoftSaturationAmplifier,
-    kf_anc,
-    kf_opc,
     simulate,
 )
 from kfopc_filterpy.filters import RandomWalkKFOPC
 from kfopc_filterpy.loop import simulation
 from kfopc_filterpy.paths import fir_path
-
-S = np.array([0.0, 0.9, -0.4])
-MAKERS = {
-    "KF-ANC": lambda s=S, **options: kf_anc(6, s, **{"state_noise": 1e-6, "measurement_noise": 0.01} | options),
-    "KF-OPC": lambda s=S, **options: kf_opc(
-        6, s, **{"rated_power": 0.2, "state_noise": 1e-6, "measurement_noise": 0.01} | options
-    ),
-    "FxLMS": lambda s=S, **options: FxLMS(6, s, **{"step_size": 0.01} | options),
-    "MOV-FxLMS": lambda s=S, **options: MOVFxLMS(6, s, **{"step_size": 0.01, "rated_power": 0.2} | options),
-}
-
-
-def noises(n=300, seed=0):
-    x, other = np.random.default_rng(seed).standard_normal((2, n))
-    return x, np.convolve(x, [0.0, 0.0, 1.0, 0.5])[:n] + 0.1 * other
-
-
-X, D = noises()
-
-
-def assert_same_run(one, two):
-    for field in dataclasses.fields(one):
-        np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
-
 
 # ---- What is recorded
 
@@ -118,20 +93,6 @@ def test_built_in_controllers_do_run_compiled(monkeypatch):
 
 
 # ---- Users' own parts
-
-
-class Integrator:
-    """A user's own controller: two methods, nothing else."""
-
-    def __init__(self):
-        self.gain, self.x = 0.0, 0.0
-
-    def control_signal(self, reference):
-        self.x = reference
-        return self.gain * reference
-
-    def update(self, error):
-        self.gain += 0.05 * error * self.x
 
 
 def test_a_users_own_controller_plugs_in():

@@ -5,28 +5,11 @@ import copy
 import control
 import numpy as np
 import pytest
-from test_simulation import MAKERS, D, Integrator, S, X
+from helpers.comparing import state_of
+from helpers.simulation import MAKERS, D, Integrator, S, X, constraint
 
-from kfopc_filterpy import FxLMS, MOVFxLMS, kf_opc, simulate
+from kfopc_filterpy import FxLMS, simulate
 from kfopc_filterpy.paths import fir_path
-
-
-def state_of(made):
-    """Every number that a controller keeps."""
-    leaves = []
-
-    def collect(value):
-        if isinstance(value, np.ndarray):
-            leaves.append(value.copy())
-        elif isinstance(value, tuple):
-            for item in value:
-                collect(item)
-
-    collect(made._state)
-    collect(made.constraint.state)
-    if hasattr(made, "estimator"):
-        collect((made.estimator.x.copy(), made.estimator.P.copy(), made.estimator.K.copy()))
-    return leaves
 
 
 REFUSED = [
@@ -128,10 +111,7 @@ def test_refuses_a_controller_made_for_another_sample_rate():
         with pytest.raises(ValueError, match=message.format("secondary path")):
             simulate(make(fir_path(S, 8000.0)), X, disturbance=D, secondary_path=S)
         simulate(make(fir_path(S, 16000.0)), X, disturbance=D, secondary_path=S)
-    constrained = [
-        kf_opc(6, S, rated_power=0.2, state_noise=1e-6, measurement_noise=0.01, fs=8000),
-        MOVFxLMS(6, S, step_size=0.01, rated_power=0.2, fs=8000),
-    ]
+    constrained = [MAKERS[name](constraint=constraint(fs=8000)) for name in ("KF-OPC", "MOV-FxLMS")]
     for made in constrained:
         with pytest.raises(ValueError, match=message.format("power memory")):
             simulate(made, X, disturbance=D, secondary_path=S)

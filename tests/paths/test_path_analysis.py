@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from kfopc_filterpy.paths import causality_margin
 from kfopc_filterpy.paths.analysis import (
     STABILITY_BOUND_DEG,
     achieved_band,
@@ -16,7 +17,6 @@ from kfopc_filterpy.paths.analysis import (
     phase_error,
     secondary_path_gain,
 )
-from kfopc_filterpy.paths.causality import causality_margin
 from kfopc_filterpy.paths.models import bandpass_path, fir_path, perturbed_path
 
 FS = 16000.0
@@ -68,7 +68,7 @@ def test_group_delay_is_nan_at_a_zero_and_constant_for_linear_phase():
     [
         (lambda: frequency_response([1.0], [9000.0], fs=FS), "frequencies_hz must lie within 0 to fs/2"),
         (lambda: frequency_response([1.0], [-1.0], fs=FS), "frequencies_hz must lie within"),
-        (lambda: frequency_response([1.0], [100.0]), "fs must be given where path is a tap array"),
+        (lambda: frequency_response([1.0], [100.0]), "fs must be given if path is a tap array"),
         (lambda: group_delay([1.0], [], fs=FS), "frequencies_hz must have at least 1"),
         (lambda: phase_error([1.0], bandpass_path(32), [100.0], fs=8000.0), "estimate is sampled at 16000"),
         (lambda: achieved_band([1.0], 3.0, fs=FS), "level_db must be negative"),

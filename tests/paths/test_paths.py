@@ -81,7 +81,9 @@ def test_taps_of_an_array_are_padded_and_cut():
 def test_taps_of_an_array_need_no_python_control():
     code = (
         "import sys; from kfopc_filterpy.paths.models import path_taps, sampling_rate;"
-        "from kfopc_filterpy import duct, wiener, path_analysis, causality, identification, path_plots;"
+        "from kfopc_filterpy.paths import duct_paths, estimate_path, phase_error;"
+        "from kfopc_filterpy.bounds import wiener_solution;"
+        "from kfopc_filterpy.plot import plot_bode;"
         "path_taps([1.0, 0.5], n_taps=2);"
         "assert not {'control', 'matplotlib'} & set(sys.modules)"
     )
@@ -133,7 +135,7 @@ def test_path_taps_refuses_measured_responses_and_names_the_argument():
     measured = control.FrequencyResponseData([1.0, 1.0], [1.0, 2.0], 1 / FS)
     with pytest.raises(TypeError, match="primary must be a TransferFunction or StateSpace"):
         path_taps(measured, n_taps=4, name="primary")
-    with pytest.raises(ValueError, match="fs must be given where path is a tap array"):
+    with pytest.raises(ValueError, match="fs must be given if path is a tap array"):
         sampling_rate([1.0])
     with pytest.raises(ValueError, match="taps must not all be zero"):
         fir_path([0.0, 0.0], FS)

@@ -58,7 +58,7 @@ def test_bode_draws_magnitude_and_phase_in_hz():
     f, angle = line.get_xdata(), line.get_ydata()
     passed = f < 4500
     np.testing.assert_allclose(angle[passed], -360 * 2.5 * f[passed] / FS, atol=1e-6)
-    assert np.isnan(angle[-1])  # no phase where the path passes nothing
+    assert np.isnan(angle[-1])  # no phase where the path is silent
     assert _labels(phase)[1] == "S, less 0.81 ms"
 
 
@@ -176,7 +176,7 @@ def test_bode_into_given_axes():
     [
         (lambda: plot_bode(S, ax=plt.subplots()[1]), ValueError, "ax must be 2 axes"),
         (lambda: plot_bode({}), ValueError, "paths must name at least one"),
-        (lambda: plot_bode([1.0]), ValueError, "fs must be given where path is a tap array"),
+        (lambda: plot_bode([1.0]), ValueError, "fs must be given if path is a tap array"),
         (lambda: plot_bode({"a": S, "b": bandpass_path(8, (0, 1e3), fs=8e3)}), ValueError, "differing sampl"),
         (lambda: plot_bode(S, frequencies_hz=[1.0]), ValueError, "frequencies_hz must have at least 2"),
         (lambda: plot_modelling_error({"x": S}), TypeError, "results must hold IdentificationResult"),

@@ -1,20 +1,20 @@
 """Figures of runs: what the curves hold, labels with units, one style per algorithm, files, refusals."""
 
+import re
 from dataclasses import replace
 
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from helpers.results import multichannel_result
 
-from kfopc_filterpy.controllers import FxLMS, MOVFxLMS, kf_anc, kf_opc
-from kfopc_filterpy.loop.simulation import simulate
-from kfopc_filterpy.metrics import nse_db
+from kfopc_filterpy import FxLMS, MOVFxLMS, kf_anc, kf_opc, simulate
+from kfopc_filterpy import plot as plotting
+from kfopc_filterpy.metrics import coherence_and_gain, nse_db, power_spectrum_db, short_time_power
 from kfopc_filterpy.paths.models import bandpass_path
-from kfopc_filterpy.plot import runs as plotting
 from kfopc_filterpy.power.amplifiers import HardClipAmplifier
-from kfopc_filterpy.signals.generators import band_limited_noise, scaled_to_power, tone
-from kfopc_filterpy.spectra import coherence_and_gain, power_spectrum_db
+from kfopc_filterpy.signals import band_limited_noise, scaled_to_power, tone
 
 FS = 16000.0
 P, S = bandpass_path(128), bandpass_path(32)
@@ -86,7 +86,7 @@ def test_error_spectra_of_a_span_and_of_seeds(tonal, noise):
     _, level = power_spectrum_db(tonal["KF-ANC"].error[1600:3200], FS, steady=1.0)
     np.testing.assert_array_equal(_line(ax, "KF-ANC").get_ydata(), level)
     ax = plotting.plot_error_spectra({"KF-OPC": noise})
-    _, level = power_spectrum_db(np.stack([run.error for run in noise]), FS)
+    _, level = power_spectrum_db(np.stack([run.error for run in noise]), FS, runs=True)
     np.testing.assert_array_equal(_line(ax, "KF-OPC").get_ydata(), level)
 
 
@@ -153,7 +153,9 @@ def test_weight_history_is_logarithmic_where_one_grows(tonal):
 
 def test_nse_pools_seeds_and_shows_the_start(noise):
     ax = plotting.plot_nse({"KF-OPC": noise}, window_s=0.005)
-    curve = nse_db(np.stack([run.error for run in noise]), np.stack([run.disturbance for run in noise]), FS, 0.005)
+    curve = nse_db(
+        np.stack([run.error for run in noise]), np.stack([run.disturbance for run in noise]), FS, 0.005, runs=True
+    )
     line = _line(ax, "KF-OPC")
     rows = np.round(line.get_xdata() * FS).astype(int) - 1
     np.testing.assert_array_equal(line.get_ydata(), curve[rows])
@@ -194,7 +196,7 @@ def test_constraint_factor_leaves_out_controllers_that_say_none(tonal):
     ax = plotting.plot_constraint_factor([tonal["KF-OPC"], silent])
     assert _labels(ax) == ["KF-OPC"]
     assert _line(ax, "KF-OPC").get_ydata()[-1] == pytest.approx(tonal["KF-OPC"].constraint_factor[-1], abs=1e-3)
-    with pytest.raises(ValueError, match="no controller has said one"):
+    with pytest.raises(ValueError, match="no controller has told one"):
         plotting.plot_constraint_factor(silent)
 
 
@@ -246,6 +248,94 @@ def test_files_are_the_same_for_the_same_figure_and_the_figure_is_closed(tonal, 
         plotting.save_figure(ax.figure, tmp_path / "nse.svg")
 
 
+# ---- several channels
+
+
+def test_nse_of_several_microphones_is_of_all_or_of_one():
+    run = multichannel_result()
+    together, one = plotting.plot_nse(run), plotting.plot_nse(run, channel=1)
+    for ax, e, d in ((together, run.error, run.disturbance), (one, run.error[1], run.disturbance[1])):
+        line = _line(ax, "KF-OPC")
+        rows = np.round(line.get_xdata() * FS).astype(int) - 1
+        np.testing.assert_array_equal(line.get_ydata(), nse_db(e, d, FS)[rows])
+    pooled = plotting.plot_nse({"KF-OPC": [run, multichannel_result(seed=1)]}, channel=2)
+    assert _labels(pooled) == ["KF-OPC"]
+
+
+def test_spectra_of_several_microphones_are_averaged_or_of_one():
+    run = multichannel_result()
+    powers = [10 ** (power_spectrum_db(e, FS)[1] / 10) for e in run.error]
+    line = _line(plotting.plot_error_spectra(run), "KF-OPC")
+    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(np.mean(powers, axis=0)), rtol=0, atol=1e-9)
+    line = _line(plotting.plot_error_spectra(run, channel=2), "KF-OPC")
+    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(powers[2]), rtol=0, atol=1e-9)
+
+
+def test_output_power_has_a_curve_for_each_loudspeaker():
+    run = multichannel_result()
+    ax = plotting.plot_output_power(run, window_s=0.01)
+    assert _labels(ax) == ["KF-OPC, 2 loudspeakers", "Rated power 1"]
+    for line, y in zip(ax.get_lines()[:2], run.control_signal, strict=True):
+        np.testing.assert_allclose(line.get_ydata(), short_time_power(y, FS, 0.01)[: line.get_ydata().size])
+        assert line.get_color() == ax.get_lines()[0].get_color()
+    one = plotting.plot_output_power(run, window_s=0.01, channel=1)
+    assert _labels(one) == ["KF-OPC", "Rated power 1"]
+    np.testing.assert_array_equal(_line(one, "KF-OPC").get_ydata(), ax.get_lines()[1].get_ydata())
+
+
+def test_constraint_factor_is_one_or_one_for_each_loudspeaker():
+    run = multichannel_result()
+    assert _labels(plotting.plot_constraint_factor(run)) == ["KF-OPC"]
+    each = multichannel_result(constraint_factor=np.array([[0.5], [0.25]]) * np.ones(4000))
+    assert _labels(plotting.plot_constraint_factor(each)) == ["KF-OPC, 2 loudspeakers"]
+    assert _line(plotting.plot_constraint_factor(each, channel=1), "KF-OPC").get_ydata()[0] == 0.25
+
+
+def test_waveforms_show_the_channel_that_is_chosen():
+    run, span, part = multichannel_result(), (0.1, 0.12), slice(1600, 1920)
+    line = _line(plotting.plot_anti_noise(run, span_s=span, channel=2), "KF-OPC")
+    np.testing.assert_array_equal(line.get_ydata(), run.anti_noise[2, part])
+    line = _line(plotting.plot_amplifier_output(run, span_s=span, channel=1), "KF-OPC")
+    np.testing.assert_array_equal(line.get_ydata(), run.amplifier_output[1, part])
+    ax = plotting.plot_disturbance_and_anti_noise(
+        multichannel_result(n_samples=32000), span_s=span, band=(200.0, 2000.0), channel=1
+    )
+    assert "coherence 1.0000, gain 0.800" in ax.get_legend().get_title().get_text()
+    assert re.search(r"Output power 0\.\d+, \d\.\d+, rated power 1", ax.get_legend().get_title().get_text())
+
+
+def test_weights_of_several_channels_are_chosen_by_loudspeaker_reference_and_tap():
+    run = multichannel_result()
+    ax = plotting.plot_weight_history(run, tap=(1, 0, 3))
+    np.testing.assert_array_equal(_line(ax, "KF-OPC").get_ydata(), run.weights[:, 1, 0, 3])
+    assert ax.get_ylabel() == "Weight (1, 0, 3) of the control filter"
+
+
+def test_channels_that_are_missing_or_not_there_are_refused(tonal):
+    many, one = multichannel_result(), tonal["KF-OPC"]
+    with pytest.raises(ValueError, match="results hold 3 channels; choose one with channel=0 to channel=2"):
+        plotting.plot_anti_noise(many, span_s=(0.1, 0.12))
+    with pytest.raises(ValueError, match="results hold 2 channels; choose one with channel=0 to channel=1"):
+        plotting.plot_amplifier_output(many, span_s=(0.1, 0.12))
+    with pytest.raises(ValueError, match=r"channel must be below the 3 channel\(s\) of the results, got 3"):
+        plotting.plot_nse(many, channel=3)
+    with pytest.raises(ValueError, match=r"channel must be below the 2 channel\(s\) of the results, got 2"):
+        plotting.plot_output_power(many, channel=2)
+    with pytest.raises(ValueError, match=r"channel must be below the 1 channel\(s\) of the results, got 1"):
+        plotting.plot_nse(one, channel=1)
+    with pytest.raises(
+        ValueError, match=r"tap must be \(loudspeaker, reference, tap\) for the weights of 'KF-OPC', got 3"
+    ):
+        plotting.plot_weight_history(many, tap=3)
+    with pytest.raises(ValueError, match=r"tap must be an index for the weights of 'KF-OPC', got \(0, 0, 3\)"):
+        plotting.plot_weight_history(one, tap=(0, 0, 3))
+    with pytest.raises(ValueError, match=r"tap must be below the \(2, 1, 4\) weights of 'KF-OPC', got \(0, 1, 3\)"):
+        plotting.plot_weight_history(many, tap=(0, 1, 3))
+    with pytest.raises(ValueError, match="with the same channels"):
+        plotting.plot_nse({"a": [many, multichannel_result(control_signal=np.zeros(4000))]})
+    assert not plt.get_fignums()
+
+
 def test_refusals_name_the_argument(tonal, noise):
     run = tonal["KF-OPC"]
     with pytest.raises(TypeError, match="results must be a SimulationResult or a sequence of them, got ndarray"):
@@ -258,7 +348,7 @@ def test_refusals_name_the_argument(tonal, noise):
         plotting.plot_nse(noise)
     with pytest.raises(ValueError, match="results 'a' must be runs of one length"):
         plotting.plot_nse({"a": [run, noise[0]]})
-    with pytest.raises(ValueError, match="results must hold one run a name here, got 2 runs of 'KF-OPC'"):
+    with pytest.raises(ValueError, match="results must hold one run per name here, got 2 runs of 'KF-OPC'"):
         plotting.plot_anti_noise({"KF-OPC": noise}, span_s=SPAN)
     with pytest.raises(ValueError, match="results must have one disturbance"):
         plotting.plot_error_spectra({"a": noise[0], "b": noise[1]})

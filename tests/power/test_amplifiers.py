@@ -7,9 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier, clipped_fraction, simulate
-from kfopc_filterpy.controllers import FxLMS
-from kfopc_filterpy.power.amplifiers import compiled_parameters
+from kfopc_filterpy import (
+    FxLMS,
+    HardClipAmplifier,
+    LinearAmplifier,
+    SoftSaturationAmplifier,
+    clipped_fraction,
+    simulate,
+)
+from kfopc_filterpy.power.amplifiers import AmplifierModel, compiled_model
 
 signals = st.floats(-1e9, 1e9)
 limits = st.floats(1e-3, 1e3)
@@ -135,10 +141,10 @@ def test_models_are_values():
         HardClipAmplifier(1.0).limit = 2.0
 
 
-def test_parameters_of_the_compiled_loop():
-    np.testing.assert_array_equal(compiled_parameters(None), LinearAmplifier().parameters)
-    assert compiled_parameters(HardClipAmplifier(2.0))[1] == 2.0
-    assert compiled_parameters(abs) is None
+def test_models_of_the_compiled_loop():
+    assert compiled_model(None) == LinearAmplifier().model == AmplifierModel()
+    assert compiled_model(HardClipAmplifier(2.0)).limit == 2.0
+    assert compiled_model(abs) is None
 
 
 def test_a_subclass_is_called_not_replaced_by_its_parents_equation():
@@ -155,4 +161,4 @@ def test_a_class_is_no_amplifier() -> None:
     with pytest.raises(
         TypeError, match=r"amplifier must be an object, such as HardClipAmplifier\(limit=1\.0\), got the"
     ):
-        compiled_parameters(HardClipAmplifier)
+        compiled_model(HardClipAmplifier)

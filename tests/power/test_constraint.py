@@ -25,7 +25,7 @@ values = st.floats(-1e3, 1e3, allow_subnormal=False).map(lambda v: 0.0 if abs(v)
 
 def constraint(samples: float, window: str = "exponential", **kwargs: float) -> OutputPowerConstraint:
     """A constraint whose memory is `samples` samples."""
-    return OutputPowerConstraint(kwargs.pop("rated_power", 1.0), fs=FS, memory=samples / FS, window=window, **kwargs)
+    return OutputPowerConstraint(kwargs.pop("rated_power", 1.0), fs=FS, memory_s=samples / FS, window=window, **kwargs)
 
 
 def direct_power(x: np.ndarray, n: int, samples: float, window: str) -> float:
@@ -206,8 +206,8 @@ def test_a_bad_sample_changes_nothing(bad: object, position: int) -> None:
     "kwargs",
     [
         {"rated_power": 0.0}, {"rated_power": -1.0}, {"rated_power": math.nan}, {"rated_power": math.inf},
-        {"secondary_path_gain": 0.0}, {"secondary_path_gain": -1.0}, {"fs": 0.0}, {"memory": 0.0},
-        {"memory": math.inf}, {"window": "hann"},
+        {"secondary_path_gain": 0.0}, {"secondary_path_gain": -1.0}, {"fs": 0.0}, {"memory_s": 0.0},
+        {"memory_s": math.inf}, {"window": "hann"},
     ],
 )  # fmt: skip
 def test_settings_out_of_range(kwargs: dict) -> None:
@@ -237,7 +237,7 @@ def test_the_memory_is_in_seconds() -> None:
     """The same signal, held twice as long at twice the rate, leaves the same power."""
     powers = []
     for fs in (8000.0, 16000.0):
-        ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory=0.01)
+        ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory_s=0.01)
         for level, seconds in ((2.0, 0.2), (1.0, 0.01)):
             for _ in range(round(seconds * fs)):
                 ours.advance(level)
@@ -250,7 +250,7 @@ def test_a_bias_free_start_scales_a_steady_tone_right_at_once() -> None:
     """A start from zero underestimates the power: the factor is far too large for long."""
     fs, memory, samples = 16000.0, 0.5, 800
     tone = 4.0 * np.sin(2 * np.pi * 400 / fs * np.arange(samples) + 0.3)
-    ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory=memory)
+    ours = OutputPowerConstraint(1.0, secondary_path_gain=1.0, fs=fs, memory_s=memory)
     right = math.sqrt(1.0 / 8.0)
     from_zero, forgetting = 0.0, math.exp(-1 / (fs * memory))
     for value in tone:

@@ -16,13 +16,12 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy import KalmanController, SimulationResult, kf_pb, simulate
+from kfopc_filterpy import SimulationResult, kf_pb, simulate
+from kfopc_filterpy.controllers import PowerBudgetController
 from kfopc_filterpy.power import PowerBudget
 from kfopc_filterpy.power.allocation import POWER_TOLERANCE, RIDGE
 from kfopc_filterpy.power.budget import (
-    ACCOUNT,
     AGREEMENT,
-    CHANCE,
     DEBT_S,
     DEFAULT_CREDIT_S,
     FORECAST_LEAST,
@@ -34,8 +33,6 @@ from kfopc_filterpy.power.budget import (
     REPAYMENT,
     SHORT,
     SHORTEST_PART,
-    SPAN,
-    SPENT,
     STEADY,
     TARGET_LEAST,
     TARGET_MOST,
@@ -62,7 +59,7 @@ def made(n_taps: int = 3, rated_power: float = 1.0, segment: int = SEGMENT, **op
 def correlations(budget: PowerBudget, span: int | None = None) -> np.ndarray:
     """First rows of R_x and R_x', (2, L), over a window of `span` segments or the one that is chosen."""
     if span is not None:
-        budget.state.table[SPAN] = span
+        budget.state.numbers["span"] = span
     rows = np.full((2, budget.n_taps), np.nan)
     sum_correlations(budget.state, *rows)
     return rows
@@ -92,7 +89,7 @@ def test_the_windows_of_the_defaults() -> None:
         assert budget.state.counts[:2].tolist() == [fs / 8, 0.0]
         budget.listen(1.0, 1.0)
         assert budget.state.counts[:2].tolist() == [fs / 8, 1.0]
-    assert (budget.memory_s, budget.credit_s, budget.state.table[SPAN]) == (1.25, 0.1, USUAL)
+    assert (budget.memory_s, budget.credit_s, budget.state.numbers["span"][0]) == (1.25, 0.1, USUAL)
 
 
 @pytest.mark.parametrize(("n_taps", "segment", "asked"), [(1, 7, 7), (4, 9, 9), (12, 30, 30), (12, 12, 3)])
@@ -160,7 +157,7 @@ def test_what_has_left_the_window_is_as_if_it_had_never_been() -> None:
 
 def span_and_chance(budget: PowerBudget) -> tuple[int, float]:
     choose_span(budget.state)
-    return int(budget.state.table[SPAN]), float(budget.state.table[CHANCE])
+    return int(budget.state.numbers["span"][0]), float(budget.state.numbers["chance"][0])
 
 
 def level_written_out(xf: np.ndarray, segment: int, span: int) -> tuple[float, float, float]:
@@ -197,7 +194,7 @@ def heard(xf: np.ndarray, segment: int = SEGMENT, span: int = USUAL) -> PowerBud
     budget = made(1, segment=segment)
     for value in xf:
         budget.listen(0.3 * value, value)
-    budget.state.table[SPAN] = span
+    budget.state.numbers["span"] = span
     return budget
 
 
@@ -367,7 +364,7 @@ def test_the_forecast_is_the_line_through_the_levels(trend: float, seed: int, sa
     x = np.random.default_rng(seed).standard_normal(samples) * np.exp(trend * np.arange(samples))
     budget = heard(x, segment=20)
     for span in SPANS:
-        budget.state.table[SPAN] = span
+        budget.state.numbers["span"] = span
         mean = np.mean(x[stretch(samples, 20, span)] ** 2)
         expected = forecast_written_out(x, 20, span, floor=1e-12 * mean)
         assert level_forecast(budget.state, mean) == pytest.approx(expected, rel=1e-9)
@@ -378,7 +375,7 @@ def test_of_steady_noise_no_change_is_foretold(span: int) -> None:
     """A line of no slope passes F(1, 4 to 23) > 6 in 2 to 7 of 100 cases; then little is foretold."""
     x = np.random.default_rng(5).standard_normal(40_000)
     budget, told = made(1), []
-    budget.state.table[SPAN] = span
+    budget.state.numbers["span"] = span
     for n, value in enumerate(x, start=1):
         budget.listen(value, value)
         if n > span * SEGMENT and n % 50 == 0:
@@ -438,7 +435,7 @@ def test_the_account_is_what_was_spent_beyond_what_was_due() -> None:
         clipped |= {account > DEBT_S, account < -0.4}
         account = min(max(account, -0.4), DEBT_S)
         assert budget.account_s == account
-        assert budget.state.table[CHANCE] == 0.0
+        assert budget.state.numbers["chance"][0] == 0.0
         clipped.add(account)
     assert {DEBT_S, -0.4} <= clipped
     assert budget.rated_power == 0.5
@@ -469,7 +466,7 @@ def test_chance_adds_to_the_credit_and_not_to_the_debt() -> None:
             limits.append(account)
         if n in due:
             chance = chosen_written_out(xf[:n], 10, fs=80.0)[1]
-        assert budget.state.table[CHANCE] == pytest.approx(chance, rel=1e-9)
+        assert budget.state.numbers["chance"][0] == pytest.approx(chance, rel=1e-9)
     assert {DEBT_S, -(0.05 + LARGEST_CHANCE_S)} <= set(limits)
     assert len(set(limits)) > 5
 
@@ -507,8 +504,8 @@ def test_the_target_repays_what_the_account_holds(spent: float, rated_power: flo
 )
 def test_power_left_unspent_beyond_chance_raises_the_target(spent: float, chance: float, factor: float) -> None:
     budget = PowerBudget(1, 0.5)
-    budget.state.table[SPENT], budget.state.table[CHANCE] = spent, chance
-    budget.state.table[ACCOUNT] = -0.5 * chance  # a credit that chance makes: no part in the target
+    budget.state.numbers["spent"], budget.state.numbers["chance"] = spent, chance
+    budget.state.numbers["account"] = -0.5 * chance  # a credit that chance makes: no part in the target
     assert target_power(budget.state, 1.0) == pytest.approx(0.5 * factor, rel=1e-12)
 
 
@@ -521,7 +518,7 @@ def test_the_share_that_is_spent_is_followed_while_there_is_use_for_more() -> No
         budget.advance(x, x, [0.0, 0.1] if 1000 <= n < 2000 else [2.0, -1.0])  # a third of it asks for little
         expected += needed * (y * y / 0.5 - expected) / 400.0
         used += needed
-        assert budget.state.table[SPENT] == pytest.approx(expected, rel=1e-9)
+        assert budget.state.numbers["spent"][0] == pytest.approx(expected, rel=1e-9)
     assert 1500 < used < 2500
 
 
@@ -542,7 +539,7 @@ def test_most_of_the_power_is_spent_on_noise_that_swells() -> None:
 
 def target(account: float, chance: float, forecast: float = 1.0, rated_power: float = 1.0) -> float:
     budget = PowerBudget(1, rated_power)
-    budget.state.table[ACCOUNT], budget.state.table[CHANCE] = account, chance
+    budget.state.numbers["account"], budget.state.numbers["chance"] = account, chance
     return target_power(budget.state, forecast)
 
 
@@ -590,8 +587,8 @@ def test_the_control_filter_is_that_of_the_chosen_window_forecast_and_target(lev
     for n in range(x.size):
         budget.advance(x[n], xf[n], w, control_signal=0.84 * (1.0 + 0.3 * (n % 3 - 1)))
     span, chance = chosen_written_out(xf, segment)
-    assert budget.state.table[SPAN] == span == expected
-    assert budget.state.table[CHANCE] == pytest.approx(chance, rel=1e-9)
+    assert budget.state.numbers["span"][0] == span == expected
+    assert budget.state.numbers["chance"][0] == pytest.approx(chance, rel=1e-9)
     R_x, R_xf = (scipy.linalg.toeplitz(correlation(u[stretch(x.size, segment, span)], n_taps)) for u in (x, xf))
     v, weight = budget.control_filter, budget.power_weight
     assert weight > 0.1
@@ -633,7 +630,7 @@ def test_what_is_heard_before_it_is_switched_on_counts_for_the_correlations_only
 # ---- What it settles to
 
 
-def of_known_estimate(rated_power: float, **budget: float) -> KalmanController:
+def of_known_estimate(rated_power: float, **budget: float) -> PowerBudgetController:
     """KF-PB whose estimate is W and stays it: no variance, no gain."""
     controller = kf_pb(
         W.size, S, rated_power=rated_power, state_noise=0.0, measurement_noise=1.0, initial_variance=0.0, **budget
@@ -718,7 +715,7 @@ def test_what_no_noise_needs_is_saved_up_to_the_credit_and_chance_and_no_further
     controller = of_known_estimate(0.25, credit_s=0.15)
     simulate(controller, quiet, disturbance=quiet, secondary_path=S, switch_on_s=0.1)
     budget = controller.estimator.budget
-    chance = budget.state.table[CHANCE]
+    chance = budget.state.numbers["chance"][0]
     assert 0.005 < chance < 0.05  # of a band of 4900 Hz: 0.01 s and, for its slopes, more
     assert budget.account_s == pytest.approx(-0.15 - chance, abs=1e-3)
     assert controller.power_weight == 0.0

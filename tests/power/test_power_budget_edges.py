@@ -9,8 +9,7 @@ import pytest
 import scipy.linalg
 import scipy.signal
 from filterpy.common import Saver
-from test_allocation import correlation, within
-from test_power_budget_filter import made, signals, step
+from helpers.power_budget import correlation, made, signals, step, within
 
 from kfopc_filterpy import bandpass_path
 from kfopc_filterpy.filters import PowerBudgetKalmanFilter

@@ -1,22 +1,20 @@
 """Readers and writers of recordings, and the measured duct; no test reaches for the network."""
 
 import hashlib
-import logging
-import os
 import struct
 import sys
-import types
 import wave
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+import soundfile
 
-from kfopc_filterpy.signals import datasets
-from kfopc_filterpy.signals.datasets import (
+from kfopc_filterpy.signals import (
     DataUnavailableError,
     MeasuredDuct,
+    datasets,
     load_measured_duct,
     read_mat_vector,
     read_wav,
@@ -33,49 +31,45 @@ def no_folder(monkeypatch):
 
 
 @pytest.fixture
-def measured_folder():
-    """The folder with the published files, or a skip."""
-    named = os.environ.get("KFOPC_DATA")
-    folder = Path(named) if named else Path(__file__).parents[3] / "shared" / "data"
-    if not (folder / "duct" / "Pz1.mat").is_file():
-        pytest.skip(f"the measured duct is not in {folder}; set KFOPC_DATA to a folder with it")
-    return folder
-
-
-@pytest.fixture
 def own_files(tmp_path, monkeypatch):
     """A folder of small files in the published layout, which counts as the published one."""
     for name, (variable, _) in FILES.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)
         scipy.io.savemat(tmp_path / name, {variable: np.arange(1.0, 4.0)[:, None]})
-    for attribute, name in (
-        ("_PRIMARY", "duct/Pz1.mat"),
-        ("_SECONDARY", "duct/Sz.mat"),
-        ("_NOISE", "motor/Motor.mat"),
-    ):
-        digest = hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
-        monkeypatch.setattr(datasets, attribute, getattr(datasets, attribute)._replace(sha256=digest))
+    for name in FILES:
+        monkeypatch.setitem(datasets._HASHES, name, hashlib.sha256((tmp_path / name).read_bytes()).hexdigest())
     return tmp_path
 
 
-def fake_pooch(retrieve, cache):
-    """Module with the part of pooch's interface that is used."""
-    return types.SimpleNamespace(
-        get_logger=lambda: logging.getLogger("pooch"),
-        retrieve=retrieve,
-        os_cache=lambda name: cache / name,
-        HTTPDownloader=lambda **kwargs: kwargs,
-    )
+@pytest.fixture
+def network(own_files, monkeypatch):
+    """A network that serves `own_files` to pooch, whose cache is a new folder; the addresses asked for."""
+    pooch = pytest.importorskip("pooch")
+    asked = []
+
+    class Downloader:
+        def __init__(self, timeout):
+            self.timeout = timeout
+
+        def __call__(self, url, output_file, _):
+            asked.append((url, self.timeout))
+            folder = "motor" if "Motor" in url else "duct"
+            Path(output_file).write_bytes((own_files / folder / url.rsplit("/", 1)[1]).read_bytes())
+
+    monkeypatch.delenv("KFOPC_DATA", raising=False)
+    monkeypatch.setattr(pooch, "HTTPDownloader", Downloader)
+    monkeypatch.setattr(pooch, "os_cache", lambda name: own_files / "cache" / name)
+    return asked
 
 
 # ---- the measured duct
 
 
-def test_published_duct_has_its_known_contents(measured_folder):
-    duct = load_measured_duct(measured_folder)
+def test_published_duct_has_its_known_contents(shared_data):
+    duct = load_measured_duct(shared_data)
     assert (duct.primary.shape, duct.secondary.shape, duct.noise.shape) == ((1024,), (512,), (162001,))
     assert duct.fs == 16000
-    expected = scipy.io.loadmat(measured_folder / "duct" / "Sz.mat")["S"][:, 0]
+    expected = scipy.io.loadmat(shared_data / "duct" / "Sz.mat")["S"][:, 0]
     np.testing.assert_array_equal(duct.secondary, expected)
     # The secondary path gains 10 to 30 dB in the middle of 200 to 2000 Hz.
     gain_db = 20 * np.log10(np.abs(np.fft.rfft(duct.secondary, 4096)))[52:513]
@@ -114,58 +108,43 @@ def test_changed_file_is_refused_with_both_hashes(own_files):
         load_measured_duct(own_files)
 
 
-@pytest.mark.usefixtures("no_folder")
-def test_download_asks_pooch_once_for_each_pinned_and_hashed_file(own_files, monkeypatch):
-    asked = []
-
-    def retrieve(url, known_hash, fname, path, downloader):
-        asked.append((url, known_hash, str(path), downloader))
-        return str(own_files / path.name / fname)
-
-    monkeypatch.setitem(sys.modules, "pooch", fake_pooch(retrieve, own_files))
+def test_download_asks_once_for_each_pinned_file_and_keeps_it(network, own_files):
     assert load_measured_duct(allow_download=True, timeout_s=2.5).secondary.tolist() == [1.0, 2.0, 3.0]
     root = "https://raw.githubusercontent.com"
     duct = f"{root}/Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
     motor = f"{root}/Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst"
     expected = [f"{duct}/Pz1.mat", f"{duct}/Sz.mat", f"{motor}/Noise_data/Motor.mat"]
-    assert [url for url, *_ in asked] == expected
-    for (_, known_hash, path, downloader), name in zip(asked, FILES, strict=True):
-        assert known_hash == "sha256:" + hashlib.sha256((own_files / name).read_bytes()).hexdigest()
-        assert Path(path) == own_files / "kfopc_filterpy" / Path(name).parent
-        assert downloader == {"timeout": 2.5}
-
-
-@pytest.mark.usefixtures("no_folder")
-@pytest.mark.parametrize("failure", [OSError("no route to host"), ValueError("hash does not match")])
-def test_failed_download_stops_at_the_first_file(failure, tmp_path, monkeypatch):
-    calls = []
-
-    def retrieve(url, **_):
-        calls.append(url)
-        raise failure
-
-    monkeypatch.setitem(sys.modules, "pooch", fake_pooch(retrieve, tmp_path))
-    with pytest.raises(DataUnavailableError, match=rf"Pz1\.mat could not be fetched \({failure}\): set KFOPC_DATA"):
-        load_measured_duct(allow_download=True)
-    assert len(calls) == 1
-
-
-@pytest.mark.usefixtures("no_folder")
-def test_real_pooch_accepts_the_call(own_files, monkeypatch):
-    pooch = pytest.importorskip("pooch")
-
-    class Copier:
-        def __init__(self, timeout):
-            assert timeout == 5.0
-
-        def __call__(self, url, output_file, _):
-            folder = "motor" if "Motor" in url else "duct"
-            Path(output_file).write_bytes((own_files / folder / url.rsplit("/", 1)[1]).read_bytes())
-
-    monkeypatch.setattr(pooch, "HTTPDownloader", Copier)
-    monkeypatch.setattr(pooch, "os_cache", lambda name: own_files / "cache" / name)
-    assert load_measured_duct(allow_download=True).primary.tolist() == [1.0, 2.0, 3.0]
+    assert network == [(url, 2.5) for url in expected]
     assert (own_files / "cache" / "kfopc_filterpy" / "motor" / "Motor.mat").is_file()
+    assert load_measured_duct(allow_download=True).primary.tolist() == [1.0, 2.0, 3.0]
+    assert len(network) == 3
+
+
+def test_a_folder_comes_before_a_download(network, own_files, monkeypatch):
+    monkeypatch.setenv("KFOPC_DATA", str(own_files))
+    load_measured_duct(allow_download=True)
+    assert network == []
+
+
+def test_a_download_with_another_hash_is_refused(network, monkeypatch):
+    monkeypatch.setitem(datasets._HASHES, "duct/Pz1.mat", 64 * "0")
+    with pytest.raises(DataUnavailableError, match=r"Pz1\.mat could not be fetched \(SHA256 hash .* does not match"):
+        load_measured_duct(allow_download=True)
+
+
+def test_failed_download_stops_at_the_first_file(network, monkeypatch):
+    import pooch
+
+    def no_route(self, url, output_file, _):
+        network.append(url)
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(pooch.HTTPDownloader, "__call__", no_route)
+    with pytest.raises(
+        DataUnavailableError, match=r"Pz1\.mat could not be fetched \(no route to host\): set KFOPC_DATA"
+    ):
+        load_measured_duct(allow_download=True)
+    assert len(network) == 1
 
 
 @pytest.mark.usefixtures("no_folder")
@@ -175,10 +154,10 @@ def test_download_without_pooch_says_what_to_install(monkeypatch):
         load_measured_duct(allow_download=True)
 
 
-def test_pinned_hashes_are_those_of_the_published_files(measured_folder):
-    for item in (datasets._PRIMARY, datasets._SECONDARY, datasets._NOISE):
-        assert hashlib.sha256((measured_folder / item.local).read_bytes()).hexdigest() == item.sha256
-        assert FILES[item.local][0] == item.variable
+def test_pinned_hashes_are_those_of_the_published_files(shared_data):
+    assert set(datasets._HASHES) == set(datasets._URLS) == set(FILES)
+    for name, expected in datasets._HASHES.items():
+        assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == expected
 
 
 def test_measured_duct_of_own_signals_is_checked():
@@ -248,7 +227,7 @@ def test_unreadable_mat_files(tmp_path):
         read_mat_vector(path, "x")
 
 
-# ---- WAV files
+# ---- audio files
 
 
 def test_wav_without_peak_keeps_single_precision_values(tmp_path):
@@ -294,16 +273,68 @@ def test_wav_of_any_width_is_read_with_full_scale_one(tmp_path, width, stored, e
     assert (signal.tolist(), fs) == (expected, 8000.0)
 
 
-def test_wav_channels_have_to_be_chosen(tmp_path):
+def test_channels_lead_in_what_is_read_and_written(tmp_path):
     with wave.open(str(tmp_path / "x.wav"), "wb") as file:
-        file.setparams((2, 2, 8000, 2, "NONE", ""))
-        file.writeframes(struct.pack("<4h", 16384, 0, -16384, 8192))
-    with pytest.raises(ValueError, match=r"has 2 channels; choose one with channel=0 to channel=1"):
-        read_wav(tmp_path / "x.wav")
-    assert read_wav(tmp_path / "x.wav", channel=0)[0].tolist() == [0.5, -0.5]
-    assert read_wav(tmp_path / "x.wav", channel=1)[0].tolist() == [0.0, 0.25]
+        file.setparams((2, 2, 8000, 3, "NONE", ""))
+        file.writeframes(struct.pack("<6h", 16384, 0, -16384, 8192, 0, 1))
+    signal, _ = read_wav(tmp_path / "x.wav")
+    assert signal.tolist() == [[0.5, -0.5, 0.0], [0.0, 0.25, 2.0**-15]]
+    assert signal.flags.c_contiguous
+    assert read_wav(tmp_path / "x.wav", channel=0)[0].tolist() == [0.5, -0.5, 0.0]
+    assert read_wav(tmp_path / "x.wav", channel=1)[0].tolist() == [0.0, 0.25, 2.0**-15]
     with pytest.raises(ValueError, match=r"channel must be below the 2 channel"):
         read_wav(tmp_path / "x.wav", channel=2)
+
+
+@pytest.mark.parametrize("peak", [None, 8.0])
+def test_two_channels_come_back_as_they_were_written(tmp_path, peak):
+    x = np.clip(np.random.default_rng(1).normal(0, 2, (2, 1000)), -8, 8)
+    write_wav(tmp_path / "x.wav", x, 16000, peak=peak)
+    assert soundfile.info(tmp_path / "x.wav").channels == 2
+    read, _ = read_wav(tmp_path / "x.wav")
+    expected = x.astype(np.float32) if peak is None else np.round(x / peak * 32767) / 32768
+    np.testing.assert_array_equal(read, expected)
+    write_wav(tmp_path / "y.wav", x[:1], 16000, peak=peak)
+    np.testing.assert_array_equal(read_wav(tmp_path / "y.wav")[0], expected[0])  # one channel drops its axis
+
+
+def test_channels_that_diverged_at_different_times_end_in_silence(tmp_path):
+    write_wav(tmp_path / "x.wav", [[1.0, 2.0, np.nan], [1.0, np.nan, np.nan]], 16000)
+    assert read_wav(tmp_path / "x.wav")[0].tolist() == [[1.0, 2.0, 0.0], [1.0, 0.0, 0.0]]
+
+
+def test_the_same_signal_gives_the_same_bytes(tmp_path):
+    for peak in (None, 1.0):
+        write_wav(tmp_path / "x.wav", [0.5, -0.5], 16000, peak=peak)
+        content = (tmp_path / "x.wav").read_bytes()
+        assert b"PEAK" not in content  # a chunk with the time of writing
+        write_wav(tmp_path / "x.wav", [0.5, -0.5], 16000, peak=peak)
+        assert (tmp_path / "x.wav").read_bytes() == content
+
+
+def test_flac_is_read(tmp_path):
+    x = np.array([[0.5, -0.25, 0.0], [0.0, 0.125, 1.0 - 2.0**-15]])
+    soundfile.write(tmp_path / "x.flac", x.T, 44100, subtype="PCM_16")
+    read, fs = read_wav(tmp_path / "x.flac")
+    np.testing.assert_array_equal(read, x)
+    assert fs == 44100.0
+
+
+def test_wav_of_unknown_size_is_read(tmp_path):
+    write_wav(tmp_path / "x.wav", [0.5, -0.5], 16000)
+    content = (tmp_path / "x.wav").read_bytes()
+    (tmp_path / "x.wav").write_bytes(content[:4] + 4 * b"\xff" + content[8:])
+    assert read_wav(tmp_path / "x.wav")[0].tolist() == [0.5, -0.5]
+
+
+def test_audio_without_samples_or_with_nan_is_refused(tmp_path):
+    soundfile.write(tmp_path / "x.wav", np.zeros((0, 2)), 16000)
+    with pytest.raises(ValueError, match=r"the signal of .*x\.wav must have at least 1 value"):
+        read_wav(tmp_path / "x.wav")
+    soundfile.write(tmp_path / "x.wav", np.array([[0.0, np.nan]]).repeat(3, axis=0), 16000, subtype="FLOAT")
+    with pytest.raises(ValueError, match=r"x\.wav must be finite, but holds NaN or Inf \(first at index \(1, 0\)\)"):
+        read_wav(tmp_path / "x.wav")
+    assert read_wav(tmp_path / "x.wav", channel=0)[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_wav_with_unknown_chunks_is_read_and_a_truncated_one_refused(tmp_path):
@@ -315,14 +346,14 @@ def test_wav_with_unknown_chunks_is_read_and_a_truncated_one_refused(tmp_path):
     path.write_bytes(marked)
     assert read_wav(path)[0].size == 100
     path.write_bytes(content[:-51])
-    with pytest.raises(ValueError, match=r"x\.wav cannot be read as a WAV file"):
+    with pytest.raises(ValueError, match=r"x\.wav cannot be read as an audio file"):
         read_wav(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"RIFF", b"no wave file at all"])
 def test_unreadable_wav_files(tmp_path, content):
     (tmp_path / "x.wav").write_bytes(content)
-    with pytest.raises(ValueError, match=r"x\.wav cannot be read as a WAV file"):
+    with pytest.raises(ValueError, match=r"x\.wav cannot be read as an audio file"):
         read_wav(tmp_path / "x.wav")
 
 
@@ -334,7 +365,8 @@ def test_wav_refusals(tmp_path):
         (([], 16000), r"signal must have at least 1 value"),
         (([np.nan, 1.0], 16000), r"signal must be finite.*index 0"),
         (([np.inf], 16000), r"signal must be finite"),
-        (([[1.0, 2.0]], 16000), r"signal must be one-dimensional"),
+        (([[[1.0, 2.0]]], 16000), r"signal must be \(n_samples,\) or \(n_channels, n_samples\), got shape \(1, 1, 2\)"),
+        (([[1.0], [2.0]], 16000), r"signal must have its channels first.*transpose it"),
         (([1.0], 16000.5), r"fs must be a whole number of Hz"),
         (([1.0], 0), r"fs must be greater than 0"),
     ):

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy.signals.generators import (
+from kfopc_filterpy.signals import (
+    Compressor,
     band_limited_noise,
     compressor_noise,
     level_jump,
@@ -93,14 +94,10 @@ def test_a_seed_repeats_and_the_global_state_is_left_alone(make):
 def test_compressor_with_steady_speed_and_levels_is_a_sum_of_exact_harmonics():
     x = compressor_noise(
         2.0,
+        Compressor(shaft_hz=25.0, n_harmonics=6, speed_fluctuation=0.0, level_fluctuation=0.0, broadband_ratio=0.0),
         fs=FS,
         rng=1,
         power=2.0,
-        shaft_hz=25.0,
-        n_harmonics=6,
-        speed_fluctuation=0.0,
-        level_fluctuation=0.0,
-        broadband_ratio=0.0,
     )
     assert np.mean(x**2) == pytest.approx(2.0, rel=EXACT)
     # 25 Hz over 2 s lies on bin 50: the six lines hold all of the power, up to rounding.
@@ -115,12 +112,9 @@ def test_compressor_lobe_lines_stand_out():
     for seed in range(40):
         x = compressor_noise(
             2.0,
+            Compressor(shaft_hz=25.0, speed_fluctuation=0.0, level_fluctuation=0.0, broadband_ratio=0.0),
             fs=FS,
             rng=seed,
-            shaft_hz=25.0,
-            speed_fluctuation=0.0,
-            level_fluctuation=0.0,
-            broadband_ratio=0.0,
         )
         energy = np.abs(np.fft.rfft(x)) ** 2
         # Orders 9 and 11 surround order 10, the peak of the envelope; 8 and 12 are lobe lines.
@@ -131,11 +125,11 @@ def test_compressor_lobe_lines_stand_out():
 
 def test_compressor_broadband_share_and_band():
     x = compressor_noise(
-        8.0, fs=FS, rng=2, broadband_ratio=0.25, speed_fluctuation=0.0, level_fluctuation=0.0, shaft_hz=25.0
+        8.0, Compressor(broadband_ratio=0.25, speed_fluctuation=0.0, level_fluctuation=0.0, shaft_hz=25.0), fs=FS, rng=2
     )
     energy = np.abs(np.fft.rfft(x)) ** 2
     energy[25 * 8 * np.arange(1, 41)] = 0.0
-    # The broadband part's own share of the 40 bins, and its correlation with the lines, are some 0.5 %.
+    # The broadband part's own share of the 40 bins, and its correlation with the lines, are about 0.5 %.
     assert np.sum(energy) / np.sum(np.abs(np.fft.rfft(x)) ** 2) == pytest.approx(0.25, rel=0.03)
     assert band_share(x, 19.9, 2000.1) == pytest.approx(1.0, abs=1e-12)
 
@@ -143,7 +137,7 @@ def test_compressor_broadband_share_and_band():
 def test_compressor_speed_and_levels_wander_as_stated():
     steady = {"broadband_ratio": 0.0, "n_harmonics": 1, "shaft_hz": 100.0, "bandwidth_hz": 1000.0}
     seconds = 60.0
-    x = compressor_noise(seconds, fs=2000, rng=4, speed_fluctuation=0.01, level_fluctuation=0.0, **steady)
+    x = compressor_noise(seconds, Compressor(speed_fluctuation=0.01, level_fluctuation=0.0, **steady), fs=2000, rng=4)
     # One line: its analytic signal's phase gives the momentary frequency.
     spectrum = np.fft.fft(x)
     spectrum[x.size // 2 :] = 0.0
@@ -153,7 +147,7 @@ def test_compressor_speed_and_levels_wander_as_stated():
     assert np.mean(frequency) == pytest.approx(100.0, abs=0.65)
     assert np.std(frequency) == pytest.approx(1.0, rel=0.45)
 
-    x = compressor_noise(seconds, fs=2000, rng=4, speed_fluctuation=0.0, level_fluctuation=0.1, **steady)
+    x = compressor_noise(seconds, Compressor(speed_fluctuation=0.0, level_fluctuation=0.1, **steady), fs=2000, rng=4)
     spectrum = np.fft.fft(x)
     spectrum[x.size // 2 :] = 0.0
     level = np.log(np.abs(np.fft.ifft(spectrum)))[200:-200]
@@ -203,24 +197,29 @@ def test_scaled_signal_has_the_power_and_the_shape(values, power):
             ValueError,
             r"power must be greater",
         ),
-        (lambda: compressor_noise(1.0, fs=FS, rng=1, n_harmonics=400), ValueError, r"beyond fs/2 = 8000 Hz"),
         (
-            lambda: compressor_noise(1.0, fs=FS, rng=1, n_harmonics=0),
+            lambda: compressor_noise(1.0, Compressor(n_harmonics=400), fs=FS, rng=1),
+            ValueError,
+            r"beyond fs/2 = 8000 Hz",
+        ),
+        (
+            lambda: compressor_noise(1.0, Compressor(n_harmonics=0), fs=FS, rng=1),
             ValueError,
             r"n_harmonics must be at least 1",
         ),
         (
-            lambda: compressor_noise(1.0, fs=FS, rng=1, broadband_ratio=1.0),
+            lambda: compressor_noise(1.0, Compressor(broadband_ratio=1.0), fs=FS, rng=1),
             ValueError,
             r"broadband_ratio must be",
         ),
         (
-            lambda: compressor_noise(1.0, fs=FS, rng=1, bandwidth_hz=9e3),
+            lambda: compressor_noise(1.0, Compressor(bandwidth_hz=9e3), fs=FS, rng=1),
             ValueError,
-            r"bandwidth_hz must be above 20 Hz",
+            r"bandwidth_hz must be at most fs/2 = 8000 Hz",
         ),
+        (lambda: Compressor(bandwidth_hz=20.0), ValueError, r"bandwidth_hz must be above 20 Hz, got 20 Hz"),
         (
-            lambda: compressor_noise(0.001, fs=FS, rng=1, bandwidth_hz=500),
+            lambda: compressor_noise(0.001, Compressor(bandwidth_hz=500), fs=FS, rng=1),
             ValueError,
             r"too short for the broadband part, 20 to 500 Hz",
         ),
@@ -233,6 +232,8 @@ def test_scaled_signal_has_the_power_and_the_shape(values, power):
         (lambda: level_jump([1.0, 2.0], -1.0, 6.0, fs=2), ValueError, r"at_s must not be negative"),
         (lambda: scaled_to_power([0.0, 0.0], 1.0), ValueError, r"signal must not be all zeros"),
         (lambda: scaled_to_power([], 1.0), ValueError, r"signal must have at least 1 value"),
+        (lambda: scaled_to_power([1j], 1.0), TypeError, r"signal must be a sequence of real numbers, got complex"),
+        (lambda: scaled_to_power([[1.0], [1.0, 2.0]], 1.0), TypeError, r"got list, whose rows differ in length"),
     ],
 )
 def test_refusals_say_what_was_wrong(call, error, message):

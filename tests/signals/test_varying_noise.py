@@ -1,4 +1,4 @@
-"""Noises whose level varies, against their description: statistics with their standard errors, levels by their own power."""
+"""Bursts, swelling noise and loops against their description: statistics with their standard errors, closed forms."""
 
 from __future__ import annotations
 
@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy.signals import band_limited_noise, bursty_noise, looped, swelling
+from kfopc_filterpy.signals import (
+    Bursts,
+    band_limited_noise,
+    bursty_noise,
+    level_jump,
+    looped,
+    scaled_to_power,
+    swelling,
+)
 
 FS = 1000.0
 EXACT = 1e-12  # rounding of a sum of 1e6 squares is far below it
@@ -18,14 +26,14 @@ WIDE = (50.0, 450.0)  # of 500 Hz: the band's own ringing is a few samples
 # ---- Bursts
 
 
-def bursts(**options: Any) -> np.ndarray:
-    """Bursts of one level over next to no background."""
-    quiet = {"fs": FS, "rng": 5, "band": WIDE, "level_spread_db": 0.0, "background_db": -90.0, "decay_s": 0.02}
-    return bursty_noise(**{"duration_s": 1000.0, "rate_hz": 2.0} | quiet | options)
+def bursts(duration_s: float = 1000.0, **options: Any) -> np.ndarray:
+    """Return bursts of one level over almost no background."""
+    quiet = {"rate_hz": 2.0, "band": WIDE, "level_spread_db": 0.0, "background_db": -90.0, "decay_s": 0.02}
+    return bursty_noise(duration_s, Bursts(**quiet | options), fs=FS, rng=5)
 
 
 def edges(x: np.ndarray, threshold: float, hold: int = 15) -> tuple[np.ndarray, np.ndarray]:
-    """Where bursts begin, and where the last overlapping one has ended: no larger sample for `hold` samples."""
+    """Return where groups of overlapping bursts begin and end; no sample exceeds the threshold for `hold` samples."""
     loud = np.flatnonzero(np.abs(x) > threshold)
     gaps = np.flatnonzero(np.diff(loud) > hold)
     return loud[np.concatenate([[0], gaps + 1])], loud[np.concatenate([gaps, [loud.size - 1]])]
@@ -41,38 +49,41 @@ def test_bursts_have_their_power_exactly(power: float) -> None:
 
 def test_a_seed_repeats_and_the_global_state_is_left_alone() -> None:
     before = np.random.get_state()[1].copy()  # noqa: NPY002 - the state that must not matter
-    first = bursty_noise(1.0, fs=FS, rng=7, band=WIDE)
-    np.testing.assert_array_equal(first, bursty_noise(1.0, fs=FS, rng=7, band=WIDE))
-    np.testing.assert_array_equal(first, bursty_noise(1.0, fs=FS, rng=np.random.default_rng(7), band=WIDE))
-    assert not np.array_equal(first, bursty_noise(1.0, fs=FS, rng=8, band=WIDE))
+    first = bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=7)
+    np.testing.assert_array_equal(first, bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=7))
+    np.testing.assert_array_equal(first, bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=np.random.default_rng(7)))
+    assert not np.array_equal(first, bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=8))
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
 @pytest.mark.parametrize("rate", [0.5, 2.0, 5.0])
 def test_bursts_come_as_a_poisson_process(rate: float) -> None:
-    """However long bursts are and however they overlap: the pauses of such a process are exponential of mean 1/rate,
-    whatever of their beginning is cut off. So mean and standard deviation are one, to 5 standard errors."""
+    """The pauses of a Poisson process are exponential with mean 1/rate, however long the bursts are and however they
+    overlap. Mean and standard deviation are therefore equal; both are held to 5 standard errors."""
     starts, ends = edges(bursts(rate_hz=rate), 0.01)
     pauses = (starts[1:] - ends[:-1] - 15) / FS  # a pause is seen from 15 samples on
     assert np.mean(pauses) == pytest.approx(1 / rate, rel=5 / np.sqrt(pauses.size))
-    # the standard deviation of an exponential distribution's estimate is sqrt(2/n) of it
+    # relative standard error of the estimated standard deviation of an exponential distribution: sqrt(2/n)
     assert np.std(pauses) == pytest.approx(1 / rate, rel=5 * np.sqrt(2 / pauses.size))
-    # and they come as often at the beginning as at the end
+    # as many in the first half as in the second
     first_half = np.sum(starts < 500 * FS)
     assert first_half == pytest.approx(starts.size / 2, abs=5 * np.sqrt(starts.size / 4))
 
 
 def lone(x: np.ndarray, decay: float, threshold: float = 0.01, rings_s: float = 0.03) -> np.ndarray:
-    """Where bursts begin that no other overlaps: an envelope ends after 6 tau, and the band rings a little."""
+    """Return where bursts begin that overlap with no other: an envelope ends after 6 tau, and the filter rings a little."""
     starts, ends = edges(x, threshold, hold=30)
     return starts[(ends - starts < (6 * decay + rings_s) * FS) & (starts < x.size - 8 * decay * FS)]
 
 
 @pytest.mark.parametrize("decay", [0.05, 0.1, 0.2])
 def test_bursts_die_away_with_their_time_constant(decay: float) -> None:
-    """The mean power of n lone bursts falls as exp(-2 t/tau). A sample of it is off by sqrt(2/n), so the slope of its
-    logarithm over 2 tau, m samples of which the band leaves 0.8 independent, by sqrt(2/n) sqrt(12/(0.8 m))/(2 tau), of
-    2/tau; 5 of that. 3 % for the few that overlap in the first 30 ms unnoticed, which lengthens them."""
+    """The mean power of n lone bursts falls as exp(-2 t/tau).
+
+    Each sample of it has a relative error of sqrt(2/n). A slope fitted to its logarithm over 2 tau, that is m samples of
+    which the band leaves 0.8 m independent, has an error of sqrt(2/n) sqrt(12/(0.8 m))/(2 tau). The tolerance is 5 of
+    these, plus 3 % for the few bursts that overlap unnoticed in the first 30 ms and so seem longer.
+    """
     x = bursts(duration_s=2000.0, rate_hz=0.3, decay_s=decay)
     starts = lone(x, decay)
     first, m = 8, round(2 * decay * FS)  # samples of the band's onset, samples fitted
@@ -83,13 +94,18 @@ def test_bursts_die_away_with_their_time_constant(decay: float) -> None:
 
 
 def test_bursts_differ_in_level_as_stated() -> None:
-    """Energies of lone bursts: 4 dB, and what else there is where all are of one level, added as squares: 0.7 dB of the
-    noise in a burst, of 80 degrees of freedom (tau fs, of the band 0.8), and the 2 % that overlap unnoticed, twice as
-    strong. 5 standard errors sqrt(1/(2 n)) of n bursts' deviation."""
+    """The energies of lone bursts deviate by 4 dB and, added as squares, by as much as those of bursts of one level.
+
+    That rest is 0.7 dB for the noise in a burst (80 degrees of freedom: tau fs, times the 0.8 of the band) and the 2 %
+    of bursts that overlap unnoticed and are twice as strong. The tolerance is 5 standard errors of the deviation of n
+    bursts, sqrt(1/(2 n)) each.
+    """
     deviation = {}
     for spread in (0.0, 4.0):
         x = bursts(duration_s=2000.0, rate_hz=0.4, decay_s=0.1, level_spread_db=spread)
-        starts = lone(x, 0.1, threshold=0.003, rings_s=0.06)  # 16 dB softer ones are seen to their ends, too
+        starts = lone(
+            x, 0.1, threshold=0.003, rings_s=0.06
+        )  # bursts that are 16 dB softer are followed to their ends too
         assert starts.size > 300
         deviation[spread] = np.std([10 * np.log10(np.sum(x[s : s + 600] ** 2)) for s in starts])
     assert deviation[0.0] < 1.5
@@ -99,8 +115,11 @@ def test_bursts_differ_in_level_as_stated() -> None:
 
 @pytest.mark.parametrize("background_db", [-30.0, -20.0, 0.0])
 def test_the_background_has_its_level(background_db: float) -> None:
-    """Between bursts, which the same seed without background shows. 800 s with 0.8 degrees of freedom a sample give it
-    to 5 sqrt(2/640000) = 0.9 %, and bursts and background together their sum of 1 to as much."""
+    """The background is measured between the bursts, which the same seed without background shows.
+
+    800 s with 0.8 degrees of freedom per sample give its power to 5 sqrt(2/640000) = 0.9 %, and the power of bursts and
+    background together, which is 1, to the same.
+    """
     starts, ends = edges(bursts(rate_hz=0.5, decay_s=0.01), 1e-3, hold=40)
     x = bursts(rate_hz=0.5, decay_s=0.01, background_db=background_db)
     pause = np.ones(x.size, dtype=bool)
@@ -112,17 +131,17 @@ def test_the_background_has_its_level(background_db: float) -> None:
 
 
 def test_bursts_lie_in_their_band() -> None:
-    x = bursty_noise(20.0, fs=16000.0, rng=1, band=(500.0, 1000.0))
+    x = bursty_noise(20.0, Bursts(band=(500.0, 1000.0)), fs=16000.0, rng=1)
     energy = np.abs(np.fft.rfft(x)) ** 2
     frequency = np.fft.rfftfreq(x.size, 1 / 16000)
     inside = (frequency > 500) & (frequency < 1000)
     assert np.sum(energy[inside]) > 0.9 * np.sum(energy)
-    # fourth order, an octave off: 24 dB of each edge at the least
+    # fourth order, an octave away: at least 24 dB below
     assert np.mean(energy[(frequency > 2000) & (frequency < 3000)]) < 10**-2.4 * np.mean(energy[inside])
 
 
 def test_bursts_take_the_whole_band() -> None:
-    x = bursty_noise(2.0, fs=FS, rng=1, band=(0.0, FS / 2))
+    x = bursty_noise(2.0, Bursts(band=(0.0, FS / 2)), fs=FS, rng=1)
     assert np.all(np.isfinite(x))
     assert np.mean(x**2) == pytest.approx(1.0, rel=EXACT)
 
@@ -153,8 +172,11 @@ def test_swelling_keeps_the_mean_power_and_its_input(
 @pytest.mark.parametrize("phase", [0.0, 1.0, -2.5])
 @pytest.mark.parametrize(("swing", "period"), [(6.0, 4.0), (3.0, 1.6), (12.0, 8.0)])
 def test_the_level_swings_as_a_sine_of_its_period(swing: float, period: float, phase: float) -> None:
-    """Seen in the powers of noise over a 40th of a period, 0.04 s and more: some 80 degrees of freedom give 0.7 dB
-    each, which 400 of them bring to 0.7 sqrt(2/400) = 0.05 dB of the sine's amplitude; 5 of it."""
+    """The level is measured as the power of noise in each 40th of a period, 0.04 s and more.
+
+    About 80 degrees of freedom give 0.7 dB for each, and 400 of them 0.7 sqrt(2/400) = 0.05 dB for the amplitude of the
+    sine. The tolerance is 5 of these.
+    """
     noise = band_limited_noise((50.0, 1000.0), 10 * period, fs=2000.0, rng=3)
     y = swelling(noise, fs=2000.0, swing_db=swing, period_s=period, phase_rad=phase)
     level = 10 * np.log10(np.mean(y.reshape(400, -1) ** 2, axis=1))
@@ -184,7 +206,7 @@ def test_one_turn_is_the_recording_but_for_the_fade() -> None:
 @given(turns=st.floats(0.01, 4.0), start=st.floats(0.0, 5.0))
 @settings(max_examples=40)
 def test_it_goes_round_and_begins_anywhere(turns: float, start: float) -> None:
-    """Sample n is that of n plus the start, in a loop of one turn."""
+    """Sample n is sample n + start of a loop of one turn."""
     one = looped(RECORDING, TURN / RATE, fs=RATE)
     y = looped(RECORDING, turns * TURN / RATE, fs=RATE, start_s=start)
     assert y.size == round(turns * TURN / RATE * RATE)
@@ -199,14 +221,14 @@ def test_it_goes_round_and_begins_anywhere(turns: float, start: float) -> None:
 )
 @settings(max_examples=40)
 def test_a_tone_has_no_click(frequency: float, phase: float, samples: int, start: float) -> None:
-    """Steps between samples: those of the two tones under sin and cos, 1 at most together sqrt(2), and the fade's own."""
+    """Steps between samples stay below those of both tones under the fade, at most sqrt(2), plus the slope of the fade."""
     turn = 2 * np.pi * frequency / RATE
     y = looped(np.sin(turn * np.arange(samples) + phase), 3.0, fs=RATE, start_s=start)
     assert np.max(np.abs(np.diff(y))) <= np.sqrt(2) * (turn + np.pi / (2 * FADE))
 
 
 def test_a_cut_without_a_fade_does_click() -> None:
-    """So the test above could fail: a quarter period is missing where the loop begins again."""
+    """Shows that the test above can fail: a quarter period is missing where the loop begins again."""
     tone = np.sin(2 * np.pi * 100.0 / RATE * np.arange(4000 - 13))
     fast = np.sqrt(2) * (2 * np.pi * 100.0 / RATE + np.pi / (2 * FADE))
     assert np.max(np.abs(np.diff(np.resize(tone, 15000)))) > 4 * fast
@@ -214,7 +236,7 @@ def test_a_cut_without_a_fade_does_click() -> None:
 
 
 def test_noise_keeps_its_power_through_the_fade() -> None:
-    """Of 400 recordings: each tenth of the fade has 10000 samples, 5 sqrt(2/10000) = 7 %. A linear fade would halve the
+    """In 400 recordings each tenth of the fade has 10000 samples, so 5 sqrt(2/10000) = 7 %. A linear fade would halve the
     power in its middle."""
     rng = np.random.default_rng(9)
     power = np.mean([looped(rng.standard_normal(600), 0.05, fs=RATE) ** 2 for _ in range(400)], axis=0)
@@ -232,29 +254,61 @@ def test_the_shortest_recording(samples: int, fs: float) -> None:
         looped(recording[1:], 1.0, fs=fs)
 
 
+# ---- Channels
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda x: level_jump(x, 0.1, 6.0, fs=RATE),
+        lambda x: looped(x, 3.0, fs=RATE, start_s=0.3),
+    ],
+)
+def test_channels_are_changed_as_each_alone(change: Any) -> None:
+    x = np.random.default_rng(2).standard_normal((3, 1000))
+    np.testing.assert_array_equal(change(x), [change(channel) for channel in x])
+
+
+@pytest.mark.parametrize("change", [lambda x: scaled_to_power(x, 3.0), lambda x: swelling(x, fs=RATE, period_s=0.07)])
+def test_channels_share_one_gain_and_one_power(change: Any) -> None:
+    x = np.random.default_rng(2).standard_normal((3, 1000)) * [[1.0], [2.0], [3.0]]
+    y = change(x)
+    gain = y / x
+    np.testing.assert_allclose(gain, np.tile(gain[0], (3, 1)), rtol=1e-12)
+    assert np.mean(y**2) == pytest.approx(np.mean(change(x.ravel()) ** 2), rel=EXACT)
+
+
 # ---- Refusals
 
 
 BAD = [
     (lambda: bursty_noise(0.0, fs=FS, rng=1), ValueError, r"duration_s must be greater than 0"),
-    (lambda: bursty_noise(1e-5, fs=FS, rng=1), ValueError, r"duration_s fs, in samples, must be at least 1"),
+    (lambda: bursty_noise(1e-5, fs=FS, rng=1), ValueError, r"duration_s must be at least one sample"),
     (lambda: bursty_noise(1.0, fs=0, rng=1), ValueError, r"fs must be greater than 0"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=None, band=WIDE), TypeError, r"rng must be a seed"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=None), TypeError, r"rng must be a seed"),
     (lambda: bursty_noise(1.0, fs=FS, rng=1), ValueError, r"band must satisfy .* fs/2 = 500 Hz, got \(100, 1500\)"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=(200, 100)), ValueError, r"band must satisfy"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, power=0.0), ValueError, r"power must be greater"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, rate_hz=0.0), ValueError, r"rate_hz must be greater"),
+    (lambda: bursty_noise(1.0, Bursts(band=(200, 100)), fs=FS, rng=1), ValueError, r"band must satisfy"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE), fs=FS, rng=1, power=0.0), ValueError, r"power must be greater"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE, rate_hz=0.0), fs=FS, rng=1), ValueError, r"rate_hz must be greater"),
     (
-        lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, rate_hz=1e-9),
+        lambda: bursty_noise(1.0, Bursts(band=WIDE, rate_hz=1e-9), fs=FS, rng=1),
         ValueError,
         r"^no burst fell into duration_s = 1 s: take a longer duration or a higher rate_hz$",
     ),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, decay_s=0.0), ValueError, r"decay_s must be greater"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, level_spread_db=-1), ValueError, r"level_spread_db must not"),
-    (lambda: bursty_noise(1.0, fs=FS, rng=1, band=WIDE, background_db=np.nan), ValueError, r"background_db must be f"),
+    (lambda: bursty_noise(1.0, Bursts(band=WIDE, decay_s=0.0), fs=FS, rng=1), ValueError, r"decay_s must be greater"),
+    (
+        lambda: bursty_noise(1.0, Bursts(band=WIDE, level_spread_db=-1), fs=FS, rng=1),
+        ValueError,
+        r"level_spread_db must not",
+    ),
+    (
+        lambda: bursty_noise(1.0, Bursts(band=WIDE, background_db=np.nan), fs=FS, rng=1),
+        ValueError,
+        r"background_db must be f",
+    ),
     (lambda: swelling([0.0, 0.0], fs=FS), ValueError, r"power must be greater than 0|not be all zeros"),
     (lambda: swelling([], fs=FS), ValueError, r"signal must have at least 1 value"),
-    (lambda: swelling([[1.0]], fs=FS), ValueError, r"signal must be one-dimensional"),
+    (lambda: swelling([[[1.0]]], fs=FS), ValueError, r"signal must be \(n_samples,\) or \(n_channels, n_samples\)"),
     (lambda: swelling([1.0], fs=0.0), ValueError, r"fs must be greater than 0"),
     (lambda: swelling([1.0], fs=FS, swing_db=-1.0), ValueError, r"swing_db must not be negative"),
     (lambda: swelling([1.0], fs=FS, period_s=0.0), ValueError, r"period_s must be greater than 0"),

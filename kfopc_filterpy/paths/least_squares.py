@@ -1,0 +1,50 @@
+"""Least squares of a signal on the delays of another, by the covariance method: exact on the samples at hand.
+
+The fit of a path and the Wiener control filter are both of this kind.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Eigenvalues of a correlation matrix below this share of the largest count as zero. Such directions of the weights
+# get no weight, which is the solution of minimum norm; for a tone only two directions remain.
+RANK_TOLERANCE = 1e-11
+
+
+def cross_correlation(output: np.ndarray, regressor: np.ndarray) -> np.ndarray:
+    """Return the mean of the products of `output` and each delay of `regressor`, which begins that many samples early.
+
+    Parameters
+    ----------
+    output : ndarray, shape (n_samples,)
+    regressor : ndarray, shape (n_samples + n_taps - 1,)
+
+    Returns
+    -------
+    ndarray, shape (n_taps,)
+    """
+    return np.correlate(regressor, output, mode="valid")[::-1] / output.size
+
+
+def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarray:
+    """Return the mean of ``signal[n - i] * signal[n - j]`` over n >= start, shape (n_taps, n_taps).
+
+    Each row follows from the one above by the products that enter and leave the window.
+    """
+    count = signal.size - start
+    matrix = np.zeros((n_taps, n_taps))
+    matrix[0] = cross_correlation(signal[start:], signal[start - n_taps + 1 :])
+    entering = signal[start - n_taps + 1 : start][::-1]  # signal[start - 1], signal[start - 2], ...
+    leaving = signal[::-1][: n_taps - 1]  # signal[-1], signal[-2], ...
+    for i in range(n_taps - 1):
+        change = entering[i] * entering[i:] - leaving[i] * leaving[i:]
+        matrix[i + 1, i + 1 :] = matrix[i, i:-1] + change / count
+    return np.triu(matrix) + np.triu(matrix, 1).T
+
+
+def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric positive semidefinite system, leaving out directions without energy."""
+    values, vectors = np.linalg.eigh(matrix)
+    kept = values > RANK_TOLERANCE * values[-1]
+    return vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])

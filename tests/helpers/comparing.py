@@ -1,0 +1,88 @@
+"""Comparisons of runs, estimators and controllers: equal, or equal to rounding."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+SIGNALS = (
+    "error",
+    "control_signal",
+    "amplifier_output",
+    "anti_noise",
+    "constraint_factor",
+    "disturbance_power",
+    "secondary_path_gain",
+    "weights",
+)
+
+
+def assert_same_run(one, two):
+    """Every field of two results, to the bit."""
+    for field in dataclasses.fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
+
+
+def assert_same_estimator(one, two):
+    """All that two random-walk filters show, to the bit; `x_prior`, which the compiled loop does not keep, to rounding."""
+    for name in ("x", "x_post", "P", "P_prior", "P_post", "K", "S", "SI", "y", "z"):
+        a, b = getattr(one, name), getattr(two, name)
+        np.testing.assert_array_equal(a, b, err_msg=name)
+        assert (type(a), a.dtype) == (type(b), b.dtype), name
+    for name in ("log_likelihood", "likelihood", "mahalanobis"):
+        assert getattr(one, name) == getattr(two, name), name
+    assert one.constraint_factor == two.constraint_factor
+    assert one.disturbance_power == two.disturbance_power
+    assert one.secondary_path_gain == two.secondary_path_gain
+    # the compiled loop keeps x only: x_prior = x - K y to rounding
+    np.testing.assert_allclose(one.x_prior, two.x_prior, rtol=0, atol=1e-14 * np.max(np.abs(two.x)))
+
+
+def assert_close(got, want, tolerance=1e-10, scale=None, name=""):
+    """To a tolerance relative to the largest value, or to `scale`; NaN where NaN is wanted."""
+    scale = np.nanmax(np.abs(want)) if scale is None else scale
+    np.testing.assert_allclose(got, want, rtol=0, atol=tolerance * scale, err_msg=name)
+
+
+def assert_run_close(got, want):
+    """Two runs of the same equations with sums in another order.
+
+    The loop contracts, so that rounding does not grow: errors were 1e-13 of the largest value.
+    """
+    for name in (*SIGNALS, "weights_time_s"):
+        if getattr(want, name) is not None:
+            assert_close(getattr(got, name), getattr(want, name), name=name)
+    for name in ("algorithm", "fs", "rated_power", "diverged_at_s"):
+        assert getattr(got, name) == getattr(want, name), name
+
+
+def assert_controller_close(got, want):
+    """Two Kalman controllers after such runs: errors were 1e-12 of P, which falls to a hundredth of P0 on the way."""
+    mine, theirs = got.estimator, want.estimator
+    measured = max(np.abs(theirs.z).max(), 1.0)  # z and y are sums of signals about 1 and larger
+    scales = {"x_prior": np.abs(theirs.x).max(), "z": measured, "y": measured}
+    for name in ("x", "x_prior", "P", "P_prior", "P_post", "K", "S", "SI", "z", "y"):
+        assert_close(getattr(mine, name), getattr(theirs, name), scale=scales.get(name), name=name)
+    np.testing.assert_array_equal(mine.P, mine.P.T)
+    np.linalg.cholesky(mine.P)
+    np.testing.assert_array_equal(got.weights, mine.x[:, 0])
+    for name in ("constraint_factor", "disturbance_power", "secondary_path_gain"):
+        assert getattr(got, name) == pytest.approx(getattr(want, name), rel=1e-10), name
+
+
+def state_of(made):
+    """Every number that a controller keeps."""
+    leaves = []
+
+    def collect(value):
+        if isinstance(value, np.ndarray):
+            leaves.append(value.copy() if value.dtype.names is None else np.array(value.tolist(), dtype=float))
+        elif isinstance(value, tuple):
+            for item in value:
+                collect(item)
+
+    collect(made._state)
+    collect(made.constraint.state)
+    if hasattr(made, "estimator"):
+        collect((made.estimator.x.copy(), made.estimator.P.copy(), made.estimator.K.copy()))
+    return leaves

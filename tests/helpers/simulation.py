@@ -1,0 +1,48 @@
+"""Four controllers with a short scene for each, and a user's own controller."""
+
+import numpy as np
+
+from kfopc_filterpy import FxLMS, MOVFxLMS, OutputPowerConstraint, kf_anc, kf_opc
+
+S = np.array([0.0, 0.9, -0.4])
+MAKERS = {
+    "KF-ANC": lambda s=S, **options: kf_anc(6, s, **{"state_noise": 1e-6, "measurement_noise": 0.01} | options),
+    "KF-OPC": lambda s=S, **options: kf_opc(
+        6, s, **rated(options) | {"state_noise": 1e-6, "measurement_noise": 0.01} | options
+    ),
+    "FxLMS": lambda s=S, **options: FxLMS(6, s, **{"step_size": 0.01} | options),
+    "MOV-FxLMS": lambda s=S, **options: MOVFxLMS(6, s, **rated(options) | {"step_size": 0.01} | options),
+}
+
+
+def rated(options):
+    """The rated power, unless the options have a constraint."""
+    return {} if "constraint" in options else {"rated_power": 0.2}
+
+
+def constraint(**settings):
+    """A constraint of the same rated power with settings of its own."""
+    return OutputPowerConstraint(0.2, **settings)
+
+
+def noises(n=300, seed=0):
+    """Reference, and a disturbance that a control filter explains in part."""
+    x, other = np.random.default_rng(seed).standard_normal((2, n))
+    return x, np.convolve(x, [0.0, 0.0, 1.0, 0.5])[:n] + 0.1 * other
+
+
+X, D = noises()
+
+
+class Integrator:
+    """A user's own controller: two methods, nothing else."""
+
+    def __init__(self):
+        self.gain, self.x = 0.0, 0.0
+
+    def control_signal(self, reference):
+        self.x = reference
+        return self.gain * reference
+
+    def update(self, error):
+        self.gain += 0.05 * error * self.x
