@@ -251,8 +251,8 @@ class FilteredReferenceController:
             },
         )
 
-    def compiled_state(self) -> Any:
-        """Return the state for the compiled loop, which advances it; None if only the steps above can run."""
+    def compiled_state(self, to_step: bool = True) -> Any:
+        """Return the state for the compiled loop, `to_step` it or to read; None if only the steps above can run."""
         return self._state if calls_of(type(self)) == calls_of(FilteredReferenceController) else None
 
     def after_compiled(self, state: Any) -> None:
