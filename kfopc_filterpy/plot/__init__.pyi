@@ -52,3 +52,4 @@ from .signals import (
 from .signals import (
     plot_error_spectra as plot_error_spectra,
 )
+from .style import curve_style as curve_style
