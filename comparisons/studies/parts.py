@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult
-from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, Table, Trial, Tuned, algorithms, setting_value
+from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, Table, Trial, Tuned, algorithms
 from kfopc_filterpy.bounds import power_constrained_solution
 from kfopc_filterpy.plot import curve_style, plot_bode
 
@@ -108,7 +108,7 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
     for name, best in tuned.items():
         own = algorithms()[name]
         parameters |= {
-            f"{name} {own.symbol}": Parameter(setting_value(scene, name, best.setting), "follows from the next line"),
+            f"{name} {own.symbol}": Parameter(own.value(scene, best.setting), "follows from the next line"),
             f"{name} {own.kind}": Parameter(best.setting, f"tuned: {Tuned.RULE}"),
             f"{name} settings tried": Parameter(tried(best.trials), "setting, mean NSE in dB, output power"),
         }

@@ -20,7 +20,6 @@ from kfopc_filterpy.bench import (
     Tuned,
     Verdict,
     algorithms,
-    refine,
     run_setting,
     try_settings,
     tune,
@@ -129,9 +128,7 @@ def _tune(runs: Runs, scene: Scene) -> TunedAt:
     tuned = {}
     for share_db in SHARES_DB:
         rated = _rated(scene, share_db)
-        seen = tune(runs, rated, [name for name in algorithms() if name not in once], seeds)
-        seen |= {name: refine(runs, rated, name, own, seeds) for name, own in trials.items()}
-        tuned[share_db] = {name: seen[name] for name in algorithms()}
+        tuned[share_db] = tune(runs, rated, list(algorithms()), seeds, trials=trials)
     return tuned
 
 

@@ -25,7 +25,7 @@ from kfopc_filterpy import (
     nse_db,
     output_power,
 )
-from kfopc_filterpy.bench import AllDivergedError, Scene, algorithms, make_controller, tune, unless_refused
+from kfopc_filterpy.bench import AllDivergedError, Scene, algorithms, make_controller, run_setting, tune
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 
@@ -205,14 +205,15 @@ def _amplifier(name: str, limit: float) -> Any:
 
 def _run(members: list[_Prepared]) -> list[Figures]:
     """Run scenarios that share a gain sequence, or a single one; without a stable setting there is no run."""
-    if members[0].setting is None:
+    setting = members[0].setting
+    if setting is None:
         return [_figures(one, None) for one in members]
     if not members[0].shares:
         (alone,) = members
         with naming(alone.scenario):
             scene = replace(alone.scene, amplifier=alone.amplifier)
-            controller = alone.controller()
-            result = unless_refused(alone.scenario["algorithm"], lambda: scene.run(controller))
+            algorithm, controller = alone.scenario["algorithm"], alone.controller()
+            result = run_setting(scene, algorithm, setting, controller=controller)
             return [_figures(alone, result)]
     try:
         results = members[0].scene.run_together(

@@ -7,7 +7,6 @@ from .items import Verdict as Verdict
 from .registry import Algorithm as Algorithm
 from .registry import algorithms as algorithms
 from .registry import make_controller as make_controller
-from .registry import setting_value as setting_value
 from .report import prepare_folder as prepare_folder
 from .report import results_table as results_table
 from .report import write_report as write_report
@@ -20,9 +19,7 @@ from .tuning import AllDivergedError as AllDivergedError
 from .tuning import Trial as Trial
 from .tuning import Tuned as Tuned
 from .tuning import best_setting as best_setting
-from .tuning import refine as refine
 from .tuning import run_setting as run_setting
 from .tuning import run_settings as run_settings
 from .tuning import try_settings as try_settings
 from .tuning import tune as tune
-from .tuning import unless_refused as unless_refused

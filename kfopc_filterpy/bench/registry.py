@@ -108,6 +108,13 @@ class Algorithm:
         near = [best[1] * ratio ** (k / 6) for k in range(-5, 6) if k]
         return [(one, two) for one in (best[0] / 2, best[0], 2 * best[0]) for two in near]
 
+    def value(self, scene: Scene, setting: Setting) -> float:
+        """Return the state noise r, step size mu or 1 - lambda that a `setting` means in the units of a `scene`."""
+        first = setting[0] if isinstance(setting, tuple) else setting
+        if self.symbol == "r":
+            return first * scene.measurement_noise / scene.filtered_power
+        return first if self.symbol == "1 - lambda" else first / (scene.n_taps * scene.filtered_power)
+
 
 def _kalman(make: Any, *, constrained: bool = True, remembers: bool = False) -> Callable[..., Controller]:
     """Return a maker of Kalman filters; `remembers` is whether the constraint follows powers with a memory."""
@@ -271,37 +278,5 @@ def make_controller(scene: Scene, algorithm: str, setting: Setting, *, amplifier
     """
     second = setting[1] if isinstance(setting, tuple) else np.nan
     amplifier = scene.known_amplifier if amplifier is None else amplifier
-    return REGISTRY[algorithm].make(scene, setting_value(scene, algorithm, setting), second, amplifier)
-
-
-def setting_value(scene: Scene, algorithm: str, setting: Setting) -> float:
-    """Return the state noise r, step size mu or 1 - lambda that a setting means in a scene.
-
-    Parameters
-    ----------
-    scene : Scene
-        Scene whose powers scale the setting.
-    algorithm : str
-        Name in the registry, see `algorithms`.
-    setting : float or tuple of float
-        Setting of its grid, or like it; of two settings the first counts.
-
-    Returns
-    -------
-    float
-        The parameter in the scene's units.
-
-    Examples
-    --------
-    >>> from kfopc_filterpy.bench import make_scene, setting_value
-    >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
-    >>> mu = setting_value(scene, "FxLMS", 0.25)
-    >>> round(mu * scene.n_taps * scene.filtered_power, 9)
-    0.25
-    """
-    first, kind = (setting[0] if isinstance(setting, tuple) else setting), REGISTRY[algorithm].symbol
-    if kind == "r":
-        return first * scene.measurement_noise / scene.filtered_power
-    return first if kind == "1 - lambda" else first / (scene.n_taps * scene.filtered_power)
+    own = REGISTRY[algorithm]
+    return own.make(scene, own.value(scene, setting), second, amplifier)

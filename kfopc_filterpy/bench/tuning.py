@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -84,46 +84,9 @@ class Tuned:
     trials: list[Trial]
 
 
-def unless_refused(algorithm: str, run: Callable[[], SimulationResult]) -> SimulationResult | None:
-    """Return the result of a run, or None if the filter found during the run that it cannot go on.
-
-    Parameters
-    ----------
-    algorithm : str
-        Name in the registry; only algorithms that may refuse return None.
-    run : callable
-        Function without arguments that runs it.
-
-    Returns
-    -------
-    SimulationResult or None
-        The result.
-
-    Raises
-    ------
-    ValueError
-        The run raised it before its first sample, or the algorithm may not refuse.
-
-    Examples
-    --------
-    >>> from kfopc_filterpy.bench import unless_refused
-    >>> def run():
-    ...     error = ValueError("P is not positive definite")
-    ...     error.add_note("in sample 3 of the run")
-    ...     raise error
-    >>> unless_refused("FxRLS", run) is None
-    True
-    """
-    try:
-        return run()
-    except ValueError as error:
-        during_the_run = any(note.startswith("in sample") for note in getattr(error, "__notes__", ()))
-        if not (REGISTRY[algorithm].may_refuse and during_the_run):
-            raise
-        return None
-
-
-def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0) -> SimulationResult | None:
+def run_setting(
+    scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0, *, controller: Any = None
+) -> SimulationResult | None:
     """Run an algorithm in a scene.
 
     Parameters
@@ -136,11 +99,13 @@ def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int 
         Setting of its grid, or like it.
     seed_index : int, default 0
         Index of the scene's seed.
+    controller : Controller, optional
+        Controller of the algorithm that is run; by default a fresh one for the scene and the setting.
 
     Returns
     -------
     SimulationResult or None
-        The result; None if the filter found during the run that it cannot go on.
+        The result; None if the filter found during the run that it cannot go on, see `Algorithm`.
 
     Examples
     --------
@@ -151,8 +116,14 @@ def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int 
     >>> run_setting(scene, "KF-OPC", 1e-6).algorithm
     'KF-OPC'
     """
-    controller = make_controller(scene, algorithm, setting)
-    return unless_refused(algorithm, lambda: scene.run(controller, seed_index))
+    controller = make_controller(scene, algorithm, setting) if controller is None else controller
+    try:
+        return scene.run(controller, seed_index)
+    except ValueError as error:
+        during_the_run = any(note.startswith("in sample") for note in getattr(error, "__notes__", ()))
+        if not (REGISTRY[algorithm].may_refuse and during_the_run):
+            raise
+        return None
 
 
 def run_settings(
@@ -299,58 +270,19 @@ def best_setting(scene: Scene, algorithm: str, trials: Sequence[Trial]) -> Tuned
     return _best(trials, scene.rated_power if REGISTRY[algorithm].keeps_budget else np.inf)
 
 
-def refine(runs: Runs, scene: Scene, algorithm: str, trials: Sequence[Trial], seeds: int = 1) -> Tuned:
-    """Return the best of a grid, or of the finer one around it if the algorithm has two settings.
-
-    Parameters
-    ----------
-    runs : Runs
-        What runs the jobs.
-    scene : Scene
-        The scene.
-    algorithm : str
-        Name in the registry, see `algorithms`.
-    trials : sequence of Trial
-        Trials of the grid.
-    seeds : int, default 1
-        Number of the scene's seeds that are run, from the first one.
-
-    Returns
-    -------
-    Tuned
-        The best setting, and all trials.
-
-    Raises
-    ------
-    AllDivergedError
-        Every setting of the grid diverged.
-
-    Examples
-    --------
-    >>> from kfopc_filterpy.bench import Runs, Trial, make_scene, refine
-    >>> from kfopc_filterpy.signals import tone
-    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
-    ...                    power_multiple=2.0, n_taps=8)
-    >>> refine(Runs(), scene, "FxLMS", [Trial(0.1, -20.0, 1.5)]).setting
-    0.1
-    """
-    best = best_setting(scene, algorithm, trials)
-    if best is None:
-        tried = [trial.setting for trial in trials]
-        raise AllDivergedError(f"{algorithm} diverged at every setting tried: {tried}")
-    finer = REGISTRY[algorithm].finer(best.setting)
-    if not finer:
-        return best
-    own = try_settings(runs, scene, {algorithm: finer}, seeds, planned=False)[algorithm]
-    return best_setting(scene, algorithm, [*trials, *own]) or best
-
-
-def tune(runs: Runs, scene: Scene, names: Sequence[str] | None = None, seeds: int = 1) -> dict[str, Tuned]:
+def tune(
+    runs: Runs,
+    scene: Scene,
+    names: Sequence[str] | None = None,
+    seeds: int = 1,
+    *,
+    trials: Mapping[str, Sequence[Trial]] | None = None,
+) -> dict[str, Tuned]:
     """Return the best setting of each algorithm, by one rule for all.
 
     The best setting has the lowest mean NSE over the whole run, start included, among settings that do not diverge and,
     for constrained methods, keep the budget to 2 % over the steady half. If no setting keeps it, the lowest mean NSE
-    wins, and `within_budget` is False. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
+    wins, and `within_budget` is False. Around the best of a grid of two settings a finer grid is tried. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
 
     Parameters
     ----------
@@ -362,6 +294,8 @@ def tune(runs: Runs, scene: Scene, names: Sequence[str] | None = None, seeds: in
         Algorithms, see `algorithms`; by default those that the paper compares.
     seeds : int, default 1
         Number of the scene's seeds that are run, from the first one.
+    trials : mapping of str to sequence of Trial, optional
+        Trials of the grids by algorithm, if they have been made before.
 
     Returns
     -------
@@ -385,8 +319,21 @@ def tune(runs: Runs, scene: Scene, names: Sequence[str] | None = None, seeds: in
     """
     if names is None:
         names = [name for name, algorithm in REGISTRY.items() if algorithm.of_paper]
-    trials = try_settings(runs, scene, {name: REGISTRY[name].grid for name in names}, seeds)
-    return {name: refine(runs, scene, name, trials[name], seeds) for name in names}
+    made = dict(trials or {})
+    made |= try_settings(runs, scene, {name: REGISTRY[name].grid for name in names if name not in made}, seeds)
+    return {name: _refined(runs, scene, name, made[name], seeds) for name in names}
+
+
+def _refined(runs: Runs, scene: Scene, algorithm: str, trials: Sequence[Trial], seeds: int) -> Tuned:
+    best = best_setting(scene, algorithm, trials)
+    if best is None:
+        tried = [trial.setting for trial in trials]
+        raise AllDivergedError(f"{algorithm} diverged at every setting tried: {tried}")
+    finer = REGISTRY[algorithm].finer(best.setting)
+    if not finer:
+        return best
+    own = try_settings(runs, scene, {algorithm: finer}, seeds, planned=False)[algorithm]
+    return best_setting(scene, algorithm, [*trials, *own]) or best
 
 
 def _best(trials: Sequence[Trial], rated_power: float) -> Tuned | None:

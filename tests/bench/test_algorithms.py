@@ -10,14 +10,13 @@ import pytest
 
 from kfopc_filterpy import HardClipAmplifier, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import registry as algorithms
-from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller, setting_value
+from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller
 from kfopc_filterpy.bench.scene import Runs, Scene, make_scene
 from kfopc_filterpy.bench.tuning import (
     AllDivergedError,
     Trial,
     _best,
     best_setting,
-    refine,
     run_setting,
     try_settings,
     tune,
@@ -79,9 +78,9 @@ def test_runs_that_do_not_see_the_budget_serve_for_all(name: str, scene: Scene) 
 def test_settings_are_in_the_units_of_the_scene(scene: Scene) -> None:
     x = scene.references[0]
     filtered = np.mean(np.convolve(x, scene.secondary)[: x.size] ** 2)
-    assert setting_value(scene, "KF-OPC", 1e-6) == pytest.approx(1e-6 * scene.measurement_noise / filtered, rel=1e-12)
-    assert setting_value(scene, "leaky FxLMS", (0.1, 3.0)) == pytest.approx(0.1 / (12 * filtered), rel=1e-12)
-    assert setting_value(scene, "FxRLS", 1e-4) == 1e-4
+    assert REGISTRY["KF-OPC"].value(scene, 1e-6) == pytest.approx(1e-6 * scene.measurement_noise / filtered, rel=1e-12)
+    assert REGISTRY["leaky FxLMS"].value(scene, (0.1, 3.0)) == pytest.approx(0.1 / (12 * filtered), rel=1e-12)
+    assert REGISTRY["FxRLS"].value(scene, 1e-4) == 1e-4
     leaky: Any = make_controller(scene, "leaky FxLMS", (0.1, 3.0))
     assert leaky.leak == pytest.approx(3.0 * filtered, rel=1e-12)
     fixed: Any = make_controller(scene, "MOV-FxLMS fixed", (0.1, 3.0))
@@ -127,7 +126,7 @@ def test_tuning_two_settings_follows_the_rule(scene: Scene, monkeypatch: Any) ->
 def test_refining_goes_on_from_trials_made_before(scene: Scene) -> None:
     settings: list[Any] = [(0.05, 0.1), (0.05, 10.0)]
     trials = try_settings(Runs(), scene, {"MOV-FxLMS fixed": settings})["MOV-FxLMS fixed"]
-    best = refine(Runs(), scene, "MOV-FxLMS fixed", trials)
+    best = tune(Runs(), scene, ["MOV-FxLMS fixed"], trials={"MOV-FxLMS fixed": trials})["MOV-FxLMS fixed"]
     assert best.trials[:2] == trials
     assert len(best.trials) == 2 + 30
 
@@ -184,4 +183,4 @@ def test_trials_are_means_over_seeds_and_one_divergence_is_all(scene: Scene, mon
     assert lost == Trial(0.1, np.inf, np.inf, 0.2)
     assert best_setting(two, "FxLMS", [lost]) is None
     with pytest.raises(AllDivergedError, match=r"FxLMS diverged at every setting tried: \[0\.1\]"):
-        refine(Runs(), two, "FxLMS", [lost])
+        tune(Runs(), two, ["FxLMS"], trials={"FxLMS": [lost]})
