@@ -69,7 +69,7 @@ class Results:
         """Runs of the constraint study of an algorithm on noise of one kind."""
         steady = ("tone", "compressor", "band noise")
         rows = self.extra("constraint", "rows")
-        return [r for r in rows if r["algorithm"] == algorithm and (r["setting"]["noise"] in steady) == stationary]
+        return [r for r in rows if r["algorithm"] == algorithm and (r["noise"] in steady) == stationary]
 
     def summary(self, algorithm: str) -> list[float]:
         """A line of the constraint study's summary."""
@@ -295,7 +295,7 @@ def _constraint() -> Iterator[Quote]:
 
 def _worst_loss(results: Results, noise: str) -> float:
     """Largest loss of KF-PB against the bound on a noise."""
-    rows = [row for row in results.rows("KF-PB", False) if row["setting"]["noise"] == noise]
+    rows = [row for row in results.rows("KF-PB", False) if row["noise"] == noise]
     return max(row["bound_db"] - row["noise_reduction_db"] for row in rows)
 
 

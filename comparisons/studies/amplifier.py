@@ -86,6 +86,7 @@ class AmplifierRow(Row):
     amplifier: str
     overdrive_db: float
     known: str
+    within_budget: bool
     harmonics_db: float = np.nan  # over the disturbance, a tone's only
     coherence: float = np.nan  # of anti-noise and disturbance over the band, a band noise's only
     clipped_fraction: float = np.nan

@@ -78,8 +78,7 @@ class Row:
     path: str
     noise: str
     algorithm: str
-    setting: Any = None
-    within_budget: bool = True
+    setting: Any = None  # the tuned one, if any
     noise_reduction_db: float = np.nan  # over the steady half
     power: float = np.nan  # over the steady half, over the rated one
     diverged_at_s: float | None = None

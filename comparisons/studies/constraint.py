@@ -226,7 +226,13 @@ def run_case(
         place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share": share, "duration_s": duration_s}
         place |= {"seed": seed, "bound_db": bound, "scaled_db": scaled}
         rows += [
-            ConstraintRow(**place, algorithm=name, **figures_of(result, share)) for name, result in results.items()
+            ConstraintRow(
+                **place,
+                algorithm=name,
+                setting=tuned[name.removesuffix(" limited")].setting,
+                **figures_of(result, share),
+            )
+            for name, result in results.items()
         ]
         if duration_s <= LONGEST_KEPT_S and not kept:  # longer ones would fill the memory
             kept = {"KF-ANC": anc, "KF-PB": results["KF-PB"]}

@@ -65,6 +65,7 @@ class MismatchRow(Row):
     kind: str
     amount: float
     tuned_with: str
+    within_budget: bool
 
 
 def planned_runs() -> int:

@@ -115,10 +115,10 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
     return parameters
 
 
-def tried(trials: Iterable[Trial]) -> list[tuple[Any, ...]]:
+def tried(trials: Iterable[Trial], digits: int = 4) -> list[tuple[Any, ...]]:
     """Return what was tried for results.json: setting, mean NSE in dB and output power, or that it diverged."""
     return [
-        (t.setting, "diverged") if t.diverged else (t.setting, round(t.mean_nse_db, 3), round(t.output_power, 4))
+        (t.setting, "diverged") if t.diverged else (t.setting, round(t.mean_nse_db, 3), round(t.output_power, digits))
         for t in trials
     ]
 

@@ -146,7 +146,7 @@ def _measure(runs: Runs, case: Case, scenes: Mapping[int, Scene], joined: Scene,
         rated = _rated(joined, share_db)
         own = {name: best for name, best in tuned[share_db].items() if name not in free}
         return _bounds(case, _rated(scenes[seed], share_db), seed, share_db) + [
-            _row(case, share_db, seed, name, run_setting(rated, name, best.setting, joined.seeds.index(seed)))
+            _row(case, share_db, seed, (name, best), run_setting(rated, name, best.setting, joined.seeds.index(seed)))
             for name, best in own.items()
         ]
 
@@ -154,9 +154,13 @@ def _measure(runs: Runs, case: Case, scenes: Mapping[int, Scene], joined: Scene,
     return [row for rows in runs.map(job, jobs) for row in rows]
 
 
-def _row(case: Case, share_db: float, seed: int, name: str, result: SimulationResult | None) -> BudgetRow:
+def _row(
+    case: Case, share_db: float, seed: int, tuned: tuple[str, Tuned], result: SimulationResult | None
+) -> BudgetRow:
+    name, best = tuned
+    place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share_db": share_db, "seed": seed}
     figures = figures_of(result, 10 ** (share_db / 10))
-    return BudgetRow(path=case.path, noise=case.noise, share_db=share_db, seed=seed, algorithm=name, **figures)
+    return BudgetRow(**place, algorithm=name, setting=best.setting, **figures)
 
 
 def _free_rows(case: Case, scene: Scene, seed: int, tuned: Mapping[str, Tuned]) -> list[BudgetRow]:
@@ -164,7 +168,7 @@ def _free_rows(case: Case, scene: Scene, seed: int, tuned: Mapping[str, Tuned]) 
     rows = []
     for name, best in tuned.items():
         result = run_setting(scene, name, best.setting, scene.seeds.index(seed))
-        rows += [_row(case, share_db, seed, name, result) for share_db in SHARES_DB]
+        rows += [_row(case, share_db, seed, (name, best), result) for share_db in SHARES_DB]
     return rows
 
 
@@ -347,7 +351,7 @@ def _searches(tuned: Mapping[Case, TunedAt]) -> list[tuple[Case, float, str, Tun
 def _parameters(tuned: Mapping[Case, TunedAt]) -> dict[str, Parameter]:
     registry = algorithms()
     trials = {
-        f"{case}, {share_db:g} dB, {name}": tried(best.trials)
+        f"{case}, {share_db:g} dB, {name}": tried(best.trials, digits=5)
         for case, share_db, name, best in _searches(tuned)
         if registry[name].sees_budget or share_db == SHARES_DB[0]  # the others' grids serve for all rated powers
     }

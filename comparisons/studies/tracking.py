@@ -100,6 +100,7 @@ class TrackingRow(WindowRow):
     """An algorithm through an event; the noise reduction is over the whole run, the steady half after all changes."""
 
     event: str
+    within_budget: bool
     mean_nse_db: float = np.nan
     steady_noise_reduction_db: float = np.nan
     settled_s: dict[str, float | None] = field(default_factory=dict)  # by stretch, see `_settling_table`
