@@ -1,4 +1,4 @@
-"""What the speed study times: this package through its public names, and the filters of others, on the same rows.
+"""The variants of the speed study: this package through its public names, and other filters, on the same rows.
 
 Each maker takes a number of taps and returns a function that runs some samples, and how many. Everything is warm by then:
 compiled, with its arrays touched. q = 1 and a small P(0|0) keep S near q, as in a run past its start.

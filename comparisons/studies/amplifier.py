@@ -119,7 +119,7 @@ def main(runs: Runs) -> StudyReport:
         summary=(
             "A tone and a band noise that ask for up to 20 dB more than the rated power, and an amplifier that puts out "
             "sqrt(2 rated power) at most, the peak of a sine of rated power: a hard clip, and a soft saturation (Rapp, p = 2). "
-            "Settings are tuned anew at every overdrive."
+            "Settings are tuned again at every overdrive."
         ),
         fs=FS,
         rated_power=1.0,
@@ -289,7 +289,7 @@ def _overruns(rows: Sequence[AmplifierRow], algorithm: str) -> Verdict:
     asked = [row.asked_power for row in driven if row.diverged_at_s is None]
     growth = [row.weight_growth for row in driven if row.diverged_at_s is None]
     return Verdict(
-        f"A tone of 5 dB of overdrive or more makes {algorithm} overrun, with both amplifiers, where it does not know them",
+        f"A tone of 5 dB of overdrive or more makes {algorithm} overrun, with both amplifiers, if it does not know them",
         len(over) == len(driven) > 0,
         f"{len(over)} of {len(driven)} runs; their weights end up asking for {_span(asked)} times the power that cancels the "
         f"tone, and grow {_span(growth)} times over the second half; {len(away)} passed 1e6 times the rated amplitude in "
@@ -376,20 +376,20 @@ def _notes(pairs: Iterable[str], rows: Sequence[AmplifierRow]) -> list[str]:
     notes = without_measured(pairs)
     if over:
         notes.append(
-            f"{', '.join(over)}: somewhere no setting tried kept the output power to 2 %; the one of lowest mean NSE is shown."
+            f"{', '.join(over)}: in some cases no setting tried kept the output power to 2 %; the one of lowest mean NSE is shown."
         )
     return [
         *notes,
         "Why KF-ANC overruns: its estimate d^ = e + s^*y counts on an anti-noise that the amplifier never put out, so that "
-        "the estimated disturbance grows with the control signal, and the control signal with it. With s^*amp(y) in its "
-        "place the estimate is the disturbance itself, and the filter asks for what a linear amplifier would need: it "
+        "the estimated disturbance grows with the control signal, and the control signal with it. With s^*amp(y) "
+        "instead the estimate is the disturbance itself, and the filter asks for what a linear amplifier would need: it "
         "still overdrives the amplifier, but it does not run away.",
         "The weights grow for as long as the run lasts, so the powers asked for are those of this duration.",
         "Far overdriven, a square wave of the amplifier's limit has a fundamental 4/pi as large (2.1 dB) as the sine at "
         "rated power: that is why an overrunning filter can leave less of a tone, and its harmonics with it.",
         "Harmonics near -63 dB are the sensor noise under them, 40 dB below the disturbance in all: a tone that is not "
         "clipped has none of its own.",
-        "A hard clip spares a sine at rated power; a soft saturation bends it too, so harmonics remain with every "
+        "A hard clip leaves a sine at rated power as it is; a soft saturation distorts it too, so harmonics remain with every "
         "algorithm that uses its rated power.",
         "The peak-limited algorithms were tuned with the amplifier's limit and with the one at which a square wave keeps the "
         "rated power; noise at such a limit has less mean power than the rated one.",
@@ -423,7 +423,7 @@ def amplifier_figures(rows: Sequence[AmplifierRow]) -> list[FigureItem]:
             FigureItem(
                 " ".join(case).replace(" ", "-"),
                 f"{case[0][0].upper()}{case[0][1:]}, {case[1]}, {case[2]}. Above: the disturbance estimate does not know the amplifier; "
-                "below: it does, where it can. Black crosses: the filter overruns, or diverged where it lies on the axis. "
+                "below: it does, if it can. Black crosses: the filter overruns; on the axis: it diverged. "
                 f"Output power is before the amplifier.{cut}",
                 _figure(own, "harmonics_db" if case[1] == "tone" else "coherence"),
             )

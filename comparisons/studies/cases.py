@@ -1,4 +1,4 @@
-"""What the studies beyond the paper and the sweeps share: paths, noises, scenes, rows of results, tuning."""
+"""Paths, noises, scenes, rows of results and tuning, shared by the studies beyond the paper and the sweeps."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What every study keeps of an algorithm in a case; figures are NaN if it diverged."""
+    """The result of an algorithm in a case, common to all studies; figures are NaN if it diverged."""
 
     path: str
     noise: str

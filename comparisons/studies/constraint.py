@@ -596,33 +596,23 @@ def constraint_figures(rows: Sequence[ConstraintRow], jumps: Sequence[Jump], cou
     shortest = min(row.duration_s for row in rows)
     shown = [row for row in rows if row.duration_s == shortest and row.share == SHARES[0]]
     part = f"rated power {100 * SHARES[0]:.0f} %, {shortest:g} s, all seeds"
+    behind = ("KF-OPC", "KF-PB", "KF-PB limited")
     return [
-        _by_case(
+        FigureItem(
             "loss",
-            f"Noise reduction below the bound, the power-constrained Wiener solution ({part}). KF-OPC can lie above it where "
+            f"Noise reduction below the bound, the power-constrained Wiener solution ({part}). KF-OPC can lie above it if "
             "it overspends.",
-            shown,
-            "Below the bound (dB)",
-            lambda row: row.loss_db,
-            mark=0.0,
+            _by_case(shown, "Below the bound (dB)", lambda row: row.loss_db, mark=0.0),
         ),
-        _by_case(
+        FigureItem(
             "power",
             f"Output power over the rated one, mean of the steady half ({part}).",
-            shown,
-            "Output power / rated power",
-            lambda row: row.power,
-            mark=1.0,
+            _by_case(shown, "Output power / rated power", lambda row: row.power),
         ),
-        _by_case(
+        FigureItem(
             "window",
             f"Largest mean power over {1e3 * WINDOW_S:g} ms over the rated power, with the limiter too ({part}).",
-            shown,
-            "Worst 100 ms / rated power",
-            lambda row: row.worst_window,
-            mark=1.0,
-            names=("KF-OPC", "KF-PB", "KF-PB limited"),
-            log=True,
+            _by_case(shown, "Worst 100 ms / rated power", lambda row: row.worst_window, names=behind, log=True),
         ),
         _course(course),
         _limiter(course),
@@ -631,16 +621,14 @@ def constraint_figures(rows: Sequence[ConstraintRow], jumps: Sequence[Jump], cou
 
 
 def _by_case(
-    stem: str,
-    caption: str,
     rows: Sequence[ConstraintRow],
     label: str,
     value: Callable[[ConstraintRow], float],
     *,
-    mark: float,
+    mark: float = 1.0,
     names: Sequence[str] = TUNED,
     log: bool = False,
-) -> FigureItem:
+) -> Any:
     """Draw a column for each combination of paths and noise, and a mark for each seed."""
     figure, ((ax,),) = new_figure((10.5, 4.4))
     cases = list(dict.fromkeys(row.case for row in rows))
@@ -668,7 +656,7 @@ def _by_case(
     ax.grid(True, axis="y", alpha=0.3)
     ax.set_ylabel(label)
     legend_of(figure, [ax])
-    return FigureItem(stem, caption, figure)
+    return figure
 
 
 def _course(course: Course) -> FigureItem:

@@ -71,7 +71,7 @@ def main(runs: Runs) -> StudyReport:
         "linear amplifier."
     )
     return _study(
-        runs, "duct", "Machine noise in a modelled duct", summary, noise, duct.primary, duct.secondary, parameters
+        runs, "duct", "Machine noise in a modelled duct", summary, noise, (duct.primary, duct.secondary), parameters
     )
 
 
@@ -100,8 +100,7 @@ def main_measured(runs: Runs) -> StudyReport | str:
         "Recorded noise in a measured duct",
         summary,
         data.noise - data.noise.mean(),
-        fir_path(data.primary / scale, data.fs),
-        fir_path(data.secondary / scale, data.fs),
+        (fir_path(data.primary / scale, data.fs), fir_path(data.secondary / scale, data.fs)),
         parameters,
     )
 
@@ -112,14 +111,12 @@ def _study(
     title: str,
     summary: str,
     noise: np.ndarray,
-    primary: Any,
-    secondary: Any,
+    paths: tuple[Any, Any],
     parameters: dict[str, Parameter],
 ) -> StudyReport:
     scene = make_scene(
         {SEED: noise},
-        primary,
-        secondary,
+        *paths,
         fs=FS,
         rated_power=RATED_POWER,
         power_multiple=POWER_MULTIPLE,
@@ -150,7 +147,7 @@ def _study(
         algorithms=algorithms,
         extra=extra,
         verdicts=_verdicts(algorithms, results, extra),
-        figures=_figures_of(scene, wiener, results, primary, secondary),
+        figures=_figures_of(scene, wiener, results, *paths),
         sounds=sounds(results),
         notes=[*tuning_note(tuned), ceiling_note(scene), _power_note(algorithms, extra)],
     )

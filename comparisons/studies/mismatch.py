@@ -309,12 +309,12 @@ def _notes(pairs: Mapping[str, Pair], rows: Sequence[MismatchRow], accuracy: Map
     return [
         *without_measured(pairs),
         *kept,
-        "Why the Kalman filters have the bound of 90 degrees too: they trust d^ = e + s^*y, which is off by (s^ - s)*y. "
+        "The Kalman filters have the bound of 90 degrees too because they trust d^ = e + s^*y, which is off by (s^ - s)*y. "
         "Filter weights that change slowly still settle where E[x' e] = 0, as those of FxLMS do, and move there along "
         "R_x'^-1 E[x' e], per frequency at a rate of s/s^: the gain no longer matters, the sign of its real part does.",
-        f"Past 90 degrees KF-ANC runs away as FxLMS does; it passed 1e6 times the rated amplitude {times}. Before that it "
-        "is louder all the same. Other settings hardly help there: the best of FxLMS is its smallest step size, which "
-        "grows too, only slowly.",
+        f"Past 90 degrees KF-ANC runs away as FxLMS does; it passed 1e6 times the rated amplitude {times}. Before that "
+        "it is already louder than the noise. Other settings hardly help: the best for FxLMS is its smallest step size, with "
+        "which it grows too, only slowly.",
         *_tone_note(pairs),
         "An output constraint works as a leak: per frequency the error is d / (1 + s conj(s^)/lambda), which stays bounded "
         "while the real part of s conj(s^) is above -lambda, and below the noise somewhat past 90 degrees.",
@@ -322,8 +322,8 @@ def _notes(pairs: Mapping[str, Pair], rows: Sequence[MismatchRow], accuracy: Map
         + ", ".join(f"{value:.1f} degrees ({name})" for name, value in accuracy.items())
         + f" over the band. A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, "
         f"one of {FS / (4 * BAND_HZ[1]):.0f} its upper edge.",
-        "One seed, one record a case: figures of one algorithm at neighbouring mismatches compare, differences of some "
-        "tenths of a dB between algorithms do not.",
+        "There is one seed and one record for each case: figures of one algorithm at neighbouring mismatches can be "
+        "compared, differences of some tenths of a dB between algorithms cannot.",
     ]
 
 

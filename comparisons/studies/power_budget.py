@@ -308,7 +308,7 @@ def _sizing_table(rows: Sequence[BudgetRow]) -> Table:
     return Table(
         "sizing",
         "Rated power, in dB over the unconstrained one, at which each reaches a noise reduction, between the rated powers "
-        f"of the study by straight lines; only where the mean output power is at most {Tuned.BUDGET:g} of the rated one",
+        f"of the study by straight lines; only if the mean output power is at most {Tuned.BUDGET:g} of the rated one",
         ["paths", "noise", "algorithm", *(f"{target:g} dB" for target in TARGETS_DB)],
         lines,
     )
@@ -411,7 +411,7 @@ def _case(rows: Sequence[BudgetRow], case: Case) -> FigureItem:
     )
     caption = (
         f"{case.noise.capitalize()}, {case.path}: noise reduction (above) and output power (below) against the rated power, "
-        f"means over seeds; hollow where the power is above {Tuned.BUDGET:g} of the rated one. Black: the power-constrained Wiener solution and the scaled one. Without a constraint: {free}."
+        f"means over seeds; hollow if the power is above {Tuned.BUDGET:g} of the rated one. Black: the power-constrained Wiener solution and the scaled one. Without a constraint: {free}."
     )
     return FigureItem(f"{case.path} {case.noise}".replace(" ", "-"), caption, figure)
 

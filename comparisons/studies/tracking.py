@@ -408,19 +408,19 @@ def _notes(pairs: Iterable[str], rows: Sequence[TrackingRow]) -> list[str]:
     ]
     notes = without_measured(pairs)
     if over:
-        notes.append(f"Kept the budget to 2 % over the steady half at no setting: {', '.join(over)}.")
+        notes.append(f"At no setting did these keep the budget to 2 % over the steady half: {', '.join(over)}.")
     return [
         *notes,
-        "To be back within 3 dB of the steady NSE is easy for an algorithm that reduces the noise by little: the settling "
-        "times of MOV-FxLMS and optimal leaky FxLMS compare with others' only beside their noise reduction. Within a jump "
-        "of +20 dB, where the budget allows less than 1 dB, the constrained ones are settled whatever they do.",
-        f"What holds the constrained algorithms back after a loud noise is its power in their memory. KF-OPC's fades with "
-        f"{Scene.power_memory_s:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB's is a window of "
-        f"{PowerBudget(1, 1.0).memory_s:g} s, which believes on purpose that a noise has become softer only when the loud "
-        "part has left it: it comes back at once then. The same memory lets them overspend at the jump itself, for an "
-        "estimate of power follows behind the noise; only a limiter behind the filter holds from the first sample.",
-        "Settings are tuned on the mean NSE over the whole run, which a change in the midst hardly moves: the Kalman "
-        "filters get longer memories than would bring them back soonest.",
+        "An algorithm that reduces the noise by little is soon back within 3 dB of its steady NSE: compare the settling times "
+        "of MOV-FxLMS and optimal leaky FxLMS with others' only together with their noise reduction. During a jump of +20 dB "
+        "the budget allows less than 1 dB, so the constrained algorithms count as settled whatever they do.",
+        "The constrained algorithms recover late from a loud noise because its power stays in their memory. KF-OPC's fades "
+        f"with {Scene.power_memory_s:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB's is a window of "
+        f"{PowerBudget(1, 1.0).memory_s:g} s. It takes a noise to be softer only after the loud part has left the window, and "
+        "then recovers at once. At the jump itself they overspend, since an estimate of power follows behind the noise; only "
+        "a limiter behind the filter holds from the first sample.",
+        "Settings are tuned on the mean NSE over the whole run, which a single change hardly moves: the Kalman filters get "
+        "longer memories than the fastest recovery would need.",
     ]
 
 
@@ -431,11 +431,11 @@ def _sweep_notes(rows: Sequence[TrackingRow], starts: Mapping[str, Sequence[floa
     ]
     notes = [
         f"One sweep starts from the initial variance P0 of a stationary noise. With {START_SHARES[1]:g} of it and the least "
-        f"state noise of the grid, KF-ANC reduces it by {less:.1f} dB in place of {usual:.1f} dB ({path}): a filter that hardly "
-        "knows its weights moves them far for each frequency that the sweep comes by, and is wrong at the next."
+        f"state noise of the grid, KF-ANC reduces it by {less:.1f} dB in place of {usual:.1f} dB ({path}): with a large "
+        "P0 the filter moves its weights far for each frequency of the sweep, and is wrong at the next."
         for path, (usual, less) in starts.items()
     ]
-    return notes + ([f"One sweep was left louder than it was by: {', '.join(louder)}."] if louder else [])
+    return notes + ([f"These left one sweep louder than it was: {', '.join(louder)}."] if louder else [])
 
 
 # ---- Tables and figures

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
             quiet=options.quiet,
         )
     except ScenarioError as error:
-        print(f"{parser.prog}: {error}\nWhat was done by then is kept in {options.output}", file=sys.stderr)
+        print(f"{parser.prog}: {error}\nFinished runs are kept in {options.output}", file=sys.stderr)
         return 1
     except (ValueError, TypeError, OSError, ImportError) as error:
         parser.error(str(error))
@@ -90,9 +90,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--axis", action="append", default=[], metavar="NAME=VALUES", help="an axis of your own function; once for each"
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--jobs", type=int, metavar="N", help="processes on this machine (default: all cores)")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do it, tcp://host:8786")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--jobs", type=int, metavar="N", help="processes on this machine (default: all cores)")
+    place.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do it, tcp://host:8786")
     parser.add_argument("--format", choices=FORMATS, default="csv", help="of the tables (default: csv)")
     parser.add_argument(
         "--x", metavar="AXIS", help="axis the figures are drawn against (default: that of most numbers)"

@@ -1,10 +1,10 @@
-"""The jobs of a sweep, and where they run: this machine's cores, or a Dask cluster."""
+"""The jobs of a sweep, which run on this machine's cores or on a Dask cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any
@@ -18,6 +18,7 @@ CONNECT_S = 15.0  # time to find a scheduler, and then its workers
 Scenario = Callable[[Values], Mapping[str, Any]]
 Job = Callable[[], list[Outcome]]
 Outcomes = Callable[[list[Job]], Generator[list[Outcome], None, None]]  # what runs jobs
+Pool = AbstractContextManager[tuple[int, Outcomes]]  # number of workers, and what runs jobs on them
 
 
 def plan(pending: Sequence[Run], workers: int) -> list[list[Run]]:
@@ -76,7 +77,7 @@ def as_figures(returned: Any) -> dict[str, Any]:
 
 
 class Sent:
-    """A scenario function as cloudpickle sends it: with its source, where its module is registered for that.
+    """A scenario function as cloudpickle sends it: with its source, if its module is registered for that.
 
     distributed itself looks at the outermost object only, and would send a function within it by name.
     """

@@ -16,7 +16,7 @@ from kfopc_filterpy.plot import save_figure
 
 from .figures import BUILT_IN_FIGURES, sweep_figures, swept_axis
 from .grid import Grid, Run, built_in_grid, own_grid
-from .jobs import Scenario, Sent, cluster, jobs_of, local
+from .jobs import Pool, Scenario, Sent, cluster, jobs_of, local
 from .scenario import FIGURES, ScenarioError
 from .store import SweepFolder
 from .table import Record, cell_rows, figure_names, require_format, run_rows, write_table
@@ -110,7 +110,7 @@ def run_sweep(
     OSError
         The folder cannot be written, or no scheduler answers.
     ScenarioError
-        A scenario raised an exception; the message says which. What was done by then is kept.
+        A scenario raised an exception; the message says which. Finished runs are kept.
 
     Examples
     --------
@@ -136,7 +136,8 @@ def run_sweep(
     done = store.done()
     pending = [run for run in made.runs() if run.index not in done]
     if pending:
-        _work_off(made, pending, store, done, scenario, jobs, scheduler, quiet)
+        pool = local(jobs) if scheduler is None else cluster(scheduler)
+        _work_off(made, pending, store, done, Sent(scenario) if scenario and scheduler else scenario, pool, quiet)
     cells, runs = cell_rows(made, done), run_rows(made, done)
     files = [write_table(cells, store.path / "cells", format), write_table(runs, store.path / "runs", format)]
     names = _drawn(figures, figure_names(done), scenario is None)
@@ -151,8 +152,7 @@ def _work_off(
     store: SweepFolder,
     done: dict[int, dict[str, Any]],
     scenario: Scenario | None,
-    jobs: int | None,
-    scheduler: str | None,
+    pool: Pool,
     quiet: bool,
 ) -> None:
     """Do the pending runs, and keep each job's as it ends."""
@@ -160,11 +160,9 @@ def _work_off(
 
     diverged = sum(figures["diverged"] for figures in done.values())
     with (
-        local(jobs) if scheduler is None else cluster(scheduler) as (workers, run),
+        pool as (workers, run),
         tqdm(total=len(grid), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
-        closing(
-            run(jobs_of(grid, pending, workers, Sent(scenario) if scenario and scheduler else scenario))
-        ) as outcomes,
+        closing(run(jobs_of(grid, pending, workers, scenario))) as outcomes,
     ):
         for own in outcomes:
             store.keep(own)

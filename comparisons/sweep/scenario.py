@@ -124,8 +124,8 @@ class _Prepared:
         setting, algorithm = self.scenario["setting"], algorithms()[self.scenario["algorithm"]]
         if setting != TUNED_SETTING:
             return middle(algorithm.first) if setting == DEFAULT_SETTING else setting
-        scene = [self.scenario[name] for name in OF_SCENE[:-1]]
-        return _tuned(*scene, tuning_seed, self.scenario["algorithm"], self.rated_power, self.amplifier)
+        scene = (*(self.scenario[name] for name in OF_SCENE[:-1]), tuning_seed)
+        return _tuned(scene, self.scenario["algorithm"], self.rated_power, self.amplifier)
 
 
 class ScenarioError(RuntimeError):
@@ -178,20 +178,9 @@ class _OneByOne:
 
 
 @lru_cache(maxsize=256)
-def _tuned(
-    path: str,
-    noise: str,
-    duration_s: float,
-    n_taps: int,
-    sensor_noise_db: float,
-    seed: int,
-    algorithm: str,
-    rated_power: float,
-    amplifier: Any,
-) -> Setting | None:
+def _tuned(of_scene: tuple[Any, ...], algorithm: str, rated_power: float, amplifier: Any) -> Setting | None:
     """Return the best setting by the studies' rule on one seed, with the exact path; None if all diverge."""
-    scene = scene_of(path, noise, duration_s, n_taps, sensor_noise_db, seed)
-    scene = replace(scene, rated_power=rated_power, amplifier=amplifier)
+    scene = replace(scene_of(*of_scene), rated_power=rated_power, amplifier=amplifier)
     try:
         return tune(_OneByOne(), scene, (algorithm,))[algorithm].setting  # type: ignore[arg-type]
     except AllDivergedError:

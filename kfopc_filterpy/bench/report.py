@@ -85,7 +85,7 @@ def prepare_folder(folder: str | os.PathLike[str]) -> Path:
 
 
 def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str]) -> Path:
-    """Write report.html, results.json, figures/, audio/ and, where there are any, tables/ into a folder.
+    """Write report.html, results.json, figures/, audio/ and, if there are any, tables/ into a folder.
 
     Parameters
     ----------

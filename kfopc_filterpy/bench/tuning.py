@@ -140,7 +140,7 @@ def run_settings(
     Parameters
     ----------
     runs : Runs
-        What runs the jobs.
+        Runs the jobs.
     scene : Scene
         The scene.
     jobs : sequence of tuple
@@ -189,7 +189,7 @@ def try_settings(
     Parameters
     ----------
     runs : Runs
-        What runs the jobs.
+        Runs the jobs.
     scene : Scene
         The scene.
     settings : mapping of str to sequence
@@ -250,7 +250,7 @@ def best_setting(scene: Scene, algorithm: str, trials: Sequence[Trial]) -> Tuned
     algorithm : str
         Name in the registry, see `algorithms`.
     trials : sequence of Trial
-        What was tried.
+        The trials to choose from.
 
     Returns
     -------
@@ -287,7 +287,7 @@ def tune(
     Parameters
     ----------
     runs : Runs
-        What runs the jobs.
+        Runs the jobs.
     scene : Scene
         The scene.
     names : sequence of str, optional
