@@ -341,7 +341,7 @@ def _budget_line(results: Results, algorithm: str) -> list[float]:
         own = [
             row
             for row in rows
-            if (row["case"]["path"], row["case"]["noise"]) == (path, noise)
+            if (row["path"], row["noise"]) == (path, noise)
             and (row["algorithm"], row["share_db"]) == (algorithm, TABLED_DB)
         ]
         numbers += [sum(row[figure] for row in own) / len(own) for figure in ("noise_reduction_db", "power")]

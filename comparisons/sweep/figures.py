@@ -13,7 +13,7 @@ import numpy as np
 
 from kfopc_filterpy.plot import curve_style
 
-from ..studies.parts import MARK, legend_of
+from ..studies.parts import MARK
 from .grid import AXES, Grid, Values
 from .table import Record
 
@@ -73,12 +73,19 @@ def _figure(
         _panel(ax, grid, rows, name, x, curves)
     axes[-1].set_xlabel(_label(x))
     if curves is not None:
-        legend_of(figure, axes[:1])
+        _legend_above(axes[0])
     if fixed:
         figure.suptitle(
             ", ".join(f"{_label(name)}: {_words(value)}" for name, value in fixed.items()), fontsize="medium"
         )
     return figure
+
+
+def _legend_above(ax: Axes) -> None:
+    """Draw a legend above an axes, below the figure's title: in one row if it fits, else in two columns."""
+    labels = ax.get_legend_handles_labels()[1]
+    columns = len(labels) if sum(len(label) + 6 for label in labels) <= 75 else 2
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False, fontsize="small")
 
 
 def _panel(ax: Axes, grid: Grid, rows: Sequence[Record], name: str, x: str, curves: str | None) -> None:
