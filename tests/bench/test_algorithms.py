@@ -23,6 +23,7 @@ from kfopc_filterpy.bench.tuning import (
 )
 from kfopc_filterpy.controllers.base import FilteredReferenceController
 from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.plot import curve_style
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = 16000.0
@@ -184,3 +185,11 @@ def test_trials_are_means_over_seeds_and_one_divergence_is_all(scene: Scene, mon
     assert best_setting(two, "FxLMS", [lost]) is None
     with pytest.raises(AllDivergedError, match=r"FxLMS diverged at every setting tried: \[0\.1\]"):
         tune(Runs(), two, ["FxLMS"], trials={"FxLMS": [lost]})
+
+
+def test_every_algorithm_has_a_style_that_no_other_has() -> None:
+    styles = {name: tuple(map(str, curve_style(name).values())) for name in REGISTRY}
+    assert len(set(styles.values())) == len(REGISTRY)
+    assert curve_style(7) == curve_style(1)
+    with pytest.raises(ValueError, match="curve must be the name of an algorithm or a number, got 'KF-XYZ'"):
+        curve_style("KF-XYZ")
