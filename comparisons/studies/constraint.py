@@ -573,9 +573,7 @@ def _amplifier_table(clipped: Sequence[ClippedRow]) -> Table:
 
 def _parameters(tuned: Mapping[Case, Mapping[str, Tuned]]) -> dict[str, Parameter]:
     defaults = PowerBudget(1, 1.0)
-    parameters = case_parameters(Parameter(N_TAPS, "the aim's own"), None)
-    del parameters["duration_s"]
-    return parameters | {
+    return case_parameters(Parameter(N_TAPS, "the aim's own")) | {
         "rated_power": Parameter(list(SHARES), "shares of the unconstrained control power of each noise"),
         "durations_s": Parameter(list(DURATIONS_S), "from switch-on on; the steady half counts"),
         "seeds": Parameter(list(SEEDS), "of noise; of a tone, its phase; of the recording, where it begins"),

@@ -139,7 +139,7 @@ def tuned_in_words(tuned: Mapping[str, Tuned | None]) -> dict[str, Any]:
     }
 
 
-def case_parameters(n_taps: Parameter, duration_s: Any) -> dict[str, Parameter]:
+def case_parameters(n_taps: Parameter) -> dict[str, Parameter]:
     """Return the parameters that the studies beyond the paper state."""
     return {
         "fs_hz": Parameter(FS, "the rate of the measured duct"),
@@ -147,7 +147,6 @@ def case_parameters(n_taps: Parameter, duration_s: Any) -> dict[str, Parameter]:
         "unconstrained_control_power": Parameter(
             1.0, "every noise is scaled to it: (R_x' + q/(N P0) I) w = r over the record"
         ),
-        "duration_s": Parameter(duration_s, "from switch-on on; the steady half counts"),
         "switch_on_s": Parameter(SWITCH_ON_S, "the noise runs before"),
         "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
     }
@@ -155,7 +154,8 @@ def case_parameters(n_taps: Parameter, duration_s: Any) -> dict[str, Parameter]:
 
 def driven_parameters(duration_s: Any, overdrive_db: Any) -> dict[str, Parameter]:
     """Return the parameters of the studies that drive a noise beyond the rated power."""
-    return case_parameters(Parameter(N_TAPS, "the tonal study's"), duration_s) | {
+    return case_parameters(Parameter(N_TAPS, "the tonal study's")) | {
+        "duration_s": Parameter(duration_s, "from switch-on on; the steady half counts"),
         "rated_power": Parameter(overdrive_db, "overdrive in dB: the unconstrained control power over the rated power"),
         "tone_hz": Parameter(TONE_HZ, "within the band"),
         "band_hz": Parameter(list(BAND_HZ), "where both ducts carry sound"),

@@ -355,7 +355,8 @@ def _parameters(tuned: Mapping[Case, TunedAt]) -> dict[str, Parameter]:
         for case, share_db, name, best in _searches(tuned)
         if registry[name].sees_budget or share_db == SHARES_DB[0]  # the others' grids serve for all rated powers
     }
-    return case_parameters(Parameter(N_TAPS, "as in the constraint study"), DURATION_S) | {
+    return case_parameters(Parameter(N_TAPS, "as in the constraint study")) | {
+        "duration_s": Parameter(DURATION_S, "from switch-on on; the steady half counts"),
         "rated_power_db": Parameter(list(SHARES_DB), "over the unconstrained control power of each noise"),
         "seeds": Parameter(list(SEEDS), "of noise; of the recording, where it begins; tuned on all of them"),
         "settings": Parameter(
