@@ -1,1 +1,1 @@
-"""Reproductions of the three studies of the KF-OPC paper: `python -m comparisons`."""
+"""Studies of the KF-OPC paper, studies beyond it, sweeps and the speed study: `python -m comparisons`."""

@@ -10,10 +10,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from textwrap import fill
 
-from kfopc_filterpy.bench.report import StudyReport, prepare_folder, results_table, write_report
-from kfopc_filterpy.bench.scene import Runs
+from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
 
-from .speed.first_use import compile_ahead
 from .studies import amplifier, broadband, constraint, duct, mismatch, power_budget, tonal, tracking
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
@@ -78,8 +76,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = {name: (STUDIES | FURTHER)[name] for name in options.studies or STUDIES}
     planned = sum(planned_runs() for _, planned_runs in chosen.values())
     with tqdm(total=planned, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
-        bar.set_description("compiling, at the first use")
-        compile_ahead()
         runs = Runs(bar)
         for name, (study, planned_runs) in chosen.items():
             bar.set_description(name)

@@ -69,7 +69,7 @@ class Results:
         """Runs of an algorithm in the constraint study, on stationary or on varying noise."""
         steady = ("tone", "compressor", "band noise")
         rows = self.extra("constraint", "rows")
-        return [r for r in rows if r["algorithm"] == algorithm and (r["setting"]["noise"] in steady) == stationary]
+        return [r for r in rows if r["algorithm"] == algorithm and (r["noise"] in steady) == stationary]
 
     def summary(self, algorithm: str) -> list[float]:
         """A line of the constraint study's summary."""
@@ -295,7 +295,7 @@ def _constraint() -> Iterator[Quote]:
 
 def _worst_loss(results: Results, noise: str) -> float:
     """Largest loss of KF-PB compared with the bound, on one noise."""
-    rows = [row for row in results.rows("KF-PB", False) if row["setting"]["noise"] == noise]
+    rows = [row for row in results.rows("KF-PB", False) if row["noise"] == noise]
     return max(row["bound_db"] - row["noise_reduction_db"] for row in rows)
 
 
@@ -341,7 +341,7 @@ def _budget_line(results: Results, algorithm: str) -> list[float]:
         own = [
             row
             for row in rows
-            if (row["case"]["path"], row["case"]["noise"]) == (path, noise)
+            if (row["path"], row["noise"]) == (path, noise)
             and (row["algorithm"], row["share_db"]) == (algorithm, TABLED_DB)
         ]
         numbers += [sum(row[figure] for row in own) / len(own) for figure in ("noise_reduction_db", "power")]

@@ -1,7 +1,7 @@
-"""`python -m comparisons speed`: what a sample costs, against the machine's limit and against other filters.
+"""`python -m comparisons speed`: the time of a sample, against the machine's limit and against other filters.
 
 The limit is 3 L^2 flops at the rate of a matrix product (dgemm, 384 x 384, best of 20), one BLAS thread. The probe and
-all variants take turns, and of each the best time counts: what other work the machine has falls on all alike.
+all variants take turns, and the best time of each counts, so that other work on the machine slows all of them alike.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from . import variants
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TAPS = (32, 64, 128, 256, 512, 1024)
+TAPS = (16, 32, 64, 128, 256, 512, 1024)
 ROUNDS = 8
 PROBE_SIZE, PROBE_TIMES = 384, 20
 TURN_S = 0.05  # a variant's turn, about as long as the probe's
 REAL_TIME_FS = (16000.0, 48000.0)
 WORST_TAPS = (128, 256, 512)
 WORST_SAMPLES = 1_000_000
-FIRST_USES, FIRST_USE_TIMES = ("alone", "together", "compile_ahead"), 3  # of `first_use`; the shortest counts
-# Above these taps a variant would take minutes or gigabytes, and the trend is plain.
+FIRST_USE_TIMES = 3  # the shortest counts
+# Above these taps a variant would take minutes or gigabytes, and the trend is clear.
 LARGEST = {"pykalman": 512, f"closed loop, each of {variants.SCENARIOS} KF-OPC": 512}
 NEEDS = {
     "statsmodels": "statsmodels",
@@ -43,7 +43,7 @@ NEEDS = {
 OTHER_RECURSIONS = ("padasip RLS", "pyroomacoustics RLS")
 FIRST_USE = """
 import time
-from comparisons.speed.first_use import {name}
+from comparisons.speed.variants import {name}
 def seconds():
     began = time.perf_counter()
     {name}()
@@ -53,14 +53,14 @@ print(seconds() - seconds())
 
 
 def seconds(work: Callable[[], Any]) -> float:
-    """Time of one call."""
+    """Return the time of one call."""
     began = time.perf_counter()
     work()
     return time.perf_counter() - began
 
 
 def shortest(work: Callable[[], Any]) -> float:
-    """Best time of a turn: as many calls as the probe has where they are short, one where they are long."""
+    """Return the best time of a turn: as many calls as the probe has if they are short, one if they are long."""
     best, spent, calls = np.inf, 0.0, 0
     while calls == 0 or (spent < TURN_S and calls < PROBE_TIMES):
         took = seconds(work)
@@ -69,7 +69,7 @@ def shortest(work: Callable[[], Any]) -> float:
 
 
 def dgemm_probe() -> Callable[[], float]:
-    """A function that gives the rate of a matrix product in GFLOP/s, the best of some."""
+    """Return a function that measures the rate of a matrix product in GFLOP/s, the best of some."""
     from scipy.linalg.blas import dgemm
 
     a = np.asfortranarray(np.random.default_rng(0).standard_normal((PROBE_SIZE, PROBE_SIZE)))
@@ -78,7 +78,7 @@ def dgemm_probe() -> Callable[[], float]:
 
 
 def chosen_variants(taps: int) -> dict[str, Callable[[int], variants.Work]]:
-    """All variants for a number of taps whose packages are installed."""
+    """Return all variants for a number of taps whose packages are installed."""
     every = variants.OURS | variants.PEERS
     return {
         name: make
@@ -88,7 +88,7 @@ def chosen_variants(taps: int) -> dict[str, Callable[[int], variants.Work]]:
 
 
 def measure(taps: int, rounds: int = ROUNDS, tick: Callable[[], Any] = lambda: None) -> tuple[float, dict[str, float]]:
-    """dgemm rate in GFLOP/s and microseconds a sample of each variant: the best of some rounds, taken in turns."""
+    """Return the dgemm rate in GFLOP/s and the time of a sample in µs by variant: the best of some rounds, in turns."""
     probe, works = dgemm_probe(), {name: make(taps) for name, make in chosen_variants(taps).items()}
     rate, best = 0.0, dict.fromkeys(works, np.inf)
     for _ in range(rounds):
@@ -100,7 +100,7 @@ def measure(taps: int, rounds: int = ROUNDS, tick: Callable[[], Any] = lambda: N
 
 
 def rows_of(taps: int, rate: float, best: dict[str, float]) -> list[dict[str, Any]]:
-    """Rows of speed.json."""
+    """Return the rows of speed.json."""
     limit = 3 * taps**2 / rate / 1e3
     return [
         {
@@ -116,19 +116,15 @@ def rows_of(taps: int, rate: float, best: dict[str, float]) -> list[dict[str, An
 
 
 def worst_sample(taps: int, samples: int = WORST_SAMPLES) -> dict[str, float]:
-    """Longest and usual time of one sample of the streaming kernel, called from Python sample by sample."""
-    from kfopc_filterpy.kernels.covariance import predict_covariance, project_covariance, update_weights
-
-    cov, w = variants.filter_state(taps)
-    x = variants.signal(taps, 4096)
+    """Return the longest and the usual time of one sample of the filter, called from Python sample by sample."""
+    kf, x = variants.random_walk(taps), variants.signal(taps, 4096)
     times = np.empty(samples)
     clock = time.perf_counter_ns
     for k in range(-10, samples):
         h = x[k % 4096 : k % 4096 + taps]
         began = clock()
-        predict_covariance(cov, 1.0, variants.R)
-        S = project_covariance(cov, h) + variants.Q
-        update_weights(cov, w, h, 1.0, S, variants.Q)
+        kf.predict()
+        kf.update(1.0, H=h)
         if k >= 0:
             times[k] = clock() - began
     usual, rare = np.percentile(times, (50, 99.99)) / 1e3
@@ -136,7 +132,7 @@ def worst_sample(taps: int, samples: int = WORST_SAMPLES) -> dict[str, float]:
 
 
 def first_samples_us(taps: int) -> float:
-    """Usual time of the samples after a large P(0|0), here 1 with q = 1e-3, whose downdate is done carefully."""
+    """Return the usual time of an update after a large P(0|0), here 1 with q = 1e-3, which is computed carefully."""
     kf = variants.KFOPC.random_walk(taps, state_noise=variants.R, measurement_noise=1e-3)
     x = variants.signal(taps, 60)
     times = []
@@ -149,10 +145,11 @@ def first_samples_us(taps: int) -> float:
 
 
 def first_use_s(name: str) -> float:
-    """Seconds that a function of `first_use` takes longer the first time, where nothing has been compiled yet."""
+    """Return the seconds that a first use takes longer than the second, with nothing compiled yet."""
     with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
-        command = [sys.executable, "-c", FIRST_USE.format(name=name)]
+        path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "PYTHONPATH": path}
+        command = [sys.executable, "-c", FIRST_USE.format(name=variants.FIRST_USES[name].__name__)]
         ran = subprocess.run(command, env=environment, capture_output=True, text=True)
     if ran.returncode:
         raise RuntimeError(f"the first run failed: {ran.stderr}")
@@ -160,13 +157,13 @@ def first_use_s(name: str) -> float:
 
 
 def real_time_taps(rows: list[dict[str, Any]], name: str, fs: float) -> int | None:
-    """Most taps timed at which a sample of a variant is over before the next."""
+    """Return the most taps at which a sample of a variant is over before the next."""
     fits = [row["taps"] for row in rows if row["variant"] == name and row["us_per_sample"] < 1e6 / fs]
     return max(fits, default=None)
 
 
 def figure(result: dict[str, Any]) -> Figure:
-    """Cost against taps, both logarithmic."""
+    """Draw the time of a sample against the taps, both logarithmic."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(8.5, 5.5), layout="constrained")
@@ -190,7 +187,7 @@ def figure(result: dict[str, Any]) -> Figure:
 
 
 def table(result: dict[str, Any]) -> str:
-    """What was measured, for the terminal."""
+    """Return what was measured for the terminal."""
     rows = result["rows"]
     lines = [f"{'µs a sample':32}" + "".join(f"{n:>10}" for n in TAPS)]
     cell = {(row["variant"], row["taps"]): row for row in rows}
@@ -209,36 +206,37 @@ def table(result: dict[str, Any]) -> str:
 
 
 def remarks(result: dict[str, Any]) -> list[str]:
-    """What the table does not say."""
+    """Return what the table does not say."""
     rows = result["rows"]
     us = {(row["variant"], row["taps"]): row["us_per_sample"] for row in rows}
     shared = f"closed loop, each of {variants.SCENARIOS} KF-OPC"
     real_time = (
         f"{name} at {fs / 1e3:g} kHz: {real_time_taps(rows, name, fs)}"
-        for name in ("streaming kernel", "closed loop, KF-OPC", "filterpy API of KFOPC", "filterpy")
+        for name in ("closed loop, KF-OPC", "stepped from Python, KF-OPC", "filterpy API of KFOPC", "filterpy")
         for fs in REAL_TIME_FS
     )
     missing = [name for name in variants.PEERS if (name, TAPS[0]) not in us]
-    burst = 3 * 256**2 * variants.BLOCK_SIZE / result["dgemm_gflops"] / 1e3
     return [
         f"dgemm, one thread: {result['dgemm_gflops']:.1f} GFLOP/s.",
         f"Most taps timed that run in real time, {'; '.join(real_time)}.",
-        f"The closed loop at 128 taps costs {us['closed loop, KF-OPC', 128] / us['streaming kernel', 128]:.2f} times its "
-        "filter's update.",
-        f"KF-PB costs {us['closed loop, KF-PB', 256] / us['closed loop, KF-OPC', 256]:.2f} times KF-OPC at 256 taps.",
-        f"{variants.SCENARIOS} scenarios that share gains, at 256 taps: "
-        f"{us['closed loop, KF-OPC', 256] / us[shared, 256]:.1f} times cheaper than as many runs.",
-        f"The causal block kernel puts its work off to the change of blocks ({variants.BLOCK_SIZE} samples): a burst of "
-        f"{burst:.0f} µs or more at 256 taps.",
         *(
-            f"One sample of the streaming kernel, called from Python, {w['taps']} taps, {WORST_SAMPLES:,} samples: "
+            f"{name} stepped from Python takes {us[f'stepped from Python, {name}', 128]:.1f} µs a sample at 128 taps, "
+            f"in the compiled loop {us[f'closed loop, {name}', 128]:.1f} µs."
+            for name in variants.CONTROLLERS
+        ),
+        f"KF-PB takes {us['closed loop, KF-PB', 256] / us['closed loop, KF-OPC', 256]:.2f} times as long as KF-OPC at 256 taps.",
+        f"{variants.SCENARIOS} scenarios that share gains, at 256 taps: "
+        f"{us['closed loop, KF-OPC', 256] / us[shared, 256]:.1f} times faster than as many runs.",
+        *(
+            f"One sample of the filterpy API, {w['taps']} taps, {WORST_SAMPLES:,} samples: "
             f"median {w['median_us']:.1f} µs, 99.99 % within {w['percentile_99_99_us']:.1f} µs, worst "
-            f"{w['worst_us']:.0f} µs (the operating system's part in it included). While S/q exceeds 1e3, after a large "
+            f"{w['worst_us']:.0f} µs (with interruptions by the operating system). While S/q exceeds 1e3, after a large "
             f"P(0|0): {w['first_samples_us']:.0f} µs."
             for w in result["worst_sample"]
         ),
-        "First use, nothing compiled yet: {alone:.1f} s for `simulate`, {together:.1f} s for `simulate_scenarios`, "
-        "{compile_ahead:.1f} s for the studies, which have both compiled at once.".format(**result["first_use_s"]),
+        "First use, nothing compiled yet: "
+        + ", ".join(f"{took:.1f} s for {name}" for name, took in result["first_use_s"].items())
+        + ".",
         f"{' and '.join(OTHER_RECURSIONS)}: another recursion, with forgetting in place of state noise.",
         *([f"Not installed, left out: {', '.join(missing)}; they come with the extra bench."] if missing else []),
     ]
@@ -254,7 +252,7 @@ def main(folder: Path, quiet: bool = False) -> int:
     rates, rows = [], []
     with (
         threadpool_limits(1),
-        tqdm(total=len(TAPS) * ROUNDS + len(WORST_TAPS) + len(FIRST_USES), disable=quiet, unit="round") as bar,
+        tqdm(total=len(TAPS) * ROUNDS + len(WORST_TAPS) + len(variants.FIRST_USES), disable=quiet, unit="round") as bar,
     ):
         for taps in TAPS:
             bar.set_description(f"speed, {taps} taps")
@@ -267,7 +265,7 @@ def main(folder: Path, quiet: bool = False) -> int:
             worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
             bar.update()
         first_use = {}
-        for name in FIRST_USES:
+        for name in variants.FIRST_USES:
             bar.set_description(f"speed, first use, {name}")
             first_use[name] = min(first_use_s(name) for _ in range(FIRST_USE_TIMES))
             bar.update()

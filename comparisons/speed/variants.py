@@ -1,143 +1,46 @@
-"""What the speed study times: the kernels of this package, and the filters of others, each on the same rows.
+"""The variants of the speed study: this package through its public names, and other filters, on the same rows.
 
-Each maker takes a number of taps and gives a function that runs some samples, and how many. Everything is warm when it
-is returned: compiled, with its arrays touched. q = 1 and a small P(0|0) keep S near q, as in a run past its start.
+Each maker takes a number of taps and returns a function that runs some samples, and how many. Everything is warm by then:
+compiled, with its arrays touched. q = 1 and a small P(0|0) keep S near q, as in a run past its start.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from numpy.lib.stride_tricks import sliding_window_view
 
-from kfopc_filterpy import KFOPC, MOVFxLMS, kf_opc, kf_pb, simulate, simulate_scenarios
-from kfopc_filterpy.kernels.block import Block, CausalBlock, project_in_block, update_in_block
-from kfopc_filterpy.kernels.compiling import compiled
-from kfopc_filterpy.kernels.covariance import (
-    FAST,
-    Covariance,
-    new_covariance,
-    predict_covariance,
-    project_covariance,
-    update_weights,
-)
+from kfopc_filterpy import KFOPC, MOVFxLMS, kf_anc, kf_opc, kf_pb, simulate, simulate_scenarios
 
 Work = tuple[Callable[[], Any], int]
 R, Q, P0 = 1e-8, 1.0, 1e-3
-BLOCK_SIZE = 48
 SCENARIOS = 64
 PATH = np.random.default_rng(0).standard_normal(32) / 8  # secondary path of the closed loops
 TARGET_FLOPS = 1e8  # a timing takes about this much work of ours, and a few samples of the slow ones
 
 
 def samples_for(taps: int, most: int = 20000, least: int = 192) -> int:
-    """Samples of one timing."""
+    """Return the number of samples of one timing."""
     return int(np.clip(TARGET_FLOPS / (3 * taps**2), least, most))
 
 
 def signal(taps: int, samples: int) -> np.ndarray:
-    """Filtered reference whose every `taps` neighbours are a row."""
+    """Return a filtered reference in which every `taps` neighbours are a row."""
     return np.random.default_rng(1).standard_normal(samples + taps)
 
 
-@compiled()
-def _stream(cov, w, x, d, state_noise, measurement_noise):
-    for k in range(d.size):
-        h = x[k : k + w.size]
-        predict_covariance(cov, 1.0, state_noise)
-        S = project_covariance(cov, h) + measurement_noise
-        update_weights(cov, w, h, d[k], S, measurement_noise)
-
-
-@compiled()
-def _stream_in_block(cov, block, w, rows, d, state_noise, measurement_noise):
-    for k in range(d.size):
-        h = rows[k, : w.size]
-        S = project_in_block(cov, block, h, state_noise)[0] + measurement_noise
-        update_in_block(cov, block, w, h, d[k], S)
-
-
-def filter_state(taps: int) -> tuple[Covariance, np.ndarray]:
-    """Covariance and weights of a filter before its first sample."""
-    return new_covariance(P0 * np.eye(taps)), np.zeros(taps)
-
-
-def streaming(taps: int) -> Work:
-    """The definition: sample by sample, in one compiled loop."""
-    samples = samples_for(taps)
-    x, (cov, w) = signal(taps, samples), filter_state(taps)
-    d = x[:samples].copy()
-    _stream(cov, w, x, d[:2], R, Q)
-    return lambda: _stream(cov, w, x, d, R, Q), samples
-
-
-def _block_samples(taps: int) -> int:
-    return samples_for(taps, most=20 * BLOCK_SIZE, least=8 * BLOCK_SIZE) // BLOCK_SIZE * BLOCK_SIZE
-
-
-def block(taps: int) -> Work:
-    """All rows of a block known, in matrix products."""
-    return _rows_known(taps, "advance")
-
-
-def pairs(taps: int) -> Work:
-    """All rows of a block known, two at a time."""
-    return _rows_known(taps, "advance_in_pairs")
-
-
-def _rows_known(taps: int, how: str) -> Work:
-    """The weights as `simulate_scenarios` has them: two products with the gains."""
-    samples = _block_samples(taps)
-    x, (cov, w) = signal(taps, samples), filter_state(taps)
-    d, work = x[:samples].copy(), Block(taps, BLOCK_SIZE)
-
-    def run() -> None:
-        for first in range(0, samples, BLOCK_SIZE):
-            work.rows[:, :taps] = sliding_window_view(x[first : first + BLOCK_SIZE + taps - 1], taps)
-            S = getattr(work, how)(cov, R, Q)
-            _correct_in_turn(w, work.rows, work.directions, S, d[first : first + BLOCK_SIZE])
-
-    run()
-    return run, samples
-
-
-@compiled(fastmath=FAST)
-def _correct_in_turn(w, rows, directions, S, d):
-    for k in range(d.size):
-        y = d[k]
-        for i in range(w.size):
-            y -= rows[k, i] * w[i]
-        for i in range(w.size):
-            w[i] += directions[k, i] * (y / S[k])
-
-
-def block_causal(taps: int) -> Work:
-    """Each row only when its sample comes."""
-    samples = _block_samples(taps)
-    x, (cov, w) = signal(taps, samples), filter_state(taps)
-    rows = sliding_window_view(x[::-1], taps)[::-1].copy()  # newest first, as a delay line has them
-    d, work = x[:samples].copy(), CausalBlock(taps, BLOCK_SIZE)
-
-    def run() -> None:
-        for first in range(1, samples + 1, BLOCK_SIZE):
-            work.open(cov, rows[first - 1])
-            _stream_in_block(
-                cov, work.state, w, rows[first : first + BLOCK_SIZE], d[first - 1 : first - 1 + BLOCK_SIZE], R, Q
-            )
-            work.close(cov, R)
-
-    run()
-    return run, samples
+def random_walk(taps: int) -> KFOPC:
+    """Return the filter that the study times."""
+    return KFOPC.random_walk(taps, state_noise=R, measurement_noise=Q, initial_variance=P0)
 
 
 def filterpy_api(taps: int) -> Work:
-    """`KFOPC.random_walk` called as a filterpy filter: `predict()`, `update(z, H=row)`."""
+    """Time `KFOPC.random_walk` called as a filterpy filter: `predict()`, `update(z, H=row)`."""
     samples = samples_for(taps, most=1000)
-    x = signal(taps, samples)
-    kf = KFOPC.random_walk(taps, state_noise=R, measurement_noise=Q, initial_variance=P0)
+    x, kf = signal(taps, samples), random_walk(taps)
 
     def run() -> None:
         for k in range(samples):
@@ -148,46 +51,93 @@ def filterpy_api(taps: int) -> Work:
     return run, samples
 
 
-def _loop(controller: Any, taps: int) -> Work:
-    samples = samples_for(taps, least=2000)
-    x = signal(0, samples)
-    d = np.random.default_rng(2).standard_normal(samples)
+# ---- Controllers, in the compiled loop and stepped from Python
+
+
+def _kalman(make: Any, taps: int, **settings: Any) -> Any:
+    return make(taps, PATH, state_noise=R, measurement_noise=Q, initial_variance=P0, **settings)
+
+
+# KF-PB has so low a rated power that lambda is always searched for.
+CONTROLLERS: dict[str, Callable[[int], Any]] = {
+    "KF-ANC": lambda taps: _kalman(kf_anc, taps),
+    "KF-OPC": lambda taps: _kalman(kf_opc, taps, rated_power=0.1),
+    "KF-PB": lambda taps: _kalman(kf_pb, taps, rated_power=1e-6),
+    "MOV-FxLMS": lambda taps: MOVFxLMS(taps, PATH, step_size=1e-5, rated_power=0.1),
+}
+
+
+def _noise(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a reference and a disturbance."""
+    return signal(0, samples), np.random.default_rng(2).standard_normal(samples)
+
+
+def closed_loop(name: str, taps: int) -> Work:
+    """Time a controller in `simulate`: amplifier, paths, power estimates, records."""
+    controller, samples = CONTROLLERS[name](taps), samples_for(taps, least=2000)
+    x, d = _noise(samples)
     simulate(controller, x[:2], disturbance=d[:2], secondary_path=PATH)
     return lambda: simulate(controller, x, disturbance=d, secondary_path=PATH), samples
 
 
-def closed_loop(taps: int) -> Work:
-    """KF-OPC in `simulate`: amplifier, paths, power estimates, records."""
-    return _loop(_kf_opc(taps, 0), taps)
+def stepped(name: str, taps: int) -> Work:
+    """Time a controller stepped from Python, two calls a sample, without a loop around it."""
+    controller, samples = CONTROLLERS[name](taps), samples_for(taps, most=1000)
+    x, d = _noise(samples)
 
+    def run() -> None:
+        for k in range(samples):
+            controller.control_signal(x[k])
+            controller.update(d[k])
 
-def closed_loop_lms(taps: int) -> Work:
-    """MOV-FxLMS in `simulate`: what the loop costs beside an O(L) update."""
-    return _loop(MOVFxLMS(taps, PATH, step_size=1e-5, rated_power=0.1), taps)
-
-
-def closed_loop_budget(taps: int) -> Work:
-    """KF-PB in `simulate`, its rated power so low that lambda is always searched for."""
-    return _loop(kf_pb(taps, PATH, rated_power=1e-6, state_noise=R, measurement_noise=Q, initial_variance=P0), taps)
-
-
-def _kf_opc(taps: int, i: int) -> Any:
-    return kf_opc(taps, PATH, rated_power=0.1 * (1 + i), state_noise=R, measurement_noise=Q, initial_variance=P0)
+    run()
+    return run, samples
 
 
 def scenarios(taps: int) -> Work:
-    """One of 64 scenarios in `simulate_scenarios`: samples of all are counted."""
+    """Time one of 64 scenarios in `simulate_scenarios`: the samples of all are counted."""
     samples = 16000 if taps <= 256 else 4000  # a second at 16 kHz
-    x = signal(0, samples)
-    d = np.random.default_rng(2).standard_normal(samples)
-    controllers = [_kf_opc(taps, i) for i in range(SCENARIOS)]
-    run = lambda: simulate_scenarios(controllers, x, disturbance=d, secondary_path=PATH)  # noqa: E731
+    x, d = _noise(samples)
+    controllers = [_kalman(kf_opc, taps, rated_power=0.1 * (1 + i)) for i in range(SCENARIOS)]
+    run = partial(simulate_scenarios, controllers, x, disturbance=d, secondary_path=PATH)
     run()
     return run, SCENARIOS * samples
 
 
+# ---- The first use, in a fresh process
+
+
+def first_update() -> None:
+    """Use the filter as a filterpy filter."""
+    kf = random_walk(8)
+    kf.predict()
+    kf.update(1.0, H=np.ones(8))
+
+
+def first_simulate() -> None:
+    """Run one controller; to the compiler those that the paper compares are one type."""
+    x, d = _noise(100)
+    simulate(CONTROLLERS["KF-OPC"](8), x, disturbance=d, secondary_path=PATH)
+
+
+def first_scenarios() -> None:
+    """Run controllers that share their gains."""
+    x, d = _noise(100)
+    simulate_scenarios([CONTROLLERS["KF-OPC"](8)], x, disturbance=d, secondary_path=PATH)
+
+
+FIRST_USES = {
+    "`predict` and `update`": first_update,
+    "`simulate`": first_simulate,
+    "`simulate_scenarios`": first_scenarios,
+}
+
+
+# ---- Others
+
+
 def numpy_rank_one(taps: int) -> Work:
-    """The O(L^2) filter in plain numpy: a product, an outer product, a difference."""
+    """Time the O(L^2) filter in plain numpy: a product, an outer product, a difference."""
     samples = max(samples_for(taps, most=400) // 8, 12)
     x = signal(taps, samples)
     w, P, diagonal = np.zeros(taps), P0 * np.eye(taps), np.arange(taps)
@@ -207,7 +157,7 @@ def numpy_rank_one(taps: int) -> Work:
 
 
 def filterpy(taps: int) -> Work:
-    """filterpy's own `KalmanFilter`, `predict()` and `update(z, H=row)`."""
+    """Time filterpy's own `KalmanFilter`, `predict()` and `update(z, H=row)`."""
     samples = int(np.clip(2e8 / taps**3, 1, 100))
     x = signal(taps, samples)
     kf = KalmanFilter(taps, 1)
@@ -223,7 +173,7 @@ def filterpy(taps: int) -> Work:
 
 
 def pykalman(taps: int) -> Work:
-    """pykalman's `filter_update` with an observation matrix each sample."""
+    """Time pykalman's `filter_update` with an observation matrix each sample."""
     from pykalman import KalmanFilter as PyKalman
 
     samples = int(np.clip(1e8 / taps**3, 1, 100))
@@ -241,7 +191,7 @@ def pykalman(taps: int) -> Work:
 
 
 def statsmodels(taps: int) -> Work:
-    """statsmodels' compiled state-space filter with a design that varies, keeping nothing."""
+    """Time statsmodels' compiled state-space filter with a design that varies, keeping nothing."""
     from statsmodels.tsa.statespace.kalman_filter import MEMORY_CONSERVE
     from statsmodels.tsa.statespace.kalman_filter import KalmanFilter as StateSpace
 
@@ -254,13 +204,12 @@ def statsmodels(taps: int) -> Work:
     model["state_cov"], model["obs_cov"] = R * np.eye(taps), np.array([[Q]])
     model.initialize_known(np.zeros(taps), P0 * np.eye(taps))
     model.set_conserve_memory(MEMORY_CONSERVE)
-    run = lambda: model.filter()  # noqa: E731
-    run()
-    return run, samples
+    model.filter()
+    return model.filter, samples
 
 
 def padasip(taps: int) -> Work:
-    """padasip's RLS, a filter with forgetting: another recursion of the same order."""
+    """Time padasip's RLS, a filter with forgetting: another recursion of the same order."""
     from padasip.filters import FilterRLS
 
     samples = max(samples_for(taps, most=400) // 16, 4)
@@ -275,7 +224,7 @@ def padasip(taps: int) -> Work:
 
 
 def pyroomacoustics(taps: int) -> Work:
-    """pyroomacoustics' RLS, which keeps its own delay line: another recursion of the same order."""
+    """Time pyroomacoustics' RLS, which has a delay line: another recursion of the same order."""
     from pyroomacoustics.adaptive import RLS
 
     samples = max(samples_for(taps, most=400) // 8, 12)
@@ -290,14 +239,9 @@ def pyroomacoustics(taps: int) -> Work:
 
 
 OURS: dict[str, Callable[[int], Work]] = {
-    "streaming kernel": streaming,
-    "block kernel, rows known": block,
-    "block kernel, causal": block_causal,
-    "two at a time, rows known": pairs,
     "filterpy API of KFOPC": filterpy_api,
-    "closed loop, KF-OPC": closed_loop,
-    "closed loop, KF-PB": closed_loop_budget,
-    "closed loop, MOV-FxLMS": closed_loop_lms,
+    **{f"closed loop, {name}": partial(closed_loop, name) for name in CONTROLLERS},
+    **{f"stepped from Python, {name}": partial(stepped, name) for name in CONTROLLERS},
     f"closed loop, each of {SCENARIOS} KF-OPC": scenarios,
 }
 PEERS: dict[str, Callable[[int], Work]] = {

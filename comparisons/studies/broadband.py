@@ -9,10 +9,20 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import HardClipAmplifier, KalmanController, SimulationResult, bandpass_path, nse_db, output_power
-from kfopc_filterpy.bench.registry import ALGORITHMS, make_controller
-from kfopc_filterpy.bench.report import FigureItem, Parameter, StudyReport, Verdict
-from kfopc_filterpy.bench.scene import Runs, Scene, figures_of_merit, make_scene
-from kfopc_filterpy.bench.tuning import Tuned, run_settings, tune, tuning_runs, went_through
+from kfopc_filterpy.bench import (
+    FigureItem,
+    Parameter,
+    Runs,
+    Scene,
+    StudyReport,
+    Tuned,
+    Verdict,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    run_settings,
+    tune,
+)
 from kfopc_filterpy.metrics import coherence_and_gain, peak_control_signal
 from kfopc_filterpy.plot import (
     plot_disturbance_and_anti_noise,
@@ -22,7 +32,8 @@ from kfopc_filterpy.plot import (
 )
 from kfopc_filterpy.signals import band_limited_noise
 
-from .study import (
+from .cases import PAPER, grid_runs
+from .parts import (
     BANDPASS_PATHS,
     ceiling_note,
     common_parameters,
@@ -48,9 +59,9 @@ Results = dict[str, list[SimulationResult]]
 
 
 def planned_runs() -> int:
-    """Runs of the study."""
-    tuning = tuning_runs(seeds=TUNING_SEEDS) + tuning_runs(CONSTRAINED)
-    return tuning + len(ALGORITHMS) * (len(SEEDS) + 1) + len(CONSTRAINED) * len(SEEDS)
+    """Return the number of runs of the study."""
+    tuning = TUNING_SEEDS * grid_runs(PAPER) + grid_runs(CONSTRAINED)
+    return tuning + len(PAPER) * (len(SEEDS) + 1) + len(CONSTRAINED) * len(SEEDS)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -118,12 +129,16 @@ def _scene(n_taps: int) -> Scene:
 
 def _run_all(runs: Runs, scene: Scene, tuned: dict[str, Tuned], seeds: int = len(SEEDS)) -> Results:
     jobs = [(name, tuned[name].setting, k) for name in tuned for k in range(seeds)]
-    outcomes = run_settings(runs, scene, jobs, went_through)
-    return {name: [r for job, r in zip(jobs, outcomes, strict=True) if job[0] == name] for name in tuned}
+    outcomes = run_settings(runs, scene, jobs, lambda result: result)
+    results: Results = {name: [] for name in tuned}
+    for (name, _, _), result in zip(jobs, outcomes, strict=True):
+        assert result is not None  # none of these algorithms refuses
+        results[name].append(result)
+    return results
 
 
 def _knowing_the_amplifier(scene: Scene, tuned: Tuned) -> SimulationResult:
-    """KF-OPC whose disturbance estimate is e + s^ * amplifier(y)."""
+    """Run KF-OPC with the disturbance estimate e + s^ * amplifier(y)."""
     estimator = make_controller(scene, "KF-OPC", tuned.setting)
     assert isinstance(estimator, KalmanController)
     return scene.run(
@@ -134,7 +149,7 @@ def _knowing_the_amplifier(scene: Scene, tuned: Tuned) -> SimulationResult:
 
 
 def _other_length(runs: Runs) -> dict[str, float | None]:
-    """Convergence times of the constrained methods with another length, tuned again on the first seed."""
+    """Return the convergence times of the constrained methods with another length, tuned again on the first seed."""
     scene = _scene(OTHER_N_TAPS)
     tuned = tune(runs, scene, CONSTRAINED)
     results = _run_all(runs, scene, tuned)
@@ -144,8 +159,8 @@ def _other_length(runs: Runs) -> dict[str, float | None]:
 def _verdicts(results: Results, algorithms: dict[str, dict[str, Any]], coherence: Any) -> list[Verdict]:
     powers = np.array([output_power(r.control_signal) for r in results["KF-OPC"]]) / RATED_POWER
     anc, opc, mov = (algorithms[name] for name in ("KF-ANC", "KF-OPC", "MOV-FxLMS"))
-    times = {name: algorithms[name]["convergence_time_s"] for name in ALGORITHMS}
-    best = max(ALGORITHMS, key=lambda name: algorithms[name]["noise_reduction_db"])
+    times = {name: algorithms[name]["convergence_time_s"] for name in PAPER}
+    best = max(PAPER, key=lambda name: algorithms[name]["noise_reduction_db"])
     return [
         Verdict(
             "KF-OPC keeps its output power to the rated power (the paper: 0.79971 of 0.8)",
@@ -182,14 +197,14 @@ def _verdicts(results: Results, algorithms: dict[str, dict[str, Any]], coherence
 
 
 def _time_below(results: Sequence[SimulationResult], level_db: float) -> float:
-    """Time from which the NSE, pooled over seeds, stays below a level."""
+    """Return the time from which the NSE, pooled over seeds, stays below a level."""
     curve = nse_db([r.error for r in results], [r.disturbance for r in results], FS, runs=True)
     above = np.flatnonzero(curve > level_db)
     return (above[-1] + 1) / FS if above.size else 0.0
 
 
 def _switch_on(result: SimulationResult) -> dict[str, float]:
-    """What the steady half does not show: the start."""
+    """Return figures of the start, which the steady half does not show."""
     return {
         "first_second_noise_reduction_db": first_second_db(result),
         "peak_control_signal_of_the_whole_run": peak_control_signal(result.control_signal, steady=1.0),

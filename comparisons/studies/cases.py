@@ -1,76 +1,91 @@
-"""What the studies of mismatch, tracking and the amplifier share: paths, noises, scenes, tuning, what a run is worth."""
+"""Paths, noises, scenes, rows of results and tuning, shared by the studies beyond the paper and the sweeps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench.registry import REGISTRY, Setting
-from kfopc_filterpy.bench.report import Parameter
-from kfopc_filterpy.bench.scene import Runs, Scene
-from kfopc_filterpy.bench.tuning import RULE, Trial, Tuned, _best, run_settings
-from kfopc_filterpy.signals import band_limited_noise, tone
+from kfopc_filterpy import (
+    SimulationResult,
+    bandpass_path,
+    noise_reduction_db,
+    output_power,
+    power_constrained_wiener,
+)
+from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_scene, try_settings
+from kfopc_filterpy.bounds import PowerConstrainedWiener
+from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.signals import (
+    DataUnavailableError,
+    band_limited_noise,
+    bursty_noise,
+    compressor_noise,
+    level_jump,
+    load_measured_duct,
+    looped,
+    swelling,
+    tone,
+)
 
-from . import constraint_cases
-from .constraint_cases import FS, SENSOR_NOISE_DB, SWITCH_ON_S, Noise
-
-N_TAPS = 128
-SEED = 1
+FS = 16000.0
+SWITCH_ON_S = 0.5
+SENSOR_NOISE_DB = -40.0
 TONE_HZ = 300.0
+WIDE_BAND_HZ = (100.0, 1000.0)
+SWING_DB, PERIOD_S = 6.0, 4.0
+STATIONARY = ("tone", "compressor", "band noise")
+WINDOW_S = 0.1  # of the largest short-time output power
+
+# Of the studies that drive a noise some dB beyond the rated power: mismatch, tracking and the amplifier.
+N_TAPS = 128
 BAND_HZ = (200.0, 1000.0)
-WORST_WINDOW_S = 0.1
-NOISES: dict[str, Noise] = {
-    "tone": lambda duration, seed: tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
-    "band noise": lambda duration, seed: band_limited_noise(BAND_HZ, duration, fs=FS, rng=seed),
-}
+SEED = 1
 
+PAPER = tuple(name for name, own in algorithms().items() if own.of_paper)  # algorithms that the paper compares
 
-def paths() -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Primary and secondary taps of the built-in duct, and of the measured one where it is at hand."""
-    return {name: pair for name, pair in constraint_cases.paths().items() if name != "band-pass"}
-
-
-def noise_of(name: str, duration_s: float, seed: int = SEED) -> np.ndarray:
-    """A noise, and as much before it as runs before the control is switched on."""
-    return NOISES[name](duration_s + SWITCH_ON_S, seed)
-
-
-def make_case(pair: tuple[np.ndarray, np.ndarray], noise: np.ndarray, overdrive_db: float) -> Scene:
-    """Scene whose unconstrained control power is 1, and so many dB above the rated one."""
-    return with_overdrive(constraint_cases.make_case(pair, noise, n_taps=N_TAPS), overdrive_db)
-
-
-def with_overdrive(scene: Scene, overdrive_db: float) -> Scene:
-    """The scene with a rated power so many dB below the unconstrained control power."""
-    return replace(scene, rated_power=scene.unconstrained_power / 10 ** (overdrive_db / 10))
-
-
-def ceilings_note(scenes: Mapping[str, Scene]) -> str:
-    """The ceiling of every constrained algorithm in each scene, as a sentence."""
-    reached = [f"{name}: {_ceiling_db(scene):.1f} dB" for name, scene in scenes.items()]
-    return (
-        "The ceiling within the rated power, of one fixed filter for the whole run, over the steady half, with a linear "
-        f"amplifier and no sensor noise (power-constrained Wiener solution): {'; '.join(reached)}."
-    )
-
-
-def _ceiling_db(scene: Scene) -> float:
-    bound = constraint_cases.bound_of(scene)
-    return bound.noise_reduction_over(0.5 * bound.whole.end_s)["whole"]
+Setting = float | tuple[float, float]  # of an algorithm, as in the registry
+Pair = tuple[np.ndarray, np.ndarray]  # taps of the primary and the secondary path
+Noise = Callable[[float, int], np.ndarray]  # of a duration in s and a seed
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What is kept of a run: its trial, and over the steady half noise reduction in dB and power over the rated one."""
+class Case:
+    """Where an algorithm is run: paths and a noise by name, and an amplifier if it is not linear."""
 
-    trial: Trial
-    noise_reduction_db: float
-    power: float
-    diverged_at_s: float | None
+    path: str
+    noise: str
+    amplifier: str = "linear"
+
+    @property
+    def stationary(self) -> bool:
+        """Whether every second of the noise is as loud as the others."""
+        return self.noise in STATIONARY
+
+    def __str__(self) -> str:
+        return f"{self.path}, {self.noise}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """The result of an algorithm in a case, common to all studies; figures are NaN if it diverged."""
+
+    path: str
+    noise: str
+    algorithm: str
+    setting: Any = None  # the tuned one, if any
+    noise_reduction_db: float = np.nan  # over the steady half
+    power: float = np.nan  # over the steady half, over the rated one
+    diverged_at_s: float | None = None
+
+    @property
+    def case(self) -> Case:
+        """Where it was run."""
+        return Case(self.path, self.noise)
 
     @property
     def unstable(self) -> bool:
@@ -78,92 +93,197 @@ class Measured:
         return self.diverged_at_s is not None or not self.noise_reduction_db > 0.0
 
 
-def measured(result: SimulationResult | None, setting: Setting, scene: Scene) -> Measured:
-    """Measure a run; one that could not go on diverged at its start."""
+@dataclass(frozen=True, kw_only=True)
+class WindowRow(Row):
+    """A row that knows the short-time output power too."""
+
+    worst_window: float = np.nan  # largest power over WINDOW_S, over the rated one
+
+
+def figures_of(result: SimulationResult | None, rated_power: float) -> dict[str, Any]:
+    """Return the figures of a `WindowRow`; a filter that could not go on diverged at its start."""
     if result is None or result.diverged_at_s is not None:
-        at = 0.0 if result is None else result.diverged_at_s
-        return Measured(Trial(setting, np.inf, np.inf, True), np.nan, np.nan, at)
-    # Before the first sound is through the primary path there is no NSE.
-    nse = float(np.nanmean(nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s)))
-    power = output_power(result.control_signal)
-    trial = Trial(setting, nse, power, False)
-    return Measured(trial, noise_reduction_db(result.error, result.disturbance), power / scene.rated_power, None)
+        return {"diverged_at_s": 0.0 if result is None else result.diverged_at_s}
+    return {
+        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
+        "power": output_power(result.control_signal) / rated_power,
+        "worst_window": overshoot(result.control_signal, rated_power, FS, window_s=WINDOW_S),
+    }
 
 
-def measure_settings(
-    runs: Runs, scene: Scene, settings: Mapping[str, Sequence[Setting]]
-) -> dict[str, dict[Setting, Measured]]:
-    """A run of each setting of each algorithm."""
-    jobs = [(name, setting, 0) for name, own in settings.items() for setting in own]
-    # The outcomes know no setting: it is put in after.
-    outcomes = run_settings(runs, scene, jobs, lambda result: measured(result, np.nan, scene))
-    found: dict[str, dict[Setting, Measured]] = {name: {} for name in settings}
-    for (name, setting, _), outcome in zip(jobs, outcomes, strict=True):
-        found[name][setting] = replace(outcome, trial=replace(outcome.trial, setting=setting))
-    return found
+# ---- Paths and noises
 
 
-def chosen(scene: Scene, algorithm: str, outcomes: Mapping[Setting, Measured]) -> Tuned | None:
-    """The best setting by the rule of all studies; None where every setting diverged."""
-    trials = [outcome.trial for outcome in outcomes.values()]
-    if all(trial.diverged for trial in trials):
+def modelled_paths() -> dict[str, Pair]:
+    """Return primary and secondary taps of the models, by name."""
+    duct = duct_paths(fs=FS)
+    return {
+        "band-pass": (path_taps(bandpass_path(128)), path_taps(bandpass_path(32))),
+        "duct": (path_taps(duct.primary), path_taps(duct.secondary)),
+    }
+
+
+def paths() -> dict[str, Pair]:
+    """Return primary and secondary taps by name, with the measured duct if it is at hand."""
+    pairs = modelled_paths()
+    measured = measured_data()
+    if measured is not None:
+        scale = np.sqrt(np.sum(measured.secondary**2))  # its scale is arbitrary: unit gain for white noise
+        pairs["measured duct"] = (measured.primary / scale, measured.secondary / scale)
+    return pairs
+
+
+def ducts() -> dict[str, Pair]:
+    """Return the taps of the built-in duct, and of the measured one if it is at hand."""
+    return {name: pair for name, pair in paths().items() if name != "band-pass"}
+
+
+def made_noises(band_hz: tuple[float, float] = WIDE_BAND_HZ) -> dict[str, Noise]:
+    """Return the noises that are made and not recorded, by name."""
+
+    def band_noise(duration: float, seed: int) -> np.ndarray:
+        return band_limited_noise(band_hz, duration, fs=FS, rng=seed)
+
+    def swelling_band_noise(duration: float, seed: int) -> np.ndarray:
+        steady = band_noise(duration, seed)
+        return swelling(steady, fs=FS, swing_db=SWING_DB, period_s=PERIOD_S, phase_rad=float(seed))
+
+    return {
+        "tone": lambda duration, seed: tone(TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
+        "compressor": lambda duration, seed: compressor_noise(duration, fs=FS, rng=seed),
+        "band noise": band_noise,
+        "bursts": lambda duration, seed: bursty_noise(duration, fs=FS, rng=seed),
+        "swelling band noise": swelling_band_noise,
+    }
+
+
+def noises() -> dict[str, Noise]:
+    """Return the noises by name, with the motor recording if it is at hand."""
+    made = made_noises()
+    measured = measured_data()
+    if measured is not None:
+        recording = measured.noise - measured.noise.mean()
+        made["motor"] = lambda duration, seed: looped(recording, duration, fs=FS, start_s=2.5 * seed)
+    return made
+
+
+@cache
+def measured_data() -> Any:
+    """Return the measured duct and the motor recording, or None if they cannot be had."""
+    try:
+        return load_measured_duct(allow_download=True)
+    except DataUnavailableError:
         return None
-    return _best(trials, scene.rated_power if REGISTRY[algorithm].keeps_budget else np.inf, algorithm)
+
+
+def with_jump(noise: np.ndarray, gain_db: float, begin_s: float, end_s: float) -> np.ndarray:
+    """Return the noise, louder or softer between two times."""
+    return level_jump(level_jump(noise, begin_s, gain_db, fs=FS), end_s, -gain_db, fs=FS)
+
+
+# ---- Scenes
+
+
+def make_case(
+    pair: Pair, noise: np.ndarray, *, n_taps: int, sensor_noise_db: float = SENSOR_NOISE_DB, seed: int = 0
+) -> Scene:
+    """Return the scene of one noise whose unconstrained control power is 1; the seed is of the sensor noise.
+
+    That power is of the filter with which a Kalman filter without state noise would end, ``(R_x' + q/(N P0) I) w = r``
+    over the record. Without the ridge, directions that the noise hardly excites could ask for any power.
+    """
+    scene = make_scene(
+        {seed: noise},
+        *pair,
+        fs=FS,
+        rated_power=1.0,
+        power_multiple=1.0,
+        n_taps=n_taps,
+        switch_on_s=SWITCH_ON_S,
+        sensor_noise_db=sensor_noise_db,
+        nse_window_s=0.05,
+    )
+    normal = louder(scene, 1.0 / np.sqrt(bound_of(scene).unconstrained.control_power))
+    return replace(normal, unconstrained_power=1.0)
+
+
+def noise_of(name: str, duration_s: float, seed: int = SEED) -> np.ndarray:
+    """Return a noise of the driven studies, with as much before it as runs before the control is switched on."""
+    return made_noises(BAND_HZ)[name](duration_s + SWITCH_ON_S, seed)
+
+
+def driven_case(pair: Pair, noise: np.ndarray, overdrive_db: float) -> Scene:
+    """Return the scene of a noise whose unconstrained control power, 1, is so many dB above the rated one."""
+    return with_overdrive(make_case(pair, noise, n_taps=N_TAPS), overdrive_db)
+
+
+def with_overdrive(scene: Scene, overdrive_db: float) -> Scene:
+    """Return the scene with a rated power so many dB below the unconstrained control power."""
+    return replace(scene, rated_power=scene.unconstrained_power / 10 ** (overdrive_db / 10))
+
+
+def louder(scene: Scene, gain: float) -> Scene:
+    """Return the scene with all signals times a gain, and the measurement noise with them."""
+    return replace(
+        scene,
+        references=[gain * x for x in scene.references],
+        disturbances=[gain * d for d in scene.disturbances],
+        sensor_noise_std=gain * scene.sensor_noise_std,
+        measurement_noise=gain**2 * scene.measurement_noise,
+        unconstrained_power=gain**2 * scene.unconstrained_power,
+        wiener_control_power=gain**2 * scene.wiener_control_power,
+    )
+
+
+def bound_of(scene: Scene) -> PowerConstrainedWiener:
+    """Return the power-constrained Wiener solutions of a case."""
+    ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
+    return power_constrained_wiener(
+        scene.references[0],
+        scene.disturbances[0],
+        scene.secondary,
+        scene.n_taps,
+        scene.rated_power,
+        fs=FS,
+        switch_on_s=SWITCH_ON_S,
+        ridge=ridge,
+    )
+
+
+def bounds_db(scene: Scene, stationary: bool) -> tuple[float, float]:
+    """Return the noise reduction of the bound and of the scaled Wiener filter over the steady half.
+
+    Both are of one filter for the whole record, or of each second's own if the noise is not stationary.
+    """
+    bound = bound_of(scene)
+    reached = bound.noise_reduction_over(0.5 * bound.whole.end_s)
+    if stationary:
+        return reached["whole"], reached["scaled"]
+    return reached["per_second"], reached["scaled_per_second"]
+
+
+# ---- Tuning
+
+
+def grids(names: Iterable[str]) -> dict[str, list[Setting]]:
+    """Return the settings that are tried of each algorithm."""
+    return {name: algorithms()[name].grid for name in names}
+
+
+def grid_runs(names: Iterable[str]) -> int:
+    """Return the number of runs of the grids; those of the finer grids are not planned."""
+    return sum(map(len, grids(names).values()))
 
 
 def tune_all(runs: Runs, scene: Scene, settings: Mapping[str, Sequence[Setting]]) -> dict[str, Tuned | None]:
-    """`tuning.tune` for settings of one's own, and for algorithms all of whose settings may diverge."""
-    outcomes = measure_settings(runs, scene, settings)
-    return {name: chosen(scene, name, outcomes[name]) for name in settings}
+    """Return the best of the given settings of each algorithm; None if all of them diverge."""
+    trials = try_settings(runs, scene, settings)
+    return {name: best_setting(scene, name, own) for name, own in trials.items()}
 
 
-def grids(algorithms: Iterable[str]) -> dict[str, list[Setting]]:
-    """Settings that are tried of each algorithm."""
-    return {name: REGISTRY[name].grid for name in algorithms}
+# ---- Measures that the package does not name
 
 
-def shared_parameters(duration_s: Any, overdrive_db: Any) -> dict[str, Parameter]:
-    """Parameters that the three studies state."""
-    return {
-        "fs_hz": Parameter(FS, "the rate of the measured duct"),
-        "n_taps": Parameter(N_TAPS, "the tonal study's"),
-        "rated_power": Parameter(overdrive_db, "overdrive in dB: the unconstrained control power over the rated power"),
-        "unconstrained_control_power": Parameter(
-            1.0, "every noise is scaled to it: (R_x' + q/(N P0) I) w = r over the record"
-        ),
-        "duration_s": Parameter(duration_s, "from switch-on on; the steady half counts"),
-        "switch_on_s": Parameter(SWITCH_ON_S, "the noise runs before"),
-        "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
-        "tone_hz": Parameter(TONE_HZ, "within the band"),
-        "band_hz": Parameter(list(BAND_HZ), "where both ducts carry sound"),
-        "seed": Parameter(SEED, "of noise; of a tone, its phase"),
-        "rule": Parameter(RULE, "for all algorithms; the settings tried and the best are below"),
-    }
-
-
-def tuned_in_words(tuned: Mapping[str, Tuned | None]) -> dict[str, Any]:
-    """Best setting of each algorithm and all that were tried, for results.json."""
-    return {
-        name: None
-        if best is None
-        else {
-            "kind": REGISTRY[name].kind,
-            "setting": best.setting,
-            "within_budget": best.within_budget,
-            "at_edge": best.at_edge,
-            "tried": [
-                (t.setting, "diverged")
-                if t.diverged
-                else (t.setting, round(t.mean_nse_db, 3), round(t.output_power, 4))
-                for t in best.trials
-            ],
-        }
-        for name, best in tuned.items()
-    }
-
-
-def without_measured(names: Iterable[str]) -> list[str]:
-    """The note that the measured duct is left out, where it is."""
-    if "measured duct" in names:
-        return []
-    return ["The measured duct was not at hand (KFOPC_DATA): it is left out."]
+def decibels(power: Any) -> Any:
+    """Return a power in dB, at least -300 dB."""
+    return 10 * np.log10(np.maximum(power, 1e-30))

@@ -8,10 +8,18 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, nse_db
-from kfopc_filterpy.bench.registry import ALGORITHMS, POWER_MEMORY_S, make_controller
-from kfopc_filterpy.bench.report import FigureItem, Parameter, StudyReport, Verdict
-from kfopc_filterpy.bench.scene import Runs, Scene, figures_of_merit, make_scene
-from kfopc_filterpy.bench.tuning import tune, tuning_runs
+from kfopc_filterpy.bench import (
+    FigureItem,
+    Parameter,
+    Runs,
+    Scene,
+    StudyReport,
+    Verdict,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    tune,
+)
 from kfopc_filterpy.bounds import WienerSolution, power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, identify_secondary_path, secondary_path_gain
@@ -30,7 +38,8 @@ from kfopc_filterpy.plot import (
 )
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
-from .study import ceiling_note, common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
+from .cases import PAPER, grid_runs
+from .parts import ceiling_note, common_parameters, draw, draw_paths, first_second_db, milliseconds, sounds, tuning_note
 
 FS = 16000.0
 DURATION_S = 10.5
@@ -42,8 +51,8 @@ SEED = 1
 
 
 def planned_runs() -> int:
-    """Runs of the study, of either duct."""
-    return tuning_runs() + len(ALGORITHMS)
+    """Return the number of runs of the study, of either duct."""
+    return grid_runs(PAPER) + len(PAPER)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -62,12 +71,12 @@ def main(runs: Runs) -> StudyReport:
         "linear amplifier."
     )
     return _study(
-        runs, "duct", "Machine noise in a modelled duct", summary, noise, duct.primary, duct.secondary, parameters
+        runs, "duct", "Machine noise in a modelled duct", summary, noise, (duct.primary, duct.secondary), parameters
     )
 
 
 def main_measured(runs: Runs) -> StudyReport | str:
-    """Run the study with the measured duct and recorded motor noise; a line that says why where there are none."""
+    """Run the study with the measured duct and recorded motor noise; without them return a line that says why."""
     try:
         data = load_measured_duct(allow_download=True)
     except DataUnavailableError as error:
@@ -91,8 +100,7 @@ def main_measured(runs: Runs) -> StudyReport | str:
         "Recorded noise in a measured duct",
         summary,
         data.noise - data.noise.mean(),
-        fir_path(data.primary / scale, data.fs),
-        fir_path(data.secondary / scale, data.fs),
+        (fir_path(data.primary / scale, data.fs), fir_path(data.secondary / scale, data.fs)),
         parameters,
     )
 
@@ -103,14 +111,12 @@ def _study(
     title: str,
     summary: str,
     noise: np.ndarray,
-    primary: Any,
-    secondary: Any,
+    paths: tuple[Any, Any],
     parameters: dict[str, Parameter],
 ) -> StudyReport:
     scene = make_scene(
         {SEED: noise},
-        primary,
-        secondary,
+        *paths,
         fs=FS,
         rated_power=RATED_POWER,
         power_multiple=POWER_MULTIPLE,
@@ -141,14 +147,14 @@ def _study(
         algorithms=algorithms,
         extra=extra,
         verdicts=_verdicts(algorithms, results, extra),
-        figures=_figures_of(scene, wiener, results, primary, secondary),
+        figures=_figures_of(scene, wiener, results, *paths),
         sounds=sounds(results),
         notes=[*tuning_note(tuned), ceiling_note(scene), _power_note(algorithms, extra)],
     )
 
 
 def _why(scene: Scene, wiener: WienerSolution, results: dict[str, SimulationResult]) -> dict[str, Any]:
-    """Why the output power is what it is: the gain eq. 11 sees, and the one the control signal sees."""
+    """Return what explains the output power: the gain that eq. 11 sees, and the one that the control signal sees."""
     x, d = scene.settled
     bound = power_constrained_solution(x, d, scene.secondary, scene.n_taps, RATED_POWER)
     d2 = np.convolve(d**2, np.full(int(FS), 1 / FS), mode="valid")
@@ -180,7 +186,7 @@ def _power_note(algorithms: dict[str, dict[str, Any]], extra: dict[str, Any]) ->
         f"these two the power of a steady noise would be {assumed / seen * share:.2f} times the rated one. The rest is "
         "the noise's level, whose power over 1 s varies "
         f"{extra['disturbance_power_over_1_s_largest_over_smallest']:.1f} times here while the power estimates remember "
-        f"{POWER_MEMORY_S:g} s, and its spectrum, which varies with it."
+        f"{Scene.power_memory_s:g} s, and its spectrum, which varies with it."
     )
 
 
@@ -260,7 +266,7 @@ def _figures_of(
 
 
 def _path_figures(scene: Scene, primary: Any, secondary: Any) -> list[FigureItem]:
-    """What a practitioner looks at before any control: the paths, and an identification of the secondary one."""
+    """Return what a practitioner looks at before any control: the paths, and an identification of the secondary one."""
     both = {"primary path": primary, "secondary path": secondary}
     identified = {
         f"{n_taps} taps": identify_secondary_path(

@@ -9,12 +9,21 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from kfopc_filterpy import HardClipAmplifier, KalmanController, SimulationResult, bandpass_path, noise_reduction_db
-from kfopc_filterpy.bench.registry import ALGORITHMS, KALMAN, Setting, make_controller
-from kfopc_filterpy.bench.report import FigureItem, Parameter, StudyReport, Verdict
-from kfopc_filterpy.bench.scene import Runs, Scene, figures_of_merit, make_scene
-from kfopc_filterpy.bench.tuning import Tuned, tune, tuning_runs
+from kfopc_filterpy.bench import (
+    FigureItem,
+    Parameter,
+    Runs,
+    Scene,
+    StudyReport,
+    Tuned,
+    Verdict,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    tune,
+)
 from kfopc_filterpy.metrics import harmonics_db
-from kfopc_filterpy.paths import achieved_band
+from kfopc_filterpy.paths import achieved_band, frequency_response
 from kfopc_filterpy.plot import (
     plot_amplifier_output,
     plot_anti_noise,
@@ -24,9 +33,11 @@ from kfopc_filterpy.plot import (
 )
 from kfopc_filterpy.signals import tone
 
-from .study import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
+from .cases import PAPER, Setting, grid_runs
+from .parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
 
 FS = 16000.0
+KALMAN = ("KF-ANC", "KF-OPC")
 TONE_HZ = 400.0
 DURATION_S = 10.5
 RATED_POWER = 1.0
@@ -39,8 +50,8 @@ WEIGHTS_EVERY = 160
 
 
 def planned_runs() -> int:
-    """Runs of the study."""
-    return tuning_runs() + len(ALGORITHMS) + len(KALMAN) * (len(OVERDRIVES_DB) + len(UNFORGETTING))
+    """Return the number of runs of the study."""
+    return grid_runs(PAPER) + len(PAPER) + len(KALMAN) * (len(OVERDRIVES_DB) + len(UNFORGETTING))
 
 
 def main(runs: Runs) -> StudyReport:
@@ -122,8 +133,6 @@ def _scene(primary: Any, secondary: Any, power_multiple: float) -> Scene:
 
 
 def _level_db(path: Any, frequency_hz: float) -> float:
-    from kfopc_filterpy.paths import frequency_response
-
     return float(20 * np.log10(abs(frequency_response(path, [frequency_hz])[0])))
 
 
@@ -133,9 +142,9 @@ def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
 
 
 def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[str, np.ndarray]:
-    """Noise reduction of both Kalman filters over the overdrive, at the settings tuned for the study.
+    """Return the noise reduction of both Kalman filters over the overdrive, at the settings tuned for the study.
 
-    In decibels a louder noise is the same as a smaller amplifier, and so all levels share the gains of one reference.
+    In decibels a louder noise is the same as a smaller amplifier, so all levels share the gains of one reference.
     """
     powers = scene.wiener_control_power / 10 ** (np.array(OVERDRIVES_DB) / 10)
     amplifiers = [HardClipAmplifier(float(np.sqrt(2 * power))) for power in powers]
@@ -143,8 +152,7 @@ def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[
     def reductions(name: str) -> list[float]:
         smaller = [dataclasses.replace(scene, rated_power=float(power)) for power in powers]
         controllers = [make_controller(budget, name, tuned[name].setting) for budget in smaller]
-        kalman = [c for c in controllers if isinstance(c, KalmanController)]
-        results = scene.run_together(kalman, amplifier=amplifiers)
+        results = scene.run_together(controllers, amplifier=amplifiers)
         return [noise_reduction_db(result.error, result.disturbance) for result in results]
 
     values = runs.map(reductions, KALMAN, worth=lambda name: len(OVERDRIVES_DB))
@@ -152,13 +160,13 @@ def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[
 
 
 def crossings_db(levels: np.ndarray, lead: np.ndarray) -> list[float]:
-    """Overdrives at which `lead` changes sign, by linear interpolation."""
+    """Return the overdrives at which `lead` changes sign, by linear interpolation."""
     k = np.flatnonzero(lead[:-1] * lead[1:] < 0)
     return [float(x) for x in levels[k] + (levels[k + 1] - levels[k]) * lead[k] / (lead[k] - lead[k + 1])]
 
 
 def _without_forgetting(runs: Runs, scene: Scene) -> dict[str, dict[str, float]]:
-    """Both Kalman filters with so little state noise that they hardly forget in a run."""
+    """Run both Kalman filters with so little state noise that they hardly forget in a run."""
     jobs = [(name, setting) for setting in UNFORGETTING for name in KALMAN]
 
     def run(job: tuple[str, float]) -> dict[str, float]:
@@ -170,7 +178,7 @@ def _without_forgetting(runs: Runs, scene: Scene) -> dict[str, dict[str, float]]
 
 
 def _by_filterpy(scene: Scene, setting: Setting) -> SimulationResult:
-    """The first part of the study with filterpy's own KalmanFilter as the estimator of KF-ANC."""
+    """Run the first part of the study with filterpy's own KalmanFilter as the estimator of KF-ANC."""
     fast = make_controller(scene, "KF-ANC", setting)
     assert isinstance(fast, KalmanController)
     estimator = KalmanFilter(dim_x=scene.n_taps, dim_z=1)
@@ -190,7 +198,7 @@ def _first_S_over_R(scene: Scene) -> float:
 
 
 def _largest_difference(theirs: SimulationResult, ours: SimulationResult) -> dict[str, float]:
-    """Largest difference from filterpy's run in the error signal and the weights, over its samples."""
+    """Return the largest difference from filterpy's run in the error signal and the weights, over its samples."""
     n = theirs.error.size
     assert ours.weights is not None
     assert theirs.weights is not None
@@ -248,7 +256,7 @@ def _verdicts(
 
 
 def weight_growth(result: SimulationResult) -> float:
-    """Largest weight at the end of a run over the largest at half of it."""
+    """Return the largest weight at the end of a run over the largest at half of it."""
     assert result.weights is not None
     largest = np.abs(result.weights).max(axis=1)
     return float(largest[-1] / largest[largest.size // 2])

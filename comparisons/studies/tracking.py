@@ -2,70 +2,137 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
-from kfopc_filterpy.bench.registry import POWER_MEMORY_S
-from kfopc_filterpy.bench.report import Parameter, Sound, StudyReport, Table, Verdict
-from kfopc_filterpy.bench.scene import Runs, Scene
-from kfopc_filterpy.bench.tuning import Tuned
-from kfopc_filterpy.power.budget import DEFAULT_CORRELATION_MEMORY_S
+from kfopc_filterpy import SimulationResult, convergence_time_s, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy.bench import (
+    FigureItem,
+    Parameter,
+    Runs,
+    Scene,
+    Sound,
+    StudyReport,
+    Table,
+    Tuned,
+    Verdict,
+    algorithms,
+    run_setting,
+)
+from kfopc_filterpy.metrics import overshoot, short_time_power
+from kfopc_filterpy.paths import Duct, duct_paths, path_taps
+from kfopc_filterpy.power import PowerBudget
 
-from .cases import FS, ceilings_note, grids, paths, shared_parameters, tuned_in_words, without_measured
-from .tracking_figures import tracking_figures
-from .tracking_runs import (
-    ALGORITHMS,
-    CHANGE_RUN_S,
-    CHANGE_S,
-    CHIRP_HZ,
-    DELAY_SAMPLES,
-    JUMP_RUN_S,
-    JUMP_S,
-    OTHER_LENGTH_M,
-    OVERDRIVE_DB,
-    SEEDS,
-    START_SHARES,
-    SWEEP_S,
-    SWEEPS,
-    Course,
-    Event,
-    Row,
-    events,
-    jobs,
-    run_event,
-    run_start,
-    scenes_of,
-    tune_event,
+from .cases import (
+    FS,
+    SEED,
+    SWITCH_ON_S,
+    WINDOW_S,
+    Pair,
+    WindowRow,
+    driven_case,
+    ducts,
+    grid_runs,
+    grids,
+    noise_of,
+    tune_all,
+    with_jump,
+)
+from .parts import (
+    MARK,
+    by_algorithm,
+    ceilings_note,
+    cell,
+    driven_parameters,
+    legend_of,
+    new_figure,
+    thin_style,
+    tuned_in_words,
+    without_measured,
 )
 
+ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 CONSTRAINED = ("KF-OPC", "KF-PB", "MOV-FxLMS")
+OVERDRIVE_DB = 3.0
+JUMP_DB = 20.0
+JUMP_S = (1.5, 3.0)  # of a run of JUMP_RUN_S, from switch-on on
+JUMP_RUN_S = 7.0
+CHANGE_S, CHANGE_RUN_S = 2.0, 6.0
 CHANGES = ("sign", "delay", "longer duct")
+DELAY_SAMPLES = 16
+OTHER_LENGTH_M = 2.6
 ONE_SWEEP = "one sweep"
+CHIRP_HZ, SWEEP_S, SWEEPS = (20.0, 1600.0), 0.25, 16
+START_SHARES = (1.0, 0.01)  # of the usual initial variance, to see what a start from little knowledge costs
+SEEDS = (SEED, 2, 3)  # the first is tuned on
+NSE_WINDOW_S = 0.05
+SWEEP_NSE_S = 0.01
+POINTS_A_SECOND = 200  # of the curves that are kept
 HEARD = {"sign": ("KF-ANC", "KF-PB", "FxLMS"), "sweeps": ("KF-ANC", "KF-PB", "FxLMS")}
+POWERS = (0.02, 500.0)  # of the figures
+NSE_DB = (-25.0, 12.0)
+
+
+@dataclass(frozen=True)
+class Event:
+    """A run in which something changes: its scene from paths and a seed, and the stretches in which the filter settles.
+
+    A stretch ends with the next change. Sweeps have none: the noise never comes to rest.
+    """
+
+    name: str
+    scene: Callable[[Pair, int], Scene]
+    stretches: dict[str, tuple[float, float]]
+    paths: tuple[str, ...] | None = None  # None: all
+    seeds: tuple[int, ...] | None = None  # None: SEEDS
+    nse_window_s: float = NSE_WINDOW_S
+    shown_window_s: float = NSE_WINDOW_S  # of the NSE in the figure
+    noise: str = "band noise"
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackingRow(WindowRow):
+    """An algorithm through an event; the noise reduction is over the whole run, the steady half after all changes."""
+
+    event: str
+    within_budget: bool
+    mean_nse_db: float = np.nan
+    steady_noise_reduction_db: float = np.nan
+    settled_s: dict[str, float | None] = field(default_factory=dict)  # by stretch, see `_settling_table`
+    stretch_worst_window: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Course:
+    """NSE in dB and output power over the rated one, over time, of all seeds together."""
+
+    time_s: np.ndarray
+    nse_db: np.ndarray
+    power: np.ndarray
 
 
 def planned_runs() -> int:
-    """Runs of the study; an algorithm's runs of one event on all seeds count as one."""
-    places = jobs(paths())
+    """Return the number of runs of the study; an algorithm's runs of one event on all seeds count as one."""
+    places = jobs(ducts())
     starts = len(START_SHARES) * sum(event.name == ONE_SWEEP for event, _ in places)
-    return len(places) * (sum(len(own) for own in grids(ALGORITHMS).values()) + len(ALGORITHMS)) + starts
+    return len(places) * (grid_runs(ALGORITHMS) + len(ALGORITHMS)) + starts
 
 
 def main(runs: Runs) -> StudyReport:
-    """Run the study on all paths at hand."""
-    pairs = paths()
-    rows: list[Row] = []
+    """Run the study on all ducts at hand."""
+    pairs = ducts()
+    rows: list[TrackingRow] = []
     courses: dict[tuple[str, str], dict[str, Course]] = {}
     tuned, sounds, starts, first = {}, [], {}, {}
     for event, path in jobs(pairs):
         scenes = scenes_of(event, pairs[path])
         first[f"{event.name}, {path}"] = scenes[0]
-        best = tune_event(runs, scenes)
-        outcomes = _run_all(runs, event, path, scenes, best)
+        best = tune_all(runs, scenes[0], grids(ALGORITHMS))  # on the first seed
+        outcomes = runs.map(partial(run_event, event, path, scenes, best), ALGORITHMS)
         rows += [row for row, _, _ in outcomes]
         courses[event.name, path] = {row.algorithm: course for row, course, _ in outcomes if course is not None}
         tuned[f"{event.name}, {path}"] = tuned_in_words(best)
@@ -83,7 +150,7 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=1.0 / 10 ** (OVERDRIVE_DB / 10),
-        parameters=shared_parameters([JUMP_RUN_S, CHANGE_RUN_S, SWEEP_S, SWEEPS * SWEEP_S], OVERDRIVE_DB)
+        parameters=driven_parameters([JUMP_RUN_S, CHANGE_RUN_S, SWEEP_S, SWEEPS * SWEEP_S], OVERDRIVE_DB)
         | {
             "seeds": Parameter(
                 list(SEEDS), "of noise and sensor noise, pooled; the first is tuned on; sweeps have one"
@@ -110,14 +177,8 @@ def main(runs: Runs) -> StudyReport:
     )
 
 
-def _run_all(
-    runs: Runs, event: Event, path: str, scenes: Sequence[Scene], best: Mapping[str, Tuned | None]
-) -> list[tuple[Row, Course | None, SimulationResult | None]]:
-    return runs.map(lambda name: run_event(event, path, scenes, name, best[name]), ALGORITHMS)
-
-
 def sounds_of(event: Event, heard: dict[str, SimulationResult]) -> list[Sound]:
-    """Disturbance and residuals of the events worth hearing."""
+    """Return the disturbance and the residuals of the events worth hearing."""
     names = [name for name in HEARD.get(event.name, ()) if name in heard]
     if not names:
         return []
@@ -129,16 +190,145 @@ def sounds_of(event: Event, heard: dict[str, SimulationResult]) -> list[Sound]:
     ]
 
 
-def verdicts(rows: Sequence[Row]) -> list[Verdict]:
-    """The findings, each on all events and paths."""
+# ---- Events
+
+
+def events() -> list[Event]:
+    """Return all events."""
+    loud = {"louder": JUMP_S, "back": (JUMP_S[1], JUMP_RUN_S)}
+    soft = {"softer": JUMP_S, "back": (JUMP_S[1], JUMP_RUN_S)}
+    changed = {"changed": (CHANGE_S, CHANGE_RUN_S)}
+    return [
+        Event("20 dB louder", lambda pair, seed: jump_scene(pair, seed, JUMP_DB), loud),
+        Event("20 dB softer", lambda pair, seed: jump_scene(pair, seed, -JUMP_DB), soft),
+        Event("sign", lambda pair, seed: change_scene(pair, seed, -pair[0]), changed),
+        Event("delay", lambda pair, seed: change_scene(pair, seed, np.pad(pair[0], (DELAY_SAMPLES, 0))), changed),
+        Event("longer duct", lambda pair, seed: change_scene(pair, seed, _longer_duct()), changed, paths=("duct",)),
+        Event("one sweep", lambda pair, _: sweep_scene(pair, 1), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_NSE_S, "sweep"),
+        Event("sweeps", lambda pair, _: sweep_scene(pair, SWEEPS), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_S, "sweep"),
+    ]
+
+
+def jobs(names: Mapping[str, Any]) -> list[tuple[Event, str]]:
+    """Return the events on the paths that have them."""
+    return [(event, path) for event in events() for path in names if event.paths is None or path in event.paths]
+
+
+def scenes_of(event: Event, pair: Pair) -> list[Scene]:
+    """Return a scene for each seed, with a sensor noise of its own."""
+    return [
+        replace(event.scene(pair, seed), seeds=[seed], nse_window_s=event.nse_window_s) for seed in event.seeds or SEEDS
+    ]
+
+
+def jump_scene(pair: Pair, seed: int, gain_db: float) -> Scene:
+    """Return band noise that is louder or softer for a while; the rated power is that of its usual level."""
+    scene = driven_case(pair, noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
+    x = with_jump(scene.references[0], gain_db, *(t + SWITCH_ON_S for t in JUMP_S))
+    return replace(scene, references=[x], disturbances=[np.convolve(x, pair[0])[: x.size]])
+
+
+def change_scene(pair: Pair, seed: int, other: np.ndarray) -> Scene:
+    """Return band noise whose primary path changes at `CHANGE_S`: what is on its way then arrives by the new one."""
+    scene = driven_case(pair, noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
+    x, d = scene.references[0], scene.disturbances[0].copy()
+    at = round((CHANGE_S + SWITCH_ON_S) * FS)
+    d[at:] = np.convolve(x, other)[at : x.size]
+    return replace(scene, disturbances=[d])
+
+
+def sweep_scene(pair: Pair, sweeps: int) -> Scene:
+    """Return sweeps from a standing start: silence until the control is switched on."""
+    silence = np.zeros(round(SWITCH_ON_S * FS))
+    return driven_case(pair, np.concatenate([silence, np.tile(sweep(CHIRP_HZ, SWEEP_S, FS), sweeps)]), OVERDRIVE_DB)
+
+
+def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndarray:
+    """Return a sine whose frequency rises linearly from one frequency to another."""
+    t = np.arange(round(duration_s * fs)) / fs
+    rise = (band_hz[1] - band_hz[0]) / duration_s
+    return np.sin(2 * np.pi * (band_hz[0] * t + 0.5 * rise * t**2))
+
+
+def _longer_duct() -> np.ndarray:
+    return path_taps(duct_paths(Duct(length_m=OTHER_LENGTH_M), fs=FS).primary)
+
+
+# ---- Runs
+
+
+def run_event(
+    event: Event, path: str, scenes: Sequence[Scene], tuned: Mapping[str, Tuned | None], algorithm: str
+) -> tuple[TrackingRow, Course | None, SimulationResult | None]:
+    """Run the best setting of an algorithm on every seed; the signals of the first seed are kept for listening."""
+    best = tuned[algorithm]
+    place: dict[str, Any] = {"path": path, "noise": event.noise, "event": event.name, "algorithm": algorithm}
+    results = [] if best is None else [run_setting(scene, algorithm, best.setting) for scene in scenes]
+    kept = [result for result in results if result is not None]
+    if best is None or len(kept) < len(scenes):
+        never: dict[str, float | None] = dict.fromkeys(event.stretches)
+        lost = dict.fromkeys(event.stretches, np.nan)
+        return (
+            TrackingRow(**place, within_budget=False, settled_s=never, stretch_worst_window=lost, diverged_at_s=0.0),
+            None,
+            None,
+        )
+    e, d, y = (np.array([getattr(r, name) for r in kept]) for name in ("error", "disturbance", "control_signal"))
+    at = [r.diverged_at_s for r in kept if r.diverged_at_s is not None]
+    rated = scenes[0].rated_power
+    parts = {name: slice(*(round(t * FS) for t in span)) for name, span in event.stretches.items()}
+    row = TrackingRow(
+        **place,
+        setting=best.setting,
+        within_budget=best.within_budget,
+        mean_nse_db=float(np.nanmean(nse_db(e, d, FS, event.nse_window_s, runs=True))),
+        noise_reduction_db=noise_reduction_db(e, d, steady=1.0, runs=True),
+        steady_noise_reduction_db=noise_reduction_db(e, d, runs=True),
+        power=output_power(y, runs=True) / rated,
+        worst_window=overshoot(y, rated, FS, window_s=WINDOW_S, runs=True),
+        settled_s={name: _settled(e[:, part], d[:, part], event.nse_window_s) for name, part in parts.items()},
+        stretch_worst_window={
+            name: overshoot(y[:, part], rated, FS, window_s=WINDOW_S, runs=True) for name, part in parts.items()
+        },
+        diverged_at_s=min(at) if at else None,
+    )
+    return row, _course(e, d, y, rated, event), kept[0]
+
+
+def _settled(e: np.ndarray, d: np.ndarray, window_s: float) -> float | None:
+    time = convergence_time_s(e, d, FS, window_s=window_s, runs=True)
+    return None if np.isnan(time) else time
+
+
+def _course(e: np.ndarray, d: np.ndarray, y: np.ndarray, rated_power: float, event: Event) -> Course:
+    every = max(1, round(FS / POINTS_A_SECOND * min(1.0, e.shape[1] / FS)))
+    nse = nse_db(e, d, FS, event.shown_window_s, runs=True)
+    power = short_time_power(y, FS, min(WINDOW_S, 0.1 * e.shape[1] / FS), runs=True) / rated_power
+    points = np.arange(every - 1, nse.size, every)
+    return Course((points + 1) / FS, nse[points], power[points])
+
+
+def run_start(scene: Scene, share: float) -> float:
+    """Return the noise reduction of KF-ANC over a whole run, with its least state noise and a share of P0."""
+    started = replace(scene, initial_variance=share * scene.initial_variance)
+    result = run_setting(started, "KF-ANC", algorithms()["KF-ANC"].grid[0])
+    assert result is not None  # KF-ANC never refuses
+    return noise_reduction_db(result.error, result.disturbance, steady=1.0)
+
+
+# ---- Claims and notes
+
+
+def verdicts(rows: Sequence[TrackingRow]) -> list[Verdict]:
+    """Return the findings, each on all events and paths."""
     return [_mean_nse(rows), _sooner(rows), _jump(rows), _change(rows), _back(rows)]
 
 
-def _by(rows: Iterable[Row], algorithm: str) -> dict[tuple[str, str], Row]:
+def _by(rows: Iterable[TrackingRow], algorithm: str) -> dict[tuple[str, str], TrackingRow]:
     return {(row.event, row.path): row for row in rows if row.algorithm == algorithm}
 
 
-def _mean_nse(rows: Sequence[Row]) -> Verdict:
+def _mean_nse(rows: Sequence[TrackingRow]) -> Verdict:
     ours, theirs = _by(rows, "KF-ANC"), _by(rows, "FxLMS")
     leads = {key: theirs[key].mean_nse_db - row.mean_nse_db for key, row in ours.items()}
     least = min(leads, key=lambda key: leads[key])
@@ -149,7 +339,7 @@ def _mean_nse(rows: Sequence[Row]) -> Verdict:
     )
 
 
-def _sooner(rows: Sequence[Row]) -> Verdict:
+def _sooner(rows: Sequence[TrackingRow]) -> Verdict:
     ours, theirs = _by(rows, "KF-ANC"), _by(rows, "FxLMS")
     times = {
         key: (_time(row, "changed"), _time(theirs[key], "changed")) for key, row in ours.items() if key[0] in CHANGES
@@ -162,7 +352,7 @@ def _sooner(rows: Sequence[Row]) -> Verdict:
     )
 
 
-def _time(row: Row, stretch: str) -> float:
+def _time(row: TrackingRow, stretch: str) -> float:
     time = row.settled_s[stretch]
     return np.inf if time is None else time
 
@@ -171,7 +361,7 @@ def _ms(time_s: float) -> str:
     return "not at all" if np.isinf(time_s) else f"{1e3 * time_s:.0f} ms"
 
 
-def _jump(rows: Sequence[Row]) -> Verdict:
+def _jump(rows: Sequence[TrackingRow]) -> Verdict:
     worst = {
         (r.algorithm, r.path): r.worst_window for r in rows if r.event == "20 dB louder" and r.algorithm in CONSTRAINED
     }
@@ -184,7 +374,7 @@ def _jump(rows: Sequence[Row]) -> Verdict:
     )
 
 
-def _change(rows: Sequence[Row]) -> Verdict:
+def _change(rows: Sequence[TrackingRow]) -> Verdict:
     own = [row for row in rows if row.event in CHANGES and row.algorithm in CONSTRAINED]
     worst = max(own, key=lambda row: row.stretch_worst_window["changed"])
     before = _by(rows, "KF-ANC")
@@ -197,7 +387,7 @@ def _change(rows: Sequence[Row]) -> Verdict:
     )
 
 
-def _back(rows: Sequence[Row]) -> Verdict:
+def _back(rows: Sequence[TrackingRow]) -> Verdict:
     times = {
         name: [_time(row, "back") for row in rows if row.event == "20 dB louder" and row.algorithm == name]
         for name in ("KF-ANC", "KF-OPC", "KF-PB")
@@ -209,7 +399,7 @@ def _back(rows: Sequence[Row]) -> Verdict:
     )
 
 
-def _notes(pairs: Iterable[str], rows: Sequence[Row]) -> list[str]:
+def _notes(pairs: Iterable[str], rows: Sequence[TrackingRow]) -> list[str]:
     over = [
         f"{r.algorithm} ({r.event}, {r.path}: {r.power:.2f})"
         for r in rows
@@ -217,64 +407,109 @@ def _notes(pairs: Iterable[str], rows: Sequence[Row]) -> list[str]:
     ]
     notes = without_measured(pairs)
     if over:
-        notes.append(f"Kept the budget to 2 % over the steady half at no setting: {', '.join(over)}.")
+        notes.append(f"At no setting did these keep the budget to 2 % over the steady half: {', '.join(over)}.")
     return [
         *notes,
-        "To be back within 3 dB of the steady NSE is easy for an algorithm that reduces the noise by little: the settling "
-        "times of MOV-FxLMS and optimal leaky FxLMS compare with others' only beside their noise reduction. Within a jump "
-        "of +20 dB, where the budget allows less than 1 dB, the constrained ones are settled whatever they do.",
-        f"What holds the constrained algorithms back after a loud noise is its power in their memory. KF-OPC's fades with "
-        f"{POWER_MEMORY_S:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB's is a window of "
-        f"{DEFAULT_CORRELATION_MEMORY_S:g} s, which believes on purpose that a noise has become softer only when the loud "
-        "part has left it: it comes back at once then. The same memory lets them overspend at the jump itself, for an "
-        "estimate of power follows behind the noise; only a limiter behind the filter holds from the first sample.",
-        "Settings are tuned on the mean NSE over the whole run, which a change in the midst hardly moves: the Kalman "
-        "filters get longer memories than would bring them back soonest.",
+        "An algorithm that reduces the noise by little is soon back within 3 dB of its steady NSE: compare the settling times "
+        "of MOV-FxLMS and optimal leaky FxLMS with others' only together with their noise reduction. During a jump of +20 dB "
+        "the budget allows less than 1 dB, so the constrained algorithms count as settled whatever they do.",
+        "The constrained algorithms recover late from a loud noise because its power stays in their memory. KF-OPC's fades "
+        f"with {Scene.power_memory_s:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB's is a window of "
+        f"{PowerBudget(1, 1.0).memory_s:g} s. It takes a noise to be softer only after the loud part has left the window, and "
+        "then recovers at once. At the jump itself they overspend, since an estimate of power follows behind the noise; only "
+        "a limiter behind the filter holds from the first sample.",
+        "Settings are tuned on the mean NSE over the whole run, which a single change hardly moves: the Kalman filters get "
+        "longer memories than the fastest recovery would need.",
     ]
 
 
-def _sweep_notes(rows: Sequence[Row], starts: Mapping[str, Sequence[float]]) -> list[str]:
+def _sweep_notes(rows: Sequence[TrackingRow], starts: Mapping[str, Sequence[float]]) -> list[str]:
     own = [row for row in rows if row.event == ONE_SWEEP]
     louder = [
         f"{row.algorithm} {row.noise_reduction_db:.1f} dB ({row.path})" for row in own if row.noise_reduction_db < 0
     ]
     notes = [
         f"One sweep starts from the initial variance P0 of a stationary noise. With {START_SHARES[1]:g} of it and the least "
-        f"state noise of the grid, KF-ANC reduces it by {less:.1f} dB in place of {usual:.1f} dB ({path}): a filter that hardly "
-        "knows its weights moves them far for each frequency that the sweep comes by, and is wrong at the next."
+        f"state noise of the grid, KF-ANC reduces it by {less:.1f} dB in place of {usual:.1f} dB ({path}): with a large "
+        "P0 the filter moves its weights far for each frequency of the sweep, and is wrong at the next."
         for path, (usual, less) in starts.items()
     ]
-    return notes + ([f"One sweep was left louder than it was by: {', '.join(louder)}."] if louder else [])
+    return notes + ([f"These left one sweep louder than it was: {', '.join(louder)}."] if louder else [])
 
 
-def event_tables(rows: Sequence[Row]) -> list[Table]:
-    """A line for each event and path, a column for each algorithm."""
+# ---- Tables and figures
+
+
+def event_tables(rows: Sequence[TrackingRow]) -> list[Table]:
+    """Return the tables of the figures that hold for whole events."""
     captions = {
         "noise_reduction_db": ("reduction", "Noise reduction over the whole run in dB"),
         "mean_nse_db": ("nse", "Mean NSE over the whole run in dB, which settings are tuned for"),
         "worst_window": ("worst", "Largest output power over 100 ms over the rated power"),
         "power": ("power", "Output power of the steady half over the rated power"),
     }
-    tables = []
-    for figure, (stem, caption) in captions.items():
-        lines: dict[tuple[str, str], list[str | float]] = {}
-        for row in rows:
-            line = lines.setdefault((row.event, row.path), [row.event, row.path])
-            line.append(getattr(row, figure) if row.diverged_at_s is None else "diverged")
-        tables.append(Table(stem, caption, ["event", "paths", *ALGORITHMS], list(lines.values())))
-    return tables
+    return [
+        by_algorithm(
+            stem,
+            caption,
+            ["event", "paths"],
+            ALGORITHMS,
+            (((row.event, row.path), row.algorithm, cell(row, figure)) for row in rows),
+        )
+        for figure, (stem, caption) in captions.items()
+    ]
 
 
-def _settling_table(rows: Sequence[Row]) -> Table:
-    lines: dict[tuple[str, str, str], list[str | float]] = {}
-    for row in rows:
-        for stretch, time in row.settled_s.items():
-            line = lines.setdefault((row.event, stretch, row.path), [row.event, stretch, row.path])
-            line.append("does not settle" if time is None else time)
-    return Table(
-        "settling",
+def _settling_table(rows: Sequence[TrackingRow]) -> Table:
+    times = [
+        ((row.event, stretch, row.path), row.algorithm, "does not settle" if time is None else time)
+        for row in rows
+        for stretch, time in row.settled_s.items()
+    ]
+    caption = (
         "Time in s from the start of each stretch until the NSE (50 ms, all seeds) stays within 3 dB of its value in the "
-        "stretch's second half",
-        ["event", "stretch", "paths", *ALGORITHMS],
-        list(lines.values()),
+        "stretch's second half"
     )
+    return by_algorithm("settling", caption, ["event", "stretch", "paths"], ALGORITHMS, times)
+
+
+def tracking_figures(
+    courses: Mapping[tuple[str, str], Mapping[str, Course]], windows: Mapping[str, float]
+) -> list[FigureItem]:
+    """Return figures of NSE and output power over time, a column for each path; `windows` are of the NSE in s."""
+    items = []
+    for event in dict.fromkeys(event for event, _ in courses):
+        own = {path: courses[event, path] for other, path in courses if other == event}
+        items.append(
+            FigureItem(
+                event.lower().replace(" ", "-"),
+                f"{event[0].upper()}{event[1:]}: normalised squared error over {1e3 * windows[event]:g} ms and output power over "
+                "the rated one, of all seeds together.",
+                _figure(own),
+            )
+        )
+    return items
+
+
+def _figure(courses: Mapping[str, Mapping[str, Course]]) -> Any:
+    size = (10.5 if len(courses) > 1 else 7.5, 5.6)
+    figure, axes = new_figure(size, 2, len(courses), sharex=True, sharey="row")
+    highest = max(float(np.nanmax(course.power)) for own in courses.values() for course in own.values())
+    for (nse, power), (path, own) in zip(axes.T, courses.items(), strict=True):
+        for k, (name, course) in enumerate(own.items()):
+            above = 3.0 - 0.1 * k  # the first in front
+            nse.plot(course.time_s, np.clip(course.nse_db, *NSE_DB), label=name, zorder=above, **thin_style(name))
+            power.plot(course.time_s, course.power, zorder=above, **thin_style(name))
+            nse.set_xlim(0, course.time_s[-1])
+        nse.set_title(path, fontsize="medium")
+        nse.axhline(0.0, color=MARK, linewidth=1)
+        power.axhline(1.0, color=MARK, linewidth=1)
+        power.set_yscale("log")
+        power.set_ylim(POWERS[0], min(POWERS[1], 1.5 * highest))
+        power.set_xlabel("Time (s)")
+        for ax in (nse, power):
+            ax.grid(True, alpha=0.3)
+    axes[0, 0].set_ylabel("Normalised squared error (dB)")
+    axes[1, 0].set_ylabel("Output power / rated power")
+    legend_of(figure, axes[0])
+    return figure

@@ -17,7 +17,7 @@ import numpy as np
 from .grid import AXES
 from .jobs import Scenario
 from .run import ScenarioError, Sweep, run_sweep
-from .table import FORMATS, Row, figure_names
+from .table import FORMATS, Record, figure_names
 
 MOST_LINES = 40  # of the table on the terminal
 SHOWN_FIGURES = 4
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
             quiet=options.quiet,
         )
     except ScenarioError as error:
-        print(f"{parser.prog}: {error}\nWhat was done by then is kept in {options.output}", file=sys.stderr)
+        print(f"{parser.prog}: {error}\nFinished runs are kept in {options.output}", file=sys.stderr)
         return 1
     except (ValueError, TypeError, OSError, ImportError) as error:
         parser.error(str(error))
@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m comparisons sweep",
         description="Run every combination of a grid with every seed: mean and 95 % interval of each cell.",
         epilog="Values are separated by commas; first:last:count are numbers at equal distances, and first:last:count:log "
-        "at equal ratios. An interrupted sweep goes on where the same command is given again.",
+        "at equal ratios. An interrupted sweep goes on if the same command is given again.",
     )
     axes = parser.add_argument_group("axes, each with one value or several")
     for axis in AXES.values():
@@ -90,9 +90,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--axis", action="append", default=[], metavar="NAME=VALUES", help="an axis of your own function; once for each"
     )
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--jobs", type=int, metavar="N", help="processes on this machine (default: all cores)")
-    where.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do it, tcp://host:8786")
+    place = parser.add_mutually_exclusive_group()
+    place.add_argument("--jobs", type=int, metavar="N", help="processes on this machine (default: all cores)")
+    place.add_argument("--scheduler", metavar="ADDRESS", help="Dask scheduler whose workers do it, tcp://host:8786")
     parser.add_argument("--format", choices=FORMATS, default="csv", help="of the tables (default: csv)")
     parser.add_argument(
         "--x", metavar="AXIS", help="axis the figures are drawn against (default: that of most numbers)"
@@ -106,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def values_joined(arguments: Sequence[str]) -> list[str]:
-    """Arguments with ``--option -20,-10`` as ``--option=-20,-10``: argparse takes the list for an option."""
+    """Return arguments with ``--option -20,-10`` as ``--option=-20,-10``: argparse would take the list for an option."""
     joined: list[str] = []
     for argument in arguments:
         negative = re.match(r"-[.\d]", argument) is not None
@@ -139,7 +139,7 @@ def _grid(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def parsed_values(text: str, name: str) -> list[Any]:
-    """Values of a list as the command line has it.
+    """Return the values of a list as the command line has it.
 
     Examples
     --------
@@ -190,7 +190,7 @@ def _seeds(text: str) -> Any:
 
 
 def loaded_scenario(text: str, send_source: bool) -> Scenario:
-    """Function of a module, which may lie in the current folder; with its source where workers elsewhere lack it."""
+    """Return a function of a module, which may lie in the current folder; with its source for workers that lack it."""
     name, colon, function = text.partition(":")
     if not (name and colon and function):
         raise ValueError(f"--scenario must be MODULE:FUNCTION, got {text!r}")
@@ -208,7 +208,7 @@ def loaded_scenario(text: str, send_source: bool) -> Scenario:
 
 
 def cells_table(sweep: Sweep) -> str:
-    """The cells for a terminal: swept axes, and the mean and half interval of the first figures."""
+    """Return the cells for a terminal: swept axes, and the mean and half interval of the first figures."""
     names = figure_names(dict(enumerate(sweep.runs)))
     names = [name for name in names if name not in (*sweep.grid.axes, "seed")][:SHOWN_FIGURES]
     axes = sweep.grid.swept or list(sweep.grid.axes)[:1]
@@ -230,7 +230,7 @@ def _words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _with_interval(row: Row, name: str) -> str:
+def _with_interval(row: Record, name: str) -> str:
     mean, high = row[f"{name}_mean"], row[f"{name}_high"]
     if math.isnan(mean):
         return "-"

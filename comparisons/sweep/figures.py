@@ -1,6 +1,6 @@
 """Figures of a sweep: noise reduction and output power against the swept axis, with intervals.
 
-A cross at the foot of a panel marks a cell of which runs diverged: its mean is of the others, or there is none.
+A cross at the foot of a panel marks a cell with runs that diverged: its mean is over the others, if any.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from kfopc_filterpy.plot.style import MARK, legend_above, line_style
+from kfopc_filterpy.plot import curve_style
 
+from ..studies.parts import MARK
 from .grid import AXES, Grid, Values
-from .table import Row
+from .table import Record
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,17 +23,16 @@ if TYPE_CHECKING:
 
 BUILT_IN_FIGURES = ("noise_reduction_db", "output_power_db")
 LABELS = {"noise_reduction_db": "Noise reduction (dB)", "output_power_db": "Output power / unconstrained (dB)"}
-MARKERS = ("o", "s", "^", "D", "v", "P")
-# Beyond these a run was on its way to divergence; it would leave the others no room. The tables have the figures.
+# Beyond these a run was on its way to divergence and would leave the others no room. The tables have its figures.
 LOWEST, HIGHEST = {"noise_reduction_db": -20.0}, {"output_power_db": 40.0}
-SHIFT = 0.08  # of a curve's marks beside those of the one before, where the axis has names
+SHIFT = 0.08  # of a curve's marks beside those of the one before, if the axis has names
 MOST_FIGURES = 40
 MOST_MARKS = 30  # of a curve
 LOGARITHMIC_FROM = 50.0  # ratio of the largest to the smallest positive value
 
 
 def swept_axis(grid: Grid, chosen: str | None = None) -> str:
-    """Axis that figures are drawn against: the one chosen, or the numbers with most values, or else the names.
+    """Return the axis that figures are drawn against: the one chosen, or the numbers with most values, or the names.
 
     Raises
     ------
@@ -47,12 +47,12 @@ def swept_axis(grid: Grid, chosen: str | None = None) -> str:
     return max(swept, key=lambda name: (_is_numeric(grid.axes[name]), len(grid.axes[name])))
 
 
-def sweep_figures(grid: Grid, cells: Sequence[Row], figures: Sequence[str], x: str) -> dict[str, Figure]:
-    """A figure by file name for each combination of the axes that are neither `x` nor the curves."""
+def sweep_figures(grid: Grid, cells: Sequence[Record], figures: Sequence[str], x: str) -> dict[str, Figure]:
+    """Return figures by file name, one for each combination of the axes that are neither `x` nor the curves."""
     others = [name for name in grid.swept if name != x]
     curves = "algorithm" if "algorithm" in others else (others[0] if others else None)
     apart = [name for name in others if name != curves]
-    groups: dict[tuple[Any, ...], list[Row]] = {}
+    groups: dict[tuple[Any, ...], list[Record]] = {}
     for row in cells:
         groups.setdefault(tuple(row[name] for name in apart), []).append(row)
     drawn = {}
@@ -63,7 +63,7 @@ def sweep_figures(grid: Grid, cells: Sequence[Row], figures: Sequence[str], x: s
 
 
 def _figure(
-    grid: Grid, rows: Sequence[Row], figures: Sequence[str], x: str, curves: str | None, fixed: Values
+    grid: Grid, rows: Sequence[Record], figures: Sequence[str], x: str, curves: str | None, fixed: Values
 ) -> Figure:
     from matplotlib.figure import Figure
 
@@ -73,7 +73,7 @@ def _figure(
         _panel(ax, grid, rows, name, x, curves)
     axes[-1].set_xlabel(_label(x))
     if curves is not None:
-        legend_above(axes[0])
+        _legend_above(axes[0])
     if fixed:
         figure.suptitle(
             ", ".join(f"{_label(name)}: {_words(value)}" for name, value in fixed.items()), fontsize="medium"
@@ -81,7 +81,14 @@ def _figure(
     return figure
 
 
-def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves: str | None) -> None:
+def _legend_above(ax: Axes) -> None:
+    """Draw a legend above an axes, below the figure's title: in one row if it fits, else in two columns."""
+    labels = ax.get_legend_handles_labels()[1]
+    columns = len(labels) if sum(len(label) + 6 for label in labels) <= 75 else 2
+    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False, fontsize="small")
+
+
+def _panel(ax: Axes, grid: Grid, rows: Sequence[Record], name: str, x: str, curves: str | None) -> None:
     values, numeric = grid.axes[x], _is_numeric(grid.axes[x])
     order = grid.axes[curves] if curves else (None,)
     for k, curve in enumerate(order):
@@ -93,8 +100,7 @@ def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves:
         places = [row[x] if numeric else values.index(row[x]) + shift for row in own]
         mean, low, high = (np.array([row[f"{name}_{end}"] for row in own], float) for end in ("mean", "low", "high"))
         bars = np.nan_to_num([mean - low, high - mean])  # no interval, no bar
-        marks = {"marker": MARKERS[k % len(MARKERS)], "markersize": 4, "markevery": 1 + len(own) // MOST_MARKS}
-        style = line_style(k) | marks | {"linewidth": 1.2}
+        style = curve_style(k) | {"markersize": 4, "markevery": 1 + len(own) // MOST_MARKS, "linewidth": 1.2}
         if not numeric:
             style["linestyle"] = "none"
         ax.errorbar(
@@ -122,7 +128,7 @@ def _panel(ax: Axes, grid: Grid, rows: Sequence[Row], name: str, x: str, curves:
 
 
 def _mark_rated_power(ax: Axes, grid: Grid, x: str) -> None:
-    """The rated power as a line, where all that is drawn has one."""
+    """Draw the rated power as a line, if it is the same for all that is drawn."""
     rated = grid.axes["rated_power_db"]
     style: Any = {"color": MARK, "linewidth": 1, "linestyle": ":", "zorder": 1}
     if x == "rated_power_db":
@@ -136,7 +142,7 @@ def _mark_rated_power(ax: Axes, grid: Grid, x: str) -> None:
 
 
 def _scale(ax: Axes, values: Sequence[float]) -> None:
-    """Limits from the grid, so that a value at which nothing was stable keeps its place."""
+    """Set the limits from the grid, so that a value at which nothing was stable keeps its place."""
     smallest, largest = min(values), max(values)
     if smallest == largest:
         return
@@ -164,6 +170,6 @@ def _words(value: Any) -> str:
 
 
 def _file_name(x: str, fixed: Values) -> str:
-    """Name without suffix; without dots, which would look like one, and slashes."""
+    """Return a name without suffix, dots (which would look like one) and slashes."""
     parts = [x, *(f"{name}={_words(value)}" for name, value in fixed.items())]
     return "--".join("".join(c if c.isalnum() or c in "=-_+" else "_" for c in part) for part in parts)

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy._validate import as_count, as_number, as_positive
-from kfopc_filterpy.bench.registry import REGISTRY
+from kfopc_filterpy.bench import algorithms
 
-from ..studies.constraint_cases import made_noises, measured_data, modelled_paths, noises, paths
+from ..studies.cases import made_noises, measured_data, modelled_paths, noises, paths
 
 Values = dict[str, Any]  # one value an axis
 
@@ -23,7 +22,7 @@ DEFAULT_SETTING, TUNED_SETTING = "default", "tuned"
 
 @dataclass(frozen=True)
 class Axis:
-    """What can be swept: how a value is checked, and its name in figures."""
+    """An axis that can be swept: how a value is checked, and its name in figures."""
 
     name: str
     label: str
@@ -33,7 +32,7 @@ class Axis:
 
     @property
     def option(self) -> str:
-        """Its option on the command line."""
+        """Option on the command line."""
         return "--" + self.name.replace("_", "-")
 
 
@@ -60,11 +59,11 @@ class Grid:
     seeds: tuple[int, ...]
 
     def cells(self) -> list[Values]:
-        """The combinations, the last axis changing fastest."""
+        """Return the combinations; the last axis changes fastest."""
         return [dict(zip(self.axes, values, strict=True)) for values in product(*self.axes.values())]
 
     def runs(self) -> Iterator[Run]:
-        """All runs, numbered; the seed changes fastest."""
+        """Yield all runs, numbered; the seed changes fastest."""
         count = len(self.seeds)
         for i, values in enumerate(self.cells()):
             for k, seed in enumerate(self.seeds):
@@ -80,7 +79,7 @@ class Grid:
 
 
 def built_in_grid(axes: Mapping[str, Any], seeds: Any) -> Grid:
-    """Grid of the built-in scenario: axes that are not named have their default.
+    """Return a grid of the built-in scenario; axes that are not named have their default.
 
     Raises
     ------
@@ -94,7 +93,7 @@ def built_in_grid(axes: Mapping[str, Any], seeds: Any) -> Grid:
     for name, axis in AXES.items():
         given = _listed(axes.get(name, axis.default), name)
         checked[name] = _different(tuple(axis.check(value, name) for value in given), name)
-    two = [name for name in checked["algorithm"] if REGISTRY[name].second]
+    two = [name for name in checked["algorithm"] if algorithms()[name].second]
     if two and checked["setting"] != (TUNED_SETTING,):
         raise ValueError(
             f'{", ".join(two)} has two settings, of which the second decides the output power: give setting "{TUNED_SETTING}"'
@@ -103,7 +102,7 @@ def built_in_grid(axes: Mapping[str, Any], seeds: Any) -> Grid:
 
 
 def own_grid(axes: Mapping[str, Any], seeds: Any) -> Grid:
-    """Grid of a scenario function of one's own: any axes, of numbers, strings, booleans or None."""
+    """Return a grid of the user's scenario function: any axes, of numbers, strings, booleans or None."""
     if not axes:
         raise ValueError("grid must have at least one axis, got none")
     checked = {}
@@ -115,14 +114,14 @@ def own_grid(axes: Mapping[str, Any], seeds: Any) -> Grid:
 
 
 def as_seeds(seeds: Any) -> tuple[int, ...]:
-    """Seeds 1 to n of a number n, or those of a sequence."""
+    """Return the seeds 1 to n of a number n, or those of a sequence."""
     if np.ndim(seeds) == 0:
-        return tuple(range(1, as_count(seeds, "seeds") + 1))
-    return _different(tuple(as_count(seed, "seeds", minimum=0) for seed in _listed(seeds, "seeds")), "seeds")
+        return tuple(range(1, as_whole(seeds, "seeds") + 1))
+    return _different(tuple(as_whole(seed, "seeds", least=0) for seed in _listed(seeds, "seeds")), "seeds")
 
 
 def _listed(given: Any, name: str) -> list[Any]:
-    """Values of an axis as a list; a single one is a list of one."""
+    """Return the values of an axis as a list, even if there is one."""
     values = [given] if given is None or isinstance(given, str) or np.ndim(given) == 0 else list(given)
     if not values:
         raise ValueError(f"{name} must have at least one value, got an empty list")
@@ -137,7 +136,7 @@ def _different(values: tuple[Any, ...], name: str) -> tuple[Any, ...]:
 
 
 def _plain(value: Any, name: str) -> Any:
-    """A value that JSON can hold and give back."""
+    """Return a value that JSON can hold and give back."""
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"{name} must hold finite numbers, got {value}")
@@ -146,22 +145,38 @@ def _plain(value: Any, name: str) -> Any:
     return value
 
 
+def as_whole(value: Any, name: str, least: int = 1) -> int:
+    """Return a whole number that is not too small."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"{name} must be a whole number, got {value!r}")
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+    return int(value)
+
+
 def _number(value: Any, name: str) -> float:
-    return as_number(value, name)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    if not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value}")
+    return float(value)
 
 
 def _positive(value: Any, name: str) -> float:
-    return as_positive(value, name)
+    number = _number(value, name)
+    if number <= 0.0:
+        raise ValueError(f"{name} must be above 0, got {number:g}")
+    return number
 
 
 def _setting(value: Any, name: str) -> Any:
     if not isinstance(value, str):
-        return as_positive(value, name)
+        return _positive(value, name)
     return _named(value, name, (DEFAULT_SETTING, TUNED_SETTING), 'a number above 0, "default" or "tuned"')
 
 
 def _named(value: Any, name: str, choices: Sequence[str], expected: str = "") -> str:
-    """The choice that a name means: hyphens for spaces and lower case will do."""
+    """Return the choice that a name means; hyphens for spaces and lower case are fine."""
     if isinstance(value, str):
         for choice in choices:
             if _folded(value) == _folded(choice):
@@ -182,7 +197,7 @@ def _noise(value: Any, name: str) -> str:
 
 
 def _at_hand(value: Any, name: str, made: tuple[str, ...], measured: str, present: Callable[[], Any]) -> str:
-    """One of the modelled choices, or the measured one where the data are to be had."""
+    """Return one of the modelled choices, or the measured one if the data are at hand."""
     choice = _named(value, name, (*made, measured))
     if choice == measured and (measured_data() is None or choice not in present()):
         raise ValueError(f"{name} {choice!r} needs the measured data: set KFOPC_DATA to their folder")
@@ -194,16 +209,16 @@ def _amplifier(value: Any, name: str) -> str:
 
 
 def _algorithm(value: Any, name: str) -> str:
-    return _named(value, name, tuple(REGISTRY))
+    return _named(value, name, tuple(algorithms()))
 
 
 AXES: dict[str, Axis] = {
     axis.name: axis
     for axis in (
-        Axis("path", "Paths", "duct", _path, "band-pass, duct, or measured duct where its data are at hand"),
-        Axis("noise", "Noise", "band noise", _noise, f"{', '.join(made_noises())}, or motor where it is at hand"),
+        Axis("path", "Paths", "duct", _path, "band-pass, duct, or measured duct if its data are at hand"),
+        Axis("noise", "Noise", "band noise", _noise, f"{', '.join(made_noises())}, or motor if it is at hand"),
         Axis("duration_s", "Duration (s)", 4.0, _positive, "time under control in seconds"),
-        Axis("n_taps", "Taps", 128, as_count, "taps of the control filter"),
+        Axis("n_taps", "Taps", 128, as_whole, "taps of the control filter"),
         Axis(
             "sensor_noise_db",
             "Sensor noise / disturbance (dB)",
@@ -219,7 +234,7 @@ AXES: dict[str, Axis] = {
             "Algorithm",
             "KF-OPC",
             _algorithm,
-            ", ".join(REGISTRY),
+            ", ".join(algorithms()),
         ),
         Axis(
             "setting",

@@ -1,17 +1,15 @@
-"""The jobs of a sweep, and where they run: this machine's cores, or a Dask cluster."""
+"""The jobs of a sweep, which run on this machine's cores or on a Dask cluster."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import lru_cache, partial
 from importlib.util import find_spec
 from typing import Any
 
-from kfopc_filterpy._validate import as_count
-
-from .grid import Grid, Run, Values
+from .grid import Grid, Run, Values, as_whole
 from .scenario import group_of, most_together, naming, run_group
 from .store import Outcome
 
@@ -20,10 +18,11 @@ CONNECT_S = 15.0  # time to find a scheduler, and then its workers
 Scenario = Callable[[Values], Mapping[str, Any]]
 Job = Callable[[], list[Outcome]]
 Outcomes = Callable[[list[Job]], Generator[list[Outcome], None, None]]  # what runs jobs
+Pool = AbstractContextManager[tuple[int, Outcomes]]  # number of workers, and what runs jobs on them
 
 
 def plan(pending: Sequence[Run], workers: int) -> list[list[Run]]:
-    """Runs of the built-in scenario in jobs: what can be shared together, no job beyond its share of all cores."""
+    """Return the runs of the built-in scenario in jobs: what can share is together, no job beyond its share of the cores."""
     share = -(-len(pending) // workers)
     groups: dict[Any, list[Run]] = {}
     for run in pending:
@@ -36,7 +35,7 @@ def _parts(runs: list[Run], size: int) -> list[list[Run]]:
 
 
 def jobs_of(grid: Grid, pending: Sequence[Run], workers: int, scenario: Scenario | None) -> list[Job]:
-    """What is to be called for the runs; an own scenario has a job for each."""
+    """Return the jobs of the runs; an own scenario has one for each."""
     if scenario is not None:
         return [partial(own_job, scenario, run.index, run.scenario) for run in pending]
     return [
@@ -52,7 +51,7 @@ def built_in_job(indices: Sequence[int], scenarios: Sequence[Values], tuning_see
 
 
 def own_job(scenario: Scenario, index: int, values: Values) -> list[Outcome]:
-    """Call a scenario function of one's own."""
+    """Call the user's scenario function."""
     with naming(values), one_thread():
         figures = as_figures(scenario(dict(values)))
         clash = [name for name in figures if name in values]
@@ -62,7 +61,7 @@ def own_job(scenario: Scenario, index: int, values: Values) -> list[Outcome]:
 
 
 def as_figures(returned: Any) -> dict[str, Any]:
-    """Figures of an own scenario as floats; `diverged` as a boolean, False where it does not say."""
+    """Return the figures of an own scenario as floats, `diverged` as a boolean, False by default."""
     if not isinstance(returned, Mapping):
         raise TypeError(f"a scenario must return a dict of figures, got {type(returned).__name__}")
     figures: dict[str, Any] = {}
@@ -78,7 +77,7 @@ def as_figures(returned: Any) -> dict[str, Any]:
 
 
 class Sent:
-    """A scenario function as cloudpickle sends it: with its source, where its module is registered for that.
+    """A scenario function as cloudpickle sends it: with its source, if its module is registered for that.
 
     distributed itself looks at the outermost object only, and would send a function within it by name.
     """
@@ -101,7 +100,7 @@ def _unpickled(pickled: bytes) -> Scenario:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One BLAS thread, whatever a worker was started with: each core has a job, and sums of several threads differ."""
+    """Run with one BLAS thread: each core has a job, and the sums of several threads differ."""
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1):
@@ -110,10 +109,10 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def local(jobs: int | None) -> Iterator[tuple[int, Outcomes]]:
-    """Number of workers, and what runs jobs on as many processes of this machine, all cores by default."""
+    """Yield the number of workers and what runs jobs on as many processes of this machine, by default all cores."""
     import joblib
 
-    workers = joblib.cpu_count() if jobs is None else as_count(jobs, "jobs")
+    workers = joblib.cpu_count() if jobs is None else as_whole(jobs, "jobs")
     threads: dict[str, Any] = {} if workers == 1 else {"inner_max_num_threads": 1}
     with joblib.parallel_config(backend="loky", n_jobs=workers, **threads):
         yield workers, _outcomes
@@ -121,7 +120,7 @@ def local(jobs: int | None) -> Iterator[tuple[int, Outcomes]]:
 
 @contextmanager
 def cluster(scheduler: str) -> Iterator[tuple[int, Outcomes]]:
-    """Number of threads of a Dask cluster's workers, and what runs jobs on them."""
+    """Yield the number of threads of a Dask cluster's workers and what runs jobs on them."""
     if find_spec("distributed") is None:
         raise ModuleNotFoundError(
             'a scheduler needs the extra cluster: python -m pip install -c constraints.txt -e ".[cluster]"'
@@ -143,9 +142,9 @@ def cluster(scheduler: str) -> Iterator[tuple[int, Outcomes]]:
 
 
 def _dask_backend(client: Any) -> Any:
-    """joblib's Dask backend, which would wait for ever for a job that Dask has given up.
+    """Return joblib's Dask backend, which would wait for ever for a job that Dask has given up.
 
-    It takes a result from its callback alone, and calls that for no job whose workers died one after another.
+    It takes results only from its callback, which is never called for a job whose workers died one after another.
     """
     from joblib._dask import DaskDistributedBackend
 
@@ -164,7 +163,7 @@ def _dask_backend(client: Any) -> Any:
 
 
 def _outcomes(jobs: list[Job]) -> Generator[list[Outcome], None, None]:
-    """What jobs give, in the order in which they end; to close it stops what still runs."""
+    """Yield the outcomes of jobs in the order in which they end; closing it stops what still runs."""
     import joblib
 
     try:

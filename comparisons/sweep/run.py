@@ -16,17 +16,17 @@ from kfopc_filterpy.plot import save_figure
 
 from .figures import BUILT_IN_FIGURES, sweep_figures, swept_axis
 from .grid import Grid, Run, built_in_grid, own_grid
-from .jobs import Scenario, Sent, cluster, jobs_of, local
+from .jobs import Pool, Scenario, Sent, cluster, jobs_of, local
 from .scenario import FIGURES, ScenarioError
 from .store import SweepFolder
-from .table import Row, cell_rows, figure_names, require_format, run_rows, write_table
+from .table import Record, cell_rows, figure_names, require_format, run_rows, write_table
 
 __all__ = ["ScenarioError", "Sweep", "run_sweep"]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a sweep left.
+    """The results of a sweep.
 
     Attributes
     ----------
@@ -41,8 +41,8 @@ class Sweep:
     """
 
     grid: Grid
-    cells: list[Row]
-    runs: list[Row]
+    cells: list[Record]
+    runs: list[Record]
     files: list[Path]
 
     @property
@@ -66,8 +66,8 @@ def run_sweep(
 ) -> Sweep:
     """Run every combination of a grid with every seed; write tables and figures of means and intervals.
 
-    What is done is kept in the folder job by job: after an interruption the same call goes on from there. Results are
-    the same to the last bit whatever the number of jobs, and on a cluster of machines that compute alike.
+    Finished jobs are kept in the folder: after an interruption the same call goes on from there. Results are the same to
+    the last bit for any number of jobs, and on a cluster of machines that compute alike.
 
     Parameters
     ----------
@@ -75,18 +75,18 @@ def run_sweep(
         Values of each axis, one or a sequence. Without `scenario` those of `comparisons.sweep.grid.AXES`
         (``python -m comparisons sweep --help`` lists them), the others having their default; with one, any.
     folder : path
-        Where to write: sweep.json and runs.jsonl, what is kept; cells and runs as tables; figures/.
+        Where to write: sweep.json and runs.jsonl, which keep the runs; cells and runs as tables; figures/.
     seeds : int or sequence of int, default 8
         Number of seeds, which are then 1, 2, ..., or the seeds.
     scenario : callable, optional
         Function of a dict, the value of each axis and `seed`, that returns a dict of figures, each a number (None or
-        NaN where it has none); ``"diverged": True`` counts the run as diverged. It must be picklable and draw its
+        NaN if undefined); ``"diverged": True`` counts the run as diverged. It must be picklable and draw its
         randomness from the seed. By default a controller in the loop on a noise.
     jobs : int, optional
         Processes on this machine, all cores by default.
     scheduler : str, optional
-        Address of a Dask scheduler, such as ``"tcp://host:8786"``, whose workers do the runs instead. They need this
-        package (and the scenario function's module) installed.
+        Address of a Dask scheduler, such as ``"tcp://host:8786"``, whose workers do the runs instead. They need the
+        package installed, and a clone (and the scenario function's module) on their path.
     format : {"csv", "parquet"}, default "csv"
         Of the tables. Parquet needs the extra `parquet`.
     x : str, optional
@@ -110,7 +110,7 @@ def run_sweep(
     OSError
         The folder cannot be written, or no scheduler answers.
     ScenarioError
-        A scenario raised an exception; the message says which. What was done by then is kept.
+        A scenario raised an exception; the message says which. Finished runs are kept.
 
     Examples
     --------
@@ -136,7 +136,8 @@ def run_sweep(
     done = store.done()
     pending = [run for run in made.runs() if run.index not in done]
     if pending:
-        _work_off(made, pending, store, done, scenario, jobs, scheduler, quiet)
+        pool = local(jobs) if scheduler is None else cluster(scheduler)
+        _work_off(made, pending, store, done, Sent(scenario) if scenario and scheduler else scenario, pool, quiet)
     cells, runs = cell_rows(made, done), run_rows(made, done)
     files = [write_table(cells, store.path / "cells", format), write_table(runs, store.path / "runs", format)]
     names = _drawn(figures, figure_names(done), scenario is None)
@@ -151,20 +152,17 @@ def _work_off(
     store: SweepFolder,
     done: dict[int, dict[str, Any]],
     scenario: Scenario | None,
-    jobs: int | None,
-    scheduler: str | None,
+    pool: Pool,
     quiet: bool,
 ) -> None:
-    """Do the runs that are pending, keeping each job's as it ends."""
+    """Do the pending runs, and keep each job's as it ends."""
     from tqdm import tqdm
 
     diverged = sum(figures["diverged"] for figures in done.values())
     with (
-        local(jobs) if scheduler is None else cluster(scheduler) as (workers, run),
+        pool as (workers, run),
         tqdm(total=len(grid), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
-        closing(
-            run(jobs_of(grid, pending, workers, Sent(scenario) if scenario and scheduler else scenario))
-        ) as outcomes,
+        closing(run(jobs_of(grid, pending, workers, scenario))) as outcomes,
     ):
         for own in outcomes:
             store.keep(own)

@@ -1,8 +1,8 @@
 """The built-in scenario of a sweep: one controller in the loop on one noise, and its figures of merit.
 
 Runs on one noise share its scene; Kalman filters without a budget that agree in r, q, P0 and estimated path share one
-gain sequence too. What a run gives does not depend, to the last bit, on the runs it shares with: a scenario's arithmetic
-is its own, and one that is alone goes through `simulate_scenarios` as well.
+gain sequence too. The results of a run do not depend, to the last bit, on the runs it shares with: the arithmetic of a
+scenario is separate, and a single one goes through `simulate_scenarios` as well.
 """
 
 from __future__ import annotations
@@ -25,22 +25,29 @@ from kfopc_filterpy import (
     nse_db,
     output_power,
 )
-from kfopc_filterpy.bench.registry import KALMAN, REGISTRY, Setting, make_controller
-from kfopc_filterpy.bench.scene import Scene
-from kfopc_filterpy.bench.tuning import AllDivergedError, tune, unless_refused
+from kfopc_filterpy.bench import AllDivergedError, Scene, algorithms, make_controller, run_setting, tune
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
-from kfopc_filterpy.plot.style import decibels
-from kfopc_filterpy.power.amplifiers import Amplifier
 
-from ..studies.constraint_cases import FS, SWITCH_ON_S, made_noises, make_case, modelled_paths, noises, paths
+from ..studies.cases import (
+    FS,
+    SWITCH_ON_S,
+    WINDOW_S,
+    Setting,
+    decibels,
+    made_noises,
+    make_case,
+    modelled_paths,
+    noises,
+    paths,
+)
 from .grid import AMPLIFIERS, DEFAULT_SETTING, TUNED_SETTING, Values
 
 # Axes that runs of one scene agree in, and those that a gain sequence depends on besides.
 OF_SCENE = ("path", "noise", "duration_s", "n_taps", "sensor_noise_db", "seed")
 OF_GAINS = ("path_gain_db", "path_delay", "path_phase_deg", "setting")
 UNCONSTRAINED_POWER = 1.0  # of every scene; it sets the scale of the divergence limit
-NSE_WINDOW_S, POWER_WINDOW_S = 0.05, 0.1
+NSE_WINDOW_S = 0.05
 SHARED_BYTES = 256e6  # of the signals of runs that go on side by side
 MOST_SHARED, MOST_ALONE = 64, 8  # runs of a job
 MEASURED = (
@@ -60,22 +67,22 @@ Figures = dict[str, Any]
 
 
 def group_of(scenario: Values) -> tuple[Any, ...]:
-    """What runs must agree in to be done together."""
+    """Return what runs must agree in to be done together."""
     scene = tuple(scenario[name] for name in OF_SCENE)
-    shares = scenario["algorithm"] in KALMAN
+    shares = algorithms()[scenario["algorithm"]].shares_gains
     return (*scene, *(scenario[name] for name in OF_GAINS)) if shares else (*scene, None)
 
 
 def most_together(scenario: Values) -> int:
-    """Runs of a group that are done in one job: so many that they share well, and no more than memory is set aside for."""
-    if scenario["algorithm"] not in KALMAN:
+    """Return how many runs of a group one job does: enough to share well, within the memory set aside."""
+    if not algorithms()[scenario["algorithm"]].shares_gains:
         return MOST_ALONE
     fits = int(SHARED_BYTES / (8 * RECORDED * FS * scenario["duration_s"]))
     return int(np.clip(fits, 1, MOST_SHARED))
 
 
 def run_group(scenarios: Sequence[Values], tuning_seed: int) -> list[Figures]:
-    """Figures of merit of scenarios of one scene, in their order; settings are tuned on the noise of `tuning_seed`."""
+    """Return the figures of merit of scenarios of one scene; settings are tuned on the noise of `tuning_seed`."""
     made = [_Prepared(scenario, tuning_seed) for scenario in scenarios]
     sharing: dict[Any, list[int]] = {}
     for i, one in enumerate(made):
@@ -103,10 +110,10 @@ class _Prepared:
     @property
     def shares(self) -> bool:
         """Whether its gains depend on the reference alone."""
-        return self.scenario["algorithm"] in KALMAN
+        return algorithms()[self.scenario["algorithm"]].shares_gains
 
     def controller(self) -> Any:
-        """A fresh controller, which knows the path as well as the scenario says."""
+        """Return a fresh controller, which knows the path as well as the scenario says."""
         errors = (self.scenario[axis] for axis in ("path_gain_db", "path_delay", "path_phase_deg"))
         estimate = estimated_path(self.scenario["path"], *errors)
         known = replace(self.scene, secondary_estimate=estimate, rated_power=self.rated_power)
@@ -114,11 +121,11 @@ class _Prepared:
         return make_controller(known, self.scenario["algorithm"], self.setting)
 
     def _setting(self, tuning_seed: int) -> Setting | None:
-        setting, algorithm = self.scenario["setting"], REGISTRY[self.scenario["algorithm"]]
+        setting, algorithm = self.scenario["setting"], algorithms()[self.scenario["algorithm"]]
         if setting != TUNED_SETTING:
             return middle(algorithm.first) if setting == DEFAULT_SETTING else setting
-        scene = [self.scenario[name] for name in OF_SCENE[:-1]]
-        return _tuned(*scene, tuning_seed, self.scenario["algorithm"], self.rated_power, self.amplifier)
+        scene = (*(self.scenario[name] for name in OF_SCENE[:-1]), tuning_seed)
+        return _tuned(scene, self.scenario["algorithm"], self.rated_power, self.amplifier)
 
 
 class ScenarioError(RuntimeError):
@@ -127,7 +134,7 @@ class ScenarioError(RuntimeError):
 
 @contextmanager
 def naming(scenario: Values) -> Iterator[None]:
-    """Say of an exception which scenario raised it."""
+    """Name the scenario in an exception that it raises."""
     try:
         yield
     except Exception as error:
@@ -136,19 +143,19 @@ def naming(scenario: Values) -> Iterator[None]:
 
 
 def middle(grid: Sequence[float]) -> float:
-    """The middle of the settings that the studies tune an algorithm on."""
+    """Return the middle of the settings that the studies tune an algorithm on."""
     return sorted(grid)[len(grid) // 2]
 
 
 def path_pair(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Primary and secondary taps."""
+    """Return primary and secondary taps."""
     modelled = modelled_paths()
     return modelled[name] if name in modelled else paths()[name]
 
 
 @lru_cache(maxsize=256)  # a phase is fitted by least squares: seconds for a long path
 def estimated_path(path: str, gain_db: float, delay: float, phase_deg: float) -> np.ndarray:
-    """Taps of a secondary path estimated with an error."""
+    """Return the taps of a secondary path estimated with an error."""
     taps = path_pair(path)[1]
     if not (gain_db or delay or phase_deg):
         return taps
@@ -157,55 +164,45 @@ def estimated_path(path: str, gain_db: float, delay: float, phase_deg: float) ->
 
 @lru_cache(maxsize=4)
 def scene_of(path: str, noise: str, duration_s: float, n_taps: int, sensor_noise_db: float, seed: int) -> Scene:
-    """Scene of one noise, of unconstrained control power 1."""
+    """Return the scene of one noise, of unconstrained control power 1."""
     made = made_noises()
     signal = (made if noise in made else noises())[noise](duration_s + SWITCH_ON_S, seed)
     return make_case(path_pair(path), signal, n_taps=n_taps, sensor_noise_db=sensor_noise_db, seed=seed)
 
 
 class _OneByOne:
-    """What `tune` runs its jobs with: in this process, for the others are at work on their own."""
+    """A `Runs` for `tune` that stays in this process, since the others have jobs too."""
 
     def map(self, job: Callable[[Any], Any], items: Iterable[Any], worth: Any = None) -> list[Any]:
         return [job(item) for item in items]
 
 
 @lru_cache(maxsize=256)
-def _tuned(
-    path: str,
-    noise: str,
-    duration_s: float,
-    n_taps: int,
-    sensor_noise_db: float,
-    seed: int,
-    algorithm: str,
-    rated_power: float,
-    amplifier: Amplifier | None,
-) -> Setting | None:
-    """Best setting by the studies' rule on the noise of one seed, the path known exactly; None where all diverge."""
-    scene = scene_of(path, noise, duration_s, n_taps, sensor_noise_db, seed)
-    scene = replace(scene, rated_power=rated_power, amplifier=amplifier)
+def _tuned(of_scene: tuple[Any, ...], algorithm: str, rated_power: float, amplifier: Any) -> Setting | None:
+    """Return the best setting by the studies' rule on one seed, with the exact path; None if all diverge."""
+    scene = replace(scene_of(*of_scene), rated_power=rated_power, amplifier=amplifier)
     try:
         return tune(_OneByOne(), scene, (algorithm,))[algorithm].setting  # type: ignore[arg-type]
     except AllDivergedError:
         return None
 
 
-def _amplifier(name: str, limit: float) -> Amplifier | None:
+def _amplifier(name: str, limit: float) -> Any:
     hard, soft = AMPLIFIERS[1:]
     return HardClipAmplifier(limit) if name == hard else SoftSaturationAmplifier(limit) if name == soft else None
 
 
 def _run(members: list[_Prepared]) -> list[Figures]:
-    """Runs that share a gain sequence, or a single run; without a stable setting there is none."""
-    if members[0].setting is None:
+    """Run scenarios that share a gain sequence, or a single one; without a stable setting there is no run."""
+    setting = members[0].setting
+    if setting is None:
         return [_figures(one, None) for one in members]
     if not members[0].shares:
         (alone,) = members
         with naming(alone.scenario):
             scene = replace(alone.scene, amplifier=alone.amplifier)
-            controller = alone.controller()
-            result = unless_refused(alone.scenario["algorithm"], lambda: scene.run(controller))
+            algorithm, controller = alone.scenario["algorithm"], alone.controller()
+            result = run_setting(scene, algorithm, setting, controller=controller)
             return [_figures(alone, result)]
     try:
         results = members[0].scene.run_together(
@@ -220,7 +217,7 @@ def _run(members: list[_Prepared]) -> list[Figures]:
 
 
 def _figures(one: _Prepared, result: SimulationResult | None) -> Figures:
-    """Figures of merit of a run; of one that diverged NaN, and the time, where it did not refuse to go on."""
+    """Return the figures of merit of a run; NaN if it diverged, with the time unless it refused to go on."""
     diverged = result is None or result.diverged_at_s is not None
     values = [np.nan] * len(MEASURED) if result is None or diverged else _measured(one, result)
     first, second = one.setting if isinstance(one.setting, tuple) else (one.setting, np.nan)
@@ -240,7 +237,7 @@ def _measured(one: _Prepared, result: SimulationResult) -> list[float]:
         noise_reduction_db(e, d),
         float(decibels(power / UNCONSTRAINED_POWER)),
         power / one.rated_power,
-        overshoot(y, one.rated_power, FS, window_s=POWER_WINDOW_S),
+        overshoot(y, one.rated_power, FS, window_s=WINDOW_S),
         power,
         clipped_fraction(y, one.limit),
         float(np.mean(nse_db(e, d, FS, NSE_WINDOW_S))),

@@ -1,9 +1,8 @@
-"""The folder of a sweep: what it is of, and the runs that are done.
+"""The folder of a sweep: its description, and the runs that are done.
 
-`sweep.json` says of which grid, seeds, scenario and code the folder is; it is written once and whole. `runs.jsonl` gets
-a line for each job that ends, on disk before the next one counts. A line is one JSON object: cut off anywhere, it has a
-brace too few and is no JSON, so that a torn one, wherever a kill or a power cut left it, is told from a whole one and
-its runs are done again. A torn line is never mended or cut away: the next goes below it.
+`sweep.json` holds the grid, seeds, scenario and code; it is written once and whole. `runs.jsonl` gets a line for each
+job that ends, on disk before the next one counts. A line is one JSON object. If a kill or a power cut leaves it torn, a
+brace is missing and it is not JSON: its runs are done again. A torn line stays, and the next one goes below it.
 """
 
 from __future__ import annotations
@@ -19,19 +18,19 @@ from pathlib import Path
 from typing import Any
 
 import kfopc_filterpy
-from kfopc_filterpy.bench.report import _replace, prepare_folder
+from kfopc_filterpy.bench import prepare_folder, write_whole
 
 from .grid import Grid
 
 FORMAT = 1
 DESCRIPTION, RUNS = "sweep.json", "runs.jsonl"
-PART_OF_SWEEP = ("studies/constraint_cases.py", "sweep/grid.py", "sweep/scenario.py")
+PART_OF_SWEEP = ("studies/cases.py", "sweep/grid.py", "sweep/scenario.py")
 
 Outcome = tuple[int, dict[str, Any]]  # number of a run, and its figures
 
 
 class SweepFolder:
-    """Where a sweep's runs are kept.
+    """The folder that keeps a sweep's runs.
 
     Raises
     ------
@@ -48,7 +47,7 @@ class SweepFolder:
         own = describe(grid, scenario)
         there = self._description()
         if there is None:
-            _replace(self.path / DESCRIPTION, json.dumps(own, ensure_ascii=False, indent=1) + "\n")
+            write_whole(self.path / DESCRIPTION, json.dumps(own, ensure_ascii=False, indent=1) + "\n")
         elif there != own:
             raise ValueError(
                 f"folder {str(self.path)!r} holds another sweep: {_difference(there, own)}. Choose another output folder, or "
@@ -72,7 +71,7 @@ class SweepFolder:
         return there
 
     def done(self) -> dict[int, dict[str, Any]]:
-        """Figures of the runs that are done, by number."""
+        """Return the figures of the runs that are done, by number."""
         outcomes: dict[int, dict[str, Any]] = {}
         if self._runs.exists():
             for line in self._runs.read_bytes().splitlines():
@@ -82,7 +81,7 @@ class SweepFolder:
         return outcomes
 
     def keep(self, outcomes: Sequence[Outcome]) -> None:
-        """Add the runs of a job, durably."""
+        """Add the runs of a job, on disk when this returns."""
         line = json.dumps(
             {"runs": [{"run": index, "figures": _to_json(figures)} for index, figures in outcomes]},
             ensure_ascii=False,
@@ -99,7 +98,7 @@ class SweepFolder:
 
 
 def describe(grid: Grid, scenario: Callable[..., Any] | None) -> dict[str, Any]:
-    """What a sweep is of, as JSON gives it back."""
+    """Return the description of a sweep, as JSON gives it back."""
     return {
         "format": FORMAT,
         "axes": {name: list(values) for name, values in grid.axes.items()},
@@ -110,7 +109,7 @@ def describe(grid: Grid, scenario: Callable[..., Any] | None) -> dict[str, Any]:
 
 
 def code_hash(scenario: Callable[..., Any] | None) -> str:
-    """Hash of the code that decides what a run gives: the package, the scenes, and the source of an own scenario."""
+    """Return the hash of the code that results rest on: the package, the scenes, and the source of an own scenario."""
     package, studies = Path(kfopc_filterpy.__file__).parent, Path(__file__).parents[1]
     digest = hashlib.sha256()
     for file in (*sorted(package.rglob("*.py")), *(studies / name for name in PART_OF_SWEEP)):
@@ -127,7 +126,7 @@ def _name(scenario: Callable[..., Any]) -> str:
 
 
 def _difference(there: Mapping[str, Any], own: Mapping[str, Any]) -> str:
-    """In what two descriptions differ, in words."""
+    """Return in words how two descriptions differ."""
     if there.get("format") != own["format"]:
         return f"its format is {there.get('format')!r}, not {own['format']}"
     for name in ("scenario", "seeds"):
@@ -149,7 +148,7 @@ def _short(value: Any) -> str:
 
 
 def _outcomes(line: bytes) -> list[Outcome]:
-    """Runs of a line; none where it is torn."""
+    """Return the runs of a line; none if it is torn."""
     try:
         return [(int(run["run"]), _from_json(run["figures"])) for run in json.loads(line)["runs"]]
     except (ValueError, KeyError, TypeError, AttributeError):
@@ -157,7 +156,7 @@ def _outcomes(line: bytes) -> list[Outcome]:
 
 
 def _to_json(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """Figures with null for what is not finite, which JSON has no number for."""
+    """Return figures with null for values that are not finite: JSON has no number for them."""
     return {
         name: None if isinstance(value, float) and not math.isfinite(value) else value
         for name, value in figures.items()

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
-from kfopc_filterpy.bench.report import _replace
+from kfopc_filterpy.bench import write_whole
 
 from .grid import Grid
 
 CONFIDENCE = 0.95
 FORMATS = ("csv", "parquet")
 
-Row = dict[str, Any]
+Record = dict[str, Any]
 
 
 def mean_and_interval(values: Iterable[float]) -> tuple[float, float, float, int]:
-    """Mean, lower and upper end of its 95 % t-interval, and number of the finite values.
+    """Return the mean, the lower and the upper end of its 95 % t-interval, and the number of the finite values.
 
     The interval is NaN for a single value, and all is NaN for none.
 
@@ -45,21 +45,23 @@ def mean_and_interval(values: Iterable[float]) -> tuple[float, float, float, int
     return mean, mean - half, mean + half, count
 
 
-def run_rows(grid: Grid, done: Mapping[int, Mapping[str, Any]]) -> list[Row]:
-    """A row for each run: the axes, the seed, the figures."""
+def run_rows(grid: Grid, done: Mapping[int, Mapping[str, Any]]) -> list[Record]:
+    """Return a row for each run: the axes, the seed, the figures."""
     return [run.values | {"seed": run.seed} | dict(done[run.index]) for run in grid.runs() if run.index in done]
 
 
-def cell_rows(grid: Grid, done: Mapping[int, Mapping[str, Any]]) -> list[Row]:
-    """A row for each cell: the axes, how many runs and how many of them diverged, and of each figure the mean over the
-    seeds that did not diverge, its interval, and how many had it."""
+def cell_rows(grid: Grid, done: Mapping[int, Mapping[str, Any]]) -> list[Record]:
+    """Return a row for each cell: the axes, the runs and how many diverged, and mean and interval of each figure.
+
+    Means are over the seeds that did not diverge.
+    """
     names = figure_names(done)
     rows = []
     seeds = len(grid.seeds)
     for i, values in enumerate(grid.cells()):
         own = [done[index] for index in range(i * seeds, (i + 1) * seeds) if index in done]
         stable = [figures for figures in own if not figures["diverged"]]
-        row: Row = values | {"runs": len(own), "diverged": len(own) - len(stable)}
+        row: Record = values | {"runs": len(own), "diverged": len(own) - len(stable)}
         for name in names:
             figures = mean_and_interval(one.get(name, math.nan) for one in (own if name == "diverged_at_s" else stable))
             row |= dict(zip((f"{name}_mean", f"{name}_low", f"{name}_high", f"{name}_n"), figures, strict=True))
@@ -68,11 +70,11 @@ def cell_rows(grid: Grid, done: Mapping[int, Mapping[str, Any]]) -> list[Row]:
 
 
 def figure_names(done: Mapping[int, Mapping[str, Any]]) -> list[str]:
-    """Names of the figures of all runs, in the order of the first run that has one."""
+    """Return the names of the figures of all runs, in the order of the first run that has one."""
     return list(dict.fromkeys(name for index in sorted(done) for name in done[index] if name != "diverged"))
 
 
-def write_table(rows: Sequence[Row], path_without_suffix: Path, kind: str) -> Path:
+def write_table(rows: Sequence[Record], path_without_suffix: Path, kind: str) -> Path:
     """Write rows as CSV (numbers in full precision, nothing for NaN) or as Parquet, whole or not at all."""
     path = path_without_suffix.with_name(f"{path_without_suffix.name}.{kind}")
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -83,12 +85,12 @@ def write_table(rows: Sequence[Row], path_without_suffix: Path, kind: str) -> Pa
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
     writer.writerows([["" if _absent(row.get(name)) else row[name] for name in names] for row in rows])
-    _replace(path, text.getvalue())
+    write_whole(path, text.getvalue())
     return path
 
 
 def require_format(kind: str) -> None:
-    """Refuse a format that is none, or that cannot be written here."""
+    """Raise an error if a format is unknown or cannot be written here."""
     if kind not in FORMATS:
         raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {kind!r}")
     if kind == "parquet" and find_spec("pyarrow") is None:
@@ -97,7 +99,7 @@ def require_format(kind: str) -> None:
         )
 
 
-def _write_parquet(rows: Sequence[Row], names: Sequence[str], path: Path) -> None:
+def _write_parquet(rows: Sequence[Record], names: Sequence[str], path: Path) -> None:
     import pyarrow
     from pyarrow import parquet
 
@@ -111,7 +113,7 @@ def _write_parquet(rows: Sequence[Row], names: Sequence[str], path: Path) -> Non
 
 
 def _of_one_type(column: list[Any]) -> list[Any]:
-    """The column as it is, numbers as floats where some are, or as strings where its types differ."""
+    """Return the column as it is, its numbers as floats if some are, or all as strings if the types differ."""
     kinds = {type(value) for value in column if value is not None}
     if len(kinds) <= 1:
         return column

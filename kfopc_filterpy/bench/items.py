@@ -1,4 +1,4 @@
-"""What a study hands over to the report."""
+"""The parts of a study's report: verdicts, parameters, tables, figures, sounds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,17 @@ HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One claim of the paper, and what was measured, as a sentence."""
+    """One claim, and what was measured.
+
+    Parameters
+    ----------
+    claim : str
+        The claim as a sentence.
+    reproduced : bool
+        Whether it holds.
+    figure : str
+        What was measured, in words.
+    """
 
     claim: str
     reproduced: bool
@@ -37,7 +47,15 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter's value, and how it was chosen."""
+    """A parameter's value, and how it was chosen.
+
+    Parameters
+    ----------
+    value : Any
+        Number, text, array, list or mapping.
+    chosen : str
+        How it was chosen.
+    """
 
     value: Any
     chosen: str
@@ -51,8 +69,24 @@ def _shown(cell: str | float) -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """A table, the end of its file's name and its caption: cells are text or numbers, of which page and terminal show
-    four digits and the file all."""
+    """A table of text and numbers: page and terminal show four digits, the file all of them.
+
+    Parameters
+    ----------
+    stem : str
+        End of the file's name.
+    caption : str
+        Caption.
+    headings : sequence of str
+        Headings of the columns.
+    rows : sequence of sequence
+        Rows of cells, each a text or a number.
+
+    Raises
+    ------
+    ValueError
+        A row has another number of cells than there are headings, or the stem cannot name a file.
+    """
 
     stem: str
     caption: str
@@ -69,18 +103,28 @@ class Table:
 
     @property
     def cells(self) -> list[list[str]]:
-        """The cells as they are shown."""
+        """Cells as they are shown."""
         return [[_shown(cell) for cell in row] for row in self.rows]
 
     @property
     def numbers(self) -> set[int]:
-        """Columns of numbers."""
+        """Columns with a number in them."""
         return {i for row in self.rows for i, cell in enumerate(row) if not isinstance(cell, str)}
 
 
 @dataclass(frozen=True)
 class FigureItem:
-    """A figure, the end of its files' name, and its caption. pyplot is made to forget it: a report holds many."""
+    """A figure with its caption. pyplot is made to forget it, since a report holds many.
+
+    Parameters
+    ----------
+    stem : str
+        End of the names of its files.
+    caption : str
+        Caption.
+    figure : matplotlib.figure.Figure
+        The figure.
+    """
 
     stem: str
     caption: str
@@ -95,7 +139,17 @@ class FigureItem:
 
 @dataclass(frozen=True)
 class Sound:
-    """A sound, (n_samples,), NaN at its end where the run diverged; the end of its file's name and its label."""
+    """A sound with its label.
+
+    Parameters
+    ----------
+    stem : str
+        End of its file's name.
+    label : str
+        Label.
+    signal : ndarray, shape (n_samples,)
+        The sound; NaN at its end if the run diverged.
+    """
 
     stem: str
     label: str
@@ -107,12 +161,12 @@ class Sound:
 
 @dataclass(frozen=True)
 class StudyReport:
-    """All that the report says of one study.
+    """Everything that the report says of one study.
 
     Parameters
     ----------
     name : str
-        "tonal", "broadband", "duct" or "duct-measured": lower-case letters, digits and "-".
+        Lower-case letters, digits and "-", for it names files.
     title, summary : str
         Heading, and a few sentences.
     fs : float
@@ -122,7 +176,7 @@ class StudyReport:
     parameters : dict of str to Parameter
         Every parameter by name.
     algorithms : dict of str to dict
-        Figures of merit by algorithm: keys out of `FIGURES_OF_MERIT`; None, NaN or left out where undefined.
+        Figures of merit by algorithm: keys out of `FIGURES_OF_MERIT`; None, NaN or left out if undefined.
     extra : dict of str to Any
         Further figures for results.json: numbers, text, arrays, lists and mappings of them.
     verdicts : list of Verdict
@@ -172,12 +226,12 @@ class StudyReport:
 
     @property
     def marks(self) -> tuple[str, str]:
-        """What a verdict is called that holds, and one that does not."""
+        """Words for a verdict that holds, and for one that does not."""
         return ("reproduced", "not reproduced") if self.claims == OF_THE_PAPER else ("met", "not met")
 
     @property
     def result(self) -> dict[str, Any]:
-        """The study's part of results.json: strict JSON values only, None where undefined."""
+        """Part of results.json: strict JSON values only, None if undefined."""
         values = {
             "rated_power": self.rated_power,
             "parameters": {name: parameter.value for name, parameter in self.parameters.items()},
@@ -194,7 +248,7 @@ class StudyReport:
 
 
 def jsonable(value: Any, where: str = "value") -> Any:
-    """`value` in strict JSON's types: arrays as lists, numpy's scalars as numbers, NaN and Inf as None.
+    """Return `value` in strict JSON's types: arrays as lists, numpy's scalars as numbers, NaN and Inf as None.
 
     Examples
     --------
@@ -229,7 +283,7 @@ COLUMNS = [
 
 
 def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
-    """Figures of merit as the table's cells, "-" where there is none."""
+    """Return figures of merit as the table's cells, "-" if there is none."""
 
     def cell(key: str, form: str, scale: float = 1.0) -> str:
         value = jsonable(figures.get(key))
@@ -248,29 +302,29 @@ def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
 
 
 def count_of_claims(studies: Sequence[StudyReport]) -> str:
-    """How many claims were reproduced, as a phrase."""
+    """Return how many claims were reproduced, as a phrase."""
     verdicts = [verdict.reproduced for study in studies for verdict in study.verdicts]
     what = "claims reproduced" if any(study.claims == OF_THE_PAPER for study in studies) else "aims met"
     return f"{sum(verdicts)} of {len(verdicts)} {what}"
 
 
 def figure_file(folder: Path, study: StudyReport, item: FigureItem) -> Path:
-    """Path of a figure, without its suffix."""
+    """Return the path of a figure, without its suffix."""
     return folder / "figures" / f"{study.name}-{item.stem}"
 
 
 def table_file(folder: Path, study: StudyReport, table: Table) -> Path:
-    """Path of a table."""
+    """Return the path of a table."""
     return folder / "tables" / f"{study.name}-{table.stem}.csv"
 
 
 def sound_file(folder: Path, study: StudyReport, sound: Sound) -> Path:
-    """Path of a sound."""
+    """Return the path of a sound."""
     return folder / "audio" / f"{study.name}-{sound.stem}.wav"
 
 
 def loudness(study: StudyReport) -> list[tuple[np.ndarray, float]]:
-    """Each sound, clipped where it must be, and the one peak that is full scale in all of the study.
+    """Return each sound, clipped if it must be, and the one peak that is full scale in all of the study.
 
     Full scale is the loudest sound's peak, at most 4 times the first's: a run that diverges would silence the rest.
     """
@@ -288,6 +342,7 @@ def _require_stem(name: str, argument: str) -> None:
 
 
 def require_different(names: Iterable[str], what: str) -> None:
+    """Raise ValueError if two names are the same."""
     names = list(names)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

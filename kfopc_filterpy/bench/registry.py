@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from kfopc_filterpy import (
     LeakyFxLMS,
     MOVFxLMS,
     OptimalLeakyFxLMS,
+    OutputPowerConstraint,
     RescalingFxLMS,
     TwoGradientFxLMS,
     fx_rls,
@@ -24,24 +26,20 @@ from kfopc_filterpy import (
     kf_opc_repaired,
     kf_pb,
 )
-from kfopc_filterpy.controllers.base import FilteredReferenceController
+from kfopc_filterpy.controllers import Controller
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 from .scene import Scene
 
-ALGORITHMS = ("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS")  # the paper's
-KALMAN = ("KF-ANC", "KF-OPC")  # whose runs share gains
-BUDGETED = ("KF-OPC repaired", "KF-PB")
-POWER_MEMORY_S = 0.5
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
-# noise is no random walk any more but recursive least squares that never forgets, which a stationary noise would always
-# favour; the tonal study shows what it changes.
+# noise makes it recursive least squares that never forgets, which stationary noise would always favour; the tonal study
+# shows the difference.
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
-# The diagonal filter learns as slowly as NLMS does, and asks for less state noise.
+# The diagonal filter learns as slowly as NLMS, and needs less state noise.
 DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
-PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer one follows around the best
+PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid follows around the best
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
@@ -49,91 +47,127 @@ Setting = float | tuple[float, float]
 
 @dataclass(frozen=True)
 class Algorithm:
-    """How an algorithm is made and tuned.
+    """One algorithm of the registry: how it is made and tuned.
 
-    `make` takes a scene, the first setting in the scene's units, the second as it stands, and the amplifier that the
-    disturbance estimate knows.
+    Parameters
+    ----------
+    make : callable
+        Function of a scene, the first setting in the scene's units, the second setting, and the amplifier known to the
+        disturbance estimate. It returns a fresh controller.
+    symbol : str
+        Parameter that the first setting sets: "r", "mu" or "1 - lambda".
+    kind : str
+        The first setting as a formula, without units.
+    first : tuple of float
+        Values of the first setting that are tried.
+    second_kind : str, default ""
+        The second setting as a formula, "" if there is none.
+    second : tuple of float, default ()
+        Values of the second setting that are tried.
+    of_paper : bool, default False
+        Whether the paper compares it.
+    keeps_budget : bool, default True
+        Whether it is meant to keep the rated power.
+    sees_budget : bool, default True
+        Whether it is made with the rated power. If not, its runs serve for all rated powers.
+    shares_gains : bool, default False
+        Whether its gain depends on the reference alone, so that several runs on one noise share it.
+    knows_amplifier : bool, default False
+        Whether its disturbance estimate can know the amplifier.
+    may_refuse : bool, default False
+        Whether it may find during a run that it cannot go on, which counts as divergence.
     """
 
-    make: Callable[[Scene, float, float, Amplifier | None], FilteredReferenceController]
-    symbol: str  # what the first setting sets
-    kind: str  # what the first setting is
+    make: Callable[[Scene, float, float, Amplifier | None], Controller]
+    symbol: str
+    kind: str
     first: tuple[float, ...]
     second_kind: str = ""
     second: tuple[float, ...] = ()
+    of_paper: bool = False
     keeps_budget: bool = True
-    sees_budget: bool = True  # whether it is made with the rated power; if not, runs serve for all rated powers
+    sees_budget: bool = True
+    shares_gains: bool = False
     knows_amplifier: bool = False
-    may_refuse: bool = False  # whether it may find in a run that it cannot go on, which counts as divergence
+    may_refuse: bool = False
 
     @property
     def grid(self) -> list[Setting]:
-        """Settings that are tried."""
+        """Settings that are tried: numbers, or pairs if there is a second setting."""
         if not self.second:
             return list(self.first)
         return [(one, two) for one in self.first for two in self.second]
 
     def finer(self, best: Setting) -> list[Setting]:
-        """Settings around the best of the grid, where there is a second: that decides how the budget is spent."""
+        """Return settings around `best`, the best of the grid; none unless there is a second setting.
+
+        The second setting decides how the budget is spent, and needs the finer steps.
+        """
         if not isinstance(best, tuple):
             return []
         ratio = self.second[1] / self.second[0]
         near = [best[1] * ratio ** (k / 6) for k in range(-5, 6) if k]
         return [(one, two) for one in (best[0] / 2, best[0], 2 * best[0]) for two in near]
 
+    def value(self, scene: Scene, setting: Setting) -> float:
+        """Return the state noise r, step size mu or 1 - lambda that a `setting` means in the units of a `scene`."""
+        first = setting[0] if isinstance(setting, tuple) else setting
+        if self.symbol == "r":
+            return first * scene.measurement_noise / scene.filtered_power
+        return first if self.symbol == "1 - lambda" else first / (scene.n_taps * scene.filtered_power)
 
-def _kalman(make: Any, constrained: bool = True, **more: Any) -> Callable[..., FilteredReferenceController]:
-    def made(scene: Scene, r: float, _: float, amplifier: Amplifier | None) -> FilteredReferenceController:
+
+def _constraint(scene: Scene) -> OutputPowerConstraint:
+    return OutputPowerConstraint(scene.rated_power, fs=scene.fs, memory_s=scene.power_memory_s)
+
+
+def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[..., Controller]:
+    """Return a maker of Kalman filters: with a constraint, `free` of any, or with a power `budget`."""
+
+    def made(scene: Scene, r: float, _: float, amplifier: Amplifier | None) -> Controller:
         settings: dict[str, Any] = {
             "state_noise": r,
             "measurement_noise": scene.measurement_noise,
             "initial_variance": scene.initial_variance,
             "amplifier": amplifier,
         }
-        if constrained:
+        if budget:
             settings |= {"rated_power": scene.rated_power, "fs": scene.fs}
-        return make(scene.n_taps, scene.known_secondary, **settings, **more)
+        elif not free:
+            settings |= {"constraint": _constraint(scene)}
+        return make(scene.n_taps, scene.known_secondary, **settings)
 
     return made
 
 
-def _rated(kind: Any, **more: Any) -> Callable[..., FilteredReferenceController]:
-    def made(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> FilteredReferenceController:
-        return kind(
-            scene.n_taps,
-            scene.known_secondary,
-            step_size=mu,
-            rated_power=scene.rated_power,
-            fs=scene.fs,
-            power_memory=POWER_MEMORY_S,
-            amplifier=amplifier,
-            **more,
-        )
+def _rated(kind: Any, **more: Any) -> Callable[..., Controller]:
+    def made(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
+        own: dict[str, Any] = {"constraint": _constraint(scene), "amplifier": amplifier, **more}
+        return kind(scene.n_taps, scene.known_secondary, step_size=mu, **own)
 
     return made
 
 
-def _plain(kind: Any) -> Callable[..., FilteredReferenceController]:
+def _plain(kind: Any) -> Callable[..., Controller]:
     return lambda scene, mu, _, amplifier: kind(scene.n_taps, scene.known_secondary, step_size=mu)
 
 
-def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> FilteredReferenceController:
+def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
     energy = scene.n_taps * scene.filtered_power  # mu is that of FxLMS; the first rows are short, hence the bottom
     return FxNLMS(scene.n_taps, scene.known_secondary, step_size=mu * energy, regularization=0.01 * energy)
 
 
-def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> FilteredReferenceController:
+def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
     leak = min(price * scene.filtered_power, 1.0 / mu)
     return LeakyFxLMS(scene.n_taps, scene.known_secondary, step_size=mu, leak=leak)
 
 
-def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> FilteredReferenceController:
+def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
     controller = MOVFxLMS(
         scene.n_taps,
         scene.known_secondary,
         step_size=mu,
-        rated_power=scene.rated_power,
-        fs=scene.fs,
+        constraint=_constraint(scene),
         penalty_factor=price * scene.secondary_gain,
         amplifier=amplifier,
     )
@@ -141,8 +175,8 @@ def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | Non
     return controller
 
 
-def _peak(kind: Any) -> Callable[..., FilteredReferenceController]:
-    def made(scene: Scene, mu: float, share: float, amplifier: Amplifier | None) -> FilteredReferenceController:
+def _peak(kind: Any) -> Callable[..., Controller]:
+    def made(scene: Scene, mu: float, share: float, amplifier: Amplifier | None) -> Controller:
         limit = float(np.sqrt(share * scene.unconstrained_power))
         more = {"output_step_size": mu * scene.secondary_gain} if kind is TwoGradientFxLMS else {}
         return kind(scene.n_taps, scene.known_secondary, step_size=mu, amplitude_limit=limit, **more)
@@ -150,7 +184,7 @@ def _peak(kind: Any) -> Callable[..., FilteredReferenceController]:
     return made
 
 
-def _rls(scene: Scene, forgetting: float, _: float, amplifier: Amplifier | None) -> FilteredReferenceController:
+def _rls(scene: Scene, forgetting: float, _: float, amplifier: Amplifier | None) -> Controller:
     return fx_rls(
         scene.n_taps,
         scene.known_secondary,
@@ -177,21 +211,21 @@ _PEAK: dict[str, Any] = _STEP | {
 _FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
 _KNOWS: dict[str, Any] = {"knows_amplifier": True}
 REGISTRY: dict[str, Algorithm] = {
-    "KF-ANC": Algorithm(_kalman(kf_anc, False), **_RANDOM_WALK, **_FREE),
-    "KF-OPC": Algorithm(_kalman(kf_opc, power_memory=POWER_MEMORY_S), **_RANDOM_WALK),
-    "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired, power_memory=POWER_MEMORY_S), **_RANDOM_WALK),
-    "KF-PB": Algorithm(_kalman(kf_pb), **_RANDOM_WALK),
-    "diagonal KF": Algorithm(_kalman(DiagonalKalman, False), **_DIAGONAL, **_FREE),
-    "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman, power_memory=POWER_MEMORY_S), **_DIAGONAL),
+    "KF-ANC": Algorithm(_kalman(kf_anc, free=True), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE),
+    "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK),
+    "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired), **_RANDOM_WALK),
+    "KF-PB": Algorithm(_kalman(kf_pb, budget=True), **_RANDOM_WALK),
+    "diagonal KF": Algorithm(_kalman(DiagonalKalman, free=True), **_DIAGONAL, **_FREE),
+    "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman), **_DIAGONAL),
     "FxRLS": Algorithm(_rls, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
-    "FxLMS": Algorithm(_plain(FxLMS), **_STEP, **_FREE),
+    "FxLMS": Algorithm(_plain(FxLMS), of_paper=True, **_STEP, **_FREE),
     "FxNLMS": Algorithm(_normalised, **_STEP, **_FREE),
     "leaky FxLMS": Algorithm(_leaky, **_STEP, second_kind="leak over E[x'^2]", second=PRICE_GRID, sees_budget=False),
     "optimal leaky FxLMS": Algorithm(_rated(OptimalLeakyFxLMS), **_STEP, **_KNOWS),
     "MOV-FxLMS fixed": Algorithm(
         _mov_fixed, **_STEP, second_kind="penalty factor over G_s", second=PRICE_GRID, sees_budget=False, **_KNOWS
     ),
-    "MOV-FxLMS": Algorithm(_rated(MOVFxLMS), **_STEP, **_KNOWS),
+    "MOV-FxLMS": Algorithm(_rated(MOVFxLMS), of_paper=True, **_STEP, **_KNOWS),
     "MOV-MFxLMS": Algorithm(_rated(MOVFxLMS, modified=True), **_STEP, **_KNOWS),
     "two-gradient FxLMS": Algorithm(_peak(TwoGradientFxLMS), **_PEAK),
     "re-scaling FxLMS": Algorithm(_peak(RescalingFxLMS), **_PEAK),
@@ -199,27 +233,54 @@ REGISTRY: dict[str, Algorithm] = {
 }
 
 
-def make_controller(
-    scene: Scene, algorithm: str, setting: Setting, *, amplifier: Amplifier | None = None
-) -> FilteredReferenceController:
-    """A fresh controller of an algorithm of `REGISTRY`, with a setting of its grid or like it.
+def algorithms() -> Mapping[str, Algorithm]:
+    """Return the registry: every algorithm that studies and sweeps compare, by name.
 
-    `amplifier` is the one that the disturbance estimate knows, for algorithms that have one; by default the scene's
-    known one.
+    Returns
+    -------
+    mapping of str to Algorithm
+        A view that cannot be changed, in the order of the tables.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import algorithms
+    >>> [name for name, algorithm in algorithms().items() if algorithm.of_paper]
+    ['KF-ANC', 'KF-OPC', 'FxLMS', 'MOV-FxLMS']
+    >>> algorithms()["KF-PB"].grid
+    [1e-08, 1e-07, 1e-06, 1e-05, 0.0001]
+    """
+    return MappingProxyType(REGISTRY)
+
+
+def make_controller(scene: Scene, algorithm: str, setting: Setting, *, amplifier: Amplifier | None = None) -> Any:
+    """Return a fresh controller for a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene that gives the taps, the known secondary path, q, P0 and the rated power.
+    algorithm : str
+        Name in the registry, see `algorithms`.
+    setting : float or tuple of float
+        Setting of its grid, or like it.
+    amplifier : amplifier, optional
+        Amplifier that the disturbance estimate knows, for algorithms that can; by default the scene's known one.
+
+    Returns
+    -------
+    Controller
+        The controller, with all weights zero.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import make_controller, make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> make_controller(scene, "KF-OPC", 1e-6).rated_power
+    1.0
     """
     second = setting[1] if isinstance(setting, tuple) else np.nan
     amplifier = scene.known_amplifier if amplifier is None else amplifier
-    return REGISTRY[algorithm].make(scene, setting_value(scene, algorithm, setting), second, amplifier)
-
-
-def setting_value(scene: Scene, algorithm: str, setting: Setting) -> float:
-    """State noise r, step size mu or 1 - lambda of a setting, in the scene's units."""
-    first, kind = (setting[0] if isinstance(setting, tuple) else setting), REGISTRY[algorithm].symbol
-    if kind == "r":
-        return first * scene.measurement_noise / scene.filtered_power
-    return first if kind == "1 - lambda" else first / (scene.n_taps * scene.filtered_power)
-
-
-def grid(algorithm: str) -> list[Setting]:
-    """Settings that are tried for an algorithm."""
-    return REGISTRY[algorithm].grid
+    own = REGISTRY[algorithm]
+    return own.make(scene, own.value(scene, setting), second, amplifier)

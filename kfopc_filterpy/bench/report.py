@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from kfopc_filterpy.plot import save_figure
-from kfopc_filterpy.signals.recordings import write_wav
+from kfopc_filterpy.signals import write_wav
 
 from .items import (
     COLUMNS,
@@ -44,16 +44,35 @@ __all__ = [
     "prepare_folder",
     "results_table",
     "write_report",
+    "write_whole",
 ]
 
 
 def prepare_folder(folder: str | os.PathLike[str]) -> Path:
-    """Make a folder where it is missing, and see that it can be written: better before the studies than after.
+    """Make a folder unless it is there, and check that it can be written: better before the studies than after.
+
+    Parameters
+    ----------
+    folder : path
+        The folder; its parents are made too.
+
+    Returns
+    -------
+    pathlib.Path
+        The folder.
 
     Raises
     ------
     OSError
         The folder cannot be made or written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from kfopc_filterpy.bench import prepare_folder
+    >>> with tempfile.TemporaryDirectory() as parent:
+    ...     print(prepare_folder(f"{parent}/new/folder").is_dir())
+    True
     """
     path = Path(folder)
     try:
@@ -66,7 +85,7 @@ def prepare_folder(folder: str | os.PathLike[str]) -> Path:
 
 
 def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str]) -> Path:
-    """Write report.html, results.json, figures/, audio/ and, where there are any, tables/ into a folder.
+    """Write report.html, results.json, figures/, audio/ and, if there are any, tables/ into a folder.
 
     Parameters
     ----------
@@ -86,6 +105,15 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
         The folder cannot be written.
     ValueError, TypeError
         No study, two of one name, or a value that JSON cannot hold.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from kfopc_filterpy.bench import StudyReport, write_report
+    >>> study = StudyReport("tonal", "A tone", "", 16000, 1.0, {}, {"KF-OPC": {"output_power": 0.9999}})
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     print(write_report([study], folder).name)
+    report.html
     """
     if not studies:
         raise ValueError("studies must hold at least one StudyReport, got none")
@@ -104,16 +132,27 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
         for table in study.tables:
             prepare_folder(path / "tables")
             _write_csv(table_file(path, study, table), table)
-    _replace(path / "results.json", results + "\n")
-    _replace(path / "report.html", page(studies, path))
+    write_whole(path / "results.json", results + "\n")
+    write_whole(path / "report.html", page(studies, path))
     return path / "report.html"
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
-    """The studies' figures and verdicts as text for a terminal.
+    """Return the studies' figures of merit, verdicts and tables as text for a terminal.
+
+    Parameters
+    ----------
+    studies : sequence of StudyReport
+        The studies, in their order.
+
+    Returns
+    -------
+    str
+        Lines without a newline at the end.
 
     Examples
     --------
+    >>> from kfopc_filterpy.bench import StudyReport, Verdict, results_table
     >>> study = StudyReport(
     ...     "tonal", "A tone", "", 16000, 1.0, {}, {"KF-OPC": {"noise_reduction_db": 10.1, "output_power": 0.9999}},
     ...     verdicts=[Verdict("KF-OPC keeps its rated power", True, "0.9999 of 1")],
@@ -147,12 +186,12 @@ def results_table(studies: Sequence[StudyReport]) -> str:
 
 
 def _aligned(table: Table) -> list[str]:
-    """A table's lines for a terminal."""
+    """Return the lines of a table for a terminal."""
     return _columns([list(table.headings), *table.cells], set(range(len(table.headings))) - table.numbers)
 
 
 def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
-    """Lines of cells in columns, those of `left` aligned to the left."""
+    """Return lines of cells in columns; the columns `left` are aligned to the left."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         "  ".join(
@@ -168,11 +207,29 @@ def _write_csv(path: Path, table: Table) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(table.headings)
     writer.writerows(table.rows)
-    _replace(path, text.getvalue())
+    write_whole(path, text.getvalue())
 
 
-def _replace(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file whole or not at all.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file; if it is there, it is replaced once the new one is complete.
+    text : str
+        Content, which is written in UTF-8.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from kfopc_filterpy.bench import write_whole
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_whole(Path(folder) / "note.txt", "done")
+    ...     print((Path(folder) / "note.txt").read_text())
+    done
+    """
     partial = path.with_name(f".{path.name}.partial")
     try:
         partial.write_text(text, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What every study shares: a scene to run controllers in, and the jobs that run there."""
+"""A scene to run controllers in, and the jobs that run there."""
 
 from __future__ import annotations
 
@@ -26,14 +26,29 @@ from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.power.amplifiers import Amplifier
 from kfopc_filterpy.signals import scaled_to_power
 
-SENSOR_NOISE_SEED = 1000  # plus the seed of the noise
+SENSOR_NOISE_SEED = 1000  # added to the noise's seed
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
 
 class Runs:
-    """Runs jobs on all cores (the compiled loop releases the interpreter), with one progress bar for all."""
+    """Jobs on all cores, with one progress bar for all of them.
+
+    Threads do, for the compiled loop releases the interpreter.
+
+    Parameters
+    ----------
+    bar : tqdm bar, optional
+        Bar that is moved on as jobs end.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import Runs
+    >>> runs = Runs()
+    >>> runs.map(lambda x: x**2, [1, 2, 3]), runs.done
+    ([1, 4, 9], 3)
+    """
 
     def __init__(self, bar: Any = None) -> None:
         self.bar = bar
@@ -43,7 +58,10 @@ class Runs:
     def map(
         self, job: Callable[[Item], Outcome], items: Iterable[Item], worth: Callable[[Item], int] = lambda item: 1
     ) -> list[Outcome]:
-        """Outcomes of `job` in the order of `items`, each of which is worth some runs of those planned."""
+        """Return what `job` makes of each of the `items`, in their order.
+
+        `worth` says how many of the planned runs an item counts for.
+        """
         items, outcomes = list(items), []
         for item, outcome in zip(items, self._pool.map(job, items), strict=True):
             outcomes.append(outcome)
@@ -55,9 +73,48 @@ class Runs:
 
 @dataclass(frozen=True)
 class Scene:
-    """Noise, paths and amplifier of a study; one reference and disturbance a seed, of equal lengths.
+    """Noise, paths and amplifier of a study, and what its controllers know of them.
 
-    The noise has been running for `switch_on_s` when the control is switched on.
+    `make_scene` makes one. There is one reference and one disturbance for each seed, all of equal length.
+
+    Parameters
+    ----------
+    fs : float
+        Sampling frequency in Hz.
+    secondary : ndarray, shape (n_path_taps,)
+        True secondary path.
+    references, disturbances : list of ndarray, shape (n_samples,)
+        One for each seed.
+    rated_power : float
+        Rated output power, a mean square.
+    n_taps : int
+        Taps of the control filter.
+    sensor_noise_std : float
+        Standard deviation of the noise that is added to the error.
+    switch_on_s : float
+        Time in seconds for which the noise runs before the control is switched on.
+    nse_window_s : float
+        Window of the normalised squared error in seconds.
+    amplifier : amplifier, optional
+        Amplifier; linear by default.
+    measurement_noise : float
+        q of the Kalman filters.
+    initial_variance : float
+        P0 of the Kalman filters.
+    unconstrained_power : float
+        Output power that the noise would need without a constraint.
+    wiener_control_power : float
+        Output power of the unconstrained Wiener solution.
+    wiener_noise_reduction_db : float
+        Its noise reduction in dB.
+    seeds : list of int
+        Seeds of the noises.
+    secondary_estimate : ndarray, optional
+        Secondary path that controllers know; by default the true one.
+    known_amplifier : amplifier, optional
+        Amplifier that disturbance estimates know; by default they take it to be linear.
+    power_memory_s : float, default 0.5
+        Memory in seconds of the power estimates of the constrained algorithms.
     """
 
     fs: float
@@ -72,42 +129,48 @@ class Scene:
     amplifier: Amplifier | None = None
     measurement_noise: float = 0.0
     initial_variance: float = 0.0
-    unconstrained_power: float = 1.0  # output power that the noise asks for without a constraint
+    unconstrained_power: float = 1.0
     wiener_control_power: float = 0.0
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
-    secondary_estimate: np.ndarray | None = None  # what controllers know of the secondary path; None: the path itself
-    known_amplifier: Amplifier | None = None  # what controllers know of the amplifier; None: that it is linear
+    secondary_estimate: np.ndarray | None = None
+    known_amplifier: Amplifier | None = None
+    power_memory_s: float = 0.5
+
+    @property
+    def sensor_noise_seeds(self) -> list[int]:
+        """Seeds of the sensor noise, apart from those of the noises."""
+        return [SENSOR_NOISE_SEED + seed for seed in self.seeds]
 
     @property
     def amplitude_limit(self) -> float:
-        """Peak of a sine at rated power, the amplitude limit of the clipping amplifiers."""
+        """Peak of a sine at rated power: the limit of the clipping amplifiers."""
         return float(np.sqrt(2 * self.rated_power))
 
     @property
     def settled(self) -> tuple[np.ndarray, np.ndarray]:
-        """First reference and disturbance from switch-on on, where the primary path's start-up is over."""
+        """First reference and disturbance from switch-on on, after the start-up of the primary path."""
         start = int(self.switch_on_s * self.fs)
         return self.references[0][start:], self.disturbances[0][start:]
 
     @property
     def known_secondary(self) -> np.ndarray:
-        """What controllers know of the secondary path."""
+        """Secondary path that the controllers know."""
         return self.secondary if self.secondary_estimate is None else self.secondary_estimate
 
     @property
     def filtered_power(self) -> float:
-        """Power of the filtered reference, which makes step sizes and state noises comparable."""
+        """Power of the filtered reference; it makes step sizes and state noises comparable."""
         x = self.references[0]
         return float(np.mean(np.convolve(x, self.known_secondary)[: x.size] ** 2))
 
     @property
     def secondary_gain(self) -> float:
-        """Power gain G_s of the secondary path that controllers know, for the reference (eq. 11)."""
+        """Power gain G_s of the known secondary path for the reference (eq. 11)."""
         return self.filtered_power / float(np.mean(self.references[0] ** 2))
 
     def run(self, controller: Any, seed_index: int = 0, **options: Any) -> SimulationResult:
-        """Run a controller on the noise of one seed."""
+        """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
         return simulate(
             controller, self.references[seed_index], amplifier=self.amplifier, **self._options(seed_index), **options
         )
@@ -115,7 +178,10 @@ class Scene:
     def run_together(
         self, controllers: Sequence[KalmanController], seed_index: int = 0, **options: Any
     ) -> list[SimulationResult]:
-        """Run Kalman controllers that share their gains on the noise of one seed."""
+        """Run `controllers` that share their gains on the noise of one seed, of index `seed_index`.
+
+        `options` go to `simulate_scenarios`.
+        """
         options = {"amplifier": self.amplifier} | self._options(seed_index) | options
         return simulate_scenarios(controllers, self.references[seed_index], **options)
 
@@ -126,7 +192,7 @@ class Scene:
             "fs": self.fs,
             "rated_power": self.rated_power,
             "sensor_noise_std": self.sensor_noise_std,
-            "rng": SENSOR_NOISE_SEED + self.seeds[seed_index],
+            "rng": self.sensor_noise_seeds[seed_index],
             "switch_on_s": self.switch_on_s,
         }
 
@@ -145,15 +211,52 @@ def make_scene(
     nse_window_s: float = 0.005,
     amplifier: Amplifier | None = None,
 ) -> Scene:
-    """Scale the references and derive what a scene needs from them.
+    """Return a scene whose noises ask for a multiple of the rated power.
 
-    `references` maps seeds to noises. They get the power at which the unconstrained Wiener control filter of the
-    first needs `power_multiple` times the rated power. q is the estimate of eq. 7 from the first noise without
-    control; P0 is what the Wiener control power is worth a tap, control power / (n_taps reference power).
+    The references get the power at which the unconstrained Wiener control filter of the first one needs
+    `power_multiple` times the rated power. q is the estimate of eq. 7 from the first noise without control. P0 is the
+    Wiener control power over the number of taps and the reference power.
+
+    Parameters
+    ----------
+    references : mapping of int to ndarray, shape (n_samples,)
+        Noise for each seed.
+    primary, secondary : array_like or control.LTI
+        Primary and secondary path: taps, or a python-control system.
+    fs : float
+        Sampling frequency in Hz.
+    rated_power : float
+        Rated output power, a mean square.
+    power_multiple : float
+        Unconstrained control power over the rated power.
+    n_taps : int
+        Taps of the control filter.
+    switch_on_s : float, default 0.5
+        Time in seconds for which the noise runs before the control is switched on.
+    sensor_noise_db : float, default -60.0
+        Power of the sensor noise over that of the disturbance in dB.
+    nse_window_s : float, default 0.005
+        Window of the normalised squared error in seconds.
+    amplifier : amplifier, optional
+        Amplifier; linear by default.
+
+    Returns
+    -------
+    Scene
+        The scene, which is not changed by runs.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> round(float((scene.references[0] ** 2).mean()), 3)  # the path has a gain of 1
+    2.0
     """
     s, p = path_taps(secondary, fs=fs), path_taps(primary, fs=fs)
     first = next(iter(references.values()))
-    settled = slice(int(switch_on_s * fs), None)  # the primary path's start-up is over
+    settled = slice(int(switch_on_s * fs), None)  # after the start-up of the primary path
     d = np.convolve(first, p)[: first.size]
     wiener = wiener_solution(first[settled], d[settled], s, n_taps)
     power = float(np.mean(first**2)) * power_multiple * rated_power / wiener.control_power
@@ -183,7 +286,30 @@ def make_scene(
 
 
 def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[str, float | None]:
-    """The figures of results.json of one algorithm: means over seeds, NSE pooled over seeds."""
+    """Return the figures of merit of one algorithm: means over seeds, the NSE pooled over seeds.
+
+    Parameters
+    ----------
+    results : sequence of SimulationResult
+        Runs of the algorithm, one for each seed.
+    scene : Scene
+        Scene of the runs.
+
+    Returns
+    -------
+    dict of str to float or None
+        The keys that a `StudyReport` takes; None if undefined.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import figures_of_merit, make_controller, make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> figures = figures_of_merit([scene.run(make_controller(scene, "KF-OPC", 1e-6))], scene)
+    >>> round(figures["output_power"], 2)
+    1.0
+    """
     diverged = [r.diverged_at_s for r in results if r.diverged_at_s is not None]
     errors = np.array([r.error for r in results])
     disturbances = np.array([r.disturbance for r in results])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
-from kfopc_filterpy import KalmanController, SimulationResult, nse_db, output_power
+from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
 
-from .registry import ALGORITHMS, KALMAN, REGISTRY, Setting, grid, make_controller
+from .registry import REGISTRY, Setting, make_controller
 from .scene import Outcome, Runs, Scene
 
 BUDGET = 1.02  # a constrained method keeps its budget with up to this share of the rated power
@@ -18,30 +19,111 @@ RULE = (
     f"methods, keep the budget to {100 * (BUDGET - 1):.0f} % over the steady half; a tie to 0.01 dB goes to the smaller"
 )
 
-Job = tuple[str, Setting, int]
+Job = tuple[str, Setting, int]  # algorithm, setting, index of the seed
 
 
-def unless_refused(algorithm: str, run: Callable[[], SimulationResult]) -> SimulationResult | None:
-    """Result of a run; None where the filter finds in its midst that it cannot go on, for the algorithms that may."""
+class AllDivergedError(RuntimeError):
+    """No setting that was tried is stable."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setting of one algorithm, means over the seeds.
+
+    Parameters
+    ----------
+    setting : float or tuple of float
+        The setting.
+    mean_nse_db : float
+        Mean normalised squared error over the whole run in dB; Inf if it diverged.
+    output_power : float
+        Output power over the steady half; Inf if it diverged.
+    diverged_at_s : float, optional
+        First time at which a run diverged, 0 if the filter refused to go on.
+    noise_reduction_db : float
+        Noise reduction over the steady half in dB; NaN if it diverged.
+    """
+
+    setting: Setting
+    mean_nse_db: float
+    output_power: float
+    diverged_at_s: float | None = None
+    noise_reduction_db: float = np.nan
+
+    @property
+    def diverged(self) -> bool:
+        """Whether a run diverged."""
+        return self.diverged_at_s is not None
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The best setting of an algorithm, and all that were tried.
+
+    ``Tuned.RULE`` states the rule in words; ``Tuned.BUDGET`` is the share of the rated power up to which a constrained
+    method keeps its budget.
+
+    Parameters
+    ----------
+    setting : float or tuple of float
+        The best setting.
+    within_budget : bool
+        Whether any setting kept the budget.
+    at_edge : bool
+        Whether the best setting, or one of its two, is the least or the largest that was tried.
+    trials : list of Trial
+        Everything that was tried.
+    """
+
+    BUDGET: ClassVar[float] = BUDGET
+    RULE: ClassVar[str] = RULE
+
+    setting: Setting
+    within_budget: bool
+    at_edge: bool
+    trials: list[Trial]
+
+
+def run_setting(
+    scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0, *, controller: Any = None
+) -> SimulationResult | None:
+    """Run an algorithm in a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene.
+    algorithm : str
+        Name in the registry, see `algorithms`.
+    setting : float or tuple of float
+        Setting of its grid, or like it.
+    seed_index : int, default 0
+        Index of the scene's seed.
+    controller : Controller, optional
+        Controller of the algorithm that is run; by default a fresh one for the scene and the setting.
+
+    Returns
+    -------
+    SimulationResult or None
+        The result; None if the filter found during the run that it cannot go on, see `Algorithm`.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import make_scene, run_setting
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> run_setting(scene, "KF-OPC", 1e-6).algorithm
+    'KF-OPC'
+    """
+    controller = make_controller(scene, algorithm, setting) if controller is None else controller
     try:
-        return run()
+        return scene.run(controller, seed_index)
     except ValueError as error:
-        in_its_midst = any(note.startswith("in sample") for note in getattr(error, "__notes__", ()))
-        if not (REGISTRY[algorithm].may_refuse and in_its_midst):
+        during_the_run = any(note.startswith("in sample") for note in getattr(error, "__notes__", ()))
+        if not (REGISTRY[algorithm].may_refuse and during_the_run):
             raise
         return None
-
-
-def run_setting(scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0) -> SimulationResult | None:
-    """Run of an algorithm in a scene, see `unless_refused`."""
-    controller = make_controller(scene, algorithm, setting)
-    return unless_refused(algorithm, lambda: scene.run(controller, seed_index))
-
-
-def went_through(result: SimulationResult | None) -> SimulationResult:
-    """The result of a run of an algorithm that never refuses."""
-    assert result is not None
-    return result
 
 
 def run_settings(
@@ -51,21 +133,46 @@ def run_settings(
     measure: Callable[[SimulationResult | None], Outcome],
     planned: bool = True,
 ) -> list[Outcome]:
-    """What `measure` makes of a run of each (algorithm, setting, index of the seed), see `run_setting`.
+    """Return what `measure` makes of each run.
 
-    Kalman filters of one setting on one noise differ in the constraint only: they share their gains. `planned` is
-    whether they are among the runs that the progress bar counts.
+    Runs of algorithms that share gains, of one setting and one noise, go on together.
+
+    Parameters
+    ----------
+    runs : Runs
+        Runs the jobs.
+    scene : Scene
+        The scene.
+    jobs : sequence of tuple
+        Algorithm, setting and index of the seed of each run.
+    measure : callable
+        Function of a run's result, which is None if the filter could not go on.
+    planned : bool, default True
+        Whether the runs are among those that the progress bar counts.
+
+    Returns
+    -------
+    list
+        Outcomes in the order of the jobs.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import Runs, make_scene, run_settings
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> run_settings(Runs(), scene, [("KF-ANC", 1e-6, 0), ("KF-OPC", 1e-6, 0)], lambda result: result.algorithm)
+    ['KF-ANC', 'KF-OPC']
     """
     groups: dict[tuple[object, ...], list[Job]] = {}
     for job in jobs:
-        groups.setdefault(("Kalman", *job[1:]) if job[0] in KALMAN else job, []).append(job)
+        groups.setdefault(("together", *job[1:]) if REGISTRY[job[0]].shares_gains else job, []).append(job)
 
     def run(group: list[Job]) -> list[Outcome]:
         if len(group) == 1:
             return [measure(run_setting(scene, *group[0]))]
         controllers = [make_controller(scene, name, setting) for name, setting, _ in group]
-        kalman = [c for c in controllers if isinstance(c, KalmanController)]
-        return [measure(result) for result in scene.run_together(kalman, group[0][2])]
+        return [measure(result) for result in scene.run_together(controllers, group[0][2])]
 
     outcomes = runs.map(run, groups.values(), worth=len if planned else lambda group: 0)
     by_job = {
@@ -74,92 +181,171 @@ def run_settings(
     return [by_job[job] for job in jobs]
 
 
-def tuning_runs(algorithms: Sequence[str] = ALGORITHMS, seeds: int = 1) -> int:
-    """Runs that `tune` takes; those around the best of a grid of two settings are not counted, being as many as chance
-    has it.
-    """
-    return seeds * sum(len(grid(name)) for name in algorithms)
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One setting of one algorithm: mean NSE over the whole run in dB, output power over the steady half."""
-
-    setting: Setting
-    mean_nse_db: float
-    output_power: float
-    diverged: bool
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """The best setting of an algorithm, and all that were tried."""
-
-    setting: Setting
-    within_budget: bool
-    at_edge: bool
-    trials: list[Trial]
-
-
-def tune(runs: Runs, scene: Scene, algorithms: Sequence[str] = ALGORITHMS, seeds: int = 1) -> dict[str, Tuned]:
-    """Best setting of each algorithm, one rule for all.
-
-    The lowest mean NSE over the whole run, start included, among settings that do not diverge and, for constrained
-    methods, keep the budget to 2 % over the steady half. Where no setting keeps it, the lowest mean NSE, and
-    `within_budget` is False. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
-    """
-    trials = try_settings(runs, scene, {name: grid(name) for name in algorithms}, seeds)
-    return {name: refine(runs, scene, name, trials[name], seeds) for name in algorithms}
-
-
 def try_settings(
-    runs: Runs, scene: Scene, settings: dict[str, list[Setting]], seeds: int = 1, planned: bool = True
+    runs: Runs, scene: Scene, settings: Mapping[str, Sequence[Setting]], seeds: int = 1, planned: bool = True
 ) -> dict[str, list[Trial]]:
-    """A trial of each setting of each algorithm, means over seeds."""
+    """Return a trial of each setting of each algorithm.
+
+    Parameters
+    ----------
+    runs : Runs
+        Runs the jobs.
+    scene : Scene
+        The scene.
+    settings : mapping of str to sequence
+        Settings by the algorithm's name.
+    seeds : int, default 1
+        Number of the scene's seeds that are run, from the first one.
+    planned : bool, default True
+        Whether the runs are among those that the progress bar counts.
+
+    Returns
+    -------
+    dict of str to list of Trial
+        Trials by the algorithm's name, in the order of the settings.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import Runs, make_scene, try_settings
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> trials = try_settings(Runs(), scene, {"FxLMS": [0.01, 0.1, 50.0]})["FxLMS"]
+    >>> [trial.diverged for trial in trials]
+    [False, False, True]
+    """
     jobs = [(name, setting, k) for name, own in settings.items() for setting in own for k in range(seeds)]
 
-    def trial(result: SimulationResult | None) -> tuple[float, float, bool]:
+    def measured(result: SimulationResult | None) -> Trial:
         if result is None or result.diverged_at_s is not None:
-            return np.inf, np.inf, True
-        nse = nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s)
-        return float(np.mean(nse)), output_power(result.control_signal), False
+            return Trial(np.nan, np.inf, np.inf, 0.0 if result is None else result.diverged_at_s)
+        # Before the first sound is through the primary path there is no NSE.
+        nse = np.nanmean(nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s))
+        reduction = noise_reduction_db(result.error, result.disturbance)
+        return Trial(np.nan, float(nse), output_power(result.control_signal), None, reduction)
 
-    outcomes = dict(zip(jobs, run_settings(runs, scene, jobs, trial, planned), strict=True))
-    trials: dict[str, list[Trial]] = {name: [] for name in settings}
-    for name, own in settings.items():
-        for setting in own:
-            rows = [outcomes[name, setting, k] for k in range(seeds)]
-            means = np.mean([row[:2] for row in rows], axis=0)
-            trials[name].append(Trial(setting, float(means[0]), float(means[1]), any(row[2] for row in rows)))
-    return trials
+    outcomes = dict(zip(jobs, run_settings(runs, scene, jobs, measured, planned), strict=True))
+    return {
+        name: [_mean(setting, [outcomes[name, setting, k] for k in range(seeds)]) for setting in own]
+        for name, own in settings.items()
+    }
 
 
-def refine(runs: Runs, scene: Scene, algorithm: str, trials: list[Trial], seeds: int = 1) -> Tuned:
-    """The best of a grid, or of the finer one around it where the algorithm has two settings."""
-    rated_power = scene.rated_power if REGISTRY[algorithm].keeps_budget else np.inf
-    best = _best(trials, rated_power, algorithm)
+def _mean(setting: Setting, trials: Sequence[Trial]) -> Trial:
+    times = [trial.diverged_at_s for trial in trials if trial.diverged_at_s is not None]
+    if times:
+        return Trial(setting, np.inf, np.inf, min(times))
+    figures = [(trial.mean_nse_db, trial.output_power, trial.noise_reduction_db) for trial in trials]
+    nse, power, reduction = (float(mean) for mean in np.mean(figures, axis=0))
+    return Trial(setting, nse, power, None, reduction)
+
+
+def best_setting(scene: Scene, algorithm: str, trials: Sequence[Trial]) -> Tuned | None:
+    """Return the best of some trials by the rule of all studies, see `tune`.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene that gives the rated power.
+    algorithm : str
+        Name in the registry, see `algorithms`.
+    trials : sequence of Trial
+        The trials to choose from.
+
+    Returns
+    -------
+    Tuned or None
+        The best setting; None if every setting diverged.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import Trial, best_setting, make_scene
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> trials = [Trial(1e-6, -20.0, 1.5), Trial(1e-7, -15.0, 1.0)]
+    >>> best_setting(scene, "KF-OPC", trials).setting, best_setting(scene, "KF-ANC", trials).setting
+    (1e-07, 1e-06)
+    """
+    return _best(trials, scene.rated_power if REGISTRY[algorithm].keeps_budget else np.inf)
+
+
+def tune(
+    runs: Runs,
+    scene: Scene,
+    names: Sequence[str] | None = None,
+    seeds: int = 1,
+    *,
+    trials: Mapping[str, Sequence[Trial]] | None = None,
+) -> dict[str, Tuned]:
+    """Return the best setting of each algorithm, by one rule for all.
+
+    The best setting has the lowest mean NSE over the whole run, start included, among settings that do not diverge and,
+    for constrained methods, keep the budget to 2 % over the steady half. If no setting keeps it, the lowest mean NSE
+    wins, and `within_budget` is False. Around the best of a grid of two settings a finer grid is tried. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
+
+    Parameters
+    ----------
+    runs : Runs
+        Runs the jobs.
+    scene : Scene
+        The scene.
+    names : sequence of str, optional
+        Algorithms, see `algorithms`; by default those that the paper compares.
+    seeds : int, default 1
+        Number of the scene's seeds that are run, from the first one.
+    trials : mapping of str to sequence of Trial, optional
+        Trials of the grids by algorithm, if they have been made before.
+
+    Returns
+    -------
+    dict of str to Tuned
+        Best settings by the algorithm's name.
+
+    Raises
+    ------
+    AllDivergedError
+        An algorithm diverged at every setting of its grid.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import Runs, make_scene, tune
+    >>> from kfopc_filterpy.signals import tone
+    >>> scene = make_scene({0: tone(400.0, 1.0, fs=8000)}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=1.0,
+    ...                    power_multiple=2.0, n_taps=8)
+    >>> best = tune(Runs(), scene, ["KF-PB"])["KF-PB"]
+    >>> best.within_budget, len(best.trials)
+    (True, 5)
+    """
+    if names is None:
+        names = [name for name, algorithm in REGISTRY.items() if algorithm.of_paper]
+    made = dict(trials or {})
+    made |= try_settings(runs, scene, {name: REGISTRY[name].grid for name in names if name not in made}, seeds)
+    return {name: _refined(runs, scene, name, made[name], seeds) for name in names}
+
+
+def _refined(runs: Runs, scene: Scene, algorithm: str, trials: Sequence[Trial], seeds: int) -> Tuned:
+    best = best_setting(scene, algorithm, trials)
+    if best is None:
+        tried = [trial.setting for trial in trials]
+        raise AllDivergedError(f"{algorithm} diverged at every setting tried: {tried}")
     finer = REGISTRY[algorithm].finer(best.setting)
     if not finer:
         return best
     own = try_settings(runs, scene, {algorithm: finer}, seeds, planned=False)[algorithm]
-    return _best([*trials, *own], rated_power, algorithm)
+    return best_setting(scene, algorithm, [*trials, *own]) or best
 
 
-class AllDivergedError(RuntimeError):
-    """No setting that was tried is stable."""
-
-
-def _best(trials: list[Trial], rated_power: float, name: str) -> Tuned:
-    stable = [t for t in trials if not t.diverged]
+def _best(trials: Sequence[Trial], rated_power: float) -> Tuned | None:
+    stable = [trial for trial in trials if not trial.diverged]
     if not stable:
-        raise AllDivergedError(f"{name} diverged at every setting tried: {[t.setting for t in trials]}")
-    kept = [t for t in stable if t.output_power <= BUDGET * rated_power]
-    best = min(kept or stable, key=lambda t: (round(t.mean_nse_db, 2), t.setting))  # a tie: the smaller setting
-    return Tuned(best.setting, bool(kept), _at_edge(best.setting, trials), trials)
+        return None
+    kept = [trial for trial in stable if trial.output_power <= BUDGET * rated_power]
+    best = min(kept or stable, key=lambda trial: (round(trial.mean_nse_db, 2), trial.setting))
+    return Tuned(best.setting, bool(kept), _at_edge(best.setting, trials), list(trials))
 
 
-def _at_edge(setting: Setting, trials: list[Trial]) -> bool:
-    """Whether the setting, or one of its two, is the least or the largest that was tried."""
-    tried = np.array([np.atleast_1d(t.setting) for t in trials])
+def _at_edge(setting: Setting, trials: Sequence[Trial]) -> bool:
+    tried = np.array([np.atleast_1d(trial.setting) for trial in trials])
     own = np.atleast_1d(setting)
     return bool(np.any((own == tried.min(axis=0)) | (own == tried.max(axis=0))))

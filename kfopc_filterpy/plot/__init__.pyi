@@ -16,3 +16,4 @@ from .signals import plot_amplifier_output as plot_amplifier_output
 from .signals import plot_anti_noise as plot_anti_noise
 from .signals import plot_disturbance_and_anti_noise as plot_disturbance_and_anti_noise
 from .signals import plot_error_spectra as plot_error_spectra
+from .style import curve_style as curve_style

@@ -9,23 +9,15 @@ import numpy as np
 
 from .._validate import as_count, as_number
 from ..loop.result import SimulationResult
+from .style import STYLES, curve_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; line styles and markers for print in grey. The solid
-# line is wide and lies beneath the broken ones, so that curves that coincide are both seen.
-STYLES: dict[str, dict[str, Any]] = {
-    "KF-OPC": {"color": "#0072B2", "linestyle": "-", "marker": "o", "linewidth": 2.2, "zorder": 2.0},
-    "KF-ANC": {"color": "#D55E00", "linestyle": (0, (5, 2.5)), "marker": "s", "linewidth": 1.4, "zorder": 2.1},
-    "MOV-FxLMS": {"color": "#009E73", "linestyle": (0, (5, 3, 1, 3)), "marker": "^", "linewidth": 1.4, "zorder": 2.2},
-    "FxLMS": {"color": "#CC79A7", "linestyle": ":", "marker": "D", "linewidth": 1.4, "zorder": 2.3},
-}
-_OTHERS: list[dict[str, Any]] = [
-    {"color": "#E69F00", "linestyle": (0, (6, 1.5, 1, 1.5, 1, 1.5)), "marker": "v", "linewidth": 1.4, "zorder": 2.4},
-    {"color": "#56B4E9", "linestyle": (0, (8, 2)), "marker": "P", "linewidth": 1.4, "zorder": 2.4},
-    {"color": "#000000", "linestyle": (0, (3, 1)), "marker": "X", "linewidth": 1.4, "zorder": 2.4},
-]
+# The solid line is wide and lies beneath the broken ones, so that curves that coincide are both seen. Curves without an
+# algorithm of their own are broken too, in the colours that follow the paper's four algorithms.
+_BROKEN = ((0, (6, 1.5, 1, 1.5, 1, 1.5)), (0, (8, 2)), (0, (3, 1)))
+_FIRST_FREE = 4
 DISTURBANCE: dict[str, Any] = {"color": "0.6", "linestyle": "-", "linewidth": 1.2, "zorder": 1.5}
 RATED: dict[str, Any] = {"color": "0.15", "linestyle": (0, (1, 1.2)), "linewidth": 1.2}
 
@@ -80,13 +72,31 @@ def one_channel(signal: np.ndarray, channel: int | None) -> np.ndarray:
 
 
 def named_styles(labels: list[str], algorithms: list[str]) -> list[dict[str, Any]]:
-    """Return the styles of curves: that of the label or the algorithm if it is free, else one of the others."""
+    """Return the styles of curves, each with a colour of its own while there are enough.
+
+    The label's style comes first, if it is an algorithm, then the algorithm's; a curve that finds both taken is drawn
+    broken, in one of the other colours.
+    """
     taken: list[dict[str, Any]] = []
     for label, algorithm in zip(labels, algorithms, strict=True):
-        others = [style for style in _OTHERS if style not in taken] or _OTHERS
-        known = [STYLES[name] for name in (label, algorithm) if name in STYLES and STYLES[name] not in taken]
-        taken.append((known or others)[0])
+        colours = {style["color"] for style in taken}
+        known = [_drawn(name) for name in (label, algorithm) if name in STYLES]
+        free = [style for style in [*known, *_others()] if style["color"] not in colours]
+        taken.append((free or _others())[0])
     return taken
+
+
+def _drawn(name: str) -> dict[str, Any]:
+    order = list(STYLES).index(name)
+    return curve_style(name) | {"linewidth": 1.4 if order else 2.2, "zorder": 2.0 + 0.1 * min(order, _FIRST_FREE)}
+
+
+def _others() -> list[dict[str, Any]]:
+    colours = [(colour, marker) for colour, _, marker in list(STYLES.values())[_FIRST_FREE:]]
+    return [
+        {"color": colour, "linestyle": line, "marker": marker, "linewidth": 1.4, "zorder": 2.4}
+        for (colour, marker), line in zip(colours, _BROKEN, strict=False)
+    ]
 
 
 def curves(results: Any, *, single: bool = False) -> list[Curve]:

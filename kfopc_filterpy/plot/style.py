@@ -9,16 +9,70 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; line styles for print in grey.
-_STYLES = [
-    {"color": color, "linestyle": style}
-    for color, style in zip(
-        ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
-        ("-", "--", "-.", ":", "-", "--"),
-        strict=True,
-    )
-]
+# Colour, line style and marker of each algorithm. The first seven have Okabe and Ito's colours, which colour-blind readers
+# tell apart; line styles and markers serve prints in grey.
+_DASHED = (0, (5, 2))
+STYLES: dict[str, tuple[str, Any, str]] = {
+    "KF-OPC": ("#0072B2", "-", "o"),
+    "KF-ANC": ("#D55E00", (0, (5, 2.5)), "s"),
+    "MOV-FxLMS": ("#009E73", (0, (5, 3, 1, 3)), "^"),
+    "FxLMS": ("#CC79A7", ":", "D"),
+    "KF-PB": ("#E69F00", "-", "v"),
+    "FxRLS": ("#56B4E9", "-", "P"),
+    "optimal leaky FxLMS": ("#000000", _DASHED, "X"),
+    "re-scaling FxLMS": ("#8C564B", _DASHED, "<"),
+    "two-gradient FxLMS": ("#7F7F7F", _DASHED, ">"),
+    "clipping FxLMS": ("#B8A000", _DASHED, "h"),
+    "KF-OPC repaired": ("#332288", "-", "p"),
+    "diagonal KF": ("#882255", "-", "d"),
+    "diagonal KF-OPC": ("#44AA99", "-", "8"),
+    "FxNLMS": ("#AA4499", _DASHED, "*"),
+    "leaky FxLMS": ("#999933", _DASHED, "1"),
+    "MOV-FxLMS fixed": ("#117733", _DASHED, "2"),
+    "MOV-MFxLMS": ("#88CCEE", _DASHED, "3"),
+}
+COLOURS = 6  # curves without an algorithm take the colours and markers of the first so many rows
+LINES = ("-", "--", "-.", ":")
 MARK = "0.35"
+
+
+def curve_style(curve: str | int) -> dict[str, Any]:
+    """Return the colour, line style and marker of an algorithm's curve, or of the i-th other curve.
+
+    An algorithm has the same style in every figure of the package and of the studies.
+
+    Parameters
+    ----------
+    curve : str or int
+        Name of an algorithm, as in ``kfopc_filterpy.bench.algorithms()``, or the number of the curve, from 0. The numbers
+        repeat six colours and four line styles.
+
+    Returns
+    -------
+    dict
+        ``color``, ``linestyle`` and ``marker``, as matplotlib's ``plot`` takes them.
+
+    Raises
+    ------
+    ValueError
+        No algorithm has that name.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.plot import curve_style
+    >>> curve_style("KF-OPC")
+    {'color': '#0072B2', 'linestyle': '-', 'marker': 'o'}
+    >>> curve_style(1)
+    {'color': '#D55E00', 'linestyle': '--', 'marker': 's'}
+    """
+    if isinstance(curve, str):
+        if curve not in STYLES:
+            raise ValueError(f"curve must be the name of an algorithm or a number, got {curve!r}")
+        colour, line, marker = STYLES[curve]
+    else:
+        colour, _, marker = list(STYLES.values())[curve % COLOURS]
+        line = LINES[curve % COLOURS % len(LINES)]
+    return {"color": colour, "linestyle": line, "marker": marker}
 
 
 def new_axes(ax: Any, rows: int = 1) -> Any:
@@ -33,8 +87,8 @@ def new_axes(ax: Any, rows: int = 1) -> Any:
 
 
 def line_style(i: int) -> dict[str, Any]:
-    """Colour and line style of the i-th curve."""
-    return _STYLES[i % len(_STYLES)]
+    """Return the colour and line style of the i-th curve, without a marker."""
+    return {key: value for key, value in curve_style(i).items() if key != "marker"}
 
 
 def frequency_axis(ax: Axes, frequencies: np.ndarray, label: bool = True) -> None:

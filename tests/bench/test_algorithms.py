@@ -8,14 +8,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import HardClipAmplifier, nse_db, output_power
+from kfopc_filterpy import HardClipAmplifier, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import registry as algorithms
-from kfopc_filterpy.bench import tuning
-from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller, setting_value
+from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller
 from kfopc_filterpy.bench.scene import Runs, Scene, make_scene
-from kfopc_filterpy.bench.tuning import Trial, _best, refine, run_setting, try_settings, tune
+from kfopc_filterpy.bench.tuning import (
+    AllDivergedError,
+    Trial,
+    _best,
+    best_setting,
+    run_setting,
+    try_settings,
+    tune,
+)
 from kfopc_filterpy.controllers.base import FilteredReferenceController
 from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.plot import curve_style
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = 16000.0
@@ -71,9 +79,9 @@ def test_runs_that_do_not_see_the_budget_serve_for_all(name: str, scene: Scene) 
 def test_settings_are_in_the_units_of_the_scene(scene: Scene) -> None:
     x = scene.references[0]
     filtered = np.mean(np.convolve(x, scene.secondary)[: x.size] ** 2)
-    assert setting_value(scene, "KF-OPC", 1e-6) == pytest.approx(1e-6 * scene.measurement_noise / filtered, rel=1e-12)
-    assert setting_value(scene, "leaky FxLMS", (0.1, 3.0)) == pytest.approx(0.1 / (12 * filtered), rel=1e-12)
-    assert setting_value(scene, "FxRLS", 1e-4) == 1e-4
+    assert REGISTRY["KF-OPC"].value(scene, 1e-6) == pytest.approx(1e-6 * scene.measurement_noise / filtered, rel=1e-12)
+    assert REGISTRY["leaky FxLMS"].value(scene, (0.1, 3.0)) == pytest.approx(0.1 / (12 * filtered), rel=1e-12)
+    assert REGISTRY["FxRLS"].value(scene, 1e-4) == 1e-4
     leaky: Any = make_controller(scene, "leaky FxLMS", (0.1, 3.0))
     assert leaky.leak == pytest.approx(3.0 * filtered, rel=1e-12)
     fixed: Any = make_controller(scene, "MOV-FxLMS fixed", (0.1, 3.0))
@@ -119,7 +127,7 @@ def test_tuning_two_settings_follows_the_rule(scene: Scene, monkeypatch: Any) ->
 def test_refining_goes_on_from_trials_made_before(scene: Scene) -> None:
     settings: list[Any] = [(0.05, 0.1), (0.05, 10.0)]
     trials = try_settings(Runs(), scene, {"MOV-FxLMS fixed": settings})["MOV-FxLMS fixed"]
-    best = refine(Runs(), scene, "MOV-FxLMS fixed", trials)
+    best = tune(Runs(), scene, ["MOV-FxLMS fixed"], trials={"MOV-FxLMS fixed": trials})["MOV-FxLMS fixed"]
     assert best.trials[:2] == trials
     assert len(best.trials) == 2 + 30
 
@@ -132,24 +140,56 @@ def test_a_filter_that_refuses_to_go_on_counts_as_diverged(scene: Scene, monkeyp
 
     monkeypatch.setattr(Scene, "run", refuse)
     trials = try_settings(Runs(), scene, {"FxRLS": [1e-5]})["FxRLS"]
-    assert trials == [Trial(1e-5, np.inf, np.inf, True)]
+    assert trials == [Trial(1e-5, np.inf, np.inf, 0.0)]
+    assert trials[0].diverged
     with pytest.raises(ValueError, match="not positive definite"):  # no other may
         try_settings(Runs(), scene, {"FxLMS": [0.1]})
     with pytest.raises(ValueError, match="forgetting must be"):  # nor may a bad setting count as divergence
         try_settings(Runs(), scene, {"FxRLS": [1.5]})
 
 
+def at_edge(trials: list[Trial]) -> bool:
+    best = _best(trials, 1.0)
+    assert best is not None
+    return best.at_edge
+
+
 def test_edges_of_one_and_of_two_settings() -> None:
-    one = [Trial(s, -s, 0.1, False) for s in (1.0, 2.0, 3.0)]
-    assert _best(one, 1.0, "a").at_edge
-    assert not _best([replace(one[1], mean_nse_db=-9.0), one[0], one[2]], 1.0, "a").at_edge
-    two = [Trial((a, b), -9.0 * (a == b == 2.0), 0.1, False) for a in (1.0, 2.0, 3.0) for b in (1.0, 2.0, 3.0)]
-    assert not _best(two, 1.0, "a").at_edge
-    assert _best([replace(t, mean_nse_db=-10.0) if t.setting == (2.0, 3.0) else t for t in two], 1.0, "a").at_edge
+    one = [Trial(s, -s, 0.1) for s in (1.0, 2.0, 3.0)]
+    assert at_edge(one)
+    assert not at_edge([replace(one[1], mean_nse_db=-9.0), one[0], one[2]])
+    two = [Trial((a, b), -9.0 * (a == b == 2.0), 0.1) for a in (1.0, 2.0, 3.0) for b in (1.0, 2.0, 3.0)]
+    assert not at_edge(two)
+    assert at_edge([replace(t, mean_nse_db=-10.0) if t.setting == (2.0, 3.0) else t for t in two])
 
 
 def test_the_state_noises_of_the_full_kalman_filters_are_one_grid() -> None:
     full = [own for name, own in REGISTRY.items() if own.symbol == "r" and not name.startswith("diagonal")]
     assert len(full) == 4
     assert all(own.first == STATE_NOISE_GRID for own in full)
-    assert tuning.tuning_runs(["KF-PB", "leaky FxLMS"], seeds=2) == 2 * (5 + 14 * len(PRICE_GRID))
+    assert len(REGISTRY["leaky FxLMS"].grid) == 14 * len(PRICE_GRID)
+
+
+def test_trials_are_means_over_seeds_and_one_divergence_is_all(scene: Scene, monkeypatch: Any) -> None:
+    two = replace(scene, references=2 * scene.references, disturbances=2 * scene.disturbances, seeds=[3, 4])
+    (both,) = try_settings(Runs(), two, {"FxLMS": [0.1]}, seeds=2)["FxLMS"]
+    results = [run_setting(two, "FxLMS", 0.1, k) for k in range(2)]
+    powers = [output_power(result.control_signal) for result in results if result is not None]
+    reductions = [noise_reduction_db(result.error, result.disturbance) for result in results if result is not None]
+    assert both.output_power == pytest.approx(np.mean(powers), rel=1e-12)
+    assert both.noise_reduction_db == pytest.approx(np.mean(reductions), rel=1e-12)
+    run = Scene.run
+    monkeypatch.setattr(Scene, "run", lambda scene, c, k=0: replace(run(scene, c, k), diverged_at_s=0.2 if k else None))
+    (lost,) = try_settings(Runs(), two, {"FxLMS": [0.1]}, seeds=2)["FxLMS"]
+    assert lost == Trial(0.1, np.inf, np.inf, 0.2)
+    assert best_setting(two, "FxLMS", [lost]) is None
+    with pytest.raises(AllDivergedError, match=r"FxLMS diverged at every setting tried: \[0\.1\]"):
+        tune(Runs(), two, ["FxLMS"], trials={"FxLMS": [lost]})
+
+
+def test_every_algorithm_has_a_style_that_no_other_has() -> None:
+    styles = {name: tuple(map(str, curve_style(name).values())) for name in REGISTRY}
+    assert len(set(styles.values())) == len(REGISTRY)
+    assert curve_style(7) == curve_style(1)
+    with pytest.raises(ValueError, match="curve must be the name of an algorithm or a number, got 'KF-XYZ'"):
+        curve_style("KF-XYZ")

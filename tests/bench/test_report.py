@@ -8,54 +8,11 @@ from html.parser import HTMLParser
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
+from helpers.reports import FS, D, figure, study
 
 from kfopc_filterpy.bench import report
-from kfopc_filterpy.bench.report import (
-    FigureItem,
-    Parameter,
-    Sound,
-    StudyReport,
-    Table,
-    Verdict,
-    results_table,
-    write_report,
-)
-from kfopc_filterpy.signals.recordings import read_wav
-
-FS = 8000.0
-D = np.sin(np.arange(400) / 3)
-
-
-def _figure():
-    figure = Figure(figsize=(3, 2))
-    figure.subplots().plot([0, 1])
-    return figure
-
-
-def _study(name="tonal", **changes):
-    settings = {
-        "name": name,
-        "title": "Tone & clip <hard>",
-        "summary": "A tone of 2 > 1.",
-        "fs": FS,
-        "rated_power": 0.8,
-        "parameters": {
-            "q": Parameter(np.float64(1e-4), "estimate <of> eq. 7"),
-            "seeds": Parameter(range(3), "of noise"),
-            "tried": Parameter([(1e-7, np.nan), (1e-6, "diverged")], "grid"),
-        },
-        "algorithms": {
-            "KF-ANC": {"noise_reduction_db": np.float64(8.125), "output_power": np.inf, "diverged_at_s": 1.5},
-            "KF-OPC": {"output_power": 0.79971, "clipped_fraction": 0.25, "harmonics_db": float("nan")},
-        },
-        "extra": {"sweep": {"over_db": np.arange(2), "best": np.array([1.0, -np.inf])}, "flip": np.float32(4.5)},
-        "verdicts": [Verdict("KF-OPC < rated", True, "0.79971 of 0.8"), Verdict("it is faster", np.bool_(False), "no")],
-        "figures": [FigureItem("a-spectra", 'Spectra "of" e & d.', _figure())],
-        "sounds": [Sound("disturbance", "Disturbance", D), Sound("kf-anc", "Residual", np.append(D[:-1] / 2, np.nan))],
-        "notes": ["One <note>."],
-    }
-    return StudyReport(**(settings | changes))
+from kfopc_filterpy.bench.report import FigureItem, Sound, Table, results_table, write_report
+from kfopc_filterpy.signals import read_wav
 
 
 class _Links(HTMLParser):
@@ -88,7 +45,7 @@ class _Links(HTMLParser):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "new" / "folder"
-    page = write_report([_study(), _study("duct-measured", figures=[], sounds=[], notes=[], extra={})], folder)
+    page = write_report([study(), study("duct-measured", figures=[], sounds=[], notes=[], extra={})], folder)
     assert page == folder / "report.html"
     return folder
 
@@ -165,27 +122,27 @@ def test_figures_and_sounds_are_files_too(written):
 
 
 def test_a_residual_far_louder_than_the_disturbance_does_not_silence_it(tmp_path):
-    study = _study(sounds=[Sound("disturbance", "Disturbance", D), Sound("fxlms", "Residual", 1e6 * D)])
-    page = write_report([study], tmp_path).read_text(encoding="utf-8")
+    made = study(sounds=[Sound("disturbance", "Disturbance", D), Sound("fxlms", "Residual", 1e6 * D)])
+    page = write_report([made], tmp_path).read_text(encoding="utf-8")
     assert np.max(np.abs(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])) == pytest.approx(0.25, abs=1e-3)
     assert "louder than full scale: clipped" in page
-    silent = _study(sounds=[Sound("disturbance", "Disturbance", 0 * D)], figures=[])
+    silent = study(sounds=[Sound("disturbance", "Disturbance", 0 * D)], figures=[])
     write_report([silent], tmp_path)
     assert not np.any(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])
 
 
 def test_a_large_figure_is_inlined_as_png(tmp_path, monkeypatch):
     monkeypatch.setattr("kfopc_filterpy.bench.page._SVG_LIMIT", 10)
-    assert "data:image/png;base64," in write_report([_study()], tmp_path).read_text(encoding="utf-8")
+    assert "data:image/png;base64," in write_report([study()], tmp_path).read_text(encoding="utf-8")
 
 
 def test_same_studies_same_bytes(tmp_path):
-    pages = [write_report([_study()], tmp_path / name).read_bytes() for name in ("one", "two")]
+    pages = [write_report([study()], tmp_path / name).read_bytes() for name in ("one", "two")]
     assert pages[0] == pages[1]
 
 
 def test_table_for_the_terminal():
-    lines = results_table([_study()]).splitlines()
+    lines = results_table([study()]).splitlines()
     assert lines[0] == "tonal: Tone & clip <hard> (rated power 0.8)"
     assert lines[4].split() == ["KF-OPC", "-", "0.79971", "0.9996", "-", "25.00", "-", "-", "-"]
     assert lines[3].split() == ["KF-ANC", "8.1", "-", "-", "-", "-", "-", "-", "1.5"]
@@ -209,8 +166,8 @@ EMPTY = Table("none", "Nothing to show", ["paths", "power"], [])
 
 
 def test_a_table_on_the_page(tmp_path):
-    study = _study(tables=[POWERS, EMPTY])
-    source = write_report([study, _study("duct")], tmp_path).read_text(encoding="utf-8")
+    made = study(tables=[POWERS, EMPTY])
+    source = write_report([made, study("duct")], tmp_path).read_text(encoding="utf-8")
     assert "<kind>" not in source
     part = source.split("Powers &lt; 1 &amp; more</h3>")
     assert len(part) == 2  # one heading: the other study has no table
@@ -218,7 +175,7 @@ def test_a_table_on_the_page(tmp_path):
     rows = [re.findall(r'<t[hd] class="(\w+)">(.*?)</t[hd]>', row) for row in table.split("<tr>")[1:]]
     assert [[text for _, text in row] for row in rows] == [
         ["paths", "noise, of &lt;kind&gt;", "power"],
-        ["duct", "tone &quot;300&quot;", "0.1235"],
+        ["duct", "tone &#34;300&#34;", "0.1235"],
         ["band-pass", "diverged", "1e+06"],
         ["duct", "7", "3"],
     ]
@@ -229,7 +186,7 @@ def test_a_table_on_the_page(tmp_path):
 
 
 def test_a_table_for_the_terminal():
-    lines = results_table([_study(tables=[POWERS])]).splitlines()
+    lines = results_table([study(tables=[POWERS])]).splitlines()
     begin = lines.index(POWERS.caption)
     assert lines[begin - 1] == ""
     assert lines[begin + 1 : begin + 5] == [  # text to the left, columns with a number in them to the right
@@ -242,7 +199,7 @@ def test_a_table_for_the_terminal():
 
 
 def test_a_table_as_a_file_has_all_digits(tmp_path):
-    write_report([_study(tables=[POWERS, EMPTY]), _study("duct")], tmp_path)
+    write_report([study(tables=[POWERS, EMPTY]), study("duct")], tmp_path)
     assert sorted(path.name for path in (tmp_path / "tables").iterdir()) == ["tonal-none.csv", "tonal-powers.csv"]
     with (tmp_path / "tables" / "tonal-powers.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
@@ -260,7 +217,7 @@ def test_without_tables_there_is_no_folder_of_tables(written):
 
 
 def test_whose_claims_the_verdicts_are_on(tmp_path):
-    source = write_report([_study(claims="Aims"), _study("duct")], tmp_path).read_text(encoding="utf-8")
+    source = write_report([study(claims="Aims"), study("duct")], tmp_path).read_text(encoding="utf-8")
     headings = re.findall(r"<h3[^>]*>(Aims|Claims of the paper)</h3>", source)
     assert headings == ["Aims", "Claims of the paper"]
 
@@ -275,21 +232,21 @@ def test_refusals_say_what_was_wrong(tmp_path):
     with pytest.raises(ValueError, match="studies must hold at least one"):
         write_report([], tmp_path)
     with pytest.raises(ValueError, match="studies must have different names, got tonal twice"):
-        write_report([_study(), _study()], tmp_path)
+        write_report([study(), study()], tmp_path)
     with pytest.raises(ValueError, match="name must be lower-case letters"):
-        _study("../tonal")
+        study("../tonal")
     with pytest.raises(ValueError, match="stem must be lower-case letters"):
         Sound("a b", "", D)
     with pytest.raises(ValueError, match="figures of study 'tonal' must have different names, got a twice"):
-        _study(figures=[FigureItem("a", "", _figure()), FigureItem("a", "", _figure())])
+        study(figures=[FigureItem("a", "", figure()), FigureItem("a", "", figure())])
     with pytest.raises(ValueError, match="tables of study 'tonal' must have different names, got powers twice"):
-        _study(tables=[POWERS, EMPTY, POWERS])
+        study(tables=[POWERS, EMPTY, POWERS])
     with pytest.raises(ValueError, match=r"stem must be lower-case letters.*got '../powers'"):
         Table("../powers", "", [], [])
     with pytest.raises(ValueError, match=r"algorithms\['KF-ANC'\] holds unknown figures of merit \['loudness'\]"):
-        _study(algorithms={"KF-ANC": {"loudness": 1.0}})
+        study(algorithms={"KF-ANC": {"loudness": 1.0}})
     with pytest.raises(TypeError, match=r"study 'tonal', 'extra', 'path' must hold numbers.*got PosixPath|WindowsPath"):
-        write_report([_study(extra={"path": tmp_path})], tmp_path / "unused")
+        write_report([study(extra={"path": tmp_path})], tmp_path / "unused")
     assert not (tmp_path / "unused").exists()  # refused before anything is written
 
 
@@ -298,14 +255,14 @@ def test_a_folder_that_cannot_be_written(tmp_path):
     with pytest.raises(OSError, match=r"file' cannot be written .*choose another output folder"):
         report.prepare_folder(tmp_path / "file")
     with pytest.raises(OSError, match="cannot be written"):
-        write_report([_study()], tmp_path / "file" / "below")
+        write_report([study()], tmp_path / "file" / "below")
 
 
 def test_a_report_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
-    write_report([_study()], tmp_path)
+    write_report([study()], tmp_path)
     before = (tmp_path / "report.html").read_bytes()
     monkeypatch.setattr(report, "page", lambda *_: "\ud800")  # cannot be encoded
     with pytest.raises(UnicodeEncodeError):
-        write_report([_study()], tmp_path)
+        write_report([study()], tmp_path)
     assert (tmp_path / "report.html").read_bytes() == before
     assert not list(tmp_path.glob(".*"))

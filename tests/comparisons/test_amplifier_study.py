@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from comparisons import __main__ as command
-from comparisons.studies import amplifier, amplifier_runs, cases, constraint_cases
-from comparisons.studies.amplifier_runs import KNOWN, UNKNOWN, Case, Row, saturating, settings_for
+from comparisons.studies import amplifier, cases
+from comparisons.studies.amplifier import KNOWN, UNKNOWN, AmplifierRow, saturating, settings_for
+from comparisons.studies.cases import Case
 from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db, simulate
-from kfopc_filterpy.bench.registry import make_controller
-from kfopc_filterpy.bench.report import StudyReport
-from kfopc_filterpy.bench.scene import Runs
+from kfopc_filterpy.bench import Runs, StudyReport, make_controller
 from kfopc_filterpy.metrics import harmonics_db
 from kfopc_filterpy.signals import tone
 
@@ -27,22 +26,21 @@ def small() -> Any:
     """Few taps, two seconds, one pair of paths cut short, two overdrives, hard clip on a tone and a band noise."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
-        constraint_cases.measured_data.cache_clear()
-        short = {"duct": tuple(path[:200] for path in cases.paths()["duct"])}
+        cases.measured_data.cache_clear()
+        short = {"duct": tuple(path[:200] for path in cases.ducts()["duct"])}
         studied = [Case("duct", "tone", "hard clip"), Case("duct", "band noise", "soft saturation")]
         patch.setattr(cases, "N_TAPS", TAPS)
-        patch.setattr(amplifier, "paths", lambda: short)
+        patch.setattr(amplifier, "ducts", lambda: short)
         patch.setattr(amplifier, "cases", lambda names: studied)
-        for module in (amplifier, amplifier_runs):
-            patch.setattr(module, "ALGORITHMS", STUDIED)
-            patch.setattr(module, "OVERDRIVES_DB", (0.0, 10.0))
-            patch.setattr(module, "DURATION_S", 2.0)
-        patch.setattr(amplifier_runs, "PEAK_LIMITED", ("clipping FxLMS",))
+        patch.setattr(amplifier, "ALGORITHMS", STUDIED)
+        patch.setattr(amplifier, "OVERDRIVES_DB", (0.0, 10.0))
+        patch.setattr(amplifier, "DURATION_S", 2.0)
+        patch.setattr(amplifier, "PEAK_LIMITED", ("clipping FxLMS",))
         runs = Runs()
         report = amplifier.main(runs)
         planned = amplifier.planned_runs()
-        scene = cases.make_case(short["duct"], cases.noise_of("tone", 2.0), 0.0)
-    constraint_cases.measured_data.cache_clear()
+        scene = cases.driven_case(short["duct"], cases.noise_of("tone", 2.0), 0.0)
+    cases.measured_data.cache_clear()
     return report, runs.done, planned, scene
 
 
@@ -119,7 +117,7 @@ def test_known_amplifiers_reach_those_that_can_know_them(small: Any) -> None:
     assert driven.known_amplifier is driven.amplifier
     assert driven.amplifier.limit == pytest.approx(np.sqrt(2 * 10**-0.6))
     assert saturating(scene, case, 6.0, UNKNOWN).known_amplifier is None
-    assert amplifier_runs.knowing() == ["KF-ANC", "KF-OPC", "KF-PB", "MOV-FxLMS"]
+    assert amplifier.knowing() == ["KF-ANC", "KF-OPC", "KF-PB", "MOV-FxLMS"]
 
 
 def test_peak_limits_go_up_to_the_amplifiers(small: Any) -> None:
@@ -156,7 +154,7 @@ def test_harmonics_of_a_clipped_sine_are_those_of_its_fourier_series(overdrive_d
 # ---- Verdicts from rows made by hand
 
 
-def _row(algorithm: str, overdrive_db: float = 10.0, **more: Any) -> Row:
+def _row(algorithm: str, overdrive_db: float = 10.0, **more: Any) -> AmplifierRow:
     values: dict[str, Any] = {
         "path": "duct",
         "noise": "tone",
@@ -173,7 +171,7 @@ def _row(algorithm: str, overdrive_db: float = 10.0, **more: Any) -> Row:
         "weight_growth": 1.0,
         "diverged_at_s": None,
     }
-    return Row(algorithm=algorithm, overdrive_db=overdrive_db, **{**values, **more})
+    return AmplifierRow(algorithm=algorithm, overdrive_db=overdrive_db, **{**values, **more})
 
 
 @pytest.mark.parametrize(("asked", "at", "met"), [(2.1, None, True), (1.9, None, False), (np.nan, 1.0, True)])

@@ -10,10 +10,10 @@ import pytest
 
 from comparisons.__main__ import STUDIES, main
 from comparisons.studies import broadband, duct, tonal
+from comparisons.studies.cases import PAPER
 from kfopc_filterpy import bandpass_path, output_power
-from kfopc_filterpy.bench.registry import ALGORITHMS, grid, make_controller
-from kfopc_filterpy.bench.scene import Runs, figures_of_merit, make_scene
-from kfopc_filterpy.bench.tuning import Trial, _best, tune
+from kfopc_filterpy.bench import Runs, Trial, algorithms, figures_of_merit, make_controller, make_scene, tune
+from kfopc_filterpy.bench.tuning import _best
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.signals import tone
@@ -71,8 +71,9 @@ def test_scaling_a_scene_scales_the_unconstrained_control_signal(scene):
 
 
 def test_every_algorithm_runs_from_every_end_of_its_grid(scene):
-    for name in ALGORITHMS:
-        for setting in (grid(name)[0], grid(name)[-1]):
+    for name in PAPER:
+        grid = algorithms()[name].grid
+        for setting in (grid[0], grid[-1]):
             result = scene.run(make_controller(scene, name, setting))
             assert result.algorithm == name
             assert result.error.size == 12000 - 1600
@@ -80,23 +81,25 @@ def test_every_algorithm_runs_from_every_end_of_its_grid(scene):
 
 def test_tuning_takes_the_lowest_error_that_keeps_the_budget():
     trials = [
-        Trial(1.0, -9.0, 9.0, True),  # diverged
-        Trial(2.0, -8.0, 0.52, False),  # over the budget
-        Trial(3.0, -7.0, 0.505, False),
-        Trial(4.0, -6.0, 0.5, False),
+        Trial(1.0, -9.0, 9.0, 0.1),  # diverged
+        Trial(2.0, -8.0, 0.52),  # over the budget
+        Trial(3.0, -7.0, 0.505),
+        Trial(4.0, -6.0, 0.5),
     ]
-    assert _best(trials, 0.5, "KF-OPC").setting == 3.0
-    assert _best(trials, np.inf, "KF-ANC").setting == 2.0
-    over = _best(trials[:2], 0.5, "KF-OPC")
+    assert _best(trials, 0.5).setting == 3.0
+    assert _best(trials, np.inf).setting == 2.0
+    over = _best(trials[:2], 0.5)
     assert (over.setting, over.within_budget) == (2.0, False)
+    assert _best(trials[:1], 0.5) is None
+    scene = tonal._scene(bandpass_path(128), bandpass_path(32), 2.0)
     with pytest.raises(RuntimeError, match="KF-OPC diverged at every setting"):
-        _best(trials[:1], 0.5, "KF-OPC")
+        tune(Runs(), scene, ["KF-OPC"], trials={"KF-OPC": trials[:1]})
 
 
 def test_tuned_setting_is_the_best_of_its_trials(scene):
     tuned = tune(Runs(), scene, ["KF-OPC", "MOV-FxLMS"], seeds=2)
     for name, best in tuned.items():
-        assert [t.setting for t in best.trials] == list(grid(name))
+        assert [t.setting for t in best.trials] == algorithms()[name].grid
         kept = [t for t in best.trials if not t.diverged and t.output_power <= 1.02 * scene.rated_power]
         assert best.within_budget == bool(kept)
         if kept:
@@ -166,7 +169,7 @@ def test_command_writes_report_and_results(monkeypatch, tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "KF-ANC run by filterpy's own KalmanFilter over the first 320 samples" in printed.replace("\n  ", " ")
     study = json.loads((tmp_path / "out" / "results.json").read_text())["studies"]["tonal"]
-    assert set(study["algorithms"]) == set(ALGORITHMS)
+    assert set(study["algorithms"]) == set(PAPER)
     assert study["extra"]["filterpy_largest_difference"]["weights"] < 1e-5  # S/R starts at 1e6: 1e-16 times that
     assert (tmp_path / "out" / "report.html").stat().st_size > 100_000
     assert sorted(p.name for p in (tmp_path / "out" / "audio").iterdir())[0] == "tonal-disturbance.wav"

@@ -6,18 +6,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-import test_report
+from helpers.reports import study
 
 from comparisons.studies import constraint
-from comparisons.studies.constraint_cases import Setting
-from comparisons.studies.constraint_runs import Row
-from kfopc_filterpy.bench.report import Table, write_report
+from comparisons.studies.constraint import ConstraintRow
+from kfopc_filterpy.bench import Table, write_report
 from kfopc_filterpy.signals import swelling
 
 
-def row(**changed: Any) -> Row:
+def row(**changed: Any) -> ConstraintRow:
     values: dict[str, Any] = {
-        "setting": Setting("duct", "tone"),
+        "path": "duct",
+        "noise": "tone",
         "share": 0.25,
         "duration_s": 8.0,
         "seed": 1,
@@ -28,7 +28,7 @@ def row(**changed: Any) -> Row:
         "bound_db": 10.0,
         "scaled_db": 9.0,
     }
-    return Row(**values | changed)
+    return ConstraintRow(**values | changed)
 
 
 @pytest.mark.parametrize("claim", [constraint._steady_claim, constraint._varying_claim])
@@ -68,9 +68,7 @@ def test_what_does_not_settle_is_slower(ours: float | None, theirs: float, held:
 
 def test_claims_and_cells_are_text_on_the_page(tmp_path: Any) -> None:
     table = Table("a", "A", ["x"], [[np.nan]])
-    text = write_report([test_report._study(claims="Aims <of> it", tables=[table])], tmp_path).read_text(
-        encoding="utf-8"
-    )
+    text = write_report([study(claims="Aims <of> it", tables=[table])], tmp_path).read_text(encoding="utf-8")
     assert "<of>" not in text
     assert ">nan<" not in text
 

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from comparisons import __main__ as command
-from comparisons.studies import constraint, constraint_cases, constraint_runs
-from comparisons.studies.constraint_cases import Setting, make_case
-from comparisons.studies.constraint_runs import SHARES, Clipped, Jump, Row
-from kfopc_filterpy.bench.report import StudyReport, Table, results_table, write_report
-from kfopc_filterpy.bench.scene import Runs, Scene
+from comparisons.studies import cases, constraint
+from comparisons.studies.cases import Case, make_case
+from comparisons.studies.constraint import SHARES, ClippedRow, ConstraintRow, Jump
+from kfopc_filterpy.bench import Runs, Scene, StudyReport, Table, results_table, write_report
 from kfopc_filterpy.paths import duct_paths, path_taps
 
 TAPS = 16
@@ -30,13 +29,12 @@ def small() -> Any:
     """The study without measured data: one pair of paths, two noises, one seed, two seconds, 16 taps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
-        constraint_cases.measured_data.cache_clear()
-        pairs, made = constraint_cases.paths(), constraint_cases.noises()
-        assert constraint_cases.measured_data() is None
+        cases.measured_data.cache_clear()
+        pairs, made = cases.paths(), cases.noises()
+        assert cases.measured_data() is None
         assert list(pairs) == ["band-pass", "duct"]
         assert list(made) == ["tone", "compressor", "band noise", "bursts", "swelling band noise"]
-        for module in (constraint, constraint_cases):
-            patch.setattr(module, "N_TAPS", TAPS)
+        patch.setattr(constraint, "N_TAPS", TAPS)
         patch.setattr(constraint, "paths", lambda: {"duct": tuple(path[:200] for path in pairs["duct"])})
         patch.setattr(constraint, "noises", lambda: {name: made[name] for name in STUDIED})
         patch.setattr(constraint, "DURATIONS_S", (2.0,))
@@ -44,7 +42,7 @@ def small() -> Any:
         patch.setattr(constraint, "CLIPPED_NOISES", ("tone",))
         runs = Runs()
         outcome = constraint.main(runs), runs.done, constraint.planned_runs()
-    constraint_cases.measured_data.cache_clear()
+    cases.measured_data.cache_clear()
     return outcome
 
 
@@ -66,7 +64,7 @@ def test_the_report_is_complete(small: Any) -> None:
     assert all(set(own) == set(constraint.TUNED) for own in tuned.values())
     # two noises, two rated powers, three filters and two behind the limiter, one of each
     rows = report.extra["rows"]
-    keys = [(row["setting"]["noise"], row["share"], row["algorithm"]) for row in rows]
+    keys = [(row["noise"], row["share"], row["algorithm"]) for row in rows]
     names = ("KF-OPC", "KF-OPC repaired", "KF-PB", "KF-OPC limited", "KF-PB limited")
     assert sorted(keys) == sorted((noise, share, name) for noise in STUDIED for share in SHARES for name in names)
     assert all(
@@ -87,7 +85,7 @@ def test_rows_say_what_such_runs_must_give(small: Any) -> None:
         assert row["scaled_db"] <= row["bound_db"] + 1e-9  # the best within the power, and one of those within it
         if row["algorithm"].endswith("limited"):
             assert row["worst_window"] <= 1 + 1e-9
-        if row["setting"]["noise"] == "tone":
+        if row["noise"] == "tone":
             # Cut to a share of the power that cancels it (1, to what the ridge and 40 dB of noise leave): the error of a
             # tone is 1 - sqrt(share) of the disturbance.
             assert row["bound_db"] == pytest.approx(-20 * np.log10(1 - np.sqrt(row["share"])), abs=0.05)
@@ -143,11 +141,7 @@ def test_tables_have_their_columns_and_files(small: Any, stem: str, tmp_path: An
 def test_the_power_table_holds_the_rows(small: Any) -> None:
     report: StudyReport = small[0]
     for cells in next(table for table in report.tables if table.stem == "power").rows:
-        own = [
-            r
-            for r in report.extra["rows"]
-            if r["setting"]["noise"] == cells[1] and f"{100 * r['share']:.0f} %" == cells[2]
-        ]
+        own = [r for r in report.extra["rows"] if r["noise"] == cells[1] and f"{100 * r['share']:.0f} %" == cells[2]]
         assert (cells[0], cells[3]) == ("duct", "2 s")
         assert cells[4:6] == pytest.approx([own[0]["bound_db"], own[0]["scaled_db"]], rel=1e-12)  # a mean of equal rows
         for k, name in enumerate(constraint.TUNED):
@@ -163,8 +157,7 @@ def test_the_summary_holds_what_the_rows_of_an_algorithm_say(small: Any) -> None
         own = [
             r
             for r in report.extra["rows"]
-            if r["algorithm"] == algorithm
-            and (r["setting"]["noise"] in constraint_cases.STATIONARY) == (noise == "stationary noise")
+            if r["algorithm"] == algorithm and (r["noise"] in cases.STATIONARY) == (noise == "stationary noise")
         ]
         losses = [r["bound_db"] - r["noise_reduction_db"] for r in own]
         assert (runs, far) == (len(own), sum(loss > 1.0 for loss in losses))
@@ -184,24 +177,39 @@ def test_the_terminal_shows_verdicts_and_tables(small: Any) -> None:
 # ---- Verdicts from rows made by hand
 
 
-TONE, SWELLING = Setting("duct", "tone"), Setting("duct", "swelling band noise")
+TONE, SWELLING = Case("duct", "tone"), Case("duct", "swelling band noise")
 
 
-def row(**changes: Any) -> Row:
-    values = {"setting": TONE, "share": 0.25, "duration_s": 8.0, "seed": 1, "algorithm": "KF-PB"}
+def row(**changes: Any) -> ConstraintRow:
+    values: dict[str, Any] = {
+        "path": "duct",
+        "noise": "tone",
+        "share": 0.25,
+        "duration_s": 8.0,
+        "seed": 1,
+        "algorithm": "KF-PB",
+    }
     values |= {"noise_reduction_db": 10.0, "power": 1.0, "worst_window": 1.5, "bound_db": 10.1, "scaled_db": 9.0}
-    return Row(**values | changes)
+    return ConstraintRow(**values | changes)
 
 
 def jump(**changes: Any) -> Jump:
-    values = {"setting": TONE, "share": 0.25, "jump_db": 20.0, "loss_db": 0.2, "weight_db": -0.3, "power_in_jump": 1.0}
+    values: dict[str, Any] = {
+        "case": TONE,
+        "share": 0.25,
+        "jump_db": 20.0,
+        "loss_db": 0.2,
+        "weight_db": -0.3,
+        "power_in_jump": 1.0,
+    }
     nothing = np.zeros(1)
     return Jump(**values | {"worst_window_limited": 1.0, "time_s": nothing, "power_weight": nothing} | changes)
 
 
-def clipped(**changes: Any) -> Clipped:
-    values = {"setting": TONE, "algorithm": "KF-PB limited", "known": "path", "noise_reduction_db": 5.0, "power": 0.9}
-    return Clipped(**values | {"worst_window": 1.0, "diverged_at_s": None} | changes)
+def clipped(**changes: Any) -> ClippedRow:
+    values: dict[str, Any] = {"path": "duct", "noise": "tone", "algorithm": "KF-PB limited", "known": "path"}
+    values |= {"noise_reduction_db": 5.0, "power": 0.9}
+    return ClippedRow(**values | {"worst_window": 1.0, "diverged_at_s": None} | changes)
 
 
 def test_loss_is_what_the_bound_is_above() -> None:
@@ -277,7 +285,7 @@ def test_verdict_on_the_guarantee() -> None:
         assert constraint._guarantee_claim([*free, *rows], jumps, clips).reproduced is False
 
 
-def pair(reduction: float, of_opc: float, **changes: Any) -> list[Row]:
+def pair(reduction: float, of_opc: float, **changes: Any) -> list[ConstraintRow]:
     """KF-PB and KF-OPC behind the limiter on one case."""
     return [
         row(algorithm="KF-PB limited", noise_reduction_db=reduction, **changes),
@@ -288,7 +296,7 @@ def pair(reduction: float, of_opc: float, **changes: Any) -> list[Row]:
 def test_verdicts_behind_the_limiter() -> None:
     """Compared case by case; the rows without a limiter, and KF-OPC's losses, count for nothing."""
     free = [row(noise_reduction_db=0.0), row(algorithm="KF-OPC", noise_reduction_db=50.0)]
-    noise = {"setting": SWELLING, "seed": 4, "share": 0.1}
+    noise = {"noise": SWELLING.noise, "seed": 4, "share": 0.1}
     compared, tones = constraint._transparency_claims([*free, *pair(10.0, 8.0), *pair(7.75, 8.0, **noise)])
     assert (compared.reproduced, tones.reproduced) == (True, True)
     assert compared.figure == ("+0.88 dB on average, -0.25 dB at worst (duct, swelling band noise, 10 %, 8 s, seed 4)")
@@ -312,9 +320,9 @@ def test_a_diverged_run_is_told_in_the_table_of_amplifiers() -> None:
 
 
 def test_decibels_of_lambdas_that_may_be_zero() -> None:
-    assert constraint_runs._decibels(0.0, 0.0) == 0.0
-    assert constraint_runs._decibels(20.0, 2.0) == pytest.approx(10.0, rel=1e-12)
-    assert constraint_runs._decibels(0.0, 1.0) == pytest.approx(-300.0, rel=1e-12)
+    assert constraint._decibels(0.0, 0.0) == 0.0
+    assert constraint._decibels(20.0, 2.0) == pytest.approx(10.0, rel=1e-12)
+    assert constraint._decibels(0.0, 1.0) == pytest.approx(-300.0, rel=1e-12)
 
 
 # ---- The scenes
@@ -343,11 +351,11 @@ def scenes() -> dict[tuple[str, str], Scene]:
     """Cases of two seconds. Without the ridge band noise in the duct would ask for 1.2 times the power."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
-        constraint_cases.measured_data.cache_clear()
-        pairs, made = constraint_cases.paths(), constraint_cases.noises()
-        constraint_cases.measured_data.cache_clear()
+        cases.measured_data.cache_clear()
+        pairs, made = cases.paths(), cases.noises()
+        cases.measured_data.cache_clear()
         return {
-            (path, noise): make_case(pairs[path], made[noise](2.5, 3))
+            (path, noise): make_case(pairs[path], made[noise](2.5, 3), n_taps=160)
             for path in ("band-pass", "duct")
             for noise in NOISES
         }
@@ -372,7 +380,7 @@ def test_a_case_is_what_it_says(scenes: Any, noise: str) -> None:
 
 def test_louder_scales_signals_powers_and_q_but_no_weights(scenes: Any) -> None:
     scene = scenes["duct", "bursts"]
-    loud = constraint_cases.louder(scene, 4.0)
+    loud = cases.louder(scene, 4.0)
     np.testing.assert_array_equal(loud.references[0], 4.0 * scene.references[0])
     np.testing.assert_array_equal(loud.disturbances[0], 4.0 * scene.disturbances[0])
     assert loud.sensor_noise_std == 4.0 * scene.sensor_noise_std
@@ -384,21 +392,21 @@ def test_louder_scales_signals_powers_and_q_but_no_weights(scenes: Any) -> None:
 
 def test_a_jump_is_between_its_times() -> None:
     noise = np.ones(16000)
-    jumped = constraint_cases.with_jump(noise, -20.0, 0.25, 0.5)
+    jumped = cases.with_jump(noise, -20.0, 0.25, 0.5)
     np.testing.assert_array_equal(noise, 1.0)
     np.testing.assert_allclose(jumped, np.where((np.arange(16000) // 4000) == 1, 0.1, 1.0), rtol=1e-15)
 
 
 def test_measured_data_join_where_they_are_at_hand(shared_data: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("KFOPC_DATA", str(shared_data))
-    constraint_cases.measured_data.cache_clear()
-    pairs, made = constraint_cases.paths(), constraint_cases.noises()
-    constraint_cases.measured_data.cache_clear()
+    cases.measured_data.cache_clear()
+    pairs, made = cases.paths(), cases.noises()
+    cases.measured_data.cache_clear()
     assert (list(pairs)[-1], list(made)[-1]) == ("measured duct", "motor")
     assert np.sum(pairs["measured duct"][1] ** 2) == pytest.approx(1.0, rel=1e-12)
     motor = [made["motor"](0.5, seed) for seed in (1, 2)]
     assert not np.array_equal(*motor)
-    everything = constraint_cases.settings(pairs, made)
+    everything = constraint.all_cases(pairs, made)
     assert len(everything) == 18
     assert [s.noise for s in everything if s.stationary and s.path == "duct"] == ["tone", "compressor", "band noise"]
     # 3 filters at 5 settings, 2 durations with 4 seeds each; jumps of 9, clipping of 6, one course

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from comparisons import __main__ as command
-from comparisons.studies import cases, constraint_cases, mismatch, mismatch_runs
-from comparisons.studies.mismatch_runs import EXACT, WRONG, Case, Row, case_scene, estimates, phase_accuracy_deg
+from comparisons.studies import cases, mismatch
+from comparisons.studies.cases import Case
+from comparisons.studies.mismatch import EXACT, WRONG, MismatchRow, case_scene, estimates, phase_accuracy_deg
 from kfopc_filterpy import FxLMS, noise_reduction_db, output_power, simulate
-from kfopc_filterpy.bench.registry import make_controller
-from kfopc_filterpy.bench.report import StudyReport
-from kfopc_filterpy.bench.scene import Runs
+from kfopc_filterpy.bench import Runs, StudyReport, make_controller
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import tone
 
@@ -28,25 +27,20 @@ def small() -> Any:
     """Few taps, one second, one pair of paths cut short, no measured data."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
-        constraint_cases.measured_data.cache_clear()
-        pairs = cases.paths()
+        cases.measured_data.cache_clear()
+        pairs = cases.ducts()
         assert list(pairs) == ["duct"]
         short = {"duct": tuple(path[:200] for path in pairs["duct"])}
         patch.setattr(cases, "N_TAPS", TAPS)
-        patch.setattr(mismatch, "paths", lambda: short)
-        for module in (mismatch, mismatch_runs):
-            patch.setattr(module, "ALGORITHMS", STUDIED)
-            patch.setattr(module, "AMOUNTS", AMOUNTS)
-            patch.setattr(module, "DURATION_S", 1.0)
-        from comparisons.studies import mismatch_figures
-
-        patch.setattr(mismatch_figures, "ALGORITHMS", STUDIED)
-        patch.setattr(mismatch_figures, "AMOUNTS", AMOUNTS)
+        patch.setattr(mismatch, "ducts", lambda: short)
+        patch.setattr(mismatch, "ALGORITHMS", STUDIED)
+        patch.setattr(mismatch, "AMOUNTS", AMOUNTS)
+        patch.setattr(mismatch, "DURATION_S", 1.0)
         runs = Runs()
         report = mismatch.main(runs)
         planned = mismatch.planned_runs()
         scene = case_scene(Case("duct", "tone"), short["duct"])
-    constraint_cases.measured_data.cache_clear()
+    cases.measured_data.cache_clear()
     return report, runs.done, planned, scene
 
 
@@ -178,7 +172,7 @@ def test_fxlms_of_a_tone_decays_below_90_degrees_and_grows_past_it(phase_deg: fl
 # ---- Verdicts from rows made by hand
 
 
-def _row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **more: Any) -> Row:
+def _row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **more: Any) -> MismatchRow:
     values = {
         "path": "duct",
         "noise": "band noise",
@@ -189,7 +183,7 @@ def _row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **m
         "within_budget": True,
         "diverged_at_s": None,
     }
-    return Row(kind=kind, amount=amount, algorithm=algorithm, **{**values, **more})
+    return MismatchRow(kind=kind, amount=amount, algorithm=algorithm, **{**values, **more})
 
 
 @pytest.mark.parametrize(

@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from comparisons.__main__ import FURTHER
-from comparisons.studies import constraint_cases, power_budget
-from comparisons.studies.constraint_cases import Setting, make_case, noises, paths
-from comparisons.studies.power_budget import BOUND, SCALED, Row, _claims, _needed, _sizing_table, mean_rows
+from comparisons.studies import cases, power_budget
+from comparisons.studies.cases import Case, make_case, noises, paths
+from comparisons.studies.power_budget import BOUND, SCALED, BudgetRow, _claims, _needed, _sizing_table, mean_rows
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
+from kfopc_filterpy.bench import Runs, StudyReport, run_setting, write_report
 from kfopc_filterpy.bench import registry as algorithms
 from kfopc_filterpy.bench.registry import REGISTRY
-from kfopc_filterpy.bench.report import StudyReport, write_report
-from kfopc_filterpy.bench.scene import Runs
-from kfopc_filterpy.bench.tuning import run_setting
 
 TAPS, DURATION_S = 16, 1.0
-CASE = Setting("duct", "band noise")
+CASE = Case("duct", "band noise")
 SHARES = (-10.0, 0.0)
 
 
@@ -29,20 +27,19 @@ def small() -> Any:
     """One case, two rated powers, two seeds of a second, 16 taps, three of each setting; the measured data away."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
-        constraint_cases.measured_data.cache_clear()
+        cases.measured_data.cache_clear()
         pairs = paths()
         patch.setattr(power_budget, "paths", lambda: {"duct": tuple(path[:200] for path in pairs["duct"])})
-        for module in (power_budget, constraint_cases):
-            patch.setattr(module, "N_TAPS", TAPS)
+        patch.setattr(power_budget, "N_TAPS", TAPS)
         patch.setattr(power_budget, "DURATION_S", DURATION_S)
         patch.setattr(power_budget, "SHARES_DB", SHARES)
         patch.setattr(power_budget, "SEEDS", (1, 2))
-        patch.setattr(power_budget, "CASES", (CASE, Setting("measured duct", "motor")))
+        patch.setattr(power_budget, "CASES", (CASE, Case("measured duct", "motor")))
         for name, own in REGISTRY.items():
             patch.setitem(algorithms.REGISTRY, name, replace(own, first=own.first[1:8:3], second=own.second[1:8:3]))
         runs = Runs()
         pair, noise = power_budget.paths()["duct"], noises()["band noise"]
-        first, scene = (make_case(pair, noise(DURATION_S + 0.5, seed)) for seed in (1, 2))
+        first, scene = (make_case(pair, noise(DURATION_S + 0.5, seed), n_taps=TAPS) for seed in (1, 2))
         rated = replace(
             first,
             rated_power=0.1,
@@ -66,7 +63,7 @@ def small() -> Any:
             switch_on_s=0.5,
             ridge=scene.measurement_noise / (scene.settled[0].size * scene.initial_variance),
         ).noise_reduction_over(0.5 * DURATION_S)
-    constraint_cases.measured_data.cache_clear()
+    cases.measured_data.cache_clear()
     return *outcome, again, bound
 
 
@@ -104,9 +101,18 @@ def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
     assert (tmp_path / "figures" / "power-budget-duct-band-noise.png").stat().st_size > 10_000
 
 
-def rows_of(name: str, reductions: Any, powers: Any = (1.0, 1.0), seed: int = 1) -> list[Row]:
+def rows_of(name: str, reductions: Any, powers: Any = (1.0, 1.0), seed: int = 1) -> list[BudgetRow]:
     return [
-        Row(CASE, share, seed, name, reduction, power, 2.0)
+        BudgetRow(
+            path=CASE.path,
+            noise=CASE.noise,
+            share_db=share,
+            seed=seed,
+            algorithm=name,
+            noise_reduction_db=reduction,
+            power=power,
+            worst_window=2.0,
+        )
         for share, reduction, power in zip(SHARES, reductions, powers, strict=True)
     ]
 

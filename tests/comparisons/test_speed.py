@@ -50,11 +50,24 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
             )
     assert rows["filterpy", 256]["times_filterpy"] == rows["numpy rank-1", 256]["times_numpy"] == 1.0
     # An O(L^3) filter is slower than an O(L^2) one at 256 taps on any machine.
-    assert rows["streaming kernel", 256]["times_filterpy"] > 5
+    assert rows["filterpy API of KFOPC", 256]["times_filterpy"] > 5
     printed = capsys.readouterr().out
     assert "times as fast as filterpy" in printed
     assert "16 taps, 200 samples" in printed
     assert "1.0 s for `simulate`" in printed
+
+
+def test_what_is_stepped_from_python_is_what_the_loop_runs():
+    for name in speed_variants.CONTROLLERS:
+        for make in (speed_variants.closed_loop, speed_variants.stepped):
+            run, samples = make(name, 8)
+            run()
+            assert samples > 0
+
+
+@pytest.mark.parametrize("use", speed_variants.FIRST_USES.values())
+def test_a_first_use_is_complete_without_what_the_study_has_imported(use):
+    use()
 
 
 def test_rows_follow_from_the_measured_times():

@@ -375,7 +375,8 @@ def test_command_sweeps_a_function_of_ones_own(module, tmp_path, capsys):
 def test_command_names_the_scenario_that_failed(module, capsys):
     assert sweep_command("--scenario", module, "--axis", "a=1", "--axis", "side=wrong", "--output", "out") == 1
     assert (
-        "scenario a=1, side=wrong, seed=1: ValueError: no such side\nWhat was done by then" in capsys.readouterr().err
+        "scenario a=1, side=wrong, seed=1: ValueError: no such side\nFinished runs are kept in out"
+        in capsys.readouterr().err
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from comparisons.sweep.grid import AXES, as_seeds, built_in_grid, own_grid
 from comparisons.sweep.jobs import plan
 from comparisons.sweep.scenario import group_of, most_together
-from kfopc_filterpy.bench.registry import REGISTRY
+from kfopc_filterpy.bench import algorithms
 
 
 def test_every_combination_has_a_run_for_each_seed():
@@ -45,7 +45,7 @@ def test_names_may_have_hyphens_for_spaces():
     assert grid.axes["path"] == ("band-pass",)
 
 
-@pytest.mark.parametrize("name", REGISTRY)
+@pytest.mark.parametrize("name", algorithms())
 def test_every_listed_algorithm_is_known(name):
     assert built_in_grid({"algorithm": name, "setting": "tuned"}, 1).axes["algorithm"] == (name,)
 

@@ -8,21 +8,19 @@ import numpy as np
 import pytest
 
 from comparisons import __main__ as command
-from comparisons.studies import cases, constraint_cases, tracking, tracking_runs
-from comparisons.studies.tracking_runs import (
+from comparisons.studies import cases, tracking
+from comparisons.studies.tracking import (
     CHIRP_HZ,
     SWEEP_S,
     Event,
-    Row,
+    TrackingRow,
     change_scene,
     jump_scene,
     sweep,
     sweep_scene,
 )
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, simulate
-from kfopc_filterpy.bench.registry import make_controller
-from kfopc_filterpy.bench.report import StudyReport
-from kfopc_filterpy.bench.scene import Runs
+from kfopc_filterpy.bench import Runs, StudyReport, make_controller
 from kfopc_filterpy.metrics import overshoot
 
 FS = 16000.0
@@ -35,26 +33,23 @@ def small() -> Any:
     """Few taps, one pair of paths cut short, a jump, a change and a sweep, two seeds, short runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
-        constraint_cases.measured_data.cache_clear()
-        short = {"duct": tuple(path[:200] for path in cases.paths()["duct"])}
+        cases.measured_data.cache_clear()
+        short = {"duct": tuple(path[:200] for path in cases.ducts()["duct"])}
         patch.setattr(cases, "N_TAPS", TAPS)
-        patch.setattr(tracking, "paths", lambda: short)
-        for module in (tracking, tracking_runs):
-            patch.setattr(module, "ALGORITHMS", STUDIED)
-        for module in (tracking, tracking_runs):
-            patch.setattr(module, "SEEDS", (1, 2))
-            patch.setattr(module, "JUMP_S", (0.4, 0.8))
-            patch.setattr(module, "JUMP_RUN_S", 1.6)
-            patch.setattr(module, "CHANGE_S", 0.5)
-            patch.setattr(module, "CHANGE_RUN_S", 1.2)
-        chosen = [event for event in tracking_runs.events() if event.name in ("20 dB louder", "sign", "one sweep")]
-        for module in (tracking, tracking_runs):
-            patch.setattr(module, "events", lambda: chosen)
+        patch.setattr(tracking, "ducts", lambda: short)
+        patch.setattr(tracking, "ALGORITHMS", STUDIED)
+        patch.setattr(tracking, "SEEDS", (1, 2))
+        patch.setattr(tracking, "JUMP_S", (0.4, 0.8))
+        patch.setattr(tracking, "JUMP_RUN_S", 1.6)
+        patch.setattr(tracking, "CHANGE_S", 0.5)
+        patch.setattr(tracking, "CHANGE_RUN_S", 1.2)
+        chosen = [event for event in tracking.events() if event.name in ("20 dB louder", "sign", "one sweep")]
+        patch.setattr(tracking, "events", lambda: chosen)
         runs = Runs()
         report = tracking.main(runs)
         planned = tracking.planned_runs()
-        scenes = tracking_runs.scenes_of(chosen[1], short["duct"])
-    constraint_cases.measured_data.cache_clear()
+        scenes = tracking.scenes_of(chosen[1], short["duct"])
+    cases.measured_data.cache_clear()
     return report, runs.done, planned, scenes
 
 
@@ -166,17 +161,17 @@ def test_a_jump_is_of_the_reference(pair: Any) -> None:
 
 
 def test_events_say_where_they_happen() -> None:
-    found = {event.name: event for event in tracking_runs.events()}
+    found = {event.name: event for event in tracking.events()}
     assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
     assert found["longer duct"].paths == ("duct",)
-    names = [(event.name, path) for event, path in tracking_runs.jobs({"duct": None, "measured duct": None})]
+    names = [(event.name, path) for event, path in tracking.jobs({"duct": None, "measured duct": None})]
     assert len(names) == 13
     assert ("longer duct", "measured duct") not in names
 
 
 def test_an_algorithm_without_a_setting_is_lost() -> None:
     event = Event("sign", lambda pair, seed: None, {"changed": (0.0, 1.0)})  # type: ignore[arg-type,return-value]
-    row, course, result = tracking_runs.run_event(event, "duct", [], "FxLMS", None)
+    row, course, result = tracking.run_event(event, "duct", [], {"FxLMS": None}, "FxLMS")
     assert (row.diverged_at_s, course, result) == (0.0, None, None)
     assert np.isnan(row.noise_reduction_db)
     assert row.settled_s == {"changed": None}
@@ -185,9 +180,10 @@ def test_an_algorithm_without_a_setting_is_lost() -> None:
 # ---- Verdicts from rows made by hand
 
 
-def _row(event: str, algorithm: str, **more: Any) -> Row:
+def _row(event: str, algorithm: str, **more: Any) -> TrackingRow:
     values: dict[str, Any] = {
         "path": "duct",
+        "noise": "band noise",
         "setting": 0.1,
         "within_budget": True,
         "mean_nse_db": -5.0,
@@ -199,7 +195,7 @@ def _row(event: str, algorithm: str, **more: Any) -> Row:
         "stretch_worst_window": {"changed": 1.0},
         "diverged_at_s": None,
     }
-    return Row(event=event, algorithm=algorithm, **{**values, **more})
+    return TrackingRow(event=event, algorithm=algorithm, **{**values, **more})
 
 
 @pytest.mark.parametrize(("nse", "met"), [(-5.1, True), (-4.9, False), (np.nan, False)])

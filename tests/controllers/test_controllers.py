@@ -179,7 +179,11 @@ KALMAN = {"state_noise": 1e-6, "measurement_noise": 0.01}
         (lambda: MOVFxLMS(4, S, step_size=0.1, constraint=constraint(window="x")), ValueError, "window must be one of"),
         (lambda: MOVFxLMS(4, S, step_size=0.1), ValueError, "give either rated_power= or constraint="),
         (lambda: kf_opc(4, S, **KALMAN), ValueError, "give either rated_power= or constraint="),
-        (lambda: kf_opc(4, S, rated_power=1, constraint=constraint(), **KALMAN), ValueError, "give either rated_power="),
+        (
+            lambda: kf_opc(4, S, rated_power=1, constraint=constraint(), **KALMAN),
+            ValueError,
+            "give either rated_power=",
+        ),
         (lambda: kf_opc(4, S, constraint=1.0, **KALMAN), TypeError, "constraint must be an OutputPowerConstraint"),
     ],
 )

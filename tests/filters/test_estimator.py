@@ -575,7 +575,9 @@ def test_two_measurements_and_a_rated_power_do_not_go_together() -> None:
         kf.update([1.0, 2.0], R=np.eye(2), H=np.ones((2, TAPS)))
 
 
-@pytest.mark.parametrize("make", [KFOPC, lambda n, **own: KFOPC.random_walk(n, state_noise=0, measurement_noise=1, **own)])
+@pytest.mark.parametrize(
+    "make", [KFOPC, lambda n, **own: KFOPC.random_walk(n, state_noise=0, measurement_noise=1, **own)]
+)
 def test_a_constraint_that_is_none_or_one_too_many_is_refused(make: Callable) -> None:
     with pytest.raises(ValueError, match=r"give either rated_power= or constraint=.*, not both"):
         make(3, rated_power=1.0, constraint=OutputPowerConstraint(1.0))

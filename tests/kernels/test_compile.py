@@ -1,99 +1,453 @@
-"""How functions are compiled: again where a module they come from was edited, and with numba's own rules bent safely."""
+"""How functions are compiled: kept on disk, anew after an edit; bodies by type; arrays that are borrowed or stacked."""
 
 from __future__ import annotations
 
-import gc
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from numba.core.errors import TypingError
+from helpers.loop import S_HAT, noises, run
+from numba.core.errors import NumbaError
 
-from kfopc_filterpy import KFOPC
-from kfopc_filterpy.kernels.compiling import SWITCHED_OFF, Settings, compiled
-from kfopc_filterpy.kernels.covariance import project_covariance, update_weights
+from kfopc_filterpy import FxLMS, OutputLimiter, kf_opc, kf_pb
+from kfopc_filterpy.kernels.borrowing import borrowed
+from kfopc_filterpy.kernels.compiling import by_type, compiled, inlined, part
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
+from kfopc_filterpy.kernels.records import new_record
+from kfopc_filterpy.kernels.stacking import member, stacked, unstack
 
 PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
+ANNOUNCED = "kfopc_filterpy: compiling, once; the first runs take some seconds longer\n"
 
 
-def test_cached_loop_notices_an_edited_kernel(tmp_path):
-    copy = tmp_path / PACKAGE.name
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "loop" / "run.py").write_text(
-        "from ..kernels.compiling import compiled\nfrom ..kernels.covariance import dot\n\n\n"
-        "@compiled()\ndef twice(a):\n    return 2 * dot(a, a)\n"
-    )
-    code = (
-        "import numpy as np; from kfopc_filterpy.loop.run import twice; from kfopc_filterpy.kernels.compiling import on_disk\n"
-        "print(on_disk(twice), twice(np.ones(3)), sum(twice.stats.cache_hits.values()))"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    environment.pop("NUMBA_CACHE_DIR", None)
+# ---- What is compiled is kept on disk
 
-    def run() -> list[str]:
-        command = [sys.executable, "-c", code]
-        return subprocess.run(
-            command, cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
-        ).stdout.split()
+STEPS = '''"""A choice by type, and its bodies, in a file of their own."""
 
-    assert run() == ["False", "6.0", "0"]
-    assert run() == ["True", "6.0", "1"]
-    kernels = copy / "kernels" / "covariance.py"
-    kernels.write_text(kernels.read_text().replace("total += a[i] * b[i]", "total += 5.0 * a[i] * b[i]"))
-    assert run() == ["False", "30.0", "0"]
+from typing import NamedTuple
+
+import numpy as np
+
+from .compiling import by_type
+from .vectors import dot
 
 
-def test_arrays_keep_their_references():
-    """What Python holds before a call of compiled code it holds after, no more, no less."""
-    x, state = np.ones(50), KFOPC.random_walk(4, state_noise=1e-6, measurement_noise=1.0).compiled_state()[0]
-    counts = [sys.getrefcount(array) for array in (x, *state)]
+class Sum(NamedTuple):
+    values: np.ndarray
+
+
+class Energy(NamedTuple):
+    values: np.ndarray
+
+
+@by_type
+def figure(state):
+    """Return what the type of the state asks for."""
+    return np.nan
+
+
+@figure.register(Sum)
+def figure_sum(state):
+    """Return the sum."""
+    return np.sum(state.values)
+
+
+@figure.register(Energy)
+def figure_energy(state):
+    """Return the sum of squares."""
+    return 1.0 * dot(state.values, state.values)
+'''
+
+LOOP = '''"""What Python calls."""
+
+from .compiling import compiled
+from .steps import figure
+
+
+@compiled()
+def figure_of(state):
+    """Call `figure`."""
+    return figure(state)
+'''
+
+PROGRAM = """
+import numpy as np
+from kfopc_filterpy.kernels.loop import figure_of
+from kfopc_filterpy.kernels.steps import Energy, Sum
+
+values = 3.0 * np.ones(2)
+print(figure_of(Sum(values)), figure_of(Energy(values)), sum(figure_of.stats.cache_hits.values()))
+"""
+
+
+class Copy:
+    """A copy of the package with two small modules more, to be edited and run in processes of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.package = folder, folder / PACKAGE.name
+        shutil.copytree(PACKAGE, self.package, ignore=shutil.ignore_patterns("__pycache__"))
+        (self.package / "kernels" / "steps.py").write_text(STEPS)
+        (self.package / "kernels" / "loop.py").write_text(LOOP)
+
+    def edit(self, path: str, old: str, new: str) -> None:
+        text = (self.package / path).read_text()
+        assert old in text
+        (self.package / path).write_text(text.replace(old, new))
+
+    def run(self, program: str = PROGRAM, **environment: str) -> tuple[list[str], str]:
+        """The words that a process prints, and what it says on stderr."""
+        kept = {k: v for k, v in os.environ.items() if k not in ("NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT")}
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            cwd=self.folder,
+            env=kept | {"PYTHONPATH": str(self.folder)} | environment,
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        return done.stdout.split(), done.stderr
+
+    def compiled_files(self) -> list[Path]:
+        """Files of compiled code beside the sources."""
+        return sorted(self.package.rglob("*.nb[ic]"))
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Copy:
+    return Copy(tmp_path)
+
+
+def test_processes_share_what_one_compiled_and_hear_of_it_once(package: Copy) -> None:
+    """Bodies chosen by type among it."""
+    assert package.run() == (["6.0", "18.0", "0"], ANNOUNCED)
+    assert package.run() == (["6.0", "18.0", "2"], "")
+
+
+@pytest.mark.parametrize(
+    ("path", "old", "new", "result"),
+    [
+        ("kernels/vectors.py", "total += a[i] * b[i]", "total += 5.0 * a[i] * b[i]", "90.0"),
+        ("kernels/steps.py", "return 1.0 * dot", "return 7.0 * dot", "126.0"),
+    ],
+    ids=["a kernel", "a body chosen by type"],
+)
+def test_an_edit_of_any_file_compiles_anew(package: Copy, path: str, old: str, new: str, result: str) -> None:
+    """numba itself would look only at the file of the function that Python calls."""
+    package.run()
+    package.edit(path, old, new)
+    assert package.run() == (["6.0", result, "0"], ANNOUNCED)
+    package.edit(path, new, old)
+    assert package.run() == (["6.0", "18.0", "2"], "")  # what was compiled for these sources is still there
+
+
+def test_the_users_cache_folder_is_respected(package: Copy, tmp_path: Path) -> None:
+    chosen = tmp_path / "chosen"
+    for hits, said in (("0", ANNOUNCED), ("2", "")):
+        assert package.run(NUMBA_CACHE_DIR=str(chosen)) == (["6.0", "18.0", hits], said)
+    assert list(chosen.rglob("*.nbc"))
+    assert package.compiled_files() == []
+    before = sorted(chosen.rglob("*"))
+    own = "from numba import config, njit\nimport kfopc_filterpy.kernels.loop\n"
+    own += "print(config.CACHE_DIR)"  # for the user's own functions it is as it was
+    assert package.run(own, NUMBA_CACHE_DIR=str(chosen))[0] == [str(chosen)]
+    assert sorted(chosen.rglob("*")) == before
+
+
+def test_where_nothing_can_be_written_it_runs_all_the_same(package: Copy) -> None:
+    """Neither beside the sources nor in the user's folder, each of which is a file here."""
+    shutil.rmtree(package.package / "__pycache__", ignore_errors=True)
+    (package.package / "__pycache__").write_text("")
+    (package.folder / "no folder").write_text("")
+    unwritable = {"XDG_CACHE_HOME": str(package.folder / "no folder"), "PYTHONDONTWRITEBYTECODE": "1"}
+    elsewhere = {"XDG_CACHE_HOME": str(package.folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
+    if sys.platform.startswith("linux"):
+        assert package.run(**elsewhere) == (["6.0", "18.0", "0"], ANNOUNCED)
+        assert package.run(**elsewhere) == (["6.0", "18.0", "2"], "")
+    assert package.run(**unwritable, HOME=str(package.folder / "no folder"))[0][:2] == ["6.0", "18.0"]
+
+
+# ---- Bodies chosen by type
+
+
+class Plain(NamedTuple):
+    """A state of no body of its own."""
+
+    values: np.ndarray
+
+
+class Doubled(NamedTuple):
+    """Another."""
+
+    values: np.ndarray
+    factor: float
+
+
+@by_type
+def first_value(state, offset):
+    """Return the first value and the offset."""
+    return state.values[0] + offset
+
+
+@first_value.register(Doubled)
+def first_doubled(state, offset):
+    """Return the first value times the factor, and the offset."""
+    return state.factor * state.values[0] + offset
+
+
+@part()
+def first_of(state, offset):
+    """Call `first_value` from compiled code."""
+    return first_value(state, offset)
+
+
+@inlined
+def first_of_inlined(state, offset):
+    """Call it from a function that is inlined."""
+    return first_value(state, offset)
+
+
+@part()
+def first_within(state, offset):
+    """Call that."""
+    return first_of_inlined(state, offset=offset)
+
+
+@pytest.mark.parametrize("call", [first_value, first_of, first_within])
+def test_the_type_chooses_the_body_in_python_and_compiled(call: Any) -> None:
+    values = np.array([2.0, 5.0])
+    assert call(Plain(values), 1.0) == 3.0
+    assert call(Doubled(values, 10.0), 1.0) == 21.0
+
+
+def test_a_body_can_be_added_after_others_were_compiled() -> None:
+    class Late(NamedTuple):
+        values: np.ndarray
+
+    values = np.array([2.0])
+    first_of(Plain(values), 0.0)
+
+    @first_value.register(Late)
+    def first_late(state, offset):
+        return -state.values[0] - offset
+
+    assert first_value(Late(values), 1.0) == first_of(Late(values), 1.0) == -3.0
+    assert first_of(Plain(values), 1.0) == 3.0
+
+
+def test_division_by_zero_is_numpys() -> None:
+    """Inf or NaN, which callers look for, and no exception: in every kind of compiled function."""
+
+    @inlined
+    def ratio_inlined(a, b):
+        return a / b
+
+    @part()
+    def ratio(a, b):
+        return ratio_inlined(a, b)
+
+    @compiled(cache=False)
+    def called(a, b):
+        return ratio(a, b)
+
+    assert called(1.0, 0.0) == np.inf
+    assert np.isnan(called(0.0, 0.0))
+
+
+# ---- Arrays that are borrowed
+
+
+class Inner(NamedTuple):
+    """A part of a state."""
+
+    numbers: np.ndarray
+    nothing: None
+
+
+class Outer(NamedTuple):
+    """A state of arrays of several kinds."""
+
+    values: np.ndarray
+    single: np.ndarray
+    square: np.ndarray
+    inner: Inner
+    factor: float
+
+
+def outer() -> Outer:
+    inner = Inner(new_record(total=0.0, count=0), None)
+    return Outer(np.arange(4.0), np.ones(2, np.float32), np.arange(6.0).reshape(2, 3), inner, 3.0)
+
+
+@part()
+def spend(state):
+    """Read and write every array of a borrowed state."""
+    state = borrowed(state)
+    numbers = state.inner.numbers[0]
+    for i in range(state.values.size):
+        state.values[i] *= state.factor
+        numbers.total += state.values[i]
+    numbers.count += 1
+    state.single[1] = 0.5
+    state.square[1, 2] = state.square[0, 1]
+    return numbers.total
+
+
+@part()
+def spend_what_fails(state):
+    """Leave in the middle."""
+    state = borrowed(state)
+    state.values[0] = -1.0
+    if state.square.shape[0] == 2:
+        raise ValueError("in the middle")
+    return state.values[0]
+
+
+def arrays_of(value: Any) -> Iterator[np.ndarray]:
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from arrays_of(item)
+
+
+def test_what_is_borrowed_is_the_array_itself() -> None:
+    state = outer()
+    assert spend(state) == 18.0
+    np.testing.assert_array_equal(state.values, [0.0, 3.0, 6.0, 9.0])
+    np.testing.assert_array_equal(state.single, np.array([1.0, 0.5], np.float32))
+    np.testing.assert_array_equal(state.square, [[0.0, 1.0, 2.0], [3.0, 4.0, 1.0]])
+    assert state.inner.numbers.item() == (18.0, 1)
+    assert borrowed(state) is state  # in Python there is nothing to do
+
+
+def test_borrowed_arrays_keep_their_references() -> None:
+    """What Python holds before a call of compiled code it holds after, no more, no less; also where the call fails."""
+    state = outer()
+    held = list(arrays_of(state))
+    counts = [sys.getrefcount(array) for array in held]
     for _ in range(100):
-        project_covariance(state, x[:4])
-        update_weights(state, np.zeros(4), x[:4], 1.0, 2.0, 1.0)
-        assert newest(delay_line(3), 2).size == 2  # a view, made in Python
-    assert [sys.getrefcount(array) for array in (x, *state)] == counts
+        spend(state)
+        with pytest.raises(ValueError, match="in the middle"):
+            spend_what_fails(state)
+    assert [sys.getrefcount(array) for array in held] == counts
+    assert newest(delay_line(3), 2).size == 2  # a view, made in Python
 
 
-@pytest.mark.skipif(SWITCHED_OFF, reason="numba's compiler is switched off")
-def test_flags_are_the_same_where_the_same_was_set():
-    """As dictionary keys, in whatever order; and never where numba's own comparison, of all values, finds a difference."""
-    one, same, other = Settings(), Settings(), Settings()
-    one.nrt, one.noalias = False, True
-    same.noalias, same.nrt = True, False
-    other.nrt, other.noalias = True, True
-    assert one == same
-    assert hash(one) == hash(same)
-    assert one.values() == same.values()
-    assert one != other
-    assert one.values() != other.values()
-    assert one.copy() == one
-    assert type(one.copy()) is Settings
-    assert {one: 1, other: 2}[same] == 1
+@pytest.mark.parametrize("name", ["FxLMS", "KF-OPC", "KF-PB"])
+def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
+    limiter = OutputLimiter(0.1, fs=8000.0, window_s=0.01)
+    kalman: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": 1e-2, "rated_power": 0.2, "limiter": limiter}
+    made: Any = (
+        FxLMS(4, S_HAT, step_size=0.01, limiter=limiter)
+        if name == "FxLMS"
+        else {"KF-OPC": kf_opc, "KF-PB": kf_pb}[name](4, S_HAT, **kalman)
+    )
+    made.constraint.fs = 8000.0
+    if name == "KF-PB":
+        made.estimator.budget.fs = 8000.0
+    x, d, _ = noises(60)
+    run(made, n=60)
+    held = list(arrays_of(made._state))
+    counts = [sys.getrefcount(array) for array in held]
+    for _ in range(5):
+        run(made, n=60)
+        run(made, n=60, compiled=False)
+        made.listen(x, d)
+        with pytest.raises(ValueError, match="finite square"):
+            made.update(1e200)
+    assert [a is b for a, b in zip(arrays_of(made._state), held, strict=True)] == [True] * len(held)
+    assert [sys.getrefcount(array) for array in held] == counts
 
 
-@pytest.mark.skipif(SWITCHED_OFF, reason="numba's compiler is switched off")
-def test_collecting_garbage_goes_on_after_a_compilation():
-    @compiled(cache=False)
-    def fails(a):
-        return a.no_such_attribute
+def test_an_array_with_gaps_is_not_read_as_one_without() -> None:
+    """A pointer and a shape say nothing of strides: such an array is refused, or read as it is."""
 
-    @compiled(cache=False)
-    def works(a):
-        return a + 1
+    @part()
+    def second(state):
+        return borrowed(state).values[1]
 
-    assert gc.isenabled()
-    assert works(1) == 2
-    with pytest.raises(TypingError):
-        fails(1)
-    assert gc.isenabled()
-    gc.disable()
+    assert second(Plain(np.arange(6.0))) == 1.0
     try:
-        works(1.0)
-        assert not gc.isenabled()
-    finally:
-        gc.enable()
+        read = second(Plain(np.arange(6.0)[::2]))
+    except (NumbaError, ValueError):
+        return
+    assert read == 2.0
+
+
+# ---- NamedTuples that are stacked
+
+
+class Shared(NamedTuple):
+    """What is one for all."""
+
+    taken: np.ndarray
+
+
+class Item(NamedTuple):
+    """One of many."""
+
+    values: np.ndarray
+    inner: Inner
+    factor: float
+    shared: Shared
+
+
+def items(count: int) -> list[Item]:
+    return [
+        Item(np.arange(3.0) + 10 * i, Inner(new_record(total=float(i), count=i), None), 2.0 + i, Shared(np.zeros(1)))
+        for i in range(count)
+    ]
+
+
+def test_stacked_arrays_and_numbers_get_a_leading_axis() -> None:
+    stack = stacked(items(4))
+    assert type(stack) is Item
+    assert type(stack.inner) is Inner
+    assert stack.values.shape == (4, 3)
+    assert stack.inner.numbers.shape == (4, 1)
+    assert stack.inner.nothing is None
+    np.testing.assert_array_equal(stack.values[2], [20.0, 21.0, 22.0])
+    np.testing.assert_array_equal(stack.inner.numbers["count"][:, 0], range(4))
+    np.testing.assert_array_equal(stack.factor, [2.0, 3.0, 4.0, 5.0])
+
+
+@part()
+def advance_members(stack, count):
+    """Change each member, and what they share."""
+    total = 0.0
+    for i in range(count):
+        one = member(stack, i)
+        for k in range(one.values.size):
+            one.values[k] *= one.factor
+        one.inner.numbers[0].count += 1
+        one.shared.taken[0] += 1
+        total += one.values[0]
+    return total
+
+
+def test_a_member_is_a_view_of_its_own_part_and_what_is_shared_is_shared() -> None:
+    alone = items(3)
+    stack = stacked(alone)._replace(shared=Shared(np.zeros(1)))
+    assert advance_members(stack, 3) == 0.0 + 10.0 * 3.0 + 20.0 * 4.0
+    assert stack.shared.taken[0] == 3.0
+    np.testing.assert_array_equal(alone[1].values, [10.0, 11.0, 12.0])  # the stack is a copy
+    for i, one in enumerate(alone):
+        own = one._replace(shared=Shared(np.zeros(1)))
+        unstack(stack._replace(shared=Shared(np.full((3, 1), 7.0))), i, own)
+        np.testing.assert_array_equal(own.values, (np.arange(3.0) + 10 * i) * (2.0 + i))
+        assert own.inner.numbers.item() == (float(i), i + 1)
+
+
+def test_a_stack_of_one_and_none() -> None:
+    value = items(1)[0]._replace(shared=None)
+    stack = stacked([value])
+    assert stack.shared is None
+    stack.values[:] = 5.0
+    unstack(stack, 0, value)
+    np.testing.assert_array_equal(value.values, 5.0)

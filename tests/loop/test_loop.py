@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from helpers.comparing import SIGNALS, assert_same_estimator, assert_same_run
 from helpers.loop import (
     AMPLIFIERS,
@@ -24,6 +22,8 @@ from helpers.loop import (
     run,
     sensor_noise,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oracles import modified_anc as oracle
 
 from kfopc_filterpy import (
@@ -39,11 +39,10 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest, push
 
+
 def controller(name, *, rated_power=0.3, window="exponential", gain=None, known=None, n_taps=N_TAPS):
     kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0, "amplifier": known}
-    constraint = OutputPowerConstraint(
-        rated_power, fs=FS, memory_s=MEMORY_S, window=window, secondary_path_gain=gain
-    )
+    constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S, window=window, secondary_path_gain=gain)
     if name == "KF-ANC":
         return kf_anc(n_taps, S_HAT, **kalman)
     if name == "KF-OPC":

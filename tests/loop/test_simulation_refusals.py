@@ -11,7 +11,6 @@ from helpers.simulation import MAKERS, D, Integrator, S, X, constraint
 from kfopc_filterpy import FxLMS, simulate
 from kfopc_filterpy.paths import fir_path
 
-
 REFUSED = [
     ({"reference": X[:0], "disturbance": D[:0]}, ValueError, "reference must have at least 1 value"),
     ({"reference": X[:, None]}, ValueError, "reference must be one-dimensional"),
