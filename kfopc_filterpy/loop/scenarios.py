@@ -210,7 +210,7 @@ def simulate_scenarios(
     taps = paths.shape[1]
     plants = stacked([Plant(s, np.zeros(0), delay_line(taps), model) for s, model in zip(paths, models, strict=True)])
     gains = _GainSequence(states[0], x)
-    own: list[Any] = [state._replace(gains=None) for state in states]  # type: ignore[arg-type]
+    own = [state._replace(gains=None) for state in states]
     scenarios = stacked(own)
     names = RECORDED + POWERS[:2] if record_powers else RECORDED
     recorded = {name: np.full((count, x.size), np.nan) for name in names}
@@ -256,7 +256,7 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
     for i, controller in enumerate(controllers):
         if not isinstance(controller, FilteredReferenceController) or not controller.has_gains:
             raise TypeError(f"controllers[{i}] must be a KalmanController, got {controller!r}")
-        if any(controller is other or controller.estimator is other.estimator for other in controllers[:i]):
+        if any(controller is other or _filter(controller) is _filter(other) for other in controllers[:i]):
             raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs a controller of its own")
         controller.require_sample_rate(fs)
         state = controller.compiled_state(to_step=False)
@@ -274,6 +274,10 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
         if difference:
             raise ValueError(f"controllers[0] and controllers[{i}] must agree in {difference} to share gains")
     return states
+
+
+def _filter(controller: Any) -> Any:
+    return controller.estimator
 
 
 def _difference(one: Any, other: Any) -> str | None:
