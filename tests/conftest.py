@@ -24,6 +24,8 @@ settings.register_profile(
 )
 settings.load_profile("ci")
 
+pytest.register_assert_rewrite("helpers")  # their assertions say what they compared, as those of the tests do
+
 ROOT = Path(__file__).resolve().parents[1]
 
 

@@ -581,7 +581,7 @@ def test_two_measurements_and_a_rated_power_do_not_go_together() -> None:
 def test_a_constraint_that_is_none_or_one_too_many_is_refused(make: Callable) -> None:
     with pytest.raises(ValueError, match=r"give either rated_power= or constraint=.*, not both"):
         make(3, rated_power=1.0, constraint=OutputPowerConstraint(1.0))
-    with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None, got 1.0"):
+    with pytest.raises(TypeError, match=r"constraint must be an OutputPowerConstraint or None, got 1\.0"):
         make(3, constraint=1.0)
     kf = make(3)
     with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None, got 'tight'"):

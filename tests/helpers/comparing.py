@@ -70,19 +70,16 @@ def assert_controller_close(got, want):
         assert getattr(got, name) == pytest.approx(getattr(want, name), rel=1e-10), name
 
 
+def numbers_of(value):
+    """Copies of all arrays in a tuple of tuples, records as plain arrays."""
+    if isinstance(value, np.ndarray):
+        return [value.copy() if value.dtype.names is None else np.array(value.tolist(), dtype=float)]
+    return [leaf for item in value for leaf in numbers_of(item)] if isinstance(value, tuple) else []
+
+
 def state_of(made):
     """Every number that a controller keeps."""
-    leaves = []
-
-    def collect(value):
-        if isinstance(value, np.ndarray):
-            leaves.append(value.copy() if value.dtype.names is None else np.array(value.tolist(), dtype=float))
-        elif isinstance(value, tuple):
-            for item in value:
-                collect(item)
-
-    collect(made._state)
-    collect(made.constraint.state)
+    kept = (made._state, made.constraint.state)
     if hasattr(made, "estimator"):
-        collect((made.estimator.x.copy(), made.estimator.P.copy(), made.estimator.K.copy()))
-    return leaves
+        kept += (made.estimator.x, made.estimator.P, made.estimator.K)
+    return numbers_of(kept)

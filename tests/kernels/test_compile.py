@@ -353,6 +353,7 @@ def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
         made.estimator.budget.fs = 8000.0
     x, d, _ = noises(60)
     run(made, n=60)
+    run(made, n=60, compiled=False)  # what is made once is there
     held = list(arrays_of(made._state))
     counts = [sys.getrefcount(array) for array in held]
     for _ in range(5):
