@@ -43,6 +43,25 @@ class Stretch(NamedTuple):
 
 
 @inlined
+def part_of(signals, begin, end):
+    """Return the samples from `begin` to `end` of all signals, as views."""
+    part = slice(begin, end)
+    return Stretch(
+        signals.reference[part],
+        signals.disturbance[part],
+        signals.sensor_noise[part],
+        signals.error[part],
+        signals.control_signal[part],
+        signals.amplifier_output[part],
+        signals.anti_noise[part],
+        signals.constraint_factor[part],
+        signals.disturbance_power[part],
+        signals.secondary_path_gain[part],
+        signals.power_weight[part],
+    )
+
+
+@inlined
 def measured_reference(plant, x):
     """Return the reference microphone's signal: the noise, and what comes back from the loudspeaker, a sample late."""
     taps = plant.feedback.size

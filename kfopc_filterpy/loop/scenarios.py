@@ -13,6 +13,7 @@ from ..kernels.compiling import compiled
 from ..kernels.covariance import (
     CANCELLATION,
     Covariance,
+    aligned_zeros,
     copy_covariance,
     correct_weights,
     covariance_matrix,
@@ -29,7 +30,7 @@ from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .result import SimulationResult
-from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, run
+from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run
 from .simulation import (
     DIVERGENCE_LIMIT,
     POWERS,
@@ -39,7 +40,7 @@ from .simulation import (
     switch_on_sample,
 )
 
-BLOCK = 256  # samples for which the gains are kept
+BLOCK = 512  # samples for which the gains are kept
 VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
 SAFE = 1e290  # a correction below does not overflow weights that are finite
 
@@ -47,7 +48,7 @@ SAFE = 1e290  # a correction below does not overflow weights that are finite
 class SharedGains(NamedTuple):
     """The gains of a block of m samples, in place of a covariance."""
 
-    directions: np.ndarray  # (m, n) g_k = S_k K_k
+    directions: np.ndarray  # (m, n or more) g_k = S_k K_k
     norms: np.ndarray  # (m,) of g_k, which no magnitude in it exceeds
     variances: np.ndarray  # (m,) S_k
     taken: np.ndarray  # (1,) samples of the block that a scenario has taken
@@ -89,14 +90,15 @@ def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
 
 
 @compiled(nogil=True)
-def run_scenarios(states, plants, signals, limits, status, done):
-    """Run each scenario over a block, unless it has ended; all but the gains is stacked."""
+def run_scenarios(states, plants, signals, limits, status, done, begin, end):
+    """Run each scenario from sample `begin` to `end`, unless it has ended; all but the gains is stacked."""
     no_weights = np.empty((0, 0))
     for i in range(limits.size):
         if status[i] == RUNNING:
             states.gains.taken[0] = 0
             state, plant = member(states, i), member(plants, i)
-            status[i], taken = run(state, plant, member(signals, i), no_weights, limits[i], 1, 0)
+            block = part_of(member(signals, i), begin, end)
+            status[i], taken = run(state, plant, block, no_weights, limits[i], 1, 0)
             done[i] += taken
 
 
@@ -213,16 +215,17 @@ def simulate_scenarios(
     own = [state._replace(gains=None) for state in states]
     scenarios = stacked(own)
     names = RECORDED + POWERS[:2] if record_powers else RECORDED
-    recorded = {name: np.full((count, x.size), np.nan) for name in names}
+    recorded = {name: np.empty((count, x.size)) for name in names}
+    signals = _signals(x, d, noises, recorded)
     status, done = np.full(count, RUNNING), np.zeros(count, np.int64)
     for first, shared, solved in gains.blocks():
-        signals = _block(x, d, noises, first, solved)
-        run_scenarios(scenarios._replace(gains=shared), plants, signals, limits, status, done)
-        for name, signal in recorded.items():
-            signal[:, first : first + solved] = getattr(signals, name)
+        run_scenarios(scenarios._replace(gains=shared), plants, signals, limits, status, done, first, first + solved)
         _raise_if_refused(status, done, first + solved if solved < shared.variances.size else None)
         if progress:
             progress(count * solved)
+    for signal in recorded.values():
+        for i, end in enumerate(done):
+            signal[i, end:] = np.nan
     for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
         unstack(scenarios, i, own[i])
         controller.after_compiled(state._replace(gains=gains.covariance), shared=True)
@@ -240,12 +243,13 @@ def simulate_scenarios(
     ]
 
 
-def _block(x: np.ndarray, d: np.ndarray, noises: list[SensorNoise], first: int, size: int) -> Stretch:
-    """Return the stacked signals of a block: what goes in, and room for what the loop leaves."""
-    shape, part = (len(noises), size), slice(first, first + size)
-    left = np.full((len(RECORDED + POWERS), *shape), np.nan)
-    reference, disturbance = (np.broadcast_to(signal, shape).copy() for signal in (x[part], d[:, part]))
-    return Stretch(reference, disturbance, np.array([np.zeros(size) + noise.take(size) for noise in noises]), *left)
+def _signals(x: np.ndarray, d: np.ndarray, noises: list[SensorNoise], recorded: dict[str, np.ndarray]) -> Stretch:
+    """Return the stacked signals of the run; one row serves all scenarios, also for what is not recorded."""
+    silent = np.zeros((1, x.size))
+    noisy = any(noise.std for noise in noises)
+    sensed = np.array([np.zeros(x.size) + noise.take(x.size) for noise in noises]) if noisy else silent
+    left = (recorded.get(name, np.empty((1, x.size))) for name in RECORDED + POWERS)
+    return Stretch(x[None], d, sensed, *left)
 
 
 def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
@@ -376,7 +380,7 @@ class _GainSequence:
         for first in range(0, self.n_samples, BLOCK):
             m = min(BLOCK, self.n_samples - first)
             if m < BLOCK or first == 0:
-                gains = SharedGains(np.zeros((m, n)), np.zeros(m), np.full(m, np.nan), np.zeros(1, np.int64))
+                gains = SharedGains(aligned_zeros(m, n), np.zeros(m), np.full(m, np.nan), np.zeros(1, np.int64))
             rows = self._filtered[first : first + n - 1 + m][::-1].copy()
             yield first, gains, advance_gains(self.covariance, rows, *self._settings, gains)
 

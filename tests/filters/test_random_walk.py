@@ -500,6 +500,34 @@ def test_a_saver_keeps_P_as_it_was_when_saved() -> None:
     assert ours.P[0, 0] == 99.0
 
 
+@pytest.mark.parametrize("cause", ["NaN", "silent", "square overflows", "S overflows", "no covariance"])
+@pytest.mark.parametrize("moment", ["predicted", "updated", "updated twice"])
+def test_a_refused_update_leaves_every_P(cause: str, moment: str) -> None:
+    """P, P_prior and P_post, whatever is owed to the triangle at that moment; to rounding, since it may be paid."""
+    ours, rng = KFOPC.random_walk(4, state_noise=0.01, measurement_noise=0.5, rated_power=0.5), np.random.default_rng(0)
+    ours.secondary_path_gain = 1.0
+    for _ in range(3):
+        ours.predict()
+        ours.update(1.0, H=rng.normal(size=4))
+    if moment == "predicted":
+        ours.predict()
+    if moment == "updated twice":
+        ours.update(1.0, H=rng.normal(size=4))
+    z, H, R = {
+        "NaN": (np.nan, np.ones(4), None),
+        "silent": (1.0, np.zeros(4), 0.0),
+        "square overflows": (1e200, np.ones(4), None),
+        "S overflows": (1.0, np.r_[1.0, np.full(3, 1e154)], None),
+        "no covariance": (1.0, np.full(4, 1e-170), 0.0),
+    }[cause]
+    names = ("P", "P_prior", "P_post", "K", "S", "x", "x_prior", "y")
+    before = {name: np.copy(getattr(ours, name)) for name in names}
+    with pytest.raises(ValueError):  # noqa: PT011 - the messages have tests of their own
+        ours.update(z, R=R, H=H)
+    for name, value in before.items():
+        np.testing.assert_allclose(getattr(ours, name), value, rtol=0, atol=1e-14, err_msg=name)
+
+
 def test_a_saver_keeps_public_names_only() -> None:
     """And what it kept stays, whatever is written into the filter's arrays afterwards."""
     _, ours = pair(3)
