@@ -182,7 +182,7 @@ def test_rules_that_do_not_act_are_fxlms(switch_on_s: float) -> None:
     x, d = noise()
     options: Any = {"disturbance": d, "secondary_path": PATH, "fs": 1000, "switch_on_s": switch_on_s}
     plain = simulate(FxLMS(L, ESTIMATE, step_size=MU), x, **options)
-    rated = {"rated_power": 1e6, "fs": 1000}
+    rated: Any = {"constraint": OutputPowerConstraint(1e6, fs=1000)}
     for controller in (
         LeakyFxLMS(L, ESTIMATE, step_size=MU, leak=0.0),
         OptimalLeakyFxLMS(L, ESTIMATE, step_size=MU, **rated),
