@@ -2,4 +2,3 @@ from .base import Controller as Controller
 from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
 from .power_budget import PowerBudgetController as PowerBudgetController
-from .repaired import RepairedKFOPC as RepairedKFOPC

@@ -52,7 +52,7 @@ class RandomWalkCovariance:
         """P at a moment, as a full symmetric array of its own."""
         if isinstance(moment, np.ndarray):
             return moment.copy()
-        if moment == TRIANGLE:  # nothing owed, as when a filter is made: nothing to compile
+        if moment == TRIANGLE and not self.arrays.owed["last_inverse_S"][0]:  # a new filter: nothing to compile yet
             n = self.arrays.product.size
             lower = np.tril(self.arrays.triangle[:n, :n].astype(np.float64))
             return lower + np.tril(lower, -1).T
