@@ -341,9 +341,10 @@ def deep_equal(a: Any, b: Any) -> bool:
 
 
 def state(kf: KFOPC) -> dict:
-    """All that a filter holds; the random-walk filter's read-only views are made when read."""
+    """All that a filter holds, and what the random-walk filter makes of it when read."""
     attributes, private = guards.state_of(kf)
-    return {key: value for key, value in (attributes | private).items() if key != "_views"}
+    made = {name: getattr(kf, name) for name in ("y", "z", "S", "SI", "x_prior", "K")}
+    return {key: value for key, value in (attributes | private | made).items() if key not in ("_views", "_made", "_K")}
 
 
 def require_equal_state(kf: KFOPC, other: KFOPC) -> bool:

@@ -13,7 +13,7 @@ import scipy.linalg
 import scipy.optimize
 from filterpy.common import Saver
 from filterpy.kalman import KalmanFilter
-from helpers.comparing import assert_same_run
+from helpers.comparing import assert_same_run, numbers_of
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, S_HAT, run
 from helpers.power_budget import N_TAPS, SETTINGS, made, signals, step
 
@@ -277,9 +277,8 @@ def test_while_it_listens_the_budget_hears() -> None:
     for samples in zip(x, np.convolve(x, S_HAT)[:150], strict=True):
         budget.listen(*samples)
     mine = made_one.estimator.budget.state
-    for name in ("own_x", "own_xf", "across_x", "across_xf", "counts"):
-        np.testing.assert_allclose(getattr(mine, name), getattr(budget.state, name), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(mine.numbers.item(), budget.state.numbers.item(), rtol=0, atol=1e-12)
+    for ours, theirs in zip(numbers_of(mine), numbers_of(budget.state), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(made_one.control_filter, 0.0)
 
 

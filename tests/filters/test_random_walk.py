@@ -517,7 +517,7 @@ def test_a_refused_update_leaves_every_P(cause: str, moment: str) -> None:
         "NaN": (np.nan, np.ones(4), None),
         "silent": (1.0, np.zeros(4), 0.0),
         "square overflows": (1e200, np.ones(4), None),
-        "S overflows": (1.0, np.r_[1.0, np.full(3, 1e154)], None),
+        "S overflows": (1.0, np.r_[1.0, np.full(3, 1e160)], None),
         "no covariance": (1.0, np.full(4, 1e-170), 0.0),
     }[cause]
     names = ("P", "P_prior", "P_post", "K", "S", "x", "x_prior", "y")
