@@ -25,7 +25,7 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
-from kfopc_filterpy.controllers import RepairedKFOPC
+from kfopc_filterpy.controllers.repaired import RepairedKFOPC
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import band_limited_noise
 
