@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..kernels.borrowing import borrowed
-from ..kernels.compiling import by_type, compiled, inlined, part
+from ..kernels.compiling import by_type, compiled, compiled_for_states, inlined, part
 from ..kernels.delay_lines import latest, newest, push
 from ..kernels.vectors import dot
 from ..power.amplifiers import amplify
@@ -123,13 +123,13 @@ def disturbance_estimate(lines, error):
 # From Python.
 
 
-@compiled()
+@compiled_for_states()
 def emit_once(state, x):
     """Call `emit`."""
     return emit(state, x)
 
 
-@compiled()
+@compiled_for_states()
 def adapt_once(state, error, control_signal):
     """Call `adapt`."""
     return adapt(state, error, control_signal)
@@ -141,7 +141,7 @@ def estimate_once(lines, error):
     return disturbance_estimate(lines, error)
 
 
-@compiled(nogil=True)
+@compiled_for_states(nogil=True)
 def listen(state, references, errors):
     """Follow a signal while the loudspeaker is silent; return the number of samples taken, all if none was refused."""
     state = borrowed(state)

@@ -28,7 +28,8 @@ class RandomWalkCovariance:
         self.arrays: Covariance = new_covariance(0.5 * (P + P.T), dtype)
         self.prior: Moment | np.ndarray = TRIANGLE
         self.posterior: Moment | np.ndarray = TRIANGLE
-        self._shown: list[np.ndarray] = []  # what P showed since the last step, newest last
+        # What P showed since the last step, newest last: each array, and a copy of it as it was shown.
+        self._shown: list[tuple[np.ndarray, np.ndarray]] = []
         self._largest = float(np.finfo(dtype).max)
         self._others_read = False  # the arrays are another's too
 
@@ -60,15 +61,13 @@ class RandomWalkCovariance:
 
     def show(self) -> np.ndarray:
         """Return P as a full array of its own; what is written into it counts at the next step (`edited`)."""
-        self._shown.append(self._shown[-1].copy() if self._shown else self.full(self.now))
-        return self._shown[-1]
+        P = self._shown[-1][0].copy() if self._shown else self.full(self.now)
+        self._shown.append((P, P.copy()))
+        return P
 
     def edited(self) -> np.ndarray | None:
         """Return the newest shown array that was written into, None if none was."""
-        if not self._shown:
-            return None
-        now = self.full(self.now)
-        return next((array for array in reversed(self._shown) if not np.array_equal(array, now)), None)
+        return next((P for P, shown in reversed(self._shown) if not np.array_equal(P, shown)), None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
         other = memo[id(self)] = object.__new__(type(self))
@@ -93,22 +92,22 @@ class RandomWalkCovariance:
         owed["scale"], owed["diagonal"] = scale, diagonal
         self.prior = scale, diagonal, -scale * inverse_S
 
-    def begin_update(self) -> Covariance:
-        """Return the arrays for a compiled update, having kept what it will overwrite."""
-        self._shown = []
+    def before_update(self) -> tuple[Covariance, Moment, Moment | np.ndarray]:
+        """Return the arrays for a compiled update, P now, and P_prior in a form that the update leaves as it is."""
         now = self.now
-        if not isinstance(self.prior, np.ndarray) and self.prior != now:  # a second update since the prediction
-            self.prior = self.full(self.prior)
-        if isinstance(self.posterior, tuple):  # the same P_post, seen from the triangle once nothing is owed
-            scale, diagonal, _ = self.posterior
-            ratio = scale / now[0]
-            self.posterior = ratio, diagonal - ratio * now[1], 0.0
-        return self.own()
+        if isinstance(self.prior, tuple) and self.prior != now:  # a second update since the prediction
+            return self.own(), now, self.full(self.prior)
+        return self.own(), now, self.prior
 
-    def refused(self) -> None:
-        """Go on after an update that was refused: P is what it was, but nothing is owed any more."""
+    def projected(self, before: Moment, prior: Moment | np.ndarray) -> None:
+        """Go on after the pass of an update, refused or not: P is still what it was `before`, but nothing is owed."""
+        self.prior = prior
+        self._shown = []
         if isinstance(self.prior, tuple):
             self.prior = TRIANGLE
+        if isinstance(self.posterior, tuple):  # the same P_post, seen from the triangle now
+            ratio = self.posterior[0] / before[0]
+            self.posterior = ratio, self.posterior[1] - ratio * before[1], 0.0
 
     def updated(self) -> None:
         """Go on after an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""

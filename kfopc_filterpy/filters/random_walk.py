@@ -20,7 +20,8 @@ from .guards import SILENT_REFERENCE, checked_measurement
 from .kfopc import KFOPC
 
 # What `correct_once` answers.
-CORRECTED, OVERFLOWING_SQUARE, SILENT, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE = range(6)
+CORRECTED, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE, OVERFLOWING_SQUARE, SILENT = range(6)
+UNTOUCHED = (NOT_FINITE, OVERFLOWING_SQUARE, SILENT)  # refused before the pass over the covariance
 
 
 @compiled()
@@ -66,11 +67,11 @@ def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: s
 
     def get(kf: Any) -> Any:
         if name not in kf._made:
-            kf._made[name] = make(kf)
+            assign(kf, make(kf))
         return kf._made[name]
 
     def assign(kf: Any, value: Any) -> None:
-        kf._made[name] = value
+        kf._made = {**kf._made, name: value}  # another dictionary: the one before may be kept, to undo a step
 
     return property(get, assign, doc=description)
 
@@ -116,6 +117,8 @@ class RandomWalkKFOPC(KFOPC):
     >>> kf.S  # 15 + 1
     array([[16.]])
     """
+
+    _log_likelihood: Any
 
     if not TYPE_CHECKING:  # Out of `Saver`'s records, filterpy's own private attributes included.
         __slots__ = (
@@ -393,15 +396,15 @@ class RandomWalkKFOPC(KFOPC):
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
         if weights.size != self.dim_x:
             self._weights()  # refused, with the reason
-        arrays = self._covariance.begin_update()
+        arrays, before, prior = self._covariance.before_update()
         x = np.nan if reference is None else reference
         outcome, y, S = correct_once(arrays, state, weights, z, h, x, noise, factor)
+        if outcome not in UNTOUCHED:
+            self._covariance.projected(before, prior)
         if outcome != CORRECTED:
-            self._covariance.refused()
             self._refuse(outcome, z, S, h, reference)
         self._covariance.updated()
-        prior = self._made.get("x_prior")
-        self._K, self._made = None, {} if prior is None else {"x_prior": prior}
+        self._K, self._made = None, {name: value for name, value in self._made.items() if name == "x_prior"}
         self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
         return weights
 

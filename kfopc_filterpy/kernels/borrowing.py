@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import carray, types
+from numba import carray, errors, types
 from numba.extending import intrinsic, overload
 
 from .compiling import OPTIONS
@@ -35,6 +35,8 @@ def borrowed(value):
 @overload(borrowed, jit_options=OPTIONS)
 def _borrowed(value):
     if isinstance(value, types.Array):
+        if value.layout != "C":
+            raise errors.TypingError("arrays of a state must be contiguous: numpy.ascontiguousarray makes them so")
         return lambda value: carray(_pointer(value.ctypes.data), value.shape, value.dtype)  # type: ignore[call-arg]
     if isinstance(value, types.BaseNamedTuple):
         kind = value.instance_class  # type: ignore[attr-defined]

@@ -46,6 +46,28 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
+class StateEntry:
+    """A compiled function whose first argument is a controller's state.
+
+    What is compiled for a state type of the package is kept on disk. For a type defined elsewhere it is not: no process
+    without that module could read the index again, and nobody would notice that the module has changed.
+    """
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self.kept = compiled(**options)(function)
+        self.passing = part(**options)(function)
+        self.__doc__, self.__name__ = function.__doc__, function.__name__
+
+    def __call__(self, state: Any, *arguments: Any) -> Any:
+        ours = type(state).__module__.startswith(PACKAGE.name)
+        return (self.kept if ours else self.passing)(state, *arguments)
+
+
+def compiled_for_states(**options: Any) -> Callable[[Callable[..., Any]], StateEntry]:
+    """Decorator of functions that Python calls with the state of a controller (see `StateEntry`)."""
+    return lambda function: StateEntry(function, **options)
+
+
 def by_type(default: Callable[..., Any]) -> Any:
     """Decorator: `functools.singledispatch` for compiled callers too.
 

@@ -287,5 +287,5 @@ def _fill(P, T, g, scale, diagonal, weight):
 
 def covariance_matrix(cov: Covariance) -> np.ndarray:
     """Return P as a full symmetric array (n, n) of its own."""
-    scale, diagonal, inverse_S, _ = cov.owed.tolist()
+    scale, diagonal, inverse_S, _ = cov.owed.item()
     return full_covariance(cov.triangle, cov.gain_direction, scale, diagonal, -scale * inverse_S)

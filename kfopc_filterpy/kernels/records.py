@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 
@@ -18,4 +19,9 @@ def new_record(**numbers: float) -> np.ndarray:
     (0.5, 2)
     """
     kinds = [(name, np.int64 if type(value) is int else np.float64) for name, value in numbers.items()]
-    return np.array([tuple(numbers.values())], np.dtype(kinds, align=True))
+    return as_records(np.array([tuple(numbers.values())], np.dtype(kinds, align=True)))
+
+
+def as_records(array: np.ndarray) -> np.ndarray:
+    """Return the array; if numba's compiler is switched off, one whose records have attributes in Python too."""
+    return array.view(np.recarray) if vars(numba)["config"].DISABLE_JIT else array

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..controllers.step import adapt, control_filter, emit, power_weight
 from ..kernels.borrowing import borrowed
-from ..kernels.compiling import compiled, inlined
+from ..kernels.compiling import compiled, compiled_for_states, inlined
 from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import copy_into, dot
 from ..power.amplifiers import amplify
@@ -82,7 +82,7 @@ def note_weights(rows, weights, every, n):
         copy_into(rows[n // every], weights)
 
 
-@compiled(nogil=True)
+@compiled_for_states(nogil=True)
 def run(state, plant, signals, weights, limit, every, first):
     """Run a controller's `state` over a stretch, whose first sample is sample `first` of the run.
 
@@ -105,6 +105,9 @@ def run(state, plant, signals, weights, limit, every, first):
         signals.secondary_path_gain[k], signals.power_weight[k] = used.gain, power_weight(state)
         note_weights(weights, control_filter(state), every, first + k)
     return RUNNING, signals.reference.size
+
+
+run_kept = run.kept  # for compiled callers
 
 
 @compiled()

@@ -9,6 +9,7 @@ import numpy as np
 
 from .._validate import as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, FilteredReferenceController
+from ..controllers.step import Lines
 from ..kernels.compiling import compiled
 from ..kernels.covariance import (
     CANCELLATION,
@@ -23,14 +24,14 @@ from ..kernels.covariance import (
     predict_covariance,
     project_covariance,
 )
-from ..kernels.delay_lines import TAPS, delay_line, newest
+from ..kernels.delay_lines import TAPS, delay_line, newest, refill
 from ..kernels.stacking import member, stacked, unstack
 from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .result import SimulationResult
-from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run
+from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run_kept
 from .simulation import (
     DIVERGENCE_LIMIT,
     POWERS,
@@ -98,7 +99,7 @@ def run_scenarios(states, plants, signals, limits, status, done, begin, end):
             states.gains.taken[0] = 0
             state, plant = member(states, i), member(plants, i)
             block = part_of(member(signals, i), begin, end)
-            status[i], taken = run(state, plant, block, no_weights, limits[i], 1, 0)
+            status[i], taken = run_kept(state, plant, block, no_weights, limits[i], 1, 0)
             done[i] += taken
 
 
@@ -228,6 +229,7 @@ def simulate_scenarios(
             signal[i, end:] = np.nan
     for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
         unstack(scenarios, i, own[i])
+        gains.refill(state.lines)  # one that diverged has not heard the end
         controller.after_compiled(state._replace(gains=gains.covariance), shared=True)
     return [
         SimulationResult(
@@ -368,11 +370,17 @@ class _GainSequence:
         self._settings = [float(state.numbers[name][0]) for name in VARIANCES]
         n, lines = state.weights.size, state.lines
         heard = newest(lines.reference, int(lines.reference[TAPS]))[::-1]
-        filtered = np.convolve(np.concatenate((heard, x)), lines.secondary_estimate)[heard.size : heard.size + x.size]
+        self._reference = np.concatenate((heard, x))
+        filtered = np.convolve(self._reference, lines.secondary_estimate)[heard.size : heard.size + x.size]
         self.n_taps, self.n_samples = n, x.size
         self._filtered = np.concatenate(
             (newest(lines.filtered, n - 1)[::-1], filtered)
         )  # n - 1 samples before the first
+
+    def refill(self, lines: Lines) -> None:
+        """Make the end of the run what the delay lines hold."""
+        refill(lines.reference, self._reference[::-1])
+        refill(lines.filtered, self._filtered[::-1])
 
     def blocks(self) -> Iterator[tuple[int, SharedGains, int]]:
         """Yield the first sample of each block, its gains, and how many of them have a solution."""

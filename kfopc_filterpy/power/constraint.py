@@ -9,7 +9,7 @@ import numpy as np
 
 from .._validate import as_choice, as_nonnegative, as_number, as_positive
 from ..kernels.compiling import compiled, inlined, part
-from ..kernels.records import new_record
+from ..kernels.records import as_records, new_record
 
 DEFAULT_FS = 16000.0
 DEFAULT_MEMORY_S = 0.5
@@ -202,12 +202,12 @@ class OutputPowerConstraint:
             power=0.0,
             gain=math.nan,
         )
-        self._state = ConstraintState(np.zeros(3, POWER), np.zeros((3, length)), numbers)
+        self._state = ConstraintState(as_records(np.zeros(3, POWER)), np.zeros((3, length)), numbers)
         self._given_gain = secondary_path_gain
         self.secondary_path_gain = secondary_path_gain
 
     def fresh(self, rated_power: float | None = None) -> OutputPowerConstraint:
-        """Return a constraint of the same settings that has seen no sample, by default of the same rated power."""
+        """Return a constraint of the same settings, but for another `rated_power` if one is given, that has seen no sample."""
         return OutputPowerConstraint(
             self.rated_power if rated_power is None else rated_power,
             secondary_path_gain=self._given_gain,
