@@ -1,4 +1,4 @@
-"""Checks of arguments, shared by every module: each error names what was wrong, what was expected, how to mend it."""
+"""Argument checks shared by every module. Each error says what was wrong, what was expected and how to fix it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
         raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
-    if real is None:  # numpy would drop the imaginary part with no more than a warning
+    if real is None:  # numpy would drop the imaginary part with only a warning
         raise TypeError(f"{name} must be a sequence of real numbers, got complex ones")
     return real
 
@@ -53,7 +53,7 @@ def as_channels(value: Any, name: str) -> np.ndarray:
 
 
 def require_channels_lead(array: np.ndarray, name: str) -> None:
-    """Raise ValueError if the last two axes hold more channels than samples: samples were put first."""
+    """Raise ValueError if the last two axes hold more channels than samples: the axes are probably swapped."""
     n_channels, n_samples = array.shape[-2:]
     if n_channels > n_samples:
         raise ValueError(
@@ -63,7 +63,7 @@ def require_channels_lead(array: np.ndarray, name: str) -> None:
 
 
 def require_finite(array: Any, name: str) -> None:
-    """Raise ValueError if `array` holds NaN or Inf, saying where the first one stands."""
+    """Raise ValueError if `array` holds NaN or Inf; the message gives the index of the first one."""
     finite = np.isfinite(array)
     if not np.all(finite):
         where = tuple(int(i) for i in np.argwhere(~np.atleast_1d(finite))[0])
@@ -73,7 +73,7 @@ def require_finite(array: Any, name: str) -> None:
 
 def as_number(value: Any, name: str, *, unit: str = "") -> float:
     """Return `value` as a finite float."""
-    if type(value) is float and math.isfinite(value):  # the plain case, of every sample
+    if type(value) is float and math.isfinite(value):  # fast path: called for every sample
         return value
     unit = f" {unit}" if unit else ""
     if isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
@@ -96,7 +96,7 @@ def as_positive(value: Any, name: str, *, unit: str = "") -> float:
 
 
 def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:
-    """Return `value` as a finite float, zero or above."""
+    """Return `value` as a finite float of at least zero."""
     number = as_number(value, name, unit=unit)
     if number < 0:
         raise ValueError(f"{name} must not be negative, got {number:g}{' ' + unit if unit else ''}")
@@ -144,7 +144,7 @@ def as_sample_count(duration_s: Any, fs: Any, name: str) -> int:
 
 
 def as_generator(rng: Any) -> np.random.Generator:
-    """Return a numpy Generator from a seed or a Generator; never the global random state."""
+    """Return a numpy Generator from a seed or a Generator. The global random state is never used."""
     if rng is None:
         raise TypeError("rng must be a seed or a numpy.random.Generator, so that a run can be repeated; got None")
     return np.random.default_rng(rng)

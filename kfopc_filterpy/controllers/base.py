@@ -1,4 +1,4 @@
-"""What a controller is, and what the built-in ones share."""
+"""The controller protocol, and the base class of the built-in controllers."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ OVERFLOW = (
 
 @runtime_checkable
 class Controller(Protocol):
-    """What `simulate` drives: two calls a sample. A user's own needs nothing else.
+    """Interface that `simulate` drives, with two calls per sample. A user-defined controller needs nothing else.
 
-    Optional: `constraint_factor`, `disturbance_power` and `secondary_path_gain` are recorded where there are such
-    attributes, `weights`, (L,), where they are asked for; `name` names the result; `listen(references, errors)` follows
-    the noise before the control is switched on.
+    Optional attributes: `constraint_factor`, `disturbance_power` and `secondary_path_gain` are recorded if present, and
+    `weights`, (L,), if requested. `name` names the result. `listen(references, errors)` follows the noise before the
+    control is switched on.
     """
 
     def control_signal(self, reference: float) -> float:
-        """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         ...
 
     def update(self, error: float) -> None:
@@ -47,7 +47,7 @@ class Controller(Protocol):
 
 
 def constraint_for(rated_power: float | None, constraint: OutputPowerConstraint | None) -> OutputPowerConstraint:
-    """Return a constraint of the controller's own: a copy of the one given, or one with the usual settings."""
+    """Return a new constraint for a controller: a copy of the one given, or one with default settings."""
     if (rated_power is None) == (constraint is None):
         raise ValueError("give either rated_power= or constraint=, an OutputPowerConstraint")
     if constraint is None:
@@ -65,7 +65,7 @@ def constraint_or_none(
 
 
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
-    """Raise ValueError where a part of a controller, by its name, is of another sample rate than the run's `fs` in Hz."""
+    """Raise ValueError if a named part of a controller has another sample rate than the run's `fs` in Hz."""
     for name, rate in rates.items():
         if rate is not None and abs(rate - fs) > 1e-9 * fs:
             raise ValueError(
@@ -87,17 +87,17 @@ class FilteredReferenceController:
     amplifier : callable, optional
         Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
     constraint : OutputPowerConstraint, optional
-        What keeps the powers and the factor; by default the powers are followed with the factor held at 1.
+        Constraint that computes the powers and the factor; by default one whose factor is fixed at 1.
     limiter : OutputLimiter, optional
-        What the control signal goes through, see `limiter`.
+        Limiter of the control signal, see `limiter`.
     filtered_taps : int, optional
-        Length of the filtered reference that is kept; by default `n_taps`.
+        Number of samples stored of the filtered reference; by default `n_taps`.
     """
 
     name = "controller"
-    has_gains = False  # whether it has Kalman gains, which scenarios can share
-    unshared = ""  # and what keeps it from sharing them
-    _refusal = OVERFLOW  # why an update is refused whose numbers are finite
+    has_gains = False  # True if it has Kalman gains, which scenarios can share
+    unshared = ""  # the part that prevents sharing, if any
+    _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
 
     def __init__(
@@ -132,14 +132,14 @@ class FilteredReferenceController:
         self._y = 0.0
 
     def _common(self) -> tuple[Lines, np.ndarray, ConstraintState]:
-        """Return the fields that every state begins with: lines, weights, constraint."""
+        """Return the first fields of every state: lines, weights, constraint."""
         return self._lines, np.zeros(self.n_taps), self._own_constraint.state
 
     @property
     def limiter(self) -> OutputLimiter | None:
-        """Limiter that the control signal goes through, or None; can be assigned, an object of its own.
+        """Limiter of the control signal, or None; can be assigned, but not shared with another controller.
 
-        The disturbance is estimated from what the limiter puts out, so that the adaptation stays right.
+        The disturbance is estimated from the output of the limiter, so the adaptation stays correct.
         """
         return self._limiter
 
@@ -156,17 +156,17 @@ class FilteredReferenceController:
 
     @property
     def control_filter(self) -> np.ndarray:
-        """Control filter that makes y, (L,); a copy."""
+        """Control filter that generates y, (L,); a copy."""
         return self.weights
 
     @property
     def rated_power(self) -> float | None:
-        """Rated output power that the controller keeps to; None if it has no constraint."""
+        """Rated output power of the controller; None if it has no constraint."""
         return self._own_constraint.rated_power if self._constrained else None
 
     @property
     def constraint(self) -> OutputPowerConstraint:
-        """What keeps the powers and the factor; without a rated power it follows the powers, the factor held."""
+        """Constraint that computes the powers and the factor; without a rated power its factor is fixed at 1."""
         return self._own_constraint
 
     @property
@@ -181,17 +181,17 @@ class FilteredReferenceController:
 
     @property
     def secondary_path_gain(self) -> float:
-        """Running secondary-path gain (eq. 11); NaN before any reference energy."""
+        """Running secondary-path gain (eq. 11); NaN until the reference has energy."""
         gain = self.constraint.secondary_path_gain
         return np.nan if gain is None else gain
 
     def control_signal(self, reference: float) -> float:
-        """Control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         self._y = emit_once(self._emitter(), as_number(reference, "reference"))
         return self._y
 
     def _emitter(self) -> Any:
-        """Return the state, or the part of it that makes the control signal."""
+        """Return the state, or the part of it that `control_signal` needs."""
         return self._state
 
     def update(self, error: float) -> None:
@@ -237,11 +237,11 @@ class FilteredReferenceController:
 
     @property
     def _powers_fs(self) -> float:
-        """Sample rate in Hz that the memory of the powers was made for."""
+        """Sample rate in Hz of the power estimates."""
         return self.constraint.fs
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError where the secondary path, the memory of the powers or the limiter is not for `fs` in Hz."""
+        """Raise ValueError if the secondary path, power estimates or limiter are for another rate than `fs` in Hz."""
         require_rates(
             fs,
             {
@@ -252,15 +252,18 @@ class FilteredReferenceController:
         )
 
     def compiled_state(self, to_step: bool = True) -> Any:
-        """Return the state for the compiled loop, `to_step` it or to read; None if only the steps above can run."""
+        """Return the state for the compiled loop; None if Python must call the steps.
+
+        `to_step` says if the caller will change the state, or only read it.
+        """
         return self._state if calls_of(type(self)) == calls_of(FilteredReferenceController) else None
 
     def after_compiled(self, state: Any) -> None:
-        """Take back what the compiled loop advanced in `state`, however many samples it ran."""
+        """Adopt what the compiled loop changed in `state`, however many samples it ran."""
 
 
 def calls_of(kind: type) -> tuple[Any, Any]:
-    """Return the two calls a sample of a class: those of a subclass are its own, and Python has to make them."""
+    """Return a class's two methods per sample; if a subclass overrides one, Python must call it."""
     return kind.control_signal, kind.update  # type: ignore[attr-defined]
 
 

@@ -1,4 +1,4 @@
-"""Clipping FxLMS: the control signal is clipped, the weights go on."""
+"""Clipping FxLMS: the control signal is clipped, the adaptation is that of FxLMS."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .step import Lines, adapt, output
 
 
 class ClippingState(NamedTuple):
-    """What the step of `ClippingFxLMS` reads and advances."""
+    """State of `ClippingFxLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -27,7 +27,7 @@ class ClippingState(NamedTuple):
 
 @output.register(ClippingState)
 def output_clipped(state):
-    """Return w'x held to the limit; Inf and NaN pass, for the loop to see a divergence."""
+    """Return w'x clipped to the limit; pass Inf and NaN, which the loop detects as a divergence."""
     w, limit = state.weights, state.amplitude_limit
     y = dot(w, newest(state.lines.reference, w.size))
     if not limit < abs(y) < np.inf:
@@ -37,7 +37,7 @@ def output_clipped(state):
 
 @adapt.register(ClippingState)
 def adapt_clipping(state, error, control_signal):
-    """Take the step of `FxLMS`."""
+    """Apply the step of `FxLMS`."""
     finite, _, _ = advance_powers(state, error)
     if finite:
         change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
@@ -45,10 +45,10 @@ def adapt_clipping(state, error, control_signal):
 
 
 class ClippingFxLMS(LMSController):
-    r"""Clipping FxLMS: the control signal is held to the limit, the weights go on as in `FxLMS`.
+    r"""Clipping FxLMS: the control signal is clipped to the limit, the weights adapt as in `FxLMS`.
 
-    The error then no longer falls with the weights, which keep growing while the noise asks for more than the limit:
-    the control signal turns into a square wave. What the paper's introduction warns of; here to compare with.
+    While the noise needs more than the limit, the error no longer falls, the weights keep growing and the control
+    signal becomes a square wave. The paper's introduction warns of this; the algorithm is here for comparison.
 
     Parameters
     ----------
@@ -60,12 +60,12 @@ class ClippingFxLMS(LMSController):
     Raises
     ------
     ValueError
-        A step size or limit that is not positive and finite, fewer than one tap, a path that is no FIR path.
+        A step size or limit that is not positive and finite, fewer than one tap, a path that is not FIR.
 
     References
     ----------
-    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001:
-    the text was not at hand, the equations are those by which later papers describe it.
+    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001.
+    The text was not available; the equations are those given for it in later papers.
 
     Examples
     --------

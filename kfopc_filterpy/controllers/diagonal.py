@@ -1,4 +1,4 @@
-"""The Kalman filter with the diagonal of its covariance alone: O(L) a sample."""
+"""The Kalman filter with only the diagonal of its covariance, in O(L) per sample."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .step import Lines, adapt
 
 
 class DiagonalState(NamedTuple):
-    """What the step of `DiagonalKalman` reads and advances."""
+    """State of `DiagonalKalman`."""
 
     lines: Lines
     weights: np.ndarray
@@ -31,7 +31,7 @@ class DiagonalState(NamedTuple):
 
 @adapt.register(DiagonalState)
 def adapt_diagonal(state, error, control_signal):
-    """Take eq. 2-9 with P held to its diagonal."""
+    """Apply eq. 2-9 with P reduced to its diagonal."""
     finite, d, factor = advance_powers(state, error)
     if finite:
         row = newest(state.lines.filtered, state.weights.size)
@@ -47,21 +47,22 @@ def correct_diagonal(variances, w, row, d, state_noise, measurement_noise):
         variances[i] += state_noise
         S += variances[i] * row[i] * row[i]
         residual -= w[i] * row[i]
-    if S > 0.0:  # q = 0 and a silent reference tell nothing
+    if S > 0.0:  # S = 0 if q = 0 and the reference is silent: there is nothing to correct
         for i in range(w.size):
             gain = variances[i] * row[i] / S
             w[i] += gain * residual
-            variances[i] *= max(1.0 - gain * row[i], 0.0)  # rounding of S may put the share above 1
+            variances[i] *= max(1.0 - gain * row[i], 0.0)  # rounding of S can make the product exceed 1
 
 
 class DiagonalKalman(FilteredReferenceController):
-    r"""Reduced-complexity Kalman filter: eq. 2-9 with P held to its diagonal p, an NLMS with a step for each tap.
+    r"""Reduced-complexity Kalman filter: eq. 2-9 with P reduced to its diagonal p, an NLMS with a step for each tap.
 
     .. math:: p \leftarrow p + r, \quad S = \sum_i p_i x_i'^2 + q, \quad K_i = p_i x'_i / S, \quad
        w \leftarrow w + K (\alpha \hat d - w^T x'), \quad p_i \leftarrow (1 - K_i x'_i) p_i
 
-    What it leaves out is what neighbouring taps of a coloured reference tell of each other, so it converges as NLMS does,
-    slower than the full filter the narrower the band; on a white reference it comes near it after a dozen samples a tap.
+    It ignores the correlation between neighbouring taps of a coloured reference. It therefore converges like NLMS: the
+    narrower the band, the slower it is than the full filter. On a white reference it comes close to the full filter
+    after a dozen samples per tap.
 
     Parameters
     ----------
@@ -72,14 +73,14 @@ class DiagonalKalman(FilteredReferenceController):
     state_noise, measurement_noise, initial_variance
         r, q and P(0|0) as for `kf_anc`.
     rated_power : float, optional
-        Rated output power rho_o: the measurement is scaled by the constraint factor alpha of eq. 13. By default no
-        constraint, alpha = 1.
+        Rated output power rho_o: the measurement is scaled by the constraint factor alpha of eq. 13. By default there
+        is no constraint, alpha = 1.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
-        Limiter of its own that the control signal goes through.
+        Limiter of the control signal, not shared with another controller.
 
     Attributes
     ----------
@@ -90,14 +91,14 @@ class DiagonalKalman(FilteredReferenceController):
     ------
     ValueError
         A variance that is negative or not finite, a rated power that is not positive and finite, both a rated power and
-        a constraint, fewer than one tap, a path that is no FIR path.
+        a constraint, fewer than one tap, a path that is not FIR.
     TypeError
-        An amplifier that is none of the amplifier models.
+        An amplifier that is not one of the package's models.
 
     References
     ----------
-    After J. Fabry, S. Liebich, P. Vary, P. Jax, "Active noise control with reduced-complexity Kalman filter", IWAENC 2018,
-    whose text was not at hand: derived here from eq. 2-9.
+    After J. Fabry, S. Liebich, P. Vary, P. Jax, "Active noise control with reduced-complexity Kalman filter", IWAENC
+    2018. The text was not available; the equations are derived from eq. 2-9.
 
     Examples
     --------

@@ -1,25 +1,27 @@
-r"""The Kalman filter without state noise, or with forgetting, in O(L): from how P changes while the row shifts by a sample.
+r"""The Kalman filter without state noise, or with forgetting, in O(L) per sample.
 
-With P in units of the measurement noise, u(n) = x'(n)^T the row, lambda the forgetting factor and
-:math:`\gamma^{-1}(n) = 1 + \lambda^{-1} u(n) P(n-1) u(n)^T`, the rows share all but one sample, so
+It uses the shift of the row by one sample at a time. Let P be in units of the measurement noise, u(n) = x'(n)^T the
+row, lambda the forgetting factor and :math:`\gamma^{-1}(n) = 1 + \lambda^{-1} u(n) P(n-1) u(n)^T`. Successive rows
+share all but one sample, so
 
 .. math:: \lambda^{-1} \left( \begin{bmatrix} P(n) & 0 \\ 0 & 0 \end{bmatrix} -
    \begin{bmatrix} 0 & 0 \\ 0 & P(n-1) \end{bmatrix} \right) = \bar L(n)\, \mathrm{diag}(1, -1)\, \bar L(n)^T
 
-keeps the rank two that it has at the start for P(-1) = eta diag(lambda^2, ..., lambda^{L+1}). One orthogonal and one
-hyperbolic rotation that zero the second and third entry of the first row below then step gain, gamma and L together:
+keeps its rank of two, which it has at the start if P(-1) = eta diag(lambda^2, ..., lambda^{L+1}). One orthogonal and
+one hyperbolic rotation, which zero the second and third entry of the first row below, then update gain, gamma and L
+together:
 
 .. math:: \begin{bmatrix} \gamma^{-1/2}(n) & \bar u(n+1) \bar L(n) \\
    \begin{bmatrix} 0 \\ g(n) \gamma^{-1/2}(n) \end{bmatrix} & \bar L(n) \end{bmatrix} \Theta =
    \begin{bmatrix} \gamma^{-1/2}(n+1) & 0 \\
    \begin{bmatrix} g(n+1) \gamma^{-1/2}(n+1) \\ 0 \end{bmatrix} & \lambda^{1/2} \bar L(n+1) \end{bmatrix}
 
-with :math:`\bar u(n+1)` the L + 1 newest samples. For forgetting rounding grows with the factor 1/lambda a sample,
-since what is forgotten of P is not forgotten of its errors.
+with :math:`\bar u(n+1)` the L + 1 newest samples. With forgetting, rounding errors grow by the factor 1/lambda per
+sample, since the errors of P are not forgotten.
 
 References: R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise
 control", Int. J. Adapt. Control Signal Process. 19, 2005; A. H. Sayed, Fundamentals of Adaptive Filtering, Wiley 2003,
-ch. 14 (fast array RLS), from which the above follows.
+ch. 14 (fast array RLS), from which these equations follow.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from .step import Lines, adapt, disturbance_estimate, follow
 
 
 class FastArray(NamedTuple):
-    """The array that the rotations step."""
+    """The array that the rotations update."""
 
     gain: np.ndarray  # (L + 1,) g gamma^(-1/2), and 0
     first: np.ndarray  # (L + 1,) first column of L
@@ -52,7 +54,7 @@ class FastArray(NamedTuple):
 
 
 class FastArrayState(NamedTuple):
-    """What the step of `FastArrayKalman` reads and advances."""
+    """State of `FastArrayKalman`."""
 
     lines: Lines
     weights: np.ndarray
@@ -61,7 +63,7 @@ class FastArrayState(NamedTuple):
 
 
 def new_fast_array(n_taps: int, initial: float, forgetting: float) -> FastArray:
-    """Return the array before the first sample: P = initial diag(lambda^2, ..., lambda^(L+1)), all samples so far zero."""
+    """Return the array before the first sample, for P = initial diag(lambda^2, ..., lambda^(L+1)) and zeros so far."""
     gain, first, second = (np.zeros(n_taps + 1) for _ in range(3))
     first[0] = np.sqrt(initial * forgetting)
     second[-1] = first[0] * forgetting ** (n_taps / 2)
@@ -76,13 +78,13 @@ def adapt_fast_array(state, error, control_signal):
 
 @follow.register(FastArrayState)
 def follow_fast_array(state, error):
-    """Learn while listening: the gains must follow the filtered reference from silence on."""
+    """Adapt while listening: the gains must follow the filtered reference from the first sample on."""
     return rotate(state, error)
 
 
 @inlined
 def rotate(state, error):
-    """Apply eq. 2-9 by the two rotations; return False, with nothing changed, if rounding has spoilt the array."""
+    """Apply eq. 2-9 by the two rotations; return False, with nothing changed, if rounding has corrupted the array."""
     row = newest(state.lines.filtered, state.weights.size + 1)
     if not array_holds(state.array, row):
         return False
@@ -96,7 +98,10 @@ def rotate(state, error):
 
 @part(fastmath=FAST)
 def array_holds(array, row):
-    """Return whether the step for this row, the L + 1 newest samples, has a solution: rounding has not spoilt the array."""
+    """Return whether the step for `row`, the L + 1 newest samples, has a solution: rounding can corrupt the array.
+
+    Also set the products of `row` and the two columns, which `correct_by_rotations` uses.
+    """
     ahead = behind = 0.0
     for i in range(row.size):
         ahead += row[i] * array.first[i]
@@ -109,7 +114,7 @@ def array_holds(array, row):
 
 @part(fastmath=FAST)
 def correct_by_rotations(array, w, row, d):
-    """Apply the two rotations, then w += g (d - w' x'); `row` is the one that `array_holds` was called with."""
+    """Apply the two rotations, then w += g (d - w' x'); call `array_holds` with the same `row` first."""
     gain, first, second, numbers = array.gain, array.first, array.second, array.numbers[0]
     root = np.sqrt(numbers.root**2 + numbers.ahead**2)
     c, s, t = numbers.root / root, numbers.ahead / root, numbers.behind / root
@@ -131,16 +136,17 @@ def correct_by_rotations(array, w, row, d):
 
 
 class FastArrayKalman(FilteredReferenceController):
-    r"""Fast-array Kalman filter: eq. 2-9 with r = 0 in O(L), by the shift of the filtered reference.
+    r"""Fast-array Kalman filter: eq. 2-9 with r = 0 in O(L), using the shift of the filtered reference.
 
-    With `forgetting` = 1 it is `kf_anc` with ``state_noise=0`` (or `kf_opc`, with a rated power), to rounding; below 1 it
-    is `fx_rls` from P = `initial_variance` diag(lambda, ..., lambda^L), the start that its derivation needs. State noise
-    breaks what makes it fast: a random walk that must follow a changing path is what the O(L^2) filter is for.
+    With `forgetting` = 1 it is `kf_anc` with ``state_noise=0`` (or `kf_opc`, with a rated power), to rounding. Below 1
+    it is `fx_rls` from P = `initial_variance` diag(lambda, ..., lambda^L), which the derivation requires. It has no
+    state noise, which would break the structure that makes the filter fast. For a random walk that follows a changing
+    path, use the O(L^2) filter.
 
-    Rounding: without forgetting the weights agree with the O(L^2) filter's to some 1e-10 over a million samples, on white,
-    coloured and band-limited noise. With forgetting an error grows by 1/lambda a sample, until the array is lost after 10
-    to 20 memories of 1/(1 - lambda) samples: some ten seconds for lambda = 0.9999 at 16 kHz. `update` then refuses and
-    says so; the weights stay as they were.
+    Rounding: without forgetting, the weights agree with those of the O(L^2) filter to about 1e-10 over a million
+    samples, on white, coloured and band-limited noise. With forgetting, errors grow by 1/lambda per sample until the
+    array is lost, after 10 to 20 memories of 1/(1 - lambda) samples: some ten seconds for lambda = 0.9999 at 16 kHz.
+    `update` then raises ValueError, and the weights stay as they were.
 
     Parameters
     ----------
@@ -153,31 +159,32 @@ class FastArrayKalman(FilteredReferenceController):
     forgetting : float, default 1
         Forgetting factor lambda, above 0 and at most 1.
     rated_power : float, optional
-        Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default no constraint.
+        Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default there is no
+        constraint.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
-        Limiter of its own that the control signal goes through.
+        Limiter of the control signal, not shared with another controller.
 
     Raises
     ------
     ValueError
         A variance or forgetting factor out of range, a rated power that is not positive and finite, both a rated power
-        and a constraint, fewer than one tap, a path that is no FIR path. In a run: an array that rounding has spoilt.
+        and a constraint, fewer than one tap, a path that is not FIR. In a run: an array that rounding has corrupted.
     TypeError
-        An amplifier that is none of the amplifier models.
+        An amplifier that is not one of the package's models.
 
     Notes
     -----
-    The gains must follow the filtered reference from silence on. While it listens, before the control is switched on,
-    the filter therefore learns: its weights are those of the noise heard when it starts.
+    The gains must follow the filtered reference from the first sample on. The filter therefore also adapts while it
+    listens, before the control is switched on: it starts with weights learnt from the noise so far.
 
     References
     ----------
     R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control",
-    Int. J. Adapt. Control Signal Process. 19, 2005; derived at the head of this module.
+    Int. J. Adapt. Control Signal Process. 19, 2005. The docstring of this module has the derivation.
 
     Examples
     --------
@@ -193,7 +200,7 @@ class FastArrayKalman(FilteredReferenceController):
     name = "fast-array KF"
     _refusal = (
         "the fast array is lost to rounding: nothing was changed, and this filter cannot go on. Use a forgetting factor "
-        "closer to 1, or kf_anc, whose O(L^2) form does not lose its covariance so"
+        "closer to 1, or kf_anc, whose O(L^2) form does not lose its covariance"
     )
 
     def __init__(

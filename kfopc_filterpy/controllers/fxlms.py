@@ -14,7 +14,7 @@ from .step import Lines, adapt
 
 
 class FxLMSState(NamedTuple):
-    """What the step of `FxLMS` reads and advances."""
+    """State of `FxLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -43,13 +43,13 @@ class FxLMS(LMSController):
     step_size : float
         Step size mu, above zero.
     limiter : OutputLimiter, optional
-        Limiter of its own that the control signal goes through. FxLMS adapts to the error alone: while the limiter acts
-        the error does not fall and the weights grow.
+        Limiter of the control signal, not shared with another controller. FxLMS adapts to the error alone: while the
+        limiter acts, the error does not fall and the weights grow.
 
     Raises
     ------
     ValueError
-        A step size that is not positive and finite, fewer than one tap, a path that is no FIR path.
+        A step size that is not positive and finite, fewer than one tap, a path that is not FIR.
 
     References
     ----------
@@ -62,7 +62,7 @@ class FxLMS(LMSController):
     >>> controller = FxLMS(4, secondary_path=[1.0], step_size=0.1)
     >>> controller.control_signal(1.0)
     0.0
-    >>> controller.update(2.0)  # e = d, nothing was cancelled yet
+    >>> controller.update(2.0)  # e = d: nothing is cancelled yet
     >>> float(controller.weights[0])  # 0.1 * 2 * 1
     0.2
     """

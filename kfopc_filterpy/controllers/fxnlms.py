@@ -16,7 +16,7 @@ from .step import Lines, adapt
 
 
 class FxNLMSState(NamedTuple):
-    """What the step of `FxNLMS` reads and advances."""
+    """State of `FxNLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -37,25 +37,25 @@ def adapt_fxnlms(state, error, control_signal):
 
 
 class FxNLMS(LMSController):
-    r"""Normalised FxLMS: the step is measured by the energy of the filtered reference, without a constraint.
+    r"""Normalised FxLMS: the step is divided by the energy of the filtered reference, without a constraint.
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
 
-    so that one step size serves soft and loud noise.
+    One step size therefore suits soft and loud noise.
 
     Parameters
     ----------
     n_taps, secondary_path, limiter
         As for `FxLMS`.
     step_size : float
-        Step size mu, above zero; below 2 for a secondary path of no delay, and the less the longer the path.
+        Step size mu, above zero; below 2 for a secondary path without delay, and smaller for a longer path.
     regularization : float, default 1e-10
-        Energy epsilon that keeps the quotient finite while the reference is silent, above zero.
+        Energy epsilon, above zero, that keeps the quotient finite while the reference is silent.
 
     Raises
     ------
     ValueError
-        A step size or regularization that is not positive and finite, fewer than one tap, a path that is no FIR path.
+        A step size or regularization that is not positive and finite, fewer than one tap, a path that is not FIR.
 
     References
     ----------

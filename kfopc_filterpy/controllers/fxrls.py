@@ -23,22 +23,22 @@ def fx_rls(
     limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
 ) -> KalmanController:
-    r"""FxRLS: the control filter of least :math:`\sum_k \lambda^{n-k} (\hat d(k) - w^T x'(k))^2`, without a constraint.
+    r"""Return FxRLS, which minimises :math:`\sum_k \lambda^{n-k} (\hat d(k) - w^T x'(k))^2` without a constraint.
 
     .. math:: K = \frac{P x'}{\lambda + x'^T P x'}, \qquad w \leftarrow w + K (\hat d - x'^T w), \qquad
        P \leftarrow (P - K x'^T P) / \lambda
 
-    from P = `initial_variance` I. It is the Kalman filter with r = 0, q = 1 and filterpy's fading memory
-    :math:`\alpha^2 = 1/\lambda`, and runs as that.
+    P starts at `initial_variance` I. This is the Kalman filter with r = 0, q = 1 and filterpy's fading memory
+    :math:`\alpha^2 = 1/\lambda`, and is computed as such.
 
     Parameters
     ----------
     n_taps, secondary_path, amplifier, limiter, dtype
         As for `kf_anc`.
     forgetting : float, default 0.9999
-        Forgetting factor lambda, above 0 and at most 1: the memory is about 1/(1 - lambda) samples.
+        Forgetting factor lambda, above 0 and at most 1; the memory is about 1/(1 - lambda) samples.
     initial_variance : float, default 1
-        P at the start over the variance of the measurement noise: large for a fast start, in the unit of w^2/d^2.
+        Initial P over the variance of the measurement noise, in the unit of w^2/d^2; large for a fast start.
 
     Returns
     -------
@@ -48,10 +48,10 @@ def fx_rls(
     Raises
     ------
     ValueError
-        A forgetting factor outside (0, 1], what `kf_anc` refuses. In a run: a P that is no longer positive definite. Where
-        the filtered reference leaves directions of the control filter unexcited, as band-limited noise and tones do, P
-        grows there by 1/lambda a sample until rounding spoils it, after some 23 time constants of the memory; state
-        noise in place of forgetting (`kf_anc`) has no such growth.
+        A forgetting factor outside (0, 1], or arguments that `kf_anc` refuses. In a run: a P that is no longer positive
+        definite. Band-limited noise and tones do not excite all directions of the control filter. In the others P grows
+        by 1/lambda per sample until rounding corrupts it, after some 23 time constants of the memory. State noise
+        instead of forgetting (`kf_anc`) causes no such growth.
 
     References
     ----------

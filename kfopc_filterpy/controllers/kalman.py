@@ -28,13 +28,13 @@ from .step import Emitter, Lines, adapt, adapt_once, disturbance_estimate, emit_
 
 
 class KalmanState(NamedTuple):
-    """What the step of KF-ANC and KF-OPC reads and advances."""
+    """State of KF-ANC and KF-OPC."""
 
     lines: Lines
     weights: np.ndarray
     constraint: ConstraintState
-    gains: Covariance  # or another source of gains that `kalman_step` has a body for
-    numbers: np.ndarray  # record: the filter's variances, and what the last update left
+    gains: Covariance  # or another source of gains for which `kalman_step` has a body
+    numbers: np.ndarray  # record: the filter's variances and the results of the last update
 
 
 @adapt.register(KalmanState)
@@ -45,7 +45,7 @@ def adapt_kalman(state, error, control_signal):
 
 @inlined
 def correct_constrained(state, error):
-    """Apply eq. 2-9 with the factor of eq. 10-13."""
+    """Apply eq. 2-9 with the factor of eq. 10-13; return False, with nothing changed, if that fails."""
     d, h0, x = disturbance_estimate(state.lines, error), latest(state.lines.filtered), latest(state.lines.reference)
     if not squares_are_finite(d, h0, x):
         return False
@@ -71,8 +71,8 @@ def correct(state, measurement, scaled):
 class KalmanController(FilteredReferenceController):
     """The modified ANC structure around a Kalman filter: any filterpy `KalmanFilter` of one measurement.
 
-    Each sample the estimator is given the disturbance estimate as z and the filtered reference as H. With a rated
-    power the estimator is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` make the estimator too.
+    In each sample, the estimator gets the disturbance estimate as z and the filtered reference as H. With a rated
+    power this is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` also make the estimator.
 
     Parameters
     ----------
@@ -86,12 +86,13 @@ class KalmanController(FilteredReferenceController):
     name : str, optional
         Name in results and legends; by default KF-OPC with a rated power, else KF-ANC.
     limiter : OutputLimiter, optional
-        Limiter of its own that the control signal goes through: no window of it passes the limiter's rated power.
+        Limiter of the control signal, not shared with another controller. No window of the control signal then exceeds
+        the limiter's rated power.
 
     Raises
     ------
     TypeError
-        An estimator that is no filterpy KalmanFilter, or has a power budget (use `PowerBudgetController`).
+        An estimator that is not a filterpy KalmanFilter, or that has a power budget (use `PowerBudgetController`).
     ValueError
         An estimator of several measurements.
 
@@ -108,7 +109,7 @@ class KalmanController(FilteredReferenceController):
     """
 
     has_gains = True
-    _filter_type: Any = RandomWalkKFOPC  # of the filters whose steps are compiled
+    _filter_type: Any = RandomWalkKFOPC  # type of the filters whose steps are compiled
 
     def __init__(
         self,
@@ -139,7 +140,7 @@ class KalmanController(FilteredReferenceController):
         return KalmanState(*self._common(), gains, numbers)
 
     def _family(self) -> type[KalmanController]:
-        """Return the class whose two calls a sample the registered step stands for."""
+        """Return the class whose `control_signal` and `update` the compiled step implements."""
         return KalmanController
 
     def _usual_name(self) -> str:
@@ -157,12 +158,12 @@ class KalmanController(FilteredReferenceController):
 
     @property
     def control_filter(self) -> np.ndarray:
-        """Control filter that makes y, (L,); a copy."""
+        """Control filter that generates y, (L,); a copy."""
         return self.weights
 
     @property
     def constraint(self) -> OutputPowerConstraint:
-        """What keeps the powers: the estimator's constraint, or one of our own with the estimator's factor held."""
+        """Constraint of the estimator, or else one that computes the powers, its factor fixed at the estimator's."""
         theirs = self.estimator.constraint if isinstance(self.estimator, KFOPC) else None
         if theirs is not None:
             return theirs
@@ -175,7 +176,7 @@ class KalmanController(FilteredReferenceController):
         """Constraint factor of the last sample."""
         return getattr(self.estimator, "constraint_factor", 1.0)
 
-    # Two calls a sample. The step of a random-walk filter is the compiled one; any other filter goes filterpy's way.
+    # Two calls per sample. A random-walk filter uses the compiled step; any other filter uses its own `update`.
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
@@ -193,7 +194,7 @@ class KalmanController(FilteredReferenceController):
         return self._state.weights
 
     def _see_weights(self) -> None:
-        """Take the estimator's weights into the state."""
+        """Copy the estimator's weights into the state."""
         x = self.estimator.x
         self._state.weights[:] = x.reshape(-1) if isinstance(x, np.ndarray) else np.reshape(x, -1)
 
@@ -206,15 +207,15 @@ class KalmanController(FilteredReferenceController):
         elif adapt_once(state, error, self._y):
             self.estimator.after_compiled(state.weights.copy())
         else:
-            self._update_through_estimator(error)  # refused again, with the reason
+            self._update_through_estimator(error)  # raises, with the reason
             raise ValueError(NO_SOLUTION)
 
     def _update_through_estimator(self, error: float) -> None:
-        """Take the step by `predict` and `update` of the estimator."""
+        """Call the estimator's `predict` and `update`."""
         d = estimate_once(self._state.lines, error)
         h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
         x, powers = latest(self._state.lines.reference), self.constraint
-        powers.preview(d, h[0, 0], x)  # refuses what would overflow before anything changes
+        powers.preview(d, h[0, 0], x)  # raises if a square overflows, before anything changes
         self.estimator.predict()
         if isinstance(self.estimator, KFOPC):
             self._update_estimator(d, h, x)
@@ -227,7 +228,7 @@ class KalmanController(FilteredReferenceController):
         self.estimator.update(d, H=h, reference=x)
 
     def _state_with_estimator(self) -> Any:
-        """Return the state, which sees what the estimator has now: its weights, and the arrays of its powers."""
+        """Return the state with the estimator's present weights and power arrays."""
         self._see_weights()
         constraint = self.constraint.state
         if constraint is not self._state.constraint:
@@ -235,7 +236,10 @@ class KalmanController(FilteredReferenceController):
         return self._state
 
     def _steppable_state(self, to_step: bool = True) -> Any:
-        """Return the state with the estimator's covariance, `to_step` it or to read; None if filterpy's way is taken."""
+        """Return the state with the estimator's covariance; None if the estimator's step is not compiled.
+
+        `to_step` says if the caller will change the state, or only read it.
+        """
         estimator: Any = self.estimator
         if type(estimator) is not self._filter_type or not estimator.steps_compiled():
             return None
@@ -248,14 +252,17 @@ class KalmanController(FilteredReferenceController):
     # A whole signal at compiled speed.
 
     def compiled_state(self, to_step: bool = True) -> Any:
-        """Return the state for the compiled loop, `to_step` it or to read; None if Python has to make the steps."""
+        """Return the state for the compiled loop; None if Python must call the steps.
+
+        `to_step` says if the caller will change the state, or only read it.
+        """
         state = self._steppable_state(to_step) if self._calls_are_ours else None
         if state is not None:
-            state.numbers["variance"] = np.nan  # until a sample was taken
+            state.numbers["variance"] = np.nan  # NaN until the first update
         return state
 
     def after_compiled(self, state: Any, shared: bool = False) -> None:
-        """Give the estimator what the last sample run left in `state`; `shared` if other filters go on from it too."""
+        """Give the estimator the results in `state`; `shared` if other filters continue from its covariance too."""
         arrays = state.gains if shared else None
         if not np.isnan(state.numbers["variance"][0]):
             self.estimator.after_compiled(state.weights.copy(), arrays)
@@ -279,7 +286,7 @@ def kf_anc(
     limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
 ) -> KalmanController:
-    """KF-ANC: the Kalman filter of eq. 2-8 without a constraint.
+    """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
 
     Parameters
     ----------
@@ -329,7 +336,7 @@ def kf_opc(
     limiter: OutputLimiter | None = None,
     dtype: Any = np.float64,
 ) -> KalmanController:
-    """KF-OPC: the Kalman filter with output power constraint, eq. 9-13.
+    """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
 
     Parameters
     ----------
@@ -338,7 +345,7 @@ def kf_opc(
     rated_power : float, optional
         Rated output power rho_o.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Leaky FxLMS: a price on the weights, chosen beforehand or followed for a rated power."""
+"""Leaky FxLMS: FxLMS with a penalty on the weights, fixed or adapted to a rated power."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from .step import Lines, adapt
 def leak_factor(
     rated_power: float, *, disturbance_power: float, secondary_path_gain: float, reference_power: float
 ) -> float:
-    r"""Leak of leaky FxLMS that a rated output power asks for, :math:`E[x^2]` times `penalty_factor`.
+    r"""Return the leak of leaky FxLMS for a rated output power, :math:`E[x^2]` times `penalty_factor`.
 
-    The leak is a price on :math:`w^T w`, and :math:`E[y^2] = E[x^2] w^T w` for a white reference. For a tone seen by L
-    taps the price that keeps the rated power is L/2 times as high: this one then spends more.
+    The leak penalises :math:`w^T w`, and :math:`E[y^2] = E[x^2] w^T w` for a white reference. For a tone and L taps,
+    the leak that keeps the rated power is L/2 times as high, so this one exceeds the rated power.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def leak_factor(
     Returns
     -------
     float
-        Leak gamma, in the unit of the squared reference; 0 where the rated power is enough.
+        Leak gamma, in the unit of the squared reference; 0 if the rated power is enough.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def leak_factor(
 
 
 class LeakyState(NamedTuple):
-    """What the step of `LeakyFxLMS` reads and advances."""
+    """State of `LeakyFxLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -78,7 +78,7 @@ def adapt_leaky(state, error, control_signal):
 
 
 class RatedLeakyState(NamedTuple):
-    """What the step of `OptimalLeakyFxLMS` reads and advances."""
+    """State of `OptimalLeakyFxLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -88,7 +88,7 @@ class RatedLeakyState(NamedTuple):
 
 @adapt.register(RatedLeakyState)
 def adapt_rated_leaky(state, error, control_signal):
-    """Take the step of leaky FxLMS with gamma(n) = E[x^2] G_s (1/alpha - 1)."""
+    """Apply the step of leaky FxLMS with gamma(n) = E[x^2] G_s (1/alpha - 1)."""
     finite, _, factor = advance_powers(state, error)
     if finite:
         leak = penalty_of_constraint(state.constraint, factor) * state.constraint.powers[REFERENCE].mean
@@ -98,22 +98,22 @@ def adapt_rated_leaky(state, error, control_signal):
 
 
 class LeakyFxLMS(LMSController):
-    r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a leak chosen beforehand.
+    r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
 
-    It settles about :math:`(R_{x'} + \gamma I) w = r`, the least :math:`E[e^2] + \gamma w^T w`.
+    The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`.
 
     Parameters
     ----------
     n_taps, secondary_path, step_size, limiter
         As for `FxLMS`.
     leak : float
-        Leak gamma, zero or above, in the unit of the squared reference; `leak_factor` gives the one for a rated power.
+        Leak gamma, zero or above, in the unit of the squared reference; `leak_factor` computes it for a rated power.
 
     Raises
     ------
     ValueError
-        A step size that is not positive and finite, a leak that is negative, not finite or takes more than the whole
-        weight in a sample, fewer than one tap, a path that is no FIR path.
+        A step size that is not positive and finite, a leak that is negative or not finite, a product of both above 1,
+        fewer than one tap, a path that is not FIR.
 
     References
     ----------
@@ -157,11 +157,11 @@ class LeakyFxLMS(LMSController):
 
 
 class OptimalLeakyFxLMS(LMSController):
-    r"""Leaky FxLMS with the leak that the rated power asks for, followed online.
+    r"""Leaky FxLMS with the leak for a rated power, computed online.
 
     .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
 
-    as `leak_factor`, from running powers as KF-OPC's.
+    The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ class OptimalLeakyFxLMS(LMSController):
     rated_power : float, optional
         Rated output power rho_o.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
@@ -180,13 +180,13 @@ class OptimalLeakyFxLMS(LMSController):
     ------
     ValueError
         A step size or rated power that is not positive and finite, neither or both of `rated_power` and `constraint`,
-        fewer than one tap, a path that is no FIR path.
+        fewer than one tap, a path that is not FIR.
     TypeError
-        An amplifier that is none of the amplifier models.
+        An amplifier that is not one of the package's models.
 
     References
     ----------
-    As for `leak_factor`; there it is known beforehand.
+    As for `leak_factor`, where the powers are known beforehand.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""A limiter behind a user's own controller."""
+"""A limiter for a user-defined controller."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from .base import Controller, FilteredReferenceController, require_rates
 
 
 class LimitedController:
-    """A controller of one's own, with its control signal through a limiter.
+    """A user-defined controller whose control signal passes through a limiter.
 
-    The built-in controllers have a `limiter` of their own and run at compiled speed with it.
+    The built-in controllers have their own `limiter`, with which they run at compiled speed.
 
     Parameters
     ----------
     controller : Controller
-        Any controller. If it has a method ``emitted(control_signal)``, it is told each sample what the limiter let
-        through, before `update`: what a disturbance estimate ``e + s^ * y`` must use.
+        Any controller. If it has a method ``emitted(control_signal)``, this is called with the limiter's output in each
+        sample, before `update`. A disturbance estimate ``e + s^ * y`` must use that output.
     limiter : OutputLimiter
-        Limiter of its own.
+        Limiter, not shared with another controller.
 
     Raises
     ------
     TypeError
-        No controller, or no limiter.
+        An object that is not a controller, or not a limiter.
     ValueError
-        A controller that has a limiter of its own.
+        A built-in controller, which has its own `limiter`.
 
     Examples
     --------
@@ -54,9 +54,9 @@ class LimitedController:
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
 
     def control_signal(self, reference: float) -> float:
-        """Control signal y(n) that the limiter lets through, for the newest reference sample x(n)."""
+        """Return the limited control signal y(n) for the newest reference sample x(n)."""
         y = self.controller.control_signal(reference)
-        if not np.isfinite(y):  # a divergence, for the loop to see
+        if not np.isfinite(y):  # a divergence: return it, so that the loop detects it
             return y
         y = self.limiter(y)
         emitted = getattr(self.controller, "emitted", None)
@@ -65,22 +65,22 @@ class LimitedController:
         return y
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError where the limiter is not for the sample rate `fs` in Hz."""
+        """Raise ValueError if the limiter is for another sample rate than `fs` in Hz."""
         require_rates(fs, {"limiter": self.limiter.fs})
 
     def update(self, error: float) -> None:
-        """Let the controller adapt to the error e(n)."""
+        """Pass the error e(n) to the controller's `update`."""
         self.controller.update(error)
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Let the controller follow `references` and `errors` before the control is switched on, the limiter silent."""
+        """Let the controller follow `references` and `errors` before the control is switched on, with silent output."""
         if not hasattr(self.controller, "listen"):
             raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
         self.controller.listen(references, errors)
         self.limiter.process(np.zeros(len(references)))
 
     def __getattr__(self, name: str) -> Any:
-        """Everything else is the controller's, but for what Python itself asks for, as for copies."""
+        """Return any other attribute of the controller, but not Python's special methods, as those for copies."""
         if name == "controller" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.controller, name)

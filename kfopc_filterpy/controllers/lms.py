@@ -1,4 +1,4 @@
-"""What the filtered-reference LMS algorithms share."""
+"""Common parts of the filtered-reference LMS algorithms."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class LMSController(FilteredReferenceController):
 
 @inlined
 def advance_powers(state, error):
-    """Take a sample into the running powers; return whether their squares are finite, d^(n) and the constraint factor.
+    """Add a sample to the running powers; return whether the squares are finite, d^(n) and the constraint factor.
 
-    If they are not, nothing was changed.
+    If they are not finite, nothing was changed.
     """
     d = disturbance_estimate(state.lines, error)
     filtered, x = latest(state.lines.filtered), latest(state.lines.reference)
@@ -48,7 +48,7 @@ def _change(w, filtered, x, keep, correction, penalty):
 def penalty_of_constraint(constraint, factor):
     """Return gamma = G_s (1/alpha - 1): zero if the rated power is enough.
 
-    While nothing has come through the estimated path, G_s = 0 and gamma = sqrt(G_s delta_d^2 / rho_o) - G_s is 0 too.
+    Until a signal has passed the estimated path, G_s = 0 and gamma = sqrt(G_s delta_d^2 / rho_o) - G_s is 0 too.
     """
     gain = constraint.numbers[0].gain
     return gain * (1.0 / factor - 1.0) if factor < 1.0 and gain > 0.0 else 0.0

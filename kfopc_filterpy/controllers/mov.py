@@ -1,4 +1,4 @@
-"""MOV-FxLMS: FxLMS with a price on the control power, chosen beforehand or followed for a rated power."""
+"""MOV-FxLMS: FxLMS with a penalty on the control power, fixed or adapted to a rated power."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .step import Lines, adapt
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
-    r"""Penalty factor of MOV-FxLMS that a rated output power asks for.
+    r"""Return the penalty factor of MOV-FxLMS for a rated output power.
 
     .. math:: \gamma = \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
 
-    With it the solution of MOV-FxLMS is the unconstrained one times :math:`G_s / (G_s + \gamma)`, which is the
-    constraint factor of eq. 13, where the secondary path has the same gain at all frequencies of the noise.
+    If the secondary path has the same gain at all frequencies of the noise, the solution of MOV-FxLMS is then the
+    unconstrained one times :math:`G_s / (G_s + \gamma)`, which is the constraint factor of eq. 13.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
     Returns
     -------
     float
-        Penalty factor, 0 where the rated power is enough.
+        Penalty factor, 0 if the rated power is enough.
 
     Raises
     ------
@@ -63,19 +63,19 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
 
 
 class MOVState(NamedTuple):
-    """What the step of `MOVFxLMS` reads and advances."""
+    """State of `MOVFxLMS`."""
 
     lines: Lines
     weights: np.ndarray
     constraint: ConstraintState
     step_size: float
-    penalty: float  # NaN: followed
+    penalty: float  # NaN: computed from the running powers
     modified: bool
 
 
 @adapt.register(MOVState)
 def adapt_mov(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu [e(n) x'(n) - gamma y(n) x(n)], with gamma = G_s (1/alpha - 1) unless one is held."""
+    """Set w(n+1) = w(n) + mu [e(n) x'(n) - gamma y(n) x(n)], with gamma = G_s (1/alpha - 1) unless it is fixed."""
     finite, d, factor = advance_powers(state, error)
     if finite:
         w, mu, gamma = state.weights, state.step_size, state.penalty
@@ -88,14 +88,14 @@ def adapt_mov(state, error, control_signal):
 
 
 class MOVFxLMS(LMSController):
-    r"""Minimum-output-variance FxLMS: FxLMS with a price on the control power that keeps it to its rated power.
+    r"""Minimum-output-variance FxLMS: FxLMS with a penalty that keeps the control power within the rated power.
 
     .. math:: w(n+1) = w(n) + \mu [e(n) x'(n) - \gamma y(n) x(n)], \qquad
        \gamma = \max\{G_s (\sqrt{\delta_d^2 / (\rho_o G_s)} - 1), 0\}
 
-    so that :math:`G_s / (G_s + \gamma)` is the constraint factor of eq. 13 for a flat path. The powers are estimated
-    as KF-OPC's are, so the penalty varies with the noise (Lai et al. 2023); `penalty_factor` holds one chosen
-    beforehand (Shi et al. 2021). It settles about :math:`(R_{x'} + \gamma R_x) w = r`.
+    For a flat path, :math:`G_s / (G_s + \gamma)` is then the constraint factor of eq. 13. The powers are estimated as
+    in KF-OPC, so the penalty varies with the noise (Lai et al. 2023); the argument `penalty_factor` fixes it (Shi et
+    al. 2021). The weights settle at about :math:`(R_{x'} + \gamma R_x) w = r`.
 
     Parameters
     ----------
@@ -104,25 +104,25 @@ class MOVFxLMS(LMSController):
     rated_power : float, optional
         Rated output power rho_o.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     amplifier : callable, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
         As for `FxLMS`.
     penalty_factor : float, optional
-        Penalty factor gamma to hold, zero or above; the function `penalty_factor` gives the one for a rated power. By
-        default it follows the running powers.
+        Fixed penalty factor gamma, zero or above; the function `penalty_factor` computes it for a rated power. By
+        default gamma follows the running powers.
     modified : bool, default False
-        Adapt to ``d^ - w' x'`` in place of the error, the modified structure of Lai et al.: the delay of the secondary
-        path no longer bounds the step size. The controller is then named MOV-MFxLMS.
+        Adapt to ``d^ - w' x'`` instead of the error, in the modified structure of Lai et al. The delay of the secondary
+        path then does not limit the step size. The controller is named MOV-MFxLMS.
 
     Raises
     ------
     ValueError
         A step size or rated power that is not positive and finite, neither or both of `rated_power` and `constraint`,
-        a penalty factor that is negative or not finite, fewer than one tap, a path that is no FIR path.
+        a penalty factor that is negative or not finite, fewer than one tap, a path that is not FIR.
     TypeError
-        An amplifier that is none of the amplifier models.
+        An amplifier that is not one of the package's models.
 
     References
     ----------
@@ -163,5 +163,5 @@ class MOVFxLMS(LMSController):
 
     @property
     def modified(self) -> bool:
-        """Whether it adapts to ``d^ - w' x'`` in place of the error."""
+        """True if the controller adapts to ``d^ - w' x'`` instead of the error."""
         return self._state.modified

@@ -1,4 +1,4 @@
-"""KF-PB: a Kalman filter, and the control filter of least error within the rated power."""
+"""KF-PB: a Kalman filter, with the control filter of least error within the rated power."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from .step import Lines, adapt, control_filter, disturbance_estimate, follow, po
 
 
 class PowerBudgetState(NamedTuple):
-    """What the step of KF-PB reads and advances."""
+    """State of KF-PB."""
 
     lines: Lines
     weights: np.ndarray
-    constraint: ConstraintState  # follows the powers; its factor is held at 1
+    constraint: ConstraintState  # computes the powers; its factor is fixed at 1
     gains: Covariance
     numbers: np.ndarray  # as of `KalmanState`
     budget: BudgetState
@@ -31,7 +31,7 @@ class PowerBudgetState(NamedTuple):
 
 @adapt.register(PowerBudgetState)
 def adapt_power_budget(state, error, control_signal):
-    """Apply eq. 2-8, and let the budget find the control filter for the estimate."""
+    """Apply eq. 2-8, then let the budget find the control filter for the estimate."""
     if not correct_constrained(state, error):
         return False
     x, filtered = latest(state.lines.reference), latest(state.lines.filtered)
@@ -41,7 +41,7 @@ def adapt_power_budget(state, error, control_signal):
 
 @follow.register(PowerBudgetState)
 def follow_power_budget(state, error):
-    """Take the sample into the powers and the correlations."""
+    """Add the sample to the powers and the correlations."""
     d, filtered, x = (
         disturbance_estimate(state.lines, error),
         latest(state.lines.filtered),
@@ -65,14 +65,14 @@ def weight_of_power_budget(state):
 
 
 class PowerBudgetController(KalmanController):
-    """The modified ANC structure around a filter with a power budget; `kf_pb` makes the filter too.
+    """The modified ANC structure around a filter with a power budget; `kf_pb` also makes the filter.
 
     Parameters
     ----------
     estimator : PowerBudgetKalmanFilter
         Filter whose state is the estimate of the unconstrained control filter.
     secondary_path, amplifier, name, limiter
-        As for `KalmanController`; by default it is named KF-PB.
+        As for `KalmanController`; the default name is KF-PB.
 
     Raises
     ------
@@ -119,7 +119,7 @@ class PowerBudgetController(KalmanController):
 
     @property
     def control_filter(self) -> np.ndarray:
-        """Control filter within the rated power, which makes y, (L,); a copy."""
+        """Control filter within the rated power, which generates y, (L,); a copy."""
         return self.estimator.control_filter
 
     @property
@@ -151,7 +151,7 @@ def kf_pb(
     dtype: Any = np.float64,
     **budget: Any,
 ) -> PowerBudgetController:
-    """KF-PB: the power-budgeted Kalman filter, the least error within the rated power.
+    """Return KF-PB, the power-budgeted Kalman filter, which has the least error within the rated power.
 
     Parameters
     ----------
@@ -165,8 +165,8 @@ def kf_pb(
     Returns
     -------
     PowerBudgetController
-        A controller named KF-PB; its `control_filter` makes the control signal, its `weights` are the estimate of the
-        unconstrained one.
+        A controller named KF-PB. Its `control_filter` generates the control signal; its `weights` are the estimate of
+        the unconstrained control filter.
 
     Examples
     --------

@@ -1,11 +1,12 @@
-"""KF-OPC with the gain of its constraint repaired: three departures from eq. 11-13, each on its own or together.
+"""KF-OPC with the gain of its constraint repaired: three changes of eq. 11-13, which can be used alone or together.
 
 Eq. 13 keeps the rated power if the secondary path is flat over the noise and the disturbance can be cancelled
-wholly. On other paths the control signal's spectrum is not the reference's, so that
+completely. On other paths the control signal and the reference have different spectra. Therefore
 
-- the gain `G_s` it sees is E[(s^ * y)^2] / E[y^2] and not E[x'^2] / E[x^2]: `of_control`;
-- whatever is still wrong shows in the output power measured, which can trim the factor: `trim_rate`;
-- the filter's memory delays what a factor on the measurement does to y; on the output it acts at once: `at_output`.
+- the gain `G_s` of the control signal is E[(s^ * y)^2] / E[y^2] and not E[x'^2] / E[x^2]: `of_control`;
+- the remaining error shows in the measured output power, which can trim the factor: `trim_rate`;
+- a factor on the measurement acts on y with the delay of the filter's memory; on the output it acts at once:
+  `at_output`.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ DEFAULT_TRIM_S = 1.0
 
 
 class RepairedState(NamedTuple):
-    """What the step of the repaired KF-OPC reads and advances."""
+    """State of the repaired KF-OPC."""
 
     lines: Lines
     weights: np.ndarray
@@ -52,7 +53,7 @@ class RepairedState(NamedTuple):
 
 
 class RepairedEmitter(NamedTuple):
-    """What a control signal is made of, see `step.Emitter`."""
+    """Part of the state that the control signal needs, see `step.Emitter`."""
 
     lines: Lines
     weights: np.ndarray
@@ -92,7 +93,7 @@ def gain_samples(repair, filtered, x, error, d, y):
 
 @inlined
 def measurement_factor(repair, factor):
-    """Return what scales the measurement (eq. 9)."""
+    """Return the factor of the measurement (eq. 9)."""
     return 1.0 if repair[0].at_output != 0 else trimmed(repair, factor)
 
 
@@ -104,9 +105,9 @@ def trimmed(repair, factor):
 
 @inlined
 def advance_repair(repair, constraint, y):
-    """Note the factor used, and trim the next one by the power of y: up while it is below the rated, down above.
+    """Record the factor used, and trim the next one by the power of y: up if it is below the rated power, else down.
 
-    At a factor of 1 there is nothing to gain, and the trim does not wind up.
+    At a factor of 1 the trim does not rise, so that it does not wind up.
     """
     own, numbers = repair[0], constraint.numbers[0]
     numbers.factor = trimmed(repair, numbers.factor)
@@ -118,9 +119,9 @@ def advance_repair(repair, constraint, y):
 
 
 class RepairedKFOPC(KalmanController):
-    """KF-OPC whose constraint factor keeps the rated power on more paths than the published one's.
+    """KF-OPC whose constraint factor keeps the rated power on more paths than the published one.
 
-    Made by `kf_opc_repaired`. The estimator has no constraint of its own: the controller gives it the factor.
+    Made by `kf_opc_repaired`. The estimator has no constraint: the controller sets its factor.
 
     Parameters
     ----------
@@ -129,14 +130,15 @@ class RepairedKFOPC(KalmanController):
     secondary_path, amplifier, name, limiter
         As for `KalmanController`.
     constraint : OutputPowerConstraint
-        What keeps the powers and the factor.
+        Constraint that computes the powers and the factor. A copy is kept.
     gain_of, trim_s, factor_at
         As for `kf_opc_repaired`.
 
     Raises
     ------
     ValueError
-        An estimator of another kind or with a rated power; another gain or place; a time not positive.
+        An estimator of another type or with a rated power; an unknown `gain_of` or `factor_at`; a `trim_s` that is not
+        positive.
 
     Examples
     --------
@@ -197,7 +199,7 @@ class RepairedKFOPC(KalmanController):
 
     @property
     def constraint(self) -> OutputPowerConstraint:
-        """What keeps the powers and the factor."""
+        """Constraint that computes the powers and the factor."""
         return self._own_constraint
 
     @property
@@ -208,13 +210,13 @@ class RepairedKFOPC(KalmanController):
     def _emitter(self) -> Any:
         return RepairedEmitter(
             self._state.lines, self._state.weights, self._repair
-        )  # the factor may stand at the output
+        )  # the factor may be applied to the output
 
     def _update_through_estimator(self, error: float) -> None:
         d = estimate_once(self._state.lines, error)
         h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
         seen = gain_samples(self._repair, h[0, 0], latest(self._state.lines.reference), error, d, self._y)
-        factor = self.constraint.preview(d, *seen)  # refuses what would overflow before anything changes
+        factor = self.constraint.preview(d, *seen)  # raises if a square overflows, before anything changes
         self.estimator.constraint_factor = measurement_factor(self._repair, factor)
         self.estimator.predict()
         self.estimator.update(d, H=h)
@@ -222,7 +224,7 @@ class RepairedKFOPC(KalmanController):
         advance_repair(self._repair, self.constraint.state, self._y)
 
     def after_compiled(self, state: Any, shared: bool = False) -> None:
-        """See `KalmanController.after_compiled`, `state` and `shared`; the estimator holds the last sample's factor."""
+        """Give the estimator the results in `state` and the last factor; see `KalmanController` for `shared`."""
         super().after_compiled(state, shared)
         self._hold_factor()
 
@@ -250,11 +252,11 @@ def kf_opc_repaired(
     amplifier: Amplifier | None = None,
     limiter: OutputLimiter | None = None,
 ) -> RepairedKFOPC:
-    r"""KF-OPC with its gain repaired: eq. 13 made to hold on paths that are not flat.
+    r"""Return KF-OPC with its gain repaired, so that eq. 13 also keeps the rated power on paths that are not flat.
 
-    Three repairs, each on its own or together. With ``gain_of="reference", trim_s=None, factor_at="measurement"`` it is
-    KF-OPC as published. It still scales the control filter as a whole, which is a poor way to spend the power where
-    the secondary path is not flat: `kf_pb` reaches more.
+    Three repairs can be used alone or together. With ``gain_of="reference", trim_s=None, factor_at="measurement"`` it
+    is KF-OPC as published. It still scales the whole control filter, which is a poor use of the power if the secondary
+    path is not flat: `kf_pb` achieves more noise reduction.
 
     Parameters
     ----------
@@ -263,16 +265,16 @@ def kf_opc_repaired(
     rated_power : float, optional
         Rated output power.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with the settings of its power estimates. A copy is kept.
+        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
     gain_of : {"control", "reference"}, default "control"
-        Signal whose gain through the secondary path is G_s: the control signal's, :math:`E[(\hat s * y)^2] / E[y^2]`,
-        or the reference's, :math:`E[x'^2] / E[x^2]` (eq. 11).
+        Signal whose gain through the secondary path is G_s: the control signal, :math:`E[(\hat s * y)^2] / E[y^2]`, or
+        the reference, :math:`E[x'^2] / E[x^2]` (eq. 11).
     trim_s : float or None, default 1
-        Integration time in seconds of a closed loop that trims the factor until the output power measured is the rated
-        one; it settles in half of it. None: no trim.
+        Integration time in seconds of a closed loop that trims the factor until the measured output power is the rated
+        power; the loop settles in half of this time. None: no trim.
     factor_at : {"output", "measurement"}, default "output"
-        Where the factor is applied: to the control signal, where it acts at once, or to the measurement (eq. 9),
-        where it acts as fast as the filter adapts.
+        Signal that the factor is applied to: the control signal, on which it acts at once, or the measurement (eq. 9),
+        on which it acts as fast as the filter adapts.
 
     Returns
     -------
@@ -282,7 +284,8 @@ def kf_opc_repaired(
     Raises
     ------
     ValueError
-        What `KFOPC.random_walk` and `OutputPowerConstraint` refuse; another gain or place; a time not positive.
+        Arguments that `KFOPC.random_walk` or `OutputPowerConstraint` refuses; an unknown `gain_of` or `factor_at`; a
+        `trim_s` that is not positive.
 
     Examples
     --------

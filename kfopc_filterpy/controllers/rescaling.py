@@ -1,4 +1,4 @@
-"""Re-scaling FxLMS: beyond an amplitude limit the weights are scaled along."""
+"""Re-scaling FxLMS: clips the control signal to an amplitude limit and scales the weights by the same ratio."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .step import Lines, adapt, output
 
 
 class RescalingState(NamedTuple):
-    """What the step of `RescalingFxLMS` reads and advances."""
+    """State of `RescalingFxLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -27,7 +27,7 @@ class RescalingState(NamedTuple):
 
 @output.register(RescalingState)
 def output_rescaled(state):
-    """Return w'x held to the limit, the weights scaled along; Inf and NaN pass, for the loop to see a divergence."""
+    """Return w'x clipped to the limit, and scale the weights likewise; pass Inf and NaN, which the loop detects."""
     w, limit = state.weights, state.amplitude_limit
     y = dot(w, newest(state.lines.reference, w.size))
     if not limit < abs(y) < np.inf:
@@ -40,7 +40,7 @@ def output_rescaled(state):
 
 @adapt.register(RescalingState)
 def adapt_rescaling(state, error, control_signal):
-    """Take the step of `FxLMS`."""
+    """Apply the step of `FxLMS`."""
     finite, _, _ = advance_powers(state, error)
     if finite:
         change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
@@ -48,11 +48,11 @@ def adapt_rescaling(state, error, control_signal):
 
 
 class RescalingFxLMS(LMSController):
-    r"""Re-scaling FxLMS: a control signal beyond the limit is held to it, and the weights are scaled along.
+    r"""Re-scaling FxLMS: a control signal beyond the limit is clipped, and the weights are scaled by the same ratio.
 
-    .. math:: \text{where } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
+    .. math:: \text{if } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
 
-    then the step of `FxLMS`. The filter stays linear between two such samples.
+    The step of `FxLMS` follows. Between two such samples the filter is linear.
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ class RescalingFxLMS(LMSController):
     Raises
     ------
     ValueError
-        A step size or limit that is not positive and finite, fewer than one tap, a path that is no FIR path.
+        A step size or limit that is not positive and finite, fewer than one tap, a path that is not FIR.
 
     References
     ----------
-    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001:
-    the text was not at hand, the equations are those by which later papers describe it.
+    X. Qiu, C. H. Hansen, "A study of time-domain FXLMS algorithms with control output constraint", JASA 109(6), 2001.
+    The text was not available; the equations are those given for it in later papers.
 
     Examples
     --------

@@ -1,13 +1,13 @@
-"""One sample of a controller, compiled: the parts that all share, and the parts that the type of the state chooses.
+"""One compiled sample of a controller: functions that all controllers share, and functions chosen by type of state.
 
-A controller's state is a NamedTuple with three fields at least,
+A controller's state is a NamedTuple with at least three fields,
 
-- `lines`: the signals it goes by (`Lines`),
-- `weights`: what it adapts,
+- `lines`: its signals (`Lines`),
+- `weights`: the adapted weights,
 - `constraint`: the running powers (`power.constraint.ConstraintState`),
 
-and whatever else its algorithm keeps. `adapt` must have a body for its type; the others have
-one for all, which an algorithm can replace: ``adapt.register(MyState)(my_step)``.
+and whatever else its algorithm stores. `adapt` must have a body for the type, registered by
+``adapt.register(MyState)(my_step)``. The other functions have a default body, which an algorithm can replace.
 """
 
 from __future__ import annotations
@@ -26,29 +26,29 @@ from ..power.limiter import LimiterState, limit_sample
 
 
 class Lines(NamedTuple):
-    """The signals that a controller goes by."""
+    """Signals that a controller uses, and its models."""
 
     secondary_estimate: np.ndarray  # taps of s^
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x' = s^ * x
-    output: np.ndarray  # delay line of y, through the amplifier model if one is known
+    output: np.ndarray  # delay line of y, after the limiter and the amplifier model
     amplifier: np.ndarray  # record of that model; linear: d^ = e + s^ * y as published
     limiter: LimiterState | None
 
 
 class Emitter(NamedTuple):
-    """What a control signal is made of, in the usual way: the little that a call from Python has to hand over."""
+    """Part of a state that the usual control signal needs; a call from Python is faster with less to pass."""
 
     lines: Lines
     weights: np.ndarray  # the control filter
 
 
-# What the type of the state chooses.
+# Functions chosen by the type of the state.
 
 
 @by_type
 def control_filter(state):
-    """Return what makes the control signal: the weights."""
+    """Return the filter that generates the control signal: by default, the weights."""
     return state.weights
 
 
@@ -67,7 +67,7 @@ def adapt(state, error, control_signal):
 
 @by_type
 def follow(state, error):
-    """Take a sample heard while the loudspeaker is silent: the powers advance. Return False if that fails."""
+    """Update the powers with a sample heard while the loudspeaker is silent. Return False if that fails."""
     d = disturbance_estimate(state.lines, error)
     advance_constraint(state.constraint, d, latest(state.lines.filtered), latest(state.lines.reference))
     return True
@@ -79,19 +79,19 @@ def power_weight(state):
     return np.nan
 
 
-# What all share.
+# Functions that all controllers share.
 
 
 @inlined
 def emit(state, x):
-    """Return y(n) for the newest reference, limited if there is a limiter; x'(n) and y(n) enter their lines."""
+    """Return y(n) for the newest reference, after any limiter; add x(n), x'(n) and y(n) to their delay lines."""
     take_reference(state.lines, x)
     return emit_limited(state.lines, output(state))
 
 
 @inlined
 def take_reference(lines, x):
-    """Take x(n) into its delay line, and x'(n) = (s^ * x)(n) into the filtered one."""
+    """Add x(n) and x'(n) = (s^ * x)(n) to their delay lines."""
     push(lines.reference, x)
     s = lines.secondary_estimate
     push(lines.filtered, dot(s, newest(lines.reference, s.size)))
@@ -99,7 +99,7 @@ def take_reference(lines, x):
 
 @inlined
 def emit_limited(lines, y):
-    """Return y after the limiter, if there is one, and take it into its line."""
+    """Return y after the limiter, if there is one, and add it to its delay line."""
     y = limited(lines.limiter, y)
     push(lines.output, amplify(lines.amplifier, y))
     return y
@@ -120,30 +120,30 @@ def disturbance_estimate(lines, error):
     return error + dot(s, newest(lines.output, s.size))
 
 
-# From Python.
+# Entry points from Python.
 
 
 @compiled_for_states()
 def emit_once(state, x):
-    """Call `emit`."""
+    """Call `emit` from Python."""
     return emit(state, x)
 
 
 @compiled_for_states()
 def adapt_once(state, error, control_signal):
-    """Call `adapt`."""
+    """Call `adapt` from Python."""
     return adapt(state, error, control_signal)
 
 
 @compiled()
 def estimate_once(lines, error):
-    """Call `disturbance_estimate`."""
+    """Call `disturbance_estimate` from Python."""
     return disturbance_estimate(lines, error)
 
 
 @compiled_for_states(nogil=True)
 def listen(state, references, errors):
-    """Follow a signal while the loudspeaker is silent; return the number of samples taken, all if none was refused."""
+    """Follow a signal while the loudspeaker is silent; return the number of samples processed before a refusal."""
     state = borrowed(state)
     for n in range(references.size):
         take_reference(state.lines, references[n])

@@ -1,4 +1,4 @@
-"""Two-gradient FxLMS: down the control power beyond an amplitude limit."""
+"""Two-gradient FxLMS: it reduces the control power if the control signal exceeds an amplitude limit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .step import Lines, adapt
 
 
 class TwoGradientState(NamedTuple):
-    """What the step of `TwoGradientFxLMS` reads and advances."""
+    """State of `TwoGradientFxLMS`."""
 
     lines: Lines
     weights: np.ndarray
@@ -26,7 +26,7 @@ class TwoGradientState(NamedTuple):
 
 @adapt.register(TwoGradientState)
 def adapt_two_gradient(state, error, control_signal):
-    """Go down the error within the limit, down the control power beyond it."""
+    """Descend the gradient of the squared error within the limit, that of the control power beyond it."""
     finite, _, _ = advance_powers(state, error)
     if finite:
         if abs(control_signal) > state.amplitude_limit:
@@ -37,13 +37,14 @@ def adapt_two_gradient(state, error, control_signal):
 
 
 class TwoGradientFxLMS(LMSController):
-    r"""Two-gradient-direction FxLMS: down the error within the limit, down the control power beyond it.
+    r"""Two-gradient-direction FxLMS: it reduces the error within the limit and the control power beyond it.
 
     .. math:: w(n+1) = w(n) + \begin{cases} \mu\, e(n)\, x'(n) & |y(n)| \le A \\
        -\mu_y\, y(n)\, x(n) & |y(n)| > A \end{cases}
 
-    The control signal is not held: it settles where the two balance, above the limit, and the closer to it the larger
-    mu_y is against mu. For a tone that the limit holds to a third, equal step sizes leave an amplitude of 1.2 A.
+    The control signal is not clipped. It settles above the limit, at the balance of the two directions, and closer to
+    the limit the larger mu_y / mu is. For a tone that needs three times the limit, equal step sizes give an amplitude
+    of 1.2 A.
 
     Parameters
     ----------
@@ -57,13 +58,13 @@ class TwoGradientFxLMS(LMSController):
     Raises
     ------
     ValueError
-        A step size or limit that is not positive and finite, fewer than one tap, a path that is no FIR path.
+        A step size or limit that is not positive and finite, fewer than one tap, a path that is not FIR.
 
     References
     ----------
     D. Shi, W.-S. Gan, B. Lam, C. Shi, "Two-gradient direction FXLMS: an adaptive active noise control algorithm with
-    output constraint", Mechanical Systems and Signal Processing 116, 2019: the text was not at hand, the equations are
-    those by which later papers describe it.
+    output constraint", Mechanical Systems and Signal Processing 116, 2019. The text was not available; the equations
+    are those given for it in later papers.
 
     Examples
     --------

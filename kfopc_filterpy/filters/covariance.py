@@ -1,4 +1,4 @@
-"""State covariance of the random-walk filter: one triangle inside, full arrays only when they are read."""
+"""State covariance of the random-walk filter: stored as one triangle, expanded to full arrays when they are read."""
 
 from __future__ import annotations
 
@@ -9,36 +9,36 @@ import numpy as np
 
 from ..kernels.covariance import Covariance, copy_covariance, full_covariance, new_covariance
 
-ASYMMETRY_LIMIT = 1e-8  # of the largest element: what rounding leaves; more is a mistake
+ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
 
 
-# P at a moment since the last pass over the triangle T, as (scale, diagonal, weight): scale T + weight g g' + diagonal I.
+# P since the last pass over the triangle T, as (scale, diagonal, weight): P = scale T + weight g g' + diagonal I.
 Moment = tuple[float, float, float]
 TRIANGLE: Moment = (1.0, 0.0, 0.0)  # P is T itself
 
 
 class RandomWalkCovariance:
-    """P, P_prior and P_post of a random-walk filter, each made full when read.
+    """P, P_prior and P_post of a random-walk filter, each expanded to a full array when read.
 
-    `arrays` is what the compiled functions advance. `prior` and `posterior` say how to make P_prior and P_post from it,
-    or are arrays if that is no longer possible.
+    The compiled functions update `arrays`. `prior` and `posterior` say how to compute P_prior and P_post from it, or
+    are full arrays if that is no longer possible.
     """
 
     def __init__(self, P: np.ndarray, dtype: Any = np.float64) -> None:
         self.arrays: Covariance = new_covariance(0.5 * (P + P.T), dtype)
         self.prior: Moment | np.ndarray = TRIANGLE
         self.posterior: Moment | np.ndarray = TRIANGLE
-        # What P showed since the last step, newest last: each array, and a copy of it as it was shown.
+        # Arrays that `show` returned since the last step, newest last, each with a copy of what it held.
         self._shown: list[tuple[np.ndarray, np.ndarray]] = []
         self._largest = float(np.finfo(dtype).max)
-        self._others_read = False  # the arrays are another's too
+        self._others_read = False  # other filters share the arrays
 
     def share(self, arrays: Covariance) -> None:
-        """Go on from arrays that others go on from too: whoever steps first takes a copy."""
+        """Continue from arrays that other filters share; a filter copies them before its first step."""
         self.arrays, self._others_read, self._shown = arrays, True, []
 
     def own(self) -> Covariance:
-        """The arrays, which nobody else reads."""
+        """Return the arrays for writing, copied first if other filters share them."""
         if self._others_read:
             self.arrays, self._others_read = copy_covariance(self.arrays), False
         return self.arrays
@@ -50,7 +50,7 @@ class RandomWalkCovariance:
         return scale, diagonal, -scale * inverse_S
 
     def full(self, moment: Moment | np.ndarray) -> np.ndarray:
-        """P at a moment, as a full symmetric array of its own."""
+        """Return P at a moment, as a new full symmetric array."""
         if isinstance(moment, np.ndarray):
             return moment.copy()
         if moment == TRIANGLE and not self.arrays.owed["last_inverse_S"][0]:  # a new filter: nothing to compile yet
@@ -60,13 +60,13 @@ class RandomWalkCovariance:
         return full_covariance(self.arrays.triangle, self.arrays.gain_direction, *moment)
 
     def show(self) -> np.ndarray:
-        """Return P as a full array of its own; what is written into it counts at the next step (`edited`)."""
+        """Return P as a new full array; values written into it take effect at the next step (see `edited`)."""
         P = self._shown[-1][0].copy() if self._shown else self.full(self.now)
         self._shown.append((P, P.copy()))
         return P
 
     def edited(self) -> np.ndarray | None:
-        """Return the newest shown array that was written into, None if none was."""
+        """Return the newest array from `show` that was written into, None if none was."""
         return next((P for P, shown in reversed(self._shown) if not np.array_equal(P, shown)), None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
@@ -76,13 +76,13 @@ class RandomWalkCovariance:
         return other
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:
-        """A covariance that goes on from another P and remembers P_prior and P_post."""
+        """Return a covariance that continues from another P and keeps P_prior and P_post."""
         other = RandomWalkCovariance(P, self.arrays.triangle.dtype)
         other.prior, other.posterior = self.full(self.prior), self.full(self.posterior)
         return other
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
-        """Apply eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I; the next pass over the triangle pays for it."""
+        """Record eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, as pending for the next pass over the triangle."""
         owed = self.own().owed
         scale, diagonal, inverse_S, _ = owed.item()
         if not alpha_sq * max(scale, diagonal) + state_noise < self._largest:
@@ -93,35 +93,35 @@ class RandomWalkCovariance:
         self.prior = scale, diagonal, -scale * inverse_S
 
     def before_update(self) -> tuple[Covariance, Moment, Moment | np.ndarray]:
-        """Return the arrays for a compiled update, P now, and P_prior in a form that the update leaves as it is."""
+        """Return the arrays for a compiled update, P now, and P_prior in a form that the update does not change."""
         now = self.now
         if isinstance(self.prior, tuple) and self.prior != now:  # a second update since the prediction
             return self.own(), now, self.full(self.prior)
         return self.own(), now, self.prior
 
     def projected(self, before: Moment, prior: Moment | np.ndarray) -> None:
-        """Go on after the pass of an update, refused or not: P is still what it was `before`, but nothing is owed."""
+        """Record the pass of an update, refused or not: P is still what it was `before`, but nothing is pending."""
         self.prior = prior
         self._shown = []
         if isinstance(self.prior, tuple):
             self.prior = TRIANGLE
-        if isinstance(self.posterior, tuple):  # the same P_post, seen from the triangle now
+        if isinstance(self.posterior, tuple):  # the same P_post, computed from the triangle as it is now
             ratio = self.posterior[0] / before[0]
             self.posterior = ratio, self.posterior[1] - ratio * before[1], 0.0
 
     def updated(self) -> None:
-        """Go on after an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""
+        """Record an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""
         scale, diagonal, inverse_S, last_inverse_S = self.arrays.owed.item()
         if isinstance(self.prior, tuple):
             self.prior = 1.0, 0.0, last_inverse_S - inverse_S
         self.posterior = scale, diagonal, -scale * inverse_S
 
     def missed(self) -> None:
-        """Go on after a missed sample: P is P_post."""
+        """Record a missed sample: P is P_post."""
         self.posterior = self.now
 
     def after_compiled(self) -> None:
-        """Go on after the compiled loop advanced `arrays`: what is owed is one downdate at most."""
+        """Record that the compiled loop updated `arrays`: at most one downdate is pending."""
         self._shown = []
         self.prior = TRIANGLE
         self.updated()

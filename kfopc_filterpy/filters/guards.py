@@ -1,4 +1,4 @@
-"""What keeps a filterpy filter from being poisoned: checks of a step's arguments, and its undoing."""
+"""Guards of a filterpy filter: they check the arguments of a step, and undo a step that fails."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ State = tuple[dict[str, Any], dict[str, Any]]
 
 
 def state_of(kf: KalmanFilter) -> State:
-    """Return the attributes of a filter: those in its __dict__, and those in slots."""
+    """Return the attributes of a filter, as two dicts: those in its __dict__ and those in slots."""
     slots = [name for kind in type(kf).__mro__ for name in vars(kind).get("__slots__", ())]
     return dict(kf.__dict__), {name: getattr(kf, name) for name in slots if hasattr(kf, name)}
 
@@ -37,16 +37,16 @@ def restore(kf: KalmanFilter, state: State) -> None:
 
 @contextmanager
 def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[None]:
-    """Around a step of `kf`: finite `arguments` go in, finite x and P come out, or an error, nothing changed.
+    """Run a step of `kf`: either it leaves x and P finite, or it raises an error and changes nothing.
 
-    Holds for steps that assign arrays, as filterpy's do; one that writes into them has to copy them first.
+    The `arguments` must be finite. The step must assign arrays, as filterpy's steps do, or copy those it writes into.
     """
     for argument, value in arguments.items():
         if value is not None:
             require_finite(np.asarray(value, dtype=np.float64), argument)
     before = state_of(kf)
     try:
-        with np.errstate(all="ignore"):  # what overflows or divides by zero is found just below
+        with np.errstate(all="ignore"):  # overflow and division by zero are detected below
             yield
         _require_sound(kf)
     except BaseException as error:
@@ -61,7 +61,7 @@ def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[No
 
 
 def _require_sound(kf: KalmanFilter) -> None:
-    """A step must leave x and P of their size, and finite."""
+    """Raise ValueError unless x and P have their sizes and are finite."""
     n = kf.dim_x
     if np.size(kf.x) != n or np.shape(kf.P) not in ((), (n, n)):
         raise ValueError(f"x would become {np.shape(kf.x)} and P {np.shape(kf.P)}, for dim_x = {n}")
@@ -74,7 +74,7 @@ def _require_sound(kf: KalmanFilter) -> None:
 
 
 def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, Any, np.ndarray | None]:
-    """z, R and H as filterpy handles them, or a clear error."""
+    """Return z, R and H as filterpy handles them, or raise a clear error."""
     n = kf.dim_x
     given = kf.H if H is None else H
     if H is not None or np.ndim(given) == 1:
@@ -91,7 +91,7 @@ def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, 
         R = np.reshape(noise, (1, 1))
     require_measurement(z, rows)
     shape = np.shape(z)
-    # filterpy 2.0.0 takes z as it comes where H is given: (rows,) against a column would broadcast
+    # filterpy 2.0.0 does not reshape z if H is given: (rows,) against a column would broadcast
     wanted = (rows, 1) if np.ndim(kf.x) == 2 else (rows,)
     if H is None or not shape or shape == wanted or (rows == 1 and len(wanted) == 2):
         return z, R, H
@@ -99,7 +99,7 @@ def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, 
 
 
 def require_measurement(z: Any, rows: int) -> None:
-    """z: finite numbers, one a row of H, in a shape that converts to (rows, 1)."""
+    """Raise an error unless z holds finite numbers, one per row of H, in a shape that converts to (rows, 1)."""
     values = np.asarray(z)
     if values.dtype.kind not in "biufc":
         raise TypeError(f"z must be a number or an array of numbers, or None for a missed sample, got {z!r}")
@@ -110,14 +110,14 @@ def require_measurement(z: Any, rows: int) -> None:
 
 
 def require_matrix(value: Any, shape: tuple[int, ...], name: str) -> None:
-    """Finite, of this shape."""
+    """Raise ValueError unless `value` is finite and has this shape."""
     if np.shape(value) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
     require_finite(value, name)
 
 
 def require_variance(value: Any, size: int, name: str) -> None:
-    """A variance: a number, or (size, size) with no negative value on its diagonal; finite."""
+    """Raise ValueError unless `value` is a finite variance: a number, or (size, size) with no negative diagonal."""
     if np.ndim(value) > 0 and np.size(value) > 1:
         require_matrix(value, (size, size), name)
     else:

@@ -35,9 +35,9 @@ class KFOPC(KalmanFilter):
 
     .. math:: \hat w(n|n) = \hat w(n|n-1) + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
 
-    With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except
-    that what would poison or break that filter (NaN, Inf, a wrong shape, a negative variance) raises before
-    any change.
+    With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
+    arguments that would corrupt that filter (NaN, Inf, a wrong shape, a negative variance) raise an error before
+    anything changes.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class KFOPC(KalmanFilter):
     rated_power : float, optional
         Rated output power (mean square of the control signal). None: no constraint.
     constraint : OutputPowerConstraint, optional
-        In place of `rated_power`: the rated power with its sample rate, the memory of its power estimates or a known
+        Given instead of `rated_power` to set also the sample rate, the memory of the power estimates or a known
         secondary-path gain. The filter keeps a copy. By default the gain is estimated from the newest sample of H and
         the `reference` given to `update` (eq. 11).
 
@@ -59,7 +59,8 @@ class KFOPC(KalmanFilter):
     z : ndarray
         Last measurement as given, unscaled.
     y : ndarray
-        Residual of the scaled measurement, alpha z - H x; `S`, `K` and the likelihoods belong to it too.
+        Residual of the scaled measurement, alpha z - H x. `S`, `K` and the likelihoods are those of the scaled
+        measurement too.
 
     Raises
     ------
@@ -69,7 +70,7 @@ class KFOPC(KalmanFilter):
 
     See Also
     --------
-    KFOPC.random_walk : the filter of eq. 1-8 at O(L^2) a sample.
+    KFOPC.random_walk : the filter of eq. 1-8 in O(L^2) per sample.
 
     Notes
     -----
@@ -93,10 +94,10 @@ class KFOPC(KalmanFilter):
     array([[1.]])
     """
 
-    if not TYPE_CHECKING:  # Out of filterpy's `Saver`, which records what is in __dict__.
+    if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
         __slots__ = ("_batch_references", "_constraint", "_lifted", "_unconstrained_factor")
 
-    x: Any  # assigned by filterpy, as the rest is
+    x: Any  # assigned by filterpy, like the others
     y: Any
     z: Any
     K: Any
@@ -135,7 +136,7 @@ class KFOPC(KalmanFilter):
         constraint: OutputPowerConstraint | None = None,
         dtype: Any = np.float64,
     ) -> RandomWalkKFOPC:
-        """Filter of eq. 1-8 for a control filter that walks at random: F = I, Q = r I, R = q, in O(L^2).
+        """Return the filter of eq. 1-8 for a random-walk control filter: F = I, Q = r I, R = q, in O(L^2) per sample.
 
         Parameters
         ----------
@@ -150,11 +151,11 @@ class KFOPC(KalmanFilter):
         rated_power : float, optional
             Rated output power; None: the unconstrained filter, KF-ANC.
         constraint : OutputPowerConstraint, optional
-            In place of `rated_power`, as for `KFOPC`.
+            Given instead of `rated_power`, as for `KFOPC`.
         dtype : {numpy.float64, numpy.float32}, default numpy.float64
-            Precision that P is kept and stepped in; the weights stay float64. float32 halves the memory and, at many
-            taps, the time. It needs a state noise well above 6e-8 of the largest variance in P: below, rounding makes P
-            indefinite within some thousand samples of a band-limited reference, and `update` then refuses.
+            Precision in which P is stored and updated; the weights stay float64. float32 halves the memory and, at many
+            taps, the time. It needs a state noise well above 6e-8 of the largest variance in P. With less, rounding
+            makes P indefinite within some thousand samples of a band-limited reference, and `update` then raises.
 
         Returns
         -------
@@ -188,7 +189,7 @@ class KFOPC(KalmanFilter):
             dtype=dtype,
         )
 
-    # The constraint: what can be read, and supplied by the caller instead.
+    # The constraint: its values can be read, or supplied by the caller.
 
     @property
     def rated_power(self) -> float | None:
@@ -208,7 +209,7 @@ class KFOPC(KalmanFilter):
 
     @property
     def constraint(self) -> OutputPowerConstraint | None:
-        """The object that keeps the powers and the factor; None without a rated power. Assign one: a copy is kept."""
+        """Constraint that computes the powers and the factor; None without a rated power. Assignment stores a copy."""
         return self._constraint
 
     @constraint.setter
@@ -226,7 +227,7 @@ class KFOPC(KalmanFilter):
 
     @property
     def constraint_factor(self) -> float:
-        """Factor that scales the measurement; assign a value to hold it, None to follow eq. 13 again."""
+        """Factor that scales the measurement; assign a value to fix it, None to follow eq. 13 again."""
         return self._unconstrained_factor if self._constraint is None else self._constraint.factor
 
     @constraint_factor.setter
@@ -256,13 +257,13 @@ class KFOPC(KalmanFilter):
 
     def _require_constraint(self, name: str) -> OutputPowerConstraint:
         if self._constraint is None:
-            raise ValueError(f"{name} takes part only in a constraint: set rated_power first")
+            raise ValueError(f"{name} needs a constraint: set rated_power first")
         return self._constraint
 
     # filterpy's steps.
 
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
-        """filterpy's `predict`; arguments that would poison the filter raise before any change."""
+        """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
         n = self.dim_x
         transition = self.F if F is None else F
         require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
@@ -272,7 +273,7 @@ class KFOPC(KalmanFilter):
             super().predict(u, B, F, Q)
 
     def predict_steadystate(self, u: Any = 0, B: Any = None) -> None:
-        """filterpy's `predict_steadystate`; what would poison the filter raises before any change."""
+        """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
         with self._all_or_nothing("predict_steadystate", u=u, B=self.B if B is None else B):
             super().predict_steadystate(u, B)
 
@@ -296,7 +297,7 @@ class KFOPC(KalmanFilter):
         ------
         ValueError
             NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power
-            with neither a reference nor a secondary-path gain. The filter is as it was and can go on.
+            with neither a reference nor a secondary-path gain. The filter is unchanged and can continue.
         """
         reference = self._next_reference(z, reference)
         if z is None:
@@ -306,7 +307,7 @@ class KFOPC(KalmanFilter):
         self._scaled_step("update", lambda scaled: KalmanFilter.update(self, scaled, R, H), z, H, reference)
 
     def update_steadystate(self, z: Any, *, reference: float | None = None) -> None:
-        """filterpy's `update_steadystate` with the measurement scaled; see `update`."""
+        """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
         if z is None:
             super().update_steadystate(None)
             return
@@ -316,7 +317,7 @@ class KFOPC(KalmanFilter):
         self._scaled_step("update_steadystate", step, z, None, reference)
 
     def update_correlated(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
-        """filterpy's `update_correlated` with the measurement scaled; see `update`."""
+        """Run filterpy's `update_correlated` with the measurement scaled; see `update`."""
         if z is None:
             super().update_correlated(None)
             return
@@ -328,7 +329,7 @@ class KFOPC(KalmanFilter):
     def update_sequential(
         self, start: int, z_i: Any, R_i: Any = None, H_i: Any = None, *, reference: float | None = None
     ) -> None:
-        """filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
+        """Run filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
         if not hasattr(KalmanFilter, "update_sequential"):
             raise AttributeError("this filterpy has no update_sequential: it needs filterpy 2.0.0 or later")
         reference = self._next_reference(z_i, reference)
@@ -344,7 +345,7 @@ class KFOPC(KalmanFilter):
             raise ValueError(SILENT_REFERENCE)
 
         def step(scaled: Any) -> None:
-            # filterpy writes into these four in place: let it write into copies, so that all can be undone
+            # filterpy writes into these four in place: give it copies, so that the step can be undone
             self.x, self.y, self.K = self.x.copy(), self.y.copy(), self.K.copy()
             self.z = np.array(self.z).reshape(self.dim_z, 1)
             KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
@@ -365,7 +366,7 @@ class KFOPC(KalmanFilter):
         *,
         references: Any = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """filterpy's `batch_filter`, with the newest reference sample of each step in `references`.
+        """Run filterpy's `batch_filter`, with the newest reference sample of each step in `references`.
 
         Parameters
         ----------
@@ -382,7 +383,7 @@ class KFOPC(KalmanFilter):
         Raises
         ------
         ValueError
-            As `predict` and `update` do; the filter is then as it was before the batch.
+            As `predict` and `update`; the filter is then as it was before the batch.
         """
         if references is not None:
             references = BatchReferences(as_signal(references, "references", length=len(zs)))
@@ -400,15 +401,15 @@ class KFOPC(KalmanFilter):
         return result
 
     def get_update(self, z: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
+        """Return filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
         return super().get_update(None if z is None else self._presently_scaled(z))
 
     def residual_of(self, z: Any) -> np.ndarray:
-        """Residual of the measurement scaled by the present factor; nothing changes."""
+        """Return the residual of the measurement scaled by the present factor; nothing changes."""
         return super().residual_of(self._presently_scaled(z))
 
     def log_likelihood_of(self, z: Any) -> float:
-        """Log-likelihood of the measurement scaled by the present factor; nothing changes."""
+        """Return the log-likelihood of the measurement scaled by the present factor; nothing changes."""
         return super().log_likelihood_of(None if z is None else self._presently_scaled(z))
 
     @property
@@ -429,7 +430,7 @@ class KFOPC(KalmanFilter):
         return self._mahalanobis
 
     def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return what a copy starts from; the powers advance in place, so that even a shallow copy needs its own."""
+        """Return the state for a copy; the powers are updated in place, so even a shallow copy needs its own."""
         attributes, private = state_of(self)
         return attributes, private | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
 
@@ -442,7 +443,7 @@ class KFOPC(KalmanFilter):
             [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint]
         )
 
-    # All or nothing: what a step needs checked, and how it is undone.
+    # All or nothing: a step is checked first, and undone if it fails.
 
     def _next_reference(self, z: Any, reference: float | None) -> float | None:
         if reference is None and self._batch_references is not None:
@@ -466,7 +467,7 @@ class KFOPC(KalmanFilter):
         reference: float | None,
         start: int | None = None,
     ) -> None:
-        """Run `step` on the scaled measurement, then advance the powers; an error leaves all as it was."""
+        """Run `step` on the scaled measurement, then update the powers; an error leaves the filter unchanged."""
         sample, factor = None, self.constraint_factor
         if self._constraint is not None:
             row = np.asarray(self.H if H is None else H)
@@ -476,7 +477,7 @@ class KFOPC(KalmanFilter):
             factor = self._constraint.preview(*sample)
         with self._all_or_nothing(name):
             step(self._scaled(z, factor))
-        if factor != 1.0:  # z is kept as given, in the shape that filterpy keeps it
+        if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
             if start is None:
                 self.z = np.reshape(z, np.shape(self.z)).copy()
             else:
@@ -489,7 +490,7 @@ class KFOPC(KalmanFilter):
 
 
 class BatchReferences:
-    """Reference samples of a batch under way; a filter copied meanwhile (`Saver` does) is in no batch."""
+    """Reference samples of a running batch; a copy of the filter, such as `Saver` makes, does not get them."""
 
     def __init__(self, samples: np.ndarray) -> None:
         self.next = iter(samples.tolist()).__next__

@@ -1,4 +1,4 @@
-"""A filterpy filter with a power budget: the random-walk Kalman filter, and the best filter within the power."""
+"""A filterpy filter with a power budget: a random-walk Kalman filter, and the best control filter within the power."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     r"""Kalman filter that spends a rated output power optimally and keeps to it; a filterpy `KalmanFilter`.
 
     The state `x` is the estimate of the unconstrained control filter (eq. 1-8, without KF-OPC's constraint factor).
-    What drives the actuator is `control_filter`: among all filters of its length within the rated power the one of
-    least error, the power-constrained Wiener solution for that estimate and the recent signals (`PowerBudget`).
+    `control_filter` drives the actuator. Of all filters of its length within the rated power, it has the least error:
+    it is the power-constrained Wiener solution for that estimate and the recent signals (`PowerBudget`).
 
     Parameters
     ----------
@@ -34,17 +34,17 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     Raises
     ------
     ValueError
-        What `KFOPC.random_walk` and `PowerBudget` refuse.
+        Arguments that `KFOPC.random_walk` or `PowerBudget` refuses.
 
     See Also
     --------
-    kf_pb : the same as an active-noise-control controller.
+    kf_pb : the same filter in an active-noise-control controller.
 
     Notes
     -----
-    Observing the control signal to be zero with a variance ``q / lambda`` beside each measurement, two observations a
-    sample, has the same fixed point. But what that filter learns at one lambda it must forget at the next, over its
-    whole memory. Here lambda takes effect at once.
+    A Kalman filter with a second observation per sample, a control signal of zero with variance ``q / lambda``, has the
+    same fixed point. But after a change of lambda that filter must forget what it learnt before, which takes its whole
+    memory. Here lambda takes effect at once.
 
     Examples
     --------
@@ -91,7 +91,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
 
     @property
     def budget(self) -> PowerBudget:
-        """What finds the control filter within the power."""
+        """Power budget that finds the control filter."""
         assert self._budget is not None
         return self._budget
 
@@ -105,7 +105,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         if self._budget is not None:
             self._budget.rated_power = value  # type: ignore[assignment]  # None is refused there
         elif value is not None:
-            raise ValueError("rated_power is the budget's")
+            raise ValueError("rated_power belongs to the power budget")
 
     @property
     def control_filter(self) -> np.ndarray:
@@ -119,7 +119,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
 
     @property
     def constraint_factor(self) -> float:
-        """1: the estimate is not scaled; what keeps the power is the control filter."""
+        """Always 1: the control filter keeps the power, the estimate is not scaled."""
         return 1.0
 
     @constraint_factor.setter
@@ -128,7 +128,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
             raise ValueError(f"constraint_factor is 1 in a power budget, got {value!r}: assign rated_power instead")
 
     def control_signal(self, reference: float) -> float:
-        """Control signal y(n) for the reference x(n); call it before `update` with the same x(n)."""
+        """Return the control signal y(n) for the `reference` x(n); call it before `update` with the same x(n)."""
         return self.budget.control_signal(reference)
 
     def update(
@@ -140,29 +140,29 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         reference: float | None = None,
         control_signal: float | None = None,
     ) -> None:
-        """Correct the state with a measurement, and the control filter with what it cost.
+        """Correct the state with a measurement, then update the control filter.
 
         Parameters
         ----------
         z, R, H
-            See `KFOPC.update`; H is the filtered reference x'(n), newest sample first. With z None, a missed sample,
-            nothing advances: what was emitted meanwhile is not accounted for.
+            See `KFOPC.update`; H is the filtered reference x'(n), newest sample first. If z is None, a missed sample,
+            nothing advances, and the power emitted in that sample is not accounted for.
         reference : float
             Newest reference x(n).
         control_signal : float, optional
-            What was emitted, where it is not `control_filter` applied to the reference: after a limiter, say.
+            Emitted control signal, if it is not `control_filter` applied to the reference, for example after a limiter.
 
         Raises
         ------
         ValueError
-            As `KFOPC.update`, or no reference. The filter is as it was and can go on.
+            As `KFOPC.update`, or no reference. The filter is unchanged and can continue.
         """
         self._spend(lambda: super(PowerBudgetKalmanFilter, self).update(z, R, H), z, H, reference, control_signal)
 
     def update_steadystate(
         self, z: Any, *, reference: float | None = None, control_signal: float | None = None
     ) -> None:
-        """filterpy's `update_steadystate`; see `update`."""
+        """Run filterpy's `update_steadystate`, then update the control filter; see `update`."""
         step = super().update_steadystate
         self._spend(lambda: step(z), z, None, reference, control_signal)
 
@@ -175,7 +175,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         reference: float | None = None,
         control_signal: float | None = None,
     ) -> None:
-        """filterpy's `update_correlated`; see `update`."""
+        """Run filterpy's `update_correlated`, then update the control filter; see `update`."""
         step = super().update_correlated
         self._spend(lambda: step(z, R, H), z, H, reference, control_signal)
 
@@ -189,16 +189,16 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         reference: float | None = None,
         control_signal: float | None = None,
     ) -> None:
-        """filterpy's `update_sequential` (filterpy 2.0.0); see `update`."""
+        """Run filterpy's `update_sequential` (filterpy 2.0.0), then update the control filter; see `update`."""
         step = super().update_sequential
         self._spend(lambda: step(start, z_i, R_i, H_i), z_i, H_i, reference, control_signal)
 
     def _spend(
         self, step: Callable[[], None], z: Any, H: Any, reference: float | None, control_signal: float | None
     ) -> None:
-        """Run filterpy's step, and let the budget follow the sample; a missed one is only the step."""
+        """Run filterpy's step, then give the sample to the budget unless it was missed."""
         reference = self._next_reference(z, reference)
-        references, self._batch_references = self._batch_references, None  # this sample's is taken
+        references, self._batch_references = self._batch_references, None  # the step must not draw another
         try:
             if z is None:
                 step()
@@ -214,9 +214,9 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
             self._batch_references = references
 
     def _require_constraint(self, name: str) -> OutputPowerConstraint:
-        raise ValueError(f"{name} has no part in a power budget, which goes by the signals' correlations")
+        raise ValueError(f"{name} is not used by a power budget, which uses the correlations of the signals")
 
     def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """A copy has a budget of its own."""
+        """Return the state for a copy, with a budget of its own."""
         attributes, private = super().__getstate__()
         return attributes, private | {"_budget": deepcopy(self._budget)}

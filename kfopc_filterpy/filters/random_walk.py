@@ -19,17 +19,17 @@ from .covariance import RandomWalkCovariance, require_covariance
 from .guards import SILENT_REFERENCE, checked_measurement
 from .kfopc import KFOPC
 
-# What `correct_once` answers.
+# Outcomes of `correct_once`.
 CORRECTED, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE, OVERFLOWING_SQUARE, SILENT = range(6)
 UNTOUCHED = (NOT_FINITE, OVERFLOWING_SQUARE, SILENT)  # refused before the pass over the covariance
 
 
 @compiled()
 def correct_once(cov, constraint, weights, z, h, reference, noise, factor):
-    """Apply eq. 5-9 to `weights` and `cov`; return what became of it, the residual and S.
+    """Apply eq. 5-9 to `weights` and `cov`; return the outcome, the residual and S.
 
-    `constraint` is None in a filter without a rated power, which scales by `factor`. Nothing but the order of P's
-    arithmetic changes in an update that is refused.
+    `constraint` is None in a filter without a rated power; the measurement is then scaled by `factor`. A refused update
+    changes nothing, except that pending changes of P may be applied, which does not change its value.
     """
     nothing = 0.0 * z
     for i in range(h.size):
@@ -56,14 +56,14 @@ def correct_once(cov, constraint, weights, z, h, reference, noise, factor):
 
 
 def new_numbers() -> np.ndarray:
-    """Return the record that a filter shares with the compiled loop: its variances, and what the last update left."""
+    """Return the record that a filter shares with the compiled loop: its variances and the last update's results."""
     return new_record(
         state_noise=0.0, measurement_noise=0.0, alpha_sq=1.0, measurement=0.0, residual=0.0, variance=np.nan
     )
 
 
 def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: str) -> Any:
-    """Return a property that is made from what the last update left, unless it was assigned since."""
+    """Return a property that is computed from the last update's results, unless it was assigned since."""
 
     def get(kf: Any) -> Any:
         if name not in kf._made:
@@ -77,27 +77,26 @@ def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: s
 
 
 class _Identity:
-    """filterpy's `_I`: an identity that is made when it is used, since it is large at many taps."""
+    """filterpy's `_I`: an identity matrix that is made when it is used, since it is large at many taps."""
 
     def __get__(self, kf: Any, owner: Any = None) -> Any:
         return self if kf is None else np.eye(kf.dim_x)
 
     def __set__(self, kf: Any, value: Any) -> None:
-        """Nothing to keep."""
+        """Ignore the value."""
 
 
 class RandomWalkKFOPC(KFOPC):
-    """Kalman filter of a random-walk control filter (eq. 1-8) with output power constraint, O(L^2) a sample.
+    """Kalman filter of a random-walk control filter (eq. 1-8) with output power constraint, O(L^2) per sample.
 
-    Made by `KFOPC.random_walk`. It answers as a filterpy `KalmanFilter` with
-    F = I, Q = r I and R = q does, to rounding:
+    Made by `KFOPC.random_walk`. To rounding, it behaves like a filterpy `KalmanFilter` with F = I, Q = r I and R = q:
 
-    - `F`, `Q` and `R` read as read-only arrays. Assign a number to `Q` or `R` to change the noise.
-    - `P` reads as a full array; editing it in place counts at the next step, as in filterpy.
-    - Another F or a full Q, assigned or passed, `B` with `u`, and an H of several rows hand the step to
-      filterpy's own equations, at their O(L^3).
+    - `F`, `Q` and `R` are returned as read-only arrays. Assign a number to `Q` or `R` to change the noise.
+    - `P` is returned as a full array; editing it in place takes effect at the next step, as in filterpy.
+    - If another F or a full Q is assigned or passed, or with `B` and `u`, or an H of several rows, the step uses
+      filterpy's own equations, in O(L^3).
     - filterpy's fading memory ``alpha`` stays fast.
-    - `dtype` is the precision that P is kept in, float64 unless float32 was asked for.
+    - `dtype` is the precision in which P is stored: float64, or float32 if requested.
 
     Parameters
     ----------
@@ -156,7 +155,7 @@ class RandomWalkKFOPC(KFOPC):
         self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
         self._delegating = False
         self._numbers = new_numbers()
-        self._made: dict[str, Any] = {}  # what was read or assigned of y, z, S, SI and x_prior since the last update
+        self._made: dict[str, Any] = {}  # those of y, z, S, SI and x_prior read or assigned since the last update
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
         self.state_noise = state_noise
         self.measurement_noise = measurement_noise
@@ -164,7 +163,7 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance = RandomWalkCovariance(variance * np.eye(n_taps), precision)
 
     def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """A copy makes its own read-only views (copied arrays are writeable) and steps its own arrays."""
+        """Return the state for a copy, with its own arrays and no views (copied views would be writeable)."""
         attributes, private = super().__getstate__()
         own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
         return attributes, private | own
@@ -173,7 +172,7 @@ class RandomWalkKFOPC(KFOPC):
 
     @property
     def state_noise(self) -> float | None:
-        """State noise variance r of eq. 4; None where a full `Q` was assigned."""
+        """State noise variance r of eq. 4; None if a full `Q` was assigned."""
         return float(self._numbers["state_noise"][0]) if self._Q is None else None
 
     @state_noise.setter
@@ -246,7 +245,7 @@ class RandomWalkKFOPC(KFOPC):
 
     _I = _Identity()
 
-    # P and what follows from it, made full when read.
+    # P and the values that follow from it, computed when read.
 
     @property
     def dtype(self) -> np.dtype:
@@ -255,19 +254,19 @@ class RandomWalkKFOPC(KFOPC):
 
     @property
     def P(self) -> np.ndarray:
-        """State covariance, a full symmetric array; what is written into it counts at the next step."""
+        """State covariance, a full symmetric array; values written into it take effect at the next step."""
         return self._covariance.show()
 
     @P.setter
     def P(self, value: Any) -> None:
-        # to filterpy's equations a number is that variance for every state
+        # as in filterpy's equations, a number is the variance of every state
         P = self._matrix(value * np.eye(self.dim_x) if np.ndim(value) == 0 else value, "P")
-        if not self._delegating:  # filterpy's own equations leave rounding, which need not be small beside P
+        if not self._delegating:  # the rounding of filterpy's own equations need not be small beside P
             require_covariance(P)
         self._replace_covariance(P)
 
     def _replace_covariance(self, P: np.ndarray) -> None:
-        self._K = self.K  # it may still be derived from the arrays to be replaced
+        self._K = self.K  # compute it before the arrays that it derives from are replaced
         self._covariance = self._covariance.replaced(P)
 
     @property
@@ -321,7 +320,7 @@ class RandomWalkKFOPC(KFOPC):
         return self.x_post - (self.K * self._numbers["residual"][0]).reshape(np.shape(self.x_post))
 
     def _take_in_edits(self) -> None:
-        """Take in what was written into the array that `P` showed."""
+        """Apply what was written into an array that `P` returned."""
         edited = self._covariance.edited()
         if edited is not None:
             self.P = edited
@@ -339,7 +338,7 @@ class RandomWalkKFOPC(KFOPC):
             self._delegating = False
 
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
-        """Apply eq. 2 and 4; a full F or Q, or B with u, takes filterpy's own equations. See `KFOPC.predict`."""
+        """Apply eq. 2 and 4; a full F or Q, or B with u, uses filterpy's own equations. See `KFOPC.predict`."""
         # batch_filter passes F and Q as they are read
         F = self._F if F is None or F is self._views.get("F") else F
         Q = self._Q if Q is None or Q is self._views.get("Q") else Q
@@ -354,7 +353,7 @@ class RandomWalkKFOPC(KFOPC):
         self.x, self.x_prior = x, x.copy()
 
     def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
-        """Apply eq. 5-9; an H of several rows, or another `inv`, takes filterpy's own equations. See `KFOPC.update`."""
+        """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
         row = self.H if H is None else H
         own_inverse = self.inv is not np.linalg.inv
         if z is not None and (own_inverse or np.size(row) != self.dim_x):
@@ -368,7 +367,7 @@ class RandomWalkKFOPC(KFOPC):
             self.y, self.z = np.zeros((1, 1)), np.array([[None]])
             return
         plain = R is None and type(z) is float and type(row) is np.ndarray and row.dtype == np.float64
-        if plain and row.shape in ((self.dim_x,), (1, self.dim_x)):  # as at every sample of a loop
+        if plain and row.shape in ((self.dim_x,), (1, self.dim_x)):  # fast path: the usual types in a loop over samples
             measurement, noise, h = z, self._numbers["measurement_noise"][0], np.ascontiguousarray(row).reshape(-1)
         else:
             measurement, noise, h = self._checked(z, R, row)
@@ -385,17 +384,17 @@ class RandomWalkKFOPC(KFOPC):
         return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
-        """Apply eq. 5-9 to the arrays; return the new weights. Refusals come before any change."""
+        """Apply eq. 5-9 to the arrays; return the new weights. A refused update raises before anything changes."""
         constraint = self._constraint
         if constraint is None:
             state, factor = None, self._unconstrained_factor
         else:
             if reference is None and constraint.needs_reference:
-                constraint.preview(z, h[0], reference)  # refused, with the reason
+                constraint.preview(z, h[0], reference)  # raises, with the reason
             state, factor = constraint.state, 1.0
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
         if weights.size != self.dim_x:
-            self._weights()  # refused, with the reason
+            self._weights()  # raises, with the reason
         arrays, before, prior = self._covariance.before_update()
         x = np.nan if reference is None else reference
         outcome, y, S = correct_once(arrays, state, weights, z, h, x, noise, factor)
@@ -423,9 +422,9 @@ class RandomWalkKFOPC(KFOPC):
         raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
 
     def _weights(self) -> np.ndarray:
-        """Return x as an array of its own, (n,)."""
+        """Return x as a new array, (n,)."""
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
-        # A finite sum of squares, quick to make, tells of finite weights; squares that overflow are looked at one by one.
+        # A finite sum of squares is quick to compute and implies finite weights. If it overflows, check each weight.
         if weights.size != self.dim_x or not (isfinite(weights @ weights) or np.isfinite(weights).all()):
             raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
         return weights
@@ -434,29 +433,29 @@ class RandomWalkKFOPC(KFOPC):
         self._log_likelihood = self._likelihood = self._mahalanobis = None
         self.x, self.x_post = x, x.copy()
 
-    # A whole signal, or a sample, at compiled speed: the arrays go out, and come back advanced.
+    # Compiled steps, of one sample or of a whole signal: the arrays are handed out, updated and taken back.
 
     def steps_compiled(self) -> bool:
-        """Return whether the random walk's own equations step this filter, and not filterpy's."""
+        """Return whether this filter uses the compiled random-walk equations, and not filterpy's own."""
         return self._F is None and self._Q is None and self.inv is np.linalg.inv
 
     def compiled_arrays(self, to_step: bool = True) -> tuple[Covariance, np.ndarray]:
-        """Return the covariance arrays, `to_step` them or to read, and the variances of the filter."""
+        """Return the covariance arrays and the variances; `to_step` says if the caller will change the arrays."""
         self._take_in_edits()
         self._numbers["alpha_sq"] = self._alpha_sq
         return self._covariance.own() if to_step else self._covariance.arrays, self._numbers
 
     def go_on_from(self, shared: Covariance) -> None:
-        """Take the covariance `shared` with other filters without an update of its own."""
+        """Continue from the covariance `shared` with other filters, without an update of this filter's own."""
         self._K, prior = self.K, self.P_prior
         self._covariance.share(shared)
         self._covariance.prior = prior
         self._covariance.missed()
 
     def after_compiled(self, weights: np.ndarray, shared: Covariance | None = None) -> None:
-        """Take back the arrays after one compiled sample or more, which left `weights`, (n,), an array of its own.
+        """Adopt the results of one or more compiled samples; the filter keeps the array `weights`, (n,).
 
-        `shared` are the arrays if other filters go on from them too.
+        `shared` is the covariance arrays if other filters continue from them too.
         """
         if shared is not None:
             self._covariance.share(shared)

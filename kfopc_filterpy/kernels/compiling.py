@@ -1,8 +1,8 @@
-"""numba's `njit` as this package uses it: `compiled` for what Python calls, `part` for what only those functions call.
+"""numba's `njit` as this package uses it: `compiled` for functions that Python calls, `part` for those they call.
 
-What is compiled is kept on disk. numba looks for changes only in the file that a function stands in, but the loop has
-functions of other files compiled into it. So the folder is named after everything that could change: all sources of the
-package and the version of numba. An edit or an upgrade begins a new folder.
+Compiled code is cached on disk. numba looks for changes only in the file that defines a function, but the compiled loop
+contains functions from other files. The cache folder is therefore named after everything that can change: all sources
+of the package and the version of numba. An edit or an upgrade starts a new folder.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from numba.extending import overload
 PACKAGE = Path(__file__).parents[1]
 CONFIG: Any = numba.config
 
-# Division as in numpy: by zero it gives Inf or NaN, which the callers look for, and no exception.
+# Divide as numpy does: division by zero gives Inf or NaN, which the callers check for, and no exception.
 OPTIONS: Any = {"error_model": "numpy"}
 
 
 def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of functions that other compiled functions call: kept on disk only within those."""
+    """Compile a function that only compiled functions call; it is cached on disk only as part of them."""
     return numba.njit(**(OPTIONS | options))
 
 
-inlined = part(forceinline=True)  # for functions of a whole state: called, each would be handed every array anew
+inlined = part(forceinline=True)  # for functions of a whole state: a real call would pass every array again
 
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator of functions that Python calls: kept on disk."""
+    """Compile a function that Python calls, and cache it on disk."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         with _cache_folder():
@@ -69,10 +69,10 @@ def compiled_for_states(**options: Any) -> Callable[[Callable[..., Any]], StateE
 
 
 def by_type(default: Callable[..., Any]) -> Any:
-    """Decorator: `functools.singledispatch` for compiled callers too.
+    """Dispatch on the type of the first argument, like `functools.singledispatch`, for compiled callers too.
 
-    The type of the first argument, a NamedTuple, chooses the body: ``register(SomeState)(body)`` adds one, with the names
-    of arguments that `default` has.
+    The first argument is a NamedTuple. ``register(SomeState)(body)`` adds a body, whose argument names must be those of
+    `default`.
     """
     generic = singledispatch(default)
 
@@ -85,7 +85,7 @@ def by_type(default: Callable[..., Any]) -> Any:
 
 
 def _sources() -> str:
-    """A hash of all that is compiled, and of what compiles it."""
+    """Return a hash of all sources of the package and of numba's version."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
@@ -102,7 +102,7 @@ def _writable(folder: Path) -> bool:
 
 
 def _user_cache() -> Path:
-    """The user's folder for what can be made again."""
+    """Return the user's cache folder."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData/Local"))
     if sys.platform == "darwin":
@@ -111,7 +111,7 @@ def _user_cache() -> Path:
 
 
 def _choose_folder() -> str:
-    """Within the user's NUMBA_CACHE_DIR if there is one, else beside the sources if they can be written to."""
+    """Return a writable folder: in NUMBA_CACHE_DIR if it is set, else beside the sources, else in the user's cache."""
     chosen = CONFIG.CACHE_DIR
     parents = [Path(chosen)] if chosen else [PACKAGE / "__pycache__", _user_cache() / PACKAGE.name]
     for parent in parents:
@@ -129,7 +129,7 @@ FOLDER = _choose_folder()
 
 @contextmanager
 def _cache_folder() -> Iterator[None]:
-    """Have numba use `FOLDER`. It looks where to keep a function only once, when the function is decorated."""
+    """Make numba use `FOLDER`. numba chooses the cache folder of a function once, when it is decorated."""
     before, CONFIG.CACHE_DIR = CONFIG.CACHE_DIR, FOLDER
     try:
         yield

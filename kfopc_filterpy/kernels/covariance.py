@@ -1,13 +1,13 @@
 """Compiled arithmetic of the Kalman filter: pure functions of arrays that know no paths or controllers.
 
-The covariance is kept as the lower triangle of a square array, with what the last step still owes it::
+The covariance is stored as the lower triangle of a square array, plus changes that are still pending (`owed`)::
 
     P = scale (T - g g' / S) + diagonal I
 
-``T`` is the stored triangle, ``g`` and ``S`` the last gain direction and innovation variance (eq. 8),
-``scale`` filterpy's fading memory squared and ``diagonal`` the state noise of eq. 4. The debt is paid in the
-same pass that forms ``P x'`` for the next sample, so each element of the triangle is read and written once a
-sample, and P is symmetric because there is only one of each element.
+``T`` is the stored triangle, ``g`` and ``S`` are the last gain direction and innovation variance (eq. 8), ``scale`` is
+filterpy's fading memory squared and ``diagonal`` the state noise of eq. 4. Pending changes are applied in the same pass
+that computes ``P x'`` for the next sample, so each element of the triangle is read and written once per sample. P is
+symmetric because each element is stored only once.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from .compiling import by_type, compiled, inlined, part
 from .records import new_record
 from .vectors import FAST, copy_into, dot
 
-# If S exceeds the measurement noise by this much, the downdate cancels so many digits of P that it is done in
-# twice the precision: the first samples after a large initial variance.
+# Above this ratio of S to the measurement noise, the downdate cancels so many digits of P that it is computed in twice
+# the precision. This happens in the first samples after a large initial variance.
 CANCELLATION = 1e3
 LINE = 64  # bytes in a cache line
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
@@ -32,14 +32,14 @@ class Covariance(NamedTuple):
 
     triangle: np.ndarray  # (n or more, n or more), lower triangle T valid; rows begin at cache lines
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
-    product: np.ndarray  # (n,), P x' of the pass under way
+    product: np.ndarray  # (n,), P x' of the current pass
     owed: (
         np.ndarray
-    )  # record: scale, diagonal, inverse_S (0 if the downdate is done); last_inverse_S of the last update
+    )  # record: scale, diagonal, inverse_S (0 if no downdate is pending); last_inverse_S of the last update
 
 
 def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
-    """Return zeros whose rows begin at cache lines, the last dimension rounded up: a quarter faster from 128 taps on."""
+    """Return zeros whose rows begin at cache lines (last dimension rounded up): a quarter faster from 128 taps on."""
     *rows, columns = shape
     line = LINE // np.dtype(dtype).itemsize
     padded = (*rows, -(-columns // line) * line)
@@ -61,7 +61,7 @@ def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
 
 
 def copy_covariance(cov: Covariance) -> Covariance:
-    """Return a covariance state of its own (a plain copy of an array need not begin at a cache line)."""
+    """Return an independent copy of a covariance state (a plain array copy might not begin at a cache line)."""
     n = cov.product.size
     other = new_covariance(cov.triangle[:n, :n], cov.triangle.dtype)
     other.gain_direction[:], other.product[:] = cov.gain_direction, cov.product
@@ -71,7 +71,7 @@ def copy_covariance(cov: Covariance) -> Covariance:
 
 @inlined
 def predict_covariance(cov, alpha_sq, state_noise):
-    """Apply eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, noted and paid in the next pass."""
+    """Record eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, as pending for the next pass."""
     owed = cov.owed[0]
     owed.scale *= alpha_sq
     owed.diagonal = alpha_sq * owed.diagonal + state_noise
@@ -89,11 +89,11 @@ def scale_triangle(T, n, scale):
 def project_triangle(T, g, h, Ph, scale, diagonal, weight):
     """Set T to scale T - weight g g' + diagonal I in the lower triangle, and Ph to T h in the same pass; return h'T h.
 
-    Two rows go together, so that each load of `g`, `h` and `Ph` serves two elements. Rows are indexed as T[i, j] and
-    no row is taken out as an array, to which numba would count a reference.
+    Rows are processed in pairs, so that each load of `g`, `h` and `Ph` serves two elements. Elements are indexed as
+    T[i, j], because numba would count references to a row that is extracted as an array.
     """
     n = h.size
-    if scale != 1.0:  # only with a fading memory; within the loop below it would be a multiplication more for everyone
+    if scale != 1.0:  # only with a fading memory; in the loop below it would always cost a multiplication
         scale_triangle(T, n, scale)
     zero = T.dtype.type(0.0)
     odd = n % 2
@@ -125,7 +125,7 @@ def project_triangle(T, g, h, Ph, scale, diagonal, weight):
 
 @inlined
 def project_covariance(cov, row):
-    """Pay what is owed to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
+    """Apply the pending changes to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
 
     The value of P does not change.
     """
@@ -138,7 +138,7 @@ def project_covariance(cov, row):
 
 @inlined
 def downdate_covariance(cov, S):
-    """Apply eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', noted and paid in the next pass."""
+    """Record eq. 8, P(n|n) = P(n|n-1) - g g'/S with g = P(n|n-1) x', as pending for the next pass."""
     copy_into(cov.gain_direction, cov.product)
     owed = cov.owed[0]
     owed.inverse_S = owed.last_inverse_S = 1.0 / S
@@ -146,7 +146,7 @@ def downdate_covariance(cov, S):
 
 @part()
 def two_sum(a, b):
-    """Return a + b as the rounded sum and what rounding left (Knuth)."""
+    """Return a + b as the rounded sum and its rounding error (Knuth)."""
     total = a + b
     rest = total - a
     return total, (a - (total - rest)) + (b - rest)
@@ -154,7 +154,7 @@ def two_sum(a, b):
 
 @part()
 def two_product(a, b):
-    """Return a b as the rounded product and what rounding left (Dekker)."""
+    """Return a b as the rounded product and its rounding error (Dekker)."""
     product = a * b
     cut = SPLIT * a
     a_high = cut - (cut - a)
@@ -174,7 +174,10 @@ def add_product(total, rest, a, b):
 
 @part()
 def downdate_carefully(cov, h, noise):
-    """Apply eq. 8 in twice the precision and at once, after `project_covariance`; return False, undone, if it overflows."""
+    """Apply eq. 8 at once, in twice the precision; return False, with nothing changed, if it overflows.
+
+    `project_covariance` must come first.
+    """
     T, n = cov.triangle, h.size
     g, g_low, k, k_low = np.empty(n), np.empty(n), np.empty(n), np.empty(n)  # direction, and the gain g/S
     for i in range(n):
@@ -223,10 +226,10 @@ def correction_is_finite(w, gain_direction, innovation_over_S):
 
 @inlined
 def update_weights(cov, w, h, scaled_measurement, S, noise):
-    """Apply eq. 9 and 8 after `project_covariance`: correct `w` in place, owe the downdate; return the innovation.
+    """Apply eq. 9 and 8 after `project_covariance`: correct `w` in place, downdate P, return the innovation.
 
-    `noise` is the measurement noise in S: if S is far larger, the downdate is done in twice the precision.
-    If the innovation or a weight would not be finite, NaN is returned with nothing changed.
+    `noise` is the measurement noise in S: if S is far larger, the downdate is computed in twice the precision.
+    If the innovation or a weight would not be finite, return NaN and change nothing.
     """
     y = scaled_measurement - dot(h, w)
     if not correction_is_finite(w, cov.product, y / S):
@@ -239,10 +242,10 @@ def update_weights(cov, w, h, scaled_measurement, S, noise):
 
 @by_type
 def kalman_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
-    """Take one sample, eq. 2-9: predict, and correct the weights `w` in place; return the innovation and S.
+    """Process one sample (eq. 2-9): predict, correct the weights `w` in place, return the innovation and S.
 
-    The innovation is NaN, with nothing changed, if the step has no solution. `gains` is the covariance, or another
-    source of gains that has a body of its own.
+    If the step has no solution, the innovation is NaN and nothing has changed. `gains` is the covariance, or another
+    source of gains with a registered body.
     """
     owed = gains.owed[0]
     scale, diagonal, inverse_S = owed.scale, owed.diagonal, owed.inverse_S
@@ -258,7 +261,7 @@ def kalman_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
 
 @part()
 def take_back(cov, scale, diagonal, inverse_S, alpha_sq, state_noise):
-    """Undo, to rounding, the prediction and projection of a step that cannot be completed."""
+    """Undo, up to rounding, the prediction and projection of a step that cannot be completed."""
     T, g = cov.triangle, cov.gain_direction
     for i in range(g.size):
         T[i, i] -= alpha_sq * diagonal + state_noise
@@ -286,6 +289,6 @@ def _fill(P, T, g, scale, diagonal, weight):
 
 
 def covariance_matrix(cov: Covariance) -> np.ndarray:
-    """Return P as a full symmetric array (n, n) of its own."""
+    """Return P as a new full symmetric array (n, n)."""
     scale, diagonal, inverse_S, _ = cov.owed.item()
     return full_covariance(cov.triangle, cov.gain_direction, scale, diagonal, -scale * inverse_S)

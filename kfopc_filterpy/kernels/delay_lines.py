@@ -1,6 +1,6 @@
-"""Delay lines: the newest sample first and contiguous, no sample shifted on the way.
+"""Delay lines whose samples are contiguous, newest first, without a shift at every sample.
 
-A line is written downwards, and its taps are moved to the end once every few lengths.
+A line is filled from its end towards its start. At the start, the newest samples are copied back to the end.
 """
 
 from __future__ import annotations
@@ -9,18 +9,18 @@ import numpy as np
 
 from .compiling import inlined, part
 
-START, TAPS, HEAD = 0, 1, 2  # a delay line's first two values, and where its samples begin
+START, TAPS, HEAD = 0, 1, 2  # a delay line's first two values, and the first index of its samples
 
 
 def delay_line(taps: int) -> np.ndarray:
-    """Return a silent delay line of `taps` samples: the newest is at index line[START], where that of line[TAPS] follow."""
+    """Return a silent delay line: its line[TAPS] = `taps` samples begin, newest first, at index line[START]."""
     line = np.zeros(HEAD + 4 * taps + 64)
     line[START], line[TAPS] = line.size - taps, taps
     return line
 
 
 def refill(line: np.ndarray, samples: np.ndarray) -> None:
-    """Make `samples` (TAPS or more,), newest first, what the line holds."""
+    """Replace the contents of the line by the newest of `samples`, (taps or more,), newest first."""
     taps = int(line[TAPS])
     line[START] = line.size - taps
     line[line.size - taps :] = samples[:taps]
@@ -28,7 +28,7 @@ def refill(line: np.ndarray, samples: np.ndarray) -> None:
 
 @part()
 def push(line, sample):
-    """Make `sample` the newest one."""
+    """Add `sample` as the newest one."""
     start = np.int64(line[START]) - 1
     if start < HEAD:
         kept = np.int64(line[TAPS]) - 1

@@ -1,4 +1,4 @@
-"""NamedTuples stacked into one whose arrays have an axis more, for compiled loops over many of a kind."""
+"""NamedTuples of one type, stacked into one whose arrays have an extra leading axis, for compiled loops over them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .covariance import LINE
 
 
 def stacked(values: list[Any]) -> Any:
-    """Return one NamedTuple for several of a type: arrays and numbers get a leading axis, None stays None."""
+    """Return several NamedTuples of one type as one: arrays and numbers get a leading axis, None stays None."""
     first = values[0]
     if isinstance(first, tuple):
         return type(first)(*(stacked(list(field)) for field in zip(*values, strict=True)))
@@ -39,7 +39,10 @@ def unstack(stack: Any, i: int, value: Any) -> None:
 
 
 def member(stack: Any, i: int) -> Any:
-    """Return the i-th of stacked NamedTuples, its arrays as views; one row serves all, and so does what has `taken`."""
+    """Return the i-th of stacked NamedTuples, its arrays as views.
+
+    An array of one row, and a NamedTuple with a field `taken`, belong to all.
+    """
     raise NotImplementedError("for compiled callers")
 
 

@@ -22,7 +22,7 @@ def toeplitz_times(t, w, out):
 
 @part(fastmath=FAST)
 def toeplitz_power(t, w):
-    """Return w' T w; the correlation of w with itself costs half of T w."""
+    """Return w' T w, from the autocorrelation of w, which costs half as much as T w."""
     n = w.size
     power = t[0] * dot(w, w)
     for k in range(1, n):
@@ -37,8 +37,8 @@ def toeplitz_power(t, w):
 def solve_toeplitz(t, b, v):
     """Set v to the solution of T v = b by Levinson's recursion; return False if T is not positive definite.
 
-    The backward predictor is the forward one reversed. Kept in an array of its own, it is read in the order in which it
-    is used, and moves by one place an order without being copied.
+    The backward predictor is the forward one reversed. It has its own array, so that it is read in memory order and
+    moves by one place per order without being copied.
     """
     n = v.size
     reversed_t = t[::-1].copy()
@@ -50,7 +50,7 @@ def solve_toeplitz(t, b, v):
     v[0] = b[0] / error
     for m in range(1, n):
         ahead = reversed_t[n - 1 - m :]  # t[m - i] at i
-        back = backward[n - 1 - m :]  # the backward predictor of the last order, one later
+        back = backward[n - 1 - m :]  # the backward predictor of the last order, shifted by one place
         reflection, rest = 0.0, b[m]
         for i in range(m):
             reflection += forward[i] * ahead[i]

@@ -10,14 +10,14 @@ FAST = {"reassoc", "contract", "nsz"}
 
 @part()
 def copy_into(target, source):
-    """Set target[:] = source (numba takes two seconds to compile the slice)."""
+    """Set target[:] = source, by a loop because numba takes two seconds to compile the slice."""
     for i in range(source.size):
         target[i] = source[i]
 
 
 @part(fastmath=FAST)
 def dot(a, b):
-    """Return the inner product of two vectors of the length of the first."""
+    """Return the inner product of `a` and the first a.size elements of `b`."""
     total = 0.0
     for i in range(a.size):
         total += a[i] * b[i]
@@ -26,6 +26,6 @@ def dot(a, b):
 
 @part(fastmath=FAST)
 def add_scaled(target, factor, source, begin, end):
-    """Add factor * source to target between two indices."""
+    """Add factor * source to target at the indices begin to end - 1."""
     for k in range(begin, end):
         target[k] += factor * source[k]

@@ -1,1 +1,1 @@
-"""The plant and the loop over samples, whole signals and scenarios."""
+"""The plant, and the loop over samples, whole signals and scenarios."""

@@ -1,4 +1,4 @@
-"""The record of a run: `simulate` returns it, figures of merit and figures are computed from it."""
+"""The record of a run, which `simulate` returns; figures of merit and plots are computed from it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ..metrics import noise_reduction_db, output_power
 class SimulationResult:
     """Record of a run: its signals, read-only, and what the controller did.
 
-    A run with one channel has signals of shape (n_samples,). With several channels the channels lead: one per reference
-    microphone, per loudspeaker or per error microphone, as stated below. After a divergence the signals that the
-    controller brings about are NaN.
+    A run with one channel has signals of shape (n_samples,). With several channels, the first axis is the channel: the
+    reference microphone, the loudspeaker or the error microphone, as stated below. After a divergence, the signals that
+    depend on the controller are NaN.
 
     Attributes
     ----------
@@ -32,17 +32,17 @@ class SimulationResult:
     control_signal, amplifier_output : ndarray, shape (n_samples,) or (n_loudspeakers, n_samples)
         Control signal y before the amplifier, and y_amp after it.
     constraint_factor : ndarray, shape (n_samples,) or (n_loudspeakers, n_samples)
-        Constraint factor; 1 for a controller without a constraint, NaN for one that does not tell it.
+        Constraint factor; 1 for a controller without a constraint, NaN for one that does not report it.
     weights : ndarray or None, shape (n_rows, n_taps) or (n_rows, n_loudspeakers, n_references, n_taps)
-        Control filter after samples 0, k, 2k, ..., if ``record_weights_every=k`` was asked for.
+        Control filter after samples 0, k, 2k, ..., if ``record_weights_every=k`` was given.
     weights_time_s : ndarray or None, shape (n_rows,)
         Times of the rows of `weights` in seconds.
     disturbance_power, secondary_path_gain : ndarray or None, shape (n_samples,)
-        Power histories (eq. 10, 11), if ``record_powers=True`` was asked for.
+        Power histories (eq. 10, 11), if ``record_powers=True`` was given.
     power_weight : ndarray or None, shape (n_samples,)
-        Weight λ of the control power in a power budget, if powers were asked for and the controller has one.
+        Weight λ of the control power, if ``record_powers=True`` was given and the controller has one.
     diverged_at_s : float or None
-        Time at which the control signal passed 1e6 sqrt(rated power); None if it did not.
+        Time at which the control signal exceeded 1e6 sqrt(rated power); None if it did not.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The compiled loop: a controller and the plant, sample by sample over a stretch of signals. It names no algorithm."""
+"""The compiled loop: a controller and the plant, sample by sample over a stretch of signals, for any algorithm."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import copy_into, dot
 from ..power.amplifiers import amplify
 
-STEP = 16000  # samples between two reports of progress, or chances to interrupt a run
+STEP = 16000  # samples between two reports of progress, or two opportunities to interrupt a run
 RUNNING, DIVERGED, REFUSED = 0, 1, 2
 
 
@@ -27,7 +27,7 @@ class Plant(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """Signals of a stretch of a run, (n,) each: what goes in, and what the loop leaves."""
+    """Signals of a stretch of a run, (n,) each: three inputs, then the results of the loop."""
 
     reference: np.ndarray
     disturbance: np.ndarray
@@ -63,7 +63,7 @@ def part_of(signals, begin, end):
 
 @inlined
 def measured_reference(plant, x):
-    """Return the reference microphone's signal: the noise, and what comes back from the loudspeaker, a sample late."""
+    """Return the reference microphone's signal: the noise, plus the loudspeaker's feedback, at least a sample late."""
     taps = plant.feedback.size
     return x if taps < 2 else x + dot(plant.feedback[1:], newest(plant.output, taps - 1))
 
@@ -77,7 +77,7 @@ def anti_noise(plant, y_amplified):
 
 @inlined
 def note_weights(rows, weights, every, n):
-    """Keep the weights of sample n if it is one of the recorded; without rows none is."""
+    """Store the weights if sample n is one that is recorded; without rows, none is."""
     if rows.shape[0] > 0 and n % every == 0:
         copy_into(rows[n // every], weights)
 
@@ -86,7 +86,8 @@ def note_weights(rows, weights, every, n):
 def run(state, plant, signals, weights, limit, every, first):
     """Run a controller's `state` over a stretch, whose first sample is sample `first` of the run.
 
-    Returns the status and the number of samples done. `weights` (rows, L) takes the control filter of each `every`-th.
+    Return the status and the number of samples done. The control filter is stored in `weights`, (rows, L), at every
+    `every`-th sample.
     """
     state, plant, signals = borrowed(state), borrowed(plant), borrowed(signals)
     for k in range(signals.reference.size):

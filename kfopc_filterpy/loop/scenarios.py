@@ -1,4 +1,4 @@
-"""Many runs at the price of one filter: scenarios of one reference, whose Kalman gains are the same."""
+"""Many runs at the cost of one filter: scenarios with the same reference have the same Kalman gains."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ from .simulation import (
     switch_on_sample,
 )
 
-BLOCK = 512  # samples for which the gains are kept
+BLOCK = 512  # samples whose gains are stored at a time
 VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
-SAFE = 1e290  # a correction below does not overflow weights that are finite
+SAFE = 1e290  # a smaller correction cannot overflow finite weights
 
 
 class SharedGains(NamedTuple):
-    """The gains of a block of m samples, in place of a covariance."""
+    """The gains of a block of m samples, used instead of a covariance."""
 
     directions: np.ndarray  # (m, n or more) g_k = S_k K_k
-    norms: np.ndarray  # (m,) of g_k, which no magnitude in it exceeds
+    norms: np.ndarray  # (m,) of g_k, a bound on its elements
     variances: np.ndarray  # (m,) S_k
-    taken: np.ndarray  # (1,) samples of the block that a scenario has taken
+    taken: np.ndarray  # (1,) samples of the block that a scenario has processed
 
 
 @kalman_step.register(SharedGains)
 def shared_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
-    """Correct the weights with the gain of the sample (eq. 5, 9); the innovation is NaN if they would overflow."""
+    """Correct the weights with the gain of the sample (eq. 5, 9); return NaN as innovation if they would overflow."""
     k = gains.taken[0]
     S = gains.variances[k]
     y = scaled_measurement - dot(h, w)
@@ -70,9 +70,9 @@ def shared_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
 
 @compiled(nogil=True)
 def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
-    """Fill `gains` for the rows that end with each sample of a block; return how many have a solution.
+    """Set the gains of the samples of a block; return the number of samples before the first without a solution.
 
-    `filtered` is the filtered reference, newest sample first: n - 1 + m of them.
+    `filtered` holds n - 1 + m samples of the filtered reference, newest first.
     """
     n, m = cov.product.size, gains.variances.size
     for k in range(m):
@@ -92,7 +92,7 @@ def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
 
 @compiled(nogil=True)
 def run_scenarios(states, plants, signals, limits, status, done, begin, end):
-    """Run each scenario from sample `begin` to `end`, unless it has ended; all but the gains is stacked."""
+    """Run each scenario that has not ended from sample `begin` to `end`; all arguments but the gains are stacked."""
     no_weights = np.empty((0, 0))
     for i in range(limits.size):
         if status[i] == RUNNING:
@@ -119,27 +119,27 @@ def simulate_scenarios(
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,
 ) -> list[SimulationResult]:
-    """Run Kalman controllers that share one gain sequence, as `simulate` would run each, to rounding.
+    """Run Kalman controllers that share one gain sequence; to rounding, the results are those of `simulate` for each.
 
-    The gain (eq. 6) follows from the reference and the filter's r, q and P(0|0), not from what is measured. Scenarios
-    that differ in rated power, amplifier, disturbance, true secondary path or sensor noise therefore need the filter's
-    O(L^2) once, and O(L) each. The scenarios go on side by side and the gains are kept for one block only.
+    The gain (eq. 6) depends on the reference and the filter's r, q and P(0|0), not on the measurements. Scenarios that
+    differ in rated power, amplifier, disturbance, true secondary path or sensor noise therefore need the filter's
+    O(L^2) only once, and O(L) each. The scenarios run side by side, and only the gains of one block are stored.
 
-    What breaks the sharing: another reference (acoustic feedback makes one for each scenario: there is no
-    `feedback_path` here), estimated secondary path, r, q or P(0|0), and any observation beside the disturbance that
-    depends on the control signal, since its row would be each scenario's own.
+    Scenarios cannot share gains if they differ in the reference, the estimated secondary path, r, q or P(0|0). Acoustic
+    feedback would give each scenario its own reference, so there is no `feedback_path` here. A second observation that
+    depends on the control signal would give each scenario its own row, so it is not supported either.
 
     Parameters
     ----------
     controllers : sequence of KalmanController
-        Of `kf_anc` and `kf_opc` filters, each its own object, that agree in taps, estimated secondary path, state and
-        measurement noise, fading memory, covariance and the signals they have heard so far.
+        Separate objects with `kf_anc` or `kf_opc` filters. They must agree in taps, estimated secondary path, state and
+        measurement noise, fading memory, covariance and the signals heard so far.
     reference : array_like
-        (n_samples,) reference x of all.
+        (n_samples,) reference x, the same for all.
     secondary_path : array_like, control.TransferFunction or list of them
         True secondary path, one for all or a list with one each.
     primary_path : array_like or control.TransferFunction, optional
-        Path that makes the disturbance of all.
+        Path from the reference to the error microphone, which gives the disturbance of all.
     disturbance : array_like, optional
         (n_samples,) disturbance of all, or (n_scenarios, n_samples), in place of `primary_path`.
     fs : float, default 16000
@@ -147,12 +147,12 @@ def simulate_scenarios(
     amplifier : callable or sequence, optional
         One of the package's amplifier models for all, or one each; by default linear.
     rated_power : float, optional
-        One for all, which sets the scale of the divergence limit only; by default each controller's own.
+        Scale of the divergence limit, one for all; by default each controller's own rated power.
     sensor_noise_std : float or sequence of float, default 0
         Standard deviation of the sensor noise, one for all or one each.
     rng : int, numpy.random.Generator or sequence, optional
-        Seed of the sensor noise: one (each scenario then hears the same noise, as runs with that seed would) or one
-        each; Generators only one each.
+        Seed of the sensor noise. With one seed, each scenario has the same noise, as separate runs with that seed
+        would. Otherwise one seed each. Generators must be given one each.
     switch_on_s : float, default 0
         See `simulate`.
     record_powers : bool, default False
@@ -163,17 +163,19 @@ def simulate_scenarios(
     Returns
     -------
     list of SimulationResult
-        One for each controller. Their signals lie in one array, which any of them keeps: copy what is to be kept alone.
-        Each controller goes on from where its run ended; one that diverged, with the covariance of the end of the run.
+        One for each controller. Their signals are views of shared arrays, which stay in memory as long as any of the
+        results: copy the signals you want to keep alone. Each controller continues from the end of its run; one that
+        diverged has the covariance of the end of the whole run.
 
     Raises
     ------
     ValueError
-        Controllers that do not share, saying which and in what; lists of another length; what `simulate` refuses. In
-        the midst of a run: weights that would overflow, an update without a solution. The controllers are then as they
-        were, but for what they heard before they were switched on; so are they after an interruption.
+        Controllers that cannot share gains (the message says which and why), lists of another length, or arguments that
+        `simulate` refuses. During a run: weights that would overflow, or an update without a solution. The controllers
+        are then unchanged, except for what they heard before they were switched on. The same holds after an
+        interruption.
     TypeError
-        Something that is no `KalmanController`, or an amplifier that is none of the models.
+        An object that is not a `KalmanController`, or an amplifier that is not one of the package's models.
 
     Examples
     --------
@@ -255,7 +257,7 @@ def _signals(x: np.ndarray, d: np.ndarray, noises: list[SensorNoise], recorded: 
 
 
 def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
-    """States of the controllers for the compiled loop, or an error that says which one differs in what."""
+    """Return the controllers' states for the compiled loop, or raise an error that names a difference."""
     if not controllers:
         raise ValueError("controllers must hold one controller at least")
     states = []
@@ -263,7 +265,7 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
         if not isinstance(controller, FilteredReferenceController) or not controller.has_gains:
             raise TypeError(f"controllers[{i}] must be a KalmanController, got {controller!r}")
         if any(controller is other or _filter(controller) is _filter(other) for other in controllers[:i]):
-            raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs a controller of its own")
+            raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs its own controller")
         controller.require_sample_rate(fs)
         state = controller.compiled_state(to_step=False)
         if state is None:
@@ -287,7 +289,7 @@ def _filter(controller: Any) -> Any:
 
 
 def _difference(one: Any, other: Any) -> str | None:
-    """In what two states do not share, in words."""
+    """Return what prevents two states from sharing gains, in words; None if nothing does."""
     if one.weights.size != other.weights.size:
         return "n_taps"
     if one.gains.triangle.dtype != other.gains.triangle.dtype:
@@ -311,7 +313,7 @@ def _difference(one: Any, other: Any) -> str | None:
 
 
 def _each(value: Any, count: int, name: str) -> list[Any]:
-    """One for each scenario: a list, tuple or array as it is, anything else for all."""
+    """Return a list of one value per scenario: from a list, tuple or array, or the same value for all."""
     if not isinstance(value, list | tuple) and np.ndim(value) == 0:
         return [value] * count
     if len(value) != count:
@@ -320,14 +322,14 @@ def _each(value: Any, count: int, name: str) -> list[Any]:
 
 
 def _several(value: Any) -> bool:
-    """Whether it is a list of signals or paths, and not one of them."""
+    """Return whether `value` is a list of signals or paths, and not a single one."""
     if isinstance(value, np.ndarray):
         return value.ndim > 1
     return isinstance(value, list | tuple) and len(value) > 0 and (is_system(value[0]) or np.ndim(value[0]) > 0)
 
 
 def _seeds(rng: Any, count: int) -> list[Any]:
-    """Seeds or generators; a generator serves one scenario, or they would draw from it in turns."""
+    """Return seeds or Generators, one each. A Generator must not be shared: scenarios would draw from it in turns."""
     each = _each(rng, count, "rng")
     generators = [id(one) for one in each if isinstance(one, np.random.Generator)]
     if len(set(generators)) < len(generators):
@@ -336,7 +338,7 @@ def _seeds(rng: Any, count: int) -> list[Any]:
 
 
 def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, count: int) -> np.ndarray:
-    """(count, n_samples), one row where one serves all; an array of its own."""
+    """Return the disturbances as a new array (count, n_samples), or (1, n_samples) if all have the same one."""
     if not _several(disturbance):
         return disturbance_at_microphone(x, primary_path, disturbance, fs)[None].copy()
     each = _each(disturbance, count, "disturbance")
@@ -344,7 +346,7 @@ def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float,
 
 
 def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
-    """(count, taps), shorter ones with zeros at the end."""
+    """Return the paths as an array (count, taps), shorter ones padded with zeros."""
     paths = _each(secondary_path, count, "secondary_path") if _several(secondary_path) else [secondary_path] * count
     taps = [path_taps(path, fs=fs, name="secondary_path") for path in paths]
     stacked = np.zeros((count, max(t.size for t in taps)))
@@ -363,7 +365,7 @@ def _model(amplifier: Amplifier | None) -> np.ndarray:
 
 
 class _GainSequence:
-    """The gains of a run, a block at a time in the same arrays, from a copy of the covariance."""
+    """The gains of a run, computed block by block in the same arrays, from a copy of the covariance."""
 
     def __init__(self, state: Any, x: np.ndarray) -> None:
         self.covariance: Covariance = copy_covariance(state.gains)
@@ -378,12 +380,12 @@ class _GainSequence:
         )  # n - 1 samples before the first
 
     def refill(self, lines: Lines) -> None:
-        """Make the end of the run what the delay lines hold."""
+        """Fill the delay lines with the end of the run."""
         refill(lines.reference, self._reference[::-1])
         refill(lines.filtered, self._filtered[::-1])
 
     def blocks(self) -> Iterator[tuple[int, SharedGains, int]]:
-        """Yield the first sample of each block, its gains, and how many of them have a solution."""
+        """Yield the first sample of each block, its gains, and how many of them were computed before a failure."""
         n = self.n_taps
         for first in range(0, self.n_samples, BLOCK):
             m = min(BLOCK, self.n_samples - first)

@@ -1,4 +1,4 @@
-"""The modified ANC structure of the paper's block diagrams: controller + amplifier + paths -> a frozen result."""
+"""The modified ANC structure of the paper's block diagrams: simulate a controller, an amplifier and the paths."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..power.constraint import DEFAULT_FS
 from .result import SimulationResult
 from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
-DIVERGENCE_LIMIT = 1e6  # control signal over sqrt(rated power) past which a run stops
+DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
 RECORDED = ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor")
 POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request
 
@@ -45,34 +45,36 @@ def simulate(
 ) -> SimulationResult:
     """Run a controller in the modified ANC structure.
 
-    Each sample: the control signal from the last weights, the amplifier, the error e = d - s*y_amp, the controller's
-    update. Single channel. The built-in controllers run at compiled speed; a user's own is called sample by sample.
+    For each sample, compute the control signal from the last weights, the amplifier's output and the error
+    e = d - s*y_amp, then update the controller. There is one channel. Built-in controllers run at compiled speed; a
+    user-defined controller is called sample by sample.
 
     Parameters
     ----------
     controller : Controller
-        Goes on from the state it is in, with paths that start silent; make a new one for a fresh run.
+        Controller. It continues from its present state, while the paths start silent: make a new one for a fresh run.
     reference : array_like
         (n_samples,) reference x.
     secondary_path : array_like or control.TransferFunction
         True secondary path s, loudspeaker amplifier to error microphone.
     primary_path : array_like or control.TransferFunction, optional
-        Path from the reference to the error microphone, which makes the disturbance p*x.
+        Path from the reference to the error microphone, which gives the disturbance p*x.
     disturbance : array_like, optional
         (n_samples,) disturbance d, in place of `primary_path`.
     fs : float, default 16000
-        Sample rate in Hz; systems given must have it.
+        Sample rate in Hz; paths given as systems must have the same.
     amplifier : callable, optional
-        Amplifier model, by default linear; any function of a sample that returns a finite number.
+        Amplifier model, or any function of a sample that returns a finite number; by default linear.
     rated_power : float, optional
-        Rated power, by default the controller's; it sets the scale of the divergence limit (1 where neither says).
+        Rated power, which sets the scale of the divergence limit; by default the controller's, or 1 if it has none.
     sensor_noise_std : float, default 0
         Standard deviation of white noise at the error microphone.
     rng : int or numpy.random.Generator, optional
-        Seed of the sensor noise, needed where there is any.
+        Seed of the sensor noise; required if there is any.
     switch_on_s : float, default 0
         Time at which the control is switched on. Until then the loudspeaker is silent and the controller listens
-        (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts there.
+        (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts at that
+        time.
     feedback_path : array_like or control.TransferFunction, optional
         Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
     record_weights_every : int, optional
@@ -82,21 +84,22 @@ def simulate(
     progress : callable, optional
         Called with the number of samples done since its last call, such as `tqdm.update`.
     compiled : bool, default True
-        False: call the controller sample by sample even where a compiled loop exists, with equal results.
+        False: call the controller sample by sample even if it has a compiled loop; the results are equal.
 
     Returns
     -------
     SimulationResult
-        Divergence is a result: past ``1e6 sqrt(rated_power)`` the run stops and `diverged_at_s` says when.
+        Record of the run. If the control signal exceeds ``1e6 sqrt(rated_power)``, the run stops without an error, and
+        `diverged_at_s` is the time.
 
     Raises
     ------
     ValueError
         Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
-        `primary_path` and `disturbance`; a feedback path without delay. Nothing was changed. In the midst of a run: an
-        amplifier that returns NaN, or an update without a solution (a silent reference with q = 0).
+        `primary_path` and `disturbance`; a feedback path without delay. Nothing was changed. During a run: an amplifier
+        that returns NaN, or an update without a solution (a silent reference with q = 0).
     TypeError
-        A controller without `control_signal` and `update`, an amplifier that is no function.
+        A controller without `control_signal` and `update`, or an amplifier that is not a function.
 
     Examples
     --------
@@ -165,10 +168,10 @@ def simulate(
 
 
 def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
-    """Samples before the control is switched on."""
+    """Return the number of samples before the control is switched on."""
     on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     if on >= n_samples:
-        raise ValueError("switch_on_s must leave samples to control: it takes the whole signal")
+        raise ValueError("switch_on_s must leave samples to control: it covers the whole signal")
     return on
 
 
@@ -179,7 +182,7 @@ def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
 
 
 def _stretch(x: np.ndarray, d: np.ndarray, noise: SensorNoise) -> Stretch:
-    """Return the signals of a stretch: what goes in, and room for what the loop leaves."""
+    """Return the signals of a stretch: the inputs, and room for the results of the loop."""
     left = np.full((len(RECORDED + POWERS), x.size), np.nan)
     return Stretch(x, d, np.zeros(x.size) + noise.take(x.size), *left)
 
@@ -195,16 +198,16 @@ def _run_compiled(
     first: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
-    """Call `run.run`."""
+    """Run a stretch by `run.run`."""
     try:
         status, done = run(state, plant, stretch, weights, limit, every, first)
-    finally:  # interrupted or not, the controller is as its last sample left it
+    finally:  # even if interrupted, the controller must have the state of its last sample
         controller.after_compiled(state)
     if progress:
         progress(done)
     if status == REFUSED:
         with _naming_sample(first + done):
-            controller.update(float(stretch.error[done]))  # refused again, with the reason
+            controller.update(float(stretch.error[done]))  # raises, with the reason
             raise ValueError(NO_SOLUTION)
     return status, done
 
@@ -220,7 +223,7 @@ def _run_steps(
     first: int,
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
-    """Make the loop of `run.run`, one call of the controller at a time."""
+    """Run a stretch like `run.run`, but call the controller for each sample."""
     for k in range(stretch.reference.size):
         with _naming_sample(first + k):
             x = reference_once(plant, stretch.reference[k])
@@ -247,7 +250,7 @@ def _run_steps(
 
 @contextmanager
 def _naming_sample(n: int) -> Iterator[None]:
-    """Tell of an error in which sample of the run it came."""
+    """Add to an error the number of the sample in which it occurred."""
     try:
         yield
     except Exception as error:
@@ -256,7 +259,7 @@ def _naming_sample(n: int) -> Iterator[None]:
 
 
 def _as_sample(value: Any, source: str) -> float:
-    """What a user's function returned, NaN included, as a float."""
+    """Return the result of a user's function, NaN included, as a float."""
     try:
         return float(np.asarray(value).reshape(()))
     except (TypeError, ValueError) as error:
@@ -264,7 +267,7 @@ def _as_sample(value: Any, source: str) -> float:
 
 
 def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
-    """(n_samples,) d, as given or p*x."""
+    """Return the disturbance d, (n_samples,), as given or as p*x."""
     if (primary_path is None) == (disturbance is None):
         raise ValueError("give either primary_path= or disturbance=, not both and not neither")
     if disturbance is not None:
@@ -273,14 +276,14 @@ def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any
 
 
 class SensorNoise:
-    """White noise, made a stretch at a time."""
+    """White noise, drawn stretch by stretch."""
 
     def __init__(self, std: float, rng: Any) -> None:
         self.std = as_nonnegative(std, "sensor_noise_std")
         self.rng = as_generator(rng) if self.std > 0 else None
 
     def take(self, n_samples: int) -> np.ndarray | float:
-        """The next samples; 0 where there is no noise."""
+        """Return the next samples, or 0 if there is no noise."""
         return 0.0 if self.rng is None else self.std * self.rng.standard_normal(n_samples)
 
 
@@ -294,7 +297,7 @@ def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None,
                 f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0"
             )
     model = compiled_model(amplifier)
-    if model is None:  # a user's own: applied in the loop of steps
+    if model is None:  # a user's function: `_run_steps` applies it
         model = LinearAmplifier().model
     return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), model)
 

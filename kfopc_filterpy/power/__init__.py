@@ -1,4 +1,4 @@
-"""What keeps or spends a rated output power: constraint, budget, limiter, amplifier models."""
+"""Rated output power: constraint factor, power budget, limiter and amplifier models."""
 
 import lazy_loader
 

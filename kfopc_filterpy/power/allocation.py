@@ -1,14 +1,14 @@
-"""The power-constrained control filter that a Kalman filter's estimate calls for, compiled.
+"""The power-constrained control filter for a Kalman filter's estimate, compiled.
 
-The estimate w of the unconstrained control filter is all that the disturbance has to say: with the optimal
-``w`` the error power of a control filter v is ``E[e^2] = J + (v - w)' R_x' (v - w)``. The least of it within
-``v' R_x v <= rho`` is therefore
+The unconstrained control filter w contains all that matters of the disturbance: with the optimal ``w``, the error power
+of any control filter v is ``E[e^2] = J + (v - w)' R_x' (v - w)``. Its minimum within ``v' R_x v <= rho`` is therefore
+given by
 
     (R_x' + lambda R_x) v = R_x' w,    lambda >= 0 such that v' R_x v = rho,
 
 the power-constrained Wiener solution, with the correlations R_x, R_x' of reference and filtered reference. Both are
-Toeplitz here: the correlations of a stretch of the signal with zeros around it, which makes them positive
-semidefinite to rounding (they are the Fourier transform of a power spectrum).
+Toeplitz here: they are the correlations of a stretch of signal with zeros around it. Being the Fourier transform of a
+power spectrum, they are positive semidefinite to rounding.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from ..kernels.compiling import part
 from ..kernels.toeplitz import solve_toeplitz, toeplitz_power, toeplitz_times
 from ..kernels.vectors import add_scaled, copy_into
 
-RIDGE = 1e-7  # of R_x'[0], on v - w: decides what no signal excites
-POWER_TOLERANCE = 0.005  # of the power that the filter is solved for
+RIDGE = 1e-7  # of R_x'[0], a penalty on v - w: it decides in the directions that no signal excites
+POWER_TOLERANCE = 0.005  # relative error of the power that is solved for
 TRIES = 20
-NEAR = 1e-6  # of E[x'^2]/E[x^2] to its inverse: where a search may start from
+NEAR = 1e-6  # a search starts from the last lambda if NEAR < lambda / gain < 1 / NEAR, with gain = E[x'^2]/E[x^2]
 
 
 @part()
 def constrained_filter(of_x, of_xf, w, power, weight, v):
     """Set v to the power-constrained filter and return lambda; the search starts from lambda = `weight`.
 
-    `of_x`, `of_xf` are the first rows of R_x and R_x'. 1/sqrt(v' R_x v) grows with lambda and is nearly straight (for
-    a flat secondary path exactly): the secular equation of trust-region methods (Hebden; More and Sorensen), solved
-    here by secants within a bracket (the Illinois rule). Where that fails the estimate is scaled, which keeps the
-    power in any case, and lambda is infinite.
+    `of_x`, `of_xf` are the first rows of R_x and R_x'. 1/sqrt(v' R_x v) grows with lambda and is nearly linear (exactly
+    linear for a flat secondary path): this is the secular equation of trust-region methods (Hebden; More and Sorensen).
+    It is solved by secants within a bracket (the Illinois rule). If that fails, the estimate is scaled, which always
+    keeps the power, and lambda is infinite.
     """
     free = toeplitz_power(of_x, w)
     if free <= power:
@@ -85,7 +85,7 @@ def constrained_filter(of_x, of_xf, w, power, weight, v):
 
 @part()
 def scaled_filter(w, factor, v):
-    """Set v to w times the factor that keeps the power, and return the weight that says so."""
+    """Set v to `factor` times w, and return Inf, the lambda of a scaled estimate."""
     for i in range(w.size):
         v[i] = factor * w[i]
     return np.inf

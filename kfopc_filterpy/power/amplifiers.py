@@ -23,7 +23,7 @@ LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
 
 @part()
 def amplify(amplifier, y):
-    """Return the output for one sample of an amplifier given by its record."""
+    """Return the output for one sample y; `amplifier` is the record of a model."""
     model = amplifier[0]
     if model.kind == HARD_CLIP:
         return min(max(y, -model.limit), model.limit)
@@ -31,7 +31,7 @@ def amplify(amplifier, y):
         ratio, p = abs(y) / model.limit, model.sharpness
         if ratio <= 1.0:
             return y / (1.0 + ratio ** (2.0 * p)) ** (0.5 / p)
-        return math.copysign(model.limit, y) / (1.0 + ratio ** (-2.0 * p)) ** (0.5 / p)  # no power overflows
+        return math.copysign(model.limit, y) / (1.0 + ratio ** (-2.0 * p)) ** (0.5 / p)  # this form does not overflow
     return y
 
 
@@ -43,13 +43,13 @@ def _amplify_all(model, signal, out):
 
 @dataclass(frozen=True)
 class _Amplifier:
-    """Callable on numbers and arrays."""
+    """Base of the amplifier models: callable on numbers and arrays."""
 
     kind: ClassVar[int] = LINEAR
 
     @property
     def model(self) -> np.ndarray:
-        """Record of kind, limit and sharpness, which the compiled loop reads."""
+        """Record of kind, limit and sharpness for the compiled loop."""
         limit, sharpness = getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)
         return new_record(kind=self.kind, limit=limit, sharpness=sharpness)
 
@@ -80,7 +80,7 @@ class HardClipAmplifier(_Amplifier):
     Parameters
     ----------
     limit : float
-        Largest output amplitude; ``sqrt(2 rated_power)`` lets a sine of the rated power through unharmed.
+        Largest output amplitude; with ``sqrt(2 rated_power)``, a sine of the rated power is not clipped.
 
     Examples
     --------
@@ -105,7 +105,7 @@ class SoftSaturationAmplifier(_Amplifier):
     limit : float
         Amplitude a that the output approaches.
     sharpness : float, default 2
-        Exponent p: the larger, the nearer to a hard clip.
+        Exponent p; the larger, the closer to a hard clip.
 
     References
     ----------
@@ -127,11 +127,11 @@ class SoftSaturationAmplifier(_Amplifier):
         object.__setattr__(self, "sharpness", as_positive(self.sharpness, "sharpness"))
 
 
-Amplifier = Callable[[Any], Any]  # a user's own may be any function of a sample
+Amplifier = Callable[[Any], Any]  # any function of a sample
 
 
 def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
-    """Return the model for the compiled loop (None stands for linear); None for a user's own, a subclass included."""
+    """Return a model's record for the compiled loop, linear for None; return None for a user's function or subclass."""
     if amplifier is None:
         return LinearAmplifier().model
     if isinstance(amplifier, type):

@@ -1,7 +1,7 @@
 """The power budget: from the unconstrained control filter to the best one within the rated power, sample by sample.
 
-`allocation` solves for the control filter; here stand the three things it has to be told: the correlations of the
-recent signals, how loud they are becoming, and what the power spent so far has left to spend.
+`allocation` solves for the control filter. This module computes what it needs: the correlations of the recent signals,
+a forecast of their level, and a target power that accounts for the power spent so far.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from .constraint import DEFAULT_FS, SILENCE
 
 DEFAULT_CORRELATION_MEMORY_S = 1.25
 DEFAULT_CREDIT_S = 0.1
-SHORT, USUAL, LONG = 6, 10, 24  # whole segments that a window may have; one more is being filled
-AGREEMENT = 1.0  # squared difference of two windows' levels over the sum of their variances, above which they differ
-DEBT_S = 1.0  # overspending beyond this much of the rated power is forgotten, so that no burst can wind the account up
-REPAYMENT = 3.0  # 1/s: what the account holds changes the target by this share of itself
-PATIENCE = 6.0  # 1/s: and by less, the more of the account chance makes
+SHORT, USUAL, LONG = 6, 10, 24  # complete segments in a window; one more is being filled
+AGREEMENT = 1.0  # levels differ if their squared difference exceeds this multiple of the sum of their variances
+DEBT_S = 1.0  # seconds of rated power; more debt is forgotten, so that no burst can wind up the account
+REPAYMENT = 3.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account / (1 + PATIENCE chance))
+PATIENCE = 6.0  # 1/s: repayment is slower if much of the account is due to chance
 LARGEST_CHANCE_S = 0.5
-UNSPENT_S = 4.0  # memory of the share that was spent
-UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # what is left of 100 % raises the target by ten times that, 30 % at most
+UNSPENT_S = 4.0  # memory of the share of the rated power that was spent
+UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # an unspent share raises the target by ten times itself, 30 % at most
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
 INTERVAL = 128  # samples between two solutions; fewer at the start
-STEADY = 6.0  # a trend counts where it is larger than sqrt(this) times its standard error
-SHORTEST_PART = 0.25  # of a segment, for its power to count
+STEADY = 6.0  # a trend counts if it is larger than sqrt(STEADY) times its standard error
+SHORTEST_PART = 0.25  # of a segment: a shorter part is ignored
 X, XF = 0, 1  # the reference and the filtered reference, in the correlations
-FORECAST_LEAST, FORECAST_MOST = 0.5, 4.0  # change of power that a trend may foretell; see choose_span for the lower
+FORECAST_LEAST, FORECAST_MOST = 0.5, 4.0  # bounds of the forecast change of power; the lower one is cautious
 
 
 class BudgetState(NamedTuple):
-    """What the compiled functions below read and advance."""
+    """State that the compiled functions below read and update."""
 
     control_filter: np.ndarray  # (L,) v, which makes the control signal
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x'
-    own: np.ndarray  # (2, LONG + 1, L) sums of products of a segment's samples at lags 0 ... L - 1: of x, and of x'
-    across: np.ndarray  # (2, LONG + 1, L) the same of its samples with samples before it
+    own: np.ndarray  # (2, LONG + 1, L) for x and x': sums of products of a segment's samples at lags 0 ... L - 1
+    across: np.ndarray  # (2, LONG + 1, L) the same, of its samples with samples before it
     counts: np.ndarray  # (LONG + 1,) samples in each segment
     numbers: np.ndarray  # record: rated power, account, lambda, ...; see `PowerBudget`
 
 
 @part()
 def take_correlations(budget, x, xf):
-    """Products of the newest x and x' with those before.
+    """Add the products of the newest x and x' with earlier samples to the correlations.
 
-    Those that reach back before the segment are kept apart: for the oldest segment of the window they are left out,
-    so that the sum is the correlation of a stretch of signal with zeros around it.
+    Products with samples before the segment are stored separately. They are left out for the oldest segment of the
+    window, so that the sum is the correlation of a stretch of signal with zeros around it.
     """
     push(budget.reference, x)
     push(budget.filtered, xf)
@@ -78,19 +78,20 @@ def take_correlations(budget, x, xf):
 
 @part()
 def choose_span(budget):
-    """Set the window: long where the level is the same as of late but for chance, short where it has risen.
+    """Choose the window: short if the level has risen, long if its changes can be due to chance.
 
-    Chance is the scatter of neighbouring segments' powers (von Neumann): bursts, which come and go, are averaged over
-    long; of a swelling noise neighbours are alike, and any difference between the means of two windows counts. (A rule
-    of intersecting confidence intervals, after Goldenshluger and Nemirovski.) That the noise has become softer is believed
-    more slowly than that it has become louder: a pause between bursts is no reason to spend more on the next one.
+    Chance is estimated from the differences of neighbouring segments' powers (von Neumann). They are large for bursts,
+    which are then averaged over a long window. They are small for a noise that swells, so that even a small difference
+    between the means of two windows counts. (This is a rule of intersecting confidence intervals, after Goldenshluger
+    and Nemirovski.) The estimate follows a fall of the level more slowly than a rise: a pause between bursts is no
+    reason to spend more on the next one.
     """
     numbers = budget.numbers[0]
     numbers.span, numbers.chance = USUAL, 0.0
     usual, variance, _ = _mean_level(budget, USUAL)
     if not usual > SILENCE:
         return
-    # Of a segment it is a dozen times that of the mean; at the start, with fewer segments, this errs towards patience.
+    # A segment's variance is 12 times the mean's. With fewer segments, at the start, this overestimates the chance.
     chance = math.sqrt(2.0 * SHORT * variance * numbers.segment / numbers.fs)
     numbers.chance = min(chance, LARGEST_CHANCE_S)
     short, short_variance, _ = _mean_level(budget, SHORT)
@@ -103,7 +104,7 @@ def choose_span(budget):
 
 @part()
 def _mean_level(budget, span):
-    """Mean power of x' in the newest segments, its relative variance by chance, and how many they are."""
+    """Return the mean power of x' in the newest segments, its relative variance by chance, and their number."""
     total = weight = 0.0
     for j in range(span + 1):
         share = _share(budget, j)
@@ -127,7 +128,7 @@ def _mean_level(budget, span):
 
 @part()
 def sum_correlations(budget, of_x, of_xf):
-    """First rows of R_x and R_x' over the window, as means."""
+    """Set the first rows of R_x and R_x' to the means over the window."""
     count, kept, span, current = 0.0, len(budget.counts), budget.numbers[0].span, budget.numbers[0].current
     for k in range(of_x.size):
         of_x[k] = of_xf[k] = 0.0
@@ -135,7 +136,7 @@ def sum_correlations(budget, of_x, of_xf):
         i = (current - j) % kept
         add_scaled(of_x, 1.0, budget.own[X, i], 0, of_x.size)
         add_scaled(of_xf, 1.0, budget.own[XF, i], 0, of_x.size)
-        if j < span:  # the oldest segment knows nothing before it
+        if j < span:  # zeros precede the oldest segment
             add_scaled(of_x, 1.0, budget.across[X, i], 0, of_x.size)
             add_scaled(of_xf, 1.0, budget.across[XF, i], 0, of_x.size)
         count += budget.counts[i]
@@ -146,10 +147,10 @@ def sum_correlations(budget, of_x, of_xf):
 
 @part()
 def level_forecast(budget, mean_power):
-    """Power of x' now over its mean in the window, where a trend stands out.
+    """Return the ratio of the present power of x' to its mean in the window; 1 unless there is a significant trend.
 
-    A straight line through the logarithm of the segments' powers. Its slope is shrunk by what its scatter would make
-    of a steady noise (James and Stein), so that bursts, which scatter, are averaged and a swelling noise is followed.
+    The trend is a straight line through the logarithm of the segments' powers. Its slope is shrunk by the part that
+    scatter alone would cause (James and Stein). Bursts scatter, so they are averaged; a swelling noise is followed.
     """
     floor, segments = 1e-12 * mean_power, budget.numbers[0].span + 1
     weight = times = levels = 0.0
@@ -175,7 +176,7 @@ def level_forecast(budget, mean_power):
     if not slope * slope > STEADY * error:
         return 1.0
     slope *= 1.0 - STEADY * error / (slope * slope)
-    mean = 0.0  # of the power along the line, over that at its middle
+    mean = 0.0  # mean power along the line, over the power at its middle
     for j in range(segments):
         mean += _share(budget, j) / weight * math.exp(slope * (_age(budget, j) - times))
     return min(max(math.exp(-slope * times) / mean, FORECAST_LEAST), FORECAST_MOST)
@@ -183,31 +184,31 @@ def level_forecast(budget, mean_power):
 
 @part(forceinline=True)
 def _share(budget, j):
-    """How much of the j-th newest segment is there; the very beginning of one says too little to count."""
+    """Return the filled share of the j-th newest segment, 0 if it is too short to count."""
     count = budget.counts[(budget.numbers[0].current - j) % len(budget.counts)] / budget.numbers[0].segment
     return count if count >= SHORTEST_PART else 0.0
 
 
 @part(forceinline=True)
 def _age(budget, j):
-    """Middle of the j-th newest segment, in segments from now (negative)."""
+    """Return the time of the middle of the j-th newest segment, in segments from now (negative)."""
     newest_part = budget.counts[budget.numbers[0].current] / budget.numbers[0].segment
     return -0.5 * newest_part if j == 0 else -newest_part - j + 0.5
 
 
 @part(forceinline=True)
 def _power(budget, j):
-    """Power of x' in the j-th newest segment, of which some is there."""
+    """Return the power of x' in the j-th newest segment, which must not be empty."""
     i = (budget.numbers[0].current - j) % len(budget.counts)
     return budget.own[XF, i, 0] / budget.counts[i]
 
 
 @part()
 def target_power(budget, forecast):
-    """Power to solve for: the rated one, corrected by the account, over what the level is forecast to become.
+    """Return the power to solve for: the rated one, corrected by the account, over the forecast change of level.
 
-    Debt is repaid at once, the more patiently the more of it chance makes; of credit, half of what chance makes in a
-    second is left to even out by itself: to chase chance would cost noise reduction.
+    Repayment of debt starts at once, but is slower the larger `chance` is. Credit of up to half of `chance` is left to
+    even out by itself: to react to chance would cost noise reduction.
     """
     numbers = budget.numbers[0]
     account, chance = numbers.account, numbers.chance
@@ -218,10 +219,10 @@ def target_power(budget, forecast):
 
 @part()
 def unspent(numbers):
-    """Factor of the target for power that was left of late, beyond what chance makes of a mean over that time.
+    """Return the factor that raises the target if, beyond what chance explains, power was recently left unspent.
 
-    Credit that could not be spent in time is lost to the account. For noise that swells that is a part of the power at
-    each swell, since falls of the level are believed slowly; the noise's own past tells how large a part.
+    The account loses credit that could not be spent in time. A noise that swells loses a part of the power at each
+    swell, since falls of the level are followed slowly. How large a part is measured from the noise's own past.
     """
     left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT_S)
     return min(1.0 + UNSPENT_GAIN * max(left, 0.0), UNSPENT_MOST)
@@ -233,7 +234,7 @@ def allocate(budget, w):
     of_x, of_xf = np.empty(budget.control_filter.size), np.empty(budget.control_filter.size)
     choose_span(budget)
     sum_correlations(budget, of_x, of_xf)
-    if not of_x[0] > SILENCE:  # nothing was heard: nothing to go by
+    if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
     power = target_power(budget, level_forecast(budget, of_xf[0]))
     budget.numbers[0].weight = constrained_filter(
@@ -243,7 +244,7 @@ def allocate(budget, w):
 
 @part()
 def advance_budget(budget, w, x, xf, y):
-    """Take a sample: reference, filtered reference and emitted control signal; solve anew where it is time to."""
+    """Process a sample of reference, filtered reference and emitted control signal; solve again if it is due."""
     numbers = budget.numbers[0]
     take_correlations(budget, x, xf)
     spent = numbers.account + (y * y / numbers.rated_power - 1.0) / numbers.fs
@@ -252,7 +253,7 @@ def advance_budget(budget, w, x, xf, y):
         numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT_S * numbers.fs)
     numbers.taken += 1.0
     numbers.waited += 1.0
-    # At the start, when the estimate grows fast, after every eighth part of the time so far.
+    # At the start the estimate grows fast, so the interval is an eighth of the time so far.
     if numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
         numbers.waited = 0.0
         allocate(budget, w)
@@ -260,7 +261,7 @@ def advance_budget(budget, w, x, xf, y):
 
 @compiled(fastmath=FAST)
 def control_sample(budget, x):
-    """v' x(n) for a reference sample that the budget has not taken yet."""
+    """Return v' x(n) for a reference sample that the budget has not processed yet."""
     v, before = budget.control_filter, newest(budget.reference, budget.control_filter.size)
     total = v[0] * x
     for k in range(1, v.size):
@@ -281,29 +282,30 @@ def listen_sample(budget, x, xf):
 
 
 class PowerBudget:
-    r"""Best use of a rated power: the control filter for an estimate of the unconstrained one.
+    r"""Best use of a rated power: the power-constrained control filter for an estimate of the unconstrained one.
 
-    An adaptive filter estimates the control filter w that would be best without a limit; every few milliseconds the
-    budget finds the one that is best within the power,
+    An adaptive filter estimates the control filter w that would be best without a limit. Every few milliseconds the
+    budget finds the filter v that is best within the power,
 
     .. math:: (R_{x'} + \lambda R_x) v = R_{x'} \hat w, \qquad v^T R_x v = \rho
 
-    which minimises :math:`E[e^2]` subject to :math:`E[y^2] \le \rho`: for any :math:`v`,
-    :math:`E[e^2] = E[e^2]_{min} + (v - w)^T R_{x'} (v - w)`, so that w is all the disturbance has to say, and its
-    conditional mean may stand in its place (certainty equivalence: the error is quadratic in w). The
-    constraint never enters the estimate. What it would have to forget when the level changes, it never learnt.
+    It minimises :math:`E[e^2]` subject to :math:`E[y^2] \le \rho`. For any :math:`v`,
+    :math:`E[e^2] = E[e^2]_{min} + (v - w)^T R_{x'} (v - w)`, so w contains all that matters of the disturbance. The
+    error is quadratic in w, so the conditional mean of w can replace it (certainty equivalence). The constraint never
+    enters the estimate, so the estimate has nothing to forget when the level changes.
 
-    Three things decide :math:`\lambda`:
+    Three things determine :math:`\lambda`:
 
-    - the correlations of reference and filtered reference over a sliding window that forgets completely: 1.25 s long,
-      0.75 s where the noise has become louder, 3 s where its level is the same but for chance;
-    - how loud the signal is becoming: where a straight line through the logarithm of the power stands out of its
-      scatter, the level it leads to now takes the place of the window's mean;
-    - an account of the power spent beyond what was due, in seconds of rated power: the target is the rated power times
-      ``exp(-3 excess / (1 + 6 chance))``. It steers the mean power to the rated one, and repays what a surprise has
-      overspent, up to a second of rated power. `chance` is the standard deviation in seconds that the scatter of the noise's level gives
-      to the account within a second; it adds to the credit, half of which it lets be. Power that was left unspent over some
-      four seconds while there was use for it, beyond what chance makes of that, raises the target by up to 30 %.
+    - the correlations of reference and filtered reference over a sliding window. The window is usually 1.25 s long,
+      0.75 s if the noise has become louder, and 3 s if changes of its level can be due to chance;
+    - a forecast of the level. If a straight line through the logarithm of the power differs significantly from a
+      constant, its present value replaces the mean of the window;
+    - an account of the power spent beyond the rated power, in seconds of rated power. The target is the rated power
+      times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending, up
+      to a second of rated power. `chance` is the standard deviation, in seconds, that random changes of the noise's
+      level give to the account within a second. It enlarges the credit that can be saved, and credit up to half of it
+      is left to even out. If more power than chance explains was left unspent over some four seconds, although it could
+      have been used, the target rises by up to 30 %.
 
     Parameters
     ----------
@@ -314,10 +316,10 @@ class PowerBudget:
     fs : float, default 16000
         Sample rate in Hz.
     memory_s : float, default 1.25
-        Usual length of the window of the correlations in seconds (0.6 and 2.4 times it where it is short or long); at
-        least 10 n_taps samples are taken.
+        Usual length of the window of the correlations in seconds, at least 10 n_taps samples. A short window is 0.6
+        times as long, a long one 2.4 times.
     credit_s : float, default 0.1
-        Seconds of rated power that may be saved up while the noise needs less.
+        Seconds of rated power that can be saved while the noise needs less.
 
     Raises
     ------
@@ -377,17 +379,17 @@ class PowerBudget:
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
                 waited=0.0,  # of these, since the last solution
-                account=0.0,  # seconds of rated power spent beyond what was due
+                account=0.0,  # seconds of rated power spent beyond the rated power
                 weight=0.0,  # lambda
                 span=USUAL,  # segments in the window
-                chance=0.0,  # s of rated power: what the scatter of levels does to the account in a second (std)
-                spent=1.0,  # mean share of the rated power spent of late, while the noise needed all of it
+                chance=0.0,  # seconds of rated power: std that the scatter of levels gives the account in a second
+                spent=1.0,  # recent mean share of the rated power spent while the noise needed all of it
             ),
         )
 
     @property
     def state(self) -> BudgetState:
-        """Arrays that the compiled loop advances."""
+        """Arrays that the compiled loop updates."""
         return self._state
 
     @property
@@ -416,17 +418,17 @@ class PowerBudget:
 
     @property
     def account_s(self) -> float:
-        """Power spent beyond what was due, in seconds of rated power; negative: credit."""
+        """Power spent beyond the rated power, in seconds of rated power; negative: credit."""
         return float(self._state.numbers["account"][0])
 
     def control_signal(self, reference: float) -> float:
-        """Control signal y(n) for the reference x(n); call it before `advance` with the same x(n)."""
+        """Return the control signal y(n) for the `reference` x(n); call it before `advance` with the same x(n)."""
         return float(control_sample(self._state, self._sample(reference, "reference")))
 
     def advance(
         self, reference: float, filtered_reference: float, weights: Any, control_signal: float | None = None
     ) -> None:
-        """Take one sample, and solve for the control filter where it is time to.
+        """Process one sample, and solve for the control filter if it is due.
 
         Parameters
         ----------
@@ -435,7 +437,7 @@ class PowerBudget:
         weights : array_like
             (L,) estimate of the unconstrained control filter.
         control_signal : float, optional
-            What was emitted, where it is not `control_signal` of the same reference: after a limiter, say.
+            Emitted control signal, if it is not `control_signal` of the same reference, for example after a limiter.
 
         Raises
         ------
@@ -447,14 +449,14 @@ class PowerBudget:
         advance_sample(self._state, w, float(reference), float(filtered_reference), y)
 
     def checked_sample(self, reference: Any, filtered_reference: Any, control_signal: Any = None) -> float:
-        """Control signal of a sample that `advance` would take, or the error it would raise."""
+        """Return the control signal that `advance` would use for these arguments, or raise its error."""
         self._sample(filtered_reference, "filtered_reference")
         return (
             self.control_signal(reference) if control_signal is None else self._sample(control_signal, "control_signal")
         )
 
     def listen(self, reference: float, filtered_reference: float) -> None:
-        """Take one sample, `reference` x(n) and `filtered_reference` x'(n), while the control is switched off."""
+        """Process a sample, `reference` x(n) and `filtered_reference` x'(n), while the control is switched off."""
         sample = self._sample(reference, "reference"), self._sample(filtered_reference, "filtered_reference")
         listen_sample(self._state, *sample)
 

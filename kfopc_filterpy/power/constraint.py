@@ -17,30 +17,30 @@ DEFAULT_MEMORY_S = 0.5
 # Below the smallest normal number a ratio of powers has no digits left: such a reference counts as silent.
 SILENCE = float(np.finfo(np.float64).tiny)
 
-# The running powers; numpy's integers, since numba compiles a function anew for each plain one it is called with.
+# Indices of the running powers; numpy integers, because numba would compile a function again for each Python int.
 DISTURBANCE, FILTERED_REFERENCE, REFERENCE = np.arange(3)
 POWER = np.dtype([("mean", np.float64), ("lap", np.float64), ("taken", np.float64)], align=True)
 
 
 class ConstraintState(NamedTuple):
-    """What the compiled functions below read and advance."""
+    """State that the compiled functions below read and update."""
 
     powers: (
         np.ndarray
     )  # (3,) of POWER: mean square, sum of squares since the sliding window last wrapped, samples taken
-    window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from there on; m = 0: exponential memory
-    numbers: np.ndarray  # record: settings; what the caller supplied (NaN: estimated); what was last used
+    window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from each index on; m = 0: exponential
+    numbers: np.ndarray  # record: settings; values that the caller supplied (NaN: estimated); values last used
 
 
 @part()
 def forgetting_mean(mean, taken, rate, square):
-    """Return the mean square with one more sample, of exponential memory and unbiased from the first sample on."""
+    """Return an exponentially weighted mean square with one more sample, unbiased from the first sample on."""
     return mean + max(rate, 1.0 / (taken + 1)) * (square - mean)
 
 
 @part()
 def power_gain(supplied, last, filtered_power, reference_power):
-    """Return the gain of eq. 11, or the one supplied, or the last one while the reference is silent."""
+    """Return the supplied gain, else that of eq. 11, or the last gain while the reference is silent."""
     if not np.isnan(supplied):
         return supplied
     if reference_power > SILENCE:
@@ -74,8 +74,8 @@ def _next_mean(state, signal, square):
 def preview_constraint(state, disturbance, filtered_reference, reference):
     """Return the constraint factor with this sample included; nothing is changed.
 
-    Also returns the disturbance power and the gain it follows from, and the three mean squares. A NaN `reference`
-    (none given) leaves the powers of the reference and the filtered reference as they are.
+    Also return the disturbance power and the gain that it was computed from, and the three mean squares. If `reference`
+    is NaN (none given), the powers of the reference and the filtered reference stay as they are.
     """
     numbers = state.numbers[0]
     mean_d = _next_mean(state, DISTURBANCE, disturbance * disturbance)
@@ -91,7 +91,7 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
 
 @inlined
 def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
-    """Take the sample that `previewed` was made of into the running powers."""
+    """Add the sample to the running powers; `previewed` is what `preview_constraint` returned for it."""
     factor, power, gain, mean_d, mean_xf, mean_x = previewed
     _take(state, DISTURBANCE, disturbance, mean_d)
     if not np.isnan(reference):
@@ -103,7 +103,7 @@ def commit_constraint(state, previewed, disturbance, filtered_reference, referen
 
 @inlined
 def advance_constraint(state, disturbance, filtered_reference, reference):
-    """Take this sample into the running powers and return the constraint factor."""
+    """Add this sample to the running powers and return the constraint factor."""
     previewed = preview_constraint(state, disturbance, filtered_reference, reference)
     commit_constraint(state, previewed, disturbance, filtered_reference, reference)
     return previewed[0]
@@ -111,13 +111,13 @@ def advance_constraint(state, disturbance, filtered_reference, reference):
 
 @part()
 def squares_are_finite(d, filtered, x):
-    """Return whether the running powers can take this sample: an infinite power would never be forgotten."""
+    """Return whether the squares of this sample are finite: an infinite power would never be forgotten."""
     return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
 
 
 @inlined
 def _take(state, signal, value, mean):
-    """Record one sample of one running power, whose new mean square is `mean`."""
+    """Add one sample to one running power, whose new mean square is `mean`."""
     power, m = state.powers[signal], state.window.shape[1]
     power.mean = mean
     if m > 0:
@@ -133,7 +133,7 @@ def _take(state, signal, value, mean):
 
 @compiled()
 def preview_sample(state, disturbance, filtered_reference, reference):
-    """Return `preview_constraint`'s factor, for Python."""
+    """Return the factor of `preview_constraint`; called from Python."""
     return preview_constraint(state, disturbance, filtered_reference, reference)[0]
 
 
@@ -144,7 +144,7 @@ def advance_sample(state, disturbance, filtered_reference, reference):
 
 
 class OutputPowerConstraint:
-    r"""Constraint factor of KF-OPC, kept sample by sample (eq. 10-13).
+    r"""Constraint factor of KF-OPC, updated sample by sample (eq. 10-13).
 
     .. math:: \alpha = \min\{\sqrt{\rho_o G_s / \delta_d^2},\ 1\}
 
@@ -160,12 +160,12 @@ class OutputPowerConstraint:
         Memory of the power estimates in seconds: the time constant of the exponential window, or the length
         of the sliding one.
     window : {"exponential", "sliding"}, default "exponential"
-        The estimates start bias-free: until the window is full they are plain means.
+        Window of the power estimates. They are unbiased from the start: plain means until the window is full.
 
     Raises
     ------
     ValueError
-        A power, gain, rate or memory that is not positive and finite, or another window.
+        A power, gain, rate or memory that is not positive and finite, or an unknown window.
 
     Examples
     --------
@@ -207,7 +207,7 @@ class OutputPowerConstraint:
         self.secondary_path_gain = secondary_path_gain
 
     def fresh(self, rated_power: float | None = None) -> OutputPowerConstraint:
-        """Return a constraint of the same settings, but for another `rated_power` if one is given, that has seen no sample."""
+        """Return a constraint with the same settings and no samples yet; `rated_power` replaces the rated power."""
         return OutputPowerConstraint(
             self.rated_power if rated_power is None else rated_power,
             secondary_path_gain=self._given_gain,
@@ -218,7 +218,7 @@ class OutputPowerConstraint:
 
     @property
     def state(self) -> ConstraintState:
-        """Arrays that the compiled loop advances."""
+        """Arrays that the compiled loop updates."""
         return self._state
 
     @property
@@ -232,7 +232,7 @@ class OutputPowerConstraint:
 
     @property
     def factor(self) -> float:
-        """Constraint factor last used; assign a value to hold it there, None to estimate it again."""
+        """Constraint factor last used; assign a value to fix it, None to compute it again."""
         return self._read("factor")
 
     @factor.setter
@@ -250,7 +250,7 @@ class OutputPowerConstraint:
 
     @property
     def secondary_path_gain(self) -> float | None:
-        """Power gain last used (eq. 11), None before any; assign to supply it, None to estimate it again."""
+        """Power gain last used (eq. 11), or None; assign a value to supply it, None to estimate it again."""
         gain = self._read("gain")
         return None if math.isnan(gain) else gain
 
@@ -260,16 +260,16 @@ class OutputPowerConstraint:
 
     @property
     def needs_reference(self) -> bool:
-        """Whether the gain has to come from the reference: neither it nor the factor was supplied."""
+        """True if the gain must be estimated from the reference: neither the gain nor the factor was supplied."""
         numbers = self._state.numbers
         return math.isnan(numbers["supplied_gain"][0]) and math.isnan(numbers["supplied_factor"][0])
 
     def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
-        """Constraint factor that `advance` would return for this sample; nothing is changed."""
+        """Return the constraint factor that `advance` would return for this sample; nothing is changed."""
         return float(preview_sample(self._state, *self._sample(disturbance, filtered_reference, reference)))
 
     def advance(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
-        """Take one sample into the powers and return the constraint factor.
+        """Add one sample to the powers and return the constraint factor.
 
         Parameters
         ----------
@@ -278,7 +278,7 @@ class OutputPowerConstraint:
         filtered_reference : float, default 0
             Newest filtered reference x'(n).
         reference : float, optional
-            Newest reference x(n); without it the gain must have been supplied.
+            Newest reference x(n); can be omitted if the gain or the factor was supplied.
 
         Returns
         -------
@@ -288,7 +288,7 @@ class OutputPowerConstraint:
         Raises
         ------
         ValueError
-            NaN, Inf or a value whose square overflows; no reference and no gain.
+            NaN, Inf or a value whose square overflows; no reference although the gain must be estimated.
         """
         return float(advance_sample(self._state, *self._sample(disturbance, filtered_reference, reference)))
 
@@ -314,7 +314,7 @@ class OutputPowerConstraint:
 
 
 def _squarable(value: Any, name: str) -> float:
-    """A finite number whose square is finite too: an infinite power would never be forgotten."""
+    """Return `value` as a float with a finite square: an infinite power would never be forgotten."""
     number = as_number(value, name)
     if math.isinf(number * number):
         raise ValueError(f"{name} must have a finite square, got {number:g}")

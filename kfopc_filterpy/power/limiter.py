@@ -1,8 +1,8 @@
-"""A limiter behind any controller: the mean square of the output over a sliding window never exceeds the rated power.
+"""A limiter for any controller: the mean square of the output over a sliding window never exceeds the rated power.
 
-Its energies are in units of the budget N rho_o, so that any rated power and any input stay within the range of a float.
-A window's energy is this lap's sum and what the last lap still has in the window, as in `constraint`: sums of squares
-only, started anew every N samples, so that rounding never accumulates.
+Energies are in units of the budget N rho_o, so that any rated power and any input stay within the range of a float. The
+energy of a window is the sum over this lap plus the part of the last lap that is still in the window, as in
+`constraint`. Only squares are summed, and the sums restart every N samples, so rounding errors do not accumulate.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from ..kernels.records import new_record
 from .constraint import DEFAULT_FS
 
 DEFAULT_WINDOW_S = 0.1
-LONGEST_WINDOW = 10**7  # samples, for which the margin for rounding is still 2e-9
-# Found by search over tones, noises, bursts and level jumps, for the least mean (u - y)^2 with little distortion.
-HORIZONS = 16  # spans ahead that the gain is planned for, evenly up to N
-RESERVE = 0.02  # of the power; with it a tone whose periods do not fill the window keeps a constant gain
+LONGEST_WINDOW = 10**7  # samples; the margin for rounding is then 2e-9 of the budget
+# Found by a search over tones, noises, bursts and level jumps for the least mean (u - y)^2 with little distortion.
+HORIZONS = 16  # future spans that the gain is planned for, evenly spaced up to N
+RESERVE = 0.02  # of the power; keeps a tone's gain constant even if the window does not hold whole periods
 MEAN_TIME, LOUD_TIME, RELEASE_TIME, MEMORY = 1 / 40, 1 / 5, 1 / 8, 20.0  # time constants in windows
-OVERSHOOT = 1.1  # the gain rises towards this much more than its aim and stops at it, so that it does reach 1
-LOUDEST = 100.0  # amplitude planned for, over the most that can leave: what is louder is clipped, and soon forgotten
-FLOOR = 1e-200  # of the budget: keeps estimates from denormal numbers, which are slow
+OVERSHOOT = 1.1  # the gain rises towards this multiple of its aim and stops at the aim, so that it does reach 1
+LOUDEST = 100.0  # times the largest output: louder input is planned for as if it were this loud, to be forgotten soon
+FLOOR = 1e-200  # of the budget: keeps estimates above denormal numbers, which are slow
 
 
 class LimiterState(NamedTuple):
-    """What `limit_sample` reads and advances.
+    """State that `limit_sample` reads and updates.
 
-    A lap is N samples. At position i of it, `laps_out` holds minus this lap's energy up to k for k < i, the last lap's
-    energy from k on for k > i, and 0 at k = N: for any m <= N the energy of the last m samples is one sum. `laps_in`
-    holds the same of what comes in.
+    A lap is N samples. At position i of a lap, ``laps_out[k]`` is minus this lap's output energy up to k for k < i, the
+    last lap's output energy from k on for k > i, and 0 for k = N. For any m <= N the energy of the last m samples is
+    then one sum. `laps_in` holds the same for the input.
     """
 
-    numbers: np.ndarray  # record: settings, then what the samples change; see `_silent_state`
+    numbers: np.ndarray  # record: settings, then values that each sample updates; see `_silent_state`
     horizons: np.ndarray  # (K,) samples, the last one N
-    held: np.ndarray  # (K,) largest energy that lately came in a span of each horizon
-    room: np.ndarray  # (K,) and the most that may leave in it
+    held: np.ndarray  # (K,) largest recent input energy in a span of each horizon
+    room: np.ndarray  # (K,) largest output energy allowed in such a span
     laps_out: np.ndarray  # (N + 1,)
     laps_in: np.ndarray  # (N + 1,)
     squares: np.ndarray  # (N + 1,) this lap's output energies
@@ -47,10 +47,11 @@ class LimiterState(NamedTuple):
 
 @part()
 def _aim(state, i, size):
-    """The largest constant gain with which every horizon fits, if what comes is as bad as foreseen.
+    """Return the largest constant gain that keeps to the budget over every horizon, for the worst input expected.
 
-    In the next h samples comes at most what lately came in any h samples; no more than h times what is loud now;
-    and, while the window is none worse than those known, no more than keeps it so.
+    The input energy expected in the next h samples is the least of three: the largest recent energy of h samples; h
+    times the present loudness; and the energy that would make the window as loud as the largest one known, unless the
+    present window is louder already.
     """
     numbers, held = state.numbers[0], state.held
     known = (1.0 + RESERVE) * numbers.known
@@ -61,7 +62,7 @@ def _aim(state, i, size):
         h = state.horizons[j]
         before = i - h if i >= h else i - h + size + 1
         held[j] = max(held[j] * numbers.fade, numbers.arrived + state.laps_in[before], FLOOR)
-        kept = i + h if i + h <= size else i + h - size - 1  # where the last N - h samples begin
+        kept = i + h if i + h <= size else i + h - size - 1  # index at which the last N - h samples begin
         coming = min(held[j], h * numbers.loud, known - (numbers.arrived + state.laps_in[kept]))
         left = min(1.0 - (numbers.spent + state.laps_out[kept]), state.room[j])
         room = min(room, left / max(coming, FLOOR))
@@ -70,7 +71,7 @@ def _aim(state, i, size):
 
 @part()
 def limit_sample(state, u):
-    """Output y for the next input; NaN, with nothing changed, where u is not finite."""
+    """Return the output y for the next input u; NaN, with nothing changed, if u is not finite."""
     if not np.isfinite(u):
         return np.nan
     numbers = state.numbers[0]
@@ -86,7 +87,7 @@ def limit_sample(state, u):
     y = min(max(wanted, -numbers.limit), numbers.limit)
     square = (y * numbers.scale) ** 2
     left = numbers.budget - (numbers.spent + state.laps_out[i + 1])
-    if square > left:  # the guarantee; all before is there to make this rare
+    if square > left:  # the guarantee; the gain above makes this rare
         y = math.copysign(numbers.peak * math.sqrt(max(left, 0.0)), u)
         square = (y * numbers.scale) ** 2
     if y != wanted:
@@ -101,11 +102,11 @@ def limit_sample(state, u):
 
 @part()
 def _start_lap(state, size):
-    """The lap just done becomes the last one."""
+    """Start a new lap; the one just completed becomes the last one."""
     numbers = state.numbers[0]
     rest = 0.0
     for k in range(size - 1, 0, -1):
-        rest += state.squares[k]  # summed anew, no differences: the guarantee rests on it
+        rest += state.squares[k]  # summed from scratch, without differences: the guarantee depends on it
         state.laps_out[k] = rest
         state.laps_in[k] = numbers.arrived + state.laps_in[k - 1]
     numbers.position = 0
@@ -125,15 +126,15 @@ def _limit_all(state, signal, out):
 
 
 class OutputLimiter:
-    r"""Limiter that keeps the output power of any controller within a hard rating, whatever comes in.
+    r"""Limiter that keeps the output power of any controller within a hard rating, for any input.
 
-    Over every window of N = round(window_s fs) samples, zeros before the first one,
+    Over every window of N = round(window_s fs) samples, with zeros before the first one,
 
     .. math:: \frac{1}{N} \sum_{k=0}^{N-1} y^2(n-k) \le \rho_o, \qquad |y(n)| \le A.
 
-    What plainly fits passes unchanged. What does not is scaled, before the budget of the window is used up, by a gain that
-    keeps a tone a tone; only what even then does not fit is clipped. One sample in, one out, without delay: call it
-    with a sample, or a compiled loop ``limit_sample(limiter.state, u)``.
+    A signal well within the rating passes unchanged. Any other is scaled before the budget of the window is used up, by
+    a gain that leaves tones undistorted. Only samples that would still exceed the rating are clipped. There is no
+    delay. Call the limiter with each sample, or use ``limit_sample(limiter.state, u)`` in a compiled loop.
 
     Parameters
     ----------
@@ -144,7 +145,7 @@ class OutputLimiter:
     window_s : float, default 0.1
         Averaging time of the rating in seconds, 1 to 10^7 samples.
     amplitude_limit : float, optional
-        Peak rating A, where the amplifier has one; none by default. Noise is clipped at it; tones are scaled to it.
+        Peak rating A of the amplifier; by default none. Noise is clipped at it; tones are scaled to it.
 
     Raises
     ------
@@ -153,23 +154,23 @@ class OutputLimiter:
 
     Notes
     -----
-    *Bound.* With :math:`v = y^2 / (N \rho_o)` each output keeps to :math:`v(n) \le 1 - \sum_{k=1}^{N-1} v(n-k)`, or is
-    zero where rounding makes the right side negative; then its window holds no more than the one before. So, by
-    induction, no window exceeds 1. In floating point, of unit roundoff :math:`\epsilon = 2^{-53}`, the sum used has at
-    most N terms, none negative, none kept for more than two laps, and no differences: it is at least
-    :math:`(1-\epsilon)^{N-1}` times the exact one, after any number of samples. v comes of at most 11 roundings, the
-    right side of one more. It begins with :math:`1 - 2 (N + 16) \epsilon` instead of 1, which is more than all that, so
-    that the exact sum stays below 1. Squares that underflow add less than :math:`2^{-1000}`.
+    *Bound.* Let :math:`v = y^2 / (N \rho_o)`. Each output satisfies :math:`v(n) \le 1 - \sum_{k=1}^{N-1} v(n-k)`. If
+    rounding makes the right side negative, the output is zero, and its window holds no more than the one before. By
+    induction, no window exceeds 1. In floating point with unit roundoff :math:`\epsilon = 2^{-53}`, the computed sum
+    has at most N terms, none negative, none kept for more than two laps, and no differences. After any number of
+    samples it is therefore at least :math:`(1-\epsilon)^{N-1}` times the exact sum. v results from at most 11 roundings
+    and the right side from one more. The budget is :math:`1 - 2 (N + 16) \epsilon` instead of 1, a margin larger than
+    all of these errors, so the exact sum stays below 1. Squares that underflow add less than :math:`2^{-1000}`.
 
-    *Gain.* Let :math:`B_h` be what the outputs still in the window h samples from now leave of the budget, and
-    :math:`P_h` the energy to come by then. The largest gain that can be kept up is the least
-    :math:`\sqrt{B_h / P_h}`, or 1. Foreseen is that the worst of some 20 windows comes again, but not louder than now.
-    The gain falls at once and rises in an eighth of a window.
+    *Gain.* Let :math:`B_h` be the part of the budget that is not used by the outputs still in the window h samples from
+    now, and :math:`P_h` the input energy until then. The largest gain that can be sustained is the minimum of
+    :math:`\sqrt{B_h / P_h}` over h, at most 1. The prediction of :math:`P_h` is the worst of some 20 past windows, but
+    not louder than the present input. The gain falls at once and rises within an eighth of a window.
 
-    *Transparency.* A signal none of whose windows has more than half of the rated power passes bit for bit (where there
-    is an amplitude limit, it has to be :math:`4 \sqrt{\rho_o}` or more for this): then :math:`P_h \le 1/2 \le B_h`. So
-    does a steady tone of up to 0.9 of the rated power, with five periods or more in a window. A louder one leaves with
-    0.98 of it, less its ripple from window to window.
+    *Transparency.* A signal passes bit for bit if no window of it has more than half of the rated power, because then
+    :math:`P_h \le 1/2 \le B_h` (an amplitude limit, if there is one, must be at least :math:`4 \sqrt{\rho_o}`). So does
+    a steady tone of up to 0.9 of the rated power that has at least five periods per window. A louder tone comes out
+    with 0.98 of the rated power, less its ripple from window to window.
 
     Examples
     --------
@@ -209,12 +210,12 @@ class OutputLimiter:
 
     @property
     def state(self) -> LimiterState:
-        """Arrays that `limit_sample` advances."""
+        """Arrays that `limit_sample` updates."""
         return self._state
 
     @property
     def rated_power(self) -> float:
-        """Rated output power. Another one takes another limiter: what has left was kept to this one."""
+        """Rated output power; read-only, because past outputs were limited to it. Make a new limiter to change it."""
         return self._rated_power
 
     @property
@@ -229,7 +230,7 @@ class OutputLimiter:
 
     @property
     def amplitude_limit(self) -> float | None:
-        """Peak rating, None where there is none."""
+        """Peak rating, or None."""
         return self._amplitude_limit
 
     @property
@@ -243,18 +244,18 @@ class OutputLimiter:
         return int(self._state.numbers["clipped"][0])
 
     def __call__(self, u: float) -> float:
-        """Output for the next input sample `u`."""
+        """Return the output for the next input sample `u`."""
         return float(_limit_one(self._state, as_number(u, "u")))
 
     def process(self, signal: Any) -> np.ndarray:
-        """Output (n,) for a whole signal (n,), or the next piece of one: as sample by sample, to the bit."""
+        """Return the output (n,) for a `signal` (n,), or for its next piece; the same bits as sample by sample."""
         signal = as_signal(signal, "signal", min_length=0)
         out = np.empty(signal.size)
         _limit_all(self._state, signal, out)
         return out
 
     def reset(self) -> None:
-        """Forget the past: what comes next is taken to follow zeros."""
+        """Forget the past, as if only zeros had come in."""
         fresh = dict(position=0, clipped=0, spent=0.0, arrived=0.0, known=0.0, mean=FLOOR, loud=FLOOR, gain=1.0)
         for name, value in fresh.items():
             self._state.numbers[name] = value
@@ -264,12 +265,12 @@ class OutputLimiter:
 
 
 def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) -> LimiterState:
-    """The settings of a limiter whose windows have `size` samples; the rest is left to `reset`."""
+    """Return the state of a limiter with windows of `size` samples; `reset` completes it."""
     peak = math.sqrt(size) * math.sqrt(rated_power)  # two roots: their product does not overflow
-    limit = 2.0 * peak if amplitude_limit is None else min(amplitude_limit, 2.0 * peak)  # finite, for finite squares
+    limit = 2.0 * peak if amplitude_limit is None else min(amplitude_limit, 2.0 * peak)  # squares stay finite
     numbers = new_record(
         scale=1.0 / peak,
-        peak=peak * (1.0 - 2.0**-50),  # so that a clipped sample's square, rounded, is within what was left
+        peak=peak * (1.0 - 2.0**-50),  # so that the rounded square of a clipped sample fits into what is left
         budget=1.0 - (size + 16) * 2.0**-52,
         limit=limit,
         planned=LOUDEST * min(limit, peak),
@@ -278,11 +279,11 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
         fade=_kept(MEMORY, size),
         release=1.0 - _kept(RELEASE_TIME, size),
         position=0,
-        spent=0.0,  # this lap's energy out
-        arrived=0.0,  # and in
-        mean=0.0,  # running mean of the energies in
-        loud=0.0,  # its slowly falling maximum
-        known=0.0,  # the largest energy of a window as it was held when the lap began
+        spent=0.0,  # output energy of this lap
+        arrived=0.0,  # input energy of this lap
+        mean=0.0,  # running mean of the input energies
+        loud=0.0,  # slowly falling maximum of `mean`
+        known=0.0,  # largest recent energy of a window, as of the start of the lap
         gain=1.0,
         clipped=0,
     )
@@ -290,7 +291,7 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
     horizons = np.arange(1, spans + 1) * size // spans
     room = np.ones(spans)
     if amplitude_limit is not None:
-        sine = (limit / peak) ** 2 / 2.0  # power of one that peaks at the limit; a short span may have more of it
+        sine = (limit / peak) ** 2 / 2.0  # power of a sine that peaks at the limit; a short span may have more
         room = np.clip(sine * (horizons + size / 16), FLOOR, 1.0)
         room[-1] = max(sine * size, FLOOR)
     room[-1] = min(room[-1], 1.0 - RESERVE)
@@ -299,5 +300,5 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
 
 
 def _kept(windows: float, size: int) -> float:
-    """Return the share that a time constant of so many windows keeps a sample."""
+    """Return the factor per sample of a decay whose time constant is `windows` windows."""
     return math.exp(-1.0 / (windows * size))
