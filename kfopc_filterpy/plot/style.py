@@ -31,6 +31,7 @@ STYLES: dict[str, tuple[str, Any, str]] = {
     "MOV-FxLMS fixed": ("#117733", _DASHED, "2"),
     "MOV-MFxLMS": ("#88CCEE", _DASHED, "3"),
 }
+UNLISTED = ("#000000", ":", "x")  # an algorithm that is not in the table
 COLOURS = 6  # curves without an algorithm take the colours and markers of the first so many rows
 LINES = ("-", "--", "-.", ":")
 MARK = "0.35"
@@ -45,17 +46,12 @@ def curve_style(curve: str | int) -> dict[str, Any]:
     ----------
     curve : str or int
         Name of an algorithm, as in ``kfopc_filterpy.bench.algorithms()``, or the number of the curve, from 0. The numbers
-        repeat six colours and four line styles.
+        repeat six colours and four line styles. An algorithm without a style of its own is drawn black and dotted.
 
     Returns
     -------
     dict
         ``color``, ``linestyle`` and ``marker``, as matplotlib's ``plot`` takes them.
-
-    Raises
-    ------
-    ValueError
-        No algorithm has that name.
 
     Examples
     --------
@@ -66,9 +62,7 @@ def curve_style(curve: str | int) -> dict[str, Any]:
     {'color': '#D55E00', 'linestyle': '--', 'marker': 's'}
     """
     if isinstance(curve, str):
-        if curve not in STYLES:
-            raise ValueError(f"curve must be the name of an algorithm or a number, got {curve!r}")
-        colour, line, marker = STYLES[curve]
+        colour, line, marker = STYLES.get(curve, UNLISTED)
     else:
         colour, _, marker = list(STYLES.values())[curve % COLOURS]
         line = LINES[curve % COLOURS % len(LINES)]

@@ -191,5 +191,4 @@ def test_every_algorithm_has_a_style_that_no_other_has() -> None:
     styles = {name: tuple(map(str, curve_style(name).values())) for name in REGISTRY}
     assert len(set(styles.values())) == len(REGISTRY)
     assert curve_style(7) == curve_style(1)
-    with pytest.raises(ValueError, match="curve must be the name of an algorithm or a number, got 'KF-XYZ'"):
-        curve_style("KF-XYZ")
+    assert tuple(map(str, curve_style("KF-XYZ").values())) not in styles.values()
