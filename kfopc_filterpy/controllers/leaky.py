@@ -91,7 +91,7 @@ def adapt_rated_leaky(state, error, control_signal):
     """Apply the step of leaky FxLMS with gamma(n) = E[x^2] G_s (1/alpha - 1)."""
     finite, _, factor = advance_powers(state, error)
     if finite:
-        leak = penalty_of_constraint(state.constraint, factor) * state.constraint.powers[REFERENCE].mean
+        leak = penalty_of_constraint(state.constraint, factor) * state.constraint.powers[REFERENCE].mean_square
         keep = 1.0 - state.step_size * leak
         change_weights(state.weights, state.lines, keep, state.step_size * error, 0.0)
     return finite

@@ -10,8 +10,10 @@ from __future__ import annotations
 import hashlib
 import inspect
 import os
+import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import singledispatch
@@ -110,6 +112,13 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache"))
 
 
+def _remove_unused(parent: Path, current: Path) -> None:
+    """Remove folders of other sources that nothing was added to for a month."""
+    for folder in parent.glob("[0-9a-f]" * 16):
+        if folder != current and time.time() - folder.stat().st_mtime > 30 * 86400:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 def _choose_folder() -> str:
     """Return a writable folder: in NUMBA_CACHE_DIR if it is set, else beside the sources, else in the user's cache."""
     chosen = CONFIG.CACHE_DIR
@@ -119,6 +128,7 @@ def _choose_folder() -> str:
         new = not folder.exists()
         if _writable(folder):
             if new:
+                _remove_unused(parent, folder)
                 print("kfopc_filterpy: compiling, once; the first runs take some seconds longer", file=sys.stderr)
             return str(folder)
     return ""  # numba's own choice

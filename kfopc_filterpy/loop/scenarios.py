@@ -231,7 +231,9 @@ def simulate_scenarios(
             signal[i, end:] = np.nan
     for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
         unstack(scenarios, i, own[i])
-        gains.refill(state.lines)  # one that diverged has not heard the end
+        gains.refill(state.lines)  # a scenario that diverged has not heard the end
+        if status[i] == DIVERGED:
+            refill(state.lines.output, np.zeros(state.lines.output.size))  # its loudspeaker was switched off
         controller.after_compiled(state._replace(gains=gains.covariance), shared=True)
     return [
         SimulationResult(

@@ -19,7 +19,7 @@ SILENCE = float(np.finfo(np.float64).tiny)
 
 # Indices of the running powers; numpy integers, because numba would compile a function again for each Python int.
 DISTURBANCE, FILTERED_REFERENCE, REFERENCE = np.arange(3)
-POWER = np.dtype([("mean", np.float64), ("lap", np.float64), ("taken", np.float64)], align=True)
+POWER = np.dtype([("mean_square", np.float64), ("lap", np.float64), ("taken", np.float64)], align=True)
 
 
 class ConstraintState(NamedTuple):
@@ -63,7 +63,7 @@ def _next_mean(state, signal, square):
     """Return the mean square of a signal with one more sample."""
     power, m = state.powers[signal], state.window.shape[1]
     if m == 0:
-        return forgetting_mean(power.mean, power.taken, state.numbers[0].rate, square)
+        return forgetting_mean(power.mean_square, power.taken, state.numbers[0].rate, square)
     position = np.int64(power.taken) % m
     rest = state.window[signal, position + 1] if position + 1 < m else 0.0
     total = power.lap + square + rest  # sums only, so that rounding never accumulates
@@ -79,7 +79,7 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     """
     numbers = state.numbers[0]
     mean_d = _next_mean(state, DISTURBANCE, disturbance * disturbance)
-    mean_xf, mean_x = state.powers[FILTERED_REFERENCE].mean, state.powers[REFERENCE].mean
+    mean_xf, mean_x = state.powers[FILTERED_REFERENCE].mean_square, state.powers[REFERENCE].mean_square
     if not np.isnan(reference):
         mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference * filtered_reference)
         mean_x = _next_mean(state, REFERENCE, reference * reference)
@@ -119,7 +119,7 @@ def squares_are_finite(d, filtered, x):
 def _take(state, signal, value, mean):
     """Add one sample to one running power, whose new mean square is `mean`."""
     power, m = state.powers[signal], state.window.shape[1]
-    power.mean = mean
+    power.mean_square = mean
     if m > 0:
         position = np.int64(power.taken) % m
         power.lap += value * value

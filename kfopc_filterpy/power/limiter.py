@@ -79,8 +79,8 @@ def limit_sample(state, u):
     energy = (min(abs(u), numbers.planned) * numbers.scale) ** 2
     numbers.arrived += energy
     state.laps_in[i] = -numbers.arrived
-    numbers.mean = max(numbers.mean + numbers.attack * (energy - numbers.mean), FLOOR)
-    numbers.loud = max(numbers.loud * numbers.calm, numbers.mean)
+    numbers.average = max(numbers.average + numbers.attack * (energy - numbers.average), FLOOR)
+    numbers.loud = max(numbers.loud * numbers.calm, numbers.average)
     aim, gain = _aim(state, i, size), numbers.gain
     numbers.gain = min(aim, gain + numbers.release * max(OVERSHOOT * aim - gain, 0.0))
     wanted = numbers.gain * u
@@ -256,7 +256,7 @@ class OutputLimiter:
 
     def reset(self) -> None:
         """Forget the past, as if only zeros had come in."""
-        fresh = dict(position=0, clipped=0, spent=0.0, arrived=0.0, known=0.0, mean=FLOOR, loud=FLOOR, gain=1.0)
+        fresh = dict(position=0, clipped=0, spent=0.0, arrived=0.0, known=0.0, average=FLOOR, loud=FLOOR, gain=1.0)
         for name, value in fresh.items():
             self._state.numbers[name] = value
         self._state.held[:] = FLOOR
@@ -281,7 +281,7 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
         position=0,
         spent=0.0,  # output energy of this lap
         arrived=0.0,  # input energy of this lap
-        mean=0.0,  # running mean of the input energies
+        average=0.0,  # running mean of the input energies
         loud=0.0,  # slowly falling maximum of `mean`
         known=0.0,  # largest recent energy of a window, as of the start of the lap
         gain=1.0,
