@@ -2,7 +2,7 @@
 
 numba counts the references to each array that is passed to a function or unpacked from a tuple. In a loop over samples
 this takes longer than the arithmetic of a short control filter. A borrowed array owns nothing, so there is nothing to
-count: the loops at 32, 128 and 256 taps take 0.2, 0.6 and 0.85 of the time. Never return a borrowed array to Python.
+count: the loop of KF-OPC at 32 taps takes a third of the time, at 128 taps 0.7. Never return a borrowed array to Python.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def _user_cache() -> Path:
 
 def _remove_unused(parent: Path, current: Path) -> None:
     """Remove folders of other sources that nothing was added to for a month."""
-    for folder in parent.glob("[0-9a-f]" * 16):
+    for folder in parent.glob(f"{PACKAGE.name}-*"):
         if folder != current and time.time() - folder.stat().st_mtime > 30 * 86400:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -124,7 +124,7 @@ def _choose_folder() -> str:
     chosen = CONFIG.CACHE_DIR
     parents = [Path(chosen)] if chosen else [PACKAGE / "__pycache__", _user_cache() / PACKAGE.name]
     for parent in parents:
-        folder = parent / _sources()
+        folder = parent / f"{PACKAGE.name}-{_sources()}"
         new = not folder.exists()
         if _writable(folder):
             if new:
