@@ -58,10 +58,10 @@ def test_each_is_made_as_the_registry_says(name: str, scene: Scene) -> None:
     controller = make_controller(known, name, middle(name), amplifier=model)
     assert isinstance(controller, FilteredReferenceController)
     assert controller.name == name
-    np.testing.assert_array_equal(controller._state.secondary_estimate, estimate)
+    np.testing.assert_array_equal(controller._state.lines.secondary_estimate, estimate)
     assert controller.weights.shape == (12,)
     if model is not None:
-        np.testing.assert_array_equal(controller._state.amplifier, model.parameters)
+        np.testing.assert_array_equal(controller._state.lines.amplifier, model.model)
     assert controller.rated_power == (0.5 if REGISTRY[name].sees_budget or name == "MOV-FxLMS fixed" else None)
     result = run_setting(scene, name, middle(name))
     assert result is not None
@@ -85,7 +85,7 @@ def test_settings_are_in_the_units_of_the_scene(scene: Scene) -> None:
     leaky: Any = make_controller(scene, "leaky FxLMS", (0.1, 3.0))
     assert leaky.leak == pytest.approx(3.0 * filtered, rel=1e-12)
     fixed: Any = make_controller(scene, "MOV-FxLMS fixed", (0.1, 3.0))
-    assert fixed._factor == pytest.approx(3.0 * filtered / np.mean(x**2), rel=1e-12)
+    assert fixed._state.penalty == pytest.approx(3.0 * filtered / np.mean(x**2), rel=1e-12)
     peak: Any = make_controller(scene, "clipping FxLMS", (0.1, 0.25))
     assert peak.amplitude_limit == pytest.approx(np.sqrt(0.25 * 2.0), rel=1e-12)  # unconstrained power 4 * 0.5
 

@@ -122,7 +122,7 @@ def peak_beyond_the_result(make, n_samples, **options):
 
 def test_memory_of_a_minute_at_48_khz():
     """60 s at 48 kHz with 1024 taps: within 50 MB of the returned signals. The LMS run has all of the loop's memory..."""
-    settings = {"rated_power": 1.0, "fs": 48000.0}
+    settings = {"constraint": OutputPowerConstraint(1.0, fs=48000.0)}
     lms = peak_beyond_the_result(lambda: MOVFxLMS(1024, np.ones(32) / 32, step_size=1e-6, **settings), 60 * 48000)
     assert 0 < lms < 30e6
 
@@ -130,7 +130,7 @@ def test_memory_of_a_minute_at_48_khz():
 def test_memory_of_1024_taps():
     """... and what the Kalman filter adds does not grow with the signal: P, 8.4 MB, which the controller brings along."""
     kalman = {"state_noise": 1e-8, "measurement_noise": 1.0, "initial_variance": 1e-3}
-    settings = {"rated_power": 1.0, "fs": 48000.0}
+    settings = {"constraint": OutputPowerConstraint(1.0, fs=48000.0)}
     run_alone = peak_beyond_the_result(lambda: kf_opc(1024, np.ones(32) / 32, **kalman, **settings), 500)
     assert run_alone < 50e6 - 30e6 - 8.4e6
 
