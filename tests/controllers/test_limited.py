@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.comparing import assert_same_estimator, assert_same_run
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, P0, Q, R, S, noises
+from helpers.naming import plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -283,7 +284,7 @@ def test_a_limiter_can_be_assigned_and_removed(name: str) -> None:
     assert pickle.dumps(own) == before  # it is out of the loop
 
 
-@pytest.mark.parametrize("wrong", [1.0, "limiter", OutputLimiter, np.tanh, HardClipAmplifier(1.0)], ids=str)
+@pytest.mark.parametrize("wrong", [1.0, "limiter", OutputLimiter, np.tanh, HardClipAmplifier(1.0)], ids=plain)
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_no_limiter_is_refused(name: str, wrong: Any) -> None:
     made = controller(name, limiter=limiter())

@@ -13,6 +13,7 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.comparing import SIGNALS, assert_same_estimator, assert_same_run
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, P0, S_HAT, Q, R, S, noises, run, sensor_noise
+from helpers.naming import plain
 from oracles import modified_anc as oracle
 
 from kfopc_filterpy import (
@@ -102,7 +103,7 @@ def assert_agrees(result: Any, expected: dict) -> None:
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("repairs", REPAIRS, ids=str)
+@pytest.mark.parametrize("repairs", REPAIRS, ids=plain)
 def test_every_repair_is_its_definition(repairs: dict, compiled: bool) -> None:
     x, d, _ = noises()
     algorithm = WrittenOut(**repairs)
@@ -229,7 +230,7 @@ def test_the_trim_keeps_the_rated_power_where_eq_13_misses_it() -> None:
 
 
 @pytest.mark.parametrize("n_taps", [1, 2, 5, 16, 33])
-@pytest.mark.parametrize("repairs", REPAIRS, ids=str)
+@pytest.mark.parametrize("repairs", REPAIRS, ids=plain)
 def test_compiled_run_is_the_steps_bit_for_bit(repairs: dict, n_taps: int) -> None:
     fast, slow = made(n_taps, **repairs), made(n_taps, **repairs)
     options = {"amplifier": AMPLIFIERS["soft"][0], "feedback": FEEDBACK, "on": 17, "n": 300}
@@ -270,7 +271,7 @@ ESTIMATOR: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
         ({"amplifier": abs}, TypeError, "one of kfopc_filterpy's amplifier models"),
         ({"secondary_path_gain": 1.0}, TypeError, "unexpected keyword"),
     ],
-    ids=str,
+    ids=plain,
 )
 def test_settings_out_of_range(options: dict, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
@@ -278,7 +279,7 @@ def test_settings_out_of_range(options: dict, error: type, message: str) -> None
 
 
 @pytest.mark.parametrize(
-    "estimator", [KFOPC.random_walk(4, rated_power=1.0, **ESTIMATOR), KFOPC(4), KalmanFilter(4, 1)], ids=str
+    "estimator", [KFOPC.random_walk(4, rated_power=1.0, **ESTIMATOR), KFOPC(4), KalmanFilter(4, 1)], ids=plain
 )
 def test_it_wants_a_random_walk_filter_without_a_rated_power(estimator: KalmanFilter) -> None:
     with pytest.raises(ValueError, match="without a rated power of its own"):

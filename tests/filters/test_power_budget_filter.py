@@ -15,6 +15,7 @@ from filterpy.common import Saver
 from filterpy.kalman import KalmanFilter
 from helpers.comparing import assert_same_run, numbers_of
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, S_HAT, run
+from helpers.naming import plain
 from helpers.power_budget import N_TAPS, SETTINGS, made, signals, step
 
 from kfopc_filterpy import (
@@ -177,7 +178,7 @@ def test_a_rated_power_assigned_is_kept_from_there_on() -> None:
         ({"R": -1.0}, "R must not be negative"),
         ({"R": 0.0, "H": [0.0, 0.0, 0.0]}, "a silent reference"),
     ],
-    ids=str,
+    ids=plain,
 )
 def test_a_bad_step_is_refused_before_anything_changes(bad: dict, message: str) -> None:
     kf, untouched = made(3), made(3)

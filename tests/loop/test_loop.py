@@ -22,6 +22,7 @@ from helpers.loop import (
     run,
     sensor_noise,
 )
+from helpers.naming import plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import modified_anc as oracle
@@ -100,7 +101,7 @@ def test_every_controller_is_the_papers_loop(name, amplifier, feedback, compiled
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("options", [{"window": "sliding"}, {"gain": 0.5}, {"rated_power": 30.0}], ids=str)
+@pytest.mark.parametrize("options", [{"window": "sliding"}, {"gain": 0.5}, {"rated_power": 30.0}], ids=plain)
 @pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
 def test_constraint_options(name, options, compiled):
     x, d, _ = noises()

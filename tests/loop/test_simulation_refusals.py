@@ -6,6 +6,7 @@ import control
 import numpy as np
 import pytest
 from helpers.comparing import state_of
+from helpers.naming import plain
 from helpers.simulation import MAKERS, D, Integrator, S, X, constraint
 
 from kfopc_filterpy import FxLMS, simulate
@@ -61,7 +62,7 @@ def test_refused_with_nothing_changed(name, wrong, kind, message):
         np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("wrong", [None, 3.0, FxLMS, Integrator, object(), np.sin], ids=str)
+@pytest.mark.parametrize("wrong", [None, 3.0, FxLMS, Integrator, object(), np.sin], ids=plain)
 def test_refuses_what_is_no_controller(wrong):
     with pytest.raises(TypeError, match=r"controller must have control_signal\(reference\) and update\(error\)"):
         simulate(wrong, X, disturbance=D, secondary_path=S)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from helpers.comparing import numbers_of
+from helpers.naming import plain
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -734,7 +735,7 @@ def test_what_no_noise_needs_is_saved_up_to_the_credit_and_chance_and_no_further
         {"control_signal": math.nan}, {"control_signal": 1e200}, {"weights": [1.0, 2.0]},
         {"weights": [1.0, math.nan, 0.0]}, {"weights": [[1.0, 2.0, 3.0]]}, {"weights": "loud"},
     ],
-    ids=str,
+    ids=plain,
 )  # fmt: skip
 def test_a_bad_sample_changes_nothing(bad: dict) -> None:
     budget, untouched = made(), made()
