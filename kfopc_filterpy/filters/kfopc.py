@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_nonnegative, as_number, as_signal, require_finite
+from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
 from .guards import (
     SILENT_REFERENCE,
     all_or_nothing,
     checked_measurement,
     require_matrix,
     require_measurement,
+    require_observation,
+    require_semidefinite,
     require_variance,
     restore,
     state_of,
@@ -26,6 +28,32 @@ from .guards import (
 if TYPE_CHECKING:
     from ..power.constraint import OutputPowerConstraint
     from .random_walk import RandomWalkKFOPC
+
+
+class _Matrix:
+    """An attribute of filterpy that it transposes: a list or tuple assigned to it is stored as an array.
+
+    It is no property, because filterpy's `Saver` would record a property twice.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, kf: Any, owner: Any = None) -> Any:
+        if kf is None:
+            return self
+        try:
+            return kf.__dict__[self.name]
+        except KeyError:
+            raise AttributeError(f"{type(kf).__name__} has no {self.name} yet") from None
+
+    def __set__(self, kf: Any, value: Any) -> None:
+        kf.__dict__[self.name] = _as_matrix(value, self.name)
+
+
+def _as_matrix(value: Any, name: str) -> Any:
+    """Return a list or tuple as an array, and anything else as it is."""
+    return as_real_array(value, name) if isinstance(value, list | tuple) else value
 
 
 class KFOPC(KalmanFilter):
@@ -37,7 +65,8 @@ class KFOPC(KalmanFilter):
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, a wrong shape, a negative variance) raise an error before
-    anything changes.
+    anything changes. So do a P that is not positive semidefinite, complex measurements, and an update without an H.
+    `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters
     ----------
@@ -64,6 +93,8 @@ class KFOPC(KalmanFilter):
 
     Raises
     ------
+    TypeError
+        A dimension that is not a whole number.
     ValueError
         A dimension out of range, a rated power with ``dim_z > 1``, a power that is not positive, both a rated power and
         a constraint.
@@ -95,13 +126,15 @@ class KFOPC(KalmanFilter):
     """
 
     if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
-        __slots__ = ("_batch_references", "_constraint", "_lifted", "_unconstrained_factor")
+        __slots__ = ("_batch_references", "_constraint", "_default_H", "_lifted", "_unconstrained_factor")
 
     x: Any  # assigned by filterpy, like the others
     y: Any
     z: Any
     K: Any
     _mahalanobis: Any
+    F: Any = _Matrix()
+    H: Any = _Matrix()
 
     def __init__(
         self,
@@ -116,7 +149,9 @@ class KFOPC(KalmanFilter):
         self._lifted: OutputPowerConstraint | None = None  # the constraint before it was lifted, for its settings
         self._unconstrained_factor = 1.0
         self._batch_references: BatchReferences | None = None
-        super().__init__(dim_x, dim_z, dim_u)
+        dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
+        super().__init__(dim_x, dim_z, as_count(dim_u, "dim_u", minimum=0))
+        self._default_H = self.H
         if constraint is not None:
             if rated_power is not None:
                 raise ValueError("give either rated_power= or constraint=, which has a rated power, not both")
@@ -265,6 +300,7 @@ class KFOPC(KalmanFilter):
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
         n = self.dim_x
+        F = _as_matrix(F, "F")
         transition = self.F if F is None else F
         require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
         require_variance(self.Q if Q is None else Q, n, "Q")
@@ -296,8 +332,11 @@ class KFOPC(KalmanFilter):
         Raises
         ------
         ValueError
-            NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power
-            with neither a reference nor a secondary-path gain. The filter is unchanged and can continue.
+            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, no H given or
+            assigned, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
+            gain. The filter is unchanged and can continue.
+        TypeError
+            A measurement that is not a real number.
         """
         reference = self._next_reference(z, reference)
         if z is None:
@@ -337,6 +376,8 @@ class KFOPC(KalmanFilter):
         if not 0 <= start <= self.dim_z - length:
             raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
         require_measurement(z_i, length)
+        if H_i is None:
+            require_observation(self, self.H, "H_i")
         rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
         require_finite(rows, "H_i")
         noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
@@ -485,7 +526,13 @@ class KFOPC(KalmanFilter):
         if sample is not None and self._constraint is not None:
             self._constraint.advance(*sample)
 
+    def _take_in_edits(self) -> None:
+        """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
+        if not (np.array_equal(self.P, self.P_post) or np.array_equal(self.P, self.P_prior)):
+            require_semidefinite(self.P, "P")
+
     def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
+        self._take_in_edits()
         return all_or_nothing(self, name, **arguments)
 
 
