@@ -411,7 +411,10 @@ class KFOPC(KalmanFilter):
 
         Parameters
         ----------
-        zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver
+        zs : sequence or numpy.ma.MaskedArray
+            As in filterpy: a sample of None is missing. So is a masked sample, and a sample of several measurements if
+            any of them is masked.
+        Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional
             (len(zs),) reference samples x(n), for a filter with a rated power.
@@ -425,6 +428,16 @@ class KFOPC(KalmanFilter):
         ------
         ValueError
             As `predict` and `update`; the filter is then as it was before the batch.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC(dim_x=1)
+        >>> kf.H = [[1.0]]
+        >>> zs = np.ma.masked_invalid([1.0, np.nan, 1.0])
+        >>> kf.batch_filter(zs)[0].ravel().round(2)  # the second sample is missing
+        array([0.67, 0.67, 0.91])
         """
         if references is not None:
             references = BatchReferences(as_signal(references, "references", length=len(zs)))
@@ -434,7 +447,7 @@ class KFOPC(KalmanFilter):
         before = self.__getstate__()
         self._batch_references = references
         try:
-            result = super().batch_filter(zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
+            result = super().batch_filter(_with_none_for_masked(zs), Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
         except BaseException:
             restore(self, before)
             raise
@@ -534,6 +547,16 @@ class KFOPC(KalmanFilter):
     def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
         self._take_in_edits()
         return all_or_nothing(self, name, **arguments)
+
+
+def _with_none_for_masked(zs: Sequence[Any]) -> np.ndarray:
+    """Return the samples, None for each that is masked in whole or in part.
+
+    In an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None.
+    """
+    samples = (None if np.ma.is_masked(z) else z for z in zs)
+    plain = (z.data if isinstance(z, np.ma.MaskedArray) else z for z in samples)
+    return np.fromiter(plain, dtype=object, count=len(zs))
 
 
 class BatchReferences:
