@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from ..power.constraint import OutputPowerConstraint
     from .random_walk import RandomWalkKFOPC
 
+MOST_STATES_SHOWN = 8  # with more, `repr` is a summary: filterpy's shows every matrix
+
 
 class _Matrix:
     """An attribute of filterpy that it transposes: a list or tuple assigned to it is stored as an array.
@@ -489,6 +491,8 @@ class KFOPC(KalmanFilter):
         return attributes, private | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
 
     def __repr__(self) -> str:
+        if self.dim_x > MOST_STATES_SHOWN:
+            return f"<{type(self).__name__}: {', '.join(self._summary())}>"
         constraint = [
             f"{name} = {getattr(self, name)}"
             for name in ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
@@ -496,6 +500,21 @@ class KFOPC(KalmanFilter):
         return "\n".join(
             [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint]
         )
+
+    def _summary(self) -> list[str]:
+        """Return the parts of the `repr` of a filter with many states."""
+        return [
+            f"dim_x {self.dim_x}",
+            f"dim_z {self.dim_z}",
+            *self._noises(),
+            *([] if self.rated_power is None else [f"rated power {self.rated_power:g}"]),
+            f"constraint factor {self.constraint_factor:.3g}",
+            f"norm of x {np.linalg.norm(self.x):.3g}",
+        ]
+
+    def _noises(self) -> list[str]:
+        """Return the noise variances for the summary, if they are single numbers."""
+        return []
 
     # All or nothing: a step is checked first, and undone if it fails.
 

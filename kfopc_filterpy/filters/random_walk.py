@@ -169,6 +169,10 @@ class RandomWalkKFOPC(KFOPC):
         own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
         return attributes, private | own
 
+    def _noises(self) -> list[str]:
+        state_noise = "full Q" if self.state_noise is None else f"state noise {self.state_noise:g}"
+        return [state_noise, f"measurement noise {self.measurement_noise:g}"]
+
     # F, Q, R: numbers, read as matrices.
 
     @property
