@@ -185,6 +185,15 @@ class FilteredReferenceController:
         gain = self.constraint.secondary_path_gain
         return np.nan if gain is None else gain
 
+    def __repr__(self) -> str:
+        parts = [
+            f"{self.n_taps} taps",
+            *([] if self.rated_power is None else [f"rated power {self.rated_power:g}"]),
+            f"constraint factor {self.constraint_factor:.3g}",
+            *([] if self.limiter is None else [f"limiter of rated power {self.limiter.rated_power:g}"]),
+        ]
+        return f"<{self.name}: {', '.join(parts)}>"
+
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         self._y = emit_once(self._emitter(), as_number(reference, "reference"))

@@ -53,6 +53,9 @@ class LimitedController:
         self.controller, self.limiter = controller, limiter
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
 
+    def __repr__(self) -> str:
+        return f"<{self.name}: limiter of rated power {self.limiter.rated_power:g}>"
+
     def control_signal(self, reference: float) -> float:
         """Return the limited control signal y(n) for the newest reference sample x(n)."""
         y = self.controller.control_signal(reference)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..kernels.covariance import Covariance, copy_covariance, full_covariance, new_covariance
+from .guards import INDEFINITE_LIMIT, require_semidefinite
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
 
@@ -127,11 +128,12 @@ class RandomWalkCovariance:
         self.updated()
 
 
-def require_covariance(P: np.ndarray) -> None:
-    """Raise ValueError unless P is symmetric, to rounding, with no negative variance."""
+def require_covariance(P: np.ndarray, dtype: np.dtype) -> None:
+    """Raise ValueError unless P is symmetric and positive semidefinite, to the rounding of `dtype`."""
     if np.diagonal(P).min() < 0:
         raise ValueError("P must not have negative variances on its diagonal")
     difference = np.abs(P - P.T)
     if difference.max() > ASYMMETRY_LIMIT * np.abs(P).max():
         i, j = np.unravel_index(np.argmax(difference), P.shape)
         raise ValueError(f"P must be symmetric, but P[{i}, {j}] = {P[i, j]:g} and P[{j}, {i}] = {P[j, i]:g}")
+    require_semidefinite(P, "P", max(INDEFINITE_LIMIT, 100 * float(np.finfo(dtype).eps)))

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import require_finite
+from .._validate import as_real_array, require_finite
+
+INDEFINITE_LIMIT = 1e-8  # of the largest element: a more negative eigenvalue of P is not rounding
 
 SILENT_REFERENCE = (
     "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
@@ -77,6 +79,7 @@ def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, 
     """Return z, R and H as filterpy handles them, or raise a clear error."""
     n = kf.dim_x
     given = kf.H if H is None else H
+    require_observation(kf, given)
     if H is not None or np.ndim(given) == 1:
         H = np.asarray(given)
         H = H.reshape(1, -1) if H.ndim == 1 else H
@@ -98,10 +101,23 @@ def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, 
     return np.reshape(z, wanted), R, H
 
 
+def require_observation(kf: KalmanFilter, H: Any, name: str = "H") -> None:
+    """Raise ValueError if H is the array of zeros that filterpy makes and nothing was written into it."""
+    if H is getattr(kf, "_default_H", None) and not np.any(H):
+        raise ValueError(
+            f"H was never assigned, and filterpy's default, zeros, corrects nothing: pass {name}= or assign kf.H. "
+            "Nothing was changed"
+        )
+
+
 def require_measurement(z: Any, rows: int) -> None:
     """Raise an error unless z holds finite numbers, one per row of H, in a shape that converts to (rows, 1)."""
+    if np.ma.is_masked(z):  # numpy would use the value behind the mask
+        raise ValueError("z must not be masked: pass None for a missed sample")
     values = np.asarray(z)
-    if values.dtype.kind not in "biufc":
+    if values.dtype.kind == "c":
+        raise TypeError(f"z must be real, got complex numbers: {z!r}")
+    if values.dtype.kind not in "biuf":
         raise TypeError(f"z must be a number or an array of numbers, or None for a missed sample, got {z!r}")
     shape = values.shape
     if values.size != rows or shape not in ((), (rows,), (rows, 1), (1, rows)):
@@ -124,3 +140,25 @@ def require_variance(value: Any, size: int, name: str) -> None:
         require_finite(np.asarray(value, dtype=np.float64), name)
     if np.min(np.diagonal(value) if np.ndim(value) == 2 else value) < 0:
         raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")
+
+
+def require_semidefinite(value: Any, name: str, limit: float = INDEFINITE_LIMIT) -> None:
+    """Raise ValueError if the covariance `value` has an eigenvalue below -`limit` times its largest element.
+
+    NaN, Inf and wrong shapes pass: the step that uses them refuses them.
+    """
+    P = np.atleast_2d(as_real_array(value, name))
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or not np.isfinite(P).all():
+        return
+    largest = np.abs(P).max()
+    if largest == 0.0:
+        return
+    scaled = 0.5 * (P / largest + P.T / largest)  # overflows nowhere
+    try:
+        np.linalg.cholesky(scaled + limit * np.eye(len(P)))
+    except np.linalg.LinAlgError:
+        smallest = largest * np.linalg.eigvalsh(scaled)[0]
+        raise ValueError(
+            f"{name} must be positive semidefinite: it is a covariance, but its smallest eigenvalue is {smallest:g}. "
+            "Nothing was changed"
+        ) from None

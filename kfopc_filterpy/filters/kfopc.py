@@ -11,13 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_nonnegative, as_number, as_signal, require_finite
+from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
 from .guards import (
     SILENT_REFERENCE,
     all_or_nothing,
     checked_measurement,
     require_matrix,
     require_measurement,
+    require_observation,
+    require_semidefinite,
     require_variance,
     restore,
     state_of,
@@ -26,6 +28,34 @@ from .guards import (
 if TYPE_CHECKING:
     from ..power.constraint import OutputPowerConstraint
     from .random_walk import RandomWalkKFOPC
+
+MOST_STATES_SHOWN = 8  # with more, `repr` is a summary: filterpy's shows every matrix
+
+
+class _Matrix:
+    """An attribute of filterpy that it transposes: a list or tuple assigned to it is stored as an array.
+
+    It is no property, because filterpy's `Saver` would record a property twice.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, kf: Any, owner: Any = None) -> Any:
+        if kf is None:
+            return self
+        try:
+            return kf.__dict__[self.name]
+        except KeyError:
+            raise AttributeError(f"{type(kf).__name__} has no {self.name} yet") from None
+
+    def __set__(self, kf: Any, value: Any) -> None:
+        kf.__dict__[self.name] = _as_matrix(value, self.name)
+
+
+def _as_matrix(value: Any, name: str) -> Any:
+    """Return a list or tuple as an array, and anything else as it is."""
+    return as_real_array(value, name) if isinstance(value, list | tuple) else value
 
 
 class KFOPC(KalmanFilter):
@@ -37,7 +67,8 @@ class KFOPC(KalmanFilter):
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, a wrong shape, a negative variance) raise an error before
-    anything changes.
+    anything changes. So do a P that is not positive semidefinite, complex measurements, and an update without an H.
+    `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters
     ----------
@@ -64,6 +95,8 @@ class KFOPC(KalmanFilter):
 
     Raises
     ------
+    TypeError
+        A dimension that is not a whole number.
     ValueError
         A dimension out of range, a rated power with ``dim_z > 1``, a power that is not positive, both a rated power and
         a constraint.
@@ -95,13 +128,15 @@ class KFOPC(KalmanFilter):
     """
 
     if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
-        __slots__ = ("_batch_references", "_constraint", "_lifted", "_unconstrained_factor")
+        __slots__ = ("_batch_references", "_constraint", "_default_H", "_lifted", "_unconstrained_factor")
 
     x: Any  # assigned by filterpy, like the others
     y: Any
     z: Any
     K: Any
     _mahalanobis: Any
+    F: Any = _Matrix()
+    H: Any = _Matrix()
 
     def __init__(
         self,
@@ -116,7 +151,9 @@ class KFOPC(KalmanFilter):
         self._lifted: OutputPowerConstraint | None = None  # the constraint before it was lifted, for its settings
         self._unconstrained_factor = 1.0
         self._batch_references: BatchReferences | None = None
-        super().__init__(dim_x, dim_z, dim_u)
+        dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
+        super().__init__(dim_x, dim_z, as_count(dim_u, "dim_u", minimum=0))
+        self._default_H = self.H
         if constraint is not None:
             if rated_power is not None:
                 raise ValueError("give either rated_power= or constraint=, which has a rated power, not both")
@@ -265,6 +302,7 @@ class KFOPC(KalmanFilter):
     def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
         n = self.dim_x
+        F = _as_matrix(F, "F")
         transition = self.F if F is None else F
         require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
         require_variance(self.Q if Q is None else Q, n, "Q")
@@ -296,8 +334,11 @@ class KFOPC(KalmanFilter):
         Raises
         ------
         ValueError
-            NaN or Inf, a wrong shape, a negative variance, a silent reference with R = 0, or a rated power
-            with neither a reference nor a secondary-path gain. The filter is unchanged and can continue.
+            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, no H given or
+            assigned, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
+            gain. The filter is unchanged and can continue.
+        TypeError
+            A measurement that is not a real number.
         """
         reference = self._next_reference(z, reference)
         if z is None:
@@ -337,6 +378,8 @@ class KFOPC(KalmanFilter):
         if not 0 <= start <= self.dim_z - length:
             raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
         require_measurement(z_i, length)
+        if H_i is None:
+            require_observation(self, self.H, "H_i")
         rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
         require_finite(rows, "H_i")
         noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
@@ -370,7 +413,10 @@ class KFOPC(KalmanFilter):
 
         Parameters
         ----------
-        zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver
+        zs : sequence or numpy.ma.MaskedArray
+            As in filterpy: a sample of None is missing. So is a masked sample, and a sample of several measurements if
+            any of them is masked.
+        Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional
             (len(zs),) reference samples x(n), for a filter with a rated power.
@@ -384,6 +430,16 @@ class KFOPC(KalmanFilter):
         ------
         ValueError
             As `predict` and `update`; the filter is then as it was before the batch.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC(dim_x=1)
+        >>> kf.H = [[1.0]]
+        >>> zs = np.ma.masked_invalid([1.0, np.nan, 1.0])
+        >>> kf.batch_filter(zs)[0].ravel().round(2)  # the second sample is missing
+        array([0.67, 0.67, 0.91])
         """
         if references is not None:
             references = BatchReferences(as_signal(references, "references", length=len(zs)))
@@ -393,7 +449,7 @@ class KFOPC(KalmanFilter):
         before = self.__getstate__()
         self._batch_references = references
         try:
-            result = super().batch_filter(zs, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
+            result = super().batch_filter(_with_none_for_masked(zs), Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
         except BaseException:
             restore(self, before)
             raise
@@ -435,6 +491,8 @@ class KFOPC(KalmanFilter):
         return attributes, private | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
 
     def __repr__(self) -> str:
+        if self.dim_x > MOST_STATES_SHOWN:
+            return f"<{type(self).__name__}: {', '.join(self._summary())}>"
         constraint = [
             f"{name} = {getattr(self, name)}"
             for name in ("rated_power", "constraint_factor", "disturbance_power", "secondary_path_gain")
@@ -442,6 +500,21 @@ class KFOPC(KalmanFilter):
         return "\n".join(
             [super().__repr__().replace("KalmanFilter object", f"{type(self).__name__} object"), *constraint]
         )
+
+    def _summary(self) -> list[str]:
+        """Return the parts of the `repr` of a filter with many states."""
+        return [
+            f"dim_x {self.dim_x}",
+            f"dim_z {self.dim_z}",
+            *self._noises(),
+            *([] if self.rated_power is None else [f"rated power {self.rated_power:g}"]),
+            f"constraint factor {self.constraint_factor:.3g}",
+            f"norm of x {np.linalg.norm(self.x):.3g}",
+        ]
+
+    def _noises(self) -> list[str]:
+        """Return the noise variances for the summary, if they are single numbers."""
+        return []
 
     # All or nothing: a step is checked first, and undone if it fails.
 
@@ -485,8 +558,24 @@ class KFOPC(KalmanFilter):
         if sample is not None and self._constraint is not None:
             self._constraint.advance(*sample)
 
+    def _take_in_edits(self) -> None:
+        """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
+        if not (np.array_equal(self.P, self.P_post) or np.array_equal(self.P, self.P_prior)):
+            require_semidefinite(self.P, "P")
+
     def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
+        self._take_in_edits()
         return all_or_nothing(self, name, **arguments)
+
+
+def _with_none_for_masked(zs: Sequence[Any]) -> np.ndarray:
+    """Return the samples, None for each that is masked in whole or in part.
+
+    In an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None.
+    """
+    samples = (None if np.ma.is_masked(z) else z for z in zs)
+    plain = (z.data if isinstance(z, np.ma.MaskedArray) else z for z in samples)
+    return np.fromiter(plain, dtype=object, count=len(zs))
 
 
 class BatchReferences:

@@ -16,7 +16,7 @@ from ..kernels.covariance import Covariance, project_covariance, update_weights
 from ..kernels.records import new_record
 from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
 from .covariance import RandomWalkCovariance, require_covariance
-from .guards import SILENT_REFERENCE, checked_measurement
+from .guards import SILENT_REFERENCE, checked_measurement, require_observation
 from .kfopc import KFOPC
 
 # Outcomes of `correct_once`.
@@ -92,7 +92,8 @@ class RandomWalkKFOPC(KFOPC):
     Made by `KFOPC.random_walk`. To rounding, it behaves like a filterpy `KalmanFilter` with F = I, Q = r I and R = q:
 
     - `F`, `Q` and `R` are returned as read-only arrays. Assign a number to `Q` or `R` to change the noise.
-    - `P` is returned as a full array; editing it in place takes effect at the next step, as in filterpy.
+    - `P` is returned as a full array; editing it in place takes effect at the next step, as in filterpy. A P that is
+      not positive semidefinite is refused, which costs O(L^3), but only when P is assigned or edited.
     - If another F or a full Q is assigned or passed, or with `B` and `u`, or an H of several rows, the step uses
       filterpy's own equations, in O(L^3).
     - filterpy's fading memory ``alpha`` stays fast.
@@ -167,6 +168,10 @@ class RandomWalkKFOPC(KFOPC):
         attributes, private = super().__getstate__()
         own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
         return attributes, private | own
+
+    def _noises(self) -> list[str]:
+        state_noise = "full Q" if self.state_noise is None else f"state noise {self.state_noise:g}"
+        return [state_noise, f"measurement noise {self.measurement_noise:g}"]
 
     # F, Q, R: numbers, read as matrices.
 
@@ -262,7 +267,7 @@ class RandomWalkKFOPC(KFOPC):
         # as in filterpy's equations, a number is the variance of every state
         P = self._matrix(value * np.eye(self.dim_x) if np.ndim(value) == 0 else value, "P")
         if not self._delegating:  # the rounding of filterpy's own equations need not be small beside P
-            require_covariance(P)
+            require_covariance(P, self.dtype)
         self._replace_covariance(P)
 
     def _replace_covariance(self, P: np.ndarray) -> None:
@@ -330,7 +335,6 @@ class RandomWalkKFOPC(KFOPC):
     @contextmanager
     def _all_or_nothing(self, name: str, **arguments: Any) -> Iterator[None]:
         """Run filterpy's own equations, which see P, F, Q as full arrays."""
-        self._take_in_edits()
         with super()._all_or_nothing(name, **arguments):
             self._replace_covariance(self._covariance.full(self._covariance.now))
             self._delegating = True
@@ -359,6 +363,8 @@ class RandomWalkKFOPC(KFOPC):
         if z is not None and (own_inverse or np.size(row) != self.dim_x):
             super().update(z, R, H, reference=reference)
             return
+        if z is not None:
+            require_observation(self, row)
         reference = self._next_reference(z, reference)
         self._take_in_edits()
         if z is None:

@@ -337,6 +337,9 @@ class CausalityMargin:
     secondary_delay_s: float
     fs: float
 
+    def __repr__(self) -> str:
+        return f"<CausalityMargin: {1e3 * self.margin_s:.3g} ms, {self.margin_samples:.4g} samples>"
+
     @property
     def margin_s(self) -> float:
         """Margin by energy onset in s, primary minus secondary; a negative one is not causal."""

@@ -97,6 +97,25 @@ def test_compiled_run_is_the_steps_bit_for_bit(name: str, variant: str) -> None:
     assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
 
 
+@pytest.mark.parametrize("name", MAKERS)
+def test_repr_names_the_algorithm_and_its_settings(name: str) -> None:
+    controller, limited = made(name, "plain"), made(name, "limiter")
+    run(controller, n=50)
+    rated = "" if controller.rated_power is None else ", rated power 0.3"
+    expected = f"<{controller.name}: {N_TAPS} taps{rated}, constraint factor {controller.constraint_factor:.3g}"
+    assert repr(controller) == f"{expected}>"
+    assert repr(limited).endswith(", limiter of rated power 0.05>")
+
+
+def test_repr_of_kf_opc() -> None:
+    controller = kf_opc(128, S_HAT, rated_power=1.0, **KALMAN)
+    controller.estimator.constraint_factor = 0.70711
+    assert repr(controller) == "<KF-OPC: 128 taps, rated power 1, constraint factor 0.707>"
+    controller.limiter = OutputLimiter(2.5)
+    controller.estimator.rated_power = None
+    assert repr(controller) == "<KF-OPC: 128 taps, constraint factor 1, limiter of rated power 2.5>"
+
+
 def test_no_controller_is_left_out() -> None:
     """Whatever the package offers with n_taps and a secondary path is made above."""
     source = inspect.getsource(inspect.getmodule(made))

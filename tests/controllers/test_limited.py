@@ -433,6 +433,7 @@ def test_copies_of_a_limited_users_controller_go_their_own_ways(clone: Any) -> N
     run(made, n=150)
     other, before = clone(made), pickle.dumps(made)
     assert isinstance(other, LimitedController)
+    assert repr(other) == f"<own LMS limited: limiter of rated power {made.limiter.rated_power:g}>"
     result = run(other, n=100)
     assert pickle.dumps(made) == before
     assert_same_run(result, run(made, n=100))

@@ -366,6 +366,7 @@ def row_with(value: float) -> np.ndarray:
 
 def faults_of_updates() -> dict[str, Fault]:
     bad_z = {"NaN": NAN, "Inf": INF, "two": [1.0, 2.0], "3-D": np.ones((1, 1, 1)), "text": "loud", "[None]": [None]}
+    bad_z |= {"complex": 1.0 + 2.0j, "[complex]": np.array([1.0 + 0.0j]), "masked": np.ma.masked}
     found: dict[str, Fault] = {}
     for method in UPDATES:
         for name, z in bad_z.items():
@@ -417,7 +418,7 @@ def faults_of_other_steps() -> dict[str, Fault]:
         "predict: B of another size": (lambda f: f.predict(u=np.ones((1, 1)), B=np.ones((TAPS + 1, 1))), "shape"),
         "predict: u of another size": (lambda f: f.predict(u=np.ones((2, 1)), B=np.ones((TAPS, 1))), "shape"),
         "predict: x broadcast": (lambda f: f.predict(u=np.ones((1, 3)), B=np.ones((TAPS, 1))), "x would become"),
-        "predict: F as a list": (lambda f: f.predict(F=np.eye(TAPS).tolist()), "list"),
+        "predict: F as a ragged list": (lambda f: f.predict(F=[[1.0], [1.0, 0.0]]), "F must be .*differ in length"),
         "predict: overflow": (lambda f: f.predict(F=1e200 * np.eye(TAPS)), "NaN or Inf"),
         "predict_steadystate: u NaN": (lambda f: f.predict_steadystate(u=NAN, B=np.ones((TAPS, 1))), "u"),
         "batch_filter: z NaN": (lambda f: batch(f, zs=[1.0, 2.0, NAN, 4.0]), "z"),
@@ -444,11 +445,13 @@ def faults_of_other_steps() -> dict[str, Fault]:
 def faults_of_random_walk_assignments() -> dict[str, Fault]:
     asymmetric = np.eye(TAPS)
     asymmetric[0, 1] = 0.5
+    indefinite = np.eye(TAPS) + 2.0 * (np.eye(TAPS, k=1) + np.eye(TAPS, k=-1))
     bad = {
         "F": {"NaN": NAN * np.eye(TAPS), "of another size": np.eye(2)},
         "Q": {"negative": -1.0, "NaN": NAN, "[[NaN]]": NAN * np.eye(TAPS), "-I": -np.eye(TAPS), "small": np.eye(2)},
         "R": {"negative": -1.0, "NaN": NAN, "[[Inf]]": [[INF]], "of another size": np.eye(2)},
-        "P": {"NaN": NAN * np.eye(TAPS), "-I": -np.eye(TAPS), "asymmetric": asymmetric, "small": np.eye(2), "-1": -1.0},
+        "P": {"NaN": NAN * np.eye(TAPS), "-I": -np.eye(TAPS), "asymmetric": asymmetric, "small": np.eye(2), "-1": -1.0}
+        | {"indefinite": indefinite},
         "state_noise": {"negative": -1.0, "NaN": NAN, "two": [1.0, 2.0], "None": None},
         "measurement_noise": {"negative": -1.0, "Inf": INF, "text": "quiet"},
     }
@@ -556,6 +559,7 @@ def test_an_interrupted_step_changes_nothing(kind: str) -> None:
 @pytest.mark.skipif(not HAS_SEQUENTIAL, reason="filterpy 1.4.5 has no update_sequential")
 def test_update_sequential_stays_within_the_measurements() -> None:
     kf = KFOPC(3, 2)
+    kf.H = np.eye(2, 3)
     for start, z in ((-1, 1.0), (2, 1.0), (1, [1.0, 2.0])):
         with pytest.raises(ValueError, match="start"):
             kf.update_sequential(start, z, R_i=1.0, H_i=np.ones((np.size(z), 3)))

@@ -311,7 +311,9 @@ def steady_state(cls: type) -> list:
 
 
 def defaults(cls: type) -> list:
+    """test_default_dims, with its zeros for H assigned: KFOPC refuses an update if no H was (test_refusals)."""
     kf = cls(dim_x=3, dim_z=1)
+    kf.H = np.zeros((1, 3))
     kf.predict()
     kf.update(np.array([[1.0]]).T)
     return [kf.x, kf.P, kf.K]

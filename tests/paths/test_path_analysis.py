@@ -174,3 +174,9 @@ def test_the_papers_short_paths_do_not_realise_20_hz():
         assert level == pytest.approx(at_zero, abs=0.01)
     long = achieved_band(bandpass_path(4097))
     assert 15 < long.low_hz < 25
+
+
+def test_repr_of_a_causality_margin_is_the_margin():
+    early, late = np.eye(1, 30, 5)[0], np.eye(1, 30, 25)[0]
+    assert repr(causality_margin(late, early, fs=16000.0)) == "<CausalityMargin: 1.25 ms, 20 samples>"
+    assert repr(causality_margin(early, late, fs=16000.0)) == "<CausalityMargin: -1.25 ms, -20 samples>"

@@ -1,0 +1,264 @@
+"""Mistakes that would go unnoticed: a covariance that is none, an H that was forgotten, dimensions that are no numbers.
+
+Each is refused with a message that says what to do. The filter is unchanged and goes on like one that never saw it.
+"""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from kfopc_filterpy import KFOPC
+from kfopc_filterpy.filters import PowerBudgetKalmanFilter
+
+N = 3
+ROW = np.array([1.0, 0.5, -0.25])
+NOISES: dict[str, Any] = {"state_noise": 0.01, "measurement_noise": 0.5}
+COPIES = [copy.copy, copy.deepcopy, lambda kf: pickle.loads(pickle.dumps(kf))]
+MAKERS: dict[str, Callable[[], KFOPC]] = {
+    "general": lambda: KFOPC(N),
+    "constrained": lambda: KFOPC(N, rated_power=0.5),
+    "random walk": lambda: KFOPC.random_walk(N, **NOISES),
+    "random walk, constrained": lambda: KFOPC.random_walk(N, rated_power=0.5, **NOISES),
+    "power budget": lambda: PowerBudgetKalmanFilter(N, rated_power=0.5, **NOISES),
+}
+every_kind = pytest.mark.parametrize("kind", MAKERS)
+
+
+def require_same_course(kf: KFOPC, twin: KFOPC) -> None:
+    """Both are in the same state, and stay so."""
+    for z in (1.0, -2.0, 0.5):
+        for name in ("x", "P", "K", "S"):
+            np.testing.assert_array_equal(getattr(kf, name), getattr(twin, name), err_msg=name)
+        for f in (kf, twin):
+            f.predict()
+            f.update(z, H=ROW, reference=1.0)
+    assert kf.x.any()
+
+
+# P
+
+
+def rotated(*eigenvalues: float) -> np.ndarray:
+    """A matrix with these eigenvalues and a positive diagonal."""
+    rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(N, N)))[0]
+    return rotation @ np.diag(eigenvalues) @ rotation.T
+
+
+NOT_COVARIANCES = {
+    "negative definite": -np.eye(N),
+    "a negative number": -2.0,
+    "a negative variance": np.diag([1.0, 1.0, -1e-3]),
+    "indefinite": np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "indefinite and tiny": 1e-200 * np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "indefinite and huge": 1e300 * np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
+    "a negative list": (-np.eye(N)).tolist(),
+}
+COVARIANCES = {
+    "zero": np.zeros((N, N)),
+    "singular": np.ones((N, N)),
+    "singular to rounding": rotated(1.0, 0.3, -1e-15),
+    "of very different sizes": np.diag([1e12, 1.0, 1e-12]),
+    "a number": 3.0,
+    "tiny": 1e-300 * np.eye(N),
+}
+
+
+@pytest.mark.parametrize("name", NOT_COVARIANCES)
+@pytest.mark.parametrize("step", ["predict", "update", "update_correlated", "predict_steadystate", "batch_filter"])
+def test_a_P_that_is_no_covariance_is_refused_at_the_next_step(name: str, step: str) -> None:
+    arguments = {"update": [1.0], "update_correlated": [1.0], "batch_filter": [[1.0, 2.0]]}.get(step, [])
+    kf = KFOPC(N)
+    kf.H = ROW
+    kf.predict()
+    kf.update(1.0)
+    twin = copy.deepcopy(kf)
+    good, kf.P = kf.P, NOT_COVARIANCES[name]
+    with pytest.raises(ValueError, match=r"P must be positive semidefinite.* smallest eigenvalue is -.*Nothing was"):
+        getattr(kf, step)(*arguments)
+    assert kf.P is NOT_COVARIANCES[name]
+    kf.P = good
+    require_same_course(kf, twin)
+
+
+def test_a_P_written_into_is_checked_too() -> None:
+    kf = KFOPC(N)
+    kf.predict()
+    twin = copy.deepcopy(kf)
+    kf.P[0, 1] = kf.P[1, 0] = 5.0
+    with pytest.raises(ValueError, match="P must be positive semidefinite"):
+        kf.update(1.0, H=ROW)
+    kf.P[0, 1] = kf.P[1, 0] = 0.0
+    require_same_course(kf, twin)
+
+
+def test_the_random_walk_filter_refuses_it_when_it_is_assigned_or_at_the_next_step() -> None:
+    kf = KFOPC.random_walk(N, **NOISES)
+    twin = copy.deepcopy(kf)
+    for P in NOT_COVARIANCES.values():
+        with pytest.raises(ValueError, match="P must"):
+            kf.P = P
+        require_same_course(copy.deepcopy(kf), copy.deepcopy(twin))
+    kf.P[0, 1] = kf.P[1, 0] = 5.0
+    with pytest.raises(ValueError, match=r"P must be positive semidefinite.* eigenvalue is -4"):
+        kf.predict()
+    kf.P[0, 1] = kf.P[1, 0] = 0.0
+    require_same_course(kf, twin)
+
+
+@pytest.mark.parametrize("name", COVARIANCES)
+def test_any_covariance_is_accepted(name: str) -> None:
+    """As filterpy's filter uses it, bit for bit."""
+    filters = [KalmanFilter(N, 1), KFOPC(N)]
+    for kf in [*filters, KFOPC.random_walk(N, **NOISES)]:
+        kf.P = COVARIANCES[name]
+        kf.predict()
+        kf.update(1.0, H=ROW.reshape(1, -1))
+    np.testing.assert_array_equal(filters[0].P, filters[1].P)
+
+
+def test_a_step_of_its_own_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check costs O(n^3): only a P that was changed since the last step pays for it."""
+    kf, other = KFOPC(N), KFOPC.random_walk(N, **NOISES)
+    with monkeypatch.context() as patched:
+        patched.setattr(np.linalg, "cholesky", None)
+        for f in (kf, other):
+            f.predict()
+            f.update(1.0, H=ROW)
+            f.update_correlated(None)
+            f.predict()
+            f.predict()
+            f.update(None)
+            f.update(2.0, H=ROW)
+            f.update(2.0, H=ROW)
+
+
+def test_float32_is_given_the_rounding_of_float32() -> None:
+    """A P that a float32 filter has rounded can be assigned to it again; in float64 it is indefinite."""
+    kf = KFOPC.random_walk(N, dtype=np.float32, **NOISES)
+    kf.P = rotated(1.0, 0.5, -1e-6)
+    with pytest.raises(ValueError, match="P must be positive semidefinite"):
+        KFOPC.random_walk(N, **NOISES).P = rotated(1.0, 0.5, -1e-6)
+
+
+# F and H as nested lists
+
+
+def test_F_and_H_may_be_nested_lists() -> None:
+    """filterpy fails at its `F.T` and `H.T`; with arrays it is the oracle."""
+    F, H, B = [[1, 0.5], [0, 1]], [[1, 0]], [[1.0], [0.0]]
+    kf, attributes, arguments = KalmanFilter(2, 1), KFOPC(2), KFOPC(2)
+    kf.F, kf.H = np.array(F), np.array(H)
+    attributes.F, attributes.H = F, H
+    means, covariances = [], []
+    for z in (1.0, 2.0, None, 4.0):
+        for f in (kf, attributes):
+            f.predict(u=1.0, B=np.array(B))
+            f.update(z)
+        arguments.predict(u=1.0, B=np.array(B), F=F)
+        arguments.update(z, H=H)
+        means, covariances = [*means, kf.x], [*covariances, kf.P]
+        for f in (attributes, arguments):
+            np.testing.assert_array_equal(f.x, kf.x)
+            np.testing.assert_array_equal(f.P, kf.P)
+    assert isinstance(attributes.F, np.ndarray)
+    smoothed = [f.rts_smoother(np.array(means), np.array(covariances))[0] for f in (kf, attributes)]
+    np.testing.assert_array_equal(*smoothed)
+    for f in (kf, attributes):
+        f.B = np.array(B)
+    np.testing.assert_array_equal(attributes.get_prediction(1.0)[1], kf.get_prediction(1.0)[1])
+
+
+@pytest.mark.parametrize("name", ["F", "H"])
+def test_a_list_that_is_no_matrix_is_refused_when_it_is_assigned(name: str) -> None:
+    kf = KFOPC(N)
+    twin = copy.deepcopy(kf)
+    for bad in ([[1.0, 0.0], [1.0]], [["a"]], [[1j]]):
+        with pytest.raises(TypeError, match=f"{name} must be a sequence of real numbers"):
+            setattr(kf, name, bad)
+    require_same_course(kf, twin)
+
+
+# z
+
+
+@every_kind
+@pytest.mark.parametrize("z", [1.0 + 2.0j, 1j, np.complex64(2.0), [1j], np.array([[1.0 + 0.0j]])])
+def test_a_complex_z_is_refused(kind: str, z: Any) -> None:
+    kf, twin = MAKERS[kind](), MAKERS[kind]()
+    for f in (kf, twin):
+        f.predict()
+    with pytest.raises(TypeError, match="z must be real, got complex numbers"):
+        kf.update(z, H=ROW, reference=1.0)
+    with pytest.raises(TypeError, match="z must be real, got complex numbers"):
+        kf.residual_of(z)
+    require_same_course(kf, twin)
+
+
+@every_kind
+def test_a_masked_z_is_refused(kind: str) -> None:
+    """numpy would use the value behind the mask; only `batch_filter` takes masked samples."""
+    kf, twin = MAKERS[kind](), MAKERS[kind]()
+    for z in (np.ma.masked, np.ma.array([7.0], mask=[True])):
+        with pytest.raises(ValueError, match="z must not be masked: pass None for a missed sample"):
+            kf.update(z, H=ROW, reference=1.0)
+    require_same_course(kf, twin)
+
+
+# Dimensions
+
+
+@pytest.mark.parametrize("bad", ["4", 4.0, None, [4], np.float64(4.0)])
+@pytest.mark.parametrize("name", ["dim_x", "dim_z", "dim_u"])
+def test_dimensions_are_whole_numbers(name: str, bad: Any) -> None:
+    with pytest.raises(TypeError, match=f"{name} must be a whole number, got "):
+        KFOPC(**{"dim_x": 4, "dim_z": 1, "dim_u": 0} | {name: bad})
+    assert KFOPC(**{"dim_x": 4, "dim_z": 1, "dim_u": 0} | {name: np.int64(2)}).x.any() == 0
+
+
+# H
+
+
+@every_kind
+@pytest.mark.parametrize("method", ["update", "update_steadystate", "update_correlated", "batch_filter"])
+def test_an_update_without_any_H_is_refused(kind: str, method: str) -> None:
+    """filterpy's default is zeros, with which an update corrects nothing."""
+    kf, twin = MAKERS[kind](), MAKERS[kind]()
+    for f in (kf, twin):
+        f.predict()
+    given: dict[str, Any] = {"references": [1.0, 1.0]} if method == "batch_filter" else {"reference": 1.0}
+    z: Any = [1.0, 2.0] if method == "batch_filter" else 1.0
+    for same in [kf, *(clone(kf) for clone in COPIES)]:
+        with pytest.raises(ValueError, match=r"H was never assigned.*: pass H= or assign kf.H. Nothing was changed"):
+            getattr(same, method)(z, **given)
+    kf.update(None)  # a missed sample needs none
+    twin.update(None)
+    require_same_course(kf, twin)
+
+
+@pytest.mark.skipif(not hasattr(KalmanFilter, "update_sequential"), reason="filterpy 1.4.5 has no update_sequential")
+def test_update_sequential_without_any_H_is_refused() -> None:
+    kf, twin = KFOPC(N), KFOPC(N)
+    with pytest.raises(ValueError, match=r"H was never assigned.*: pass H_i= or assign kf.H"):
+        kf.update_sequential(0, 1.0)
+    require_same_course(kf, twin)
+
+
+@pytest.mark.parametrize("kind", ["general", "random walk"])
+def test_an_H_that_was_assigned_or_written_into_is_used(kind: str) -> None:
+    assigned, written, zeros = (MAKERS[kind]() for _ in range(3))
+    assigned.H = ROW.reshape(1, -1)
+    written.H[0] = ROW
+    zeros.H = np.zeros((1, N))  # asked for: it corrects nothing
+    for kf in (assigned, written, zeros):
+        kf.predict()
+        kf.update(1.0)
+    np.testing.assert_array_equal(assigned.x, written.x)
+    assert assigned.x.any()
+    assert not zeros.x.any()

@@ -1,0 +1,70 @@
+"""What a filter says of itself: filterpy's matrices for a few states, a summary for many."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import KFOPC, OutputPowerConstraint
+from kfopc_filterpy.filters import PowerBudgetKalmanFilter
+
+NOISES: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
+
+
+def test_the_general_filter() -> None:
+    kf = KFOPC(dim_x=100, dim_z=2)
+    assert repr(kf) == "<KFOPC: dim_x 100, dim_z 2, constraint factor 1, norm of x 0>"
+
+
+@pytest.mark.parametrize("column", [True, False])
+def test_the_random_walk_filter(column: bool) -> None:
+    kf = KFOPC.random_walk(128, constraint=OutputPowerConstraint(1.5, secondary_path_gain=1.0), **NOISES)
+    kf.x = np.zeros((128, 1)[: 1 + column])
+    kf.x[0], kf.x[1] = 3.0, 4.0
+    kf.constraint_factor = 0.70711
+    assert repr(kf) == (
+        "<RandomWalkKFOPC: dim_x 128, dim_z 1, state noise 1e-06, measurement noise 0.1, rated power 1.5, "
+        "constraint factor 0.707, norm of x 5>"
+    )
+    kf.Q = np.diag(np.arange(128.0))
+    kf.rated_power = None
+    assert repr(kf) == (
+        "<RandomWalkKFOPC: dim_x 128, dim_z 1, full Q, measurement noise 0.1, constraint factor 1, norm of x 5>"
+    )
+
+
+def test_the_filter_with_a_power_budget() -> None:
+    kf = PowerBudgetKalmanFilter(9, rated_power=0.5, **NOISES)
+    assert repr(kf) == (
+        "<PowerBudgetKalmanFilter: dim_x 9, dim_z 1, state noise 1e-06, measurement noise 0.1, rated power 0.5, "
+        "constraint factor 1, norm of x 0>"
+    )
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        KFOPC,
+        lambda n: KFOPC.random_walk(n, **NOISES),
+        lambda n: PowerBudgetKalmanFilter(n, rated_power=0.5, **NOISES),
+    ],
+)
+def test_up_to_eight_states_all_is_shown(make: Any) -> None:
+    text = repr(make(8))
+    assert text.startswith(f"{type(make(8)).__name__} object\ndim_x = 8\n")
+    assert "\nP = [[" in text
+    assert repr(make(9)).startswith(f"<{type(make(9)).__name__}: dim_x 9, ")
+
+
+def test_a_repr_changes_nothing() -> None:
+    kf = KFOPC.random_walk(16, **NOISES)
+    other = KFOPC.random_walk(16, **NOISES)
+    for f in (kf, other):
+        for z in (1.0, 2.0):
+            f.predict()
+            f.update(z, H=np.linspace(1.0, 2.0, 16))
+            assert "norm of x" in repr(kf)
+    np.testing.assert_array_equal(kf.x, other.x)
+    np.testing.assert_array_equal(kf.P, other.P)
