@@ -11,7 +11,8 @@ from ..kernels.delay_lines import newest
 from ..kernels.vectors import dot
 from ..power.constraint import ConstraintState
 from ..power.limiter import OutputLimiter
-from .lms import LMSController, advance_powers, change_weights
+from .fxlms import adapt_fxlms
+from .lms import LMSController
 from .step import Lines, adapt, output
 
 
@@ -38,13 +39,7 @@ def output_rescaled(state):
     return limit if y > 0.0 else -limit
 
 
-@adapt.register(RescalingState)
-def adapt_rescaling(state, error, control_signal):
-    """Apply the step of `FxLMS`."""
-    finite, _, _ = advance_powers(state, error)
-    if finite:
-        change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
-    return finite
+adapt.register(RescalingState)(adapt_fxlms)
 
 
 class RescalingFxLMS(LMSController):
