@@ -10,6 +10,7 @@ import numpy as np
 
 from .._validate import as_count, as_number, as_signal
 from ..kernels.delay_lines import delay_line, latest, newest
+from ..kernels.holding import Held
 from ..paths.models import is_system, path_taps, sampling_rate
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import ConstraintState, OutputPowerConstraint
@@ -99,6 +100,7 @@ class FilteredReferenceController:
     unshared = ""  # the part that prevents sharing, if any
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
+    _holding: Held | None = None
 
     def __init__(
         self,
@@ -196,17 +198,19 @@ class FilteredReferenceController:
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        self._y = emit_once(self._emitter(), as_number(reference, "reference"))
+        self._y = emit_once.with_held(self._held(), as_number(reference, "reference"))
         return self._y
 
-    def _emitter(self) -> Any:
-        """Return the state, or the part of it that `control_signal` needs."""
-        return self._state
+    def _held(self) -> Held:
+        """Return the state, held for compiled code."""
+        if self._holding is None or self._holding.state is not self._state:
+            self._holding = Held(self._state)
+        return self._holding
 
     def update(self, error: float) -> None:
         """Adapt to the error e(n) that the last control signal left."""
         error = as_number(error, "error")
-        if not adapt_once(self._state, error, self._y):
+        if not adapt_once.with_held(self._held(), error, self._y):
             raise ValueError(self._reason(error))
 
     def _reason(self, error: float) -> str:

@@ -24,7 +24,7 @@ from ..power.constraint import (
 )
 from ..power.limiter import OutputLimiter
 from .base import NO_SOLUTION, FilteredReferenceController, calls_of, constraint_for
-from .step import Emitter, Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
+from .step import Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
 
 
 class KalmanState(NamedTuple):
@@ -124,7 +124,6 @@ class KalmanController(FilteredReferenceController):
         super().__init__(estimator.dim_x, secondary_path, amplifier=amplifier, limiter=limiter)
         self.estimator = estimator
         self._state = self._new_state(new_covariance(np.zeros((1, 1))), new_numbers())
-        self._emits: Emitter | None = None
         self._calls_are_ours = calls_of(type(self)) == calls_of(self._family())
         self.name = name or self._usual_name()
 
@@ -182,16 +181,8 @@ class KalmanController(FilteredReferenceController):
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         reference = as_number(reference, "reference")
         self._see_weights()
-        self._y = emit_once(self._emitter(), reference)
+        self._y = emit_once.with_held(self._held(), reference)
         return self._y
-
-    def _emitter(self) -> Any:
-        if self._emits is None or self._emits.lines is not self._state.lines:
-            self._emits = Emitter(self._state.lines, self._emitting_filter())
-        return self._emits
-
-    def _emitting_filter(self) -> np.ndarray:
-        return self._state.weights
 
     def _see_weights(self) -> None:
         """Copy the estimator's weights into the state."""
@@ -204,7 +195,7 @@ class KalmanController(FilteredReferenceController):
         state = self._steppable_state()
         if state is None:
             self._update_through_estimator(error)
-        elif adapt_once(state, error, self._y):
+        elif adapt_once.with_held(self._held(), error, self._y):
             self.estimator.after_compiled(state.weights.copy())
         else:
             self._update_through_estimator(error)  # raises, with the reason

@@ -131,9 +131,6 @@ class PowerBudgetController(KalmanController):
     def _powers_fs(self) -> float:
         return self.estimator.budget.fs
 
-    def _emitting_filter(self) -> np.ndarray:
-        return self._state.budget.control_filter
-
     def _update_estimator(self, d: float, h: np.ndarray, x: float) -> None:
         self.estimator.update(d, H=h, reference=x, control_signal=self._y)
 

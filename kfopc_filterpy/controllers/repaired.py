@@ -52,15 +52,6 @@ class RepairedState(NamedTuple):
     repair: np.ndarray  # record: of_control, trim_rate (0: none), at_output; log of the trim, factor at the output
 
 
-class RepairedEmitter(NamedTuple):
-    """Part of the state that the control signal needs, see `step.Emitter`."""
-
-    lines: Lines
-    weights: np.ndarray
-    repair: np.ndarray
-
-
-@output.register(RepairedEmitter)
 @output.register(RepairedState)
 def output_repaired(state):
     """Return w'x times the factor at the output."""
@@ -206,11 +197,6 @@ class RepairedKFOPC(KalmanController):
     def constraint_factor(self) -> float:
         """Constraint factor of the last sample, trimmed."""
         return self.constraint.factor
-
-    def _emitter(self) -> Any:
-        return RepairedEmitter(
-            self._state.lines, self._state.weights, self._repair
-        )  # the factor may be applied to the output
 
     def _update_through_estimator(self, error: float) -> None:
         d = estimate_once(self._state.lines, error)

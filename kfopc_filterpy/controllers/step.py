@@ -36,13 +36,6 @@ class Lines(NamedTuple):
     limiter: LimiterState | None
 
 
-class Emitter(NamedTuple):
-    """Part of a state that the usual control signal needs; a call from Python is faster with less to pass."""
-
-    lines: Lines
-    weights: np.ndarray  # the control filter
-
-
 # Functions chosen by the type of the state.
 
 
@@ -124,15 +117,15 @@ def disturbance_estimate(lines, error):
 
 
 @compiled_for_states()
-def emit_once(state, x):
-    """Call `emit` from Python."""
-    return emit(state, x)
+def emit_once(held, x):
+    """Call `emit` from Python, with a `Held` state."""
+    return emit(held.state, x)
 
 
 @compiled_for_states()
-def adapt_once(state, error, control_signal):
-    """Call `adapt` from Python."""
-    return adapt(state, error, control_signal)
+def adapt_once(held, error, control_signal):
+    """Call `adapt` from Python, with a `Held` state."""
+    return adapt(held.state, error, control_signal)
 
 
 @compiled()

@@ -6,26 +6,46 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from math import isfinite, log, pi
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, require_finite
-from ..kernels.compiling import compiled
+from ..kernels.compiling import compiled_for_states, part
 from ..kernels.covariance import Covariance, project_covariance, update_weights
+from ..kernels.holding import Held
 from ..kernels.records import new_record
-from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
+from ..power.constraint import (
+    ConstraintState,
+    OutputPowerConstraint,
+    commit_constraint,
+    preview_constraint,
+    squares_are_finite,
+)
 from .covariance import RandomWalkCovariance, require_covariance
 from .guards import SILENT_REFERENCE, checked_measurement, require_observation
 from .kfopc import KFOPC
 
-# Outcomes of `correct_once`.
+# Outcomes of `correct`.
 CORRECTED, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE, OVERFLOWING_SQUARE, SILENT = range(6)
 UNTOUCHED = (NOT_FINITE, OVERFLOWING_SQUARE, SILENT)  # refused before the pass over the covariance
 
 
-@compiled()
-def correct_once(cov, constraint, weights, z, h, reference, noise, factor):
+class FilterArrays(NamedTuple):
+    """Arrays that an update changes, beside the weights."""
+
+    covariance: Covariance
+    constraint: ConstraintState | None  # None in a filter without a rated power
+
+
+@compiled_for_states()
+def correct_once(held, weights, z, h, reference, noise, factor):
+    """Call `correct` from Python, with held `FilterArrays`."""
+    return correct(held.state.covariance, held.state.constraint, weights, z, h, reference, noise, factor)
+
+
+@part()
+def correct(cov, constraint, weights, z, h, reference, noise, factor):
     """Apply eq. 5-9 to `weights` and `cov`; return the outcome, the residual and S.
 
     `constraint` is None in a filter without a rated power; the measurement is then scaled by `factor`. A refused update
@@ -128,6 +148,7 @@ class RandomWalkKFOPC(KFOPC):
             "_alpha_sq",
             "_covariance",
             "_delegating",
+            "_held",
             "_likelihood",
             "_log_likelihood",
             "_made",
@@ -155,6 +176,7 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance = RandomWalkCovariance(np.eye(n_taps))
         self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
         self._delegating = False
+        self._held: Held | None = None
         self._numbers = new_numbers()
         self._made: dict[str, Any] = {}  # those of y, z, S, SI and x_prior read or assigned since the last update
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
@@ -166,7 +188,12 @@ class RandomWalkKFOPC(KFOPC):
     def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the state for a copy, with its own arrays and no views (copied views would be writeable)."""
         attributes, private = super().__getstate__()
-        own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
+        own: dict[str, Any] = {
+            "_views": {},
+            "_held": None,
+            "_covariance": deepcopy(self._covariance),
+            "_numbers": deepcopy(self._numbers),
+        }
         return attributes, private | own
 
     def _noises(self) -> list[str]:
@@ -403,7 +430,7 @@ class RandomWalkKFOPC(KFOPC):
             self._weights()  # raises, with the reason
         arrays, before, prior = self._covariance.before_update()
         x = np.nan if reference is None else reference
-        outcome, y, S = correct_once(arrays, state, weights, z, h, x, noise, factor)
+        outcome, y, S = correct_once.with_held(self._hold(arrays, state), weights, z, h, x, noise, factor)
         if outcome not in UNTOUCHED:
             self._covariance.projected(before, prior)
         if outcome != CORRECTED:
@@ -413,8 +440,15 @@ class RandomWalkKFOPC(KFOPC):
         self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
         return weights
 
+    def _hold(self, covariance: Covariance, constraint: ConstraintState | None) -> Held:
+        """Return the arrays, held for compiled code."""
+        held = self._held
+        if held is None or held.state.covariance is not covariance or held.state.constraint is not constraint:
+            self._held = held = Held(FilterArrays(covariance, constraint))
+        return held
+
     def _refuse(self, outcome: int, z: float, S: float, h: np.ndarray, reference: float | None) -> None:
-        """Raise ValueError for an update that `correct_once` refused."""
+        """Raise ValueError for an update that `correct` refused."""
         if outcome == NOT_FINITE:
             self._weights()
             checked_measurement(self, z, None, h)

@@ -48,6 +48,11 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
+def is_ours(kind: type) -> bool:
+    """Return whether a type is defined in this package."""
+    return kind.__module__.startswith(PACKAGE.name)
+
+
 class StateEntry:
     """A compiled function whose first argument is a controller's state.
 
@@ -61,8 +66,11 @@ class StateEntry:
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
     def __call__(self, state: Any, *arguments: Any) -> Any:
-        ours = type(state).__module__.startswith(PACKAGE.name)
-        return (self.kept if ours else self.passing)(state, *arguments)
+        return (self.kept if is_ours(type(state)) else self.passing)(state, *arguments)
+
+    def with_held(self, held: Any, *arguments: Any) -> Any:
+        """Call it with a `Held` state, of which it reads the field `state`."""
+        return (self.kept if held.ours else self.passing)(held.passed, *arguments)
 
 
 def compiled_for_states(**options: Any) -> Callable[[Callable[..., Any]], StateEntry]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,8 +19,9 @@ from numba.core.errors import NumbaError
 
 from kfopc_filterpy import FxLMS, OutputLimiter, kf_opc, kf_pb
 from kfopc_filterpy.kernels.borrowing import borrowed
-from kfopc_filterpy.kernels.compiling import by_type, compiled, inlined, part
+from kfopc_filterpy.kernels.compiling import by_type, compiled, compiled_for_states, inlined, part
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
+from kfopc_filterpy.kernels.holding import Held
 from kfopc_filterpy.kernels.records import new_record
 from kfopc_filterpy.kernels.stacking import member, stacked, unstack
 
@@ -379,6 +382,55 @@ def test_an_array_with_gaps_is_not_read_as_one_without() -> None:
     except (NumbaError, ValueError):
         return
     assert read == 2.0
+
+
+# ---- States that are held
+
+
+@compiled_for_states()
+def spend_held(held, factor):
+    """Call `spend` with the state that is held."""
+    return factor * spend(held.state)
+
+
+@pytest.mark.parametrize("how", ["itself", "deepcopy", "pickle"])
+def test_a_held_state_is_the_state_itself_and_is_copied_with_it(how: str) -> None:
+    state = outer()
+    held: Held = {"itself": lambda h: h, "deepcopy": deepcopy, "pickle": lambda h: pickle.loads(pickle.dumps(h))}[how](
+        Held(state)
+    )
+    assert spend_held.with_held(held, 2.0) == 36.0
+    assert held.state.inner.numbers.item() == (18.0, 1)
+    np.testing.assert_array_equal(state.values, [0.0, 3.0, 6.0, 9.0] if how == "itself" else np.arange(4.0))
+
+
+def test_held_arrays_are_given_back() -> None:
+    state = outer()
+    arrays = list(arrays_of(state))
+    counts = [sys.getrefcount(array) for array in arrays]
+    held = Held(state)
+    for _ in range(100):
+        spend_held.with_held(held, 1.0)
+    del held
+    assert [sys.getrefcount(array) for array in arrays] == counts
+
+
+@pytest.mark.parametrize("name", ["FxLMS", "KF-OPC", "KF-PB"])
+def test_a_copied_controller_steps_on_its_own(name: str) -> None:
+    """What is held of the original must not be stepped by the copy, nor the other way round."""
+    kalman: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": 1e-2, "rated_power": 0.2}
+    made: Any = (
+        FxLMS(4, S_HAT, step_size=0.01)
+        if name == "FxLMS"
+        else {"KF-OPC": kf_opc, "KF-PB": kf_pb}[name](4, S_HAT, **kalman)
+    )
+    run(made, n=60, compiled=False)
+    copy, weights = deepcopy(made), made.weights
+    run(copy, n=60, compiled=False)
+    assert np.any(copy.weights != weights)
+    np.testing.assert_array_equal(made.weights, weights)
+    run(made, n=60, compiled=False)
+    np.testing.assert_array_equal(made.weights, copy.weights)
 
 
 # ---- NamedTuples that are stacked
