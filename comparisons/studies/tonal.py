@@ -123,11 +123,15 @@ def main(runs: Runs) -> StudyReport:
             "filterpy_largest_difference": oracle,
         },
         verdicts=[
-            harmonics_verdict(*(_number(merits[name], "harmonics_db") for name in KALMAN)),
+            harmonics_verdict(_number(merits["KF-ANC"], "harmonics_db"), _number(merits["KF-OPC"], "harmonics_db")),
             peak_verdict(float(np.abs(results["KF-OPC"].control_signal).max()), scene.amplitude_limit),
             power_verdict(_number(merits["KF-OPC"], "output_power") / RATED_POWER),
             growth_verdict(growths),
-            reduction_verdict(*(_number(merits[name], "noise_reduction_db") for name in KALMAN), crossings),
+            reduction_verdict(
+                _number(merits["KF-ANC"], "noise_reduction_db"),
+                _number(merits["KF-OPC"], "noise_reduction_db"),
+                crossings,
+            ),
         ],
         figures=_figures_of(results, forgetful, scene, sweep, crossings, theirs, primary, secondary),
         sounds=sounds(results),

@@ -33,7 +33,9 @@ def test_harmonics(anc_db: float, opc_db: float, held: bool) -> None:
     assert tonal.harmonics_verdict(anc_db, opc_db).reproduced is held
 
 
-@pytest.mark.parametrize(("share", "held"), [(0.9, True), (1.009, True), (1.011, False), (20.0, False), (np.nan, False)])
+@pytest.mark.parametrize(
+    ("share", "held"), [(0.9, True), (1.009, True), (1.011, False), (20.0, False), (np.nan, False)]
+)
 def test_peak(share: float, held: bool) -> None:
     assert tonal.peak_verdict(share * LIMIT, LIMIT).reproduced is held
 
