@@ -120,6 +120,7 @@ def main(runs: Runs) -> StudyReport:
             "with_less_state_noise": unforgetting,
             "with_most_state_noise": {name: _overflow(result, optimal_weight) for name, result in forgetful.items()},
             "largest_optimal_weight": optimal_weight,
+            "largest_weight_over_optimal": growth_of(results["KF-ANC"], optimal_weight).over_optimal,
             "filterpy_largest_difference": oracle,
         },
         verdicts=[
@@ -403,6 +404,12 @@ def _figures_of(
     def amplifier(ax: Any, from_s: float = span[0]) -> None:
         plot_amplifier_output(pair, span_s=(from_s, end), limit=scene.amplitude_limit, ax=ax)
 
+    def line(ax: Any) -> None:
+        plot_weight_history(list(forgetful.values()), tap=tap, ax=ax).set_yscale(
+            "linear"
+        )  # a straight line is the point
+        ax.autoscale(axis="y")
+
     def overdrive(ax: Any) -> None:
         plot_noise_reduction_against_overdrive(OVERDRIVES_DB, sweep, flip_db=crossings, ax=ax)
         ax.set_ylim(0, 25)
@@ -429,7 +436,7 @@ def _figures_of(
             f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d). Left: at the settings tuned; right: with "
             f"the most state noise of the grid, r E[x'^2]/q = {FORGETFUL:g}. KF-OPC is the same in both.",
             lambda ax: plot_weight_history(pair, tap=tap, ax=ax),
-            lambda ax: plot_weight_history(list(forgetful.values()), tap=tap, ax=ax),
+            line,
         ),
         draw(
             "overdrive",
