@@ -81,6 +81,7 @@ def main(runs: Runs) -> StudyReport:
     coherence = coherence_and_gain(opc[0].disturbance, opc[0].anti_noise, FS, BAND)
     return StudyReport(
         name="broadband",
+        conditions=("broadband noise", "band-pass paths"),
         title="Broadband noise and a linear amplifier",
         summary=(
             f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of "

@@ -209,8 +209,8 @@ def milliseconds(time_s: float | None) -> str:
 def sounds(results: Mapping[str, SimulationResult]) -> list[Sound]:
     """Return the disturbance, and what each algorithm leaves of it."""
     first = next(iter(results.values()))
-    heard = [Sound("disturbance", "disturbance, control off", first.disturbance)]
-    return heard + [Sound(name.lower(), f"residual of {name}", r.error) for name, r in results.items()]
+    heard = [Sound("disturbance", "Control off", first.disturbance)]
+    return heard + [Sound(name.lower(), name, r.error) for name, r in results.items()]
 
 
 # ---- Tables
