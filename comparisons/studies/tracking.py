@@ -183,7 +183,7 @@ def sounds_of(event: Event, heard: dict[str, SimulationResult]) -> list[Sound]:
     if not names:
         return []
     # A second before the event, so that the excerpt has the event in it.
-    begin = next(iter(event.stretches.values()))[0] - 1.0 if event.stretches else 0.0
+    begin = max(0.0, min((start for start, _ in event.stretches.values()), default=0.0) - 1.0)
     signals = {"Control off": heard[names[0]].disturbance} | {name: heard[name].error for name in names}
     stems = ["disturbance", *map(str.lower, names)]
     return [

@@ -146,7 +146,7 @@ class FigureItem:
         )
         drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
         return (
-            _plain("Plot of " + "; ".join(drawn) + (f". Curves: {', '.join(names)}." if names else "."))
+            _plain("Plot of " + "; ".join(drawn) + (f". Curves: {'; '.join(names)}." if names else "."))
             if drawn
             else ""
         )

@@ -35,7 +35,7 @@ PAPER = (
 )
 TEMPLATE = "report.html.jinja"
 _COLOURS = 64  # of an inlined figure: lines and letters need no more, and it is a third as large
-_LONG = 6  # lines of a parameter's value beyond which they are folded away
+_LONG = 4  # lines of a parameter's value beyond which they are folded away
 
 
 def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) -> str:
@@ -53,10 +53,11 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
     )
     layout.filters |= {"math": mathml, "prose": prose}
     figures = [[_image(item, figure_file(folder, study, item)) for item in study.figures] for study in studies]
+    first: dict[str, Any] | None = None
     if lead is not None:
         first = _image(lead, folder / "figures" / lead.stem)
-    else:
-        first = next((own.pop(0) for own in figures if own), None)
+    elif shown := next(filter(None, figures), None):
+        first = shown.pop(0)
     return layout.get_template(TEMPLATE).render(
         title=TITLE,
         paper=PAPER,
@@ -68,7 +69,7 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
     )
 
 
-def _part(study: StudyReport, figures: list[dict[str, str]], folder: Path) -> dict[str, Any]:
+def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> dict[str, Any]:
     """Return what the template shows of a study."""
     headings, merit = _merit(study)
     return {
@@ -122,18 +123,16 @@ def _text(value: Any) -> str:
     return "–" if value is None else str(value)
 
 
-def _image(item: FigureItem, file: Path) -> dict[str, str]:
+def _image(item: FigureItem, file: Path) -> dict[str, Any]:
     """Return a figure as a small PNG of few colours; its files are the full ones."""
     from PIL import Image
 
     with Image.open(file.with_name(file.name + ".png")) as image:
         small = io.BytesIO()
         image.convert("RGB").quantize(_COLOURS).save(small, "PNG", optimize=True)
-    return {
-        "caption": item.caption,
-        "alt": item.alt or item.caption,
-        "source": _data_uri(small.getvalue(), "image/png"),
-    }
+        broad = image.width > 2 * image.height
+    source = _data_uri(small.getvalue(), "image/png")
+    return {"caption": item.caption, "alt": item.alt or item.caption, "source": source, "broad": broad}
 
 
 def _players(study: StudyReport, folder: Path) -> Iterator[dict[str, Any]]:

@@ -35,7 +35,6 @@
     hear(on, chosen) {
       this.on = on;
       this.chosen = chosen;
-      this.control.setAttribute("aria-pressed", String(on));
       this.control.textContent = on ? "Control is on" : "Control is off";
       this.status.textContent = `You hear: ${this.audio[this.heard].getAttribute("aria-label")}`;
       this.box.dataset.heard = this.heard;
@@ -44,8 +43,8 @@
     }
 
     async start() {
-      if (running) running.stop();
-      this.play.disabled = true;
+      if (this.starting) return;
+      this.starting = true; // the button stays enabled, for a disabled one loses the focus
       try {
         context ??= new AudioContext();
         await context.resume();
@@ -55,9 +54,9 @@
         this.box.querySelector(".switch").hidden = true;
         throw error;
       } finally {
-        this.play.disabled = false;
+        this.starting = false;
       }
-      if (running) running.stop(); // another was started meanwhile
+      if (running) running.stop();
       this.gains = this.buffers.map((_, i) => new GainNode(context, { gain: i === this.heard ? 1 : 0 }));
       this.sources = this.buffers.map((buffer, i) => {
         const source = new AudioBufferSourceNode(context, { buffer, loop: true });
@@ -67,28 +66,23 @@
       this.began = context.currentTime + 0.05;
       for (const source of this.sources) source.start(this.began);
       running = this;
-      this.playing(true);
+      this.play.textContent = "■ Stop";
       this.show();
     }
 
     stop() {
+      cancelAnimationFrame(this.frame);
       for (const source of this.sources) source.stop();
       for (const gain of this.gains) gain.disconnect();
       this.sources = this.gains = running = null;
       this.progress.value = 0;
-      this.playing(false);
-    }
-
-    playing(now) {
-      this.play.textContent = now ? "■ Stop" : "▶ Play";
-      this.play.setAttribute("aria-pressed", String(now));
+      this.play.textContent = "▶ Play";
     }
 
     show() {
-      if (!this.sources) return;
       const duration = this.buffers[0].duration;
       this.progress.value = (Math.max(0, context.currentTime - this.began) % duration) / duration;
-      requestAnimationFrame(() => this.show());
+      this.frame = requestAnimationFrame(() => this.show());
     }
   }
 

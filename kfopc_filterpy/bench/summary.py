@@ -123,7 +123,7 @@ def glance(studies: Sequence[StudyReport]) -> FigureItem | None:
     shown = [study for study in studies if study.algorithms]
     if not shown:
         return None
-    figure = Figure(figsize=(7.0, 5.6), layout="constrained")
+    figure = Figure(figsize=(5.8, 5.4), layout="constrained")
     powers, reductions = figure.subplots(2, 1, sharex=True)
     names = list(dict.fromkeys(name for study in shown for name in study.algorithms))
     for i, name in enumerate(names):
@@ -137,7 +137,7 @@ def glance(studies: Sequence[StudyReport]) -> FigureItem | None:
     powers.set_ylim(min(low, 0.2), max(high, 5.0))  # a decade at least, which has ticks
     powers.yaxis.set_major_formatter("{x:g}")
     powers.yaxis.set_minor_formatter("")
-    reductions.set(ylabel="noise reduction (dB)", xlim=(-0.5, len(shown) - 0.5))
+    reductions.set(xlabel="study", ylabel="noise reduction (dB)", xlim=(-0.5, len(shown) - 0.5))
     reductions.set_xticks(range(len(shown)), [study.name.replace("-", "\n") for study in shown])
     for ax in (powers, reductions):
         ax.grid(axis="y", color="0.9")
