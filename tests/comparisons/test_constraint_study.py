@@ -13,7 +13,7 @@ from comparisons import __main__ as command
 from comparisons.studies import cases, constraint
 from comparisons.studies.cases import Case, make_case
 from comparisons.studies.constraint import SHARES, ClippedRow, ConstraintRow, Jump
-from kfopc_filterpy.bench import Runs, Scene, StudyReport, Table, results_table, write_report
+from kfopc_filterpy.bench import Runs, Scene, StudyReport, Table, results_table, verdict_sentence, write_report
 from kfopc_filterpy.paths import duct_paths, path_taps
 
 TAPS = 16
