@@ -117,7 +117,7 @@ def _text(value: Any) -> str:
     if isinstance(value, list):
         return ("\n" if any(isinstance(item, list) for item in value) else ", ").join(map(_text, value))
     if isinstance(value, dict):
-        return "\n".join(f"{key}: {_text(item)}" for key, item in value.items())
+        return "\n".join(f"{key.replace('_', ' ')}: {_text(item)}" for key, item in value.items())
     if isinstance(value, float):
         return f"{value:.6g}"
     return "–" if value is None else str(value)
