@@ -99,6 +99,7 @@ def main(runs: Runs) -> StudyReport:
     reductions = {name: own["noise_reduction_db"] for name, own in merits.items()}
     return StudyReport(
         name="broadband",
+        conditions=("broadband noise", "band-pass paths"),
         title="Broadband noise and a linear amplifier",
         summary=(
             f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of "

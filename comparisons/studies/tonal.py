@@ -97,6 +97,7 @@ def main(runs: Runs) -> StudyReport:
     band = achieved_band(secondary, fs=FS)
     return StudyReport(
         name="tonal",
+        conditions=("a tone", "band-pass paths", "an amplifier that clips"),
         title="Tonal noise and a clipping amplifier",
         summary=(
             f"A {TONE_HZ:g} Hz tone needs {POWER_MULTIPLE:g} times the rated power. The amplifier clips at "
