@@ -211,6 +211,35 @@ def test_every_tutorial_is_a_notebook_to_download_without_outputs(page):
     assert f"\n{page.stem}\n" in text_of(DOCS / "tutorials" / "index.md")
 
 
+# Figures of the pages.
+
+CELL = re.compile(r"^```\{code-cell\}.*?^```$", flags=re.M | re.S)
+DRAWS = re.compile(r"\bplt\.subplots\(|\bplot_\w+\(|^diagrams\.\w+\(", flags=re.M)
+
+
+def drawing_cells(text: str) -> list[str]:
+    """Cells of a page that leave a figure on it."""
+    return [cell for cell in CELL.findall(text) if DRAWS.search(cell) and "remove-cell" not in cell]
+
+
+CAPTIONED = [page for page in PAGES if page.stem != "your_recording"]
+
+
+@pytest.mark.parametrize("page", CAPTIONED, ids=lambda page: page.stem)
+def test_every_figure_that_a_page_draws_has_a_caption_and_words_in_its_place(page):
+    for cell in drawing_cells(text_of(page)):
+        settings = cell.split("---")[1] if cell.count("---") >= 2 else ""
+        assert re.search(r"^  figure:\n    caption: \|\n      \S", settings, flags=re.M), f"no caption:\n{cell}"
+        assert re.search(r"^  image:\n    alt: \S", settings, flags=re.M), f"no alternative text:\n{cell}"
+
+
+def test_the_reader_of_cells_finds_those_that_draw():
+    drawn = "```{code-cell} python\nfigure, ax = plt.subplots()\n```"
+    hidden = "```{code-cell} python\n:tags: [remove-cell]\nplot_nse(run)\n```"
+    computed = "```{code-cell} python\nfrom kfopc_filterpy.plot import plot_nse\n```"
+    assert drawing_cells("\n\n".join([computed, drawn, hidden])) == [drawn]
+
+
 # The theory.
 
 
