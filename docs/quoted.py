@@ -319,13 +319,25 @@ def _constraint() -> Iterator[Quote]:
     yield quote("the measured duct at 25 % (up to {:.1f} dB)", lambda r: [_worst_loss(r, "swelling band noise")])
     yield quote(
         "KF-OPC's output power was {:.2f} to {:.2f} of the rated power, KF-PB's {:.2f} to {:.2f}",
-        lambda r: [
-            f(x["power"] for k in (True, False) for x in r.rows(name, k))
-            for name in ("KF-OPC", "KF-PB")
-            for f in (min, max)
-        ],
+        _least_and_most_power,
         page="limits.md",
     )
+
+
+def _power_range() -> Iterator[Quote]:
+    """What the README, the front page and the limitations begin with."""
+    words = "KF-OPC's output power was {:.2f} to {:.2f} times the rated power and KF-PB's {:.2f} to {:.2f} times"
+    for page in ("../README.md", "index.md", "limits.md"):
+        yield Quote(page, words, ("constraint",), _least_and_most_power, CONSTRAINT)
+
+
+def _least_and_most_power(results: Results) -> list[float]:
+    """Output power over the rated power of KF-OPC and of KF-PB, over all runs."""
+    return [
+        extreme(row["power"] for stationary in (True, False) for row in results.rows(name, stationary))
+        for name in ("KF-OPC", "KF-PB")
+        for extreme in (min, max)
+    ]
 
 
 def _worst_loss(results: Results, noise: str) -> float:
@@ -420,7 +432,15 @@ def _further() -> Iterator[Quote]:
     )
 
 
-QUOTES: tuple[Quote, ...] = (*_tonal(), *_broadband(), *_duct(), *_constraint(), *_algorithms(), *_further())
+QUOTES: tuple[Quote, ...] = (
+    *_tonal(),
+    *_broadband(),
+    *_duct(),
+    *_constraint(),
+    *_power_range(),
+    *_algorithms(),
+    *_further(),
+)
 
 
 def table() -> str:
