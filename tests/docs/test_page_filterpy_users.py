@@ -28,7 +28,7 @@ def test_the_figures_say_what_the_page_says():
     for got, expected in zip(v.banks(v.KFOPC), v.banks(v.KalmanFilter), strict=True):
         assert np.array_equal(got, expected)
     calm, agile, *both = v.errors["straight"]
-    assert max(both) < 1.1 * calm < 0.6 * agile
+    assert max(both) < 1.2 * calm < 0.6 * agile
     calm, agile, *both = v.errors["manoeuvre"]
     assert max(both) < 1.1 * agile < 0.3 * calm
     before, after = (v.probability[half].mean() for half in v.halves.values())
@@ -53,5 +53,7 @@ def test_it_shows_two_rows_of_the_table_on_speed():
     text = (TUTORIALS / "filterpy_users.md").read_text(encoding="utf-8")
     chosen = re.search(r"\.\./speed\.txt\n:language: text\n:lines: (.*)", text)[1]
     lines = (TUTORIALS.parent / "speed.txt").read_text(encoding="utf-8").splitlines()
-    shown = [line for item in chosen.split(", ") for line in lines[int(item.split("-")[0]) - 1 : int(item.split("-")[-1])]]
+    shown = [
+        line for item in chosen.split(", ") for line in lines[int(item.split("-")[0]) - 1 : int(item.split("-")[-1])]
+    ]
     assert [line[:20].strip() for line in shown] == ["µs a sample", "filterpy API of KFOP", "filterpy"]

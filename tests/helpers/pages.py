@@ -10,7 +10,9 @@ from typing import Any
 import matplotlib.pyplot as plt
 
 TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
-_PART = re.compile(r"^```\{code-cell\}[^\n]*\n(?P<options>(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$", re.M | re.S)
+_PART = re.compile(
+    r"^```\{code-cell\}[^\n]*\n(?P<options>(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$", re.M | re.S
+)
 
 
 class Page:
