@@ -171,7 +171,7 @@ def noises() -> dict[str, Noise]:
 def measured_data() -> Any:
     """Return the measured duct and the motor recording, or None if they cannot be had."""
     try:
-        return load_measured_duct(allow_download=True)
+        return load_measured_duct(noise="motor", allow_download=True)
     except DataUnavailableError:
         return None
 
