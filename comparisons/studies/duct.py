@@ -54,6 +54,7 @@ RATED_POWER = 0.5
 POWER_MULTIPLE = 4.0
 N_TAPS = 256
 NSE_WINDOW_S = 0.05
+TIME_WINDOW_S = 0.02  # of the times to a common level, which are shorter than 50 ms would resolve
 SEED = 1
 FIXED = "MOV-FxLMS by variance"
 ALGORITHMS = (*PAPER, FIXED, "KF-PB")
@@ -79,7 +80,8 @@ class Figures:
 class Start:
     """The second after the control is switched on, at a time at which the constraint acts throughout that second.
 
-    Noise reductions and powers are over that second, the powers over the rated power.
+    Noise reductions and powers are over that second, the powers over the rated power. Times are those at which the NSE
+    first comes within 1 dB of the lesser of the two steady reductions: a level that both reach.
     """
 
     at_s: float
@@ -88,6 +90,10 @@ class Start:
     power: Mapping[str, float]
     equal_power: float  # of KF-OPC with another rated power, chosen so that it puts out as much as MOV-FxLMS
     equal_power_db: float
+    time_s: float  # of KF-OPC
+    mov_time_s: float
+    equal_time_s: float  # of KF-OPC with equal power, to the level that it has in common with MOV-FxLMS there
+    mov_equal_time_s: float
 
 
 def planned_runs() -> int:
@@ -285,6 +291,8 @@ def start_under_constraint(scene: Scene, tuned: Mapping[str, Tuned], factor: np.
     power = {algorithm: float(np.mean(r.control_signal**2)) for algorithm, r in results.items()}
     # KF-OPC's power is proportional to its rated power as long as the factor is below 1.
     equal = run("KF-OPC", RATED_POWER * power["MOV-FxLMS"] / power["KF-OPC"])
+    time, mov_time = times_to_a_common_level(results["KF-OPC"], results["MOV-FxLMS"])
+    equal_time, mov_equal_time = times_to_a_common_level(equal, results["MOV-FxLMS"])
     return Start(
         at_s=float(at_s),
         largest_factor=float(np.max(results["KF-OPC"].constraint_factor)),
@@ -292,7 +300,22 @@ def start_under_constraint(scene: Scene, tuned: Mapping[str, Tuned], factor: np.
         power={algorithm: own / RATED_POWER for algorithm, own in power.items()},
         equal_power=float(np.mean(equal.control_signal**2)) / RATED_POWER,
         equal_power_db=_reduction_db(equal),
+        time_s=time,
+        mov_time_s=mov_time,
+        equal_time_s=equal_time,
+        mov_equal_time_s=mov_equal_time,
     )
+
+
+def times_to_a_common_level(one: SimulationResult, other: SimulationResult) -> tuple[float, float]:
+    """Return when the NSE of each first comes within 1 dB of the lesser of their steady noise reductions, in seconds."""
+    level = 1.0 - min(noise_reduction_db(r.error, r.disturbance) for r in (one, other))
+
+    def first(result: SimulationResult) -> float:
+        below = nse_db(result.error, result.disturbance, FS, TIME_WINDOW_S) <= level
+        return float(np.argmax(below)) / FS if below.any() else np.inf
+
+    return first(one), first(other)
 
 
 def _reduction_db(result: SimulationResult) -> float:
@@ -427,7 +450,7 @@ def confined_claim(opc: Figures) -> Verdict:
 
 
 def faster_claim(start: Start | None) -> Verdict:
-    """Return the verdict on the start: KF-OPC must be ahead as it is, and with as much power as MOV-FxLMS."""
+    """Return the verdict on the start: KF-OPC must be sooner as it is, and with as much power as MOV-FxLMS."""
     claim = "KF-OPC converges faster than MOV-FxLMS"
     if start is None:
         return Verdict(
@@ -439,11 +462,13 @@ def faster_claim(start: Start | None) -> Verdict:
     mov = reduction["MOV-FxLMS"]
     return Verdict(
         claim,
-        bool(reduction["KF-OPC"] > mov and start.equal_power_db > mov),
-        f"noise reduction over the second after a start at {start.at_s:g} s, where the constraint factor is at most "
-        f"{start.largest_factor:.2f}: {reduction['KF-OPC']:.2f} against {mov:.2f} dB, at {power['KF-OPC']:.2f} and "
-        f"{power['MOV-FxLMS']:.2f} of the rated power. With a rated power at which KF-OPC puts out {start.equal_power:.2f} "
-        f"as well it is {start.equal_power_db:.2f} dB. MOV-FxLMS with a fixed penalty reaches {reduction[FIXED]:.2f} dB at "
+        bool(start.time_s < start.mov_time_s and start.equal_time_s < start.mov_equal_time_s),
+        f"after a start at {start.at_s:g} s, where the constraint factor is at most {start.largest_factor:.2f}, they reach a "
+        f"common level in {milliseconds(start.time_s)} and {milliseconds(start.mov_time_s)}, at {power['KF-OPC']:.2f} and "
+        f"{power['MOV-FxLMS']:.2f} of the rated power; with a rated power at which KF-OPC puts out "
+        f"{start.equal_power:.2f} as well, in {milliseconds(start.equal_time_s)} and "
+        f"{milliseconds(start.mov_equal_time_s)}. The noise reduction over that second is {reduction['KF-OPC']:.2f} against "
+        f"{mov:.2f} dB, and {start.equal_power_db:.2f} dB at equal power. MOV-FxLMS with a fixed penalty reaches {reduction[FIXED]:.2f} dB at "
         f"{power[FIXED]:.2f}",
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -65,33 +66,38 @@ def test_confined_is_over_the_steady_half_and_over_every_second(changed: dict[st
     assert f"{changed.get('worst_50_ms', 1.5):.1f} times the rated power over 50 ms" in verdict.figure
 
 
-def start(opc: float, equal: float, mov: float = 5.0) -> Start:
+def start(time_s: float, equal_time_s: float) -> Start:
     return Start(
         at_s=3.0,
         largest_factor=0.8,
-        noise_reduction_db={"KF-OPC": opc, "KF-PB": 9.0, "MOV-FxLMS": mov, FIXED: 7.0},
+        noise_reduction_db={"KF-OPC": 6.5, "KF-PB": 9.0, "MOV-FxLMS": 5.0, FIXED: 7.0},
         power={"KF-OPC": 1.25, "KF-PB": 1.0, "MOV-FxLMS": 0.9, FIXED: 0.95},
         equal_power=0.91,
-        equal_power_db=equal,
+        equal_power_db=4.5,
+        time_s=time_s,
+        mov_time_s=0.020,
+        equal_time_s=equal_time_s,
+        mov_equal_time_s=0.010,
     )
 
 
 @pytest.mark.parametrize(
-    ("opc", "equal", "met"),
+    ("time_s", "equal_time_s", "met"),
     [
-        (5.1, 5.1, True),
-        (5.1, 4.9, False),
-        (4.9, 5.1, False),
-        (5.1, 5.0, False),
-        (5.0, 5.1, False),
-        (np.nan, 5.1, False),
+        (0.0199, 0.0099, True),
+        (0.0199, 0.0101, False),
+        (0.0201, 0.0099, False),
+        (0.0199, 0.0100, False),
+        (0.0200, 0.0099, False),
+        (np.inf, 0.0099, False),
     ],
 )
-def test_faster_is_ahead_at_equal_power_too(opc: float, equal: float, met: bool) -> None:
-    verdict = duct.faster_claim(start(opc, equal))
+def test_faster_is_sooner_at_equal_power_too(time_s: float, equal_time_s: float, met: bool) -> None:
+    verdict = duct.faster_claim(start(time_s, equal_time_s))
     assert verdict.reproduced is met
     assert "after a start at 3 s, where the constraint factor is at most 0.80" in verdict.figure
-    assert f"puts out 0.91 as well it is {equal:.2f} dB" in verdict.figure
+    assert f"puts out 0.91 as well, in {1e3 * equal_time_s:.1f} ms and 10.0 ms" in verdict.figure
+    assert "6.50 against 5.00 dB, and 4.50 dB at equal power" in verdict.figure
 
 
 def test_without_a_second_under_the_constraint_nothing_is_claimed() -> None:
@@ -172,6 +178,23 @@ def test_both_start_where_the_constraint_acts_and_with_equal_power(scene: Any) -
     assert found.equal_power < 0.98 * found.power["KF-OPC"]
     assert found.equal_power_db < found.noise_reduction_db["KF-OPC"]
     assert duct.start_under_constraint(scene, tuned, np.ones(int(2.5 * FS))) is None
+
+
+def test_the_common_level_is_that_of_the_lesser(scene: Any) -> None:
+    d = scene.disturbances[0][: int(FS)]
+
+    def course(at_s: float, reduction_db: float) -> Any:
+        """A run that reduces the noise from a time on."""
+        late = np.arange(d.size) >= at_s * FS
+        return SimpleNamespace(error=np.where(late, d * 10 ** (-reduction_db / 20), d), disturbance=d)
+
+    lesser, better = course(0.2, 5.0), course(0.1, 20.0)
+    one, other = duct.times_to_a_common_level(lesser, better)
+    assert duct.times_to_a_common_level(better, lesser) == (other, one)
+    # At -4 dB most of the window has to be late for the lesser, and less of it for the better.
+    assert 0.2 < one < 0.2 + duct.TIME_WINDOW_S + 1 / FS
+    assert 0.1 < other < 0.1 + duct.TIME_WINDOW_S
+    assert other - 0.1 < one - 0.2
 
 
 # ---- Which noise
