@@ -51,10 +51,6 @@ class Results:
             value = value[key]
         return value
 
-    def over_rated(self, study: str, key: str, algorithm: str) -> float:
-        """A power among the extras over the rated power."""
-        return self.extra(study, key, algorithm) / self.studies[study]["rated_power"]
-
     def said(self, study: str, claim: str) -> list[float]:
         """Numbers in the verdict on the claim that begins with these words."""
         verdict = next(v for v in self.studies[study]["verdicts"] if v["claim"].startswith(claim))

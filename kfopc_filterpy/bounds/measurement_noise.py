@@ -43,7 +43,7 @@ def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path:
     -----
     numpy.exceptions.RankWarning
         If q cannot be told: the reference is so narrow-band that float64 correlations do not resolve all directions of
-        the weights, and weights in those would explain part of the residual. The estimate is then too high by at least 1 dB.
+        the weights, and weights in those would explain part of the residual. The estimate is then too high by at least 6 dB.
 
     Examples
     --------

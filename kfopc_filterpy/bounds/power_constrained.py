@@ -270,7 +270,7 @@ def power_constrained_wiener(
     -----
     numpy.exceptions.RankWarning
         If, over the whole record, the directions left out would lower the error of `whole` or `unconstrained` by more
-        than 1 dB, and its noise reduction is below 60 dB.
+        than 6 dB, and its noise reduction is below 60 dB.
 
     See Also
     --------

@@ -20,8 +20,9 @@ from ..paths.models import path_taps
 BUDGET_TOLERANCE = 1e-12
 
 # The directions that `RANK_TOLERANCE` leaves out matter if they would lower the error by so much, unless the error is
-# below -60 dB already: there a microphone's own noise decides.
-LOSS_THAT_MATTERS_DB = 1.0
+# below -60 dB already: there a microphone's own noise decides. Noise of a few octaves in a duct loses up to 4 dB, with
+# weights of 1e10 that no controller could use.
+LOSS_THAT_MATTERS_DB = 6.0
 ERROR_THAT_MATTERS = 1e-6
 ROWS_PER_TAP = 8  # samples that are fitted anew to find that out
 
@@ -74,7 +75,7 @@ def wiener_solution(
 
     Eigenvalues of the correlation matrix below 1e-11 of the largest count as zero, because float64 correlations do not
     resolve them. A narrow-band reference has such eigenvalues, and then a filter with very large weights can have a
-    smaller error than the solution. A warning says so if it matters.
+    smaller error than the solution. A warning says so if it matters: the solution is then no bound.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def wiener_solution(
     Warns
     -----
     numpy.exceptions.RankWarning
-        If the directions left out would lower the error by more than 1 dB, and the noise reduction is below 60 dB.
+        If the directions left out would lower the error by more than 6 dB, and the noise reduction is below 60 dB.
 
     See Also
     --------
