@@ -282,6 +282,18 @@ def _duct() -> Iterator[Quote]:
         ],
     )
     yield quote(
+        "starts the control at {:.0f} s",
+        ("duct-motor",),
+        lambda r: [r.extra("duct-motor", "start_under_constraint", "at_s")],
+    )
+    yield quote(
+        "at equal power KF-OPC takes {:.0f} ms and MOV-FxLMS {:.0f} ms",
+        ("duct-motor",),
+        lambda r: [
+            1e3 * r.extra("duct-motor", "start_under_constraint", key) for key in ("equal_time_s", "mov_equal_time_s")
+        ],
+    )
+    yield quote(
         "it then reduces the noise by {:.2f} and {:.2f} dB, MOV-FxLMS by {:.2f} and {:.2f} dB",
         ("duct", "duct-measured"),
         lambda r: start(r, "equal_power_db") + start(r, "noise_reduction_db", "MOV-FxLMS"),
