@@ -25,8 +25,14 @@ extensions = [
     "myst_nb",
     "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
     "public_names",  # docs/extensions: a reference page for each public name
+    "offline",  # docs/extensions: nothing that a page loads comes from a network
 ]
+from offline import mathjax_file  # noqa: E402
 from source_lines import linkcode_resolve  # noqa: E402, F401
+
+# MathJax is copied into the pages. It writes SVG, because browsers refuse the fonts of a page that is opened as a file.
+mathjax_path = "tex-svg-full.js"
+mathjax3_config = {"options": {"enableMenu": False}}  # the menu's settings load parts that are not in the file
 
 # Tutorials are MyST text notebooks, executed anew in every build; a cell that raises ends it.
 nb_execution_mode = "force"
@@ -55,7 +61,7 @@ linkcheck_anchors = False
 linkcheck_allow_unauthorized = True
 
 html_theme = "furo"
-html_static_path = ["_static"]
+html_static_path = ["_static", mathjax_file()]
 html_css_files = ["wide.css"]
 html_title = "kfopc_filterpy"
 html_copy_source = False

@@ -134,6 +134,7 @@ def _study(
     extra = _why(scene, wiener, results)
     return StudyReport(
         name=name,
+        conditions=("machine noise in a duct",),
         title=title,
         summary=summary,
         fs=FS,

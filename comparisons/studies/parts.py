@@ -93,7 +93,8 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
             scene.measurement_noise, "estimate of eq. 7: residual of a batch fit to a run without control"
         ),
         "initial_variance_P0": Parameter(
-            scene.initial_variance, "Wiener control power over n_taps and reference power: the weights' expected square"
+            scene.initial_variance,
+            "Wiener control power over L times the reference's power: the weights' expected square",
         ),
         "power_memory_s": Parameter(scene.power_memory_s, "exponential window; the package's default"),
         "secondary_path_estimate": Parameter("exact", "the paper models no mismatch"),
@@ -209,8 +210,8 @@ def milliseconds(time_s: float | None) -> str:
 def sounds(results: Mapping[str, SimulationResult]) -> list[Sound]:
     """Return the disturbance, and what each algorithm leaves of it."""
     first = next(iter(results.values()))
-    heard = [Sound("disturbance", "disturbance, control off", first.disturbance)]
-    return heard + [Sound(name.lower(), f"residual of {name}", r.error) for name, r in results.items()]
+    heard = [Sound("disturbance", "Control off", first.disturbance)]
+    return heard + [Sound(name.lower(), name, r.error) for name, r in results.items()]
 
 
 # ---- Tables

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import HardClipAmplifier, KalmanController, SimulationResult, bandpass_path, noise_reduction_db
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    KalmanController,
+    SimulationResult,
+    bandpass_path,
+    noise_reduction_db,
+    output_power,
+)
 from kfopc_filterpy.bench import (
     FigureItem,
     Parameter,
@@ -17,11 +26,13 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Tuned,
     Verdict,
+    algorithms,
     figures_of_merit,
     make_controller,
     make_scene,
     tune,
 )
+from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.metrics import harmonics_db
 from kfopc_filterpy.paths import achieved_band, frequency_response
 from kfopc_filterpy.plot import (
@@ -45,13 +56,23 @@ POWER_MULTIPLE = 2.0
 N_TAPS = 128
 OVERDRIVES_DB = np.arange(0.0, 10.5, 1.0)
 UNFORGETTING = (1e-10, 1e-12)
+FORGETFUL = max(algorithms()["KF-ANC"].grid)  # most state noise of the grid: the fastest forgetting
 FILTERPY_SAMPLES = 4000
 WEIGHTS_EVERY = 160
+
+# Criteria of the verdicts
+HARMONICS_DB = -30.0  # over the disturbance; louder ones are harmonics, 3 % in amplitude
+CLEAN_DB = -60.0  # softer ones are none: the sensor noise is as loud
+PEAK_SHARE = 1.01  # of the amplifier's limit
+POWER_TOLERANCE = 0.01
+MANY_TIMES = 10.0  # the optimal weight
+LINEAR_TOLERANCE = 0.1
+CONSTANT_TOLERANCE = 0.01
 
 
 def planned_runs() -> int:
     """Return the number of runs of the study."""
-    return grid_runs(PAPER) + len(PAPER) + len(KALMAN) * (len(OVERDRIVES_DB) + len(UNFORGETTING))
+    return grid_runs(PAPER) + len(PAPER) + len(KALMAN) * (len(OVERDRIVES_DB) + len(UNFORGETTING) + 1)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -60,12 +81,14 @@ def main(runs: Runs) -> StudyReport:
     scene = _scene(primary, secondary, POWER_MULTIPLE)
     tuned = tune(runs, scene)
 
-    def run(name: str) -> SimulationResult:
-        controller = make_controller(scene, name, tuned[name].setting)
-        return scene.run(controller, record_weights_every=WEIGHTS_EVERY)
-
-    results = dict(zip(tuned, runs.map(run, tuned), strict=True))
-    algorithms = {name: _figures(result, scene) for name, result in results.items()}
+    recorded = runs.map(lambda name: _recorded(scene, name, tuned[name].setting), tuned)
+    results = dict(zip(tuned, recorded, strict=True))
+    merits = {name: _figures(result, scene) for name, result in results.items()}
+    forgetful = dict(zip(KALMAN, runs.map(lambda name: _recorded(scene, name, FORGETFUL), KALMAN), strict=True))
+    optimal = wiener_solution(*scene.settled, scene.secondary, scene.n_taps)
+    optimal_weight = float(np.abs(optimal.weights).max())
+    pairs = {tuned["KF-ANC"].setting: results, FORGETFUL: forgetful}
+    growths = {setting: [growth_of(pair[name], optimal_weight) for name in KALMAN] for setting, pair in pairs.items()}
     sweep = _overdrive_sweep(runs, scene, tuned)
     crossings = crossings_db(OVERDRIVES_DB, sweep["KF-OPC"] - sweep["KF-ANC"])
     unforgetting = _without_forgetting(runs, scene)
@@ -74,6 +97,7 @@ def main(runs: Runs) -> StudyReport:
     band = achieved_band(secondary, fs=FS)
     return StudyReport(
         name="tonal",
+        conditions=("a tone", "band-pass paths", "an amplifier that clips"),
         title="Tonal noise and a clipping amplifier",
         summary=(
             f"A {TONE_HZ:g} Hz tone needs {POWER_MULTIPLE:g} times the rated power. The amplifier clips at "
@@ -89,16 +113,29 @@ def main(runs: Runs) -> StudyReport:
             "amplitude": Parameter(float(np.abs(scene.references[0]).max()), "follows from the control power"),
         }
         | BANDPASS_PATHS,
-        algorithms=algorithms,
+        algorithms=merits,
         extra={
             "overdrive_db": OVERDRIVES_DB,
             "noise_reduction_db_over_overdrive": sweep,
             "ordering_flips_at_overdrive_db": crossings,
             "with_less_state_noise": unforgetting,
+            "with_most_state_noise": {name: _overflow(result, optimal_weight) for name, result in forgetful.items()},
+            "largest_optimal_weight": optimal_weight,
+            "largest_weight_over_optimal": growth_of(results["KF-ANC"], optimal_weight).over_optimal,
             "filterpy_largest_difference": oracle,
         },
-        verdicts=_verdicts(results, algorithms, crossings),
-        figures=_figures_of(results, scene, sweep, crossings, theirs, primary, secondary),
+        verdicts=[
+            harmonics_verdict(_number(merits["KF-ANC"], "harmonics_db"), _number(merits["KF-OPC"], "harmonics_db")),
+            peak_verdict(float(np.abs(results["KF-OPC"].control_signal).max()), scene.amplitude_limit),
+            power_verdict(_number(merits["KF-OPC"], "output_power") / RATED_POWER),
+            growth_verdict(growths),
+            reduction_verdict(
+                _number(merits["KF-ANC"], "noise_reduction_db"),
+                _number(merits["KF-OPC"], "noise_reduction_db"),
+                crossings,
+            ),
+        ],
+        figures=_figures_of(results, forgetful, scene, sweep, crossings, theirs, primary, secondary),
         sounds=sounds(results),
         notes=[
             *tuning_note(tuned),
@@ -113,6 +150,7 @@ def main(runs: Runs) -> StudyReport:
                 for name, row in unforgetting.items()
             )
             + ". KF-ANC's weights then grow more slowly, and it gains on KF-OPC.",
+            *_overflow_note(forgetful, optimal_weight, merits),
             f"A path of 32 taps cannot realise a band edge of 20 Hz: the secondary path passes "
             f"{band.low_hz:.0f} to {band.high_hz:.0f} Hz at -3 dB, with {_level_db(secondary, 20.0):.1f} dB at 20 Hz.",
         ],
@@ -130,6 +168,10 @@ def _scene(primary: Any, secondary: Any, power_multiple: float) -> Scene:
         n_taps=N_TAPS,
     )
     return dataclasses.replace(scene, amplifier=HardClipAmplifier(scene.amplitude_limit))
+
+
+def _recorded(scene: Scene, name: str, setting: Setting) -> SimulationResult:
+    return scene.run(make_controller(scene, name, setting), record_weights_every=WEIGHTS_EVERY)
 
 
 def _level_db(path: Any, frequency_hz: float) -> float:
@@ -170,7 +212,7 @@ def _without_forgetting(runs: Runs, scene: Scene) -> dict[str, dict[str, float]]
     jobs = [(name, setting) for setting in UNFORGETTING for name in KALMAN]
 
     def run(job: tuple[str, float]) -> dict[str, float]:
-        result = scene.run(make_controller(scene, *job), record_weights_every=WEIGHTS_EVERY)
+        result = _recorded(scene, *job)
         reduction = noise_reduction_db(result.error, result.disturbance)
         return {"noise_reduction_db": reduction, "weight_growth": weight_growth(result)}
 
@@ -209,57 +251,133 @@ def _largest_difference(theirs: SimulationResult, ours: SimulationResult) -> dic
     }
 
 
-def _verdicts(
-    results: dict[str, SimulationResult], algorithms: dict[str, dict[str, float | None]], crossings: list[float]
-) -> list[Verdict]:
-    anc, opc = algorithms["KF-ANC"], algorithms["KF-OPC"]
-    below = _number(anc, "harmonics_db") - _number(opc, "harmonics_db")
-    growth = weight_growth(results["KF-ANC"])
-    at, duration = results["KF-ANC"].diverged_at_s, results["KF-ANC"].error.size / FS
-    diverged = "it did not diverge" if at is None else f"it diverged after {at:.1f} s"
-    peak, power = float(np.abs(results["KF-OPC"].control_signal).max()), _number(opc, "output_power")
-    limit = float(np.sqrt(2 * RATED_POWER))
-    better = _number(opc, "noise_reduction_db") > _number(anc, "noise_reduction_db")
+# ---- Verdicts, of plain figures
+
+
+def harmonics_verdict(anc_db: float, opc_db: float) -> Verdict:
+    """Return the verdict on Fig. 5 a and b from the harmonics of both filters, in dB over the disturbance."""
+    return Verdict(
+        "KF-ANC produces harmonics, KF-OPC does not",
+        bool(anc_db >= HARMONICS_DB and opc_db <= CLEAN_DB),
+        f"harmonics over the disturbance: KF-ANC {anc_db:.1f} dB, KF-OPC {opc_db:.1f} dB, the sensor noise as a whole "
+        f"{CLEAN_DB:.0f} dB",
+    )
+
+
+def peak_verdict(peak: float, limit: float) -> Verdict:
+    """Return the verdict on Fig. 5 c from the largest control signal of KF-OPC and the amplifier's limit."""
+    return Verdict(
+        "The control signal of KF-OPC stays within what the amplifier can put out",
+        bool(peak <= PEAK_SHARE * limit),
+        f"largest control signal of the whole run {peak:.4f}, limit {limit:.4f}, kept to {100 * (PEAK_SHARE - 1):.0f} %",
+    )
+
+
+def power_verdict(over_rated: float) -> Verdict:
+    """Return the verdict on the output power of KF-OPC, given over the rated power."""
+    return Verdict(
+        "The output power of KF-OPC is the rated power",
+        bool(abs(over_rated - 1.0) <= POWER_TOLERANCE),
+        f"output power {over_rated * RATED_POWER:.4f}, rated power {RATED_POWER:g}",
+    )
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How the largest weight of a control filter went on; all of it but `diverged_at_s` are ratios."""
+
+    over_optimal: float  # at the end, over the largest weight of the Wiener solution
+    over_half: float  # at the end, over half of the run
+    of_quarters: float  # gained in the last quarter, over what was gained in the second: 1 on a straight line
+    diverged_at_s: float | None = None
+
+    @property
+    def linear_without_bound(self) -> bool:
+        """Whether it grows in a straight line, and is far beyond the optimum."""
+        return self.over_optimal >= MANY_TIMES and abs(self.of_quarters - 1.0) <= LINEAR_TOLERANCE
+
+    @property
+    def none(self) -> bool:
+        """Whether it keeps its size."""
+        return abs(self.over_half - 1.0) <= CONSTANT_TOLERANCE
+
+
+def growth_verdict(growths: Mapping[Setting, Sequence[Growth]]) -> Verdict:
+    """Return the verdict on Fig. 5 d from the growth of KF-ANC and of KF-OPC at each state noise."""
+    held = [anc.linear_without_bound and opc.none for anc, opc in growths.values()]
+    said = "; ".join(
+        f"with r E[x'^2]/q = {setting:g} its largest weight is {anc.over_optimal:.0f} times the optimal one at the end, "
+        f"{anc.over_half:.2f} times that at half of the run, that of KF-OPC {opc.over_half:.2f} times"
+        for setting, (anc, opc) in growths.items()
+    )
+    times = [anc.diverged_at_s for anc, _ in growths.values() if anc.diverged_at_s is not None]
+    number = f"diverged after {min(times):.1f} s" if times else "the numbers do not overflow"
+    return Verdict(
+        "The control filter of KF-ANC grows without bound, that of KF-OPC does not",
+        bool(held) and all(held),
+        f"{said}. The growth is a straight line; {number}",
+    )
+
+
+def reduction_verdict(anc_db: float, opc_db: float, crossings: Sequence[float]) -> Verdict:
+    """Return the verdict on the noise reduction of both filters, with the overdrives at which the order flips."""
     flips = " and ".join(f"{level:.1f} dB" for level in crossings)
     order = f"the order flips at {flips} of overdrive" if crossings else "the order is the same at every overdrive"
-    return [
-        Verdict(
-            "KF-ANC produces harmonics, KF-OPC does not",
-            below >= 40,
-            f"harmonics of KF-OPC {below:.1f} dB below those of KF-ANC ({_number(opc, 'harmonics_db'):.1f} against "
-            f"{_number(anc, 'harmonics_db'):.1f} dB over the disturbance)",
-        ),
-        Verdict(
-            "The control signal of KF-OPC stays within what the amplifier can put out",
-            peak <= 1.01 * limit,
-            f"largest control signal of the whole run {peak:.4f}, limit {limit:.4f}, kept to 1 %",
-        ),
-        Verdict(
-            "The output power of KF-OPC is the rated power",
-            abs(power - RATED_POWER) <= 0.01 * RATED_POWER,
-            f"output power {power:.4f}, rated power {RATED_POWER:g}",
-        ),
-        Verdict(
-            "The control filter of KF-ANC grows without bound",
-            growth > 1.5,
-            f"its largest weight grew {growth:.1f} times over the second half of the run, that of KF-OPC "
-            f"{weight_growth(results['KF-OPC']):.2f} times; in {duration:g} s {diverged}, and the growth depends on the "
-            "state noise (see the notes)",
-        ),
-        Verdict(
-            "KF-OPC reduces the noise more than KF-ANC",
-            better,
-            f"{_number(opc, 'noise_reduction_db'):.1f} against {_number(anc, 'noise_reduction_db'):.1f} dB at {10 * np.log10(POWER_MULTIPLE):.0f} dB of overdrive; "
-            f"{order}, see the figure",
-        ),
-    ]
+    return Verdict(
+        "KF-OPC reduces the noise more than KF-ANC",
+        bool(opc_db > anc_db),
+        f"{opc_db:.1f} against {anc_db:.1f} dB at {10 * np.log10(POWER_MULTIPLE):.0f} dB of overdrive; {order}, see the "
+        "figure",
+    )
+
+
+# ---- Figures of the weights
+
+
+def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
+    """Return how the largest weight of a run went on."""
+    largest = _largest_weights(result)
+    quarter, half, three, end = (float(largest[k * (largest.size - 1) // 4]) for k in (1, 2, 3, 4))
+    gained = (end - three) / (half - quarter) if half != quarter else np.inf
+    return Growth(end / optimal_weight, end / half, gained, result.diverged_at_s)
 
 
 def weight_growth(result: SimulationResult) -> float:
     """Return the largest weight at the end of a run over the largest at half of it."""
+    return growth_of(result, 1.0).over_half
+
+
+def _largest_weights(result: SimulationResult) -> np.ndarray:
     assert result.weights is not None
-    largest = np.abs(result.weights).max(axis=1)
-    return float(largest[-1] / largest[largest.size // 2])
+    return np.abs(result.weights).max(axis=1)
+
+
+def _overflow(result: SimulationResult, optimal_weight: float) -> dict[str, float]:
+    """Return what Fig. 5 d leaves out: how far the control signal goes with the weights."""
+    largest = float(_largest_weights(result)[-1])
+    return {
+        "setting": FORGETFUL,
+        "largest_weight": largest,
+        "largest_weight_over_optimal": largest / optimal_weight,
+        "peak_control_signal": float(np.abs(result.control_signal).max()),
+        "output_power": output_power(result.control_signal),
+        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
+    }
+
+
+def _overflow_note(
+    forgetful: dict[str, SimulationResult], optimal_weight: float, merits: dict[str, dict[str, float | None]]
+) -> list[str]:
+    anc, opc = (_overflow(forgetful[name], optimal_weight) for name in KALMAN)
+    return [
+        f"The rule of tuning takes the least state noise, with which KF-ANC's weights grow most slowly. With the most of the "
+        f"grid, r E[x'^2]/q = {FORGETFUL:g}, its largest weight ends at {anc['largest_weight']:.1f}, the optimum's is "
+        f"{optimal_weight:.3f}; its control signal goes up to {anc['peak_control_signal']:.0f}, its output power is "
+        f"{anc['output_power'] / RATED_POWER:.0f} times the rated one and its noise reduction "
+        f"{anc['noise_reduction_db']:.2f} dB ({_number(merits['KF-ANC'], 'noise_reduction_db'):.2f} dB as tuned). KF-OPC's "
+        f"control signal goes up to {opc['peak_control_signal']:.2f}, and it reduces the noise by "
+        f"{opc['noise_reduction_db']:.2f} dB, as before.",
+    ]
 
 
 def _number(figures: dict[str, float | None], key: str) -> float:
@@ -269,6 +387,7 @@ def _number(figures: dict[str, float | None], key: str) -> float:
 
 def _figures_of(
     results: dict[str, SimulationResult],
+    forgetful: dict[str, SimulationResult],
     scene: Scene,
     sweep: dict[str, np.ndarray],
     crossings: list[float],
@@ -285,6 +404,12 @@ def _figures_of(
 
     def amplifier(ax: Any, from_s: float = span[0]) -> None:
         plot_amplifier_output(pair, span_s=(from_s, end), limit=scene.amplitude_limit, ax=ax)
+
+    def line(ax: Any) -> None:
+        plot_weight_history(list(forgetful.values()), tap=tap, ax=ax).set_yscale(
+            "linear"
+        )  # a straight line is the point
+        ax.autoscale(axis="y")
 
     def overdrive(ax: Any) -> None:
         plot_noise_reduction_against_overdrive(OVERDRIVES_DB, sweep, flip_db=crossings, ax=ax)
@@ -309,8 +434,10 @@ def _figures_of(
         ),
         draw(
             "d-weight-history",
-            f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d).",
+            f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d). Left: at the settings tuned; right: with "
+            f"the most state noise of the grid, r E[x'^2]/q = {FORGETFUL:g}. KF-OPC is the same in both.",
             lambda ax: plot_weight_history(pair, tap=tap, ax=ax),
+            line,
         ),
         draw(
             "overdrive",

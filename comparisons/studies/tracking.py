@@ -182,11 +182,13 @@ def sounds_of(event: Event, heard: dict[str, SimulationResult]) -> list[Sound]:
     names = [name for name in HEARD.get(event.name, ()) if name in heard]
     if not names:
         return []
-    sounds = [
-        Sound(f"{event.name}-disturbance", f"{event.name}: disturbance, control off", heard[names[0]].disturbance)
-    ]
-    return sounds + [
-        Sound(f"{event.name}-{name.lower()}", f"{event.name}: residual of {name}", heard[name].error) for name in names
+    # A second before the event, so that the excerpt has the event in it.
+    begin = max(0.0, min((start for start, _ in event.stretches.values()), default=0.0) - 1.0)
+    signals = {"Control off": heard[names[0]].disturbance} | {name: heard[name].error for name in names}
+    stems = ["disturbance", *map(str.lower, names)]
+    return [
+        Sound(f"{event.name}-{stem}".replace(" ", "-"), label, signal, event.name, begin)
+        for stem, (label, signal) in zip(stems, signals.items(), strict=True)
     ]
 
 

@@ -15,6 +15,7 @@ from .scene import Runs as Runs
 from .scene import Scene as Scene
 from .scene import figures_of_merit as figures_of_merit
 from .scene import make_scene as make_scene
+from .summary import verdict_sentence as verdict_sentence
 from .tuning import AllDivergedError as AllDivergedError
 from .tuning import Trial as Trial
 from .tuning import Tuned as Tuned

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FIGURES_OF_MERIT = (
@@ -24,6 +25,7 @@ FIGURES_OF_MERIT = (
 )
 OF_THE_PAPER = "Claims of the paper"
 HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond which it is clipped
+EXCERPT_S = 4.0  # what the page plays of a sound; the file has all of it
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,31 @@ class FigureItem:
         _require_stem(self.stem, "stem")
         plt.close(self.figure)
 
+    @property
+    def alt(self) -> str:
+        """What is drawn, in words: the axes and the names of the curves."""
+        names = dict.fromkeys(
+            text for ax in self.figure.axes for text in ax.get_legend_handles_labels()[1] if not text.startswith("_")
+        )
+        drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
+        return (
+            _plain("Plot of " + "; ".join(drawn) + (f". Curves: {'; '.join(names)}." if names else "."))
+            if drawn
+            else ""
+        )
+
+
+def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
+    """Return an axes' labels; one that shares its time or frequency axis has the label of the lowest."""
+    below = next((own.get_xlabel() for own in [ax, *others] if own.get_xlabel()), "")
+    words = [ax.get_ylabel(), below] if ax.get_ylabel() else []
+    return " over ".join(" ".join(word.split()) for word in words if word)
+
+
+def _plain(text: str) -> str:
+    """Return a text without the marks of matplotlib's formulas."""
+    return re.sub(r"[${}\\]|\\mathrm", "", text)
+
 
 @dataclass(frozen=True)
 class Sound:
@@ -149,14 +176,33 @@ class Sound:
         Label.
     signal : ndarray, shape (n_samples,)
         The sound; NaN at its end if the run diverged.
+    group : str, default ""
+        Sounds of one group are of one moment, so that the page switches between them while they play. The first one is
+        the noise without control.
+    from_s : float, default 0.0
+        Where the excerpt begins that the page plays, in s.
+
+    Raises
+    ------
+    ValueError
+        The stem cannot name a file, or the excerpt begins before the sound.
     """
 
     stem: str
     label: str
     signal: np.ndarray
+    group: str = ""
+    from_s: float = 0.0
 
     def __post_init__(self) -> None:
         _require_stem(self.stem, "stem")
+        if not self.from_s >= 0:
+            raise ValueError(f"from_s must be a time in s from 0 on, got {self.from_s}")
+
+    def excerpt(self, signal: np.ndarray, fs: float) -> np.ndarray:
+        """Return the part of a signal that the page plays: 4 s, or what there is of them."""
+        first = round(self.from_s * fs)
+        return signal[first : first + round(EXCERPT_S * fs)]
 
 
 @dataclass(frozen=True)
@@ -191,6 +237,9 @@ class StudyReport:
         Further tables in their order.
     claims : str
         Whose claims the verdicts are on.
+    conditions : sequence of str
+        Conditions that all its verdicts are under, in words that follow "with", such as "a tone". What failed verdicts
+        have in common is found among them.
 
     Raises
     ------
@@ -212,6 +261,7 @@ class StudyReport:
     notes: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     claims: str = OF_THE_PAPER
+    conditions: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         _require_stem(self.name, "name")
@@ -299,13 +349,6 @@ def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
         cell("convergence_time_s", ".4g"),
         cell("diverged_at_s", ".4g"),
     ]
-
-
-def count_of_claims(studies: Sequence[StudyReport]) -> str:
-    """Return how many claims were reproduced, as a phrase."""
-    verdicts = [verdict.reproduced for study in studies for verdict in study.verdicts]
-    what = "claims reproduced" if any(study.claims == OF_THE_PAPER for study in studies) else "aims met"
-    return f"{sum(verdicts)} of {len(verdicts)} {what}"
 
 
 def figure_file(folder: Path, study: StudyReport, item: FigureItem) -> Path:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import base64
-import json
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -12,29 +13,36 @@ import numpy as np
 
 from .items import (
     COLUMNS,
+    EXCERPT_S,
     HEADROOM,
     FigureItem,
+    Parameter,
     Sound,
     StudyReport,
     cells,
-    count_of_claims,
     figure_file,
     jsonable,
     loudness,
     sound_file,
 )
+from .mathematics import mathml, parameter, prose
+from .summary import verdict_sentence
 
-TITLE = "Kalman filter with output power constraint: the paper's studies"
+TITLE = "Kalman filter with output power constraint"
 PAPER = (
     "J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo and W.-S. Gan, “Preventing output saturation in active noise control: "
     "An output-constrained Kalman filter approach”."
 )
 TEMPLATE = "report.html.jinja"
-_SVG_LIMIT = 600_000  # bytes beyond which a page inlines a figure as PNG
+_COLOURS = 64  # of an inlined figure: lines and letters need no more, and it is a third as large
+_LONG = 4  # lines of a parameter's value beyond which they are folded away
 
 
-def page(studies: Sequence[StudyReport], folder: Path) -> str:
-    """Return the report as HTML, with the figures and sounds that lie in `folder` inlined."""
+def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) -> str:
+    """Return the report as HTML, with its figures, which lie in `folder`, and excerpts of its sounds inlined.
+
+    The `lead` figure stands at the top; without one, the first figure of the studies does.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     layout = Environment(
@@ -43,64 +51,114 @@ def page(studies: Sequence[StudyReport], folder: Path) -> str:
         undefined=StrictUndefined,
         keep_trailing_newline=True,
     )
+    layout.filters |= {"math": mathml, "prose": prose}
+    figures = [[_image(item, figure_file(folder, study, item)) for item in study.figures] for study in studies]
+    first: dict[str, Any] | None = None
+    if lead is not None:
+        first = _image(lead, folder / "figures" / lead.stem)
+    elif shown := next(filter(None, figures), None):
+        first = shown.pop(0)
     return layout.get_template(TEMPLATE).render(
         title=TITLE,
         paper=PAPER,
-        contents=[("verdicts", "Verdicts"), *((study.name, study.title) for study in studies), ("terms", "Terms")],
-        count=count_of_claims(studies),
-        has_verdicts=any(study.verdicts for study in studies),
+        lead=first,
+        verdict=verdict_sentence(studies),
         headroom=HEADROOM,
-        parts=[_part(study, folder) for study in studies],
+        excerpt_s=EXCERPT_S,
+        parts=[_part(study, own, folder) for study, own in zip(studies, figures, strict=True)],
     )
 
 
-def _part(study: StudyReport, folder: Path) -> dict[str, Any]:
+def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> dict[str, Any]:
     """Return what the template shows of a study."""
+    headings, merit = _merit(study)
     return {
         "study": study,
-        "merit_headings": [
-            "Algorithm",
-            *(heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in COLUMNS),
-        ],
-        "merit": [
-            [name, *("–" if cell == "-" else cell for cell in cells(figures, study.rated_power))]
-            for name, figures in study.algorithms.items()
-        ],
-        "figures": [(item.caption, _image(study, item, folder)) for item in study.figures],
-        "sounds": list(_sounds(study, folder)),
-        "parameters": [(name, _lines(own.value), own.chosen) for name, own in study.parameters.items()],
-        "extra": json.dumps(jsonable(study.extra), ensure_ascii=False, indent=1) if study.extra else "",
+        "held": sum(bool(verdict.reproduced) for verdict in study.verdicts),
+        "merit_headings": headings,
+        "merit": merit,
+        "figures": figures,
+        "players": list(_players(study, folder)),
+        "parameters": list(_parameters(study.parameters, study.algorithms)),
     }
 
 
-def _lines(value: Any) -> list[str]:
-    """Return a parameter's value as lines of text: one for each row of a table, and for each key of a mapping."""
-    return _text(jsonable(value)).split("\n")
+def _merit(study: StudyReport) -> tuple[list[str], list[list[str]]]:
+    """Return the headings and rows of the figures of merit, without the columns that say nothing."""
+    headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in COLUMNS]
+    rows = [cells(figures, study.rated_power) for figures in study.algorithms.values()]
+    kept = [i for i in range(len(headings)) if any(row[i] != "-" for row in rows)]
+    shown = [
+        [name, *("–" if row[i] == "-" else row[i] for i in kept)]
+        for name, row in zip(study.algorithms, rows, strict=True)
+    ]
+    return ["Algorithm", *(headings[i] for i in kept)], shown
+
+
+def _parameters(parameters: Mapping[str, Parameter], algorithms: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the algorithm, symbol, meaning, value and origin of each parameter; without an algorithm it is the study's."""
+    longest_first = sorted(algorithms, key=len, reverse=True)
+    for name, own in parameters.items():
+        whose = next((algorithm for algorithm in longest_first if name.startswith(f"{algorithm} ")), "")
+        symbol, meaning = parameter(name.removeprefix(f"{whose} ") if whose else name)
+        lines = _text(jsonable(own.value)).split("\n")
+        yield {
+            "whose": whose,
+            "symbol": symbol,
+            "meaning": meaning,
+            "lines": lines,
+            "folded": len(lines) > _LONG,
+            "chosen": own.chosen,
+        }
 
 
 def _text(value: Any) -> str:
+    """Return a value as text: a line for each row of a table, and for each key of a mapping."""
     if isinstance(value, list):
         return ("\n" if any(isinstance(item, list) for item in value) else ", ").join(map(_text, value))
     if isinstance(value, dict):
-        return "\n".join(f"{key}: {_text(item)}" for key, item in value.items())
+        return "\n".join(f"{key.replace('_', ' ')}: {_text(item)}" for key, item in value.items())
     if isinstance(value, float):
         return f"{value:.6g}"
     return "–" if value is None else str(value)
 
 
-def _image(study: StudyReport, item: FigureItem, folder: Path) -> str:
-    path = figure_file(folder, study, item)
-    data, kind = path.with_name(path.name + ".svg").read_bytes(), "svg+xml"
-    if len(data) > _SVG_LIMIT:
-        data, kind = path.with_name(path.name + ".png").read_bytes(), "png"
-    return _data_uri(data, f"image/{kind}")
+def _image(item: FigureItem, file: Path) -> dict[str, Any]:
+    """Return a figure as a small PNG of few colours; its files are the full ones."""
+    from PIL import Image
+
+    with Image.open(file.with_name(file.name + ".png")) as image:
+        small = io.BytesIO()
+        image.convert("RGB").quantize(_COLOURS).save(small, "PNG", optimize=True)
+        broad = image.width > 2 * image.height
+    source = _data_uri(small.getvalue(), "image/png")
+    return {"caption": item.caption, "alt": item.alt or item.caption, "source": source, "broad": broad}
 
 
-def _sounds(study: StudyReport, folder: Path) -> Iterator[tuple[str, str, str]]:
-    """Yield the label, the caveat and the data of each sound."""
-    for sound, (clipped, _) in zip(study.sounds, loudness(study), strict=True):
-        source = _data_uri(sound_file(folder, study, sound).read_bytes(), "audio/wav")
-        yield sound.label, _caveat(sound, clipped), source
+def _players(study: StudyReport, folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield the sounds of each group, which one player switches between."""
+    scaled = zip(study.sounds, loudness(study), strict=True)
+    for number, (group, members) in enumerate(groupby(scaled, key=lambda member: member[0].group)):
+        tracks = [
+            {
+                "label": sound.label,
+                "caveat": _caveat(sound, clipped),
+                "source": _data_uri(_flac(sound.excerpt(clipped / peak, study.fs), study.fs), "audio/flac"),
+                "file": sound_file(folder, study, sound).relative_to(folder).as_posix(),
+            }
+            for sound, (clipped, peak) in members
+        ]
+        shown = next((i for i, track in enumerate(tracks) if "KF-OPC" in track["label"]), min(1, len(tracks) - 1))
+        yield {"id": f"{study.name}-sounds-{number}", "group": group, "tracks": tracks, "shown": shown}
+
+
+def _flac(signal: np.ndarray, fs: float) -> bytes:
+    """Return a signal of full scale 1 as FLAC of 16 bits, lossless and half as large as WAV; NaN is silence."""
+    import soundfile
+
+    data = io.BytesIO()
+    soundfile.write(data, np.nan_to_num(signal), round(fs), format="FLAC", subtype="PCM_16")
+    return data.getvalue()
 
 
 def _caveat(sound: Sound, clipped: np.ndarray) -> str:

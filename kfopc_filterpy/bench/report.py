@@ -24,7 +24,6 @@ from .items import (
     Table,
     Verdict,
     cells,
-    count_of_claims,
     figure_file,
     loudness,
     require_different,
@@ -32,6 +31,7 @@ from .items import (
     table_file,
 )
 from .page import page
+from .summary import glance, verdict_sentence
 
 __all__ = [
     "FIGURES_OF_MERIT",
@@ -97,7 +97,7 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
     Returns
     -------
     pathlib.Path
-        report.html, which needs none of the other files.
+        report.html, which needs none of the other files: it links to the sounds in full length, and plays excerpts.
 
     Raises
     ------
@@ -124,6 +124,9 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
     path = prepare_folder(folder)
     for kind in ("figures", "audio"):
         prepare_folder(path / kind)
+    lead = glance(studies)
+    if lead is not None:
+        save_figure(lead.figure, path / "figures" / lead.stem)
     for study in studies:
         for item in study.figures:
             save_figure(item.figure, figure_file(path, study, item))
@@ -133,7 +136,7 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
             prepare_folder(path / "tables")
             _write_csv(table_file(path, study, table), table)
     write_whole(path / "results.json", results + "\n")
-    write_whole(path / "report.html", page(studies, path))
+    write_whole(path / "report.html", page(studies, path, lead))
     return path / "report.html"
 
 
@@ -165,7 +168,7 @@ def results_table(studies: Sequence[StudyReport]) -> str:
       REPRODUCED      KF-OPC keeps its rated power
                       0.9999 of 1
     <BLANKLINE>
-    1 of 1 claims reproduced
+    The one claim of the paper was reproduced.
     """
     lines = []
     for study in studies:
@@ -182,7 +185,7 @@ def results_table(studies: Sequence[StudyReport]) -> str:
         for table in study.tables:
             lines += ["", table.caption, *_aligned(table)]
         lines.append("")
-    return "\n".join([*lines, count_of_claims(studies)])
+    return "\n".join([*lines, *textwrap.wrap(verdict_sentence(studies), 116)])
 
 
 def _aligned(table: Table) -> list[str]:

@@ -201,6 +201,10 @@ class FilteredReferenceController:
         self._y = emit_once.with_held(self._held(), as_number(reference, "reference"))
         return self._y
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for a copy, which holds a state of its own."""
+        return {name: value for name, value in vars(self).items() if name != "_holding"}
+
     def _held(self) -> Held:
         """Return the state, held for compiled code."""
         if self._holding is None or self._holding.state is not self._state:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..kernels.covariance import Covariance, copy_covariance, full_covariance, new_covariance
+from ..kernels.holding import Held
+from ..power.constraint import ConstraintState
 from .guards import INDEFINITE_LIMIT, require_semidefinite
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
@@ -16,6 +18,13 @@ ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
 # P since the last pass over the triangle T, as (scale, diagonal, weight): P = scale T + weight g g' + diagonal I.
 Moment = tuple[float, float, float]
 TRIANGLE: Moment = (1.0, 0.0, 0.0)  # P is T itself
+
+
+class FilterArrays(NamedTuple):
+    """Arrays that an update changes, beside the weights."""
+
+    covariance: Covariance
+    constraint: ConstraintState | None  # None in a filter without a rated power
 
 
 class RandomWalkCovariance:
@@ -33,6 +42,7 @@ class RandomWalkCovariance:
         self._shown: list[tuple[np.ndarray, np.ndarray]] = []
         self._largest = float(np.finfo(dtype).max)
         self._others_read = False  # other filters share the arrays
+        self._held: Held | None = None
 
     def share(self, arrays: Covariance) -> None:
         """Continue from arrays that other filters share; a filter copies them before its first step."""
@@ -72,8 +82,8 @@ class RandomWalkCovariance:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
         other = memo[id(self)] = object.__new__(type(self))
-        other.__dict__.update(deepcopy({k: v for k, v in vars(self).items() if k != "arrays"}, memo))
-        other.arrays = copy_covariance(self.arrays)
+        other.__dict__.update(deepcopy({k: v for k, v in vars(self).items() if k not in ("arrays", "_held")}, memo))
+        other.arrays, other._held = copy_covariance(self.arrays), None
         return other
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:
@@ -93,12 +103,18 @@ class RandomWalkCovariance:
         owed["scale"], owed["diagonal"] = scale, diagonal
         self.prior = scale, diagonal, -scale * inverse_S
 
-    def before_update(self) -> tuple[Covariance, Moment, Moment | np.ndarray]:
-        """Return the arrays for a compiled update, P now, and P_prior in a form that the update does not change."""
-        now = self.now
-        if isinstance(self.prior, tuple) and self.prior != now:  # a second update since the prediction
-            return self.own(), now, self.full(self.prior)
-        return self.own(), now, self.prior
+    def before_update(self, constraint: ConstraintState | None) -> tuple[Held, Moment, Moment | np.ndarray]:
+        """Return held `FilterArrays` for a compiled update, P now, and P_prior in a form that the update keeps."""
+        now, prior = self.now, self.prior
+        if isinstance(prior, tuple) and prior != now:  # a second update since the prediction
+            prior = self.full(prior)
+        return self._hold(self.own(), constraint), now, prior
+
+    def _hold(self, arrays: Covariance, constraint: ConstraintState | None) -> Held:
+        held = self._held
+        if held is None or held.state.covariance is not arrays or held.state.constraint is not constraint:
+            self._held = held = Held(FilterArrays(arrays, constraint))
+        return held
 
     def projected(self, before: Moment, prior: Moment | np.ndarray) -> None:
         """Record the pass of an update, refused or not: P is still what it was `before`, but nothing is pending."""

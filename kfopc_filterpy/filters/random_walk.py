@@ -6,22 +6,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from math import isfinite, log, pi
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, require_finite
 from ..kernels.compiling import compiled_for_states, part
 from ..kernels.covariance import Covariance, project_covariance, update_weights
-from ..kernels.holding import Held
 from ..kernels.records import new_record
-from ..power.constraint import (
-    ConstraintState,
-    OutputPowerConstraint,
-    commit_constraint,
-    preview_constraint,
-    squares_are_finite,
-)
+from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
 from .covariance import RandomWalkCovariance, require_covariance
 from .guards import SILENT_REFERENCE, checked_measurement, require_observation
 from .kfopc import KFOPC
@@ -31,16 +24,9 @@ CORRECTED, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE, OVERFLOWING_SQUARE, SIL
 UNTOUCHED = (NOT_FINITE, OVERFLOWING_SQUARE, SILENT)  # refused before the pass over the covariance
 
 
-class FilterArrays(NamedTuple):
-    """Arrays that an update changes, beside the weights."""
-
-    covariance: Covariance
-    constraint: ConstraintState | None  # None in a filter without a rated power
-
-
 @compiled_for_states()
 def correct_once(held, weights, z, h, reference, noise, factor):
-    """Call `correct` from Python, with held `FilterArrays`."""
+    """Call `correct` from Python, with a held `FilterArrays`."""
     return correct(held.state.covariance, held.state.constraint, weights, z, h, reference, noise, factor)
 
 
@@ -148,7 +134,6 @@ class RandomWalkKFOPC(KFOPC):
             "_alpha_sq",
             "_covariance",
             "_delegating",
-            "_held",
             "_likelihood",
             "_log_likelihood",
             "_made",
@@ -176,7 +161,6 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance = RandomWalkCovariance(np.eye(n_taps))
         self._K: np.ndarray | None = np.zeros((n_taps, 1))  # None: derived from the last update when read
         self._delegating = False
-        self._held: Held | None = None
         self._numbers = new_numbers()
         self._made: dict[str, Any] = {}  # those of y, z, S, SI and x_prior read or assigned since the last update
         super().__init__(n_taps, 1, rated_power=rated_power, constraint=constraint)
@@ -188,12 +172,7 @@ class RandomWalkKFOPC(KFOPC):
     def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the state for a copy, with its own arrays and no views (copied views would be writeable)."""
         attributes, private = super().__getstate__()
-        own: dict[str, Any] = {
-            "_views": {},
-            "_held": None,
-            "_covariance": deepcopy(self._covariance),
-            "_numbers": deepcopy(self._numbers),
-        }
+        own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
         return attributes, private | own
 
     def _noises(self) -> list[str]:
@@ -428,9 +407,9 @@ class RandomWalkKFOPC(KFOPC):
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
         if weights.size != self.dim_x:
             self._weights()  # raises, with the reason
-        arrays, before, prior = self._covariance.before_update()
+        held, before, prior = self._covariance.before_update(state)
         x = np.nan if reference is None else reference
-        outcome, y, S = correct_once.with_held(self._hold(arrays, state), weights, z, h, x, noise, factor)
+        outcome, y, S = correct_once.with_held(held, weights, z, h, x, noise, factor)
         if outcome not in UNTOUCHED:
             self._covariance.projected(before, prior)
         if outcome != CORRECTED:
@@ -439,13 +418,6 @@ class RandomWalkKFOPC(KFOPC):
         self._K, self._made = None, {name: value for name, value in self._made.items() if name == "x_prior"}
         self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
         return weights
-
-    def _hold(self, covariance: Covariance, constraint: ConstraintState | None) -> Held:
-        """Return the arrays, held for compiled code."""
-        held = self._held
-        if held is None or held.state.covariance is not covariance or held.state.constraint is not constraint:
-            self._held = held = Held(FilterArrays(covariance, constraint))
-        return held
 
     def _refuse(self, outcome: int, z: float, S: float, h: np.ndarray, reference: float | None) -> None:
         """Raise ValueError for an update that `correct` refused."""

@@ -36,14 +36,11 @@ def _hold(state):
 class Held:
     """A state and its held form, `passed`, whose field `state` compiled code reads.
 
-    The arrays are those of the state: what compiled code writes into them, Python sees.
+    The arrays are those of the state: what compiled code writes into them, Python sees. It cannot be copied: a copy of
+    its owner makes another one.
     """
 
     def __init__(self, state: Any) -> None:
         self.state = state
         self.ours = is_ours(type(state))
         self.passed = self if CONFIG.DISABLE_JIT else _hold(state)
-
-    def __reduce__(self) -> tuple[type[Held], tuple[Any]]:
-        """Return how to copy it: hold the copied state."""
-        return Held, (self.state,)

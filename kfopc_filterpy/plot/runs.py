@@ -17,6 +17,7 @@ These rules hold for the functions here and in `kfopc_filterpy.plot.signals`:
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -103,19 +104,23 @@ def plot_weight_history(results: Any, *, tap: int | tuple[int, int, int], ax: Ax
 def plot_nse(
     results: Any,
     *,
-    window_s: float = 0.005,
+    window_s: float | None = None,
     time_axis: str = "linear",
     channel: int | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the normalised squared error over time (the paper's Fig. 6 a and 7 a).
 
+    The axis says how long the window is. Over seconds of noise, a window of 5 ms, as in the figures of merit, fills the
+    figure with a solid block; over the first tenths of a second, a longer one hides how fast a controller converges.
+
     Parameters
     ----------
     results : SimulationResult, sequence or mapping
         Runs; squares are summed over several under a name.
-    window_s : float, default 0.005
-        Sliding window in seconds.
+    window_s : float, optional
+        Sliding window in seconds. By default a fiftieth of the longest run, rounded down to 1, 2 or 5 times a power of
+        ten, and at least 5 ms: 5 ms for 0.25 s, 20 ms for 2 s, 1 s for a minute. With a logarithmic axis 5 ms.
     time_axis : {"linear", "log"}, default "linear"
         "log" shows the start.
     channel : int, optional
@@ -142,11 +147,14 @@ def plot_nse(
     >>> result = simulate(FxLMS(8, [1.0], step_size=0.01), x, secondary_path=[1.0], primary_path=[0.5])
     >>> ax = plot_nse(result, time_axis="log")
     >>> ax.get_ylabel()
-    'Normalised squared error (dB)'
+    'Normalised squared error (dB)\\nover 5 ms'
     >>> plt.close(ax.figure)
     """
     shown = curves(results)
     scale = as_choice(time_axis, "time_axis", ("linear", "log"))
+    if window_s is None:
+        longest = max(curve.run.n_samples / curve.run.fs for curve in shown)
+        window_s = SHORT_WINDOW_S if scale == "log" else readable_window_s(longest)
     width = as_sample_count(window_s, shown[0].run.fs, "window_s")
     levels = []
     for curve in shown:
@@ -164,9 +172,20 @@ def plot_nse(
     if scale == "log":
         ax.set_xscale("log")
         ax.set_xlim(left=window_s / 5)  # before the first sound has come through the paths
-    ax.set_ylabel("Normalised squared error (dB)")
+    shown_window = f"{window_s:g} s" if window_s >= 1 else f"{1e3 * window_s:g} ms"
+    ax.set_ylabel(f"Normalised squared error (dB)\nover {shown_window}")
     legend_above(ax)
     return ax
+
+
+SHORT_WINDOW_S = 0.005  # that of the figures of merit
+
+
+def readable_window_s(duration_s: float) -> float:
+    """Return a window for a figure of a run: at most fifty to a hundred and twenty-five of them side by side."""
+    longest = duration_s / 50 * (1 + 1e-9)  # a window of exactly a fiftieth is not lost to rounding
+    decade = 10.0 ** math.floor(math.log10(longest))
+    return max(SHORT_WINDOW_S, *(step * decade for step in (1, 2, 5) if step * decade <= longest))
 
 
 def plot_output_power(

@@ -1,6 +1,8 @@
 """The report: strict JSON, a page that needs no other file, sounds of one scale, tables, refusals."""
 
+import base64
 import csv
+import io
 import json
 import re
 from html.parser import HTMLParser
@@ -8,7 +10,9 @@ from html.parser import HTMLParser
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import soundfile
 from helpers.reports import FS, D, figure, study
+from matplotlib.figure import Figure
 
 from kfopc_filterpy.bench import report
 from kfopc_filterpy.bench.report import FigureItem, Sound, Table, results_table, write_report
@@ -26,11 +30,11 @@ class _Links(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.tags.append(tag)
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "input"):
             self.open.append(tag)
         for key, value in attrs:
             if key in ("src", "href", "srcset", "data", "action", "poster"):
-                self.references.append(value)
+                self.references.append((tag, value))
             if key == "id":
                 self.ids.append(value)
 
@@ -38,7 +42,7 @@ class _Links(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open[-1:] not in (["style"], ["pre"]):
+        if self.open[-1:] not in (["style"], ["script"]):
             self.text += data
 
 
@@ -75,15 +79,64 @@ def test_results_are_strict_json_of_the_agreed_layout(written):
 
 
 def test_page_needs_no_other_file(written):
-    page = _Links((written / "report.html").read_text(encoding="utf-8"))
-    anchors = [reference for reference in page.references if reference.startswith("#")]
-    others = [reference for reference in page.references if not reference.startswith("#")]
-    assert len(others) == 3
-    assert all(re.match(r"data:(image/svg\+xml|audio/wav);base64,[A-Za-z0-9+/=]+$", other) for other in others)
+    source = (written / "report.html").read_text(encoding="utf-8")
+    page = _Links(source)
+    anchors = [reference for tag, reference in page.references if reference.startswith("#")]
+    links = [reference for tag, reference in page.references if tag == "a" and not reference.startswith("#")]
+    data = [reference for tag, reference in page.references if tag != "a"]
     assert {anchor[1:] for anchor in anchors} <= set(page.ids)
     assert len(page.ids) == len(set(page.ids))
-    assert not {"script", "link", "iframe", "object"} & set(page.tags)
-    assert not re.search(r"@import|url\(", (written / "report.html").read_text(encoding="utf-8"))
+    assert links == ["audio/tonal-disturbance.wav", "audio/tonal-kf-anc.wav"]  # in full length, beside the page
+    assert all((written / link).is_file() for link in links)
+    assert len(data) == 4
+    assert all(re.match(r"data:(image/png|audio/flac);base64,[A-Za-z0-9+/=]+$", own) for own in data)
+
+
+def test_page_uses_no_network(written):
+    source = (written / "report.html").read_text(encoding="utf-8")
+    assert not {"link", "iframe", "object"} & set(_Links(source).tags)
+    assert not re.search(r"https?:|@import|url\(|fetch\(|import\(|XMLHttpRequest|<script src", source)
+    assert "default-src 'none'" in source  # and the browser holds it to that
+
+
+def test_page_opens_with_the_argument(written):
+    """What KF-OPC is, the figure, the verdict; the table of verdicts, once; of each study the figures before all else."""
+    source = (written / "report.html").read_text(encoding="utf-8")
+    marks = ["KF-OPC is a Kalman filter", '<figure class="first"', 'class="verdict"', 'id="verdicts"', 'id="tonal"']
+    places = [source.index(mark) for mark in marks]
+    assert places == sorted(places)
+    assert source.count('<th scope="col" class="value">Claim</th>') == 1
+    assert source.count("0.79971 of 0.8") == 2  # one row for each study, nowhere else
+    own = source[source.index('id="tonal"') : source.index('id="duct-measured"')]
+    order = [
+        own.index(mark) for mark in ('<div class="figures">', 'class="player', "<h3>Results", "<details><summary>Notes")
+    ]
+    assert order == sorted(order)
+    assert own.index("</table>") < own.index("<details>")
+    folded = re.sub(r"<details>.*</details>", "", own, flags=re.DOTALL)
+    for hidden in ("One &lt;note&gt;.", "estimate &lt;of&gt; eq. 7"):
+        assert hidden in own
+        assert hidden not in folded
+
+
+def test_figures_have_captions_and_words_for_those_who_do_not_see_them(written):
+    source = (written / "report.html").read_text(encoding="utf-8")
+    for alt, rest in re.findall(r'<img alt="([^"]*)"(.*?)</figure>', source, flags=re.DOTALL):
+        assert alt
+        assert re.search(r"<figcaption>.+</figcaption>", rest)
+    assert source.count("<img ") == source.count("<figcaption>") == source.count("</figure>") == 2
+
+
+def test_words_for_a_figure():
+    drawn = Figure()
+    above, below = drawn.subplots(2, sharex=True)
+    above.plot([0, 1], label="KF-OPC")
+    below.plot([0, 1], label="_limit")
+    above.set_ylabel("error (dB)")
+    below.set(ylabel=r"factor $\alpha$", xlabel="time (s)")
+    alt = FigureItem("a", "Caption", drawn).alt
+    assert alt == "Plot of error (dB) over time (s); factor alpha over time (s). Curves: KF-OPC."
+    assert FigureItem("a", "Caption", Figure()).alt == ""
 
 
 def test_page_says_everything_and_escapes_it(written):
@@ -93,15 +146,15 @@ def test_page_says_everything_and_escapes_it(written):
     for said in (
         "Tone & clip <hard>",
         "A tone of 2 > 1.",
-        "2 of 4 claims reproduced",
+        "2 of the 4 claims of the paper were reproduced",
         "KF-OPC < rated",
         "✓ reproduced",
         "✗ not reproduced",
         "0.79971 of 0.8",
         "estimate <of> eq. 7",
-        "1e-07, –",
+        "10−7, –",
         'Spectra "of" e & d.',
-        "Residual (silent after the divergence)",
+        "Residual, full length (silent after the divergence)",
         "One <note>.",
         "Noise reduction (dB)",
         "so their levels compare",
@@ -111,7 +164,9 @@ def test_page_says_everything_and_escapes_it(written):
 
 
 def test_figures_and_sounds_are_files_too(written):
-    assert {path.name for path in (written / "figures").iterdir()} == {"tonal-a-spectra.png", "tonal-a-spectra.svg"}
+    assert {path.name for path in (written / "figures").iterdir()} == {
+        f"{stem}.{kind}" for stem in ("at-a-glance", "tonal-a-spectra") for kind in ("png", "svg")
+    }
     loud, fs = read_wav(written / "audio" / "tonal-disturbance.wav")
     soft, _ = read_wav(written / "audio" / "tonal-kf-anc.wav")
     assert fs == FS
@@ -131,9 +186,62 @@ def test_a_residual_far_louder_than_the_disturbance_does_not_silence_it(tmp_path
     assert not np.any(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])
 
 
-def test_a_large_figure_is_inlined_as_png(tmp_path, monkeypatch):
-    monkeypatch.setattr("kfopc_filterpy.bench.page._SVG_LIMIT", 10)
-    assert "data:image/png;base64," in write_report([study()], tmp_path).read_text(encoding="utf-8")
+def _inlined_sounds(source):
+    """Return the sounds of a page, decoded, with their sampling frequencies."""
+    found = re.findall(r"data:audio/flac;base64,([A-Za-z0-9+/=]+)", source)
+    return [soundfile.read(io.BytesIO(base64.b64decode(data))) for data in found]
+
+
+def test_the_page_plays_excerpts_of_one_moment(tmp_path):
+    fs, n = 8000, 8000 * 12
+    x = np.random.default_rng(0).standard_normal(n)
+    sounds = [Sound("disturbance", "Control off", x, "noise", 2.0), Sound("kf", "KF-OPC", -x / 4, "noise", 2.0)]
+    source = write_report([study(sounds=sounds, figures=[])], tmp_path).read_text(encoding="utf-8")
+    (off, rate), (on, _) = _inlined_sounds(source)
+    assert rate == fs
+    assert off.size == 4 * fs
+    np.testing.assert_allclose(
+        off, x[2 * fs : 6 * fs] / np.abs(x).max(), atol=1e-4
+    )  # the file's scale and the file's bits
+    np.testing.assert_allclose(on, -off / 4, atol=1e-4)  # the same moment
+    assert read_wav(tmp_path / "audio" / "tonal-kf.wav")[0].size == n  # the file has all of it
+    assert len(source) < 2 * (4 * fs * 2) * 4 / 3 + 100_000  # at most what 16 bits take; lossless packing takes less
+
+
+def test_sounds_after_a_divergence_are_silent(written):
+    (_, _), (diverged, _) = _inlined_sounds((written / "report.html").read_text(encoding="utf-8"))
+    assert diverged[-1] == 0
+    assert np.any(diverged)
+
+
+def test_players_switch_within_their_group(tmp_path):
+    labels = ("Control off", "FxLMS", "KF-OPC")
+    groups = [Sound(f"{group}-{i}", label, D, group) for group in ("jump", "sweep") for i, label in enumerate(labels)]
+    source = write_report([study(sounds=[*groups, Sound("alone", "Alone", D)])], tmp_path).read_text(encoding="utf-8")
+    assert re.findall(r'<div class="(player[ group]*)" id="([\w-]+)"', source) == [
+        ("player group", "tonal-sounds-0"),
+        ("player group", "tonal-sounds-1"),
+        ("player", "tonal-sounds-2"),  # nothing to switch to
+    ]
+    radios = re.findall(r'<input type="radio" name="([\w-]+)" value="(\d)"( checked)?>(.*?)</label>', source)
+    assert radios == [
+        (f"tonal-sounds-{number}", value, checked, label)
+        for number in (0, 1)
+        for value, checked, label in (("1", "", "FxLMS"), ("2", " checked", "KF-OPC"))
+    ]
+    assert source.count('<button type="button" class="control"') == 2  # buttons and radios take keys by themselves
+
+
+def test_without_figures_of_merit_the_first_figure_leads(tmp_path):
+    source = write_report([study(algorithms={})], tmp_path).read_text(encoding="utf-8")
+    assert source.count("<figure") == 1
+    assert '<figure class="first"' in source
+    assert not (tmp_path / "figures" / "at-a-glance.png").exists()
+
+
+def test_an_excerpt_from_before_the_sound_is_refused():
+    with pytest.raises(ValueError, match="from_s must be a time in s from 0 on, got -1"):
+        Sound("a", "", D, from_s=-1.0)
 
 
 def test_same_studies_same_bytes(tmp_path):
@@ -152,7 +260,7 @@ def test_table_for_the_terminal():
         "  NOT REPRODUCED  it is faster",
         "                  no",
     ]
-    assert lines[-1] == "1 of 2 claims reproduced"
+    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the exception is")
     assert max(map(len, lines)) <= 120
 
 
@@ -172,15 +280,15 @@ def test_a_table_on_the_page(tmp_path):
     part = source.split("Powers &lt; 1 &amp; more</h3>")
     assert len(part) == 2  # one heading: the other study has no table
     table = part[1].split("</table>")[0]
-    rows = [re.findall(r'<t[hd] class="(\w+)">(.*?)</t[hd]>', row) for row in table.split("<tr>")[1:]]
+    rows = [re.findall(r'<t[hd][^>]* class="(\w+)">(.*?)</t[hd]>', row) for row in table.split("<tr>")[1:]]
     assert [[text for _, text in row] for row in rows] == [
         ["paths", "noise, of &lt;kind&gt;", "power"],
         ["duct", "tone &#34;300&#34;", "0.1235"],
-        ["band-pass", "diverged", "1e+06"],
+        ["band-pass", "diverged", "10<sup>6</sup>"],
         ["duct", "7", "3"],
     ]
     assert all([kind for kind, _ in row] == ["value", "number", "number"] for row in rows)  # of numbers where one is
-    assert source.index("Claims of the paper</h3>") < source.index("Powers &lt; 1") < source.index("Notes</h3>")
+    assert source.index("Results</h3>") < source.index("Powers &lt; 1") < source.index("<summary>Notes")
     assert "Nothing to show" not in source
     assert "Powers < 1 & more" in _Links(source).text
 
@@ -195,7 +303,7 @@ def test_a_table_for_the_terminal():
         "band-pass          diverged   1e+06",
         "duct                      7       3",
     ]
-    assert lines[-1] == "1 of 2 claims reproduced"
+    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the exception is")
 
 
 def test_a_table_as_a_file_has_all_digits(tmp_path):
@@ -218,8 +326,7 @@ def test_without_tables_there_is_no_folder_of_tables(written):
 
 def test_whose_claims_the_verdicts_are_on(tmp_path):
     source = write_report([study(claims="Aims"), study("duct")], tmp_path).read_text(encoding="utf-8")
-    headings = re.findall(r"<h3[^>]*>(Aims|Claims of the paper)</h3>", source)
-    assert headings == ["Aims", "Claims of the paper"]
+    assert re.findall(r"</a>: (.*?)</th>", source) == ["aims, 1 of 2 met", "claims of the paper, 1 of 2 reproduced"]
 
 
 def test_figures_held_for_the_report_are_unknown_to_pyplot():

@@ -64,6 +64,7 @@ def test_the_report_is_complete(small: Any) -> None:
     assert (report.name, report.claims, len(report.verdicts)) == ("tracking", "Findings", 5)
     assert [item.stem for item in report.figures] == ["20-db-louder", "sign", "one-sweep"]
     assert [sound.stem for sound in report.sounds] == ["sign-disturbance", "sign-kf-anc", "sign-kf-pb", "sign-fxlms"]
+    assert {(sound.group, sound.from_s) for sound in report.sounds} == {("sign", 0.0)}  # the change is at 0.5 s
     assert [table.stem for table in report.tables] == ["reduction", "nse", "worst", "power", "settling"]
     for table in report.tables[:4]:
         assert list(table.headings) == ["event", "paths", *STUDIED]

@@ -6,6 +6,7 @@ import inspect
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from kfopc_filterpy import KFOPC
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path.insert(0, str(DOCS / "extensions"))
 
+import offline  # noqa: E402
 import public_names  # noqa: E402
 import source_lines  # noqa: E402
 
@@ -57,6 +59,48 @@ def test_the_theory_page_has_each_equation_of_the_paper_with_a_line_of_code(numb
     after = theory.split(rf"\tag{{{number}}}")[1]
     # The code comes before the next experiment or section; (12) is no line of its own, it becomes (13).
     assert LINE_ROLE.search(re.split(r"\n#|```", after)[0]), f"no line of code follows equation {number}"
+
+
+# The network.
+
+PAGE = """<link rel="canonical" href="https://x.org/page.html"><a href="https://x.org">link</a>
+<script src="_static/tex-svg-full.js"></script><link rel="stylesheet" href="_static/wide.css">
+<img src="data:image/png;base64,AAAA"><img src="../_images/a.png"><audio src="data:audio/wav;base64,AAAA"></audio>"""
+
+
+@pytest.mark.parametrize(
+    "loads",
+    [
+        '<script async src="https://cdn.org/a.js"></script>',
+        '<script src="//cdn.org/a.js"></script>',
+        '<link rel="preload stylesheet" href="http://cdn.org/a.js">',
+        '<img alt="" src="https://cdn.org/a.js">',
+        '<p style="background: url(https://cdn.org/a.js)">',
+        "a.css",
+    ],
+)
+def test_a_page_that_loads_something_from_a_network_fails_the_build(tmp_path, loads):
+    (tmp_path / "deep").mkdir()
+    page, sheet = tmp_path / "deep" / "page.html", tmp_path / "a.css"
+    page.write_text(PAGE, encoding="utf-8")
+    sheet.write_text('@import "own.css"; a { background: url("data:image/svg+xml,<svg/>") }', encoding="utf-8")
+    app = SimpleNamespace(builder=SimpleNamespace(format="html"), outdir=tmp_path)
+    offline.require_offline(app, None)
+    if loads == "a.css":
+        sheet.write_text("@import url('https://cdn.org/a.js');", encoding="utf-8")
+    else:
+        page.write_text(PAGE + loads, encoding="utf-8")
+    ((name, address),) = offline.remote_resources(tmp_path)
+    assert name == (loads if loads == "a.css" else str(Path("deep", "page.html")))
+    assert address.endswith("//cdn.org/a.js")
+    with pytest.raises(ValueError, match=r"pages must read without a network, but\n.* loads .*//cdn\.org/a\.js"):
+        offline.require_offline(app, None)
+
+
+def test_without_mathjax_the_error_names_what_to_install(monkeypatch):
+    monkeypatch.setattr(offline, "find_spec", lambda name: None)
+    with pytest.raises(ModuleNotFoundError, match=r"sphinx-mathjax-offline; install the extra"):
+        offline.mathjax_file()
 
 
 # The reference.
@@ -165,6 +209,35 @@ def test_every_tutorial_is_a_notebook_to_download_without_outputs(page):
     assert f"{{nb-download}}`{page.stem}.ipynb`" in text
     assert "assert " in text, "its claims are not checked when it is built"
     assert f"\n{page.stem}\n" in text_of(DOCS / "tutorials" / "index.md")
+
+
+# Figures of the pages.
+
+CELL = re.compile(r"^```\{code-cell\}.*?^```$", flags=re.M | re.S)
+DRAWS = re.compile(r"\bplt\.subplots\(|\bplot_\w+\(|^diagrams\.\w+\(", flags=re.M)
+
+
+def drawing_cells(text: str) -> list[str]:
+    """Cells of a page that leave a figure on it."""
+    return [cell for cell in CELL.findall(text) if DRAWS.search(cell) and "remove-cell" not in cell]
+
+
+CAPTIONED = [page for page in PAGES if page.stem != "your_recording"]
+
+
+@pytest.mark.parametrize("page", CAPTIONED, ids=lambda page: page.stem)
+def test_every_figure_that_a_page_draws_has_a_caption_and_words_in_its_place(page):
+    for cell in drawing_cells(text_of(page)):
+        settings = cell.split("---")[1] if cell.count("---") >= 2 else ""
+        assert re.search(r"^  figure:\n    caption: \|\n      \S", settings, flags=re.M), f"no caption:\n{cell}"
+        assert re.search(r"^  image:\n    alt: \S", settings, flags=re.M), f"no alternative text:\n{cell}"
+
+
+def test_the_reader_of_cells_finds_those_that_draw():
+    drawn = "```{code-cell} python\nfigure, ax = plt.subplots()\n```"
+    hidden = "```{code-cell} python\n:tags: [remove-cell]\nplot_nse(run)\n```"
+    computed = "```{code-cell} python\nfrom kfopc_filterpy.plot import plot_nse\n```"
+    assert drawing_cells("\n\n".join([computed, drawn, hidden])) == [drawn]
 
 
 # The theory.

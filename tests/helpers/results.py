@@ -29,3 +29,21 @@ def multichannel_result(n_samples: int = 4000, fs: float = 16000.0, seed: int = 
         "weights_time_s": np.arange(n_samples // every) * every / fs,
     }
     return SimulationResult(**(fields | changes))
+
+
+def single_result(n_samples: int = 400, fs: float = 16000.0, **changes) -> SimulationResult:
+    """Return a run with one microphone, loudspeaker and reference that cancels half of the disturbance."""
+    disturbance = np.ones(n_samples)
+    fields = {
+        "algorithm": "KF-OPC",
+        "fs": fs,
+        "rated_power": 1.0,
+        "reference": disturbance,
+        "disturbance": disturbance,
+        "error": 0.5 * disturbance,
+        "control_signal": disturbance,
+        "amplifier_output": disturbance,
+        "anti_noise": 0.5 * disturbance,
+        "constraint_factor": np.full(n_samples, 0.5),
+    }
+    return SimulationResult(**(fields | changes))

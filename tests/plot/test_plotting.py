@@ -56,6 +56,13 @@ def _figures():
         plt.close("all")
 
 
+def _steady_noise(duration_s, fs):
+    """A run whose error and disturbance are white noise of equal power."""
+    d, e = np.random.default_rng(1).standard_normal((2, round(duration_s * fs)))
+    run = simulate(FxLMS(1, [1.0], step_size=1e-9), d, disturbance=d, secondary_path=[1.0], fs=fs)
+    return replace(run, error=e)
+
+
 def _diverged(run):
     blank = np.full_like(run.error, np.nan)
     return replace(run, error=blank, control_signal=blank, amplifier_output=blank, diverged_at_s=0.25)
@@ -160,12 +167,45 @@ def test_nse_pools_seeds_and_shows_the_start(noise):
     rows = np.round(line.get_xdata() * FS).astype(int) - 1
     np.testing.assert_array_equal(line.get_ydata(), curve[rows])
     assert np.max(np.diff(rows)) <= 20  # a quarter of the window
-    assert ax.get_ylabel() == "Normalised squared error (dB)"
+    assert ax.get_ylabel() == "Normalised squared error (dB)\nover 5 ms"
     log = plotting.plot_nse({"KF-OPC": noise}, time_axis="log")
     log.figure.canvas.draw()
     assert log.get_xscale() == "log"
     assert _line(log, "KF-OPC").get_xdata()[0] == 1 / FS
     assert _line(log, "KF-OPC").get_xdata()[-1] == noise[0].error.size / FS
+    assert log.get_ylabel().endswith("over 5 ms")
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "window_s", "said"),
+    [
+        (0.01, 0.005, "5 ms"),
+        (0.25, 0.005, "5 ms"),
+        (0.6, 0.01, "10 ms"),
+        (1.0, 0.02, "20 ms"),
+        (2.0, 0.02, "20 ms"),
+        (10.0, 0.2, "200 ms"),
+        (60.0, 1.0, "1 s"),
+        (600.0, 10.0, "10 s"),
+    ],
+)
+def test_the_window_of_the_nse_grows_with_the_longest_run(duration_s, window_s, said):
+    run, short = _steady_noise(duration_s, 200.0), _steady_noise(0.01, 200.0)
+    ax = plotting.plot_nse({"short": short, "long": run})
+    assert ax.get_ylabel() == f"Normalised squared error (dB)\nover {said}"
+    line, curve = _line(ax, "long"), nse_db(run.error, run.disturbance, 200.0, window_s)
+    np.testing.assert_array_equal(line.get_ydata(), curve[np.round(line.get_xdata() * 200.0).astype(int) - 1])
+    assert plotting.plot_nse(run, window_s=0.005).get_ylabel().endswith("over 5 ms")
+    assert plotting.plot_nse(run, time_axis="log").get_ylabel().endswith("over 5 ms")
+
+
+def test_seconds_of_noise_are_a_line_and_no_block():
+    """A window of 40 times the samples scatters by the root of 40 less."""
+    run, scatter = _steady_noise(10.0, FS), {}
+    for window_s in (None, 0.005):
+        line = plotting.plot_nse(run, window_s=window_s).get_lines()[0]
+        scatter[window_s] = np.std(line.get_ydata()[line.get_xdata() > 0.5])
+    assert scatter[0.005] / scatter[None] == pytest.approx(np.sqrt(0.2 / 0.005), rel=0.3)
 
 
 def test_disturbance_and_anti_noise_say_how_linear_they_are(noise):

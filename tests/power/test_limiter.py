@@ -274,6 +274,26 @@ def test_a_huge_sample_is_forgotten_in_five_windows(huge: float) -> None:
     assert y[2000:].tobytes() == u[2000:].tobytes()
 
 
+@pytest.mark.parametrize("samples", [400, 1600])
+def test_the_gain_rises_with_a_time_constant_of_an_eighth_of_a_window(samples: int) -> None:
+    """After a huge sample. Towards 1.1, never faster; at that rate once the past leaves room for all of the input.
+
+    1e-12: the gains are near 1, their differences of 1e-3 a sample are rounded to some 1e-16.
+    """
+    u = np.full(4 * samples, 1e-3)
+    u[samples // 10] = 1e3
+    limited = limiter(samples)
+    gains = np.array([(limited(v), limited.gain)[1] for v in u])
+    risen = int(np.flatnonzero(gains < 1.0)[-1])
+    assert gains[samples // 5] < 0.05
+    assert samples < risen < 3 * samples
+    to_go = 1.1 - gains[samples // 5 : risen + 1]
+    rates = to_go[1:] / to_go[:-1]
+    expected = math.exp(-8.0 / samples)
+    assert rates.min() >= expected - 1e-12
+    np.testing.assert_allclose(rates[-samples // 20 :], expected, rtol=1e-12)
+
+
 def test_an_overload_is_forgotten() -> None:
     """Bursts that fit, after half a second 20 times as loud: as if that had not been, to the bit.
 

@@ -1,0 +1,136 @@
+"""The first figure of the README and of these pages: a noise that gets too loud for its amplifier.
+
+``python docs/overview.py docs/figures/overview.png`` draws it and prints its numbers.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    noise_reduction_db,
+    output_power,
+    power_constrained_wiener,
+    simulate,
+)
+from kfopc_filterpy.bounds import wiener_solution
+from kfopc_filterpy.paths import duct_paths, path_taps
+from kfopc_filterpy.plot import curve_style
+from kfopc_filterpy.signals import band_limited_noise
+
+FS, TAPS, SWITCH_ON_S = 16000.0, 256, 0.5
+LEVELS_DB = tuple(float(level) for level in np.arange(-3.0, 12.1, 1.5))
+ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB")
+SAID = {"KF-ANC": "plain Kalman filter", "KF-OPC": "KF-OPC", "KF-PB": "KF-PB"}
+
+
+@dataclass(frozen=True)
+class Overload:
+    """Noise of 100 to 1200 Hz in the modelled duct, and an amplifier that clips at twice the root of its rated power.
+
+    Only the ratio of noise and rated power matters. So the noise stays as it is, and the amplifier gets smaller.
+    """
+
+    duration_s: float = 6.0
+
+    @cached_property
+    def duct(self):
+        """Primary and secondary path."""
+        return duct_paths(fs=FS)
+
+    @cached_property
+    def signals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Reference and disturbance."""
+        x = band_limited_noise((100, 1200), self.duration_s, fs=FS, rng=3)
+        return x, np.convolve(x, path_taps(self.duct.primary))[: x.size]
+
+    @cached_property
+    def full_control(self):
+        """The best fixed filter without a constraint; its power is the rated power of 0 dB."""
+        x, d = (signal[int(SWITCH_ON_S * FS) :] for signal in self.signals)
+        return wiener_solution(x, d, self.duct.secondary, TAPS)
+
+    def rated_power(self, level_db: float) -> float:
+        """Rated power that the noise exceeds by a level."""
+        return self.full_control.control_power / 10 ** (level_db / 10)
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Settings of all three Kalman filters: those of the tutorial on the constraint factor."""
+        q = 1e-3 * self.full_control.disturbance_power
+        variance = self.full_control.control_power / (TAPS * np.mean(self.signals[0] ** 2))
+        return {"state_noise": 1e-8 * q, "measurement_noise": q, "initial_variance": float(variance)}
+
+    def run(self, algorithm: str, level_db: float) -> tuple[float, float]:
+        """Noise reduction in dB, and power of the control signal over the rated power, in the second half of a run."""
+        rated, s = self.rated_power(level_db), self.duct.secondary
+        if algorithm == "KF-ANC":
+            controller = kf_anc(TAPS, s, **self.settings)
+        else:
+            make = {"KF-OPC": kf_opc, "KF-PB": kf_pb}[algorithm]
+            controller = make(TAPS, s, rated_power=rated, **self.settings)
+        x, d = self.signals
+        result = simulate(
+            controller, x, disturbance=d, secondary_path=s, amplifier=HardClipAmplifier(2 * rated**0.5), fs=FS,
+            rated_power=rated, switch_on_s=SWITCH_ON_S,
+        )  # fmt: skip
+        return noise_reduction_db(result.error, result.disturbance), output_power(result.control_signal) / rated
+
+    def bound(self, level_db: float) -> float:
+        """Noise reduction in dB of the best fixed filter within the rated power, in the second half of the run."""
+        x, d = self.signals
+        ridge = self.settings["measurement_noise"] / (x.size * self.settings["initial_variance"])
+        rated = self.rated_power(level_db)
+        best = power_constrained_wiener(
+            x, d, self.duct.secondary, TAPS, rated_power=rated, fs=FS, switch_on_s=SWITCH_ON_S, ridge=ridge
+        )
+        return float(best.noise_reduction_over(0.5 * best.whole.end_s)["whole"])
+
+
+def draw(levels_db: Sequence[float], runs: dict[str, np.ndarray], bounds: Sequence[float]) -> Figure:
+    """Noise reduction and power over the level of the noise; `runs` holds two rows for each algorithm."""
+    with plt.rc_context({"font.size": 11.5}):
+        figure, (left, right) = plt.subplots(1, 2, figsize=(7.8, 3.8), sharex=True, layout="constrained")
+        left.plot(levels_db, bounds, color="0.78", lw=6, solid_capstyle="round", label="most within rated power")
+        for name in ALGORITHMS:
+            for ax, values in zip((left, right), runs[name], strict=True):
+                ax.plot(levels_db, values, **curve_style(name), lw=2, ms=6, clip_on=False, zorder=3, label=SAID[name])
+        for name, height in (("KF-OPC", 3.0), ("KF-PB", 0.33)):
+            text = f"{name}: {runs[name][1, -1]:.2f} times"
+            right.text(11.8, height, text, color=curve_style(name)["color"], weight="bold", ha="right", va="center")
+        left.axhline(0, color="0.5", lw=1)
+        right.axhline(1, color="k", ls=":")
+        left.set(title="Noise reduction (dB)", ylim=(-2.5, 15))
+        right.set(title="Power asked for / rated power", yscale="log", ylim=(0.12, 1e6))
+        for ax in (left, right):
+            ax.axvspan(0, max(levels_db), color="#D55E00", alpha=0.06, lw=0)
+            ax.set(xlim=(min(levels_db), max(levels_db)), xticks=(0, 3, 6, 9, 12))
+            ax.grid(alpha=0.3)
+        figure.supxlabel("Noise level (dB over what the rated power can cancel)", fontsize=11.5)
+        handles, labels = left.get_legend_handles_labels()
+        order = {"ncols": 4, "columnspacing": 1.2, "handletextpad": 0.5, "frameon": False}
+        figure.legend(handles[1:] + handles[:1], labels[1:] + labels[:1], loc="outside upper center", **order)
+    return figure
+
+
+if __name__ == "__main__":
+    overload = Overload()
+    found = {name: np.transpose([overload.run(name, level) for level in LEVELS_DB]) for name in ALGORITHMS}
+    limits = [overload.bound(level) for level in LEVELS_DB]
+    for k, level_db in enumerate(LEVELS_DB):
+        told = (
+            f"{name} {found[name][0, k]:.1f} dB at {found[name][1, k]:.2f} of the rated power" for name in ALGORITHMS
+        )
+        print(f"{level_db:5.1f} dB: bound {limits[k]:.1f} dB; {'; '.join(told)}")
+    draw(LEVELS_DB, found, limits).savefig(sys.argv[1], dpi=180)

@@ -1,0 +1,114 @@
+"""What the report opens with: the verdicts in a sentence, made from hand-made verdicts, and the figure of all studies."""
+
+import numpy as np
+import pytest
+from helpers.reports import study
+
+from kfopc_filterpy.bench import Verdict, verdict_sentence
+from kfopc_filterpy.bench.summary import GLANCE, glance
+
+POWER, SPEED, CLEAN = "It keeps the Rated Power", "It converges faster", "It has no harmonics"
+
+
+def made(name, conditions, *claims, **changes):
+    """Return a study with a verdict for each pair of a claim and whether it holds."""
+    verdicts = [Verdict(text, holds, "") for text, holds in claims]
+    return study(name, conditions=conditions, verdicts=verdicts, **changes)
+
+
+@pytest.mark.parametrize(
+    ("holds", "sentence"),
+    [
+        (True, "All 3 claims of the paper were reproduced."),
+        (False, "None of the 3 claims of the paper was reproduced."),
+    ],
+    ids=["all", "none"],
+)
+def test_all_or_none(holds, sentence):
+    assert verdict_sentence([made("a", ["a tone"], (POWER, holds), (SPEED, holds), (CLEAN, holds))]) == sentence
+
+
+def test_without_verdicts_there_is_nothing_to_say():
+    assert verdict_sentence([made("a", ["a tone"])]) == ""
+
+
+@pytest.mark.parametrize(("holds", "word"), [(True, "was"), (False, "was not")], ids=["holds", "fails"])
+def test_one_claim(holds, word):
+    assert verdict_sentence([made("a", [], (POWER, holds))]) == f"The one claim of the paper {word} reproduced."
+
+
+def test_one_exception_is_named():
+    studies = [made("a", ["a tone"], (POWER, True), (SPEED, False))]
+    assert (
+        verdict_sentence(studies)
+        == "1 of the 2 claims of the paper was reproduced; the exception is “It converges faster”."
+    )
+
+
+def test_what_all_exceptions_share_is_named():
+    flat = made("flat", ["a flat path"], (POWER, True), (SPEED, True))
+    duct = made("duct", ["a duct"], (POWER, False), (SPEED, True))
+    other = made("other", ["a duct"], (POWER, False), (CLEAN, True))
+    assert verdict_sentence([flat, duct, other]) == (
+        "4 of the 6 claims of the paper were reproduced; both exceptions concern the output power, with a duct."
+    )
+    third = made("third", ["a flat path"], (POWER, False))
+    assert verdict_sentence([flat, duct, other, third]).endswith("; all 3 exceptions concern the output power.")
+
+
+def test_what_most_exceptions_share_is_named_with_its_count():
+    studies = [
+        made("a", ["a tone"], (POWER, False), (SPEED, True), (CLEAN, True)),
+        made("b", ["noise"], (POWER, False), (SPEED, False), (CLEAN, True), (SPEED, True)),
+    ]
+    assert verdict_sentence(studies).endswith("; 2 of the 3 exceptions concern the output power.")
+
+
+def test_a_condition_alone():
+    studies = [
+        made("a", ["a tone"], (POWER, True), (SPEED, True)),
+        made("b", ["noise"], (POWER, False), (SPEED, False)),
+    ]
+    assert verdict_sentence(studies).endswith("; both exceptions occurred with noise.")
+
+
+def test_nothing_in_common():
+    studies = [
+        made("a", ["a tone"], (POWER, False), (SPEED, True), (CLEAN, True)),
+        made("b", ["noise"], (POWER, True), (SPEED, False), (CLEAN, True)),
+    ]
+    assert verdict_sentence(studies).endswith("; the 2 exceptions have neither a subject nor a condition in common.")
+
+
+def test_what_every_claim_has_says_nothing_of_the_exceptions():
+    studies = [made("a", ["a tone"], (POWER, False), (POWER, False), (POWER, True))]
+    assert verdict_sentence(studies).endswith("have neither a subject nor a condition in common.")
+
+
+def test_aims_are_counted_apart_from_the_papers_claims():
+    ours = made("ours", [], (POWER, True), (SPEED, True), claims="Aims")
+    paper = made("paper", [], (POWER, False), (SPEED, False))
+    assert verdict_sentence([ours, paper]) == (
+        "None of the 2 claims of the paper was reproduced. All 2 aims of the studies were met."
+    )
+
+
+def test_the_figure_holds_every_algorithm_of_every_study():
+    first = study(
+        algorithms={"KF-ANC": {"output_power": 8.0, "noise_reduction_db": 20.0}, "KF-OPC": {"output_power": 0.4}}
+    )
+    second = study("duct", rated_power=2.0, algorithms={"KF-OPC": {"output_power": 3.0, "noise_reduction_db": 5.0}})
+    item = glance([first, second])
+    assert item.stem == GLANCE
+    powers, reductions = item.figure.axes
+    shown = {line.get_label(): line.get_ydata() for line in powers.get_lines() if line.get_marker() != "None"}
+    np.testing.assert_allclose(shown["KF-ANC"], [10.0, np.nan])
+    np.testing.assert_allclose(shown["KF-OPC"], [0.5, 1.5])
+    np.testing.assert_allclose([line.get_ydata() for line in reductions.get_lines()][:2], [[20, np.nan], [np.nan, 5]])
+    assert "KF-OPC asks for 0.50 to 1.50 times the rated power." in item.caption
+    assert "KF-ANC" in item.alt
+    assert "noise reduction (dB)" in item.alt
+
+
+def test_no_figure_without_figures_of_merit():
+    assert glance([study(algorithms={})]) is None

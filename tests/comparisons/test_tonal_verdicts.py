@@ -1,0 +1,109 @@
+"""Verdicts on the paper's Fig. 5 from figures made by hand: on both sides of every threshold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.results import single_result
+
+from comparisons.studies import tonal
+from comparisons.studies.tonal import Growth, growth_of, growth_verdict
+
+LIMIT = np.sqrt(2.0)
+LINE = Growth(over_optimal=600.0, over_half=2.0, of_quarters=1.0)
+STILL = Growth(over_optimal=0.7, over_half=1.0, of_quarters=0.0)
+
+
+@pytest.mark.parametrize(
+    ("anc_db", "opc_db", "held"),
+    [
+        (-8.5, -88.0, True),
+        (-29.9, -60.1, True),
+        (-30.1, -88.0, False),  # KF-ANC as good as clean
+        (-8.5, -59.9, False),
+        (-8.5, -48.5, False),  # 40 dB below those of KF-ANC are harmonics still
+        (-88.0, -8.5, False),  # turned round
+        (np.nan, -88.0, False),
+        (-8.5, np.nan, False),
+    ],
+)
+def test_harmonics(anc_db: float, opc_db: float, held: bool) -> None:
+    assert tonal.harmonics_verdict(anc_db, opc_db).reproduced is held
+
+
+@pytest.mark.parametrize(
+    ("share", "held"), [(0.9, True), (1.009, True), (1.011, False), (20.0, False), (np.nan, False)]
+)
+def test_peak(share: float, held: bool) -> None:
+    assert tonal.peak_verdict(share * LIMIT, LIMIT).reproduced is held
+
+
+@pytest.mark.parametrize(
+    ("power", "held"), [(1.0, True), (0.991, True), (1.009, True), (0.989, False), (1.011, False), (np.nan, False)]
+)
+def test_power(power: float, held: bool) -> None:
+    """Not a constraint but an equality: too little is as wrong as too much."""
+    assert tonal.power_verdict(power).reproduced is held
+
+
+@pytest.mark.parametrize(
+    ("anc_db", "opc_db", "held"), [(8.1, 10.7, True), (10.6, 10.7, True), (10.8, 10.7, False), (10.7, np.nan, False)]
+)
+def test_reduction(anc_db: float, opc_db: float, held: bool) -> None:
+    verdict = tonal.reduction_verdict(anc_db, opc_db, [1.2, 4.6])
+    assert verdict.reproduced is held
+    assert "the order flips at 1.2 dB and 4.6 dB of overdrive" in verdict.figure
+    assert "the same at every overdrive" in tonal.reduction_verdict(anc_db, opc_db, []).figure
+
+
+@pytest.mark.parametrize(
+    ("anc", "opc", "held"),
+    [
+        (LINE, STILL, True),
+        (Growth(10.1, 1.8, 0.91), STILL, True),
+        (Growth(10.1, 1.8, 1.09), STILL, True),
+        (Growth(9.9, 2.0, 1.0), STILL, False),  # not many times the optimum
+        (Growth(600.0, 1.2, 0.89), STILL, False),  # comes to rest
+        (Growth(600.0, 9.0, 1.11), STILL, False),  # faster than a line
+        (Growth(0.5, 0.5, -0.3), STILL, False),  # shrinks
+        (LINE, Growth(0.7, 1.009, 0.0), True),
+        (LINE, Growth(0.7, 0.991, 0.0), True),
+        (LINE, Growth(0.7, 1.011, 1.0), False),
+        (LINE, Growth(0.7, 0.989, 1.0), False),
+        (LINE, LINE, False),
+        (Growth(np.nan, np.nan, np.nan), STILL, False),
+        (LINE, Growth(np.nan, np.nan, np.nan), False),
+    ],
+)
+def test_growth(anc: Growth, opc: Growth, held: bool) -> None:
+    assert growth_verdict({1e-8: (anc, opc)}).reproduced is held
+    assert growth_verdict({1e-8: (LINE, STILL), 1e-4: (anc, opc)}).reproduced is held  # at every state noise
+    assert growth_verdict({1e-8: (anc, opc), 1e-4: (LINE, STILL)}).reproduced is held
+
+
+def test_growth_of_nothing_is_not_held_and_a_divergence_is_said() -> None:
+    assert not growth_verdict({}).reproduced
+    assert "the numbers do not overflow" in growth_verdict({1e-8: (LINE, STILL)}).figure
+    diverged = Growth(600.0, 2.0, 1.0, diverged_at_s=3.14)
+    assert growth_verdict({1e-8: (diverged, STILL)}).figure.endswith("diverged after 3.1 s")
+
+
+def of_weights(largest: Any) -> Any:
+    """A run of three weights, of which the second one is the largest."""
+    return single_result(weights=np.outer(largest, [0.5, -1.0, 0.0]))
+
+
+def test_growth_of_a_line_of_a_constant_and_of_an_exponential() -> None:
+    t = np.linspace(0.0, 1.0, 401)
+    line = growth_of(of_weights(0.2 + 3.0 * t), optimal_weight=0.1)
+    assert (line.over_optimal, line.over_half, line.of_quarters) == pytest.approx((32.0, 3.2 / 1.7, 1.0), rel=1e-12)
+    still = growth_of(of_weights(np.full(401, 0.3)), optimal_weight=0.1)
+    assert (still.over_optimal, still.over_half) == pytest.approx((3.0, 1.0), rel=1e-12)
+    assert still.none
+    assert not still.linear_without_bound
+    exponential = growth_of(of_weights(np.exp(8.0 * t)), optimal_weight=0.1)
+    assert exponential.of_quarters == pytest.approx(np.exp(4.0), rel=1e-12)
+    assert not exponential.linear_without_bound
+    assert tonal.weight_growth(of_weights(0.2 + 3.0 * t)) == line.over_half

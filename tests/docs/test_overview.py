@@ -1,0 +1,63 @@
+"""The first figure of the README and the front page: that what their caption says is what the runs give."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "docs"))
+
+import overview  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def overload():
+    return overview.Overload()
+
+
+@pytest.fixture(scope="module")
+def runs(overload):
+    """Noise reduction and power over the rated power by algorithm, 12 dB above what the rated power can cancel."""
+    return {name: overload.run(name, 12.0) for name in overview.ALGORITHMS}
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/index.md"])
+def test_the_caption_says_what_the_runs_give(runs, page):
+    text = " ".join((ROOT / page).read_text(encoding="utf-8").split())
+    assert "figures/overview.png" in text
+    (least,) = re.findall(r"asks for more and more, ([\d,]+) times the rated power and above", text)
+    assert runs["KF-ANC"][1] > float(least.replace(",", ""))
+    assert "in the end it makes the noise louder" in text
+    assert runs["KF-ANC"][0] < 0
+    (said,) = re.findall(r"KF-OPC goes on reducing the noise, at ([\d.]+) times the rated power", text)
+    assert runs["KF-OPC"][1] == pytest.approx(float(said), abs=0.05)
+    assert runs["KF-OPC"][0] > 2
+    assert "KF-PB reduces the noise as much within the rated power" in text
+    assert runs["KF-PB"][1] <= 1
+    assert runs["KF-PB"][0] >= runs["KF-OPC"][0]
+
+
+def test_the_bound_is_above_what_keeps_the_rated_power(overload, runs):
+    assert runs["KF-PB"][0] < overload.bound(12.0) < runs["KF-PB"][0] + 0.5
+
+
+def test_the_figure_shows_each_algorithm_in_both_panels(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    import matplotlib.pyplot as plt
+
+    found = {name: np.array([[12.0, 5.0], [0.5, 1.0 + k]]) for k, name in enumerate(overview.ALGORITHMS)}
+    figure = overview.draw([-3.0, 12.0], found, [12.5, 5.5])
+    figure.canvas.draw()
+    left, right = figure.axes
+    for name in overview.ALGORITHMS:
+        for ax, row in zip((left, right), found[name], strict=True):
+            (line,) = (line for line in ax.get_lines() if line.get_label() == overview.SAID[name])
+            assert list(line.get_ydata()) == list(row)
+    assert [text.get_text() for text in right.texts] == ["KF-OPC: 2.00 times", "KF-PB: 3.00 times"]
+    assert left.get_lines()[0].get_label() == "most within rated power"
+    plt.close(figure)
