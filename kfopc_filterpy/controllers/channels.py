@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_positive, as_real_array, require_finite
+from .._validate import as_count, as_positive, as_real_array
 from ..kernels.compiling import compiled_for_states, inlined
 from ..kernels.delay_lines import delay_line, newest, push
 from ..kernels.holding import Held
@@ -121,12 +121,14 @@ def per_loudspeaker(value: Any, n_loudspeakers: int, name: str) -> np.ndarray:
     return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, n_loudspeakers)])
 
 
-def channel_sample(value: Any, size: int, name: str, what: str) -> np.ndarray:
-    """Return a sample of each channel, (size,), finite; `what` names the channels in an error."""
+def channel_sample(value: Any, size: int, name: str, channel: str) -> np.ndarray:
+    """Return a sample of each channel, (size,), finite; `channel` is what an error calls one of them."""
     sample = as_real_array(value, name).reshape(-1)
     if sample.size != size:
-        raise ValueError(f"{name} must have a value for each of the {size} {what}, got {sample.size}")
-    require_finite(sample, name)
+        raise ValueError(f"{name} must have a value for each {channel}, ({size},), got {sample.size}")
+    bad = np.flatnonzero(~np.isfinite(sample))
+    if bad.size:
+        raise ValueError(f"{name} must be finite, got {sample[bad[0]]} from {channel} {bad[0]}; nothing was changed")
     return np.ascontiguousarray(sample)
 
 
@@ -216,13 +218,13 @@ class ChannelController:
 
     def control_signal(self, reference: Any) -> np.ndarray:
         """Return the control signals y(n), (J,), for the newest reference samples x(n), (I,)."""
-        x = channel_sample(reference, self.n_references, "reference", "references")
+        x = channel_sample(reference, self.n_references, "reference", "reference microphone")
         emit_channels_once.with_held(self._held(), x)
         return self._lines.control_signal.copy()
 
     def update(self, error: Any) -> None:
         """Adapt to the errors e(n), (K,), that the last control signals left."""
-        e = channel_sample(error, self.n_microphones, "error", "microphones")
+        e = channel_sample(error, self.n_microphones, "error", "microphone")
         if not adapt_channels_once.with_held(self._held(), e):
             raise ValueError(REFUSED)
         self.after_compiled(self._state)

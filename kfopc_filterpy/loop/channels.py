@@ -23,8 +23,7 @@ from ..kernels.borrowing import borrowed
 from ..kernels.compiling import compiled, compiled_for_states, inlined
 from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import dot
-from ..paths.channels import path_matrix, primary_paths, secondary_paths
-from ..paths.models import is_system
+from ..paths.channels import is_path_matrix, path_matrix, primary_paths, secondary_paths
 from ..power.amplifiers import amplify, compiled_model
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, naming_sample, switch_on_sample
 from .result import SimulationResult
@@ -195,11 +194,8 @@ class ChannelRun:
 
 def is_multichannel(controller: Any, reference: Any, secondary_path: Any, disturbance: Any) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
-    if isinstance(controller, ChannelController) or np.ndim(reference) == 2 or np.ndim(disturbance) == 2:
-        return True
-    return (not is_system(secondary_path) and np.ndim(np.asarray(secondary_path, dtype=object)) > 1) or (
-        is_system(secondary_path) and (secondary_path.noutputs, secondary_path.ninputs) != (1, 1)
-    )
+    signals = np.ndim(reference) == 2 or np.ndim(disturbance) == 2
+    return isinstance(controller, ChannelController) or signals or is_path_matrix(secondary_path)
 
 
 def filters_of(controller: Any) -> Any:
@@ -256,6 +252,8 @@ def simulate_channels(
         for signal in signals[3:]:
             signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
+    if np.ndim(reference) == 1 and J == K == 1:
+        signals = ChannelStretch(*(signal[0] for signal in signals))  # one channel drops its axis, as it was given
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,
@@ -266,7 +264,7 @@ def simulate_channels(
         control_signal=signals.control_signal,
         amplifier_output=signals.amplifier_output,
         anti_noise=signals.anti_noise,
-        constraint_factor=np.full((J, d.shape[1]), getattr(controller, "constraint_factor", np.nan)),
+        constraint_factor=np.full(signals.control_signal.shape, getattr(controller, "constraint_factor", np.nan)),
         weights=weights if every else None,
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
         diverged_at_s=end / fs if status == DIVERGED else None,

@@ -24,6 +24,13 @@ def primary_paths(
     return path_matrix(paths, fs=fs, name=name, axes="(K microphones, I references, taps)")
 
 
+def is_path_matrix(paths: Any) -> bool:
+    """Return whether paths are given as a matrix, by shape or as a system of several inputs or outputs."""
+    if is_system(paths):
+        return (paths.noutputs, paths.ninputs) != (1, 1)
+    return _has_systems(paths) or np.ndim(paths) > 1
+
+
 def path_matrix(
     paths: Any, *, fs: float | None, name: str, axes: str = "(outputs, inputs, taps)"
 ) -> tuple[np.ndarray, float | None]:
@@ -31,7 +38,7 @@ def path_matrix(
     if is_system(paths):
         rows: Any = [[paths]] if (paths.noutputs, paths.ninputs) == (1, 1) else _entries(paths)
         return _from_systems(rows, fs, name, axes)
-    if isinstance(paths, list | tuple) and any(is_system(entry) for row in paths for entry in np.ravel(row)):
+    if _has_systems(paths):
         return _from_systems(paths, fs, name, axes)
     taps = as_real_array(paths, name)
     if taps.ndim == 1:
@@ -42,6 +49,11 @@ def path_matrix(
         raise ValueError(f"{name} must have shape {axes}, got {taps.shape}: taps come last, see numpy.moveaxis")
     require_finite(taps, name)
     return np.ascontiguousarray(taps), None
+
+
+def _has_systems(paths: Any) -> bool:
+    rows = paths if isinstance(paths, list | tuple) else ()
+    return any(is_system(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
 
 
 def _entries(system: Any) -> list[list[Any]]:
