@@ -34,7 +34,12 @@ def dense_systems(
     x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int, start: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R_x' (J I L, J I L), R_x (I L, I L) and r (J I L,) of signals from `start` on, from the signals themselves."""
-    filtered = [np.concatenate([delayed(through(s.reshape(1, 1, -1), x[i : i + 1]), n_taps) for s in row for i in range(len(x))]) for row in secondary]
+    filtered = [
+        np.concatenate(
+            [delayed(through(s.reshape(1, 1, -1), x[i : i + 1]), n_taps) for s in row for i in range(len(x))]
+        )
+        for row in secondary
+    ]
     R = sum(rows[:, start:] @ rows[:, start:].T for rows in filtered)
     r = sum(rows[:, start:] @ one[start:] for rows, one in zip(filtered, d, strict=True))
     of_x = delayed(x, n_taps)[:, start:]
