@@ -423,7 +423,7 @@ def _figures_of(
         draw(
             "a-nse",
             f"Normalised squared error over 5 ms, pooled over {len(SEEDS)} seeds, first 0.25 s (Fig. 6 a).",
-            lambda ax: plot_nse(results, ax=ax).set_xlim(0, 0.25),
+            lambda ax: plot_nse(results, window_s=0.005, ax=ax).set_xlim(0, 0.25),
         ),
         draw(
             "a-weight-error",

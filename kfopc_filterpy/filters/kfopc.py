@@ -507,10 +507,17 @@ class KFOPC(KalmanFilter):
             f"dim_x {self.dim_x}",
             f"dim_z {self.dim_z}",
             *self._noises(),
-            *([] if self.rated_power is None else [f"rated power {self.rated_power:g}"]),
+            *self._power_settings(),
             f"constraint factor {self.constraint_factor:.3g}",
             f"norm of x {np.linalg.norm(self.x):.3g}",
         ]
+
+    def _power_settings(self) -> list[str]:
+        """Return the rated power for the summary, and the settings of the constraint that keeps it."""
+        parts = [] if self.rated_power is None else [f"rated power {self.rated_power:g}"]
+        if self._constraint is not None:
+            parts += [f"fs {self._constraint.fs:g} Hz", f"memory {self._constraint.memory_s:g} s"]
+        return parts
 
     def _noises(self) -> list[str]:
         """Return the noise variances for the summary, if they are single numbers."""

@@ -317,7 +317,7 @@ class RandomWalkKFOPC(KFOPC):
 
     @property
     def log_likelihood(self) -> float:
-        """Log-likelihood of the last measurement; of a single one in closed form, fifty times as fast as filterpy's."""
+        """Log-likelihood of the last measurement; of a single one in closed form."""
         if self._log_likelihood is None and self.S.shape == (1, 1) and self.S[0, 0] > 0:
             y, S = self.y.item(), self.S.item()
             self._log_likelihood = -0.5 * (log(2.0 * pi * S) + y * y / S)

@@ -1,4 +1,4 @@
-"""Primary and secondary paths: models, analysis, identification."""
+"""Primary and secondary paths: models, analysis, identification, resampling."""
 
 import lazy_loader
 

@@ -17,3 +17,4 @@ from .identification import modelling_error_db as modelling_error_db
 from .models import fir_path as fir_path
 from .models import path_taps as path_taps
 from .models import perturbed_path as perturbed_path
+from .resampling import resample_path as resample_path

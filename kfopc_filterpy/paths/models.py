@@ -168,7 +168,7 @@ def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> 
         )
     rate = 1 / float(path.dt)
     if fs is not None and abs(rate - fs) > 1e-9 * fs:
-        raise ValueError(f"{name} is sampled at {rate:g} Hz but fs is {fs:g} Hz; resample one of them")
+        raise ValueError(f"{name} is sampled at {rate:g} Hz but fs is {fs:g} Hz; resample one (resample_path)")
     return rate if fs is None else fs
 
 

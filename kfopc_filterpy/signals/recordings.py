@@ -117,7 +117,8 @@ def read_wav(
         raise ValueError(f"{path} cannot be read as an audio file: {error}") from error
     if fs is not None and file_fs != as_positive(fs, "fs", unit="Hz"):
         raise ValueError(
-            f"{path} is sampled at {file_fs} Hz, expected fs = {fs:g} Hz; resample it (scipy.signal.resample_poly)"
+            f"{path} is sampled at {file_fs} Hz, expected fs = {fs:g} Hz; read it without fs and "
+            "resample it: a recording with scipy.signal.resample_poly, an impulse response with paths.resample_path"
         )
     name, channels = f"the signal of {path}", frames.T
     if channel is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import inspect
 import re
 import sys
@@ -199,15 +200,40 @@ def test_every_argument_of_a_public_method_is_named_where_it_is_described(name, 
         assert not missing, f"{name}.{method_name} leaves undescribed: {missing}"
 
 
+# Code fits its box in a window of 1300 pixels. A box has room for 124 columns on a page, 120 in the docstring of a function
+# or class, and 116 in that of a method.
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_code_on_a_page_is_no_wider_than_its_box(page):
+    blocks = re.findall(r"^```[^\n]*\n(.*?)^```", text_of(page), re.M | re.S)
+    too_wide = [line for block in blocks for line in block.splitlines() if len(line) > 120]
+    assert not too_wide
+
+
+@pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=NAMES)
+def test_an_example_in_a_docstring_is_no_wider_than_its_box(name, thing):
+    docs = [(inspect.getdoc(thing), 118)]
+    docs += [(inspect.getdoc(method), 114) for _, method in methods(thing) if inspect.isclass(thing)]
+    for doc, room in docs:
+        for example in doctest.DocTestParser().get_examples(doc or ""):
+            lines = [f">>> {line}" for line in example.source.splitlines()] + example.want.splitlines()
+            assert not [line for line in lines if len(line) > room]
+
+
 # Tutorials.
 
 
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
-def test_every_tutorial_is_a_notebook_to_download_without_outputs(page):
+def test_every_tutorial_is_a_notebook_to_download_with_nothing_hidden(page):
+    """What it says of its figures is checked by a test of its own, so that the notebook runs on other files too."""
     text = text_of(page)
     assert "format_name: myst" in text
     assert f"{{nb-download}}`{page.stem}.ipynb`" in text
-    assert "assert " in text, "its claims are not checked when it is built"
+    assert not re.search(r":tags:.*(remove|hide)|^ *assert ", text, re.M), (
+        "a cell that its reader does not see, or an assertion"
+    )
+    assert (Path(__file__).parent / f"test_page_{page.stem}.py").exists(), "no test checks what it says"
     assert f"\n{page.stem}\n" in text_of(DOCS / "tutorials" / "index.md")
 
 

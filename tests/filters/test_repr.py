@@ -20,13 +20,15 @@ def test_the_general_filter() -> None:
 
 @pytest.mark.parametrize("column", [True, False])
 def test_the_random_walk_filter(column: bool) -> None:
-    kf = KFOPC.random_walk(128, constraint=OutputPowerConstraint(1.5, secondary_path_gain=1.0), **NOISES)
+    kf = KFOPC.random_walk(
+        128, constraint=OutputPowerConstraint(1.5, secondary_path_gain=1.0, fs=8000, memory_s=0.2), **NOISES
+    )
     kf.x = np.zeros((128, 1)[: 1 + column])
     kf.x[0], kf.x[1] = 3.0, 4.0
     kf.constraint_factor = 0.70711
     assert repr(kf) == (
         "<RandomWalkKFOPC: dim_x 128, dim_z 1, state noise 1e-06, measurement noise 0.1, rated power 1.5, "
-        "constraint factor 0.707, norm of x 5>"
+        "fs 8000 Hz, memory 0.2 s, constraint factor 0.707, norm of x 5>"
     )
     kf.Q = np.diag(np.arange(128.0))
     kf.rated_power = None

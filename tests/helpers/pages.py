@@ -1,0 +1,45 @@
+"""Runs a tutorial as its reader does, cell by cell, so that tests can look at what it computed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib.pyplot as plt
+
+TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
+_PART = re.compile(
+    r"^```\{code-cell\}[^\n]*\n(?P<options>(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$", re.M | re.S
+)
+
+
+class Page:
+    """A tutorial, whose cells run in the order of the page.
+
+    Parameters
+    ----------
+    stem : str
+        Name of its file without suffix.
+    without : str, optional
+        Cells with this tag are left out.
+    """
+
+    def __init__(self, stem: str, without: str | None = None) -> None:
+        self.stem, self._variables = stem, {"__name__": "__main__"}
+        text = (TUTORIALS / f"{stem}.md").read_text(encoding="utf-8")
+        parts = list(_PART.finditer(text))
+        assert sum(part["code"] is not None for part in parts) == text.count("```{code-cell}")  # none was overlooked
+        self._left = [part for part in parts if without is None or f"[{without}]" not in (part["options"] or "")]
+        assert without is None or len(self._left) < len(parts), f"{stem}.md has no cell tagged {without}"
+
+    def run(self, until: str | None = None) -> Any:
+        """Run the cells before the heading `until`, by default all that are left; return the variables."""
+        while self._left and not (until and self._left[0]["heading"] == until):
+            part = self._left.pop(0)
+            if part["code"] is not None:
+                exec(compile(part["code"], f"{self.stem}.md", "exec"), self._variables)
+                plt.close("all")  # as a notebook does
+        assert self._left or until is None, f"{self.stem}.md has no heading {until!r} there"
+        return SimpleNamespace(**{name: value for name, value in self._variables.items() if not name.startswith("__")})
