@@ -46,27 +46,35 @@ def simulate(
     """Run a controller in the modified ANC structure.
 
     For each sample, compute the control signal from the last weights, the amplifier's output and the error
-    e = d - s*y_amp, then update the controller. There is one channel. Built-in controllers run at compiled speed; a
-    user-defined controller is called sample by sample.
+    e = d - s*y_amp, then update the controller. Built-in controllers run at compiled speed; a user-defined controller is
+    called sample by sample.
+
+    With several channels, the channel is the leading axis: I references, J loudspeakers, K error microphones. A
+    user-defined controller then gets and returns arrays: ``control_signal(reference)``, (I,), returns (J,), and
+    ``update(error)`` gets (K,).
 
     Parameters
     ----------
     controller : Controller
         Controller. It continues from its present state, while the paths start silent: make a new one for a fresh run.
     reference : array_like
-        (n_samples,) reference x.
+        (n_samples,) reference x, or (I, n_samples).
     secondary_path : array_like or control.TransferFunction
-        True secondary path s, loudspeaker amplifier to error microphone.
+        True secondary path s, loudspeaker amplifier to error microphone. With several channels (K, J, n_taps), or a
+        matrix of systems: nested lists, or a system of several inputs and outputs.
     primary_path : array_like or control.TransferFunction, optional
-        Path from the reference to the error microphone, which gives the disturbance p*x.
+        Path from the reference to the error microphone, which gives the disturbance p*x; (K, I, n_taps) or a matrix of
+        systems.
     disturbance : array_like, optional
-        (n_samples,) disturbance d, in place of `primary_path`.
+        (n_samples,) disturbance d, or (K, n_samples), in place of `primary_path`.
     fs : float, default 16000
         Sample rate in Hz; paths given as systems must have the same.
     amplifier : callable, optional
-        Amplifier model, or any function of a sample that returns a finite number; by default linear.
-    rated_power : float, optional
-        Rated power, which sets the scale of the divergence limit; by default the controller's, or 1 if it has none.
+        Amplifier model, or any function of a sample that returns a finite number; by default linear. With several
+        loudspeakers one for all, or a sequence with one for each.
+    rated_power : float or array_like, optional
+        Rated power, which sets the scale of the divergence limit, of all loudspeakers or of each, (J,); by default the
+        controller's, or 1 if it has none.
     sensor_noise_std : float, default 0
         Standard deviation of white noise at the error microphone.
     rng : int or numpy.random.Generator, optional
@@ -76,11 +84,12 @@ def simulate(
         (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts at that
         time.
     feedback_path : array_like or control.TransferFunction, optional
-        Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
+        Acoustic feedback from the amplifier to the reference microphone, (I, J, n_taps) with several; its first tap must
+        be 0. By default none.
     record_weights_every : int, optional
         Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     record_powers : bool, default False
-        Record the disturbance power, the secondary-path gain and the weight of a power budget.
+        Record the disturbance power, the secondary-path gain and the weight of a power budget; for one channel.
     progress : callable, optional
         Called with the number of samples done since its last call, such as `tqdm.update`.
     compiled : bool, default True
