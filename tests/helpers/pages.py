@@ -11,7 +11,8 @@ import matplotlib.pyplot as plt
 
 TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
 _PART = re.compile(
-    r"^```\{code-cell\}[^\n]*\n(?P<options>(?:---\n.*?^---\n)?(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$", re.M | re.S
+    r"^```\{code-cell\}[^\n]*\n(?P<options>(?:---\n.*?^---\n)?(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$",
+    re.M | re.S,
 )
 
 
