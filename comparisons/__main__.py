@@ -23,6 +23,7 @@ STUDIES: dict[str, Study] = {
     "duct-measured": (duct.main_measured, duct.planned_runs),
 }
 FURTHER: dict[str, Study] = {  # beyond the paper
+    "duct-motor": (duct.main_motor, duct.planned_runs),
     "constraint": (constraint.main, constraint.planned_runs),
     "power_budget": (power_budget.main, power_budget.planned_runs),
     "mismatch": (mismatch.main, mismatch.planned_runs),

@@ -51,10 +51,6 @@ class Results:
             value = value[key]
         return value
 
-    def over_rated(self, study: str, key: str, algorithm: str) -> float:
-        """A power among the extras over the rated power."""
-        return self.extra(study, key, algorithm) / self.studies[study]["rated_power"]
-
     def said(self, study: str, claim: str) -> list[float]:
         """Numbers in the verdict on the claim that begins with these words."""
         verdict = next(v for v in self.studies[study]["verdicts"] if v["claim"].startswith(claim))
@@ -235,47 +231,114 @@ def _broadband() -> Iterator[Quote]:
     )
 
 
+DUCTS = {  # study, and what the pages call its duct and noise
+    "duct": "modelled duct, synthetic compressor",
+    "duct-measured": "measured duct, recorded compressor",
+    "duct-motor": "measured duct, recorded motor",
+}
+
+
 def _duct() -> Iterator[Quote]:
-    second, burst = "largest_output_power_over_1_s", "overshoot_of_50_ms_power"
-    for study, words in (("duct", "modelled duct"), ("duct-measured", "measured duct")):
-        yield Quote(
-            "limits.md",
+    def quote(words: str, studies: tuple[str, ...], numbers: Callable[[Results], Sequence[float]]) -> Quote:
+        command = "python -m comparisons duct-motor" if "duct-motor" in studies else STUDIES
+        return Quote("limits.md", words, studies, numbers, command)
+
+    def of(
+        results: Results, study: str, *names: str, algorithms: Sequence[str] = ("KF-OPC", "MOV-FxLMS")
+    ) -> list[float]:
+        return [results.extra(study, "figures", algorithm, name) for name in names for algorithm in algorithms]
+
+    def gains(results: Results, study: str) -> list[float]:
+        return [
+            results.extra(study, key) for key in ("gain_of_the_reference_eq_11", "gain_of_the_wiener_control_signal")
+        ]
+
+    def start(results: Results, *keys: str) -> list[float]:
+        return [results.extra(study, "start_under_constraint", *keys) for study in ("duct", "duct-measured")]
+
+    for study, words in DUCTS.items():
+        yield quote(
             f"| {words} | {{:.2f}} | {{:.2f}} | {{:.1f}} |",
             (study,),
-            lambda r, study=study: [
-                r.rated(study, "KF-OPC"),
-                r.over_rated(study, second, "KF-OPC"),
-                r.extra(study, burst, "KF-OPC"),
-            ],
+            lambda r, study=study: of(r, study, "power", "worst_second", "worst_50_ms", algorithms=["KF-OPC"]),
         )
-        yield Quote(
-            "limits.md",
-            f"In the {words} the reference sees a gain of {{:.2f}} and the control signal one of {{:.2f}}",
+    yield quote(
+        "In the modelled duct the reference sees a gain of {:.2f} and the control signal one of {:.2f}",
+        ("duct",),
+        lambda r: gains(r, "duct"),
+    )
+    yield quote(
+        "the compressor sees a gain of {:.3f} and the control signal one of {:.3f}",
+        ("duct-measured",),
+        lambda r: gains(r, "duct-measured"),
+    )
+    yield quote("With the motor these gains are {:.3f} and {:.3f}", ("duct-motor",), lambda r: gains(r, "duct-motor"))
+    kalman = ("KF-OPC", "KF-PB")
+    yield quote(
+        "A rated power that is {:.1f} times too high for the amplifier is not a constraint. KF-PB keeps {:.2f} of",
+        ("duct-measured",),
+        lambda r: of(r, "duct-measured", "power", algorithms=kalman),
+    )
+    yield quote(
+        "KF-OPC reduces the noise by {:.1f} dB and KF-PB by {:.1f} dB; with one of 10 %, by {:.1f} dB and {:.1f} dB",
+        ("duct-measured",),
+        lambda r: [
+            r.extra("duct-measured", key, algorithm, "noise_reduction_db")
+            for key in ("figures", "figures_at_the_smaller_rated_power")
+            for algorithm in kalman
+        ],
+    )
+    for study in ("duct-measured", "duct-motor"):
+        words = DUCTS[study].removeprefix("measured duct, ")
+        yield quote(
+            f"| {words} | {{:.2f}}, {{:.2f}} dB | {{:.2f}}, {{:.2f}} dB | {{:.2f}}, {{:.2f}} |",
             (study,),
-            lambda r, study=study: [
-                r.extra(study, "gain_of_the_reference_eq_11"),
-                r.extra(study, "gain_of_the_wiener_control_signal"),
-            ],
+            lambda r, study=study: of(r, study, "mean_nse_db", "noise_reduction_db", "power"),
         )
-    yield Quote(
-        "limits.md",
+    yield quote(
+        "power a fixed filter reaches {:.2f} dB on the compressor and {:.2f} dB on the motor",
+        ("duct-measured", "duct-motor"),
+        lambda r: [
+            r.extra(study, "best_noise_reduction_within_the_power_db") for study in ("duct-measured", "duct-motor")
+        ],
+    )
+    yield quote(
+        "with the compressor it reaches {:.2f} dB at {:.2f} of the rated power",
+        ("duct-measured",),
+        lambda r: of(r, "duct-measured", "noise_reduction_db", "power", algorithms=["MOV-FxLMS by variance"]),
+    )
+    yield quote(
+        "{:.0f} against {:.0f} ms in the modelled duct, {:.0f} against {:.0f} ms in the measured one",
+        ("duct", "duct-measured"),
+        lambda r: [
+            1e3 * time
+            for pair in zip(start(r, "equal_time_s"), start(r, "mov_equal_time_s"), strict=True)
+            for time in pair
+        ],
+    )
+    yield quote(
+        "starts the control at {:.0f} s",
+        ("duct-motor",),
+        lambda r: [r.extra("duct-motor", "start_under_constraint", "at_s")],
+    )
+    yield quote(
+        "at equal power KF-OPC takes {:.0f} ms and MOV-FxLMS {:.0f} ms",
+        ("duct-motor",),
+        lambda r: [
+            1e3 * r.extra("duct-motor", "start_under_constraint", key) for key in ("equal_time_s", "mov_equal_time_s")
+        ],
+    )
+    yield quote(
+        "it then reduces the noise by {:.2f} and {:.2f} dB, MOV-FxLMS by {:.2f} and {:.2f} dB",
+        ("duct", "duct-measured"),
+        lambda r: start(r, "equal_power_db") + start(r, "noise_reduction_db", "MOV-FxLMS"),
+    )
+    yield quote(
         "MOV-FxLMS at {:.2f} and {:.2f} of the rated power",
         ("duct", "duct-measured"),
         lambda r: [r.rated("duct", "MOV-FxLMS"), r.rated("duct-measured", "MOV-FxLMS")],
     )
-    yield Quote(
-        "limits.md",
-        "On the measured duct KF-OPC reaches {:.2f} dB and MOV-FxLMS, with a third of the power, {:.2f} dB",
-        ("duct-measured",),
-        lambda r: [r.merit("duct-measured", "KF-OPC"), r.merit("duct-measured", "MOV-FxLMS")],
-    )
-    yield Quote(
-        "limits.md",
-        "within that power a fixed filter reaches {:.2f} dB",
-        ("duct-measured",),
-        lambda r: [r.extra("duct-measured", "best_noise_reduction_within_the_power_db")],
-    )
-    yield Quote("limits.md", "{:.0f} of the {:.0f} claims", PAPER, lambda r: r.reproduced())
+    yield quote("{:.0f} of the {:.0f} claims", PAPER, lambda r: r.reproduced())
 
 
 def _constraint() -> Iterator[Quote]:
@@ -317,11 +380,6 @@ def _constraint() -> Iterator[Quote]:
     )
     yield quote("one run of bursts ({:.1f} dB)", lambda r: [_worst_loss(r, "bursts")])
     yield quote("the measured duct at 25 % (up to {:.1f} dB)", lambda r: [_worst_loss(r, "swelling band noise")])
-    yield quote(
-        "KF-OPC's output power was {:.2f} to {:.2f} of the rated power, KF-PB's {:.2f} to {:.2f}",
-        _least_and_most_power,
-        page="limits.md",
-    )
 
 
 def _power_range() -> Iterator[Quote]:

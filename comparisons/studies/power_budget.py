@@ -43,7 +43,14 @@ TARGETS_DB = (3.0, 6.0, 10.0)
 BOUND, SCALED = "bound", "scaled Wiener"
 PANELS = {
     "Kalman filters": ("KF-OPC", "KF-OPC repaired", "KF-PB", "diagonal KF-OPC"),
-    "FxLMS with a price": ("leaky FxLMS", "optimal leaky FxLMS", "MOV-FxLMS fixed", "MOV-FxLMS", "MOV-MFxLMS"),
+    "FxLMS with a price": (
+        "leaky FxLMS",
+        "optimal leaky FxLMS",
+        "MOV-FxLMS fixed",
+        "MOV-FxLMS by variance",
+        "MOV-FxLMS",
+        "MOV-MFxLMS",
+    ),
     "FxLMS with an amplitude limit": ("two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"),
 }
 

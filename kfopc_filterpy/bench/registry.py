@@ -26,7 +26,7 @@ from kfopc_filterpy import (
     kf_opc_repaired,
     kf_pb,
 )
-from kfopc_filterpy.controllers import Controller
+from kfopc_filterpy.controllers import Controller, penalty_factor
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 from .scene import Scene
@@ -163,15 +163,31 @@ def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -
 
 
 def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
+    return _mov(scene, mu, price * scene.secondary_gain, amplifier, "MOV-FxLMS fixed")
+
+
+def _mov_by_variance(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
+    """Take the penalty from the variance of the whole disturbance, as the public code of its authors does.
+
+    They take the secondary path's gain for the disturbance, from an inverse model of the path; here it is that of eq. 11,
+    as for all algorithms. The penalty hardly depends on it if the noise needs about four times the rated power.
+    """
+    variance = float(np.var(scene.settled[1]))
+    gamma = penalty_factor(scene.rated_power, disturbance_power=variance, secondary_path_gain=scene.secondary_gain)
+    return _mov(scene, mu, gamma, amplifier, "MOV-FxLMS by variance")
+
+
+def _mov(scene: Scene, mu: float, gamma: float, amplifier: Amplifier | None, name: str) -> Controller:
+    """Return an MOV-FxLMS with a fixed penalty, of another name than the one whose penalty follows the powers."""
     controller = MOVFxLMS(
         scene.n_taps,
         scene.known_secondary,
         step_size=mu,
         constraint=_constraint(scene),
-        penalty_factor=price * scene.secondary_gain,
+        penalty_factor=gamma,
         amplifier=amplifier,
     )
-    controller.name = "MOV-FxLMS fixed"
+    controller.name = name
     return controller
 
 
@@ -225,6 +241,7 @@ REGISTRY: dict[str, Algorithm] = {
     "MOV-FxLMS fixed": Algorithm(
         _mov_fixed, **_STEP, second_kind="penalty factor over G_s", second=PRICE_GRID, sees_budget=False, **_KNOWS
     ),
+    "MOV-FxLMS by variance": Algorithm(_mov_by_variance, **_STEP, **_KNOWS),
     "MOV-FxLMS": Algorithm(_rated(MOVFxLMS), of_paper=True, **_STEP, **_KNOWS),
     "MOV-MFxLMS": Algorithm(_rated(MOVFxLMS, modified=True), **_STEP, **_KNOWS),
     "two-gradient FxLMS": Algorithm(_peak(TwoGradientFxLMS), **_PEAK),

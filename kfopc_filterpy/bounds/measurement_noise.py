@@ -8,7 +8,7 @@ import numpy as np
 
 from .._validate import as_count, as_signal
 from ..paths.models import path_taps
-from .wiener import wiener_solution
+from .wiener import full_stretch, loss_db, warn_of_loss
 
 
 def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> float:
@@ -39,6 +39,12 @@ def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path:
     ValueError
         If the signals are too short for the fit, of different lengths, silent or not finite.
 
+    Warns
+    -----
+    numpy.exceptions.RankWarning
+        If q cannot be told: the reference is so narrow-band that float64 correlations do not resolve all directions of
+        the weights, and weights in those would explain part of the residual. The estimate is then too high by at least 6 dB.
+
     Examples
     --------
     >>> import numpy as np
@@ -58,7 +64,12 @@ def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path:
             f"reference and disturbance must have at least {transient + 2 * n_taps} samples for {n_taps} taps and a "
             f"secondary path of {s.size}, got {x.size}"
         )
-    weights = wiener_solution(x, d, s, n_taps).weights
+    stretch = full_stretch(x, d, s, n_taps)
+    correlations = stretch.correlations()
+    weights = correlations.weights()
+    warn_of_loss(
+        loss_db(stretch, correlations, weights), "q cannot be told from this run, and the estimate is too high"
+    )
     explained = np.convolve(np.convolve(x, s), weights)[: x.size]
     return measurement_noise_from_residual((d - explained)[transient:], n_fitted=n_taps)
 

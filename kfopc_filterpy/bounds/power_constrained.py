@@ -13,7 +13,17 @@ import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal
 from ..paths.models import path_taps
-from .wiener import Stretch, WienerSolution, constrained_weights, full_stretch, mean_square, reduction_db, require_sound
+from .wiener import (
+    Stretch,
+    WienerSolution,
+    constrained_weights,
+    full_stretch,
+    loss_db,
+    mean_square,
+    reduction_db,
+    require_sound,
+    warn_of_loss,
+)
 
 
 @dataclass(frozen=True)
@@ -207,15 +217,17 @@ def power_constrained_wiener(
 
     .. math:: (R_{x'} + λ R_x)\, w = r, \qquad λ ≥ 0, \qquad λ\,(E[y^2] - ρ_o) = 0
 
-    is a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power. A filter that
-    adapts may do better if the noise changes within the stretch. The bound is fitted to the stretch it is judged on, so
+    is a bound: no filter of `n_taps` taps that stays fixed over the stretch does better within the power, unless its
+    weights are very large in the directions left out (below). A filter that adapts may do better if the noise changes within the stretch. The bound is fitted to the stretch it is judged on, so
     by chance alone it removes about ``n_taps / fs`` per second of what the reference does not explain. The bound of each
     second meets the budget in each second, that of the record on average; which of them is better depends on the noise.
 
     Delay lines hold the past of the record, also at the edges of segments, and zeros before its first sample. So only
-    the record itself starts up, and the anti-noise at an edge is that of weights that have been there before. Directions
-    in which reference and filtered reference have less than 1e-11 of the energy of the strongest get no weight, because
-    float64 correlations do not resolve them.
+    the record itself starts up, and the anti-noise at an edge is that of weights that have been there before.
+
+    Directions in which reference and filtered reference have less than 1e-11 of the energy of the strongest get no
+    weight, because float64 correlations do not resolve them. A narrow-band reference has such directions, and then very
+    large weights can do better than the bound. A warning says so if it matters for the whole record.
 
     Parameters
     ----------
@@ -253,6 +265,12 @@ def power_constrained_wiener(
         If the signals differ in length, have fewer than `n_taps` samples that count, are silent in them, or are not
         finite; if an argument is out of range, or `fs` is not that of `secondary_path`. A silent segment is no error: it
         needs no power and gets zero weights.
+
+    Warns
+    -----
+    numpy.exceptions.RankWarning
+        If, over the whole record, the directions left out would lower the error of `whole` or `unconstrained` by more
+        than 6 dB, and its noise reduction is below 60 dB.
 
     See Also
     --------
@@ -306,6 +324,12 @@ def power_constrained_wiener(
         return _solve(record.part(start, stop), rated_power, ridge, (start - first) / fs, (stop - first) / fs)
 
     whole, unconstrained, scaled = solve(first, n_samples)
+    correlations = counted.correlations()
+    losses = [
+        loss_db(counted, correlations, whole.weights, penalty=whole.penalty),
+        loss_db(counted, correlations, unconstrained.weights, ridge=ridge),
+    ]
+    warn_of_loss(max(losses))
     each = [solve(start, stop) for start, stop in zip(edges, [*edges[1:], n_samples], strict=True)]
     return PowerConstrainedWiener(
         whole=whole,
@@ -326,8 +350,9 @@ def power_constrained_solution(
     """Return the least-squares control filter whose control power does not exceed the rated power.
 
     The penalty γ of `wiener_solution` is chosen so that the control power is `rated_power`, or zero if the filter needs
-    less. No filter of this length has a smaller error within the power. As in `wiener_solution`, only samples at which
-    the delay lines of control filter and secondary path are full count.
+    less. As in `wiener_solution`, only samples at which the delay lines of control filter and secondary path are full
+    count, and directions in which the reference has hardly any energy get no weight. But for those, no filter of this
+    length has a smaller error within the power.
 
     Parameters
     ----------
@@ -346,6 +371,11 @@ def power_constrained_solution(
     TypeError, ValueError
         As for `wiener_solution`, or if `rated_power` is not positive.
 
+    Warns
+    -----
+    numpy.exceptions.RankWarning
+        As for `wiener_solution`.
+
     See Also
     --------
     power_constrained_wiener : the same in each second too, with the scaled filter beside it.
@@ -359,7 +389,10 @@ def power_constrained_solution(
     """
     rated_power = as_positive(rated_power, "rated_power")
     stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
-    return stretch.solution(constrained_weights(stretch, stretch.correlations(), rated_power)[0])
+    correlations = stretch.correlations()
+    weights, penalty = constrained_weights(stretch, correlations, rated_power)
+    warn_of_loss(loss_db(stretch, correlations, weights, penalty))
+    return stretch.solution(weights)
 
 
 def _record(reference: Any, disturbance: Any, taps: np.ndarray, n_taps: int) -> Stretch:

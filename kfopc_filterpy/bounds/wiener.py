@@ -6,6 +6,7 @@ Sign convention: ``e = d - s*y``, ``y = w*x`` with the newest sample first, filt
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,13 @@ from ..paths.models import path_taps
 
 # A control power that exceeds the rated one by no more than this share of it counts as within it.
 BUDGET_TOLERANCE = 1e-12
+
+# The directions that `RANK_TOLERANCE` leaves out matter if they would lower the error by so much, unless the error is
+# below -60 dB already: there a microphone's own noise decides. Noise of a few octaves in a duct loses up to 4 dB, with
+# weights of 1e10 that no controller could use.
+LOSS_THAT_MATTERS_DB = 6.0
+ERROR_THAT_MATTERS = 1e-6
+ROWS_PER_TAP = 8  # samples that are fitted anew to find that out
 
 
 @dataclass(frozen=True)
@@ -61,10 +69,13 @@ def wiener_solution(
     r"""Return the least-squares control filter of a reference and a disturbance.
 
     Minimises :math:`E[(d - w^T x')^2] + \gamma E[(w^T x)^2] + \lambda E[x'^2] \|w\|^2` over the samples at which the
-    delay lines of control filter and secondary path are full: exact least squares on the data at hand, not the biased
+    delay lines of control filter and secondary path are full: least squares on the data at hand, not the biased
     autocorrelation. Leave out the start-up transient of the disturbance if it should not count. If the data leave
-    weights undetermined (a tone determines only two numbers), the solution of minimum norm is taken; eigenvalues below
-    1e-11 of the largest count as zero.
+    weights undetermined (a tone determines only two numbers), the solution of minimum norm is taken.
+
+    Eigenvalues of the correlation matrix below 1e-11 of the largest count as zero, because float64 correlations do not
+    resolve them. A narrow-band reference has such eigenvalues, and then a filter with very large weights can have a
+    smaller error than the solution. A warning says so if it matters: the solution is then no bound.
 
     Parameters
     ----------
@@ -80,7 +91,7 @@ def wiener_solution(
         Ridge λ, relative to the power of the filtered reference.
     control_penalty : float, default 0.0
         Penalty γ on the control power; MOV-FxLMS steers to this optimum. With the γ at which `control_power` equals the
-        rated power, no filter of the length has a smaller error within that power.
+        rated power, no filter of the length has a smaller error within that power, but for the directions left out.
 
     Returns
     -------
@@ -91,6 +102,11 @@ def wiener_solution(
     ------
     TypeError, ValueError
         If the signals differ in length, are shorter than the delay lines, silent, or not finite.
+
+    Warns
+    -----
+    numpy.exceptions.RankWarning
+        If the directions left out would lower the error by more than 6 dB, and the noise reduction is below 60 dB.
 
     See Also
     --------
@@ -113,7 +129,10 @@ def wiener_solution(
     stretch = full_stretch(reference, disturbance, secondary_path, n_taps)
     ridge = as_nonnegative(regularization, "regularization") * stretch.filtered_power
     penalty = as_nonnegative(control_penalty, "control_penalty")
-    return stretch.solution(stretch.correlations().weights(penalty, ridge))
+    correlations = stretch.correlations()
+    weights = correlations.weights(penalty, ridge)
+    warn_of_loss(loss_db(stretch, correlations, weights, penalty, ridge))
+    return stretch.solution(weights)
 
 
 @dataclass(frozen=True)
@@ -199,9 +218,13 @@ class Correlations:
 
     def weights(self, penalty: float = 0.0, ridge: float = 0.0) -> np.ndarray:
         """Return the minimum-norm solution of (R_x' + penalty R_x + ridge I) w = r."""
+        return minimum_norm_solve(self.matrix(penalty, ridge), self.cross)
+
+    def matrix(self, penalty: float, ridge: float) -> np.ndarray:
+        """Return R_x' + penalty R_x + ridge I."""
         matrix = self.filtered + penalty * self.reference
         matrix.flat[:: self.cross.size + 1] += ridge
-        return minimum_norm_solve(matrix, self.cross)
+        return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,6 +314,54 @@ def reduction_db(error_power: float, disturbance_power: float) -> float:
     if disturbance_power == 0:
         return float("nan")
     return float(-10 * np.log10(max(error_power / disturbance_power, 1e-30)))
+
+
+def loss_db(
+    stretch: Stretch, correlations: Correlations, weights: np.ndarray, penalty: float = 0.0, ridge: float = 0.0
+) -> float:
+    """Return by how many dB weights in the directions left out would lower the error, 0 if it does not matter.
+
+    With a penalty or a ridge, the error is that of the penalised problem. The signals themselves resolve weights that
+    their correlations do not: a QR decomposition of evenly spaced samples is compared with `weights` at those samples.
+    """
+    from scipy.linalg import lstsq
+
+    values = np.linalg.eigvalsh(correlations.matrix(penalty, ridge))
+    if values[0] > RANK_TOLERANCE * values[-1]:
+        return 0.0
+    n_taps, n_samples = stretch.n_taps, stretch.d.size
+    chosen = np.linspace(0, n_samples - 1, min(n_samples, ROWS_PER_TAP * n_taps)).astype(int)
+    of_filtered, of_reference = (
+        np.lib.stride_tricks.sliding_window_view(signal, n_taps)[chosen, ::-1]
+        for signal in (stretch.filtered, stretch.x)
+    )
+    blocks = [of_filtered]
+    if penalty:
+        blocks.append(math.sqrt(penalty) * of_reference)
+    if ridge:
+        blocks.append(math.sqrt(ridge * chosen.size) * np.eye(n_taps))
+    rows = np.concatenate(blocks)
+    right = np.concatenate([stretch.d[chosen], np.zeros(len(rows) - chosen.size)])
+    best, _, rank, _ = lstsq(rows, right, cond=len(rows) * np.finfo(float).eps, lapack_driver="gelsy")
+    error = mean_square(right - rows @ weights)
+    least = mean_square(right - rows @ best) * right.size / max(right.size - rank, 1)  # each weight fits by chance too
+    if error <= ERROR_THAT_MATTERS * mean_square(right):
+        return 0.0
+    loss = 10 * math.log10(error / max(least, 1e-30 * error))
+    return loss if loss > LOSS_THAT_MATTERS_DB else 0.0
+
+
+def warn_of_loss(loss: float, what: str = "the solution is not the least-squares optimum, and no bound") -> None:
+    """Warn the caller of the public function that calls this one, if there is a loss in dB."""
+    if loss:
+        warnings.warn(
+            f"the reference is too narrow-band for this many taps: {what}. Weights in directions with less than "
+            f"{RANK_TOLERANCE:g} of the strongest one's energy, which float64 correlations do not resolve, would lower "
+            f"the error by {loss:.1f} dB more, with very large weights. Use fewer taps, add the sensor noise to the "
+            "reference, or give a regularization",
+            np.exceptions.RankWarning,
+            stacklevel=3,
+        )
 
 
 def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:

@@ -29,6 +29,7 @@ STYLES: dict[str, tuple[str, Any, str]] = {
     "FxNLMS": ("#AA4499", _DASHED, "*"),
     "leaky FxLMS": ("#999933", _DASHED, "1"),
     "MOV-FxLMS fixed": ("#117733", _DASHED, "2"),
+    "MOV-FxLMS by variance": ("#661100", _DASHED, "4"),
     "MOV-MFxLMS": ("#88CCEE", _DASHED, "3"),
 }
 UNLISTED = ("#000000", ":", "x")  # an algorithm that is not in the table

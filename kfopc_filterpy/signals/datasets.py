@@ -1,4 +1,4 @@
-"""The public measured duct and motor noise.
+"""The public measured duct, and recordings of a motor and a compressor.
 
 These are third-party data without a stated licence, so they are not part of this package. They are read from a folder
 of the user's, or fetched from their public sources, and checked by SHA-256.
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._validate import as_positive, as_signal
+from .._validate import as_choice, as_positive, as_signal
 from .recordings import read_mat_vector
 
 _FOLDER_VARIABLE = "KFOPC_DATA"
@@ -23,14 +23,19 @@ _HASHES = {
     "duct/Pz1.mat": "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
     "duct/Sz.mat": "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
     "motor/Motor.mat": "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
+    "compressor/compressor_16kHz.mat": "41498a595d746ce706926c2b33156bc868753a7e29be1ebb6a1eabcf3417227d",
 }
 _DUCT = "Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
 _MOTOR = "Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst/Noise_data"
+_COMPRESSOR = "ANC-Research/IC-DMCANC-CPA/ed1d5dbe59c990c1718052e6d3e28513ff12b70c"
 _URLS = {
     "duct/Pz1.mat": f"https://raw.githubusercontent.com/{_DUCT}/Pz1.mat",
     "duct/Sz.mat": f"https://raw.githubusercontent.com/{_DUCT}/Sz.mat",
     "motor/Motor.mat": f"https://raw.githubusercontent.com/{_MOTOR}/Motor.mat",
+    "compressor/compressor_16kHz.mat": f"https://raw.githubusercontent.com/{_COMPRESSOR}/compressor_16kHz.mat",
 }
+# File and variable of each noise.
+_NOISES = {"motor": ("motor/Motor.mat", "Motor_noise"), "compressor": ("compressor/compressor_16kHz.mat", "yr")}
 
 
 class DataUnavailableError(FileNotFoundError):
@@ -78,19 +83,29 @@ class MeasuredDuct:
 
 
 def load_measured_duct(
-    folder: str | os.PathLike[str] | None = None, *, allow_download: bool = False, timeout_s: float = 5.0
+    folder: str | os.PathLike[str] | None = None,
+    *,
+    noise: str = "motor",
+    allow_download: bool = False,
+    timeout_s: float = 5.0,
 ) -> MeasuredDuct:
-    """Load measured duct paths and recorded motor noise at 16 kHz, in place of the paper's, which are not public.
+    """Load measured duct paths and a recorded noise at 16 kHz.
+
+    The paper does not say which paths and which compressor it used. The compressor recording here was published by its
+    first author, so it is probably the paper's.
 
     The first of these that is given is used, and no other is tried after it: `folder`; the folder that the environment
     variable KFOPC_DATA names; the public sources, if `allow_download` is true and pooch is installed. A folder holds
-    duct/Pz1.mat, duct/Sz.mat and motor/Motor.mat. From any source, every file must have the published SHA-256; for
-    paths of your own, build a `MeasuredDuct`. Units are arbitrary: the secondary path gains 10 to 30 dB.
+    duct/Pz1.mat, duct/Sz.mat, and motor/Motor.mat or compressor/compressor_16kHz.mat. From any source, every file must
+    have the published SHA-256; for paths of your own, build a `MeasuredDuct`. Units are arbitrary: the secondary path
+    gains 10 to 30 dB.
 
     Parameters
     ----------
     folder : path, optional
         Folder with the files.
+    noise : {"motor", "compressor"}, default "motor"
+        Recording that is read; the file of the other one is not needed.
     allow_download : bool, default False
         Fetch the files, one try each, into pooch's cache of the operating system; later calls find them there.
     timeout_s : float, default 5.0
@@ -99,20 +114,20 @@ def load_measured_duct(
     Returns
     -------
     MeasuredDuct
-        primary (1024,), secondary (512,), noise (162001,), fs = 16000.
+        primary (1024,), secondary (512,), noise (162001,) of the motor or (279378,) of the compressor, fs = 16000.
 
     Raises
     ------
     DataUnavailableError
         If a file is missing, differs from the published one or cannot be fetched.
     ValueError, TypeError
-        If `timeout_s` is not above 0.
+        If `noise` names no recording, or `timeout_s` is not above 0.
 
     References
     ----------
     Z. Luo et al., "GFANC-Kalman: generative fixed-filter active noise control with CNN-Kalman filtering",
-    IEEE Signal Process. Lett., 2023 (duct). J. Ji et al., MOV-FxLMS with primary-path estimation (motor
-    noise).
+    IEEE Signal Process. Lett., 2023 (duct). J. Ji et al., MOV-FxLMS with primary-path estimation (motor noise). The
+    repository ANC-Research/IC-DMCANC-CPA of J. Ji et al. on distributed multichannel ANC (compressor noise).
 
     Examples
     --------
@@ -122,6 +137,7 @@ def load_measured_duct(
     ...     print("run the built-in duct instead")
     run the built-in duct instead
     """
+    noise_file = _NOISES[as_choice(noise, "noise", _NOISES)]
     timeout = as_positive(timeout_s, "timeout_s", unit="s")
     chosen = folder if folder is not None else os.environ.get(_FOLDER_VARIABLE) or None
     if chosen is None and not allow_download:
@@ -137,7 +153,7 @@ def load_measured_duct(
     return MeasuredDuct(
         primary=vector("duct/Pz1.mat", "Pz1"),
         secondary=vector("duct/Sz.mat", "S"),
-        noise=vector("motor/Motor.mat", "Motor_noise"),
+        noise=vector(*noise_file),
     )
 
 

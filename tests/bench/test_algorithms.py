@@ -86,6 +86,11 @@ def test_settings_are_in_the_units_of_the_scene(scene: Scene) -> None:
     assert leaky.leak == pytest.approx(3.0 * filtered, rel=1e-12)
     fixed: Any = make_controller(scene, "MOV-FxLMS fixed", (0.1, 3.0))
     assert fixed._state.penalty == pytest.approx(3.0 * filtered / np.mean(x**2), rel=1e-12)
+    computed: Any = make_controller(scene, "MOV-FxLMS by variance", 0.1)
+    gain = filtered / np.mean(x**2)
+    ratio = np.var(scene.disturbances[0][int(scene.switch_on_s * scene.fs) :]) / (gain * 0.5)
+    assert computed._state.penalty == pytest.approx(gain * (np.sqrt(ratio) - 1), rel=1e-12)
+    assert ratio > 1.5  # the penalty acts
     peak: Any = make_controller(scene, "clipping FxLMS", (0.1, 0.25))
     assert peak.amplitude_limit == pytest.approx(np.sqrt(0.25 * 2.0), rel=1e-12)  # unconstrained power 4 * 0.5
 

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from kfopc_filterpy.bounds import measurement_noise_from_residual, measurement_noise_from_run
 from kfopc_filterpy.bounds.wiener import wiener_solution
-from kfopc_filterpy.paths import fir_path
+from kfopc_filterpy.paths import duct_paths, fir_path, path_taps
+from kfopc_filterpy.signals import band_limited_noise
 
 S = np.array([0.0, 0.9, -0.4, 0.2])
 
@@ -134,3 +135,19 @@ def test_from_run_refuses(arguments, kind, message):
 def test_from_residual_refuses(residual, n_fitted, kind, message):
     with pytest.raises(kind, match=message):
         measurement_noise_from_residual(residual, n_fitted=n_fitted)
+
+
+def test_says_when_it_cannot_tell():
+    """A narrow-band reference: weights that the correlations do not resolve would explain most of the residual."""
+    fs = 16000.0
+    x = band_limited_noise((300.0, 400.0), 0.75, fs=fs, rng=0)
+    duct = duct_paths(fs=fs)
+    d = np.convolve(x, path_taps(duct.primary))[: x.size]
+    with pytest.warns(np.exceptions.RankWarning, match="q cannot be told from this run") as caught:
+        too_high = measurement_noise_from_run(x[3000:], d[3000:], duct.secondary, 64)
+    assert caught[0].filename == __file__
+    assert too_high > 1e-4 * np.mean(d[3000:] ** 2)  # although nothing but the length of the filter limits it
+    # With much sensor noise the same fit tells q; warnings are errors in these tests.
+    q = np.mean(d[3000:] ** 2)
+    noisy = d[3000:] + np.sqrt(q) * np.random.default_rng(0).standard_normal(d.size - 3000)
+    assert measurement_noise_from_run(x[3000:], noisy, duct.secondary, 64) == pytest.approx(q, rel=0.1)

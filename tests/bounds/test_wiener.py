@@ -1,5 +1,7 @@
 """Wiener filters against numpy.linalg.lstsq on the same data, closed forms and perturbed neighbours."""
 
+import re
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -7,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy.bounds import coherence_bound, wiener_solution
-from kfopc_filterpy.bounds.power_constrained import power_constrained_solution
+from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
+from kfopc_filterpy.paths import duct_paths
 from kfopc_filterpy.paths.least_squares import correlation_matrix, minimum_norm_solve
 from kfopc_filterpy.paths.models import bandpass_path, path_taps
+from kfopc_filterpy.signals import band_limited_noise
 
 FS = 16000.0
 
@@ -165,3 +169,65 @@ def test_coherence_bound_is_the_incoherent_share():
 def test_wiener_refuses(call, message):
     with pytest.raises(ValueError, match=message):
         call(*_scene())
+
+
+# ---- Directions that float64 correlations do not resolve
+
+
+def narrow(n=12_000, seed=0):
+    """Noise of 300 to 400 Hz through two paths, and what full least squares makes of it."""
+    x = band_limited_noise((300.0, 400.0), n / FS, fs=FS, rng=seed)
+    duct = duct_paths(fs=FS)
+    d = np.convolve(x, path_taps(duct.primary))[: x.size]
+    return x[3000:], d[3000:], path_taps(duct.secondary)
+
+
+def dense_reduction_db(x, d, s, n_taps):
+    start = n_taps + s.size - 2
+    rows = np.lib.stride_tricks.sliding_window_view(scipy.signal.lfilter(s, 1.0, x), n_taps)[start - n_taps + 1 :, ::-1]
+    weights = np.linalg.lstsq(rows, d[start:], rcond=None)[0]
+    error = d[start:] - rows @ weights
+    return -10 * np.log10(np.mean(error**2) / np.mean(d[start:] ** 2)), np.abs(weights).max()
+
+
+def test_a_narrow_band_reference_warns_that_larger_weights_do_better():
+    x, d, s = narrow()
+    reached, largest = dense_reduction_db(x, d, s, 64)
+    with pytest.warns(np.exceptions.RankWarning, match="too narrow-band for this many taps") as caught:
+        found = wiener_solution(x, d, s, 64)
+    assert caught[0].filename == __file__
+    assert reached > found.noise_reduction_db + 5
+    assert largest > 1e4 * np.abs(found.weights).max()
+    told = float(re.search(r"lower the error by (\d+\.\d) dB", str(caught[0].message))[1])
+    # The warning compares evenly spaced samples, and leaves out the smallest directions by its own measure.
+    assert told == pytest.approx(reached - found.noise_reduction_db, abs=6)
+
+
+def test_the_bounds_within_a_power_warn_too():
+    x, d, s = narrow()
+    with pytest.warns(np.exceptions.RankWarning, match="no bound"):
+        free = wiener_solution(x, d, s, 64).control_power
+    with pytest.warns(np.exceptions.RankWarning, match="no bound"):
+        power_constrained_solution(x, d, s, 64, 2 * free)
+    with pytest.warns(np.exceptions.RankWarning, match="no bound"):
+        power_constrained_wiener(x, d, s, 64, 2 * free, fs=FS, switch_on_s=0.1)  # without the start-up
+
+
+def test_what_the_cut_does_not_change_does_not_warn():
+    """Warnings are errors in these tests."""
+    x, d, s = narrow()
+    wiener_solution(x, d, s, 64, regularization=1e-6)  # nothing is cut
+    noise = np.sqrt(np.mean(d**2)) * np.random.default_rng(1).standard_normal(d.size)
+    wiener_solution(x, d + noise, s, 64)  # the reference explains half the disturbance; the cut changes little
+    n = np.arange(8000)
+    wiener_solution(np.sin(0.2 * n), np.sin(0.2 * n + 1), [0.5, 0.2], 32)  # two directions are all there are
+
+
+def test_the_tolerance_keeps_directions_of_a_billionth_of_the_energy():
+    """A tone and noise 90 dB below its eigenvalues: all directions are resolved, and needed for an exact fit."""
+    n = np.arange(8000)
+    x = np.sqrt(2) * np.sin(0.3 * n) + 1e-4 * np.random.default_rng(2).standard_normal(n.size)
+    d = np.convolve(x, [0.0, 0.5, -0.8, 0.3])[: x.size]
+    shares = np.linalg.eigvalsh(correlation_matrix(x, 32, 31))
+    assert 1e-10 < shares[0] / shares[-1] < 1e-8
+    assert wiener_solution(x[8:], d[8:], [1.0], 32).noise_reduction_db > 150

@@ -48,6 +48,22 @@ def test_scene_knows_its_measurement_noise(scene):
     assert scene.measurement_noise > floor
 
 
+def test_scene_expects_weights_of_the_wiener_filters_size(scene):
+    """P0 is the square of a tap, if 64 taps share the control power that the reference's power gives rise to."""
+    assert scene.initial_variance == pytest.approx(4.0 * 0.5 / (64 * np.mean(scene.references[0] ** 2)), rel=1e-12)
+
+
+def test_each_noise_has_a_sensor_noise_of_its_own(scene):
+    sensors = []
+    for k in range(2):
+        result = scene.run(make_controller(scene, "FxLMS", 1e-3), k)
+        sensors.append(result.error - (scene.disturbances[k][1600:] - result.anti_noise))
+    for sensor in sensors:
+        assert np.std(sensor) == pytest.approx(scene.sensor_noise_std, rel=5 * np.sqrt(0.5 / sensor.size))
+    assert abs(np.corrcoef(*sensors)[0, 1]) < 5 / np.sqrt(sensors[0].size)
+    assert not set(scene.sensor_noise_seeds) & set(scene.seeds)
+
+
 def scaled(scene, wiener_control_power):
     """The scene with all signals louder or softer, and another Wiener control power with them; same amplifier."""
     ratio = wiener_control_power / scene.wiener_control_power

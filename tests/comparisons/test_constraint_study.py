@@ -257,7 +257,16 @@ def test_verdict_on_varying_noise(changes: dict, kept: bool) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "kept"),
-    [({}, True), ({"loss_db": 1.01}, False), ({"loss_db": -1.01}, False), ({"weight_db": -1.01}, False)],
+    [
+        ({}, True),
+        ({"loss_db": 0.99}, True),
+        ({"loss_db": 1.01}, False),
+        ({"loss_db": -0.99}, True),
+        ({"loss_db": -1.01}, False),
+        ({"weight_db": 0.99}, True),
+        ({"weight_db": 1.01}, False),
+        ({"weight_db": -1.01}, False),
+    ],
 )
 def test_verdict_on_jumps(changes: dict, kept: bool) -> None:
     verdict = constraint._jump_claim([jump(), jump(**changes)])
@@ -276,6 +285,8 @@ def test_verdict_on_the_guarantee() -> None:
     verdict = constraint._guarantee_claim([*free, limited], [jump()], others)
     assert verdict.reproduced is True
     assert verdict.figure == "3 runs: 1.000000000 of the rated power at most"
+    nearly = replace(limited, worst_window=1 + 5e-10)
+    assert constraint._guarantee_claim([*free, nearly], [jump()], others).reproduced is True
     for rows, jumps, clips in (
         ([replace(limited, worst_window=over)], [jump()], others),
         ([limited, of_opc], [jump()], others),
@@ -305,11 +316,39 @@ def test_verdicts_behind_the_limiter() -> None:
     assert (compared.reproduced, tones.reproduced) == (False, False)
 
 
+@pytest.mark.parametrize(("of_pb", "met"), [(7.71, True), (7.69, False)])
+def test_behind_the_limiter_a_third_of_a_decibel_is_allowed(of_pb: float, met: bool) -> None:
+    compared, _ = constraint._transparency_claims(pair(10.0, 8.0) + pair(of_pb, 8.0, noise="bursts"))
+    assert compared.reproduced is met
+
+
+@pytest.mark.parametrize(("reduction", "met"), [(9.61, True), (9.59, False)])
+def test_behind_the_limiter_a_tone_is_half_a_decibel_from_the_bound(reduction: float, met: bool) -> None:
+    _, tones = constraint._transparency_claims(pair(reduction, 8.0) + pair(1.0, 0.0, noise="bursts"))
+    assert tones.reproduced is met
+
+
+def test_each_claim_is_on_its_own_rows() -> None:
+    """Wrong figures of KF-OPC, and of the other kind of noise, change no verdict on KF-PB."""
+    limited = pair(10.0, 9.9)
+    rows = [row(), row(noise=SWELLING.noise, power=0.5), row(algorithm="KF-OPC", power=2.0, noise_reduction_db=0.0)]
+    settled = {"duct": {"KF-PB": 1.0, "KF-ANC": 1.0}}
+
+    def met(rows: list[ConstraintRow]) -> list[bool]:
+        limits = [replace(own, worst_window=1.0) for own in limited]
+        return [v.reproduced for v in constraint._claims(rows + limits, [jump()], [clipped()], settled)]
+
+    assert met(rows) == [True] * 7
+    assert met([*rows, row(power=0.5)]) == [False] + [True] * 6
+    assert met([*rows, row(noise=SWELLING.noise, power=1.1)]) == [True, False] + [True] * 5
+
+
 def test_verdict_on_convergence() -> None:
     kept = {"a": {"KF-PB": 1.5, "KF-ANC": 1.0}, "b": {"KF-PB": 0.25, "KF-ANC": 0.5}}
     verdict = constraint._convergence_claim(kept)
     assert verdict.reproduced
     assert verdict.figure == "1.00 times on average, 1.50 at most (a); NSE over 50 ms, pooled over seeds"
+    assert not constraint._convergence_claim(kept | {"c": {"KF-PB": 1.51, "KF-ANC": 1.0}}).reproduced
     for order in (kept | {"c": {"KF-PB": 1.6, "KF-ANC": 1.0}}, {"c": {"KF-PB": 1.6, "KF-ANC": 1.0}} | kept):
         assert not constraint._convergence_claim(order).reproduced
 

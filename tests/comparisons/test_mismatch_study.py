@@ -187,14 +187,15 @@ def _row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **m
 
 
 @pytest.mark.parametrize(
-    ("below_db", "above_db", "met"), [(0.5, -0.5, True), (-0.5, -0.5, False), (0.5, 0.5, False), (0.5, np.nan, True)]
+    ("below_db", "above_db", "met"),
+    [(0.01, -0.01, True), (-0.01, -0.5, False), (0.5, 0.01, False), (0.5, np.nan, True)],
 )
 def test_the_bound_of_90_degrees_needs_both_sides(below_db: float, above_db: float, met: bool) -> None:
     rows = [
         _row(amount=0.0),
-        _row(amount=75.0, noise_reduction_db=below_db),
+        _row(amount=89.0, noise_reduction_db=below_db),
         _row(amount=90.0, noise_reduction_db=-3.0),  # on the bound: says nothing
-        _row(amount=105.0, noise_reduction_db=above_db, diverged_at_s=1.0 if np.isnan(above_db) else None),
+        _row(amount=91.0, noise_reduction_db=above_db, diverged_at_s=1.0 if np.isnan(above_db) else None),
         _row(amount=105.0, noise_reduction_db=20.0, noise="tone"),  # another noise
         _row(amount=105.0, noise_reduction_db=20.0, tuned_with=EXACT),  # another tuning
     ]
@@ -228,7 +229,21 @@ def test_one_divergence_is_one_too_many() -> None:
     assert mismatch._bounded([*rows, _row(algorithm="FxLMS", tuned_with=EXACT, diverged_at_s=2.0)]).reproduced
 
 
-@pytest.mark.parametrize(("ours", "theirs", "met"), [(1.0, 1.2, True), (1.03, 1.2, False), (1.0, 1.0, False)])
+@pytest.mark.parametrize(
+    ("ours", "theirs", "met"),
+    [
+        (1.0, 1.2, True),
+        (1.02, 1.2, True),
+        (1.021, 1.2, False),
+        (0.97, 1.2, True),
+        (0.969, 1.2, False),
+        (1.0, 1.0, False),
+        (1.0, 1.02, False),
+        (1.0, 1.021, True),
+        (1.0, 0.97, False),
+        (1.0, 0.969, True),
+    ],
+)
 def test_power_under_a_wrong_gain(ours: float, theirs: float, met: bool) -> None:
     rows = [
         _row("gain", 6.0, name, tuned_with=EXACT, power=power)

@@ -21,7 +21,12 @@ from kfopc_filterpy.signals import (
     write_wav,
 )
 
-FILES = {"duct/Pz1.mat": ("Pz1", 1024), "duct/Sz.mat": ("S", 512), "motor/Motor.mat": ("Motor_noise", 162001)}
+FILES = {
+    "duct/Pz1.mat": ("Pz1", 1024),
+    "duct/Sz.mat": ("S", 512),
+    "motor/Motor.mat": ("Motor_noise", 162001),
+    "compressor/compressor_16kHz.mat": ("yr", 279378),
+}
 
 
 @pytest.fixture
@@ -53,8 +58,8 @@ def network(own_files, monkeypatch):
 
         def __call__(self, url, output_file, _):
             asked.append((url, self.timeout))
-            folder = "motor" if "Motor" in url else "duct"
-            Path(output_file).write_bytes((own_files / folder / url.rsplit("/", 1)[1]).read_bytes())
+            (name,) = (name for name in FILES if name.endswith("/" + url.rsplit("/", 1)[1]))
+            Path(output_file).write_bytes((own_files / name).read_bytes())
 
     monkeypatch.delenv("KFOPC_DATA", raising=False)
     monkeypatch.setattr(pooch, "HTTPDownloader", Downloader)
@@ -74,6 +79,30 @@ def test_published_duct_has_its_known_contents(shared_data):
     # The secondary path gains 10 to 30 dB in the middle of 200 to 2000 Hz.
     gain_db = 20 * np.log10(np.abs(np.fft.rfft(duct.secondary, 4096)))[52:513]
     assert 10 < np.median(gain_db) < 30
+
+
+def test_published_compressor_has_its_known_contents(shared_data):
+    duct = load_measured_duct(shared_data, noise="compressor")
+    expected = scipy.io.loadmat(shared_data / "compressor" / "compressor_16kHz.mat")
+    np.testing.assert_array_equal(duct.noise, expected["yr"][:, 0])
+    np.testing.assert_allclose(np.diff(expected["tr"][:, 0]), 1 / duct.fs, rtol=1e-6)
+    np.testing.assert_array_equal(duct.secondary, load_measured_duct(shared_data).secondary)
+
+
+@pytest.mark.parametrize(
+    ("noise", "other"), [("motor", "compressor/compressor_16kHz.mat"), ("compressor", "motor/Motor.mat")]
+)
+def test_only_the_noise_that_is_asked_for_is_needed(own_files, noise, other):
+    (own_files / other).unlink()
+    assert load_measured_duct(own_files, noise=noise).noise.tolist() == [1.0, 2.0, 3.0]
+    (wanted,) = {"motor", "compressor"} - {noise}
+    with pytest.raises(DataUnavailableError, match=f"{Path(other).name} is missing: put https"):
+        load_measured_duct(own_files, noise=wanted)
+
+
+def test_an_unknown_noise_is_refused(own_files):
+    with pytest.raises(ValueError, match="noise must be one of 'motor', 'compressor', got 'fan'"):
+        load_measured_duct(own_files, noise="fan")
 
 
 def test_folder_argument_comes_before_the_environment(own_files, monkeypatch, tmp_path):
@@ -118,6 +147,9 @@ def test_download_asks_once_for_each_pinned_file_and_keeps_it(network, own_files
     assert (own_files / "cache" / "kfopc_filterpy" / "motor" / "Motor.mat").is_file()
     assert load_measured_duct(allow_download=True).primary.tolist() == [1.0, 2.0, 3.0]
     assert len(network) == 3
+    load_measured_duct(noise="compressor", allow_download=True)
+    compressor = "ANC-Research/IC-DMCANC-CPA/ed1d5dbe59c990c1718052e6d3e28513ff12b70c/compressor_16kHz.mat"
+    assert network[3:] == [(f"{root}/{compressor}", 5.0)]
 
 
 def test_a_folder_comes_before_a_download(network, own_files, monkeypatch):
