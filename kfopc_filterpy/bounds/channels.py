@@ -44,11 +44,14 @@ class ChannelStretch:
     def correlations(self) -> ChannelCorrelations:
         """Return the correlations of the stretch."""
         n_samples, n_taps = self.d.shape[1], self.n_taps
-        filtered, cross = 0.0, 0.0
+        size = self.filtered.shape[1] * self.filtered.shape[2] * n_taps
+        filtered, cross = np.zeros((size, size)), np.zeros(size)
         for x, d in zip(self.filtered.reshape(len(self.d), -1, self.x.shape[1]), self.d, strict=True):
-            filtered = filtered + block_correlation(x, n_taps)
-            cross = cross + np.array([correlate(row, d, "valid")[::-1] for row in x]).ravel() / n_samples
-        return ChannelCorrelations(np.asarray(filtered), block_correlation(self.x, n_taps), np.asarray(cross), self.shape)
+            filtered += block_correlation(x, n_taps)
+            cross += np.array([correlate(row, d, "valid")[::-1] for row in x]).ravel() / n_samples
+        return ChannelCorrelations(
+            np.asarray(filtered), block_correlation(self.x, n_taps), np.asarray(cross), self.shape
+        )
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -159,6 +162,6 @@ def channel_record(reference: Any, disturbance: Any, secondary_path: Any, n_taps
         raise ValueError(
             f"disturbance must be (K microphones, n_samples) = {(len(secondary), x.shape[1])}, got {d.shape}"
         )
-    filtered = fftconvolve(x, secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
+    filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
     past = [(0, 0), (n_taps - 1, 0)]
     return ChannelStretch(np.pad(x, past), np.pad(filtered, [(0, 0), (0, 0), *past]), d, n_taps)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_positive, as_real_array
+from .._validate import as_count, as_real_array
 from ..kernels.compiling import compiled_for_states, inlined
 from ..kernels.delay_lines import delay_line, newest, push
 from ..kernels.holding import Held
@@ -108,17 +108,6 @@ def listen_channels(state, references, errors):
         if not follow(state, errors[:, n]):
             return n
     return references.shape[1]
-
-
-def per_loudspeaker(value: Any, n_loudspeakers: int, name: str) -> np.ndarray:
-    """Return one positive number, or one for each loudspeaker, as (J,)."""
-    numbers = as_real_array(value, name)
-    if numbers.shape not in ((), (n_loudspeakers,)):
-        raise ValueError(
-            f"{name} must be one number or one for each of the {n_loudspeakers} loudspeakers, ({n_loudspeakers},), "
-            f"got shape {numbers.shape}"
-        )
-    return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, n_loudspeakers)])
 
 
 def channel_sample(value: Any, size: int, name: str, channel: str) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_positive
+from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
 from ..kernels.compiling import inlined
 from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_covariance
 from ..kernels.delay_lines import latest, newest
@@ -24,7 +24,7 @@ from ..power.amplifiers import Amplifier
 from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .channels import ChannelController, ChannelLines, estimate_disturbances, per_loudspeaker
+from .channels import ChannelController, ChannelLines, estimate_disturbances
 from .step import adapt, follow
 
 PRIOR = 1e3  # energy of the reference in the unknown paths, relative to the measurement noise

@@ -9,14 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.signal import fftconvolve
 
-from .._validate import as_channels, as_count, as_positive
+from .._validate import as_channels, as_count, as_positive, per_loudspeaker
 from ..controllers.base import FilteredReferenceController
 from ..controllers.channels import (
     ChannelController,
     amplifier_models,
     delay_lines,
     emit_channels,
-    per_loudspeaker,
 )
 from ..controllers.step import adapt, control_filter
 from ..kernels.borrowing import borrowed
