@@ -95,6 +95,17 @@ def as_positive(value: Any, name: str, *, unit: str = "") -> float:
     return number
 
 
+def per_loudspeaker(value: Any, n_loudspeakers: int, name: str) -> np.ndarray:
+    """Return one positive number, or one for each loudspeaker, as (J,)."""
+    numbers = as_real_array(value, name)
+    if numbers.shape not in ((), (n_loudspeakers,)):
+        raise ValueError(
+            f"{name} must be one number or one for each of the {n_loudspeakers} loudspeakers, ({n_loudspeakers},), "
+            f"got shape {numbers.shape}"
+        )
+    return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, n_loudspeakers)])
+
+
 def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:
     """Return `value` as a finite float of at least zero."""
     number = as_number(value, name, unit=unit)

@@ -32,6 +32,7 @@ REAL_TIME_FS = (16000.0, 48000.0)
 WORST_TAPS = (128, 256, 512)
 WORST_SAMPLES = 1_000_000
 FIRST_USE_TIMES = 3  # the shortest counts
+CHANNEL_BLOCKS = 100
 # Above these taps a variant would take minutes or gigabytes, and the trend is clear.
 LARGEST = {"pykalman": 512, f"closed loop, each of {variants.SCENARIOS} KF-OPC": 512}
 NEEDS = {
@@ -144,6 +145,41 @@ def first_samples_us(taps: int) -> float:
     return float(np.median(times[10:]) * 1e6)
 
 
+def channel_times(taps: int = 512) -> list[dict[str, Any]]:
+    """Return the times of KF-PB with several channels, a block at a time, beside one channel of KF-OPC in the same run."""
+    single, samples = variants.closed_loop("KF-OPC", taps)
+    rows = []
+    for sizes in variants.CHANNELS:
+        run, block = variants.channel_blocks(*sizes)
+        reference = min(seconds(single) for _ in range(3)) / samples
+        blocks = [seconds(run) for _ in range(CHANNEL_BLOCKS)]
+        names = ("references", "loudspeakers", "microphones", "n_taps", "n_primary")
+        rows.append(
+            dict(zip(names, sizes, strict=True))
+            | {
+                "us_per_sample": 1e6 * min(blocks) / block,
+                "times_one_channel": min(blocks) / block / reference,
+                "worst_block_share": max(blocks) / (block / REAL_TIME_FS[0]),
+            }
+        )
+    return rows
+
+
+def channel_table(rows: list[dict[str, Any]], taps: int = 512) -> str:
+    """Return the times of several channels for the terminal."""
+    title = f"KF-PB, shared gain: I x J x K, taps L, L_p   µs a sample   times one channel of {taps} taps   worst block / its duration"
+    return "\n".join(
+        [
+            title,
+            *(
+                f"{row['references']:22} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}, {row['n_primary']:4}"
+                f"{row['us_per_sample']:14.1f}{row['times_one_channel']:22.2f}{row['worst_block_share']:36.2f}"
+                for row in rows
+            ),
+        ]
+    )
+
+
 def first_use_s(name: str) -> float:
     """Return the seconds that a first use takes longer than the second, with nothing compiled yet."""
     with tempfile.TemporaryDirectory() as cache:
@@ -252,7 +288,9 @@ def main(folder: Path, quiet: bool = False) -> int:
     rates, rows = [], []
     with (
         threadpool_limits(1),
-        tqdm(total=len(TAPS) * ROUNDS + len(WORST_TAPS) + len(variants.FIRST_USES), disable=quiet, unit="round") as bar,
+        tqdm(
+            total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 1 + len(variants.FIRST_USES), disable=quiet, unit="round"
+        ) as bar,
     ):
         for taps in TAPS:
             bar.set_description(f"speed, {taps} taps")
@@ -264,14 +302,30 @@ def main(folder: Path, quiet: bool = False) -> int:
             bar.set_description(f"speed, worst of {WORST_SAMPLES:,} samples, {taps} taps")
             worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
             bar.update()
+        bar.set_description("speed, several channels")
+        channels = channel_times()
+        bar.update()
         first_use = {}
         for name in variants.FIRST_USES:
             bar.set_description(f"speed, first use, {name}")
             first_use[name] = min(first_use_s(name) for _ in range(FIRST_USE_TIMES))
             bar.update()
-    result = {"dgemm_gflops": max(rates), "rows": rows, "worst_sample": worst, "first_use_s": first_use}
+    result = {
+        "dgemm_gflops": max(rates),
+        "rows": rows,
+        "worst_sample": worst,
+        "channels": channels,
+        "first_use_s": first_use,
+    }
     (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
     figure(result).savefig(folder / "speed.png", dpi=150)
-    print(table(result), "", *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)), sep="\n")
+    print(
+        table(result),
+        "",
+        channel_table(channels),
+        "",
+        *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)),
+        sep="\n",
+    )
     print(f"\n{folder / 'speed.json'} and speed.png written")
     return 0

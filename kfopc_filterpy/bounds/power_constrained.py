@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal
+from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal, per_loudspeaker
+from ..paths.channels import is_path_matrix
 from ..paths.models import path_taps
+from .channels import ChannelStretch, channel_record
 from .wiener import (
     Stretch,
     WienerSolution,
@@ -36,8 +38,8 @@ class ControlFilter(WienerSolution):
     ----------
     weights, control_power, antinoise_power, disturbance_power, error_power, noise_reduction_db
         As in `WienerSolution`; the powers are mean squares over the stretch.
-    penalty : float
-        λ; 0 if the budget does not constrain the filter.
+    penalty : float or ndarray, shape (J,)
+        λ of each loudspeaker; 0 if the budget does not constrain the filter.
     constraint_factor : float
         α, as in KF-OPC; 1 for filters that are not scaled.
     start_s, end_s : float
@@ -46,11 +48,11 @@ class ControlFilter(WienerSolution):
         Samples of the stretch.
     """
 
-    penalty: float
+    penalty: Any
     constraint_factor: float
     start_s: float
     end_s: float
-    stretch: Stretch = field(repr=False, compare=False)
+    stretch: Stretch | ChannelStretch = field(repr=False, compare=False)
 
     @property
     def control_signal(self) -> np.ndarray:
@@ -108,18 +110,18 @@ class ControlFilters:
     @property
     def noise_reduction_db(self) -> float:
         """Noise reduction over all segments, -10 log10(sum e^2 / sum d^2), at most 300 dB."""
-        d = np.concatenate([segment.stretch.d for segment in self.segments])
+        d = np.concatenate([segment.stretch.d for segment in self.segments], axis=-1)
         return reduction_db(mean_square(self.error), mean_square(d))
 
     @property
     def control_signal(self) -> np.ndarray:
         """Control signal, each segment with its own weights, shape (n_samples,)."""
-        return np.concatenate([segment.control_signal for segment in self.segments])
+        return np.concatenate([segment.control_signal for segment in self.segments], axis=-1)
 
     @property
     def error(self) -> np.ndarray:
         """Error, each segment with its own weights, shape (n_samples,)."""
-        return np.concatenate([segment.error for segment in self.segments])
+        return np.concatenate([segment.error for segment in self.segments], axis=-1)
 
     def _each(self, name: str) -> np.ndarray:
         return np.array([getattr(segment, name) for segment in self.segments])
@@ -144,7 +146,7 @@ class PowerConstrainedWiener:
         The unconstrained filter times the factor of at most 1 that meets the budget: KF-OPC steers to it.
     scaled_per_second : ControlFilters
         The same for each segment: its own unconstrained filter, scaled.
-    rated_power : float
+    rated_power : float or ndarray, shape (J,)
         Budget ρ_o, mean square of the control signal.
     filtered_power : float
         Power of the filtered reference, E[x'^2].
@@ -159,7 +161,7 @@ class PowerConstrainedWiener:
     unconstrained: ControlFilter
     scaled: ControlFilter
     scaled_per_second: ControlFilters
-    rated_power: float
+    rated_power: float | np.ndarray
     filtered_power: float
     disturbance: np.ndarray = field(repr=False)
     fs: float
@@ -185,7 +187,7 @@ class PowerConstrainedWiener:
         TypeError, ValueError
             If no sample lies in the part, or it ends after the record.
         """
-        n_samples = self.disturbance.size
+        n_samples = self.disturbance.shape[-1]
         start = round(as_nonnegative(start_s, "start_s", unit="s") * self.fs)
         stop = n_samples if end_s is None else round(as_positive(end_s, "end_s", unit="s") * self.fs)
         if not start < stop <= n_samples:
@@ -194,9 +196,11 @@ class PowerConstrainedWiener:
                 f"got {start_s:g} s to {stop / self.fs:g} s"
             )
         part = slice(start, stop)
-        disturbance_power = mean_square(self.disturbance[part])
+        disturbance_power = mean_square(self.disturbance[..., part])
         names = ("whole", "per_second", "unconstrained", "scaled", "scaled_per_second")
-        return {name: reduction_db(mean_square(getattr(self, name).error[part]), disturbance_power) for name in names}
+        return {
+            name: reduction_db(mean_square(getattr(self, name).error[..., part]), disturbance_power) for name in names
+        }
 
 
 def power_constrained_wiener(
@@ -204,7 +208,7 @@ def power_constrained_wiener(
     disturbance: Any,
     secondary_path: Any,
     n_taps: int,
-    rated_power: float,
+    rated_power: Any,
     *,
     fs: float,
     segment_s: float = 1.0,
@@ -222,6 +226,10 @@ def power_constrained_wiener(
     by chance alone it removes about ``n_taps / fs`` per second of what the reference does not explain. The bound of each
     second meets the budget in each second, that of the record on average; which of them is better depends on the noise.
 
+    With several loudspeakers, microphones or references the sum of the squared errors is minimised, and each loudspeaker
+    j has a budget and a :math:`λ_j` of its own. `scaled` then is the unconstrained solution times the largest factor that
+    keeps every budget: what one constraint factor can do at best.
+
     Delay lines hold the past of the record, also at the edges of segments, and zeros before its first sample. So only
     the record itself starts up, and the anti-noise at an edge is that of weights that have been there before.
 
@@ -231,16 +239,17 @@ def power_constrained_wiener(
 
     Parameters
     ----------
-    reference : array_like, shape (n_samples,)
+    reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference signal x.
-    disturbance : array_like, shape (n_samples,)
+    disturbance : array_like, shape (n_samples,) or (K, n_samples)
         Disturbance d at the error microphone, with its sensor noise if the error is to include it.
-    secondary_path : control.TransferFunction or array_like, shape (n_path,)
-        Secondary path s with a finite response, at the signals' sampling rate.
+    secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
+        Secondary path s with a finite response, at the signals' sampling rate; with several channels also a matrix of
+        systems, as for `simulate`.
     n_taps : int
         Length of the control filter.
-    rated_power : float
-        Budget ρ_o, mean square of the control signal.
+    rated_power : float or array_like, shape (J,)
+        Budget ρ_o, mean square of the control signal, of all loudspeakers or of each.
     fs : float
         Sampling rate in Hz.
     segment_s : float, default 1.0
@@ -299,11 +308,16 @@ def power_constrained_wiener(
     {'whole': 5.6, 'per_second': 4.4, 'unconstrained': 16.0, 'scaled': 3.3, 'scaled_per_second': 2.5}
     """
     fs = as_positive(fs, "fs", unit="Hz")
-    rated_power = as_positive(rated_power, "rated_power")
     ridge = as_nonnegative(ridge, "ridge")
-    record = _record(reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps)
+    record: Stretch | ChannelStretch
+    if is_path_matrix(secondary_path):
+        record = channel_record(reference, disturbance, secondary_path, n_taps, fs)
+        rated_power = per_loudspeaker(rated_power, record.shape[0], "rated_power")
+    else:
+        rated_power = as_positive(rated_power, "rated_power")
+        record = _record(reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps)
     first = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
-    n_samples = record.d.size
+    n_samples = record.d.shape[-1]
     if n_samples - first < record.n_taps:
         raise ValueError(
             f"reference must have at least {record.n_taps} samples from switch_on_s on for {record.n_taps} taps, "
@@ -324,12 +338,7 @@ def power_constrained_wiener(
         return _solve(record.part(start, stop), rated_power, ridge, (start - first) / fs, (stop - first) / fs)
 
     whole, unconstrained, scaled = solve(first, n_samples)
-    correlations = counted.correlations()
-    losses = [
-        loss_db(counted, correlations, whole.weights, penalty=whole.penalty),
-        loss_db(counted, correlations, unconstrained.weights, ridge=ridge),
-    ]
-    warn_of_loss(max(losses))
+    warn_of_loss(max(_losses_db(counted, whole, unconstrained, ridge)))
     each = [solve(start, stop) for start, stop in zip(edges, [*edges[1:], n_samples], strict=True)]
     return PowerConstrainedWiener(
         whole=whole,
@@ -409,21 +418,37 @@ def _record(reference: Any, disturbance: Any, taps: np.ndarray, n_taps: int) -> 
     return record
 
 
+def _losses_db(
+    counted: Stretch | ChannelStretch, whole: ControlFilter, unconstrained: ControlFilter, ridge: float
+) -> list[float]:
+    """Return `loss_db` of the bound and of the filter without a budget; it is not computed for several channels."""
+    if isinstance(counted, ChannelStretch):
+        return [0.0]
+    correlations = counted.correlations()
+    return [
+        loss_db(counted, correlations, whole.weights, penalty=whole.penalty),
+        loss_db(counted, correlations, unconstrained.weights, ridge=ridge),
+    ]
+
+
 def _solve(
-    stretch: Stretch, rated_power: float, ridge: float, start_s: float, end_s: float
+    stretch: Stretch | ChannelStretch, rated_power: Any, ridge: float, start_s: float, end_s: float
 ) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
     """Return the filter within the power, the one without a budget, and the latter scaled."""
 
-    def control_filter(weights: np.ndarray, penalty: float = 0.0, constraint_factor: float = 1.0) -> ControlFilter:
+    def control_filter(weights: np.ndarray, penalty: Any = 0.0, constraint_factor: float = 1.0) -> ControlFilter:
         solution = stretch.solution(weights)
         weights.flags.writeable = False
         return ControlFilter(**vars(solution), **times, penalty=penalty, constraint_factor=constraint_factor)
 
     times: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "stretch": stretch}
-    correlations = stretch.correlations()
-    constrained = control_filter(*constrained_weights(stretch, correlations, rated_power))
+    correlations: Any = stretch.correlations()
+    if isinstance(stretch, ChannelStretch):
+        constrained = control_filter(*correlations.constrained_weights(rated_power))
+    else:
+        constrained = control_filter(*constrained_weights(stretch, correlations, rated_power))
     free = control_filter(correlations.weights(ridge=ridge))
-    if free.control_power <= rated_power:
+    if np.all(free.control_power <= rated_power):
         return constrained, free, free
-    factor = float(np.sqrt(rated_power / free.control_power))
+    factor = float(np.sqrt(np.min(rated_power / np.maximum(free.control_power, np.finfo(float).tiny))))
     return constrained, free, control_filter(factor * free.weights, constraint_factor=factor)

@@ -37,8 +37,8 @@ class WienerSolution:
     ----------
     weights : numpy.ndarray, shape (n_taps,)
         Control filter w, newest sample first.
-    control_power : float
-        Mean square of the control signal y = w*x.
+    control_power : float or numpy.ndarray, shape (J,)
+        Mean square of the control signal y = w*x, of each loudspeaker if there are several.
     antinoise_power : float
         Mean square of the anti-noise s*y.
     disturbance_power : float
@@ -50,7 +50,7 @@ class WienerSolution:
     """
 
     weights: np.ndarray
-    control_power: float
+    control_power: Any
     antinoise_power: float
     disturbance_power: float
     error_power: float
@@ -295,7 +295,7 @@ def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: 
     return require_sound(Stretch(x[past:], lfilter(taps, 1.0, x)[past:], d[start:], n_taps))
 
 
-def require_sound(stretch: Stretch) -> Stretch:
+def require_sound(stretch: Any) -> Any:
     """Return the stretch, or raise ValueError if x' or d is silent."""
     filtered_power = stretch.filtered_power
     if filtered_power == 0 or mean_square(stretch.d) == 0:

@@ -7,14 +7,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from .._validate import as_choice
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
+from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, take_correlations
 from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .kalman import KalmanController, correct_constrained
+from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
 
 
@@ -135,42 +138,78 @@ class PowerBudgetController(KalmanController):
         self.estimator.update(d, H=h, reference=x, control_signal=self._y)
 
 
+FORMS = ("direct", "shared gain")
+
+
 def kf_pb(
     n_taps: int,
     secondary_path: Any,
     *,
-    rated_power: float,
-    state_noise: float,
-    measurement_noise: float,
+    rated_power: Any,
+    state_noise: float | None = None,
+    measurement_noise: float | None = None,
     initial_variance: float = 1.0,
-    amplifier: Amplifier | None = None,
-    limiter: OutputLimiter | None = None,
+    amplifier: Any = None,
+    limiter: Any = None,
     dtype: Any = np.float64,
-    **budget: Any,
-) -> PowerBudgetController:
+    form: str | None = None,
+    **settings: Any,
+) -> PowerBudgetController | SharedGainKalman:
     """Return KF-PB, the power-budgeted Kalman filter, which has the least error within the rated power.
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter, dtype
-        As for `kf_anc`.
-    rated_power : float
-        Rated output power.
-    **budget
-        `fs`, `memory_s`, `credit_s`, see `PowerBudget`.
+    n_taps : int
+        Taps L of a control filter.
+    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+        Estimated secondary path, or those from J loudspeakers to K microphones.
+    rated_power : float or array_like, shape (J,)
+        Rated output power, of all loudspeakers or of each.
+    state_noise, measurement_noise, initial_variance, dtype
+        Of the direct form, as for `kf_anc`; the shared-gain form does not need them.
+    amplifier, limiter
+        As for `kf_anc`; with several loudspeakers, a sequence with one for each.
+    form : {"direct", "shared gain"}, optional
+        "direct" estimates the control filter (the paper's equations), "shared gain" the primary paths
+        (`SharedGainKalman`). By default direct for one channel, shared gain for several.
+    **settings
+        Of the direct form: `fs`, `memory_s`, `credit_s`, see `PowerBudget`. Of the shared-gain form: see
+        `SharedGainKalman`.
 
     Returns
     -------
-    PowerBudgetController
-        A controller named KF-PB. Its `control_filter` generates the control signal; its `weights` are the estimate of
-        the unconstrained control filter.
+    PowerBudgetController or SharedGainKalman
+        A controller. Its `control_filter` generates the control signal. The `weights` of a direct form are the estimate
+        of the unconstrained control filter.
+
+    Raises
+    ------
+    ValueError, TypeError
+        The direct form for several channels, or without its noises; noises for the shared-gain form; see the classes.
 
     Examples
     --------
+    >>> import numpy as np
     >>> from kfopc_filterpy import kf_pb
     >>> kf_pb(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).name
     'KF-PB'
+    >>> paths = np.zeros((2, 2, 8))  # two loudspeakers, two microphones
+    >>> paths[:, :, 1] = [[1.0, 0.3], [0.2, 1.0]]
+    >>> kf_pb(32, paths, rated_power=[0.5, 0.2])
+    <KF-PB (shared gain): 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2>
     """
+    several = is_path_matrix(secondary_path)
+    form = as_choice(form or FORMS[several], "form", FORMS)
+    if form == "shared gain":
+        if state_noise is not None or measurement_noise is not None:
+            raise TypeError("the shared-gain form takes path_memory_s instead of state_noise and measurement_noise")
+        return SharedGainKalman(
+            n_taps, secondary_path, rated_power=rated_power, amplifier=amplifier, limiter=limiter, **settings
+        )
+    if several:
+        raise ValueError("the direct form has one channel; use form='shared gain' for several")
+    if state_noise is None or measurement_noise is None:
+        raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
     estimator = PowerBudgetKalmanFilter(
         n_taps,
         state_noise=state_noise,
@@ -178,6 +217,6 @@ def kf_pb(
         rated_power=rated_power,
         initial_variance=initial_variance,
         dtype=dtype,
-        **budget,
+        **settings,
     )
     return PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,7 @@ class SimulationResult:
         Name of the controller.
     fs : float
         Sampling frequency in Hz.
-    rated_power : float or None
+    rated_power : float, ndarray of shape (n_loudspeakers,), or None
         Rated output power of each loudspeaker: the controller's, or the one given to `simulate`.
     reference : ndarray, shape (n_samples,) or (n_references, n_samples)
         Reference x.
@@ -55,7 +56,7 @@ class SimulationResult:
 
     algorithm: str
     fs: float
-    rated_power: float | None
+    rated_power: float | np.ndarray | None
     reference: np.ndarray
     disturbance: np.ndarray
     error: np.ndarray
@@ -92,6 +93,10 @@ class SimulationResult:
         if self.diverged_at_s is not None:
             return f"{text}, diverged at {self.diverged_at_s:.3g} s>"
         reduction = noise_reduction_db(self.error, self.disturbance)
-        powers = ", ".join(f"{power:.3g}" for power in np.atleast_1d(output_power(self.control_signal)))
-        rated = "" if self.rated_power is None else f" (rated {self.rated_power:g})"
+        powers = _listed(output_power(self.control_signal), ".3g")
+        rated = "" if self.rated_power is None else f" (rated {_listed(self.rated_power)})"
         return f"{text}, noise reduction {reduction:.1f} dB, output power {powers}{rated}>"
+
+
+def _listed(values: Any, form: str = "g") -> str:
+    return ", ".join(format(value, form) for value in np.atleast_1d(values))

@@ -30,16 +30,10 @@ from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
+from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
 from .result import SimulationResult
 from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run_kept
-from .simulation import (
-    DIVERGENCE_LIMIT,
-    POWERS,
-    RECORDED,
-    SensorNoise,
-    disturbance_at_microphone,
-    switch_on_sample,
-)
+from .simulation import POWERS, RECORDED
 
 BLOCK = 512  # samples whose gains are stored at a time
 VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_generator, as_nonnegative, as_positive, as_signal
+from .._validate import as_count, as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
 from ..controllers.limited import LimitedController
 from ..kernels.delay_lines import delay_line
 from ..paths.models import path_taps
 from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
+from .channels import is_multichannel, simulate_channels
+from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, naming_sample, switch_on_sample
 from .result import SimulationResult
 from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
-DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
 RECORDED = ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor")
 POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request
 
@@ -46,27 +46,35 @@ def simulate(
     """Run a controller in the modified ANC structure.
 
     For each sample, compute the control signal from the last weights, the amplifier's output and the error
-    e = d - s*y_amp, then update the controller. There is one channel. Built-in controllers run at compiled speed; a
-    user-defined controller is called sample by sample.
+    e = d - s*y_amp, then update the controller. Built-in controllers run at compiled speed; a user-defined controller is
+    called sample by sample.
+
+    With several channels, the channel is the leading axis: I references, J loudspeakers, K error microphones. A
+    user-defined controller then gets and returns arrays: ``control_signal(reference)``, (I,), returns (J,), and
+    ``update(error)`` gets (K,).
 
     Parameters
     ----------
     controller : Controller
         Controller. It continues from its present state, while the paths start silent: make a new one for a fresh run.
     reference : array_like
-        (n_samples,) reference x.
+        (n_samples,) reference x, or (I, n_samples).
     secondary_path : array_like or control.TransferFunction
-        True secondary path s, loudspeaker amplifier to error microphone.
+        True secondary path s, loudspeaker amplifier to error microphone. With several channels (K, J, n_taps), or a
+        matrix of systems: nested lists, or a system of several inputs and outputs.
     primary_path : array_like or control.TransferFunction, optional
-        Path from the reference to the error microphone, which gives the disturbance p*x.
+        Path from the reference to the error microphone, which gives the disturbance p*x; (K, I, n_taps) or a matrix of
+        systems.
     disturbance : array_like, optional
-        (n_samples,) disturbance d, in place of `primary_path`.
+        (n_samples,) disturbance d, or (K, n_samples), in place of `primary_path`.
     fs : float, default 16000
         Sample rate in Hz; paths given as systems must have the same.
     amplifier : callable, optional
-        Amplifier model, or any function of a sample that returns a finite number; by default linear.
-    rated_power : float, optional
-        Rated power, which sets the scale of the divergence limit; by default the controller's, or 1 if it has none.
+        Amplifier model, or any function of a sample that returns a finite number; by default linear. With several
+        loudspeakers one for all, or a sequence with one for each.
+    rated_power : float or array_like, optional
+        Rated power, which sets the scale of the divergence limit, of all loudspeakers or of each, (J,); by default the
+        controller's, or 1 if it has none.
     sensor_noise_std : float, default 0
         Standard deviation of white noise at the error microphone.
     rng : int or numpy.random.Generator, optional
@@ -76,11 +84,12 @@ def simulate(
         (`listen`): its delay lines and power estimates follow the noise, its weights stay. The result starts at that
         time.
     feedback_path : array_like or control.TransferFunction, optional
-        Acoustic feedback from the amplifier to the reference microphone; its first tap must be 0. By default none.
+        Acoustic feedback from the amplifier to the reference microphone, (I, J, n_taps) with several; its first tap must
+        be 0. By default none.
     record_weights_every : int, optional
         Record the control filter (a controller's `control_filter`, or else its `weights`) every so many samples.
     record_powers : bool, default False
-        Record the disturbance power, the secondary-path gain and the weight of a power budget.
+        Record the disturbance power, the secondary-path gain and the weight of a power budget; for one channel.
     progress : callable, optional
         Called with the number of samples done since its last call, such as `tqdm.update`.
     compiled : bool, default True
@@ -113,6 +122,23 @@ def simulate(
     """
     if isinstance(controller, type) or not isinstance(controller, Controller):
         raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    if is_multichannel(controller, reference, secondary_path, disturbance):
+        return simulate_channels(
+            controller,
+            reference,
+            secondary_path=secondary_path,
+            primary_path=primary_path,
+            disturbance=disturbance,
+            fs=fs,
+            amplifier=amplifier,
+            rated_power=rated_power,
+            noise=SensorNoise(sensor_noise_std, rng),
+            switch_on_s=switch_on_s,
+            feedback_path=feedback_path,
+            record_weights_every=record_weights_every,
+            progress=progress,
+            compiled=compiled,
+        )
     if amplifier is not None and not callable(amplifier):
         raise TypeError(f"amplifier must be a function of a sample, or None, got {amplifier!r}")
     fs = as_positive(fs, "fs", unit="Hz")
@@ -167,14 +193,6 @@ def simulate(
     )
 
 
-def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
-    """Return the number of samples before the control is switched on."""
-    on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
-    if on >= n_samples:
-        raise ValueError("switch_on_s must leave samples to control: it covers the whole signal")
-    return on
-
-
 def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
     if not hasattr(controller, "listen"):
         raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
@@ -206,7 +224,7 @@ def _run_compiled(
     if progress:
         progress(done)
     if status == REFUSED:
-        with _naming_sample(first + done):
+        with naming_sample(first + done):
             controller.update(float(stretch.error[done]))  # raises, with the reason
             raise ValueError(NO_SOLUTION)
     return status, done
@@ -225,7 +243,7 @@ def _run_steps(
 ) -> tuple[int, int]:
     """Run a stretch like `run.run`, but call the controller for each sample."""
     for k in range(stretch.reference.size):
-        with _naming_sample(first + k):
+        with naming_sample(first + k):
             x = reference_once(plant, stretch.reference[k])
             y = _as_sample(controller.control_signal(x), "control_signal")
             if not abs(y) <= limit:
@@ -248,43 +266,12 @@ def _run_steps(
     return RUNNING, stretch.reference.size
 
 
-@contextmanager
-def _naming_sample(n: int) -> Iterator[None]:
-    """Add to an error the number of the sample in which it occurred."""
-    try:
-        yield
-    except Exception as error:
-        error.add_note(f"in sample {n} of the run")
-        raise
-
-
 def _as_sample(value: Any, source: str) -> float:
     """Return the result of a user's function, NaN included, as a float."""
     try:
         return float(np.asarray(value).reshape(()))
     except (TypeError, ValueError) as error:
         raise TypeError(f"{source} must return one number, got {value!r}") from error
-
-
-def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
-    """Return the disturbance d, (n_samples,), as given or as p*x."""
-    if (primary_path is None) == (disturbance is None):
-        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
-    if disturbance is not None:
-        return as_signal(disturbance, "disturbance", length=x.size)
-    return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
-
-
-class SensorNoise:
-    """White noise, drawn stretch by stretch."""
-
-    def __init__(self, std: float, rng: Any) -> None:
-        self.std = as_nonnegative(std, "sensor_noise_std")
-        self.rng = as_generator(rng) if self.std > 0 else None
-
-    def take(self, n_samples: int) -> np.ndarray | float:
-        """Return the next samples, or 0 if there is no noise."""
-        return 0.0 if self.rng is None else self.std * self.rng.standard_normal(n_samples)
 
 
 def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None, fs: float) -> Plant:

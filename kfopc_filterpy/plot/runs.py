@@ -237,16 +237,17 @@ def plot_output_power(
     """
     shown = curves(results)
     if rated_power is None:
-        rated = sorted({curve.run.rated_power for curve in shown if curve.run.rated_power is not None})
+        powers = [curve.run.rated_power for curve in shown if curve.run.rated_power is not None]
+        rated = sorted({float(power) for each in powers for power in np.atleast_1d(each)})
     else:
         rated = [as_positive(rated_power, "rated_power")]
-    powers = [
+    short_time = [
         short_time_power(curve.stack("control_signal", channel=channel), curve.run.fs, window_s, runs=True)
         for curve in shown
     ]
     ax = new_axes(ax)
     highest = 0.0
-    for i, (curve, power) in enumerate(zip(shown, powers, strict=True)):
+    for i, (curve, power) in enumerate(zip(shown, short_time, strict=True)):
         rows = thinned(curve.run.n_samples)
         curve.draw(ax, (rows + 1) / curve.run.fs, power[..., rows], i)
         highest = max(highest, np.max(power, initial=0.0, where=~np.isnan(power)))

@@ -18,8 +18,15 @@ from kfopc_filterpy.power.constraint import OutputPowerConstraint, preview_const
 @pytest.fixture
 def small(monkeypatch):
     """The study with few taps and samples, and no compilation timed."""
-    for name, value in {"TAPS": (128, 256), "ROUNDS": 1, "WORST_TAPS": (16,), "WORST_SAMPLES": 200}.items():
+    for name, value in {
+        "TAPS": (128, 256),
+        "ROUNDS": 1,
+        "WORST_TAPS": (16,),
+        "WORST_SAMPLES": 200,
+        "CHANNEL_BLOCKS": 2,
+    }.items():
         monkeypatch.setattr(speed, name, value)
+    monkeypatch.setattr(speed_variants, "CHANNELS", [(1, 2, 3, 16, 32)])
     monkeypatch.setattr(speed, "first_use_s", lambda name: 1.0)
     monkeypatch.setattr(speed, "find_spec", lambda name: None)  # the same wherever it runs
     monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
@@ -51,7 +58,11 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
     assert rows["filterpy", 256]["times_filterpy"] == rows["numpy rank-1", 256]["times_numpy"] == 1.0
     # An O(L^3) filter is slower than an O(L^2) one at 256 taps on any machine.
     assert rows["filterpy API of KFOPC", 256]["times_filterpy"] > 5
+    (channels,) = result["channels"]
+    assert (channels["references"], channels["loudspeakers"], channels["microphones"]) == (1, 2, 3)
+    assert channels["us_per_sample"] > 0
     printed = capsys.readouterr().out
+    assert "1 x  2 x  3,   16,   32" in printed
     assert "times as fast as filterpy" in printed
     assert "16 taps, 200 samples" in printed
     assert "1.0 s for `simulate`" in printed

@@ -1,0 +1,167 @@
+"""The bound for several loudspeakers: the least error of fixed control filters, each loudspeaker within its rated power.
+
+It minimises the sum of the squared errors over the microphones. Control filters are (J, I, n_taps), signals have the
+channel as the leading axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.signal import correlate, fftconvolve
+
+from .._validate import as_channels, as_count
+from ..paths.channels import secondary_paths
+from .wiener import WienerSolution, mean_square, reduction_db
+
+RIDGE = 1e-10  # of the mean energy of a tap: directions with less get no weight
+TOLERANCE = 1e-5  # to which a rated power that binds is met
+SWEEPS = 300  # at most; some twenty are usual
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelStretch:
+    """Samples that control filters are fitted to. x and x' begin `n_taps` - 1 samples early, to fill the delay lines."""
+
+    x: np.ndarray  # (I, n + n_taps - 1)
+    filtered: np.ndarray  # (K, J, I, n + n_taps - 1)
+    d: np.ndarray  # (K, n)
+    n_taps: int
+
+    @property
+    def filtered_power(self) -> float:
+        """Power of the filtered references, summed over microphones and loudspeakers."""
+        return float(np.mean(self.filtered[..., self.n_taps - 1 :] ** 2, axis=-1).sum())
+
+    def part(self, start: int, stop: int) -> ChannelStretch:
+        """Return the samples from `start` to before `stop`, with their true past."""
+        with_past = slice(start, stop + self.n_taps - 1)
+        return ChannelStretch(self.x[:, with_past], self.filtered[..., with_past], self.d[:, start:stop], self.n_taps)
+
+    def correlations(self) -> ChannelCorrelations:
+        """Return the correlations of the stretch."""
+        n_samples, n_taps = self.d.shape[1], self.n_taps
+        size = self.filtered.shape[1] * self.filtered.shape[2] * n_taps
+        filtered, cross = np.zeros((size, size)), np.zeros(size)
+        for x, d in zip(self.filtered.reshape(len(self.d), -1, self.x.shape[1]), self.d, strict=True):
+            filtered += block_correlation(x, n_taps)
+            cross += np.array([correlate(row, d, "valid")[::-1] for row in x]).ravel() / n_samples
+        return ChannelCorrelations(
+            np.asarray(filtered), block_correlation(self.x, n_taps), np.asarray(cross), self.shape
+        )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of the control filters, (J, I, n_taps)."""
+        return self.filtered.shape[1], self.filtered.shape[2], self.n_taps
+
+    def control_signal(self, weights: np.ndarray) -> np.ndarray:
+        """Return the control signals, (J, n)."""
+        return np.array([_sum_of_convolutions(self.x, w) for w in weights])
+
+    def antinoise(self, weights: np.ndarray) -> np.ndarray:
+        """Return the anti-noise, (K, n)."""
+        n_signals = weights.shape[0] * weights.shape[1]
+        filters = weights.reshape(n_signals, -1)
+        return np.array([_sum_of_convolutions(x.reshape(n_signals, -1), filters) for x in self.filtered])
+
+    def solution(self, weights: np.ndarray) -> WienerSolution:
+        """Return the weights with their powers; the control power is (J,), the others are means over microphones."""
+        antinoise = self.antinoise(weights)
+        error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
+        return WienerSolution(
+            weights=weights,
+            control_power=np.mean(self.control_signal(weights) ** 2, axis=-1),
+            antinoise_power=mean_square(antinoise),
+            disturbance_power=disturbance_power,
+            error_power=error_power,
+            noise_reduction_db=reduction_db(error_power, disturbance_power),
+        )
+
+
+def _sum_of_convolutions(signals: np.ndarray, filters: np.ndarray) -> np.ndarray:
+    return fftconvolve(signals, filters, mode="valid", axes=-1).sum(axis=0)
+
+
+@dataclass(frozen=True)
+class ChannelCorrelations:
+    """Correlations R_x', R_x and r of a stretch, from which its filters follow for any penalties."""
+
+    filtered: np.ndarray  # (J I n_taps, J I n_taps), summed over microphones
+    reference: np.ndarray  # (I n_taps, I n_taps)
+    cross: np.ndarray  # (J I n_taps,)
+    shape: tuple[int, int, int]
+
+    def weights(self, penalty: np.ndarray | float = 0.0, ridge: float = 0.0) -> np.ndarray:
+        """Return the solution of (R_x' + blkdiag(penalty_j R_x) + ridge I) w = r, (J, I, n_taps)."""
+        J = self.shape[0]
+        matrix = self.filtered + block_diag(*(p * self.reference for p in np.broadcast_to(penalty, J)))
+        matrix.flat[:: self.cross.size + 1] += ridge + RIDGE * np.trace(self.filtered) / self.cross.size
+        return cho_solve(cho_factor(matrix), self.cross).reshape(self.shape)
+
+    def powers(self, weights: np.ndarray) -> np.ndarray:
+        """Return the powers of the control signals, (J,)."""
+        rows = weights.reshape(self.shape[0], -1)
+        return np.einsum("ja,ab,jb->j", rows, self.reference, rows)
+
+    def constrained_weights(self, rated_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the weights of the least error within the rated powers, and the penalties, (J,).
+
+        Each penalty is multiplied by its power over its rated power until the powers that bind are met: the fixed
+        points of this are the solutions with complementary slackness.
+        """
+        J = self.shape[0]
+        if not np.trace(self.filtered) > 0.0:
+            return np.zeros(self.shape), np.zeros(J)
+        weights = self.weights()
+        if np.all(self.powers(weights) <= rated_power):
+            return weights, np.zeros(J)
+        natural = np.trace(self.filtered) / np.trace(self.reference) / J
+        penalty = np.full(J, natural)
+        for _ in range(SWEEPS):
+            weights = self.weights(penalty)
+            ratio = self.powers(weights) / rated_power
+            binding = penalty > 1e-9 * natural
+            if np.all(ratio < 1.0 + TOLERANCE) and np.all(np.abs(ratio[binding] - 1.0) < TOLERANCE):
+                break
+            penalty = np.maximum(penalty * np.maximum(ratio, 1e-6), 1e-12 * natural)
+        return weights, np.where(binding, penalty, 0.0)
+
+
+def block_correlation(signals: np.ndarray, n_taps: int) -> np.ndarray:
+    """Return the mean of ``signals[a, n - i] * signals[b, n - j]`` over n >= n_taps - 1, (C n_taps, C n_taps).
+
+    Each row of a block follows from the one above by the products that enter and leave the window.
+    """
+    n_signals, length = signals.shape
+    count = length - n_taps + 1
+    blocks = np.empty((n_signals, n_signals, n_taps, n_taps))
+    now = signals[:, n_taps - 1 :]
+    for a in range(n_signals):
+        for b in range(n_signals):
+            blocks[a, b, 0] = correlate(signals[b], now[a], "valid")[::-1] / count
+    blocks[:, :, :, 0] = blocks[:, :, 0, :].swapaxes(0, 1)
+    entering = signals[:, : n_taps - 1][:, ::-1]  # the samples before the window, newest first
+    leaving = signals[:, ::-1][:, : n_taps - 1]  # the last samples, newest first
+    for i in range(n_taps - 1):
+        change = entering[:, i, None, None] * entering - leaving[:, i, None, None] * leaving
+        blocks[:, :, i + 1, 1:] = blocks[:, :, i, :-1] + change / count
+    return blocks.swapaxes(1, 2).reshape(n_signals * n_taps, -1)
+
+
+def channel_record(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, fs: float) -> ChannelStretch:
+    """Check the signals of several channels and return them with silence before the first sample."""
+    x = np.atleast_2d(as_channels(reference, "reference"))
+    d = np.atleast_2d(as_channels(disturbance, "disturbance"))
+    secondary, _ = secondary_paths(secondary_path, fs=fs)
+    n_taps = as_count(n_taps, "n_taps")
+    if d.shape != (len(secondary), x.shape[1]):
+        raise ValueError(
+            f"disturbance must be (K microphones, n_samples) = {(len(secondary), x.shape[1])}, got {d.shape}"
+        )
+    filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
+    past = [(0, 0), (n_taps - 1, 0)]
+    return ChannelStretch(np.pad(x, past), np.pad(filtered, [(0, 0), (0, 0), *past]), d, n_taps)

@@ -1,0 +1,77 @@
+"""Symmetric block Toeplitz systems: products by FFT, and conjugate gradients with a circulant preconditioner.
+
+The matrix has B x B blocks of n x n. Element (l, m) of block (a, b) is ``lags[l - m, a, b]``, where negative lags stand
+at the end of the array, as in a discrete Fourier transform. A vector is an array (B, n).
+
+References
+----------
+T. F. Chan, "An optimal circulant preconditioner for Toeplitz systems", SIAM J. Sci. Stat. Comput. 9(4), 1988.
+R. H. Chan and M. K. Ng, "Conjugate gradient methods for Toeplitz systems", SIAM Review 38(3), 1996.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import fft
+
+Operator = Callable[[np.ndarray], np.ndarray]
+
+
+def circulant_spectrum(lags: np.ndarray, n: int) -> np.ndarray:
+    """Return the spectrum, (2n/2 + 1, B, B), of the block circulant of size 2n that contains the matrix."""
+    embedded = np.zeros((2 * n, *lags.shape[1:]))
+    embedded[:n], embedded[n + 1 :] = lags[:n], lags[-(n - 1) :]
+    return fft.rfft(embedded, axis=0)
+
+
+def nearest_circulant_spectrum(lags: np.ndarray, n: int) -> np.ndarray:
+    """Return the spectrum, (n/2 + 1, B, B), of the block circulant of size n that is nearest to the matrix.
+
+    It is positive definite if the matrix is (T. F. Chan).
+    """
+    share = (np.arange(n) / n).reshape(-1, *(1,) * (lags.ndim - 1))
+    nearest = (1.0 - share) * lags[:n]
+    nearest[1:] += share[1:] * lags[-(n - 1) :]
+    return fft.rfft(nearest, axis=0)
+
+
+def toeplitz_product(spectrum: np.ndarray, n: int) -> Operator:
+    """Return the product with the block Toeplitz matrix whose `circulant_spectrum` is given."""
+
+    def product(v: np.ndarray) -> np.ndarray:
+        transformed = fft.rfft(v, 2 * n).T[:, :, np.newaxis]
+        return fft.irfft((spectrum @ transformed)[:, :, 0].T, 2 * n)[:, :n]
+
+    return product
+
+
+def circulant_inverse(spectrum: np.ndarray, n: int) -> Operator:
+    """Return the product with the inverse of a block circulant of size n."""
+    inverse = np.linalg.inv(spectrum)
+
+    def product(v: np.ndarray) -> np.ndarray:
+        transformed = fft.rfft(v).T[:, :, np.newaxis]
+        return fft.irfft((inverse @ transformed)[:, :, 0].T, n)
+
+    return product
+
+
+def conjugate_gradients(
+    product: Operator, precondition: Operator, b: np.ndarray, x: np.ndarray, steps: int
+) -> np.ndarray:
+    """Return `x` after some preconditioned steps towards the solution of ``product(x) = b``."""
+    residual = b - product(x)
+    direction = preconditioned = precondition(residual)
+    size = np.vdot(residual, preconditioned)
+    for _ in range(steps):
+        if not size > 0.0:  # solved
+            break
+        moved = product(direction)
+        step = size / np.vdot(direction, moved)
+        x, residual = x + step * direction, residual - step * moved
+        preconditioned = precondition(residual)
+        size, before = np.vdot(residual, preconditioned), size
+        direction = preconditioned + size / before * direction
+    return x

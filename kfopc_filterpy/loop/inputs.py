@@ -1,0 +1,53 @@
+"""What a run is given beside the controller and the plant: the disturbance, sensor noise, the time of switching on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_generator, as_nonnegative, as_signal
+from ..paths.models import path_taps
+
+DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
+
+
+def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
+    """Return the disturbance d, (n_samples,), as given or as p*x."""
+    if (primary_path is None) == (disturbance is None):
+        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+    if disturbance is not None:
+        return as_signal(disturbance, "disturbance", length=x.size)
+    return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+
+
+class SensorNoise:
+    """White noise, drawn stretch by stretch."""
+
+    def __init__(self, std: float, rng: Any) -> None:
+        self.std = as_nonnegative(std, "sensor_noise_std")
+        self.rng = as_generator(rng) if self.std > 0 else None
+
+    def take(self, *shape: int) -> np.ndarray | float:
+        """Return the next samples in an array of a shape, or 0 if there is no noise."""
+        return 0.0 if self.rng is None else self.std * self.rng.standard_normal(shape)
+
+
+def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:
+    """Return the number of samples before the control is switched on."""
+    on = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
+    if on >= n_samples:
+        raise ValueError("switch_on_s must leave samples to control: it covers the whole signal")
+    return on
+
+
+@contextmanager
+def naming_sample(n: int) -> Iterator[None]:
+    """Add to an error the number of the sample in which it occurred."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in sample {n} of the run")
+        raise

@@ -1,0 +1,77 @@
+"""Paths between several loudspeakers, references and microphones, as one array of taps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_real_array, require_finite
+from .models import is_system, path_taps, sampling_rate
+
+
+def secondary_paths(
+    paths: Any, *, fs: float | None = None, name: str = "secondary_path"
+) -> tuple[np.ndarray, float | None]:
+    """Return secondary paths as taps (K, J, n_taps), and their sampling rate in Hz if systems tell it."""
+    return path_matrix(paths, fs=fs, name=name, axes="(K microphones, J loudspeakers, taps)")
+
+
+def primary_paths(
+    paths: Any, *, fs: float | None = None, name: str = "primary_path"
+) -> tuple[np.ndarray, float | None]:
+    """Return primary paths as taps (K, I, n_taps), and their sampling rate in Hz if systems tell it."""
+    return path_matrix(paths, fs=fs, name=name, axes="(K microphones, I references, taps)")
+
+
+def is_path_matrix(paths: Any) -> bool:
+    """Return whether paths are given as a matrix, by shape or as a system of several inputs or outputs."""
+    if is_system(paths):
+        return (paths.noutputs, paths.ninputs) != (1, 1)
+    return _has_systems(paths) or np.ndim(paths) > 1
+
+
+def path_matrix(
+    paths: Any, *, fs: float | None, name: str, axes: str = "(outputs, inputs, taps)"
+) -> tuple[np.ndarray, float | None]:
+    """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz if systems tell it."""
+    if is_system(paths):
+        rows: Any = [[paths]] if (paths.noutputs, paths.ninputs) == (1, 1) else _entries(paths)
+        return _from_systems(rows, fs, name, axes)
+    if _has_systems(paths):
+        return _from_systems(paths, fs, name, axes)
+    taps = as_real_array(paths, name)
+    if taps.ndim == 1:
+        taps = taps.reshape(1, 1, -1)
+    if taps.ndim != 3 or 0 in taps.shape:
+        raise ValueError(f"{name} must have shape {axes}, got {taps.shape}")
+    if max(taps.shape[:2]) > taps.shape[2]:
+        raise ValueError(f"{name} must have shape {axes}, got {taps.shape}: taps come last, see numpy.moveaxis")
+    require_finite(taps, name)
+    return np.ascontiguousarray(taps), None
+
+
+def _has_systems(paths: Any) -> bool:
+    rows = paths if isinstance(paths, list | tuple) else ()
+    return any(is_system(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
+
+
+def _entries(system: Any) -> list[list[Any]]:
+    """Return the entries of a system of several inputs and outputs."""
+    return [[system[k, j] for j in range(system.ninputs)] for k in range(system.noutputs)]
+
+
+def _from_systems(rows: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float | None]:
+    if len({len(row) for row in rows}) != 1:
+        raise ValueError(f"{name} must be {axes}: its rows differ in length")
+    rates = {sampling_rate(path, fs, name=name) for row in rows for path in row if is_system(path)}
+    if len(rates) > 1:
+        raise ValueError(f"{name} has systems of different sampling rates: {sorted(rates)} Hz")
+    taps = [
+        [path_taps(path, fs=fs, name=f"{name}[{k}][{j}]") for j, path in enumerate(row)] for k, row in enumerate(rows)
+    ]
+    matrix = np.zeros((len(taps), len(taps[0]), max(path.size for row in taps for path in row)))
+    for k, row in enumerate(taps):
+        for j, path in enumerate(row):
+            matrix[k, j, : path.size] = path
+    return matrix, rates.pop() if rates else None

@@ -1,0 +1,123 @@
+"""The control filters of several loudspeakers with the least error, each within its own rated power.
+
+For estimated primary paths P, known secondary paths S and the correlation of the references, the control filters solve
+
+    (R_x' + blkdiag(lambda_j R_x)) v = r,    lambda_j >= 0,    lambda_j (v_j' R_x v_j - rho_j) = 0,
+
+where R_x' is the correlation of the filtered references, summed over the microphones, and r their cross-correlation with
+the disturbances. Both follow from the paths and R_x alone, as products of spectra.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+from ..kernels.block_toeplitz import (
+    circulant_inverse,
+    circulant_spectrum,
+    conjugate_gradients,
+    nearest_circulant_spectrum,
+    toeplitz_product,
+)
+
+SWEEPS, STEPS = 3, 5  # multipliers are adjusted after each sweep of so many conjugate-gradient steps
+RIDGE = 1e-6  # of the mean energy: bounds the weights in directions without energy
+LARGEST_CHANGE = 10.0  # of a multiplier in a sweep
+SMALLEST_WEIGHT = 1e-6  # of the natural weight: a multiplier that is not needed must be able to grow again
+
+
+class ChannelBudget:
+    """Control filters of J loudspeakers for I references, followed from solve to solve.
+
+    Parameters
+    ----------
+    secondary : ndarray, shape (K, J, n_secondary)
+        Secondary paths, each microphone's row weighted as its error counts.
+    n_taps, n_primary : int
+        Taps of a control filter, and of an estimated primary path.
+    n_references : int
+        Number of references I.
+    rated_power : ndarray, shape (J,)
+        Rated power of each loudspeaker.
+    """
+
+    def __init__(
+        self, secondary: np.ndarray, n_taps: int, n_primary: int, n_references: int, rated_power: np.ndarray
+    ) -> None:
+        self.secondary, self.n_taps, self.n_primary = secondary, n_taps, n_primary
+        self.n_references, self.rated_power = n_references, rated_power
+        _, self.n_loudspeakers, n_secondary = secondary.shape
+        self.n_lags = n_taps + n_secondary + n_primary  # lags of R_x that the right-hand side depends on
+        self._inner = n_taps + n_secondary  # lags that R_x' depends on
+        self._size = fft.next_fast_len(self.n_lags + max(n_primary, self._inner), real=True)
+        self._spectra = fft.rfft(secondary, self._size)
+        self._gram = np.einsum("kaf,kbf->fab", self._spectra.conj(), self._spectra)
+        self.weights = np.zeros((self.n_loudspeakers, n_references, n_taps))
+        self.penalty: np.ndarray | None = None  # lambda, (J,)
+
+    def solve(self, correlation: np.ndarray, primary: np.ndarray) -> None:
+        """Move `weights` and `penalty` towards the solution.
+
+        Parameters
+        ----------
+        correlation : ndarray, shape (n_lags, I, I)
+            Correlation of the references, E[x_i(n - m) x_k(n)] at [m, i, k].
+        primary : ndarray, shape (K, I, n_primary)
+            Primary paths.
+        """
+        J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
+        r = self._right_side(correlation, primary)
+        lags = self._filtered_lags(correlation)
+        of_x = _two_sided(correlation[:n], 2 * n)
+        natural = np.trace(lags[0]) / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
+        ridge = RIDGE * np.trace(lags[0]) / (J * n_references)
+        if not natural > 0.0:
+            return  # silence: nothing to solve
+        if self.penalty is None:
+            self.penalty = np.full(J, 1e-3 * natural)
+        whole, nearest = circulant_spectrum(lags, n), nearest_circulant_spectrum(lags, n)
+        whole_x, nearest_x = circulant_spectrum(of_x, n), nearest_circulant_spectrum(of_x, n)
+        power_product = toeplitz_product(whole_x, n)
+        v = self.weights.reshape(J * n_references, n)
+        for _ in range(SWEEPS):
+            product = toeplitz_product(_with_penalty(whole, whole_x, self.penalty, ridge), n)
+            inverse = circulant_inverse(_with_penalty(nearest, nearest_x, self.penalty, ridge), n)
+            v = conjugate_gradients(product, inverse, r, v, STEPS)
+            filters = v.reshape(J, n_references, n)
+            power = np.array([np.vdot(w, power_product(w)) for w in filters])
+            change = np.clip(power / self.rated_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
+            self.penalty = np.maximum(self.penalty * change, SMALLEST_WEIGHT * natural)
+        self.weights = filters
+
+    def _right_side(self, correlation: np.ndarray, primary: np.ndarray) -> np.ndarray:
+        """Return r, (J I, n_taps)."""
+        of_x = fft.rfft(_two_sided(correlation, self._size), axis=0)
+        disturbances = np.einsum("kpf,fip->kif", fft.rfft(primary, self._size), of_x)
+        r = np.einsum("kjf,kif->jif", self._spectra.conj(), disturbances)
+        return fft.irfft(r, self._size)[..., : self.n_taps].reshape(-1, self.n_taps)
+
+    def _filtered_lags(self, correlation: np.ndarray) -> np.ndarray:
+        """Return the correlation of the filtered references, summed over microphones, (lags, J I, J I)."""
+        of_x = fft.rfft(_two_sided(correlation[: self._inner], self._size), axis=0)
+        spectrum = self._gram[:, :, np.newaxis, :, np.newaxis] * of_x[:, np.newaxis, :, np.newaxis, :]
+        blocks = self.n_loudspeakers * self.n_references
+        return fft.irfft(spectrum.reshape(-1, blocks, blocks), self._size, axis=0)
+
+
+def _two_sided(correlation: np.ndarray, size: int) -> np.ndarray:
+    """Return a correlation with its negative lags at the end of `size` samples; that of -m is the transpose of m's."""
+    lags = len(correlation)
+    both = np.zeros((size, *correlation.shape[1:]))
+    both[:lags] = correlation
+    both[size - lags + 1 :] += correlation[:0:-1].transpose(0, 2, 1)
+    return both
+
+
+def _with_penalty(filtered: np.ndarray, of_x: np.ndarray, penalty: np.ndarray, ridge: float) -> np.ndarray:
+    """Return the spectrum of R_x' + blkdiag(penalty_j R_x) + ridge I, (f, J I, J I)."""
+    J, n_references = penalty.size, of_x.shape[-1]
+    spectrum = filtered.reshape(-1, J, n_references, J, n_references).copy()
+    for j in range(J):
+        spectrum[:, j, :, j, :] += penalty[j] * of_x + ridge * np.eye(n_references)
+    return spectrum.reshape(filtered.shape)

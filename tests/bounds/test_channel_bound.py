@@ -1,0 +1,91 @@
+"""The bound for several loudspeakers: against dense sums over delayed signals, and one channel of today."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.channels import constrained_filters, dense_systems, random_paths, through
+
+from kfopc_filterpy import power_constrained_wiener
+from kfopc_filterpy.bounds.channels import block_correlation
+
+FS, K, J, REFERENCES, TAPS = 1000.0, 3, 2, 2, 10
+SECONDARY = random_paths(K, J, 7, seed=0)
+PRIMARY = random_paths(K, REFERENCES, 12, seed=1, delay=3)
+
+
+def signals(n_samples: int = 3000) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(2)
+    x = np.array([np.convolve(row, [1.0, 0.7], "same") for row in rng.standard_normal((REFERENCES, n_samples))])
+    return x, through(PRIMARY, x) + 0.1 * rng.standard_normal((K, n_samples))
+
+
+def test_block_correlations_are_sums_over_delayed_signals() -> None:
+    x = np.random.default_rng(3).standard_normal((3, 60))
+    rows = np.array([s[TAPS - 1 - m : 60 - m] for s in x for m in range(TAPS)])
+    np.testing.assert_allclose(block_correlation(x, TAPS), rows @ rows.T / rows.shape[1], atol=1e-13)
+
+
+def test_the_bound_meets_dense_solves_and_every_budget() -> None:
+    x, d = signals()
+    R, of_x, r = dense_systems(x, d, SECONDARY, TAPS, 0)
+    free = np.linalg.solve(R, r).reshape(J, -1)
+    wanted = np.einsum("ja,ab,jb->j", free, of_x, free)
+    rated = np.array([0.3 * wanted[0], 4.0 * wanted[1]])  # the second does not bind
+    bound = power_constrained_wiener(x, d, SECONDARY, TAPS, rated, fs=FS)
+    w, penalty, power = constrained_filters(R, of_x, r, rated, ridge=1e-12)
+    np.testing.assert_allclose(bound.unconstrained.weights.reshape(J, -1), free, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(bound.whole.weights.reshape(J, -1), w, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(bound.whole.penalty, penalty, rtol=1e-3, atol=1e-7 * penalty.max())
+    np.testing.assert_allclose(bound.whole.control_power, power, rtol=1e-4)
+    assert bound.whole.control_power[0] == pytest.approx(rated[0], rel=1e-4)
+    assert bound.whole.penalty[1] == 0.0
+    error = d - bound.whole.stretch.antinoise(bound.whole.weights)
+    expected = -10 * np.log10(np.mean(error**2) / np.mean(d**2))
+    assert bound.whole.noise_reduction_db == pytest.approx(expected, abs=1e-9)
+    assert bound.scaled.constraint_factor == pytest.approx(np.sqrt(0.3), rel=1e-6)
+    assert bound.unconstrained.noise_reduction_db > bound.whole.noise_reduction_db > bound.scaled.noise_reduction_db
+
+
+def test_each_second_keeps_its_budgets() -> None:
+    x, d = signals()
+    x, d = x * np.repeat([1.0, 3.0, 0.1], 1000), d * np.repeat([1.0, 3.0, 0.1], 1000)
+    bound = power_constrained_wiener(x, d, SECONDARY, TAPS, 0.05, fs=FS)
+    assert bound.per_second.control_power.shape == (3, J)
+    assert np.all(bound.per_second.control_power <= 0.05 * (1 + 1e-4))
+    assert bound.per_second.control_signal.shape == (J, 3000)
+    assert bound.per_second.error.shape == (K, 3000)
+    reductions = bound.noise_reduction_over(1.0)
+    assert reductions["unconstrained"] > reductions["per_second"] > reductions["scaled_per_second"]
+
+
+def test_one_channel_as_a_matrix_is_the_bound_of_one_channel() -> None:
+    """To 1e-4: the ridge in place of the eigenvalue cut, and the tolerance to which the budget is met."""
+    x, d = signals()
+    one = power_constrained_wiener(x[0], d[0], SECONDARY[0, 0], TAPS, 0.02, fs=FS)
+    matrix = power_constrained_wiener(x[:1], d[:1], SECONDARY[:1, :1], TAPS, 0.02, fs=FS)
+    np.testing.assert_allclose(matrix.whole.weights.ravel(), one.whole.weights, rtol=1e-3, atol=1e-5)
+    assert matrix.whole.noise_reduction_db == pytest.approx(one.whole.noise_reduction_db, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"rated_power": [1.0, 2.0, 3.0]}, "one for each of the 2 loudspeakers"),
+        ({"disturbance": np.ones((2, 3000))}, r"\(K microphones, n_samples\) = \(3, 3000\)"),
+        ({"disturbance": np.zeros((K, 3000))}, "silent"),
+        ({"secondary_path": 0.0 * SECONDARY}, "silent"),
+    ],
+    ids=["powers", "microphones", "silent disturbance", "silent paths"],
+)
+def test_what_does_not_fit_is_refused(changed: dict, match: str) -> None:
+    x, d = signals()
+    arguments = {
+        "reference": x,
+        "disturbance": d,
+        "secondary_path": SECONDARY,
+        "n_taps": TAPS,
+        "rated_power": 1.0,
+    } | changed
+    with pytest.raises(ValueError, match=match):
+        power_constrained_wiener(**arguments, fs=FS)

@@ -1,0 +1,76 @@
+"""The control filters within each loudspeaker's power: against dense solves and the conditions of optimality."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.channels import constrained_filters, correlation, random_paths
+from scipy.linalg import block_diag
+
+from kfopc_filterpy.power.channels import RIDGE, ChannelBudget
+
+K, J, REFERENCES, TAPS, PATH, PRIMARY = 4, 3, 2, 20, 8, 14
+
+
+def scene(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Secondary and primary paths, and coloured references that are correlated with each other."""
+    x = np.random.default_rng(seed).standard_normal((REFERENCES, 20000))
+    x = np.array([np.convolve(row, [1.0, 0.5, -0.3], "same") for row in x])
+    x[1] += 0.5 * np.roll(x[0], 3)
+    primary = random_paths(K, REFERENCES, PRIMARY, seed=seed + 1, delay=4)
+    return random_paths(K, J, PATH, seed=seed + 2), primary, x
+
+
+def dense(secondary: np.ndarray, primary: np.ndarray, D: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """R_x', R_x and r as sums over the taps of the paths; D[m] is that of lag m, D[-m].T of lag -m."""
+
+    def at(lag: np.ndarray) -> np.ndarray:
+        lag = np.asarray(lag)
+        return np.where((lag >= 0)[..., None, None], D[np.abs(lag)], D[np.abs(lag)].swapaxes(-1, -2))
+
+    steps, s, p = np.arange(TAPS), np.arange(PATH), np.arange(PRIMARY)
+    lags = at(steps[:, None, None, None] - steps[None, :, None, None] + s[:, None] - s[None, :])  # l m t u i k
+    R = np.einsum("cat,cbu,lmtuik->ailbkm", secondary, secondary, lags)
+    cross = at(steps[:, None, None] + s[None, :, None] - p[None, None, :])  # l t u i k
+    r = np.einsum("cat,cku,ltuik->ail", secondary, primary, cross)
+    of_x = at(steps[:, None] - steps[None, :]).transpose(2, 0, 3, 1).reshape(REFERENCES * TAPS, -1)
+    return R.reshape(J * REFERENCES * TAPS, -1), of_x, r.ravel()
+
+
+def test_it_converges_to_the_dense_solution_with_complementary_slackness() -> None:
+    secondary, primary, x = scene()
+    rated = np.array([0.1, 0.2, 50.0])  # the last one does not bind
+    budget = ChannelBudget(secondary, TAPS, PRIMARY, REFERENCES, rated)
+    D = correlation(x, budget.n_lags)
+    for _ in range(40):
+        budget.solve(D, primary)
+    R, of_x, r = dense(secondary, primary, D)
+    w, _, power = constrained_filters(R, of_x, r, rated, RIDGE)
+    np.testing.assert_allclose(budget.weights.reshape(J, -1), w, rtol=1e-5, atol=1e-6 * np.abs(w).max())
+    np.testing.assert_allclose(power[:2], rated[:2], rtol=1e-6)
+    assert power[2] < rated[2]
+    assert budget.penalty is not None
+    assert budget.penalty[2] < 1e-4 * budget.penalty[0]  # the power that is not used up has no price
+    penalties = block_diag(*(p * of_x for p in budget.penalty)) + RIDGE * np.trace(R) / len(R) * np.eye(len(R))
+    residual = (R + penalties) @ budget.weights.ravel() - r
+    assert np.abs(residual).max() < 1e-9 * np.abs(r).max()
+
+
+@pytest.mark.parametrize("fault", ["unplugged", "identical", "silent"])
+def test_a_singular_case_stays_finite(fault: str) -> None:
+    secondary, primary, x = scene()
+    if fault == "unplugged":
+        secondary[:, 1] = 0.0
+    if fault == "identical":
+        secondary[:, 1] = secondary[:, 0]
+    budget = ChannelBudget(secondary, TAPS, PRIMARY, REFERENCES, np.array([0.1, 0.1, 0.1]))
+    D = correlation(x, budget.n_lags) * (fault != "silent")
+    for _ in range(30):
+        budget.solve(D, primary)
+    assert np.isfinite(budget.weights).all()
+    if fault == "unplugged":
+        np.testing.assert_allclose(budget.weights[1], 0.0, atol=1e-9)
+    if fault == "identical":  # the least norm: both share the work
+        np.testing.assert_allclose(budget.weights[0], budget.weights[1], rtol=1e-6, atol=1e-9)
+    if fault == "silent":
+        np.testing.assert_array_equal(budget.weights, 0.0)
