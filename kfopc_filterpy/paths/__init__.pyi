@@ -17,3 +17,6 @@ from .identification import modelling_error_db as modelling_error_db
 from .models import fir_path as fir_path
 from .models import path_taps as path_taps
 from .models import perturbed_path as perturbed_path
+from .rooms import RoomPaths as RoomPaths
+from .rooms import horizontal_plane as horizontal_plane
+from .rooms import room_paths as room_paths
