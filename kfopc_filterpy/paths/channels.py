@@ -9,19 +9,29 @@ import numpy as np
 from .._validate import as_real_array, require_finite
 from .models import is_system, path_taps, sampling_rate
 
+SECONDARY_AXES = "(K microphones, J loudspeakers, taps)"
+PRIMARY_AXES = "(K microphones, I references, taps)"
+
 
 def secondary_paths(
     paths: Any, *, fs: float | None = None, name: str = "secondary_path"
 ) -> tuple[np.ndarray, float | None]:
     """Return secondary paths as taps (K, J, n_taps), and their sampling rate in Hz if systems tell it."""
-    return path_matrix(paths, fs=fs, name=name, axes="(K microphones, J loudspeakers, taps)")
+    return path_matrix(paths, fs=fs, name=name, axes=SECONDARY_AXES)
 
 
 def primary_paths(
     paths: Any, *, fs: float | None = None, name: str = "primary_path"
 ) -> tuple[np.ndarray, float | None]:
     """Return primary paths as taps (K, I, n_taps), and their sampling rate in Hz if systems tell it."""
-    return path_matrix(paths, fs=fs, name=name, axes="(K microphones, I references, taps)")
+    return path_matrix(paths, fs=fs, name=name, axes=PRIMARY_AXES)
+
+
+def is_path_matrix(paths: Any) -> bool:
+    """Return whether paths are given as a matrix, by shape or as a system of several inputs or outputs."""
+    if is_system(paths):
+        return (paths.noutputs, paths.ninputs) != (1, 1)
+    return _has_systems(paths) or np.ndim(paths) > 1
 
 
 def path_matrix(
@@ -31,7 +41,7 @@ def path_matrix(
     if is_system(paths):
         rows: Any = [[paths]] if (paths.noutputs, paths.ninputs) == (1, 1) else _entries(paths)
         return _from_systems(rows, fs, name, axes)
-    if isinstance(paths, list | tuple) and any(is_system(entry) for row in paths for entry in np.ravel(row)):
+    if _has_systems(paths):
         return _from_systems(paths, fs, name, axes)
     taps = as_real_array(paths, name)
     if taps.ndim == 1:
@@ -42,6 +52,17 @@ def path_matrix(
         raise ValueError(f"{name} must have shape {axes}, got {taps.shape}: taps come last, see numpy.moveaxis")
     require_finite(taps, name)
     return np.ascontiguousarray(taps), None
+
+
+def sampled_path_matrix(paths: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
+    """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz: the systems' own, or `fs`."""
+    taps, rate = path_matrix(paths, fs=fs, name=name, axes=axes)
+    return taps, sampling_rate(taps, fs, name=name) if rate is None else rate
+
+
+def _has_systems(paths: Any) -> bool:
+    rows = paths if isinstance(paths, list | tuple) else ()
+    return any(is_system(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
 
 
 def _entries(system: Any) -> list[list[Any]]:

@@ -451,7 +451,7 @@ def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     results : IdentificationResult, or mapping of str to IdentificationResult
-        Identifications by legend entry.
+        Identifications by legend entry. One of several paths has a curve for each path.
     ax : matplotlib.axes.Axes, optional
         Axes to draw into, by default new ones.
 
@@ -481,8 +481,13 @@ def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
     for i, (label, result) in enumerate(_named(named).items()):
         if not isinstance(result, IdentificationResult):
             raise TypeError(f"results must hold IdentificationResult, got {type(result).__name__} for {label!r}")
-        text = f"{label}: {result.misalignment_db:.1f} dB overall"
-        ax.plot(result.frequencies_hz, result.modelling_error_db, label=text, **line_style(i))
+        overall = np.ravel(result.misalignment_db)
+        text = f"{label}: {overall[0]:.1f} dB overall"
+        if overall.size > 1:
+            text = f"{label}, {overall.size} paths: {overall.min():.1f} to {overall.max():.1f} dB overall"
+        errors = np.reshape(result.modelling_error_db, (overall.size, -1))
+        for n, error in enumerate(errors):
+            ax.plot(result.frequencies_hz, error, label=None if n else text, **line_style(i))
     ax.set_ylabel("Modelling error (dB)")
     frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))
     legend_above(ax)

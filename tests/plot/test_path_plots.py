@@ -145,6 +145,18 @@ def test_modelling_error_of_several_runs():
     assert len(plot_modelling_error(results["white"]).get_lines()) == 1
 
 
+def test_modelling_error_of_several_paths_has_a_curve_for_each():
+    taps = path_taps(S)
+    paths = np.array([[taps, 0.5 * taps, taps[::-1]], [2 * taps, -taps, taps]])
+    result = identify_secondary_path(paths, n_taps=32, duration_s=0.2, rng=0, fs=FS, sensor_noise_std=0.1)
+    ax = plot_modelling_error({"in turn": result})
+    ax.figure.canvas.draw()
+    assert len(ax.get_lines()) == 6
+    np.testing.assert_array_equal(ax.get_lines()[4].get_ydata(), result.modelling_error_db[1, 1])
+    low, high = result.misalignment_db.min(), result.misalignment_db.max()
+    assert _labels(ax) == [f"in turn, 6 paths: {low:.1f} to {high:.1f} dB overall"]
+
+
 @pytest.mark.parametrize(
     "draw",
     [
