@@ -88,6 +88,20 @@ def test_causality_margin_is_written_out(primary, secondary, text):
     assert _labels(ax) == ["Primary path P", "Secondary path S"]
 
 
+def test_causality_margins_of_several_channels_are_a_table():
+    delays = np.array([[10, 38], [20, 24], [-1, 12]])  # -1: silent
+    secondary = np.vstack([np.eye(64), np.zeros(64)])[delays]
+    primary = np.eye(64)[[[30], [36], [44]]]
+    ax = plot_causality_margin(primary, secondary, fs=FS)
+    ax.figure.canvas.draw()
+    expected = [["1.25", "-0.50"], ["1.00", "0.75"], ["silent", "2.00"]]
+    written = {text.get_position(): text.get_text() for text in ax.texts}
+    assert written == {(j, k): expected[k][j] for k in range(3) for j in range(2)}
+    assert _labels(ax) == ["margin of the whole: 1.00 ms (16 samples)"]
+    assert ax.patches[0].get_xy() == (-0.5, 0.5)  # loudspeaker 0 at microphone 1
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Loudspeaker (margins in ms)", "Microphone")
+
+
 def test_secondary_path_gain_for_band_and_reference():
     noise = np.random.default_rng(0).standard_normal(5000)
     ax = plot_secondary_path_gain(S, band=(200.0, 2000.0), reference=noise)
