@@ -23,6 +23,7 @@ from .._validate import (
 from .analysis import frequency_response
 from .channels import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .least_squares import (
+    RANK_TOLERANCE,
     correlation_matrix,
     cross_correlation,
     cross_correlation_matrix,
@@ -197,7 +198,9 @@ def _fit(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float
         matrix[diagonal, diagonal] += regularization * float(np.mean(signal[n_taps - 1 :] ** 2))
     settled = heard[:, n_taps - 1 :]
     right = np.array([np.concatenate([cross_correlation(k, signal) for signal in sent]) for k in settled])
-    taps = _solve(matrix, right, definite=len(sent) > 1 and regularization > 0).reshape(len(heard), len(sent), n_taps)
+    taps = _solve(matrix, right, definite=len(sent) > 1 and regularization > RANK_TOLERANCE).reshape(
+        len(heard), len(sent), n_taps
+    )
     left = settled - [
         sum(np.convolve(signal, path, mode="valid") for signal, path in zip(sent, paths, strict=True)) for paths in taps
     ]
