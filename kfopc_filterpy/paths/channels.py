@@ -54,12 +54,6 @@ def path_matrix(
     return np.ascontiguousarray(taps), None
 
 
-def sampled_path_matrix(paths: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
-    """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz: the systems' own, or `fs`."""
-    taps, rate = path_matrix(paths, fs=fs, name=name, axes=axes)
-    return taps, sampling_rate(taps, fs, name=name) if rate is None else rate
-
-
 def _has_systems(paths: Any) -> bool:
     rows = paths if isinstance(paths, list | tuple) else ()
     return any(is_system(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
@@ -68,6 +62,12 @@ def _has_systems(paths: Any) -> bool:
 def _entries(system: Any) -> list[list[Any]]:
     """Return the entries of a system of several inputs and outputs."""
     return [[system[k, j] for j in range(system.ninputs)] for k in range(system.noutputs)]
+
+
+def sampled_path_matrix(paths: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
+    """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz: the systems' own, or `fs`."""
+    taps, rate = path_matrix(paths, fs=fs, name=name, axes=axes)
+    return taps, sampling_rate(taps, fs, name=name) if rate is None else rate
 
 
 def _from_systems(rows: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float | None]:
