@@ -18,3 +18,6 @@ from .models import fir_path as fir_path
 from .models import path_taps as path_taps
 from .models import perturbed_path as perturbed_path
 from .resampling import resample_path as resample_path
+from .rooms import RoomPaths as RoomPaths
+from .rooms import horizontal_plane as horizontal_plane
+from .rooms import room_paths as room_paths

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from .._validate import as_band, as_number, as_positive, as_signal
+from .channels import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .models import finite_taps, is_system, path_taps, sampling_rate
 
 STABILITY_BOUND_DEG = 90.0
@@ -320,30 +322,48 @@ def _crossing(frequencies: np.ndarray, magnitude: np.ndarray, level: float, insi
 class CausalityMargin:
     """Delay of the primary path over that of the secondary path.
 
+    With several channels there is a margin for each pair of a microphone and a loudspeaker. At a microphone the
+    loudspeaker with the largest one can act first. The margin of the whole is that of the microphone where this comes
+    latest: the smallest over the microphones of the largest over the loudspeakers.
+
     Attributes
     ----------
-    primary_onset_s, secondary_onset_s : float
-        Energy onset of each path in s: the time by which its impulse response has delivered `onset_share` of its energy.
-    primary_delay_s, secondary_delay_s : float
-        Group delay of each path in s, averaged over the band with the weight ``|H|^2``. In a reverberant path it includes
-        the reverberation, so the onset is the safer measure.
+    primary_onset_s : float or numpy.ndarray, shape (K,)
+        Energy onset of the primary path in s: the time by which its impulse response has delivered `onset_share` of its
+        energy. With several channels the earliest over the references, at each microphone.
+    secondary_onset_s : float or numpy.ndarray, shape (K, J)
+        Energy onset of the secondary path, or of that from each loudspeaker to each microphone; inf for a silent one.
+    primary_delay_s : float or numpy.ndarray, shape (K,)
+        Group delay of the primary path in s, averaged over the band with the weight ``|H|^2``. In a reverberant path it
+        includes the reverberation, so the onset is the safer measure.
+    secondary_delay_s : float or numpy.ndarray, shape (K, J)
+        The same of the secondary path.
     fs : float
         Sampling rate in Hz.
     """
 
-    primary_onset_s: float
-    secondary_onset_s: float
-    primary_delay_s: float
-    secondary_delay_s: float
+    primary_onset_s: Any
+    secondary_onset_s: Any
+    primary_delay_s: Any
+    secondary_delay_s: Any
     fs: float
 
     def __repr__(self) -> str:
-        return f"<CausalityMargin: {1e3 * self.margin_s:.3g} ms, {self.margin_samples:.4g} samples>"
+        margin = f"{1e3 * self.margin_s:.3g} ms, {self.margin_samples:.4g} samples"
+        if np.ndim(self.secondary_onset_s) == 0:
+            return f"<CausalityMargin: {margin}>"
+        K, J = self.margins_s.shape
+        return f"<CausalityMargin of {K} microphone(s) and {J} loudspeaker(s): {margin}>"
+
+    @property
+    def margins_s(self) -> np.ndarray:
+        """Margins by energy onset in s, shape (K, J), one for each pair; -inf for a silent secondary path."""
+        return _pairwise(self.primary_onset_s, self.secondary_onset_s)
 
     @property
     def margin_s(self) -> float:
-        """Margin by energy onset in s, primary minus secondary; a negative one is not causal."""
-        return self.primary_onset_s - self.secondary_onset_s
+        """Margin by energy onset in s, primary minus secondary, of the whole; a negative one is not causal."""
+        return _of_the_whole(self.margins_s)
 
     @property
     def margin_samples(self) -> float:
@@ -351,14 +371,34 @@ class CausalityMargin:
         return self.margin_s * self.fs
 
     @property
+    def deciding_pair(self) -> tuple[int, int]:
+        """Microphone and loudspeaker (k, j), from 0, whose margin is that of the whole."""
+        k = int(np.argmin(self.margins_s.max(axis=1)))
+        return k, int(np.argmax(self.margins_s[k]))
+
+    @property
+    def group_delay_margins_s(self) -> np.ndarray:
+        """Margins by mean group delay in s, shape (K, J), one for each pair; -inf for a silent secondary path."""
+        return _pairwise(self.primary_delay_s, self.secondary_delay_s)
+
+    @property
     def group_delay_margin_s(self) -> float:
-        """Margin by mean group delay in s."""
-        return self.primary_delay_s - self.secondary_delay_s
+        """Margin by mean group delay in s, of the whole."""
+        return _of_the_whole(self.group_delay_margins_s)
 
     @property
     def group_delay_margin_samples(self) -> float:
         """Margin by mean group delay in samples."""
         return self.group_delay_margin_s * self.fs
+
+
+def _pairwise(primary: Any, secondary: Any) -> np.ndarray:
+    return np.atleast_1d(primary)[:, np.newaxis] - np.atleast_2d(secondary)
+
+
+def _of_the_whole(margins: np.ndarray) -> float:
+    """Return the margin (K, J) of each microphone's best loudspeaker, at the worst microphone."""
+    return float(margins.max(axis=1).min())
 
 
 def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
@@ -381,8 +421,10 @@ def causality_margin(
 
     Parameters
     ----------
-    primary, secondary : control.TransferFunction or array_like, shape (n_taps,)
-        Paths with finite impulse responses.
+    primary : control.TransferFunction or array_like, shape (n_taps,) or (K, I, n_taps)
+        Primary path with a finite impulse response, or that from each of I references to each of K microphones.
+    secondary : control.TransferFunction or array_like, shape (n_taps,) or (K, J, n_taps)
+        Secondary path, or that from each of J loudspeakers to each microphone.
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
     band : (float, float), optional
@@ -394,12 +436,14 @@ def causality_margin(
     Returns
     -------
     CausalityMargin
-        Onsets, mean group delays and margins.
+        Onsets, mean group delays and margins: of each pair of a microphone and a loudspeaker if there are several, and
+        of the whole.
 
     Raises
     ------
     TypeError, ValueError
-        If the paths differ in sampling rate or are silent, or an argument is out of range.
+        If the paths differ in sampling rate or in the number of microphones, no sound reaches a microphone, or an
+        argument is out of range.
 
     Examples
     --------
@@ -407,12 +451,24 @@ def causality_margin(
     >>> margin = causality_margin(bandpass_path(128), bandpass_path(32))
     >>> round(margin.margin_samples), round(margin.group_delay_margin_samples)
     (45, 48)
+
+    Two loudspeakers and two microphones, in which sounds arrive after whole samples:
+
+    >>> arriving = lambda samples: np.eye(16)[np.array(samples)]
+    >>> margin = causality_margin(arriving([[9], [10]]), arriving([[2, 7], [6, 5]]), fs=8000.0)
+    >>> margin.margins_s * margin.fs
+    array([[7., 2.],
+           [4., 5.]])
+    >>> margin, margin.deciding_pair
+    (<CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): 0.625 ms, 5 samples>, (1, 1))
     """
-    fs = sampling_rate(primary, fs, name="primary")
-    sampling_rate(secondary, fs, name="secondary")
     share = as_positive(onset_share, "onset_share")
     if share >= 1:
         raise ValueError(f"onset_share must be below 1, got {share:g}")
+    if is_path_matrix(primary) or is_path_matrix(secondary):
+        return _margins(primary, secondary, fs, band, share)
+    fs = sampling_rate(primary, fs, name="primary")
+    sampling_rate(secondary, fs, name="secondary")
     low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
     responses = (path_taps(primary, name="primary"), path_taps(secondary, name="secondary"))
     for name, taps in zip(("primary", "secondary"), responses, strict=True):
@@ -421,6 +477,30 @@ def causality_margin(
     onsets = [energy_onset(h, share) / fs for h in responses]
     delays = [_mean_group_delay(h, low, high, fs) for h in responses]
     return CausalityMargin(onsets[0], onsets[1], delays[0], delays[1], fs)
+
+
+def _margins(primary: Any, secondary: Any, fs: float | None, band: Any, share: float) -> CausalityMargin:
+    """Return the causality margins of several channels."""
+    p, fs = sampled_path_matrix(primary, fs, "primary", PRIMARY_AXES)
+    s, fs = sampled_path_matrix(secondary, fs, "secondary", SECONDARY_AXES)
+    low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
+    if len(p) != len(s):
+        raise ValueError(
+            f"primary and secondary must have the same K microphones as their first axis, got {len(p)} and {len(s)}"
+        )
+    for name, paths, source in (("primary", p, "reference"), ("secondary", s, "loudspeaker")):
+        silent = np.flatnonzero(~np.any(paths, axis=(1, 2)))
+        if silent.size:
+            raise ValueError(
+                f"{name}[{silent[0]}] must not be all zeros: no {source} reaches that microphone; leave it out"
+            )
+
+    def of_each(paths: np.ndarray, measure: Callable[[np.ndarray], float]) -> np.ndarray:
+        return np.array([[measure(h) if np.any(h) else np.inf for h in row] for row in paths])
+
+    onsets = [of_each(paths, lambda h: energy_onset(h, share) / fs) for paths in (p, s)]
+    delays = [of_each(paths, lambda h: _mean_group_delay(h, low, high, fs)) for paths in (p, s)]
+    return CausalityMargin(onsets[0].min(axis=1), onsets[1], delays[0].min(axis=1), delays[1], fs)
 
 
 def _mean_group_delay(taps: np.ndarray, low: float, high: float, fs: float) -> float:

@@ -9,19 +9,29 @@ import numpy as np
 from .._validate import as_real_array, require_finite
 from .models import is_system, path_taps, sampling_rate
 
+SECONDARY_AXES = "(K microphones, J loudspeakers, taps)"
+PRIMARY_AXES = "(K microphones, I references, taps)"
+
 
 def secondary_paths(
     paths: Any, *, fs: float | None = None, name: str = "secondary_path"
 ) -> tuple[np.ndarray, float | None]:
     """Return secondary paths as taps (K, J, n_taps), and their sampling rate in Hz if systems tell it."""
-    return path_matrix(paths, fs=fs, name=name, axes="(K microphones, J loudspeakers, taps)")
+    return path_matrix(paths, fs=fs, name=name, axes=SECONDARY_AXES)
 
 
 def primary_paths(
     paths: Any, *, fs: float | None = None, name: str = "primary_path"
 ) -> tuple[np.ndarray, float | None]:
     """Return primary paths as taps (K, I, n_taps), and their sampling rate in Hz if systems tell it."""
-    return path_matrix(paths, fs=fs, name=name, axes="(K microphones, I references, taps)")
+    return path_matrix(paths, fs=fs, name=name, axes=PRIMARY_AXES)
+
+
+def is_path_matrix(paths: Any) -> bool:
+    """Return whether paths are given as a matrix, by shape or as a system of several inputs or outputs."""
+    if is_system(paths):
+        return (paths.noutputs, paths.ninputs) != (1, 1)
+    return _has_systems(paths) or np.ndim(paths) > 1
 
 
 def is_path_matrix(paths: Any) -> bool:
@@ -59,6 +69,12 @@ def _has_systems(paths: Any) -> bool:
 def _entries(system: Any) -> list[list[Any]]:
     """Return the entries of a system of several inputs and outputs."""
     return [[system[k, j] for j in range(system.ninputs)] for k in range(system.noutputs)]
+
+
+def sampled_path_matrix(paths: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
+    """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz: the systems' own, or `fs`."""
+    taps, rate = path_matrix(paths, fs=fs, name=name, axes=axes)
+    return taps, sampling_rate(taps, fs, name=name) if rate is None else rate
 
 
 def _from_systems(rows: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float | None]:

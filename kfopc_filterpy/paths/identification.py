@@ -1,45 +1,68 @@
-"""Identification of the secondary path: excite the loudspeaker, record the microphone, fit an impulse response."""
+"""Identification of secondary paths: excite the loudspeakers, record the microphones, fit impulse responses."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_choice, as_count, as_generator, as_nonnegative, as_positive, as_signal
+from .._validate import (
+    as_channels,
+    as_choice,
+    as_count,
+    as_generator,
+    as_nonnegative,
+    as_positive,
+    as_real_array,
+    as_signal,
+    require_channels_lead,
+    require_finite,
+)
 from .analysis import frequency_response
-from .least_squares import correlation_matrix, cross_correlation, minimum_norm_solve
+from .channels import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
+from .least_squares import (
+    RANK_TOLERANCE,
+    correlation_matrix,
+    cross_correlation,
+    cross_correlation_matrix,
+    minimum_norm_solve,
+)
 from .models import fir_path, path_taps, sampling_rate
 
 if TYPE_CHECKING:
     import control
 
 
+# Excitations at once whose correlation coefficient exceeds this at some delay count as the same signal.
+_LARGEST_CORRELATION = 0.9
+
+
 @dataclass(frozen=True)
 class PathEstimate:
-    """A path fitted to an excitation and the response to it.
+    """A path, or the paths of several loudspeakers and microphones, fitted to excitations and the responses to them.
 
     Attributes
     ----------
     estimate : control.TransferFunction
-        The fitted path, with ``dt = 1/fs``.
-    taps : numpy.ndarray, shape (n_taps,)
-        Its impulse response.
-    residual_db : float
+        The fitted path, with ``dt = 1/fs``; with several, a system of J inputs and K outputs.
+    taps : numpy.ndarray, shape (n_taps,) or (K, J, n_taps)
+        Its impulse response, or that from each of J loudspeakers to each of K microphones.
+    residual_db : float or numpy.ndarray, shape (K,) or (K, J)
         Share of the response's power that the fit leaves unexplained, in dB: noise, distortion by the amplifier, and the
-        part of the path beyond `n_taps`. At least -300 dB.
+        part of the path beyond `n_taps`. At least -300 dB. With several paths one for each response: (K,) if all
+        loudspeakers played at once, (K, J) if in turn.
     """
 
     estimate: control.TransferFunction
     taps: np.ndarray
-    residual_db: float
+    residual_db: Any
 
 
 @dataclass(frozen=True)
 class IdentificationResult(PathEstimate):
-    """Result of a simulated identification, in which the true path is known.
+    """Result of a simulated identification, in which the true paths are known.
 
     Attributes
     ----------
@@ -47,32 +70,39 @@ class IdentificationResult(PathEstimate):
         As in `PathEstimate`.
     frequencies_hz : numpy.ndarray, shape (n_frequencies,)
         Frequencies of the modelling error in Hz.
-    modelling_error_db : numpy.ndarray, shape (n_frequencies,)
+    modelling_error_db : numpy.ndarray, shape (n_frequencies,) or (K, J, n_frequencies)
         ``20 log10(|S_est - S| / |S|)`` at each frequency.
-    misalignment_db : float
+    misalignment_db : float or numpy.ndarray, shape (K, J)
         ``10 log10(sum (s_est - s)^2 / sum s^2)``, the error of the whole impulse response.
     """
 
     frequencies_hz: np.ndarray
     modelling_error_db: np.ndarray
-    misalignment_db: float
+    misalignment_db: Any
 
 
 def estimate_path(
     excitation: Any, response: Any, n_taps: int, fs: float, *, regularization: float = 1e-5
 ) -> PathEstimate:
-    """Fit an impulse response to a recorded excitation and response by least squares.
+    """Fit impulse responses to recorded excitations and responses by least squares.
 
     The first ``n_taps - 1`` samples fill the delay line and are not fitted.
 
+    The paths from several loudspeakers can be recorded in two ways. In turn: one loudspeaker plays at a time, and its
+    paths are fitted to its own recording. At once: all play noises that are not correlated, and all paths to a
+    microphone are fitted to its response together. Noise of the microphones then costs no more accuracy than in runs of
+    this length for each loudspeaker. But what no fit explains, such as distortion and the paths beyond `n_taps`, adds up
+    over all loudspeakers.
+
     Parameters
     ----------
-    excitation : array_like, shape (n_samples,)
-        Signal sent to the amplifier.
-    response : array_like, shape (n_samples,)
-        Signal of the error microphone, recorded at the same time.
+    excitation : array_like, shape (n_samples,) or (J, n_samples)
+        Signal sent to the amplifier, or to each of J amplifiers. In turn, (n_samples,) is the same signal for all.
+    response : array_like, shape (n_samples,), (K, n_samples) or (J, K, n_samples)
+        Signal of the error microphone, recorded at the same time; or of each of K microphones while all loudspeakers
+        play at once; or of each of K microphones while loudspeaker j plays alone.
     n_taps : int
-        Length of the impulse response, including the delay of the path.
+        Length of the impulse responses, including the delay of the path.
     fs : float
         Sampling rate in Hz.
     regularization : float, default 1e-5
@@ -82,12 +112,13 @@ def estimate_path(
     Returns
     -------
     PathEstimate
-        The path as a system, its taps and the residual.
+        The path as a system, its taps and the residual. Of paths (K, J, n_taps) unless both signals are (n_samples,).
 
     Raises
     ------
     TypeError, ValueError
-        If the signals differ in length, are shorter than ``2 n_taps - 1``, silent or not finite.
+        If the signals differ in length, are shorter than ``(J + 1) n_taps - 1`` (in turn, or with one loudspeaker,
+        ``2 n_taps - 1``), silent or not finite, or loudspeakers play the same noise at once.
 
     Examples
     --------
@@ -95,22 +126,124 @@ def estimate_path(
     >>> response = np.convolve(excitation, [0.0, 0.8, -0.2])[:1000]
     >>> estimate_path(excitation, response, n_taps=4, fs=8000.0).taps.round(4) + 0.0
     array([ 0. ,  0.8, -0.2,  0. ])
+
+    Two loudspeakers at once:
+
+    >>> noises = np.random.default_rng(0).standard_normal((2, 1000))
+    >>> response = 0.5 * noises[0] - 0.3 * noises[1]
+    >>> estimate_path(noises, [response], n_taps=2, fs=8000.0).taps.round(4) + 0.0
+    array([[[ 0.5,  0. ],
+            [-0.3,  0. ]]])
     """
     fs = as_positive(fs, "fs", unit="Hz")
     n_taps = as_count(n_taps, "n_taps")
-    excitation = as_signal(excitation, "excitation", min_length=2 * n_taps - 1)
-    response = as_signal(response, "response", length=excitation.size)
-    for name, signal in (("excitation", excitation), ("response", response)):
-        if not np.any(signal[n_taps - 1 :]):
-            raise ValueError(f"{name} must not be silent: it does not reveal the path")
-    heard = response[n_taps - 1 :]
-    matrix = correlation_matrix(excitation, n_taps, n_taps - 1)
-    ridge = as_nonnegative(regularization, "regularization") * float(np.mean(excitation[n_taps - 1 :] ** 2))
-    matrix.flat[:: n_taps + 1] += ridge
-    taps = minimum_norm_solve(matrix, cross_correlation(heard, excitation))
-    left = heard - np.convolve(excitation, taps, mode="valid")
-    residual_db = 10 * np.log10(max(np.mean(left**2) / np.mean(heard**2), 1e-30))
-    return PathEstimate(fir_path(taps, fs), taps, float(residual_db))
+    ridge = as_nonnegative(regularization, "regularization")
+    sent, heard = as_real_array(excitation, "excitation"), as_real_array(response, "response")
+    if heard.ndim == 3:
+        taps, residual_db = _fit_in_turn(sent, heard, n_taps, ridge)
+        return PathEstimate(_system(taps, fs), taps, residual_db)
+    if sent.ndim == 2 or heard.ndim == 2:
+        sent, heard = np.atleast_2d(as_channels(sent, "excitation")), np.atleast_2d(as_channels(heard, "response"))
+        _require_length(sent.shape[1], (len(sent) + 1) * n_taps - 1)
+        if heard.shape[1] != sent.shape[1]:
+            raise ValueError(f"response must have {sent.shape[1]} samples, as excitation has, got {heard.shape[1]}")
+        _require_audible(sent, heard, n_taps)
+        taps, residual_db = _fit(sent, heard, n_taps, ridge)
+        return PathEstimate(_system(taps, fs), taps, residual_db)
+    sent = as_signal(sent, "excitation", min_length=2 * n_taps - 1)
+    heard = as_signal(heard, "response", length=sent.size)
+    _require_audible(sent, heard, n_taps)
+    taps, residual_db = _fit(sent[np.newaxis], heard[np.newaxis], n_taps, ridge)
+    return PathEstimate(fir_path(taps[0, 0], fs), taps[0, 0], float(residual_db[0]))
+
+
+def _require_audible(sent: np.ndarray, heard: np.ndarray, n_taps: int) -> None:
+    """Raise ValueError if a signal, (..., n_samples), is silent where it is fitted; the message gives its index."""
+    for name, signals in (("excitation", sent), ("response", heard)):
+        silent = np.argwhere(~np.any(signals[..., n_taps - 1 :], axis=-1))
+        if len(silent):
+            index = "".join(f"[{i}]" for i in silent[0])
+            raise ValueError(f"{name}{index} must not be silent: it does not reveal the path")
+
+
+def _require_length(n_samples: int, needed: int) -> None:
+    if n_samples < needed:
+        raise ValueError(f"excitation must have at least {needed} samples for these paths, got {n_samples}")
+
+
+def _fit_in_turn(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return taps (K, J, n_taps) and residuals (K, J) in dB of loudspeakers that play alone, one after the other."""
+    if 0 in heard.shape:
+        raise ValueError(f"response must be (J loudspeakers, K microphones, n_samples), got shape {heard.shape}")
+    require_channels_lead(heard, "response")
+    require_finite(heard, "response")
+    sent = as_channels(sent, "excitation")
+    sent = np.broadcast_to(sent, (len(heard), sent.shape[-1])) if sent.ndim == 1 else sent
+    if sent.shape != (len(heard), heard.shape[2]):
+        raise ValueError(
+            f"excitation must be (J loudspeakers, n_samples) = {(len(heard), heard.shape[2])} for a response of shape "
+            f"{heard.shape}, got {sent.shape}"
+        )
+    _require_length(sent.shape[1], 2 * n_taps - 1)
+    _require_audible(sent, heard, n_taps)
+    fits = [_fit(sent[j : j + 1], responses, n_taps, ridge) for j, responses in enumerate(heard)]
+    return np.concatenate([taps for taps, _ in fits], axis=1), np.stack([residual for _, residual in fits], axis=1)
+
+
+def _fit(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return taps (K, J, n_taps) and residuals (K,) in dB of loudspeakers that play at once."""
+    matrix = _normal_matrix(sent, n_taps)
+    for j, signal in enumerate(sent):
+        diagonal = np.arange(j * n_taps, (j + 1) * n_taps)
+        matrix[diagonal, diagonal] += regularization * float(np.mean(signal[n_taps - 1 :] ** 2))
+    settled = heard[:, n_taps - 1 :]
+    right = np.array([np.concatenate([cross_correlation(k, signal) for signal in sent]) for k in settled])
+    taps = _solve(matrix, right, definite=len(sent) > 1 and regularization > RANK_TOLERANCE).reshape(
+        len(heard), len(sent), n_taps
+    )
+    left = settled - [
+        sum(np.convolve(signal, path, mode="valid") for signal, path in zip(sent, paths, strict=True)) for paths in taps
+    ]
+    unexplained = np.mean(left**2, axis=1) / np.mean(settled**2, axis=1)
+    return taps, 10 * np.log10(np.maximum(unexplained, 1e-30))
+
+
+def _normal_matrix(sent: np.ndarray, n_taps: int) -> np.ndarray:
+    """Return the correlations of all delays of all excitations, (J n_taps, J n_taps); refuse excitations that agree."""
+    J, start = len(sent), n_taps - 1
+    blocks = np.empty((J, n_taps, J, n_taps))
+    for j, signal in enumerate(sent):
+        blocks[j, :, j] = correlation_matrix(signal, n_taps, start)
+        for i in range(j):
+            blocks[i, :, j] = cross_correlation_matrix(sent[i], signal, n_taps, start)
+            blocks[j, :, i] = blocks[i, :, j].T
+            size = np.sqrt(blocks[i, 0, i, 0] * blocks[j, 0, j, 0])
+            if np.abs(blocks[i, :, j]).max() > _LARGEST_CORRELATION * size:
+                raise ValueError(
+                    f"excitation[{j}] must not be correlated with excitation[{i}], for their paths cannot be told "
+                    "apart: play noises of different seeds, or let the loudspeakers play in turn"
+                )
+    return blocks.reshape(J * n_taps, J * n_taps)
+
+
+def _solve(matrix: np.ndarray, right: np.ndarray, *, definite: bool) -> np.ndarray:
+    """Solve for each row of `right`.
+
+    With a ridge the matrix is positive definite, and Cholesky's method saves most of the time where it is large.
+    """
+    if definite:
+        from scipy.linalg import cho_factor, cho_solve
+
+        return cho_solve(cho_factor(matrix), right.T).T
+    return minimum_norm_solve(matrix, right)
+
+
+def _system(taps: np.ndarray, fs: float) -> control.TransferFunction:
+    """Return paths (K, J, n_taps) as a system of J inputs and K outputs."""
+    from control import TransferFunction
+
+    denominator = np.eye(1, taps.shape[2])[0]
+    return TransferFunction([list(row) for row in taps], [[denominator] * taps.shape[1]] * len(taps), 1 / fs)
 
 
 def identify_secondary_path(
@@ -122,24 +255,25 @@ def identify_secondary_path(
     fs: float | None = None,
     excitation: str = "white",
     level: float = 1.0,
-    amplifier: Callable[[np.ndarray], np.ndarray] | None = None,
+    amplifier: Callable[[np.ndarray], np.ndarray] | Sequence[Callable[[np.ndarray], np.ndarray] | None] | None = None,
     sensor_noise_std: float = 0.0,
     regularization: float = 1e-5,
     frequencies_hz: Any = None,
+    loudspeakers: str = "in turn",
 ) -> IdentificationResult:
-    """Simulate the identification of a secondary path, as it is done before the control starts.
+    """Simulate the identification of secondary paths, as it is done before the control starts.
 
     The excitation runs through the amplifier and the true path, sensor noise is added, and `estimate_path` fits the taps
-    to excitation and response.
+    to excitation and response. Several loudspeakers play in turn, or noises of their own at once.
 
     Parameters
     ----------
-    secondary_path : control.TransferFunction or array_like, shape (n_path,)
-        True path s with a finite impulse response.
+    secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
+        True path s with a finite impulse response, or that from each of J loudspeakers to each of K microphones.
     n_taps : int
         Length of the estimate.
     duration_s : float
-        Duration of the run in s.
+        Duration of the run in s; in turn, of each loudspeaker's run.
     rng : int or numpy.random.Generator
         Seed or generator of excitation and sensor noise.
     fs : float, optional
@@ -148,25 +282,30 @@ def identify_secondary_path(
         Gaussian white noise, or a sine whose frequency rises exponentially from fs/1000 to fs/2.
     level : float, default 1.0
         Root mean square of the excitation. A sweep peaks at ``sqrt(2) * level``.
-    amplifier : callable, optional
-        Maps the signal before the amplifier, (n,), to that after it; by default linear.
+    amplifier : callable, or sequence of J callables or None, optional
+        Maps the signal before the amplifier, (n,), to that after it; by default linear. One is used for all
+        loudspeakers.
     sensor_noise_std : float, default 0.0
-        Standard deviation of the noise of the microphone.
+        Standard deviation of the noise of the microphones.
     regularization : float, default 1e-5
         As in `estimate_path`.
     frequencies_hz : array_like, shape (n_frequencies,), optional
         Frequencies of the modelling error in Hz; by default 256, evenly spaced up to 0.45 fs, above which converters
         pass little.
+    loudspeakers : {"in turn", "at once"}, default "in turn"
+        How several loudspeakers play; a sweep only in turn.
 
     Returns
     -------
     IdentificationResult
-        Estimate, residual, modelling error over frequency and overall misalignment.
+        Estimate, residual, modelling error over frequency and overall misalignment, of each pair of a microphone and a
+        loudspeaker if there are several.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range, the run is too short, or the amplifier changes the shape of the signal.
+        If an argument is out of range, the run is too short, the amplifier changes the shape of the signal, or a path
+        is silent.
 
     Examples
     --------
@@ -176,31 +315,75 @@ def identify_secondary_path(
     ... )
     >>> result.misalignment_db < -40
     True
+
+    Two loudspeakers and two microphones, at once:
+
+    >>> paths = [[[0.0, 1.0, 0.2], [0.0, 0.0, 0.5]], [[0.0, 0.0, 0.4], [0.0, 0.9, 0.1]]]
+    >>> settings = dict(n_taps=3, duration_s=1.0, rng=1, fs=8000.0, sensor_noise_std=0.01)
+    >>> result = identify_secondary_path(paths, **settings, loudspeakers="at once")
+    >>> result.taps.shape, bool(result.misalignment_db.max() < -30)
+    ((2, 2, 3), True)
     """
-    fs = sampling_rate(secondary_path, fs, name="secondary_path")
-    true = path_taps(secondary_path, name="secondary_path")
+    several = is_path_matrix(secondary_path)
+    if several:
+        true, fs = sampled_path_matrix(secondary_path, fs, "secondary_path", SECONDARY_AXES)
+        _require_sound(true)
+    else:
+        fs = sampling_rate(secondary_path, fs, name="secondary_path")
+        true = path_taps(secondary_path, name="secondary_path").reshape(1, 1, -1)
+    K, J, _ = true.shape
     n_samples = round(as_positive(duration_s, "duration_s", unit="s") * fs)
     n_taps = as_count(n_taps, "n_taps")
-    if n_samples < 2 * n_taps - 1:
-        raise ValueError(
-            f"duration_s must be at least {(2 * n_taps - 1) / fs:.3g} s for {n_taps} taps, got {duration_s:g}"
-        )
+    in_turn = as_choice(loudspeakers, "loudspeakers", ("in turn", "at once")) == "in turn"
+    if excitation == "sweep" and J > 1 and not in_turn:
+        raise ValueError("loudspeakers must be 'in turn' for a sweep: several sweeps at once are the same signal")
+    needed = 2 * n_taps - 1 if in_turn else (J + 1) * n_taps - 1
+    if n_samples < needed:
+        raise ValueError(f"duration_s must be at least {needed / fs:.3g} s for {n_taps} taps, got {duration_s:g}")
     generator = as_generator(rng)
-    sent = _excitation(excitation, n_samples, fs, as_positive(level, "level"), generator)
-    received = _through(sent, amplifier, true)
-    received += as_nonnegative(sensor_noise_std, "sensor_noise_std") * generator.standard_normal(n_samples)
+    sent = np.array([_excitation(excitation, n_samples, fs, as_positive(level, "level"), generator) for _ in range(J)])
+    received = _through(sent, _amplifiers(amplifier, J), true)  # (J, K, n_samples)
+    received = received if in_turn else received.sum(axis=0)
+    received += as_nonnegative(sensor_noise_std, "sensor_noise_std") * generator.standard_normal(received.shape)
+    if not several:
+        sent, received = sent[0], received.reshape(-1)
 
     fitted = estimate_path(sent, received, n_taps, fs, regularization=regularization)
     if frequencies_hz is None:
         frequencies_hz = np.arange(1, 257) * 0.45 * fs / 256
+    found = fitted.taps.reshape(K, J, -1)
+    errors = np.array(
+        [[modelling_error_db(true[k, j], found[k, j], frequencies_hz, fs=fs) for j in range(J)] for k in range(K)]
+    )
+    misalignments = np.array([[misalignment_db(true[k, j], found[k, j]) for j in range(J)] for k in range(K)])
     return IdentificationResult(
         estimate=fitted.estimate,
         taps=fitted.taps,
         residual_db=fitted.residual_db,
         frequencies_hz=as_signal(frequencies_hz, "frequencies_hz"),
-        modelling_error_db=modelling_error_db(true, fitted.taps, frequencies_hz, fs=fs),
-        misalignment_db=misalignment_db(true, fitted.taps),
+        modelling_error_db=errors if several else errors[0, 0],
+        misalignment_db=misalignments if several else float(misalignments[0, 0]),
     )
+
+
+def _require_sound(paths: np.ndarray) -> None:
+    """Raise ValueError if a path is silent: an error relative to it is undefined."""
+    silent = np.argwhere(~np.any(paths, axis=2))
+    if silent.size:
+        k, j = silent[0]
+        raise ValueError(
+            f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
+            "loudspeaker if it is unplugged, or the microphone if it is dead"
+        )
+
+
+def _amplifiers(amplifier: Any, n_loudspeakers: int) -> list[Any]:
+    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
+    if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
+        raise TypeError(
+            f"amplifier must be a function of a signal, or one for each of the {n_loudspeakers} loudspeakers, or None"
+        )
+    return each
 
 
 def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.random.Generator) -> np.ndarray:
@@ -212,15 +395,19 @@ def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.rand
     return np.sqrt(2) * level * chirp(t, fs / 1000, n_samples / fs, fs / 2, method="logarithmic", phi=-90)
 
 
-def _through(sent: np.ndarray, amplifier: Callable[[np.ndarray], np.ndarray] | None, taps: np.ndarray) -> np.ndarray:
-    """Run a signal through the amplifier and the path."""
+def _through(sent: np.ndarray, amplifiers: list[Any], paths: np.ndarray) -> np.ndarray:
+    """Return what each loudspeaker alone adds to each microphone, (J, K, n_samples)."""
     from scipy.signal import lfilter
 
-    amplified = sent
-    if amplifier is not None:
-        # A copy, so that an amplifier that works in place does not change the excitation.
-        amplified = as_signal(amplifier(sent.copy()), "amplifier(excitation)", length=sent.size)
-    return lfilter(taps, 1.0, amplified)
+    received = np.empty((len(sent), len(paths), sent.shape[1]))
+    for j, amplifier in enumerate(amplifiers):
+        amplified = sent[j]
+        if amplifier is not None:
+            # A copy, so that an amplifier that works in place does not change the excitation.
+            amplified = as_signal(amplifier(sent[j].copy()), "amplifier(excitation)", length=sent.shape[1])
+        for k, row in enumerate(paths):
+            received[j, k] = lfilter(row[j], 1.0, amplified)
+    return received
 
 
 def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:

@@ -45,8 +45,29 @@ def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarra
     return np.triu(matrix) + np.triu(matrix, 1).T
 
 
+def cross_correlation_matrix(first: np.ndarray, second: np.ndarray, n_taps: int, start: int) -> np.ndarray:
+    """Return the mean of ``first[n - i] * second[n - j]`` over n >= start, shape (n_taps, n_taps).
+
+    As in `correlation_matrix`, each entry follows from the one above it to the left.
+    """
+    count = first.size - start
+    matrix = np.empty((n_taps, n_taps))
+    matrix[0] = cross_correlation(first[start:], second[start - n_taps + 1 :])
+    matrix[:, 0] = cross_correlation(second[start:], first[start - n_taps + 1 :])
+    entering = [signal[start - n_taps + 1 : start][::-1] for signal in (first, second)]
+    leaving = [signal[::-1][: n_taps - 1] for signal in (first, second)]
+    for i in range(n_taps - 1):
+        change = entering[0][i] * entering[1] - leaving[0][i] * leaving[1]
+        matrix[i + 1, 1:] = matrix[i, :-1] + change / count
+    return matrix
+
+
 def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a symmetric positive semidefinite system, leaving out directions without energy."""
+    """Solve a symmetric positive semidefinite system, leaving out directions without energy.
+
+    `right` is (n,), or (n_systems, n) for several right sides; the solution has its shape.
+    """
     values, vectors = np.linalg.eigh(matrix)
     kept = values > RANK_TOLERANCE * values[-1]
-    return vectors[:, kept] @ ((vectors[:, kept].T @ right) / values[kept])
+    solved = [vectors[:, kept] @ ((vectors[:, kept].T @ b) / values[kept]) for b in np.atleast_2d(right)]
+    return np.reshape(solved, right.shape)

@@ -16,6 +16,7 @@ from ..bounds.rated_power import required_rated_power
 from ..bounds.wiener import WienerSolution
 from ..paths.analysis import (
     STABILITY_BOUND_DEG,
+    CausalityMargin,
     causality_margin,
     energy_onset,
     frequency_response,
@@ -208,10 +209,15 @@ def plot_group_delay(
 def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = None, ax: Axes | None = None) -> Axes:
     """Draw the impulse responses of both paths, with their energy onsets and the margin between them.
 
+    With several channels, draw the margin of each microphone and loudspeaker as a table. A frame marks the pair that
+    decides: the best loudspeaker of the worst microphone.
+
     Parameters
     ----------
-    primary, secondary : control.TransferFunction or array_like, shape (n_taps,)
-        Paths with finite impulse responses.
+    primary : control.TransferFunction or array_like, shape (n_taps,) or (K, I, n_taps)
+        Primary paths with finite impulse responses.
+    secondary : control.TransferFunction or array_like, shape (n_taps,) or (K, J, n_taps)
+        Secondary paths with finite impulse responses.
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
     ax : matplotlib.axes.Axes, optional
@@ -238,9 +244,18 @@ def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = No
     >>> plt.close(ax.figure)
     """
     margin = causality_margin(primary, secondary, fs=fs)
-    onsets = (1e3 * margin.primary_onset_s, 1e3 * margin.secondary_onset_s)
     ax = new_axes(ax)
-    for i, (label, path) in enumerate((("Primary path P", primary), ("Secondary path S", secondary))):
+    if np.ndim(margin.secondary_onset_s) == 2:
+        _draw_margins(margin, ax)
+    else:
+        _draw_onsets(margin, {"Primary path P": primary, "Secondary path S": secondary}, ax)
+    return ax
+
+
+def _draw_onsets(margin: CausalityMargin, paths: Mapping[str, Any], ax: Axes) -> None:
+    """Draw a primary and a secondary path with their onsets."""
+    onsets = (1e3 * margin.primary_onset_s, 1e3 * margin.secondary_onset_s)
+    for i, (label, path) in enumerate(paths.items()):
         taps = path_taps(path)
         ax.plot(1e3 * np.arange(taps.size) / margin.fs, taps / np.abs(taps).max(), label=label, **line_style(i))
         ax.axvline(onsets[i], color=line_style(i)["color"], linewidth=0.8)
@@ -258,7 +273,32 @@ def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = No
     ax.set(xlabel="Time (ms)", ylabel="Impulse response / peak")
     ax.grid(True, alpha=0.3)
     legend_above(ax)
-    return ax
+
+
+def _draw_margins(margin: CausalityMargin, ax: Axes) -> None:
+    """Draw the margins of all pairs as a table: blue is causal, red is not, grey is a silent path."""
+    from matplotlib.patches import Rectangle
+
+    margins = 1e3 * margin.margins_s
+    heard = np.isfinite(margins)
+    largest = max(float(np.abs(margins[heard]).max()), 1e-9)
+    # Twice the range keeps the colours pale under the numbers.
+    shown = np.ma.masked_where(~heard, margins)
+    ax.imshow(shown, cmap="RdBu", vmin=-2 * largest, vmax=2 * largest, aspect="auto")
+    ax.set_facecolor("0.85")  # where no sound arrives
+    for (k, j), value in np.ndenumerate(margins):
+        ax.text(j, k, f"{value:.2f}" if heard[k, j] else "silent", ha="center", va="center", fontsize="small")
+    k, j = margin.deciding_pair
+    ax.add_patch(
+        Rectangle(
+            (j - 0.5, k - 0.5), 1, 1, fill=False, edgecolor="black", linewidth=2, clip_on=False,
+            label=f"margin of the whole: {1e3 * margin.margin_s:.2f} ms ({margin.margin_samples:.0f} samples)",
+        )
+    )  # fmt: skip
+    ax.set(xlabel="Loudspeaker (margins in ms)", ylabel="Microphone")
+    ax.set_xticks(range(margins.shape[1]))
+    ax.set_yticks(range(margins.shape[0]))
+    legend_above(ax)
 
 
 def plot_secondary_path_gain(
@@ -451,7 +491,7 @@ def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     results : IdentificationResult, or mapping of str to IdentificationResult
-        Identifications by legend entry.
+        Identifications by legend entry. One of several paths has a curve for each path.
     ax : matplotlib.axes.Axes, optional
         Axes to draw into, by default new ones.
 
@@ -481,8 +521,13 @@ def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
     for i, (label, result) in enumerate(_named(named).items()):
         if not isinstance(result, IdentificationResult):
             raise TypeError(f"results must hold IdentificationResult, got {type(result).__name__} for {label!r}")
-        text = f"{label}: {result.misalignment_db:.1f} dB overall"
-        ax.plot(result.frequencies_hz, result.modelling_error_db, label=text, **line_style(i))
+        overall = np.ravel(result.misalignment_db)
+        text = f"{label}: {overall[0]:.1f} dB overall"
+        if overall.size > 1:
+            text = f"{label}, {overall.size} paths: {overall.min():.1f} to {overall.max():.1f} dB overall"
+        errors = np.reshape(result.modelling_error_db, (overall.size, -1))
+        for n, error in enumerate(errors):
+            ax.plot(result.frequencies_hz, error, label=None if n else text, **line_style(i))
     ax.set_ylabel("Modelling error (dB)")
     frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))
     legend_above(ax)

@@ -1,6 +1,8 @@
 from .datasets import DataUnavailableError as DataUnavailableError
 from .datasets import MeasuredDuct as MeasuredDuct
+from .datasets import MeasuredRoom as MeasuredRoom
 from .datasets import load_measured_duct as load_measured_duct
+from .datasets import load_measured_room as load_measured_room
 from .generators import Bursts as Bursts
 from .generators import Compressor as Compressor
 from .generators import band_limited_noise as band_limited_noise

@@ -63,6 +63,11 @@ def test_group_delay_is_nan_at_a_zero_and_constant_for_linear_phase():
     np.testing.assert_allclose(delay, 15.5 / FS, rtol=1e-9)
 
 
+def _arriving(samples, n_taps=64):
+    """Return paths with a single tap each; none for -1."""
+    return np.vstack([np.eye(n_taps), np.zeros(n_taps)])[np.array(samples)]
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -83,6 +88,14 @@ def test_group_delay_is_nan_at_a_zero_and_constant_for_linear_phase():
         (lambda: causality_margin([1.0], [1.0], fs=FS, onset_share=1.0), "onset_share must be below 1"),
         (lambda: causality_margin([1.0], bandpass_path(32), fs=8000.0), "secondary is sampled at 16000"),
         (lambda: causality_margin(_iir()[2], [1.0], fs=FS), "primary has an infinite impulse response"),
+        (lambda: causality_margin(_arriving([[9]]), _arriving([[2], [3]]), fs=FS), "the same K microphones .* 1 and 2"),
+        (lambda: causality_margin(_arriving([[9]]), _arriving([[2]])), "fs must be given if primary is a tap array"),
+        (
+            lambda: causality_margin(_arriving([[9], [-1]]), _arriving([[2], [3]]), fs=FS),
+            r"primary\[1\] must not be all",
+        ),
+        (lambda: causality_margin(_arriving([[9]]), _arriving([[-1, -1]]), fs=FS), "no loudspeaker reaches that"),
+        (lambda: causality_margin(_arriving([[9]]), np.ones((1, 8)), fs=FS), r"secondary must have shape \(K micro"),
     ],
 )
 def test_analysis_refuses(call, message):
@@ -180,3 +193,56 @@ def test_repr_of_a_causality_margin_is_the_margin():
     early, late = np.eye(1, 30, 5)[0], np.eye(1, 30, 25)[0]
     assert repr(causality_margin(late, early, fs=16000.0)) == "<CausalityMargin: 1.25 ms, 20 samples>"
     assert repr(causality_margin(early, late, fs=16000.0)) == "<CausalityMargin: -1.25 ms, -20 samples>"
+
+
+def test_margins_of_several_channels_are_those_of_their_pairs():
+    rng = np.random.default_rng(2)
+    primary = rng.standard_normal((3, 2, 80)) * np.exp(-np.arange(80) / 20)
+    primary = np.pad(primary, [(0, 0), (0, 0), (40, 0)])
+    secondary = rng.standard_normal((3, 4, 90)) * np.exp(-np.abs(np.arange(90) - rng.integers(5, 30, (3, 4, 1))))
+    margin = causality_margin(primary, secondary, fs=FS, band=(200.0, 3000.0))
+    for of_pairs, of_pair in (("margins_s", "margin_s"), ("group_delay_margins_s", "group_delay_margin_s")):
+        pairs = np.array(
+            [
+                [
+                    [getattr(causality_margin(p, s, fs=FS, band=(200.0, 3000.0)), of_pair) for p in primary[k]]
+                    for s in secondary[k]
+                ]
+                for k in range(3)
+            ]
+        ).min(axis=2)  # of the reference that arrives first
+        np.testing.assert_allclose(getattr(margin, of_pairs), pairs, atol=1e-15)
+        # At each microphone the best loudspeaker, and of these the worst.
+        assert getattr(margin, of_pair) == pytest.approx(min(max(row) for row in pairs.tolist()), abs=1e-15)
+    assert margin.margins_s[margin.deciding_pair] == margin.margin_s
+    assert margin.margin_samples == margin.margin_s * FS
+
+
+def test_margins_of_systems_are_those_of_their_taps():
+    delays = [[9, 30], [12, 5]]
+    secondary = [[fir_path(_arriving(n, 32), FS) for n in row] for row in delays]
+    primary = [[fir_path(_arriving(20, 32), FS)], [fir_path(_arriving(25, 32), FS)]]
+    margin = causality_margin(primary, secondary)
+    np.testing.assert_allclose(margin.margins_s * FS, [[11, -10], [13, 20]], atol=1e-9)
+    assert margin.margin_samples == pytest.approx(11)
+    assert margin.deciding_pair == (0, 0)
+    with pytest.raises(ValueError, match="secondary is sampled at 16000"):
+        causality_margin(_arriving([[9], [9]]), secondary, fs=8000.0)
+
+
+def test_an_unplugged_loudspeaker_does_not_decide_the_margin():
+    margin = causality_margin(_arriving([[20], [22]]), _arriving([[-1, 15], [-1, 30]]), fs=FS)
+    np.testing.assert_allclose(margin.margins_s * FS, [[-np.inf, 5], [-np.inf, -8]], atol=1e-9)
+    assert margin.margin_samples == pytest.approx(-8)
+    assert margin.group_delay_margin_samples == pytest.approx(-8)
+    assert margin.deciding_pair == (1, 1)
+    assert repr(margin) == "<CausalityMargin of 2 microphone(s) and 2 loudspeaker(s): -0.5 ms, -8 samples>"
+
+
+def test_a_single_pair_has_its_margin_as_a_matrix_too():
+    margin = causality_margin(_arriving(20), _arriving(4), fs=FS)
+    assert margin.margins_s.tolist() == [[margin.margin_s]]
+    assert margin.deciding_pair == (0, 0)
+    assert isinstance(margin.margin_s, float)
+    as_matrix = causality_margin(_arriving([[20]]), _arriving(4), fs=FS)
+    assert as_matrix.margin_s == margin.margin_s

@@ -88,6 +88,20 @@ def test_causality_margin_is_written_out(primary, secondary, text):
     assert _labels(ax) == ["Primary path P", "Secondary path S"]
 
 
+def test_causality_margins_of_several_channels_are_a_table():
+    delays = np.array([[10, 38], [20, 24], [-1, 12]])  # -1: silent
+    secondary = np.vstack([np.eye(64), np.zeros(64)])[delays]
+    primary = np.eye(64)[[[30], [36], [44]]]
+    ax = plot_causality_margin(primary, secondary, fs=FS)
+    ax.figure.canvas.draw()
+    expected = [["1.25", "-0.50"], ["1.00", "0.75"], ["silent", "2.00"]]
+    written = {text.get_position(): text.get_text() for text in ax.texts}
+    assert written == {(j, k): expected[k][j] for k in range(3) for j in range(2)}
+    assert _labels(ax) == ["margin of the whole: 1.00 ms (16 samples)"]
+    assert ax.patches[0].get_xy() == (-0.5, 0.5)  # loudspeaker 0 at microphone 1
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Loudspeaker (margins in ms)", "Microphone")
+
+
 def test_secondary_path_gain_for_band_and_reference():
     noise = np.random.default_rng(0).standard_normal(5000)
     ax = plot_secondary_path_gain(S, band=(200.0, 2000.0), reference=noise)
@@ -143,6 +157,18 @@ def test_modelling_error_of_several_runs():
     np.testing.assert_array_equal(ax.get_lines()[0].get_ydata(), results["white"].modelling_error_db)
     assert _labels(ax)[0].startswith("white: -")
     assert len(plot_modelling_error(results["white"]).get_lines()) == 1
+
+
+def test_modelling_error_of_several_paths_has_a_curve_for_each():
+    taps = path_taps(S)
+    paths = np.array([[taps, 0.5 * taps, taps[::-1]], [2 * taps, -taps, taps]])
+    result = identify_secondary_path(paths, n_taps=32, duration_s=0.2, rng=0, fs=FS, sensor_noise_std=0.1)
+    ax = plot_modelling_error({"in turn": result})
+    ax.figure.canvas.draw()
+    assert len(ax.get_lines()) == 6
+    np.testing.assert_array_equal(ax.get_lines()[4].get_ydata(), result.modelling_error_db[1, 1])
+    low, high = result.misalignment_db.min(), result.misalignment_db.max()
+    assert _labels(ax) == [f"in turn, 6 paths: {low:.1f} to {high:.1f} dB overall"]
 
 
 @pytest.mark.parametrize(

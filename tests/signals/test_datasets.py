@@ -187,9 +187,9 @@ def test_download_without_pooch_says_what_to_install(monkeypatch):
 
 
 def test_pinned_hashes_are_those_of_the_published_files(shared_data):
-    assert set(datasets._HASHES) == set(datasets._URLS) == set(FILES)
-    for name, expected in datasets._HASHES.items():
-        assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == expected
+    assert set(datasets._HASHES) == set(datasets._URLS) >= set(FILES)
+    for name in FILES:
+        assert hashlib.sha256((shared_data / name).read_bytes()).hexdigest() == datasets._HASHES[name]
 
 
 def test_measured_duct_of_own_signals_is_checked():

@@ -1,0 +1,110 @@
+"""The measured room of four loudspeakers and microphones; no test reaches for the network."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from kfopc_filterpy.signals import DataUnavailableError, MeasuredRoom, datasets, load_measured_room
+
+EACH = range(1, 5)
+NAMES = [f"P{k}" for k in EACH] + [f"S{k}{j}" for k in EACH for j in EACH]
+SOURCE = "https://raw.githubusercontent.com/ShiDongyuan/Meta/dd99aaa351c397090ab7efc03f02a84b669cf302/path"
+
+
+@pytest.fixture
+def own_files(tmp_path, monkeypatch):
+    """A folder of small files in the published layout, which counts as the published one: S{k}{j} holds k and j."""
+    monkeypatch.delenv("KFOPC_DATA", raising=False)
+    (tmp_path / "room4x4").mkdir()
+    for name in NAMES:
+        path = tmp_path / "room4x4" / f"{name}.mat"
+        scipy.io.savemat(path, {name: np.array([[float(digit)] for digit in name[1:]])})
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        monkeypatch.setitem(datasets._HASHES, f"room4x4/{name}.mat", digest)
+    return tmp_path
+
+
+def test_published_room_has_its_known_contents(shared_data):
+    if not (shared_data / "room4x4").is_dir():
+        pytest.skip(f"no measured room: {shared_data} has no folder room4x4")
+    room = load_measured_room(shared_data)
+    assert (room.primary.shape, room.secondary.shape, room.fs) == ((4, 1, 256), (4, 4, 256), 16000)
+    expected = scipy.io.loadmat(shared_data / "room4x4" / "S23.mat")["S23"][:, 0]
+    np.testing.assert_array_equal(room.secondary[1, 2], expected)
+    np.testing.assert_array_equal(room.primary[3, 0], scipy.io.loadmat(shared_data / "room4x4" / "P4.mat")["P4"][:, 0])
+    # The noise arrives 30 samples in, after every loudspeaker's sound: control is causal.
+    onset = np.argmax(
+        np.cumsum(room.secondary**2, axis=2) > 0.01 * np.sum(room.secondary**2, axis=2)[..., None], axis=2
+    )
+    assert 8 <= onset.min() < onset.max() <= 14
+
+
+def test_first_index_is_the_microphone_and_second_the_loudspeaker(own_files):
+    room = load_measured_room(own_files)
+    for k in EACH:
+        assert room.primary[k - 1, 0].tolist() == [k]
+        for j in EACH:
+            assert room.secondary[k - 1, j - 1].tolist() == [k, j]
+
+
+def test_room_is_found_through_the_environment(own_files, monkeypatch):
+    with pytest.raises(DataUnavailableError, match="no folder with the measured room is named: pass folder"):
+        load_measured_room()
+    monkeypatch.setenv("KFOPC_DATA", str(own_files))
+    assert load_measured_room().secondary.shape == (4, 4, 2)
+    (own_files / "room4x4" / "S41.mat").unlink()
+    with pytest.raises(DataUnavailableError, match=rf"S41\.mat is missing: put {SOURCE}/S41\.mat there"):
+        load_measured_room()
+
+
+def test_changed_file_of_the_room_is_refused(own_files):
+    path = own_files / "room4x4" / "P3.mat"
+    path.write_bytes(path.read_bytes() + b"\0")
+    with pytest.raises(DataUnavailableError, match=r"P3\.mat is not the published file"):
+        load_measured_room(own_files)
+
+
+def test_download_asks_once_for_each_file_of_the_room(own_files, monkeypatch):
+    pooch = pytest.importorskip("pooch")
+    asked = []
+
+    class Downloader:
+        def __init__(self, timeout):
+            self.timeout = timeout
+
+        def __call__(self, url, output_file, _):
+            asked.append((url, self.timeout))
+            Path(output_file).write_bytes((own_files / "room4x4" / url.rsplit("/", 1)[1]).read_bytes())
+
+    monkeypatch.setattr(pooch, "HTTPDownloader", Downloader)
+    monkeypatch.setattr(pooch, "os_cache", lambda name: own_files / "cache" / name)
+    for _ in range(2):
+        assert load_measured_room(allow_download=True, timeout_s=2.5).secondary[3, 1].tolist() == [4, 2]
+    assert sorted(asked) == sorted((f"{SOURCE}/{name}.mat", 2.5) for name in NAMES)
+
+
+def test_pinned_files_of_the_room_are_the_published_ones(shared_data):
+    if not (shared_data / "room4x4").is_dir():
+        pytest.skip(f"no measured room: {shared_data} has no folder room4x4")
+    for name in NAMES:
+        content = (shared_data / "room4x4" / f"{name}.mat").read_bytes()
+        assert hashlib.sha256(content).hexdigest() == datasets._HASHES[f"room4x4/{name}.mat"]
+        assert datasets._URLS[f"room4x4/{name}.mat"] == f"{SOURCE}/{name}.mat"
+
+
+def test_measured_room_of_own_paths_is_checked():
+    room = MeasuredRoom(np.ones((2, 1, 3), dtype=int), np.ones((2, 2, 3)), fs=8000)
+    assert room.primary.dtype == np.float64
+    with pytest.raises(AttributeError):
+        room.fs = 1
+    with pytest.raises(ValueError, match=r"secondary must have shape \(K microphones, inputs, taps\), got \(2, 3\)"):
+        MeasuredRoom(np.ones((2, 1, 3)), np.ones((2, 3)))
+    with pytest.raises(ValueError, match=r"must have the same K microphones as their first axis, got 3 and 2"):
+        MeasuredRoom(np.ones((3, 1, 3)), np.ones((2, 2, 3)))
+    with pytest.raises(ValueError, match="primary must be finite"):
+        MeasuredRoom(np.full((2, 1, 3), np.nan), np.ones((2, 2, 3)))
+    with pytest.raises(ValueError, match="fs must be greater than 0"):
+        MeasuredRoom(np.ones((2, 1, 3)), np.ones((2, 2, 3)), fs=0)
