@@ -8,26 +8,26 @@ import numpy as np
 
 from .._validate import as_positive
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
-from .lms import LMSController, advance_powers, change_weights
-from .step import Lines, adapt
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_weights
+from .step import Lines, adapt, advance_powers
 
 
 class FxLMSState(NamedTuple):
     """State of `FxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
 
 
 @adapt.register(FxLMSState)
 def adapt_fxlms(state, error, control_signal):
     """Set w(n+1) = w(n) + mu e(n) x'(n)."""
-    finite, _, _ = advance_powers(state, error)
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
+        change_weights(state.lines, state.weights, 1.0, state.step_size, error, 0.0)
     return finite
 
 
@@ -70,7 +70,13 @@ class FxLMS(LMSController):
     name = "FxLMS"
 
     def __init__(
-        self, n_taps: int, secondary_path: Any, *, step_size: float, limiter: OutputLimiter | None = None
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
         self._state = FxLMSState(*self._common(), as_positive(step_size, "step_size"))

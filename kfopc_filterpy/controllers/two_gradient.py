@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_positive
+from ..kernels.vectors import at
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
-from .lms import LMSController, advance_powers, change_weights
-from .step import Lines, adapt
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_filter
+from .step import Lines, adapt, advance_powers, loudspeakers
 
 
 class TwoGradientState(NamedTuple):
     """State of `TwoGradientFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
-    amplitude_limit: float
+    amplitude_limit: float | np.ndarray  # (J,)
     output_step_size: float
 
 
 @adapt.register(TwoGradientState)
 def adapt_two_gradient(state, error, control_signal):
     """Descend the gradient of the squared error within the limit, that of the control power beyond it."""
-    finite, _, _ = advance_powers(state, error)
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        if abs(control_signal) > state.amplitude_limit:
-            change_weights(state.weights, state.lines, 1.0, 0.0, state.output_step_size * control_signal)
-        else:
-            change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
+        for j in range(loudspeakers(state.lines)):
+            y = at(control_signal, j)
+            if abs(y) > at(state.amplitude_limit, j):
+                change_filter(state.lines, state.weights, j, 1.0, 0.0, error, state.output_step_size * y)
+            else:
+                change_filter(state.lines, state.weights, j, 1.0, state.step_size, error, 0.0)
     return finite
 
 
@@ -85,19 +90,20 @@ class TwoGradientFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        amplitude_limit: float,
+        amplitude_limit: float | Sequence[float] | np.ndarray,
         output_step_size: float | None = None,
-        limiter: OutputLimiter | None = None,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), as_positive(amplitude_limit, "amplitude_limit")
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
+        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
         second = step if output_step_size is None else as_positive(output_step_size, "output_step_size")
         self._state = TwoGradientState(*self._common(), step, limit, second)
 
     @property
-    def amplitude_limit(self) -> float:
-        """Amplitude limit A of the control signal."""
-        return self._state.amplitude_limit
+    def amplitude_limit(self) -> Any:
+        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
+        return copy(self._state.amplitude_limit)
 
     @property
     def output_step_size(self) -> float:

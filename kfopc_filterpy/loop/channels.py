@@ -11,20 +11,13 @@ from scipy.signal import fftconvolve
 
 from .._validate import as_channels, as_count, as_positive
 from ..controllers.base import FilteredReferenceController
-from ..controllers.channels import (
-    ChannelController,
-    amplifier_models,
-    delay_lines,
-    emit_channels,
-    per_loudspeaker,
-)
-from ..controllers.step import adapt, control_filter
+from ..controllers.channels import amplifier_models, delay_lines, per_loudspeaker
+from ..controllers.step import adapt, control_filter, emit
 from ..kernels.borrowing import borrowed
 from ..kernels.compiling import compiled, compiled_for_states, inlined
 from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import dot
-from ..paths.channels import path_matrix, primary_paths, secondary_paths
-from ..paths.models import is_system
+from ..paths.channels import has_channels, path_matrix, primary_paths, secondary_paths
 from ..power.amplifiers import amplify, compiled_model
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, naming_sample, switch_on_sample
 from .result import SimulationResult
@@ -90,8 +83,7 @@ def run_channels(state, plant, signals, weights, limit, every, first, begin, end
     x, e = np.empty(signals.reference.shape[0]), np.empty(signals.error.shape[0])
     for n in range(begin, end):
         hear(plant, signals, n, x)
-        emit_channels(state, x)
-        y = state.lines.control_signal
+        y = emit(state, x)
         for j in range(y.size):
             if not abs(y[j]) <= limit[j]:
                 return DIVERGED, n
@@ -131,7 +123,7 @@ class ChannelRun:
 
     def stretch(self, signals: ChannelStretch, first: int, compiled: bool) -> tuple[int, int]:
         """Run a stretch; return the status and the first sample not done."""
-        own = isinstance(self.controller, ChannelController) and not any(self.amplifiers)
+        own = isinstance(self.controller, FilteredReferenceController) and not any(self.amplifiers)
         state = self.controller.compiled_state() if compiled and own else None
         return self._steps(signals, first) if state is None else self._blocks(state, signals, first)
 
@@ -195,11 +187,8 @@ class ChannelRun:
 
 def is_multichannel(controller: Any, reference: Any, secondary_path: Any, disturbance: Any) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
-    if isinstance(controller, ChannelController) or np.ndim(reference) == 2 or np.ndim(disturbance) == 2:
-        return True
-    return (not is_system(secondary_path) and np.ndim(np.asarray(secondary_path, dtype=object)) > 1) or (
-        is_system(secondary_path) and (secondary_path.noutputs, secondary_path.ninputs) != (1, 1)
-    )
+    own = isinstance(controller, FilteredReferenceController) and controller.multichannel
+    return own or np.ndim(reference) == 2 or np.ndim(disturbance) == 2 or has_channels(secondary_path)
 
 
 def filters_of(controller: Any) -> Any:
@@ -235,7 +224,7 @@ def simulate_channels(
     rated = None if rated is None else per_loudspeaker(rated, J, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
-    if isinstance(controller, ChannelController):
+    if isinstance(controller, FilteredReferenceController):
         controller.require_sample_rate(fs)
     if on:
         if not hasattr(controller, "listen"):
@@ -295,10 +284,10 @@ def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float,
 
 def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_microphones: int) -> None:
     """Raise ValueError if a built-in controller is made for other numbers of channels."""
-    if isinstance(controller, FilteredReferenceController):
-        raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
-    if not isinstance(controller, ChannelController):
+    if not isinstance(controller, FilteredReferenceController):
         return
+    if not controller.multichannel:
+        raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
     counts = {
         "references": (controller.n_references, n_references),
         "loudspeakers": (controller.n_loudspeakers, n_loudspeakers),

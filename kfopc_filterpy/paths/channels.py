@@ -10,6 +10,13 @@ from .._validate import as_real_array, require_finite
 from .models import is_system, path_taps, sampling_rate
 
 
+def has_channels(paths: Any) -> bool:
+    """Return whether paths are given for several channels, (outputs, inputs, taps), be they one of each."""
+    if is_system(paths):
+        return (paths.noutputs, paths.ninputs) != (1, 1)
+    return np.ndim(np.asarray(paths, dtype=object)) > 1
+
+
 def secondary_paths(
     paths: Any, *, fs: float | None = None, name: str = "secondary_path"
 ) -> tuple[np.ndarray, float | None]:
