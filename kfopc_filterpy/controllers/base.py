@@ -16,7 +16,7 @@ from ..paths.models import is_system, path_taps, sampling_rate
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .channels import ChannelLines, channel_lines, channel_sample, per_loudspeaker
+from .channels import channel_lines, channel_sample, per_loudspeaker
 from .step import Lines, adapt_once, emit_once, estimate_once, listen
 
 NO_SOLUTION = (
@@ -31,7 +31,9 @@ OVERFLOW = (
 )
 
 
-MULTICHANNEL = "FxLMS and its leaky, MOV, two-gradient, re-scaling and clipping forms, SharedGainKalman"
+MULTICHANNEL = (
+    "FxLMS, LeakyFxLMS, OptimalLeakyFxLMS, MOVFxLMS, TwoGradientFxLMS, RescalingFxLMS, ClippingFxLMS, SharedGainKalman"
+)
 
 Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
@@ -149,18 +151,18 @@ class FilteredReferenceController:
         secondary = self._read_paths(secondary_path, n_references, multichannel)
         self._limiter = self._checked_limiter(limiter)
         filtered_taps = self.n_taps if filtered_taps is None else filtered_taps
-        self._lines = self._new_lines(secondary, amplifier, filtered_taps, max(self.n_taps, history))
+        self._lines: Any = self._new_lines(secondary, amplifier, filtered_taps, max(self.n_taps, history))
         self._constrained = constraint is not None
         self._own_constraint = self._checked_constraint(constraint)
-        self._y: Any = self._lines.control_signal if isinstance(self._lines, ChannelLines) else 0.0
+        self._y: Any = self._lines.control_signal if self.multichannel else 0.0
 
     def _read_paths(self, paths: Any, n_references: int | None, multichannel: bool | None) -> np.ndarray:
         """Set the numbers of channels and return the taps of the secondary path."""
         several = has_channels(paths)
         if several and n_references is None:
             raise ValueError(
-                f"{self.name} takes one channel: secondary_path must be one-dimensional, (taps,), or a system of one "
-                f"input and one output; several channels: {MULTICHANNEL}"
+                f"{type(self).__name__} takes one channel: secondary_path must be one-dimensional, (taps,), or a system "
+                f"of one input and one output. These take several channels: {MULTICHANNEL}"
             )
         self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
         self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
@@ -173,9 +175,7 @@ class FilteredReferenceController:
         self._path_fs = sampling_rate(paths, name="secondary_path") if is_system(paths) else None
         return secondary
 
-    def _new_lines(
-        self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int
-    ) -> Lines | ChannelLines:
+    def _new_lines(self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int) -> Any:
         if self.multichannel:
             return channel_lines(
                 secondary,
@@ -233,7 +233,7 @@ class FilteredReferenceController:
         """Return a checked number; with several channels (J,), from one number or one for each loudspeaker."""
         return per_loudspeaker(value, self.n_loudspeakers, name, check) if self.multichannel else check(value, name)
 
-    def _common(self) -> tuple[Lines | ChannelLines, np.ndarray, Any]:
+    def _common(self) -> tuple[Any, np.ndarray, Any]:
         """Return the first fields of every state: lines, weights, constraint."""
         shape = (self.n_loudspeakers, self.n_references, self.n_taps) if self.multichannel else self.n_taps
         return self._lines, np.zeros(shape), states_of(self._own_constraint)

@@ -42,15 +42,17 @@ adapt.register(ClippingState)(adapt_fxlms)
 class ClippingFxLMS(LMSController):
     r"""Clipping FxLMS: the control signal is clipped to the limit, the weights adapt as in `FxLMS`.
 
+    With several loudspeakers, each control signal is clipped to its own limit.
+
     While the noise needs more than the limit, the error no longer falls, the weights keep growing and the control
     signal becomes a square wave. The paper's introduction warns of this; the algorithm is here for comparison.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    amplitude_limit : float
-        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    amplitude_limit : float or array_like, shape (J,)
+        Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
 
     Raises
     ------

@@ -106,14 +106,17 @@ def adapt_rated_leaky(state, error, control_signal):
 class LeakyFxLMS(LMSController):
     r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
 
-    The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`.
+    The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`. With
+    several channels this is :math:`\sum_k E[e_k^2] + \sum_j \gamma_j \sum_i w_{ji}^T w_{ji}`, and a leak also keeps
+    the weights finite where loudspeakers are interchangeable.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    leak : float
-        Leak gamma, zero or above, in the unit of the squared reference; `leak_factor` computes it for a rated power.
+    leak : float or array_like, shape (J,)
+        Leak gamma, or that of each loudspeaker, zero or above, in the unit of the squared reference; `leak_factor`
+        computes it for a rated power.
 
     Raises
     ------
@@ -169,17 +172,18 @@ class OptimalLeakyFxLMS(LMSController):
 
     .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
 
-    The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC.
+    The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC. With several loudspeakers, each has
+    its own gamma, from the sums stated in `MOVFxLMS`.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size
+    n_taps, secondary_path, step_size, n_references
         As for `FxLMS`.
-    rated_power : float, optional
-        Rated output power rho_o.
-    constraint : OutputPowerConstraint, optional
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power rho_o, or that of each loudspeaker.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
-    amplifier : callable, optional
+    amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
         As for `FxLMS`.

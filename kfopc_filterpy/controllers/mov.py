@@ -119,20 +119,25 @@ class MOVFxLMS(LMSController):
     in KF-OPC, so the penalty varies with the noise (Lai et al. 2023); the argument `penalty_factor` fixes it (Shi et
     al. 2021). The weights settle at about :math:`(R_{x'} + \gamma R_x) w = r`.
 
+    With several channels, loudspeaker j has the penalty gamma_j, from its own rated power, the disturbance power
+    :math:`\sum_k E[d_k^2]` and the gain :math:`G_j = \sum_{ki} E[x'^2_{kji}] / \sum_i E[x_i^2]`. This extension is ours.
+    It assumes that the loudspeaker has to cancel the whole disturbance alone, so several loudspeakers that share the
+    work usually stay well below their rated powers.
+
     Parameters
     ----------
-    n_taps, secondary_path, step_size
+    n_taps, secondary_path, step_size, n_references
         As for `FxLMS`.
-    rated_power : float, optional
-        Rated output power rho_o.
-    constraint : OutputPowerConstraint, optional
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power rho_o, or that of each loudspeaker.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
-    amplifier : callable, optional
+    amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
         As for `FxLMS`.
-    penalty_factor : float, optional
-        Fixed penalty factor gamma, zero or above; the function `penalty_factor` computes it for a rated power. By
+    penalty_factor : float or array_like, shape (J,), optional
+        Fixed penalty factor gamma, or that of each loudspeaker, zero or above; the function `penalty_factor` computes it for a rated power. By
         default gamma follows the running powers.
     modified : bool, default False
         Adapt to ``d^ - w' x'`` instead of the error, in the modified structure of Lai et al. The delay of the secondary

@@ -47,14 +47,15 @@ class RescalingFxLMS(LMSController):
 
     .. math:: \text{if } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
 
-    The step of `FxLMS` follows. Between two such samples the filter is linear.
+    The step of `FxLMS` follows. Between two such samples the filter is linear. With several loudspeakers, each has its
+    own limit, and only the control filters of a loudspeaker beyond it are scaled.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    amplitude_limit : float
-        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    amplitude_limit : float or array_like, shape (J,)
+        Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
 
     Raises
     ------

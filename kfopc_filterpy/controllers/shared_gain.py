@@ -235,6 +235,10 @@ class SharedGainKalman(FilteredReferenceController):
             parts.append("rated power " + ", ".join(f"{power:g}" for power in self._rated))
         return f"<{self.name}: {', '.join(parts)}>"
 
+    @property
+    def _powers_fs(self) -> float:
+        return self.fs
+
     def samples_to_block(self) -> int:
         """Return the number of samples until the next solution."""
         return max(self.block - int(self._state.numbers["waiting"][0]), 1)

@@ -49,14 +49,15 @@ class TwoGradientFxLMS(LMSController):
 
     The control signal is not clipped. It settles above the limit, at the balance of the two directions, and closer to
     the limit the larger mu_y / mu is. For a tone that needs three times the limit, equal step sizes give an amplitude
-    of 1.2 A.
+    of 1.2 A. With several loudspeakers, each chooses its direction by its own control signal and limit; the direction
+    within the limit is that of the multiple-error LMS (see `FxLMS`).
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    amplitude_limit : float
-        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    amplitude_limit : float or array_like, shape (J,)
+        Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
     output_step_size : float, optional
         Step size of the second direction, above zero; by default that of the first.
 

@@ -43,6 +43,7 @@ class ChannelStretch(NamedTuple):
     anti_noise: np.ndarray  # (K, n)
     control_signal: np.ndarray  # (J, n)
     amplifier_output: np.ndarray  # (J, n)
+    constraint_factor: np.ndarray  # (J, n)
 
 
 @inlined
@@ -92,6 +93,8 @@ def run_channels(state, plant, signals, weights, limit, every, first, begin, end
             e[k] = signals.error[k, n]
         if not adapt(state, e, y):
             return REFUSED, n
+        for j in range(y.size):
+            signals.constraint_factor[j, n] = state.lines.constraint_factor[j]
         if weights.shape[0] > 0 and (first + n) % every == 0:
             weights[(first + n) // every] = control_filter(state)
     return RUNNING, end
@@ -158,6 +161,7 @@ class ChannelRun:
                     return DIVERGED, n
                 self._play(y, signals, n)
                 self.controller.update(signals.error[:, n].copy())
+            signals.constraint_factor[:, n] = getattr(self.controller, "constraint_factor", np.nan)
             if self.weights.shape[0] > 0 and (first + n) % self.every == 0:
                 self.weights[(first + n) // self.every] = filters_of(self.controller)
             if self.progress:
@@ -238,7 +242,7 @@ def simulate_channels(
     signals = ChannelStretch(
         *(np.ascontiguousarray(s) for s in (x, d, np.zeros(d.shape) + noise.take(K, d.shape[1]))),
         *np.full((2, *d.shape), np.nan),
-        *np.full((2, J, d.shape[1]), np.nan),
+        *np.full((3, J, d.shape[1]), np.nan),
     )
     status, end = run.stretch(signals, 0, compiled)
     if status == DIVERGED:
@@ -255,7 +259,7 @@ def simulate_channels(
         control_signal=signals.control_signal,
         amplifier_output=signals.amplifier_output,
         anti_noise=signals.anti_noise,
-        constraint_factor=np.full((J, d.shape[1]), getattr(controller, "constraint_factor", np.nan)),
+        constraint_factor=signals.constraint_factor,
         weights=weights if every else None,
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
         diverged_at_s=end / fs if status == DIVERGED else None,
