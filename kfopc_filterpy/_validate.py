@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -95,15 +95,17 @@ def as_positive(value: Any, name: str, *, unit: str = "") -> float:
     return number
 
 
-def per_loudspeaker(value: Any, n_loudspeakers: int, name: str) -> np.ndarray:
-    """Return one positive number, or one for each loudspeaker, as (J,)."""
+def per_loudspeaker(
+    value: Any, n_loudspeakers: int, name: str, check: Callable[[Any, str], float] = as_positive
+) -> np.ndarray:
+    """Return one number, or one for each loudspeaker, as (J,); each must pass `check`."""
     numbers = as_real_array(value, name)
     if numbers.shape not in ((), (n_loudspeakers,)):
         raise ValueError(
             f"{name} must be one number or one for each of the {n_loudspeakers} loudspeakers, ({n_loudspeakers},), "
             f"got shape {numbers.shape}"
         )
-    return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, n_loudspeakers)])
+    return np.array([check(number, name) for number in np.broadcast_to(numbers, n_loudspeakers)])
 
 
 def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:

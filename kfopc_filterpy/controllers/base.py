@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from .._validate import as_count, as_number, as_signal
+from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
 from ..kernels.delay_lines import delay_line, latest, newest
 from ..kernels.holding import Held
+from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
 from ..power.amplifiers import Amplifier, compiled_model
-from ..power.constraint import ConstraintState, OutputPowerConstraint
+from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
+from .channels import channel_lines, channel_sample
 from .step import Lines, adapt_once, emit_once, estimate_once, listen
 
 NO_SOLUTION = (
@@ -27,6 +29,13 @@ OVERFLOW = (
     "the disturbance estimate, the reference and the filtered reference must have finite squares, and one overflows: "
     "nothing was changed; scale the signals, or use a smaller step"
 )
+
+
+MULTICHANNEL = (
+    "FxLMS, LeakyFxLMS, OptimalLeakyFxLMS, MOVFxLMS, TwoGradientFxLMS, RescalingFxLMS, ClippingFxLMS, SharedGainKalman"
+)
+
+Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
 
 @runtime_checkable
@@ -47,20 +56,25 @@ class Controller(Protocol):
         ...
 
 
-def constraint_for(rated_power: float | None, constraint: OutputPowerConstraint | None) -> OutputPowerConstraint:
-    """Return a new constraint for a controller: a copy of the one given, or one with default settings."""
+def constraint_for(rated_power: Any, constraint: Any) -> Any:
+    """Return a new constraint for a controller: a copy of the one given, or one with default settings.
+
+    Several rated powers or constraints, one for each loudspeaker, give a tuple.
+    """
     if (rated_power is None) == (constraint is None):
         raise ValueError("give either rated_power= or constraint=, an OutputPowerConstraint")
+    if isinstance(constraint, list | tuple):
+        return tuple(constraint_for(None, one) for one in constraint)
     if constraint is None:
-        return OutputPowerConstraint(rated_power)  # type: ignore[arg-type]
+        if np.ndim(rated_power) == 1:
+            return tuple(OutputPowerConstraint(power) for power in rated_power)
+        return OutputPowerConstraint(rated_power)
     if not isinstance(constraint, OutputPowerConstraint):
         raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {constraint!r}")
     return deepcopy(constraint)
 
 
-def constraint_or_none(
-    rated_power: float | None, constraint: OutputPowerConstraint | None
-) -> OutputPowerConstraint | None:
+def constraint_or_none(rated_power: Any, constraint: Any) -> Any:
     """Return `constraint_for`, or None if neither a rated power nor a constraint is given."""
     return None if rated_power is None and constraint is None else constraint_for(rated_power, constraint)
 
@@ -84,15 +98,33 @@ class FilteredReferenceController:
     n_taps : int
         Taps L of the control filter.
     secondary_path : array_like or control.TransferFunction
-        Estimated secondary path s^, taps or an FIR system.
+        Estimated secondary path s^, taps or an FIR system; with several channels (K microphones, J loudspeakers, taps)
+        or a matrix of systems.
+    n_references : int, optional
+        Number of references I of an algorithm that takes several channels. By default it takes one channel only.
+    multichannel : bool, optional
+        Whether signals have a channel axis; by default if the secondary path has channel axes or there are several
+        references.
     amplifier : callable, optional
-        Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published.
+        Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y as published. With several
+        channels also a sequence, one for each loudspeaker.
     constraint : OutputPowerConstraint, optional
-        Constraint that computes the powers and the factor; by default one whose factor is fixed at 1.
+        Constraint that computes the powers and the factor; by default one whose factor is fixed at 1. With several
+        channels also a tuple, one for each loudspeaker.
     limiter : OutputLimiter, optional
-        Limiter of the control signal, see `limiter`.
+        Limiter of the control signal, see `limiter`. With several channels a sequence, one for each loudspeaker.
     filtered_taps : int, optional
-        Number of samples stored of the filtered reference; by default `n_taps`.
+        Number of samples stored of the filtered reference; by default `n_taps`. With several channels, 0 for an
+        algorithm that needs no filtered reference.
+    history : int, optional
+        Number of samples stored of the reference, if the algorithm needs more than the filters.
+
+    Attributes
+    ----------
+    multichannel : bool
+        Whether references, errors, control signals, powers and factors are arrays with a value for each channel.
+    n_microphones, n_loudspeakers, n_references : int
+        K, J and I.
     """
 
     name = "controller"
@@ -107,97 +139,195 @@ class FilteredReferenceController:
         n_taps: int,
         secondary_path: Any,
         *,
-        amplifier: Amplifier | None = None,
-        constraint: OutputPowerConstraint | None = None,
-        limiter: OutputLimiter | None = None,
+        n_references: int | None = None,
+        multichannel: bool | None = None,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        constraint: Constraints | None = None,
+        limiter: OutputLimiter | Sequence[OutputLimiter] | None = None,
         filtered_taps: int | None = None,
+        history: int = 0,
     ) -> None:
         self.n_taps = as_count(n_taps, "n_taps")
-        secondary = path_taps(secondary_path, name="secondary_path")
+        secondary = self._read_paths(secondary_path, n_references, multichannel)
+        self._limiter = self._checked_limiter(limiter)
+        filtered_taps = self.n_taps if filtered_taps is None else filtered_taps
+        self._lines: Any = self._new_lines(secondary, amplifier, filtered_taps, max(self.n_taps, history))
+        self._constrained = constraint is not None
+        self._own_constraint = self._checked_constraint(constraint)
+        self._y: Any = self._lines.control_signal if self.multichannel else 0.0
+
+    def _read_paths(self, paths: Any, n_references: int | None, multichannel: bool | None) -> np.ndarray:
+        """Set the numbers of channels and return the taps of the secondary path."""
+        several = is_path_matrix(paths)
+        if several and n_references is None:
+            raise ValueError(
+                f"{type(self).__name__} takes one channel: secondary_path must be one-dimensional, (taps,), or a system "
+                f"of one input and one output. These take several channels: {MULTICHANNEL}"
+            )
+        self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
+        self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
+        self.n_microphones, self.n_loudspeakers = 1, 1
+        if self.multichannel:
+            secondary, self._path_fs = secondary_paths(paths)
+            self.n_microphones, self.n_loudspeakers, _ = secondary.shape
+            return secondary
+        secondary = path_taps(paths, name="secondary_path")
+        self._path_fs = sampling_rate(paths, name="secondary_path") if is_system(paths) else None
+        return secondary
+
+    def _new_lines(self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int) -> Any:
+        if self.multichannel:
+            return channel_lines(
+                secondary,
+                self.n_references,
+                reference_taps=reference_taps,
+                filtered_taps=filtered_taps,
+                amplifier=amplifier,
+                limiter=states_of(self._limiter),
+            )
         model = compiled_model(amplifier)
         if model is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
-        self._path_fs = sampling_rate(secondary_path, name="secondary_path") if is_system(secondary_path) else None
-        self._constrained = constraint is not None
-        self._own_constraint = constraint or OutputPowerConstraint(1.0)
-        if constraint is None:
-            self._own_constraint.factor = 1.0
-        self._limiter = _checked_limiter(limiter)
-        self._lines = Lines(
+        return Lines(
             secondary_estimate=secondary,
-            reference=delay_line(max(self.n_taps, secondary.size)),
-            filtered=delay_line(filtered_taps or self.n_taps),
+            reference=delay_line(max(reference_taps, secondary.size)),
+            filtered=delay_line(filtered_taps),
             output=delay_line(secondary.size),
             amplifier=model,
-            limiter=None if limiter is None else limiter.state,
+            limiter=states_of(self._limiter),
         )
-        self._y = 0.0
 
-    def _common(self) -> tuple[Lines, np.ndarray, ConstraintState]:
+    def _checked_limiter(self, limiter: Any) -> Any:
+        """Return None, a limiter, or a tuple of limiters."""
+        if limiter is None or (not self.multichannel and isinstance(limiter, OutputLimiter)):
+            return limiter
+        if not self.multichannel:
+            raise TypeError(f"limiter must be an OutputLimiter or None, got {limiter!r}")
+        limiters = tuple(limiter) if isinstance(limiter, Sequence) else ()
+        different = len(limiters) == self.n_loudspeakers == len({id(one) for one in limiters})
+        if not different or not all(isinstance(one, OutputLimiter) for one in limiters):
+            raise TypeError(
+                f"limiter must be {self.n_loudspeakers} different OutputLimiters, one for each loudspeaker, got {limiter!r}"
+            )
+        return limiters
+
+    def _checked_constraint(self, constraint: Constraints | None) -> Any:
+        """Return a constraint, or a tuple of them; without one given, its factor is fixed at 1."""
+        own: Any = constraint
+        if constraint is None:
+            own = OutputPowerConstraint(1.0)
+            own.factor = 1.0
+        if not self.multichannel:
+            if isinstance(own, tuple):
+                raise ValueError(f"rated power and constraint must be one for one loudspeaker, got {len(own)}")
+            return own
+        each = own if isinstance(own, tuple) else tuple(deepcopy(own) for _ in range(self.n_loudspeakers))
+        if len(each) != self.n_loudspeakers:
+            raise ValueError(
+                f"rated power and constraint must be one, or one for each of the {self.n_loudspeakers} loudspeakers, "
+                f"got {len(each)}"
+            )
+        return each
+
+    def _each_loudspeaker(self, value: Any, name: str, check: Callable[[Any, str], float] = as_positive) -> Any:
+        """Return a checked number; with several channels (J,), from one number or one for each loudspeaker."""
+        return per_loudspeaker(value, self.n_loudspeakers, name, check) if self.multichannel else check(value, name)
+
+    def _common(self) -> tuple[Any, np.ndarray, Any]:
         """Return the first fields of every state: lines, weights, constraint."""
-        return self._lines, np.zeros(self.n_taps), self._own_constraint.state
+        shape = (self.n_loudspeakers, self.n_references, self.n_taps) if self.multichannel else self.n_taps
+        return self._lines, np.zeros(shape), states_of(self._own_constraint)
 
     @property
-    def limiter(self) -> OutputLimiter | None:
+    def limiter(self) -> Any:
         """Limiter of the control signal, or None; can be assigned, but not shared with another controller.
 
-        The disturbance is estimated from the output of the limiter, so the adaptation stays correct.
+        With several channels it is a tuple, one for each loudspeaker. The disturbance is estimated from the output of
+        the limiter, so the adaptation stays correct.
         """
         return self._limiter
 
     @limiter.setter
-    def limiter(self, value: OutputLimiter | None) -> None:
-        self._limiter = _checked_limiter(value)
-        lines = self._state.lines._replace(limiter=None if value is None else value.state)
+    def limiter(self, value: OutputLimiter | Sequence[OutputLimiter] | None) -> None:
+        self._limiter = self._checked_limiter(value)
+        lines = self._state.lines._replace(limiter=states_of(self._limiter))
         self._state = self._state._replace(lines=lines)
 
     @property
     def weights(self) -> np.ndarray:
-        """Control filter w, (L,), newest-sample tap first; a copy."""
+        """Control filter w, (L,), or with several channels (J, I, L), newest-sample tap first; a copy."""
         return self._state.weights.copy()
 
     @property
     def control_filter(self) -> np.ndarray:
-        """Control filter that generates y, (L,); a copy."""
+        """Control filter that generates y, of the shape of `weights`; a copy."""
         return self.weights
 
     @property
-    def rated_power(self) -> float | None:
-        """Rated output power of the controller; None if it has no constraint."""
-        return self._own_constraint.rated_power if self._constrained else None
+    def rated_power(self) -> Any:
+        """Rated output power of the controller, or of each loudspeaker, (J,); None if it has no constraint."""
+        return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
 
     @property
-    def constraint(self) -> OutputPowerConstraint:
-        """Constraint that computes the powers and the factor; without a rated power its factor is fixed at 1."""
+    def constraint(self) -> Any:
+        """Constraint that computes the powers and the factor; without a rated power its factor is fixed at 1.
+
+        With several channels it is a tuple, one for each loudspeaker.
+        """
         return self._own_constraint
 
     @property
-    def constraint_factor(self) -> float:
-        """Constraint factor of the last sample."""
-        return self.constraint.factor
+    def constraint_factor(self) -> Any:
+        """Constraint factor of the last sample; with several channels (J,)."""
+        return self._of_constraint("factor")
 
     @property
-    def disturbance_power(self) -> float:
-        """Running power of the disturbance estimate (eq. 10)."""
-        return self.constraint.disturbance_power
+    def disturbance_power(self) -> Any:
+        """Running power of the disturbance estimate (eq. 10); with several channels (J,), summed over microphones."""
+        return self._of_constraint("disturbance_power")
 
     @property
-    def secondary_path_gain(self) -> float:
-        """Running secondary-path gain (eq. 11); NaN until the reference has energy."""
-        gain = self.constraint.secondary_path_gain
-        return np.nan if gain is None else gain
+    def secondary_path_gain(self) -> Any:
+        """Running secondary-path gain (eq. 11); NaN until the reference has energy.
+
+        With several channels (J,): E[x'^2] summed over microphones and references, over E[x^2] summed over references.
+        """
+        gain = self._of_constraint("secondary_path_gain")
+        return np.array(gain, dtype=np.float64) if self.multichannel else np.nan if gain is None else gain
+
+    def _of_constraint(self, name: str, constraint: Any = None) -> Any:
+        """Return a number of the constraint, or of each of them, (J,)."""
+        own = self.constraint if constraint is None else constraint
+        return np.array([getattr(one, name) for one in own]) if isinstance(own, tuple) else getattr(own, name)
 
     def __repr__(self) -> str:
+        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
         parts = [
+            *(self._channel_counts() if self.multichannel else []),
             f"{self.n_taps} taps",
-            *([] if self.rated_power is None else [f"rated power {self.rated_power:g}"]),
-            f"constraint factor {self.constraint_factor:.3g}",
-            *([] if self.limiter is None else [f"limiter of rated power {self.limiter.rated_power:g}"]),
+            *([] if self.rated_power is None else [f"rated power {listed(self.rated_power, 'g')}"]),
+            f"constraint factor {listed(self.constraint_factor, '.3g')}",
+            *([f"limiter of rated power {listed([one.rated_power for one in limiters], 'g')}"] if limiters else []),
         ]
         return f"<{self.name}: {', '.join(parts)}>"
 
-    def control_signal(self, reference: float) -> float:
-        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+    def _channel_counts(self) -> list[str]:
+        counts = {
+            "microphone": self.n_microphones,
+            "loudspeaker": self.n_loudspeakers,
+            "reference": self.n_references,
+        }
+        return [f"{count} {what}{'s' if count > 1 else ''}" for what, count in counts.items()]
+
+    def control_signal(self, reference: Any) -> Any:
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample.
+
+        With several channels, x(n) is (I,) and y(n) is (J,).
+        """
+        if self.multichannel:
+            x = channel_sample(reference, self.n_references, "reference", "references")
+            emit_once.with_held(self._held(), x)
+            return self._y.copy()
         self._y = emit_once.with_held(self._held(), as_number(reference, "reference"))
         return self._y
 
@@ -211,14 +341,21 @@ class FilteredReferenceController:
             self._holding = Held(self._state)
         return self._holding
 
-    def update(self, error: float) -> None:
-        """Adapt to the error e(n) that the last control signal left."""
-        error = as_number(error, "error")
+    def update(self, error: Any) -> None:
+        """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
+        if self.multichannel:
+            error = channel_sample(error, self.n_microphones, "error", "microphones")
+        else:
+            error = as_number(error, "error")
         if not adapt_once.with_held(self._held(), error, self._y):
             raise ValueError(self._reason(error))
+        if self.multichannel:
+            self.after_compiled(self._state)  # a solution may be due
 
-    def _reason(self, error: float) -> str:
+    def _reason(self, error: Any) -> str:
         """Return why an update was refused."""
+        if self.multichannel:
+            return OVERFLOW
         lines = self._state.lines
         values = np.array([estimate_once(lines, error), latest(lines.filtered), latest(lines.reference)])
         with np.errstate(over="ignore"):
@@ -229,17 +366,34 @@ class FilteredReferenceController:
 
         Parameters
         ----------
-        references, errors : ndarray
-            (n_samples,) reference, and the error microphone's signal while the loudspeaker is silent.
+        references : ndarray, shape (n_samples,) or (I, n_samples)
+            Reference.
+        errors : ndarray, shape (n_samples,) or (K, n_samples)
+            Signals of the error microphones while the loudspeakers are silent.
         """
-        x = as_signal(references, "references")
-        e = as_signal(errors, "errors", length=x.size)
-        self._require_finite_squares(x, e)
+        if self.multichannel:
+            x, e = self._channel_signals(references, errors)
+        else:
+            x = as_signal(references, "references")
+            e = as_signal(errors, "errors", length=x.size)
+            self._require_finite_squares(x, e)
         taken = listen(self._state, x, e)
-        if taken < x.size:
-            refused = ValueError(self._refusal)
+        if taken < len(x):
+            refused = ValueError(OVERFLOW if self.multichannel else self._refusal)
             refused.add_note(f"in sample {taken} of those listened to")
             raise refused
+        if self.multichannel:
+            self.after_compiled(self._state)  # a solution may be due
+
+    def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return references and errors with a sample in each row."""
+        x, e = np.atleast_2d(as_channels(references, "references")), np.atleast_2d(as_channels(errors, "errors"))
+        if (len(x), len(e)) != (self.n_references, self.n_microphones) or x.shape[1] != e.shape[1]:
+            raise ValueError(
+                f"references must be (I, n_samples) and errors (K microphones, n_samples) with I = {self.n_references}, "
+                f"K = {self.n_microphones}, got {x.shape} and {e.shape}"
+            )
+        return np.ascontiguousarray(x.T), np.ascontiguousarray(e.T)
 
     def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:
         s, heard = self._lines.secondary_estimate, self._lines.reference
@@ -255,17 +409,19 @@ class FilteredReferenceController:
     @property
     def _powers_fs(self) -> float:
         """Sample rate in Hz of the power estimates."""
-        return self.constraint.fs
+        return np.ravel(self.constraint)[0].fs
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if the secondary path, power estimates or limiter are for another rate than `fs` in Hz."""
+        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
+        named = {f"limiter {j}" if self.multichannel else "limiter": one.fs for j, one in enumerate(limiters)}
         require_rates(
             fs,
             {
                 "secondary path": self._path_fs,
-                "power memory": self._powers_fs if self.rated_power else None,
-                "limiter": None if self.limiter is None else self.limiter.fs,
-            },
+                "power memory": None if self.rated_power is None else self._powers_fs,
+            }
+            | named,
         )
 
     def compiled_state(self, to_step: bool = True) -> Any:
@@ -274,6 +430,10 @@ class FilteredReferenceController:
         `to_step` says if the caller will change the state, or only read it.
         """
         return self._state if calls_of(type(self)) == calls_of(FilteredReferenceController) else None
+
+    def samples_to_block(self) -> int:
+        """Return the number of samples until the controller works between blocks; 0 if it never does."""
+        return 0
 
     def after_compiled(self, state: Any) -> None:
         """Adopt what the compiled loop changed in `state`, however many samples it ran."""
@@ -284,7 +444,13 @@ def calls_of(kind: type) -> tuple[Any, Any]:
     return kind.control_signal, kind.update  # type: ignore[attr-defined]
 
 
-def _checked_limiter(limiter: OutputLimiter | None) -> OutputLimiter | None:
-    if limiter is not None and not isinstance(limiter, OutputLimiter):
-        raise TypeError(f"limiter must be an OutputLimiter or None, got {limiter!r}")
-    return limiter
+def states_of(value: Any) -> Any:
+    """Return the state of a limiter or a constraint, or of each of a tuple; None stays None."""
+    if isinstance(value, tuple):
+        return tuple(one.state for one in value)
+    return None if value is None else value.state
+
+
+def listed(values: Any, form: str) -> str:
+    """Return a number, or several after each other, as text."""
+    return ", ".join(format(value, form) for value in np.ravel(values))

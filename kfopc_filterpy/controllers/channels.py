@@ -1,4 +1,4 @@
-"""Several loudspeakers and microphones: the signals of a controller, its compiled sample and its base class.
+"""Several loudspeakers and microphones: the signals of a controller, and the functions of `step` for them.
 
 Axes lead with the channel, in the order in which sound travels backwards: microphones K, loudspeakers J, references I,
 taps. Secondary paths are (K, J, taps), control filters (J, I, taps), primary paths (K, I, taps).
@@ -11,20 +11,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_real_array
-from ..kernels.compiling import compiled_for_states, inlined
-from ..kernels.delay_lines import delay_line, newest, push
-from ..kernels.holding import Held
-from ..kernels.vectors import dot
-from ..paths.channels import secondary_paths
-from ..power.amplifiers import Amplifier, LinearAmplifier, amplify, compiled_model
-from ..power.limiter import LimiterState, OutputLimiter, limit_sample
-from .base import require_rates
-from .step import adapt, control_filter, follow
-
-REFUSED = (
-    "the errors and the disturbance estimates must have finite squares, and one overflows: nothing was changed; scale "
-    "the signals"
+from .._validate import as_real_array
+from ..kernels.compiling import inlined
+from ..kernels.delay_lines import delay_line, latest, newest, push
+from ..kernels.vectors import at, dot
+from ..power.amplifiers import LinearAmplifier, amplify, compiled_model
+from ..power.constraint import advance_squares
+from ..power.limiter import LimiterState, limit_sample
+from .step import (
+    advance_powers,
+    emit_outputs,
+    emit_silence,
+    filter_output,
+    loudspeakers,
+    output,
+    take_reference,
+    weights_of,
 )
 
 
@@ -33,32 +35,97 @@ class ChannelLines(NamedTuple):
 
     secondary_estimate: np.ndarray  # (K, J, taps) of s^
     reference: np.ndarray  # (I, size) delay lines of x
+    filtered: np.ndarray  # (K, J, I, size) delay lines of x'_kji = s^_kj * x_i; K = 0 if the algorithm needs none
     output: np.ndarray  # (J, size) delay lines of y, after limiters and amplifier models
-    amplifiers: np.ndarray  # (J, 1) records of those models
-    limiters: tuple[LimiterState, ...] | None
+    amplifier: np.ndarray  # (J, 1) records of those models
+    limiter: tuple[LimiterState, ...] | None
     control_signal: np.ndarray  # (J,) the last y
     disturbance: np.ndarray  # (K,) the last estimate d^
+    modified_error: np.ndarray  # (K,) room for an algorithm that adapts to another error
+    constraint_factor: np.ndarray  # (J,) the last factors
 
 
-@inlined
-def emit_channels(state, x):
-    """Set the control signals y(n) for the newest references x, (I,), after any limiters; add both to their lines."""
-    lines, w = state.lines, control_filter(state)
-    for i in range(x.size):
+def channel_lines(
+    secondary: np.ndarray,
+    n_references: int,
+    *,
+    reference_taps: int,
+    filtered_taps: int,
+    amplifier: Any,
+    limiter: tuple[Any, ...] | None,
+) -> ChannelLines:
+    """Return silent lines for secondary paths (K, J, taps); 0 `filtered_taps`: no filtered references."""
+    K, J, taps = secondary.shape
+    filtered = [delay_lines(n_references, filtered_taps) for _ in range(K * J)] if filtered_taps else []
+    size = filtered[0].shape[1] if filtered else 0
+    return ChannelLines(
+        secondary_estimate=secondary,
+        reference=delay_lines(n_references, max(reference_taps, taps)),
+        filtered=np.array(filtered).reshape(K if filtered else 0, J, n_references, size),
+        output=delay_lines(J, taps),
+        amplifier=amplifier_models(amplifier, J),
+        limiter=limiter,
+        control_signal=np.zeros(J),
+        disturbance=np.zeros(K),
+        modified_error=np.zeros(K),
+        constraint_factor=np.ones(J),
+    )
+
+
+@loudspeakers.register(ChannelLines)
+def channel_loudspeakers(lines):
+    """Return J."""
+    return lines.output.shape[0]
+
+
+@filter_output.register(ChannelLines)
+def channel_output(lines, weights, j):
+    """Return sum_i w_ji' x_i."""
+    y = 0.0
+    for i in range(weights.shape[1]):
+        y += dot(weights[j, i], newest(lines.reference[i], weights.shape[2]))
+    return y
+
+
+@weights_of.register(ChannelLines)
+def channel_weights(lines, weights, j):
+    """Return the weights for all references, (I L,)."""
+    return weights[j].reshape(-1)
+
+
+@take_reference.register(ChannelLines)
+def take_references(lines, x):
+    """Add x_i(n) and x'_kji(n) = (s^_kj * x_i)(n) to their delay lines."""
+    for i in range(lines.reference.shape[0]):
         push(lines.reference[i], x[i])
-    for j in range(w.shape[0]):
-        y = 0.0
-        for i in range(w.shape[1]):
-            y += dot(w[j, i], newest(lines.reference[i], w.shape[2]))
-        emit_channel(lines, j, y)
+    s, filtered = lines.secondary_estimate, lines.filtered
+    for k in range(filtered.shape[0]):
+        for j in range(filtered.shape[1]):
+            for i in range(filtered.shape[2]):
+                push(filtered[k, j, i], dot(s[k, j], newest(lines.reference[i], s.shape[2])))
+
+
+@emit_outputs.register(ChannelLines)
+def emit_channel_outputs(lines, state):
+    """Return y(n), (J,)."""
+    for j in range(lines.output.shape[0]):
+        emit_channel(lines, j, output(state, j))
+    return lines.control_signal
+
+
+@emit_silence.register(ChannelLines)
+def emit_channel_silence(lines):
+    """Add y_j(n) = 0 to their delay lines."""
+    for j in range(lines.output.shape[0]):
+        emit_channel(lines, j, 0.0)
 
 
 @inlined
 def emit_channel(lines, j, y):
     """Set the control signal of a loudspeaker to y after its limiter, if there is one."""
-    y = limited_channel(lines.limiters, j, y)
+    y = limited_channel(lines.limiter, j, y)
     lines.control_signal[j] = y
-    push(lines.output[j], amplify(lines.amplifiers[j], y))
+    push(lines.output[j], amplify(lines.amplifier[j], y))
 
 
 @inlined
@@ -82,177 +149,41 @@ def estimate_disturbances(lines, error):
     return finite
 
 
-# Entry points from Python.
+@advance_powers.register(ChannelLines)
+def advance_channel_powers(lines, constraint, error):
+    """Add a sample to the powers of each loudspeaker: sums over microphones and references, as if it were alone."""
+    finite, d, x = estimate_disturbances(lines, error), 0.0, 0.0
+    for k in range(lines.disturbance.size):
+        d += lines.disturbance[k] ** 2
+    for i in range(lines.reference.shape[0]):
+        x += latest(lines.reference[i]) ** 2
+    finite &= np.isfinite(d) and np.isfinite(x)
+    for j in range(lines.output.shape[0]):
+        finite &= np.isfinite(filtered_square(lines, j))
+    if finite:
+        for j in range(lines.output.shape[0]):
+            lines.constraint_factor[j] = advance_squares(at(constraint, j), d, filtered_square(lines, j), x)
+    return finite, lines.disturbance, lines.constraint_factor
 
 
-@compiled_for_states()
-def emit_channels_once(held, x):
-    """Call `emit_channels` from Python, with a `Held` state."""
-    emit_channels(held.state, x)
+@inlined
+def filtered_square(lines, j):
+    """Return the sum of x'_kji(n)^2 over microphones and references."""
+    total = 0.0
+    for k in range(lines.filtered.shape[0]):
+        for i in range(lines.filtered.shape[2]):
+            total += latest(lines.filtered[k, j, i]) ** 2
+    return total
 
 
-@compiled_for_states()
-def adapt_channels_once(held, error):
-    """Call `adapt` from Python, with a `Held` state."""
-    return adapt(held.state, error, held.state.lines.control_signal)
-
-
-@compiled_for_states(nogil=True)
-def listen_channels(state, references, errors):
-    """Follow signals while the loudspeakers are silent; return the number of samples processed before a refusal."""
-    for n in range(references.shape[1]):
-        for i in range(references.shape[0]):
-            push(state.lines.reference[i], references[i, n])
-        for j in range(state.lines.output.shape[0]):
-            emit_channel(state.lines, j, 0.0)
-        if not follow(state, errors[:, n]):
-            return n
-    return references.shape[1]
-
-
-def channel_sample(value: Any, size: int, name: str, channel: str) -> np.ndarray:
-    """Return a sample of each channel, (size,), finite; `channel` is what an error calls one of them."""
+def channel_sample(value: Any, size: int, name: str, what: str) -> np.ndarray:
+    """Return a sample of each channel, (size,), finite; `what` names the channels in an error."""
     sample = as_real_array(value, name).reshape(-1)
     if sample.size != size:
-        raise ValueError(f"{name} must have a value for each {channel}, ({size},), got {sample.size}")
-    bad = np.flatnonzero(~np.isfinite(sample))
-    if bad.size:
-        raise ValueError(f"{name} must be finite, got {sample[bad[0]]} from {channel} {bad[0]}; nothing was changed")
+        raise ValueError(f"{name} must have a value for each of the {size} {what}, got {sample.size}")
+    for channel in np.flatnonzero(~np.isfinite(sample)):
+        raise ValueError(f"{name} must be finite, but that of {what[:-1]} {channel} is {sample[channel]}")
     return np.ascontiguousarray(sample)
-
-
-class ChannelController:
-    """Signals that controllers of several channels share; a subclass sets `_state`, which begins with `lines`.
-
-    Parameters
-    ----------
-    n_taps : int
-        Taps L of each control filter.
-    secondary_path : array_like, shape (K, J, n_path), or nested sequence of control systems
-        Estimated secondary paths, loudspeaker j to microphone k.
-    n_references : int
-        Number of references I.
-    history : int
-        Number of reference samples that the algorithm needs.
-    amplifier : callable or sequence of callables, optional
-        Known amplifier model of all loudspeakers, or one for each.
-    limiter : sequence of OutputLimiter, optional
-        A limiter for each loudspeaker.
-    """
-
-    name = "controller"
-    _state: Any
-    _holding: Held | None = None
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: Any,
-        *,
-        n_references: int,
-        history: int,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
-        limiter: Sequence[OutputLimiter] | None = None,
-    ) -> None:
-        self.n_taps = as_count(n_taps, "n_taps")
-        self.n_references = as_count(n_references, "n_references")
-        secondary, self._path_fs = secondary_paths(secondary_path)
-        self.n_microphones, self.n_loudspeakers, n_path = secondary.shape
-        self._limiters = self._checked_limiters(limiter)
-        self._lines = ChannelLines(
-            secondary_estimate=secondary,
-            reference=delay_lines(self.n_references, max(self.n_taps, history)),
-            output=delay_lines(self.n_loudspeakers, n_path),
-            amplifiers=amplifier_models(amplifier, self.n_loudspeakers),
-            limiters=None if self._limiters is None else tuple(one.state for one in self._limiters),
-            control_signal=np.zeros(self.n_loudspeakers),
-            disturbance=np.zeros(self.n_microphones),
-        )
-
-    def _checked_limiters(self, limiter: Any) -> tuple[OutputLimiter, ...] | None:
-        if limiter is None:
-            return None
-        limiters = tuple(limiter) if isinstance(limiter, Sequence) else ()
-        right = len(limiters) == self.n_loudspeakers == len({id(one) for one in limiters})
-        if not right or not all(isinstance(one, OutputLimiter) for one in limiters):
-            raise TypeError(
-                f"limiter must be {self.n_loudspeakers} different OutputLimiters, one for each loudspeaker, got {limiter!r}"
-            )
-        return limiters
-
-    @property
-    def limiter(self) -> tuple[OutputLimiter, ...] | None:
-        """Limiters of the loudspeakers, or None."""
-        return self._limiters
-
-    @property
-    def weights(self) -> np.ndarray:
-        """Control filters w, (J, I, L), newest-sample tap first; a copy."""
-        return self._state.weights.copy()
-
-    @property
-    def control_filter(self) -> np.ndarray:
-        """Control filters that generate y, (J, I, L); a copy."""
-        return self.weights
-
-    @property
-    def rated_power(self) -> np.ndarray | None:
-        """Rated output power of each loudspeaker, (J,); None without a constraint."""
-        return None
-
-    def _held(self) -> Held:
-        if self._holding is None or self._holding.state is not self._state:
-            self._holding = Held(self._state)
-        return self._holding
-
-    def control_signal(self, reference: Any) -> np.ndarray:
-        """Return the control signals y(n), (J,), for the newest reference samples x(n), (I,)."""
-        x = channel_sample(reference, self.n_references, "reference", "reference microphone")
-        emit_channels_once.with_held(self._held(), x)
-        return self._lines.control_signal.copy()
-
-    def update(self, error: Any) -> None:
-        """Adapt to the errors e(n), (K,), that the last control signals left."""
-        e = channel_sample(error, self.n_microphones, "error", "microphone")
-        if not adapt_channels_once.with_held(self._held(), e):
-            raise ValueError(REFUSED)
-        self.after_compiled(self._state)
-
-    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
-        """Follow the noise before the control is switched on.
-
-        Parameters
-        ----------
-        references : ndarray, shape (I, n_samples)
-            References.
-        errors : ndarray, shape (K, n_samples)
-            Signals of the error microphones while the loudspeakers are silent.
-        """
-        taken = listen_channels(self._state, references, errors)
-        if taken < references.shape[1]:
-            refused = ValueError(REFUSED)
-            refused.add_note(f"in sample {taken} of those listened to")
-            raise refused
-        self.after_compiled(self._state)
-
-    def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the secondary paths or limiters are for another rate than `fs` in Hz."""
-        limiters = self._limiters or ()
-        require_rates(
-            fs, {"secondary path": self._path_fs} | {f"limiter {j}": one.fs for j, one in enumerate(limiters)}
-        )
-
-    def compiled_state(self) -> Any:
-        """Return the state for the compiled loop; None if a subclass replaces a method that the loop replaces."""
-        own = type(self).control_signal is ChannelController.control_signal
-        return self._state if own and type(self).update is ChannelController.update else None
-
-    def samples_to_block(self) -> int:
-        """Return the number of samples until the controller works between blocks; 0 if it never does."""
-        return 0
-
-    def after_compiled(self, state: Any) -> None:
-        """Adopt what the compiled loop changed in `state`."""
 
 
 def delay_lines(n_lines: int, taps: int) -> np.ndarray:

@@ -2,35 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_positive
-from ..kernels.delay_lines import newest
-from ..kernels.vectors import dot
+from ..kernels.vectors import at
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
+from .channels import ChannelLines
 from .fxlms import adapt_fxlms
-from .lms import LMSController
-from .step import Lines, adapt, output
+from .lms import Limiters, LMSController
+from .step import Lines, adapt, filter_output, output
 
 
 class ClippingState(NamedTuple):
     """State of `ClippingFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
-    amplitude_limit: float
+    amplitude_limit: float | np.ndarray  # (J,)
 
 
 @output.register(ClippingState)
-def output_clipped(state):
+def output_clipped(state, j):
     """Return w'x clipped to the limit; pass Inf and NaN, which the loop detects as a divergence."""
-    w, limit = state.weights, state.amplitude_limit
-    y = dot(w, newest(state.lines.reference, w.size))
+    y, limit = filter_output(state.lines, state.weights, j), at(state.amplitude_limit, j)
     if not limit < abs(y) < np.inf:
         return y
     return limit if y > 0.0 else -limit
@@ -42,15 +42,17 @@ adapt.register(ClippingState)(adapt_fxlms)
 class ClippingFxLMS(LMSController):
     r"""Clipping FxLMS: the control signal is clipped to the limit, the weights adapt as in `FxLMS`.
 
+    With several loudspeakers, each control signal is clipped to its own limit.
+
     While the noise needs more than the limit, the error no longer falls, the weights keep growing and the control
     signal becomes a square wave. The paper's introduction warns of this; the algorithm is here for comparison.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    amplitude_limit : float
-        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    amplitude_limit : float or array_like, shape (J,)
+        Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
 
     Raises
     ------
@@ -81,14 +83,15 @@ class ClippingFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        amplitude_limit: float,
-        limiter: OutputLimiter | None = None,
+        amplitude_limit: float | Sequence[float] | np.ndarray,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), as_positive(amplitude_limit, "amplitude_limit")
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
+        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
         self._state = ClippingState(*self._common(), step, limit)
 
     @property
-    def amplitude_limit(self) -> float:
-        """Amplitude limit A of the control signal."""
-        return self._state.amplitude_limit
+    def amplitude_limit(self) -> Any:
+        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
+        return copy(self._state.amplitude_limit)

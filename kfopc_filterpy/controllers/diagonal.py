@@ -14,8 +14,7 @@ from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController, constraint_or_none
-from .lms import advance_powers
-from .step import Lines, adapt
+from .step import Lines, adapt, advance_powers
 
 
 class DiagonalState(NamedTuple):
@@ -32,7 +31,7 @@ class DiagonalState(NamedTuple):
 @adapt.register(DiagonalState)
 def adapt_diagonal(state, error, control_signal):
     """Apply eq. 2-9 with P reduced to its diagonal."""
-    finite, d, factor = advance_powers(state, error)
+    finite, d, factor = advance_powers(state.lines, state.constraint, error)
     if finite:
         row = newest(state.lines.filtered, state.weights.size)
         correct_diagonal(state.variances, state.weights, row, factor * d, state.state_noise, state.measurement_noise)

@@ -8,53 +8,70 @@ import numpy as np
 
 from .._validate import as_positive
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
-from .lms import LMSController, advance_powers, change_weights
-from .step import Lines, adapt
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_weights
+from .step import Lines, adapt, advance_powers
 
 
 class FxLMSState(NamedTuple):
     """State of `FxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
 
 
 @adapt.register(FxLMSState)
 def adapt_fxlms(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu e(n) x'(n)."""
-    finite, _, _ = advance_powers(state, error)
+    """Set w(n+1) = w(n) + mu e(n) x'(n); with several channels, w_ji(n+1) = w_ji(n) + mu sum_k e_k(n) x'_kji(n)."""
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
+        change_weights(state.lines, state.weights, 1.0, state.step_size, error, 0.0)
     return finite
 
 
 class FxLMS(LMSController):
     r"""Filtered-reference LMS, :math:`w(n+1) = w(n) + \mu e(n) x'(n)`, without a constraint.
 
+    With K microphones, J loudspeakers and I references it is the multiple-error LMS (MEFxLMS), which descends the
+    gradient of the sum of the squared errors:
+
+    .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \sum_k e_k(n)\, x'_{kji}(n), \qquad x'_{kji} = \hat s_{kj} * x_i
+
     Parameters
     ----------
     n_taps : int
-        Taps L of the control filter.
-    secondary_path : array_like or control.TransferFunction
-        Estimated secondary path, taps or an FIR system.
+        Taps L of the control filter, or of each of them.
+    secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
+        Estimated secondary path, taps or an FIR system. With channel axes, those from loudspeaker j to microphone k; a
+        system of several inputs and outputs, or a nested sequence of systems, is taken likewise.
     step_size : float
         Step size mu, above zero.
-    limiter : OutputLimiter, optional
-        Limiter of the control signal, not shared with another controller. FxLMS adapts to the error alone: while the
-        limiter acts, the error does not fall and the weights grow.
+    n_references : int, default 1
+        Number of references I.
+    limiter : OutputLimiter or sequence of J of them, optional
+        Limiter of the control signal, or one for each loudspeaker, not shared with another controller. FxLMS adapts to
+        the error alone: while the limiter acts, the error does not fall and the weights grow.
 
     Raises
     ------
     ValueError
-        A step size that is not positive and finite, fewer than one tap, a path that is not FIR.
+        A step size that is not positive and finite, fewer than one tap or reference, a path that is not FIR or has
+        other axes.
+    TypeError
+        A limiter that is not an `OutputLimiter`, or not as many different ones as there are loudspeakers.
+
+    Notes
+    -----
+    If the secondary path has channel axes, (1, 1, taps) too, or if there are several references, all signals are
+    arrays: ``control_signal`` takes (I,) and returns (J,), ``update`` takes (K,), `weights` is (J, I, L).
 
     References
     ----------
     D. Morgan, "An analysis of multiple correlation cancellation loops with a filter in the auxiliary path", IEEE
-    Trans. ASSP 28(4), 1980.
+    Trans. ASSP 28(4), 1980. S. J. Elliott, I. M. Stothers, P. A. Nelson, "A multiple error LMS algorithm and its
+    application to the active control of sound and vibration", IEEE Trans. ASSP 35(10), 1987.
 
     Examples
     --------
@@ -65,12 +82,29 @@ class FxLMS(LMSController):
     >>> controller.update(2.0)  # e = d: nothing is cancelled yet
     >>> float(controller.weights[0])  # 0.1 * 2 * 1
     0.2
+
+    Two loudspeakers and one microphone, which hears the second one half as loud:
+
+    >>> two = FxLMS(4, secondary_path=[[[1.0, 0.0], [0.5, 0.0]]], step_size=0.1)
+    >>> two.control_signal([1.0])
+    array([0., 0.])
+    >>> two.update([2.0])
+    >>> two.weights.shape  # loudspeakers, references, taps
+    (2, 1, 4)
+    >>> two.weights[:, 0, 0]  # 0.1 * 2 * 1 and 0.1 * 2 * 0.5
+    array([0.2, 0.1])
     """
 
     name = "FxLMS"
 
     def __init__(
-        self, n_taps: int, secondary_path: Any, *, step_size: float, limiter: OutputLimiter | None = None
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        step_size: float,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
         self._state = FxLMSState(*self._common(), as_positive(step_size, "step_size"))

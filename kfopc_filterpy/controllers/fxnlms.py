@@ -11,8 +11,8 @@ from ..kernels.delay_lines import newest
 from ..kernels.vectors import dot
 from ..power.constraint import ConstraintState
 from ..power.limiter import OutputLimiter
-from .lms import LMSController, advance_powers, change_weights
-from .step import Lines, adapt
+from .lms import LMSController, change_weights
+from .step import Lines, adapt, advance_powers
 
 
 class FxNLMSState(NamedTuple):
@@ -28,11 +28,11 @@ class FxNLMSState(NamedTuple):
 @adapt.register(FxNLMSState)
 def adapt_fxnlms(state, error, control_signal):
     """Set w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n))."""
-    finite, _, _ = advance_powers(state, error)
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
         row = newest(state.lines.filtered, state.weights.size)
         energy = state.regularization + dot(row, row)
-        change_weights(state.weights, state.lines, 1.0, state.step_size * error / energy, 0.0)
+        change_weights(state.lines, state.weights, 1.0, 1.0, state.step_size * error / energy, 0.0)
     return finite
 
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_nonnegative, as_positive
+from ..kernels.vectors import at
 from ..power.amplifiers import Amplifier
 from ..power.constraint import REFERENCE, ConstraintState, OutputPowerConstraint
-from ..power.limiter import OutputLimiter
 from .base import constraint_for
-from .lms import LMSController, advance_powers, change_weights, penalty_of_constraint
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_filter, penalty_of_constraint
 from .mov import penalty_factor
-from .step import Lines, adapt
+from .step import Lines, adapt, advance_powers, loudspeakers
 
 
 def leak_factor(
@@ -60,54 +63,60 @@ def leak_factor(
 class LeakyState(NamedTuple):
     """State of `LeakyFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
-    leak: float
+    leak: float | np.ndarray  # (J,)
 
 
 @adapt.register(LeakyState)
 def adapt_leaky(state, error, control_signal):
     """Set w(n+1) = (1 - mu gamma) w(n) + mu e(n) x'(n)."""
-    finite, _, _ = advance_powers(state, error)
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        keep = 1.0 - state.step_size * state.leak
-        change_weights(state.weights, state.lines, keep, state.step_size * error, 0.0)
+        for j in range(loudspeakers(state.lines)):
+            keep = 1.0 - state.step_size * at(state.leak, j)
+            change_filter(state.lines, state.weights, j, keep, state.step_size, error, 0.0)
     return finite
 
 
 class RatedLeakyState(NamedTuple):
     """State of `OptimalLeakyFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
 
 
 @adapt.register(RatedLeakyState)
 def adapt_rated_leaky(state, error, control_signal):
     """Apply the step of leaky FxLMS with gamma(n) = E[x^2] G_s (1/alpha - 1)."""
-    finite, _, factor = advance_powers(state, error)
+    finite, _, factor = advance_powers(state.lines, state.constraint, error)
     if finite:
-        leak = penalty_of_constraint(state.constraint, factor) * state.constraint.powers[REFERENCE].mean_square
-        keep = 1.0 - state.step_size * leak
-        change_weights(state.weights, state.lines, keep, state.step_size * error, 0.0)
+        for j in range(loudspeakers(state.lines)):
+            own = at(state.constraint, j)
+            leak = penalty_of_constraint(own, at(factor, j)) * own.powers[REFERENCE].mean_square
+            keep = 1.0 - state.step_size * leak
+            change_filter(state.lines, state.weights, j, keep, state.step_size, error, 0.0)
     return finite
 
 
 class LeakyFxLMS(LMSController):
     r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
 
-    The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`.
+    The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`. With
+    several channels this is :math:`\sum_k E[e_k^2] + \sum_j \gamma_j \sum_i w_{ji}^T w_{ji}`, and a leak also keeps
+    the weights finite where loudspeakers are interchangeable.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    leak : float
-        Leak gamma, zero or above, in the unit of the squared reference; `leak_factor` computes it for a rated power.
+    leak : float or array_like, shape (J,)
+        Leak gamma, or that of each loudspeaker, zero or above, in the unit of the squared reference; `leak_factor`
+        computes it for a rated power.
 
     Raises
     ------
@@ -139,21 +148,23 @@ class LeakyFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        leak: float,
-        limiter: OutputLimiter | None = None,
+        leak: float | Sequence[float] | np.ndarray,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        step_size, leak = as_positive(step_size, "step_size"), as_nonnegative(leak, "leak")
-        if step_size * leak > 1.0:
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
+        step, own = as_positive(step_size, "step_size"), self._each_loudspeaker(leak, "leak", as_nonnegative)
+        most = float(np.max(step * own))
+        if most > 1.0:
             raise ValueError(
-                f"step_size * leak must be 1 at most, got {step_size * leak:g}: a sample would take more than the weight"
+                f"step_size * leak must be 1 at most, got {most:g}: a sample would take more than the weight"
             )
-        super().__init__(n_taps, secondary_path, limiter=limiter)
-        self._state = LeakyState(*self._common(), step_size, leak)
+        self._state = LeakyState(*self._common(), step, own)
 
     @property
-    def leak(self) -> float:
-        """Leak gamma."""
-        return self._state.leak
+    def leak(self) -> Any:
+        """Leak gamma; with several channels (J,), a copy."""
+        return copy(self._state.leak)
 
 
 class OptimalLeakyFxLMS(LMSController):
@@ -161,17 +172,18 @@ class OptimalLeakyFxLMS(LMSController):
 
     .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
 
-    The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC.
+    The formula is that of `leak_factor`, and the powers are estimated as in KF-OPC. With several loudspeakers, each has
+    its own gamma, from the sums stated in `MOVFxLMS`.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size
+    n_taps, secondary_path, step_size, n_references
         As for `FxLMS`.
-    rated_power : float, optional
-        Rated output power rho_o.
-    constraint : OutputPowerConstraint, optional
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power rho_o, or that of each loudspeaker.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
-    amplifier : callable, optional
+    amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
         As for `FxLMS`.
@@ -203,11 +215,19 @@ class OptimalLeakyFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        rated_power: float | None = None,
-        constraint: OutputPowerConstraint | None = None,
-        amplifier: Amplifier | None = None,
-        limiter: OutputLimiter | None = None,
+        rated_power: float | Sequence[float] | np.ndarray | None = None,
+        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
         own = constraint_for(rated_power, constraint)
-        super().__init__(n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter)
+        super().__init__(
+            n_taps,
+            secondary_path,
+            n_references=n_references,
+            amplifier=amplifier,
+            constraint=own,
+            limiter=limiter,
+        )
         self._state = RatedLeakyState(*self._common(), as_positive(step_size, "step_size"))

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from ..kernels.compiling import inlined, part
-from ..kernels.delay_lines import latest, newest
-from ..kernels.vectors import FAST
-from ..power.constraint import advance_constraint, squares_are_finite
+from collections.abc import Sequence
+
+from ..kernels.compiling import by_type, inlined, part
+from ..kernels.delay_lines import newest
+from ..kernels.vectors import FAST, add_scaled
+from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController
-from .step import disturbance_estimate
+from .channels import ChannelLines
+from .step import loudspeakers
+
+Limiters = OutputLimiter | Sequence[OutputLimiter] | None
 
 
 class LMSController(FilteredReferenceController):
@@ -20,26 +25,33 @@ class LMSController(FilteredReferenceController):
 
 
 @inlined
-def advance_powers(state, error):
-    """Add a sample to the running powers; return whether the squares are finite, d^(n) and the constraint factor.
-
-    If they are not finite, nothing was changed.
-    """
-    d = disturbance_estimate(state.lines, error)
-    filtered, x = latest(state.lines.filtered), latest(state.lines.reference)
-    if not squares_are_finite(d, filtered, x):
-        return False, d, 1.0
-    return True, d, advance_constraint(state.constraint, d, filtered, x)
+def change_weights(lines, weights, keep, mu, error, penalty):
+    """Set w(n+1) = keep w(n) + mu e(n) x'(n) - penalty x(n), alike for all loudspeakers."""
+    for j in range(loudspeakers(lines)):
+        change_filter(lines, weights, j, keep, mu, error, penalty)
 
 
-@inlined
-def change_weights(w, lines, keep, correction, penalty):
-    """Set w(n+1) = keep w(n) + correction x'(n) - penalty x(n)."""
-    _change(w, newest(lines.filtered, w.size), newest(lines.reference, w.size), keep, correction, penalty)
+@by_type
+def change_filter(lines, weights, j, keep, mu, error, penalty):
+    """Set w(n+1) = keep w(n) + mu e(n) x'(n) - penalty x(n) for loudspeaker j, with e x' summed over microphones."""
+    filtered, x = newest(lines.filtered, weights.size), newest(lines.reference, weights.size)
+    change(weights, filtered, x, keep, mu * error, penalty)
+
+
+@change_filter.register(ChannelLines)
+def change_channel(lines, weights, j, keep, mu, error, penalty):
+    """Do so for the references one by one."""
+    taps = weights.shape[2]
+    for i in range(weights.shape[1]):
+        w, x = weights[j, i], newest(lines.reference[i], taps)
+        change(w, newest(lines.filtered[0, j, i], taps), x, keep, mu * error[0], penalty)
+        for k in range(1, lines.filtered.shape[0]):
+            add_scaled(w, mu * error[k], newest(lines.filtered[k, j, i], taps), 0, taps)
 
 
 @part(fastmath=FAST)
-def _change(w, filtered, x, keep, correction, penalty):
+def change(w, filtered, x, keep, correction, penalty):
+    """Set w = keep w + correction x' - penalty x."""
     for i in range(w.size):
         w[i] = keep * w[i] + correction * filtered[i] - penalty * x[i]
 

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_nonnegative, as_positive
+from ..kernels.compiling import by_type
 from ..kernels.delay_lines import newest
-from ..kernels.vectors import dot
+from ..kernels.vectors import at, dot
 from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint
-from ..power.limiter import OutputLimiter
 from .base import constraint_for
-from .lms import LMSController, advance_powers, change_weights, penalty_of_constraint
-from .step import Lines, adapt
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_filter, penalty_of_constraint
+from .step import Lines, adapt, advance_powers, loudspeakers
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
@@ -65,26 +67,46 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
 class MOVState(NamedTuple):
     """State of `MOVFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
-    penalty: float  # NaN: computed from the running powers
+    penalty: float | np.ndarray  # or (J,); NaN: computed from the running powers
     modified: bool
 
 
 @adapt.register(MOVState)
 def adapt_mov(state, error, control_signal):
     """Set w(n+1) = w(n) + mu [e(n) x'(n) - gamma y(n) x(n)], with gamma = G_s (1/alpha - 1) unless it is fixed."""
-    finite, d, factor = advance_powers(state, error)
+    finite, d, factor = advance_powers(state.lines, state.constraint, error)
     if finite:
-        w, mu, gamma = state.weights, state.step_size, state.penalty
-        if np.isnan(gamma):
-            gamma = penalty_of_constraint(state.constraint, factor)
+        w, mu = state.weights, state.step_size
         if state.modified:
-            error = d - dot(w, newest(state.lines.filtered, w.size))
-        change_weights(w, state.lines, 1.0, mu * error, mu * gamma * control_signal)
+            error = modified_error(state.lines, w, d)
+        for j in range(loudspeakers(state.lines)):
+            gamma = at(state.penalty, j)
+            if np.isnan(gamma):
+                gamma = penalty_of_constraint(at(state.constraint, j), at(factor, j))
+            change_filter(state.lines, w, j, 1.0, mu, error, mu * gamma * at(control_signal, j))
     return finite
+
+
+@by_type
+def modified_error(lines, weights, disturbance):
+    """Return d^(n) - w(n)' x'(n)."""
+    return disturbance - dot(weights, newest(lines.filtered, weights.size))
+
+
+@modified_error.register(ChannelLines)
+def modified_channel_errors(lines, weights, disturbance):
+    """Return it for each microphone, (K,)."""
+    for k in range(disturbance.size):
+        total = 0.0
+        for j in range(weights.shape[0]):
+            for i in range(weights.shape[1]):
+                total += dot(weights[j, i], newest(lines.filtered[k, j, i], weights.shape[2]))
+        lines.modified_error[k] = disturbance[k] - total
+    return lines.modified_error
 
 
 class MOVFxLMS(LMSController):
@@ -97,20 +119,25 @@ class MOVFxLMS(LMSController):
     in KF-OPC, so the penalty varies with the noise (Lai et al. 2023); the argument `penalty_factor` fixes it (Shi et
     al. 2021). The weights settle at about :math:`(R_{x'} + \gamma R_x) w = r`.
 
+    With several channels, loudspeaker j has the penalty gamma_j, from its own rated power, the disturbance power
+    :math:`\sum_k E[d_k^2]` and the gain :math:`G_j = \sum_{ki} E[x'^2_{kji}] / \sum_i E[x_i^2]`. This extension is ours.
+    It assumes that the loudspeaker has to cancel the whole disturbance alone, so several loudspeakers that share the
+    work usually stay well below their rated powers.
+
     Parameters
     ----------
-    n_taps, secondary_path, step_size
+    n_taps, secondary_path, step_size, n_references
         As for `FxLMS`.
-    rated_power : float, optional
-        Rated output power rho_o.
-    constraint : OutputPowerConstraint, optional
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power rho_o, or that of each loudspeaker.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
-    amplifier : callable, optional
+    amplifier : callable or sequence of J of them, optional
         Known amplifier model: the disturbance estimate is then e + s^ * amplifier(y); by default e + s^ * y.
     limiter : OutputLimiter, optional
         As for `FxLMS`.
-    penalty_factor : float, optional
-        Fixed penalty factor gamma, zero or above; the function `penalty_factor` computes it for a rated power. By
+    penalty_factor : float or array_like, shape (J,), optional
+        Fixed penalty factor gamma, or that of each loudspeaker, zero or above; the function `penalty_factor` computes it for a rated power. By
         default gamma follows the running powers.
     modified : bool, default False
         Adapt to ``d^ - w' x'`` instead of the error, in the modified structure of Lai et al. The delay of the secondary
@@ -147,16 +174,28 @@ class MOVFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        rated_power: float | None = None,
-        constraint: OutputPowerConstraint | None = None,
-        amplifier: Amplifier | None = None,
-        limiter: OutputLimiter | None = None,
-        penalty_factor: float | None = None,
+        rated_power: float | Sequence[float] | np.ndarray | None = None,
+        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        n_references: int = 1,
+        limiter: Limiters = None,
+        penalty_factor: float | Sequence[float] | np.ndarray | None = None,
         modified: bool = False,
     ) -> None:
         own = constraint_for(rated_power, constraint)
-        super().__init__(n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter)
-        penalty = math.nan if penalty_factor is None else as_nonnegative(penalty_factor, "penalty_factor")
+        super().__init__(
+            n_taps,
+            secondary_path,
+            n_references=n_references,
+            amplifier=amplifier,
+            constraint=own,
+            limiter=limiter,
+        )
+        penalty = self._each_loudspeaker(
+            0.0 if penalty_factor is None else penalty_factor, "penalty_factor", as_nonnegative
+        )
+        if penalty_factor is None:
+            penalty = penalty * math.nan  # computed from the running powers
         self._state = MOVState(*self._common(), as_positive(step_size, "step_size"), penalty, bool(modified))
         if modified:
             self.name = "MOV-MFxLMS"

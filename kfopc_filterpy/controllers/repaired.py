@@ -53,7 +53,7 @@ class RepairedState(NamedTuple):
 
 
 @output.register(RepairedState)
-def output_repaired(state):
+def output_repaired(state, j):
     """Return w'x times the factor at the output."""
     w = state.weights
     return state.repair[0].output_gain * dot(w, newest(state.lines.reference, w.size))

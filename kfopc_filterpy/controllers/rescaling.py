@@ -2,38 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_positive
-from ..kernels.delay_lines import newest
-from ..kernels.vectors import dot
+from ..kernels.vectors import at
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
+from .channels import ChannelLines
 from .fxlms import adapt_fxlms
-from .lms import LMSController
-from .step import Lines, adapt, output
+from .lms import Limiters, LMSController
+from .step import Lines, adapt, filter_output, output, weights_of
 
 
 class RescalingState(NamedTuple):
     """State of `RescalingFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
-    amplitude_limit: float
+    amplitude_limit: float | np.ndarray  # (J,)
 
 
 @output.register(RescalingState)
-def output_rescaled(state):
+def output_rescaled(state, j):
     """Return w'x clipped to the limit, and scale the weights likewise; pass Inf and NaN, which the loop detects."""
-    w, limit = state.weights, state.amplitude_limit
-    y = dot(w, newest(state.lines.reference, w.size))
+    y, limit = filter_output(state.lines, state.weights, j), at(state.amplitude_limit, j)
     if not limit < abs(y) < np.inf:
         return y
-    ratio = limit / abs(y)
+    ratio, w = limit / abs(y), weights_of(state.lines, state.weights, j)
     for i in range(w.size):
         w[i] *= ratio
     return limit if y > 0.0 else -limit
@@ -47,14 +47,15 @@ class RescalingFxLMS(LMSController):
 
     .. math:: \text{if } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
 
-    The step of `FxLMS` follows. Between two such samples the filter is linear.
+    The step of `FxLMS` follows. Between two such samples the filter is linear. With several loudspeakers, each has its
+    own limit, and only the control filters of a loudspeaker beyond it are scaled.
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    amplitude_limit : float
-        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    amplitude_limit : float or array_like, shape (J,)
+        Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
 
     Raises
     ------
@@ -85,14 +86,15 @@ class RescalingFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        amplitude_limit: float,
-        limiter: OutputLimiter | None = None,
+        amplitude_limit: float | Sequence[float] | np.ndarray,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), as_positive(amplitude_limit, "amplitude_limit")
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
+        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
         self._state = RescalingState(*self._common(), step, limit)
 
     @property
-    def amplitude_limit(self) -> float:
-        """Amplitude limit A of the control signal."""
-        return self._state.amplitude_limit
+    def amplitude_limit(self) -> Any:
+        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
+        return copy(self._state.amplitude_limit)

@@ -24,7 +24,8 @@ from ..power.amplifiers import Amplifier
 from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .channels import ChannelController, ChannelLines, estimate_disturbances
+from .base import FilteredReferenceController
+from .channels import ChannelLines, estimate_disturbances
 from .step import adapt, follow
 
 PRIOR = 1e3  # energy of the reference in the unknown paths, relative to the measurement noise
@@ -93,7 +94,7 @@ def add_correlation(state):
     numbers.waiting += 1
 
 
-class SharedGainKalman(ChannelController):
+class SharedGainKalman(FilteredReferenceController):
     """KF-PB for several channels, in real time: primary paths by a Kalman filter, control filters within the powers.
 
     Parameters
@@ -117,7 +118,7 @@ class SharedGainKalman(ChannelController):
     microphone_weights : array_like, shape (K,), optional
         Weight of each microphone's squared error; 0 leaves a microphone out. By default 1.
     amplifier, limiter
-        As for `ChannelController`.
+        As for `FilteredReferenceController`.
 
     Raises
     ------
@@ -162,7 +163,14 @@ class SharedGainKalman(ChannelController):
         n_primary = n_taps + secondary.shape[2] if n_primary is None else as_count(n_primary, "n_primary")
         n_lags = n_taps + secondary.shape[2] + n_primary
         super().__init__(
-            n_taps, secondary_path, n_references=n_references, history=n_lags, amplifier=amplifier, limiter=limiter
+            n_taps,
+            secondary_path,
+            n_references=n_references,
+            multichannel=True,
+            amplifier=amplifier,
+            limiter=limiter,
+            filtered_taps=0,
+            history=n_lags,
         )
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
@@ -226,6 +234,10 @@ class SharedGainKalman(ChannelController):
         if self._rated is not None:
             parts.append("rated power " + ", ".join(f"{power:g}" for power in self._rated))
         return f"<{self.name}: {', '.join(parts)}>"
+
+    @property
+    def _powers_fs(self) -> float:
+        return self.fs
 
     def samples_to_block(self) -> int:
         """Return the number of samples until the next solution."""

@@ -2,9 +2,9 @@
 
 A controller's state is a NamedTuple with at least three fields,
 
-- `lines`: its signals (`Lines`),
-- `weights`: the adapted weights,
-- `constraint`: the running powers (`power.constraint.ConstraintState`),
+- `lines`: its signals (`Lines`, or `ChannelLines` with several channels),
+- `weights`: the adapted weights, (L,) or (J, I, L),
+- `constraint`: the running powers (`power.constraint.ConstraintState`), or a tuple of them, one for each loudspeaker,
 
 and whatever else its algorithm stores. `adapt` must have a body for the type, registered by
 ``adapt.register(MyState)(my_step)``. The other functions have a default body, which an algorithm can replace.
@@ -21,7 +21,7 @@ from ..kernels.compiling import by_type, compiled, compiled_for_states, inlined,
 from ..kernels.delay_lines import latest, newest, push
 from ..kernels.vectors import dot
 from ..power.amplifiers import amplify
-from ..power.constraint import advance_constraint
+from ..power.constraint import advance_constraint, squares_are_finite
 from ..power.limiter import LimiterState, limit_sample
 
 
@@ -46,10 +46,9 @@ def control_filter(state):
 
 
 @by_type
-def output(state):
-    """Return w(n-1)' x(n), before any limiter."""
-    w = control_filter(state)
-    return dot(w, newest(state.lines.reference, w.size))
+def output(state, j):
+    """Return w(n-1)' x(n) of loudspeaker j (0 if there is one), before any limiter."""
+    return filter_output(state.lines, control_filter(state), j)
 
 
 @by_type
@@ -61,15 +60,68 @@ def adapt(state, error, control_signal):
 @by_type
 def follow(state, error):
     """Update the powers with a sample heard while the loudspeaker is silent. Return False if that fails."""
-    d = disturbance_estimate(state.lines, error)
-    advance_constraint(state.constraint, d, latest(state.lines.filtered), latest(state.lines.reference))
-    return True
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
+    return finite
 
 
 @by_type
 def power_weight(state):
     """Return the weight lambda of the control power; NaN for an algorithm without one."""
     return np.nan
+
+
+# Functions chosen by the type of the lines: `Lines` here, `ChannelLines` in `channels`.
+
+
+@by_type
+def loudspeakers(lines):
+    """Return the number of loudspeakers."""
+    return 1
+
+
+@by_type
+def filter_output(lines, weights, j):
+    """Return w' x of loudspeaker j."""
+    return dot(weights, newest(lines.reference, weights.size))
+
+
+@by_type
+def weights_of(lines, weights, j):
+    """Return the weights of loudspeaker j in one row, as a view."""
+    return weights
+
+
+@by_type
+def take_reference(lines, x):
+    """Add x(n) and x'(n) = (s^ * x)(n) to their delay lines."""
+    push(lines.reference, x)
+    s = lines.secondary_estimate
+    push(lines.filtered, dot(s, newest(lines.reference, s.size)))
+
+
+@by_type
+def emit_outputs(lines, state):
+    """Return y(n), after any limiter, and add it to its delay line."""
+    return emit_limited(lines, output(state, 0))
+
+
+@by_type
+def emit_silence(lines):
+    """Add y(n) = 0 to its delay line."""
+    emit_limited(lines, 0.0)
+
+
+@by_type
+def advance_powers(lines, constraint, error):
+    """Add a sample to the running powers; return whether the squares are finite, d^(n) and the constraint factor.
+
+    If they are not finite, nothing was changed. With several channels, d^ and the factor are arrays.
+    """
+    d = disturbance_estimate(lines, error)
+    filtered, x = latest(lines.filtered), latest(lines.reference)
+    if not squares_are_finite(d, filtered, x):
+        return False, d, 1.0
+    return True, d, advance_constraint(constraint, d, filtered, x)
 
 
 # Functions that all controllers share.
@@ -79,15 +131,7 @@ def power_weight(state):
 def emit(state, x):
     """Return y(n) for the newest reference, after any limiter; add x(n), x'(n) and y(n) to their delay lines."""
     take_reference(state.lines, x)
-    return emit_limited(state.lines, output(state))
-
-
-@inlined
-def take_reference(lines, x):
-    """Add x(n) and x'(n) = (s^ * x)(n) to their delay lines."""
-    push(lines.reference, x)
-    s = lines.secondary_estimate
-    push(lines.filtered, dot(s, newest(lines.reference, s.size)))
+    return emit_outputs(state.lines, state)
 
 
 @inlined
@@ -136,11 +180,14 @@ def estimate_once(lines, error):
 
 @compiled_for_states(nogil=True)
 def listen(state, references, errors):
-    """Follow a signal while the loudspeaker is silent; return the number of samples processed before a refusal."""
+    """Follow signals while the loudspeakers are silent; return the number of samples processed before a refusal.
+
+    The first axis is time; with several channels, each row is a sample.
+    """
     state = borrowed(state)
-    for n in range(references.size):
+    for n in range(references.shape[0]):
         take_reference(state.lines, references[n])
-        emit_limited(state.lines, 0.0)
+        emit_silence(state.lines)
         if not follow(state, errors[n]):
             return n
-    return references.size
+    return references.shape[0]

@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_positive
+from ..kernels.vectors import at
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
-from .lms import LMSController, advance_powers, change_weights
-from .step import Lines, adapt
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_filter
+from .step import Lines, adapt, advance_powers, loudspeakers
 
 
 class TwoGradientState(NamedTuple):
     """State of `TwoGradientFxLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
-    amplitude_limit: float
+    amplitude_limit: float | np.ndarray  # (J,)
     output_step_size: float
 
 
 @adapt.register(TwoGradientState)
 def adapt_two_gradient(state, error, control_signal):
     """Descend the gradient of the squared error within the limit, that of the control power beyond it."""
-    finite, _, _ = advance_powers(state, error)
+    finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        if abs(control_signal) > state.amplitude_limit:
-            change_weights(state.weights, state.lines, 1.0, 0.0, state.output_step_size * control_signal)
-        else:
-            change_weights(state.weights, state.lines, 1.0, state.step_size * error, 0.0)
+        for j in range(loudspeakers(state.lines)):
+            y = at(control_signal, j)
+            if abs(y) > at(state.amplitude_limit, j):
+                change_filter(state.lines, state.weights, j, 1.0, 0.0, error, state.output_step_size * y)
+            else:
+                change_filter(state.lines, state.weights, j, 1.0, state.step_size, error, 0.0)
     return finite
 
 
@@ -44,14 +49,15 @@ class TwoGradientFxLMS(LMSController):
 
     The control signal is not clipped. It settles above the limit, at the balance of the two directions, and closer to
     the limit the larger mu_y / mu is. For a tone that needs three times the limit, equal step sizes give an amplitude
-    of 1.2 A.
+    of 1.2 A. With several loudspeakers, each chooses its direction by its own control signal and limit; the direction
+    within the limit is that of the multiple-error LMS (see `FxLMS`).
 
     Parameters
     ----------
-    n_taps, secondary_path, step_size, limiter
+    n_taps, secondary_path, step_size, n_references, limiter
         As for `FxLMS`.
-    amplitude_limit : float
-        Amplitude limit A, above zero; sqrt(2 rated_power) for a sine.
+    amplitude_limit : float or array_like, shape (J,)
+        Amplitude limit A of each control signal, above zero; sqrt(2 rated_power) for a sine.
     output_step_size : float, optional
         Step size of the second direction, above zero; by default that of the first.
 
@@ -85,19 +91,20 @@ class TwoGradientFxLMS(LMSController):
         secondary_path: Any,
         *,
         step_size: float,
-        amplitude_limit: float,
+        amplitude_limit: float | Sequence[float] | np.ndarray,
         output_step_size: float | None = None,
-        limiter: OutputLimiter | None = None,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), as_positive(amplitude_limit, "amplitude_limit")
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
+        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
         second = step if output_step_size is None else as_positive(output_step_size, "output_step_size")
         self._state = TwoGradientState(*self._common(), step, limit, second)
 
     @property
-    def amplitude_limit(self) -> float:
-        """Amplitude limit A of the control signal."""
-        return self._state.amplitude_limit
+    def amplitude_limit(self) -> Any:
+        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
+        return copy(self._state.amplitude_limit)
 
     @property
     def output_step_size(self) -> float:

@@ -28,7 +28,7 @@ def _pointer(typing_context: Any, address: Any) -> Any:
 
 
 def borrowed(value):
-    """Return a NamedTuple, possibly nested, with every array borrowed; called from Python, return the value itself."""
+    """Return a NamedTuple, possibly nested, or a tuple of them, with every array borrowed; called from Python, return the value itself."""
     return value
 
 
@@ -41,6 +41,8 @@ def _borrowed(value):
     if isinstance(value, types.BaseNamedTuple):
         kind = value.instance_class  # type: ignore[attr-defined]
         return lambda value: kind(*_borrowed_items(tuple(value)))
+    if isinstance(value, types.UniTuple):  # of NamedTuples, one for each loudspeaker
+        return lambda value: _borrowed_items(value)
     return lambda value: value
 
 

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from .compiling import part
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.extending import overload
+
+from .compiling import OPTIONS, part
 
 # No flag here lets the compiler assume that NaN or Inf do not occur: the checks for them must survive.
 FAST = {"reassoc", "contract", "nsz"}
@@ -29,3 +35,16 @@ def add_scaled(target, factor, source, begin, end):
     """Add factor * source to target at the indices begin to end - 1."""
     for k in range(begin, end):
         target[k] += factor * source[k]
+
+
+def at(values: Any, j: int) -> Any:
+    """Return the j-th of several values, in an array or a plain tuple; a single value, a NamedTuple too, is returned."""
+    several = isinstance(values, np.ndarray) or (isinstance(values, tuple) and not hasattr(values, "_fields"))
+    return values[j] if several else values
+
+
+@overload(at, jit_options=OPTIONS | {"forceinline": True})
+def _at(values, j):
+    if isinstance(values, types.Array | types.UniTuple):
+        return lambda values, j: values[j]
+    return lambda values, j: values

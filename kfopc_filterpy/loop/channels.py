@@ -11,13 +11,8 @@ from scipy.signal import fftconvolve
 
 from .._validate import as_channels, as_count, as_positive, per_loudspeaker
 from ..controllers.base import FilteredReferenceController
-from ..controllers.channels import (
-    ChannelController,
-    amplifier_models,
-    delay_lines,
-    emit_channels,
-)
-from ..controllers.step import adapt, control_filter
+from ..controllers.channels import amplifier_models, delay_lines
+from ..controllers.step import adapt, control_filter, emit
 from ..kernels.borrowing import borrowed
 from ..kernels.compiling import compiled, compiled_for_states, inlined
 from ..kernels.delay_lines import newest, push
@@ -48,6 +43,7 @@ class ChannelStretch(NamedTuple):
     anti_noise: np.ndarray  # (K, n)
     control_signal: np.ndarray  # (J, n)
     amplifier_output: np.ndarray  # (J, n)
+    constraint_factor: np.ndarray  # (J, n)
 
 
 @inlined
@@ -88,8 +84,7 @@ def run_channels(state, plant, signals, weights, limit, every, first, begin, end
     x, e = np.empty(signals.reference.shape[0]), np.empty(signals.error.shape[0])
     for n in range(begin, end):
         hear(plant, signals, n, x)
-        emit_channels(state, x)
-        y = state.lines.control_signal
+        y = emit(state, x)
         for j in range(y.size):
             if not abs(y[j]) <= limit[j]:
                 return DIVERGED, n
@@ -98,6 +93,8 @@ def run_channels(state, plant, signals, weights, limit, every, first, begin, end
             e[k] = signals.error[k, n]
         if not adapt(state, e, y):
             return REFUSED, n
+        for j in range(y.size):
+            signals.constraint_factor[j, n] = state.lines.constraint_factor[j]
         if weights.shape[0] > 0 and (first + n) % every == 0:
             weights[(first + n) // every] = control_filter(state)
     return RUNNING, end
@@ -129,7 +126,7 @@ class ChannelRun:
 
     def stretch(self, signals: ChannelStretch, first: int, compiled: bool) -> tuple[int, int]:
         """Run a stretch; return the status and the first sample not done."""
-        own = isinstance(self.controller, ChannelController) and not any(self.amplifiers)
+        own = isinstance(self.controller, FilteredReferenceController) and not any(self.amplifiers)
         state = self.controller.compiled_state() if compiled and own else None
         return self._steps(signals, first) if state is None else self._blocks(state, signals, first)
 
@@ -164,6 +161,7 @@ class ChannelRun:
                     return DIVERGED, n
                 self._play(y, signals, n)
                 self.controller.update(signals.error[:, n].copy())
+            signals.constraint_factor[:, n] = getattr(self.controller, "constraint_factor", np.nan)
             if self.weights.shape[0] > 0 and (first + n) % self.every == 0:
                 self.weights[(first + n) // self.every] = filters_of(self.controller)
             if self.progress:
@@ -193,8 +191,8 @@ class ChannelRun:
 
 def is_multichannel(controller: Any, reference: Any, secondary_path: Any, disturbance: Any) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
-    signals = np.ndim(reference) == 2 or np.ndim(disturbance) == 2
-    return isinstance(controller, ChannelController) or signals or is_path_matrix(secondary_path)
+    own = isinstance(controller, FilteredReferenceController) and controller.multichannel
+    return own or np.ndim(reference) == 2 or np.ndim(disturbance) == 2 or is_path_matrix(secondary_path)
 
 
 def filters_of(controller: Any) -> Any:
@@ -230,7 +228,7 @@ def simulate_channels(
     rated = None if rated is None else per_loudspeaker(rated, J, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
-    if isinstance(controller, ChannelController):
+    if isinstance(controller, FilteredReferenceController):
         controller.require_sample_rate(fs)
     if on:
         if not hasattr(controller, "listen"):
@@ -244,7 +242,7 @@ def simulate_channels(
     signals = ChannelStretch(
         *(np.ascontiguousarray(s) for s in (x, d, np.zeros(d.shape) + noise.take(K, d.shape[1]))),
         *np.full((2, *d.shape), np.nan),
-        *np.full((2, J, d.shape[1]), np.nan),
+        *np.full((3, J, d.shape[1]), np.nan),
     )
     status, end = run.stretch(signals, 0, compiled)
     if status == DIVERGED:
@@ -263,7 +261,7 @@ def simulate_channels(
         control_signal=signals.control_signal,
         amplifier_output=signals.amplifier_output,
         anti_noise=signals.anti_noise,
-        constraint_factor=np.full(signals.control_signal.shape, getattr(controller, "constraint_factor", np.nan)),
+        constraint_factor=signals.constraint_factor,
         weights=weights if every else None,
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
         diverged_at_s=end / fs if status == DIVERGED else None,
@@ -292,10 +290,10 @@ def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float,
 
 def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_microphones: int) -> None:
     """Raise ValueError if a built-in controller is made for other numbers of channels."""
-    if isinstance(controller, FilteredReferenceController):
-        raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
-    if not isinstance(controller, ChannelController):
+    if not isinstance(controller, FilteredReferenceController):
         return
+    if not controller.multichannel:
+        raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
     counts = {
         "references": (controller.n_references, n_references),
         "loudspeakers": (controller.n_loudspeakers, n_loudspeakers),

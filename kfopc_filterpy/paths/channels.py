@@ -28,14 +28,7 @@ def primary_paths(
 
 
 def is_path_matrix(paths: Any) -> bool:
-    """Return whether paths are given as a matrix, by shape or as a system of several inputs or outputs."""
-    if is_system(paths):
-        return (paths.noutputs, paths.ninputs) != (1, 1)
-    return _has_systems(paths) or np.ndim(paths) > 1
-
-
-def is_path_matrix(paths: Any) -> bool:
-    """Return whether paths are given as a matrix, by shape or as a system of several inputs or outputs."""
+    """Return whether paths are given as a matrix (outputs, inputs, taps), be it one by one, or as a matrix of systems."""
     if is_system(paths):
         return (paths.noutputs, paths.ninputs) != (1, 1)
     return _has_systems(paths) or np.ndim(paths) > 1

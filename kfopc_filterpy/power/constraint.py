@@ -77,12 +77,19 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     Also return the disturbance power and the gain that it was computed from, and the three mean squares. If `reference`
     is NaN (none given), the powers of the reference and the filtered reference stay as they are.
     """
+    return _preview_squares(
+        state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
+    )
+
+
+@inlined
+def _preview_squares(state, disturbance, filtered_reference, reference):
     numbers = state.numbers[0]
-    mean_d = _next_mean(state, DISTURBANCE, disturbance * disturbance)
+    mean_d = _next_mean(state, DISTURBANCE, disturbance)
     mean_xf, mean_x = state.powers[FILTERED_REFERENCE].mean_square, state.powers[REFERENCE].mean_square
     if not np.isnan(reference):
-        mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference * filtered_reference)
-        mean_x = _next_mean(state, REFERENCE, reference * reference)
+        mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference)
+        mean_x = _next_mean(state, REFERENCE, reference)
     gain = power_gain(numbers.supplied_gain, numbers.gain, mean_xf, mean_x)
     power = mean_d if np.isnan(numbers.supplied_power) else numbers.supplied_power
     factor = constraint_factor(numbers.supplied_factor, numbers.rated_power, power, gain)
@@ -92,6 +99,13 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
 @inlined
 def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
     """Add the sample to the running powers; `previewed` is what `preview_constraint` returned for it."""
+    _commit_squares(
+        state, previewed, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
+    )
+
+
+@inlined
+def _commit_squares(state, previewed, disturbance, filtered_reference, reference):
     factor, power, gain, mean_d, mean_xf, mean_x = previewed
     _take(state, DISTURBANCE, disturbance, mean_d)
     if not np.isnan(reference):
@@ -104,8 +118,16 @@ def commit_constraint(state, previewed, disturbance, filtered_reference, referen
 @inlined
 def advance_constraint(state, disturbance, filtered_reference, reference):
     """Add this sample to the running powers and return the constraint factor."""
-    previewed = preview_constraint(state, disturbance, filtered_reference, reference)
-    commit_constraint(state, previewed, disturbance, filtered_reference, reference)
+    return advance_squares(
+        state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
+    )
+
+
+@inlined
+def advance_squares(state, disturbance, filtered_reference, reference):
+    """Add squares, which can be sums over channels, to the running powers and return the constraint factor."""
+    previewed = _preview_squares(state, disturbance, filtered_reference, reference)
+    _commit_squares(state, previewed, disturbance, filtered_reference, reference)
     return previewed[0]
 
 
@@ -116,14 +138,14 @@ def squares_are_finite(d, filtered, x):
 
 
 @inlined
-def _take(state, signal, value, mean):
-    """Add one sample to one running power, whose new mean square is `mean`."""
+def _take(state, signal, square, mean):
+    """Add one square to one running power, whose new mean square is `mean`."""
     power, m = state.powers[signal], state.window.shape[1]
     power.mean_square = mean
     if m > 0:
         position = np.int64(power.taken) % m
-        power.lap += value * value
-        state.window[signal, position] = value * value
+        power.lap += square
+        state.window[signal, position] = square
         if position == m - 1:
             power.lap = 0.0
             for i in range(m - 2, -1, -1):

@@ -77,7 +77,7 @@ adapt.register(HalvedState)(adapt_sign)
 
 
 @output.register(HalvedState)
-def output_halved(state):
+def output_halved(state, j):
     """Return half of w'x."""
     return 0.5 * dot(state.weights, newest(state.lines.reference, state.weights.size))
 

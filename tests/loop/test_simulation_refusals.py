@@ -14,7 +14,7 @@ from kfopc_filterpy.paths import fir_path
 
 REFUSED = [
     ({"reference": X[:0], "disturbance": D[:0]}, ValueError, "reference must have at least 1 value"),
-    ({"reference": X[:, None]}, ValueError, "reference must be one-dimensional"),
+    ({"reference": X[:, None]}, ValueError, "reference must have its channels first"),
     ({"reference": np.where(X > 2, np.nan, X)}, ValueError, "reference must be finite"),
     ({"reference": ["a"] * 300}, TypeError, "reference must be a sequence of real numbers"),
     ({"disturbance": np.where(D > 2, np.inf, D)}, ValueError, "disturbance must be finite"),

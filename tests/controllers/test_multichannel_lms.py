@@ -1,0 +1,463 @@
+"""The LMS family with several channels: against a literal transcription, against one channel, and where it settles."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers.comparing import assert_same_run
+
+from kfopc_filterpy import (
+    ClippingFxLMS,
+    DiagonalKalman,
+    FxLMS,
+    FxNLMS,
+    HardClipAmplifier,
+    LeakyFxLMS,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    OutputPowerConstraint,
+    RescalingFxLMS,
+    TwoGradientFxLMS,
+    kf_anc,
+    output_power,
+    simulate,
+)
+from kfopc_filterpy.controllers.shared_gain import SharedGainKalman
+
+K, J, I, L = 3, 2, 2, 5  # microphones, loudspeakers, references, taps  # noqa: E741
+FS = 16000.0
+MU = 0.01
+_rng = np.random.default_rng(5)
+PATHS = np.zeros((K, J, 6))  # true secondary paths
+PATHS[:, :, 1:5] = _rng.standard_normal((K, J, 4)) * [0.8, 0.5, 0.3, 0.2]
+ESTIMATE = 0.9 * PATHS[:, :, :4]  # what the controllers know of them
+PRIMARY = _rng.standard_normal((K, I, 7)) * 0.5
+A = np.array([0.3, 0.6])  # amplitude limits
+LEAK = np.array([0.4, 0.1])
+PENALTY = np.array([0.7, 0.2])
+RATED, MEMORY = np.array([0.4, 0.8]), 60
+
+
+def noise(n: int = 400, n_references: int = I) -> np.ndarray:
+    return np.random.default_rng(3).standard_normal((n_references, n))
+
+
+def constraints() -> list[OutputPowerConstraint]:
+    """The rated powers, the powers with a memory of `MEMORY` samples."""
+    return [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY / FS) for power in RATED]
+
+
+# ---- A literal transcription
+
+
+def delayed(signal: np.ndarray, n: int, length: int) -> np.ndarray:
+    """The newest `length` samples of a signal at n, newest first, zeros before the first."""
+    return np.array([signal[n - m] if n >= m else 0.0 for m in range(length)])
+
+
+def transcribed(x: np.ndarray, d: np.ndarray, step: Any, held: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The loop, sum by sum; `step(w, j, i, at)` is the new w_ji, `held(w_j, y_j, j)` what leaves loudspeaker j."""
+    n_samples = x.shape[1]
+    w, y, e, d_hat = np.zeros((J, I, L)), np.zeros((J, n_samples)), np.zeros((K, n_samples)), np.zeros((K, n_samples))
+    xf = np.zeros((K, J, I, n_samples))
+    for n in range(n_samples):
+        rows = [delayed(x[i], n, L) for i in range(I)]
+        for k in range(K):
+            for j in range(J):
+                for i in range(I):
+                    xf[k, j, i, n] = ESTIMATE[k, j] @ delayed(x[i], n, ESTIMATE.shape[2])
+        for j in range(J):
+            y[j, n] = sum(w[j, i] @ rows[i] for i in range(I))
+            w[j], y[j, n] = held(w[j], y[j, n], j)
+        for k in range(K):
+            heard = sum(PATHS[k, j] @ delayed(y[j], n, PATHS.shape[2]) for j in range(J))
+            e[k, n] = d[k, n] - heard
+            d_hat[k, n] = e[k, n] + sum(ESTIMATE[k, j] @ delayed(y[j], n, ESTIMATE.shape[2]) for j in range(J))
+        filtered = np.array(
+            [[[delayed(xf[k, j, i], n, L) for i in range(I)] for j in range(J)] for k in range(K)]
+        )  # (K, J, I, L)
+        at = {"n": n, "e": e[:, n], "y": y[:, n], "x": rows, "xf": filtered, "signals": (d_hat, xf, x)}
+        at["modified"] = np.array(
+            [d_hat[k, n] - sum(w[j, i] @ filtered[k, j, i] for j in range(J) for i in range(I)) for k in range(K)]
+        )
+        w = np.array([[step(w[j, i], j, i, at) for i in range(I)] for j in range(J)])
+    return e, y, w
+
+
+def gradient(at: dict[str, Any], j: int, i: int, error: str = "e") -> np.ndarray:
+    """mu sum_k e_k(n) x'_kji(n)."""
+    return MU * sum(at[error][k] * at["xf"][k, j, i] for k in range(K))
+
+
+def mean_square(squares: np.ndarray) -> float:
+    """A plain mean until the window is full, then forgetting."""
+    mean = 0.0
+    for k, square in enumerate(squares):
+        mean += max(-np.expm1(-1.0 / MEMORY), 1.0 / (k + 1)) * (square - mean)
+    return mean
+
+
+def rated_gamma(at: dict[str, Any], j: int) -> float:
+    """gamma_j = max(sqrt(G_j delta^2 / rho_j) - G_j, 0)."""
+    (d, xf, _), n = at["signals"], at["n"]
+    d2 = mean_square(np.sum(d[:, : n + 1] ** 2, axis=0))
+    gain = mean_square(np.sum(xf[:, j, :, : n + 1] ** 2, axis=(0, 1))) / reference_power(at)
+    return max(np.sqrt(gain * d2 / RATED[j]) - gain, 0.0)
+
+
+def reference_power(at: dict[str, Any]) -> float:
+    _, _, x = at["signals"]
+    return mean_square(np.sum(x[:, : at["n"] + 1] ** 2, axis=0))
+
+
+def as_it_is(w: np.ndarray, y: float, j: int) -> tuple[np.ndarray, float]:
+    return w, y
+
+
+EVERY: dict[str, tuple[Callable[..., Any], Any, Any]] = {
+    "FxLMS": (
+        lambda path, **o: FxLMS(L, path, step_size=MU, **o),
+        lambda w, j, i, at: w + gradient(at, j, i),
+        as_it_is,
+    ),
+    "clipping FxLMS": (
+        lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=A, **o),
+        lambda w, j, i, at: w + gradient(at, j, i),
+        lambda w, y, j: (w, np.clip(y, -A[j], A[j])),
+    ),
+    "re-scaling FxLMS": (
+        lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=A, **o),
+        lambda w, j, i, at: w + gradient(at, j, i),
+        lambda w, y, j: (w, y) if abs(y) <= A[j] else (w * A[j] / abs(y), np.sign(y) * A[j]),
+    ),
+    "leaky FxLMS": (
+        lambda path, **o: LeakyFxLMS(L, path, step_size=MU, leak=LEAK, **o),
+        lambda w, j, i, at: (1 - MU * LEAK[j]) * w + gradient(at, j, i),
+        as_it_is,
+    ),
+    "optimal leaky FxLMS": (
+        lambda path, **o: OptimalLeakyFxLMS(L, path, step_size=MU, constraint=constraints(), **o),
+        lambda w, j, i, at: (1 - MU * reference_power(at) * rated_gamma(at, j)) * w + gradient(at, j, i),
+        as_it_is,
+    ),
+    "MOV-FxLMS": (
+        lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), **o),
+        lambda w, j, i, at: w + gradient(at, j, i) - MU * rated_gamma(at, j) * at["y"][j] * at["x"][i],
+        as_it_is,
+    ),
+    "MOV-FxLMS fixed": (
+        lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), penalty_factor=PENALTY, **o),
+        lambda w, j, i, at: w + gradient(at, j, i) - MU * PENALTY[j] * at["y"][j] * at["x"][i],
+        as_it_is,
+    ),
+    "MOV-MFxLMS": (
+        lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), modified=True, **o),
+        lambda w, j, i, at: w + gradient(at, j, i, "modified") - MU * rated_gamma(at, j) * at["y"][j] * at["x"][i],
+        as_it_is,
+    ),
+    "two-gradient FxLMS": (
+        lambda path, **o: TwoGradientFxLMS(L, path, step_size=MU, amplitude_limit=A, output_step_size=0.05, **o),
+        lambda w, j, i, at: w + (gradient(at, j, i) if abs(at["y"][j]) <= A[j] else -0.05 * at["y"][j] * at["x"][i]),
+        as_it_is,
+    ),
+}
+
+
+def made(name: str, path: np.ndarray = ESTIMATE, **options: Any) -> Any:
+    return EVERY[name][0](path, **({"n_references": I} | options))
+
+
+def run(controller: Any, x: np.ndarray, **options: Any) -> Any:
+    return simulate(controller, x, primary_path=PRIMARY, secondary_path=PATHS, fs=FS, **options)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_run_is_the_equations(name: str) -> None:
+    x = noise()
+    controller = made(name)
+    result = run(controller, x)
+    e, y, w = transcribed(x, result.disturbance, *EVERY[name][1:])
+    for got, want in ((result.error, e), (result.control_signal, y), (controller.weights, w)):
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-12 * np.abs(want).max())
+    assert np.mean(e[:, -100:] ** 2) < 0.9 * np.mean(result.disturbance[:, -100:] ** 2)  # it did cancel
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if name != "FxLMS"])
+def test_the_rule_acts_in_that_run(name: str) -> None:
+    """The transcriptions above would agree as well where no limit or penalty ever acted."""
+    x = noise()
+    one, free = made(name), made("FxLMS")
+    one_run, free_run = run(one, x), run(free, x)
+    for j in range(J):
+        assert np.abs(one_run.control_signal[j] - free_run.control_signal[j]).max() > 0.05
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
+    fast, slow = made(name), made(name)
+    options: dict[str, Any] = {"record_weights_every": 7, "sensor_noise_std": 0.01, "rng": 1, "switch_on_s": 20 / FS}
+    assert_same_run(run(fast, noise(200), **options), run(slow, noise(200), compiled=False, **options))
+    np.testing.assert_array_equal(fast.weights, slow.weights)
+    assert_same_run(run(fast, noise(50), compiled=False), run(slow, noise(50)))  # and they go on alike
+    for twin in (copy.deepcopy(fast), pickle.loads(pickle.dumps(fast))):
+        assert_same_run(run(twin, noise(50)), run(copy.deepcopy(slow), noise(50)))
+
+
+# ---- One channel
+
+
+ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
+ONE: dict[str, Callable[..., Any]] = {
+    "FxLMS": lambda path, **o: FxLMS(L, path, step_size=MU, **o),
+    "clipping FxLMS": lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
+    "re-scaling FxLMS": lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
+    "leaky FxLMS": lambda path, **o: LeakyFxLMS(L, path, step_size=MU, leak=0.4, **o),
+    "optimal leaky FxLMS": lambda path, **o: OptimalLeakyFxLMS(L, path, step_size=MU, constraint=constraints()[0], **o),
+    "MOV-FxLMS": lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints()[0], **o),
+    "MOV-MFxLMS": lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints()[0], modified=True, **o),
+    "two-gradient FxLMS": lambda path, **o: TwoGradientFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
+}
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("name", ONE)
+def test_channels_of_one_are_the_single_channel_bit_for_bit(name: str, compiled: bool) -> None:
+    x, other = noise(300)
+    d = np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:300] + 0.1 * other
+    single, many = ONE[name](ONE_PATH), ONE[name](ONE_PATH.reshape(1, 1, -1))
+    options: dict[str, Any] = {
+        "secondary_path": ONE_PATH,
+        "fs": FS,
+        "amplifier": HardClipAmplifier(0.5),
+        "switch_on_s": 30 / FS,
+        "record_weights_every": 5,
+        "compiled": compiled,
+    }
+    want, got = simulate(single, x, disturbance=d, **options), simulate(many, x, disturbance=d, **options)
+    for signal in ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor"):
+        assert getattr(got, signal).shape == (1, want.n_samples)
+        np.testing.assert_array_equal(getattr(got, signal)[0], getattr(want, signal), err_msg=signal)
+    np.testing.assert_array_equal(got.weights[:, 0, 0], want.weights)
+    for attribute in ("weights", "disturbance_power", "secondary_path_gain", "constraint_factor"):
+        np.testing.assert_array_equal(np.ravel(getattr(many, attribute)), getattr(single, attribute), err_msg=attribute)
+    assert got.algorithm == want.algorithm
+
+
+def test_each_loudspeaker_has_its_own_limiter_and_amplifier_model() -> None:
+    """Two loudspeakers that do not hear each other are two single-channel runs."""
+    x = noise(600, 1)
+    paths = np.zeros((2, 2, 4))
+    paths[0, 0], paths[1, 1] = ONE_PATH, 0.5 * ONE_PATH[::-1]
+    d = np.array([np.convolve(x[0], [0.0, 0.0, 0.0, 0.0, 1.2, 0.5])[:600], np.roll(x[0], 4)])
+    amplifiers = [HardClipAmplifier(0.2), HardClipAmplifier(0.3)]
+
+    def limiters() -> list[OutputLimiter]:
+        return [OutputLimiter(power, fs=FS, window_s=20 / FS) for power in (0.02, 0.05)]
+
+    def controller(path: np.ndarray, penalty: Any, amplifier: Any, limiter: Any) -> MOVFxLMS:
+        options: dict[str, Any] = {"rated_power": 1.0, "penalty_factor": penalty, "modified": True}
+        return MOVFxLMS(L, path, step_size=MU, amplifier=amplifier, limiter=limiter, **options)
+
+    both = controller(paths, PENALTY, amplifiers, limiters())
+    np.testing.assert_array_equal(both.rated_power, [1.0, 1.0])
+    both.limiter = limiters()  # can be assigned
+    got = simulate(both, x, disturbance=d, secondary_path=paths, amplifier=amplifiers, fs=FS, rated_power=1.0)
+    for j, limiter in enumerate(limiters()):
+        one = controller(paths[j, j], PENALTY[j], amplifiers[j], limiter)
+        options = {"secondary_path": paths[j, j], "amplifier": amplifiers[j], "fs": FS, "rated_power": 1.0}
+        want = simulate(one, x[0], disturbance=d[j], **options)
+        np.testing.assert_allclose(got.control_signal[j], want.control_signal, rtol=0, atol=1e-12)
+        assert limiter.clipped + (limiter.gain < 1.0) > 0  # it did limit
+        assert np.abs(want.control_signal - want.amplifier_output).max() > 0.01  # and the amplifier clipped
+
+
+# ---- Where it settles
+
+
+def wiener(paths: np.ndarray, primary: np.ndarray, leak: np.ndarray) -> np.ndarray:
+    """Return the solution of (R + diag(leak_j)) w = r for white references of power 1, from dense convolutions."""
+    n_k, n_j, _ = paths.shape
+    rows = paths.shape[2] + L - 1
+    columns = [[scipy.linalg.convolution_matrix(paths[k, j], L, mode="full") for j in range(n_j)] for k in range(n_k)]
+    A_ = np.block(columns)  # (K rows, J L): what each tap of each loudspeaker adds at each lag and microphone
+    solutions = []
+    for i in range(primary.shape[1]):
+        b = np.concatenate([np.pad(primary[k, i], (0, rows - primary.shape[2])) for k in range(n_k)])
+        w = np.linalg.solve(A_.T @ A_ + np.diag(np.repeat(leak, L)), A_.T @ b)
+        solutions.append(w.reshape(n_j, L))
+    return np.stack(solutions, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("make", "leak"),
+    [
+        (lambda **o: FxLMS(L, PATHS, step_size=1e-3, **o), [0.0, 0.0]),
+        (lambda **o: LeakyFxLMS(L, PATHS, step_size=1e-3, leak=[0.8, 0.3], **o), [0.8, 0.3]),
+        (lambda **o: LeakyFxLMS(L, PATHS, step_size=1e-3, leak=0.5, **o), [0.5, 0.5]),
+        (lambda **o: MOVFxLMS(L, PATHS, step_size=1e-3, rated_power=1.0, penalty_factor=[0.8, 0.3], **o), [0.8, 0.3]),
+    ],
+    ids=["FxLMS", "leaks", "one leak", "penalties"],
+)
+def test_it_settles_at_the_regularised_wiener_solution(make: Callable[..., Any], leak: list[float]) -> None:
+    """The mean of the weights, within 1 % of the largest one. R_x = I, so a penalty is a leak."""
+    x = noise(200_000)
+    result = run(make(n_references=I), x, record_weights_every=50)
+    weights = result.weights[len(result.weights) // 4 :].mean(axis=0)
+    want = wiener(PATHS, PRIMARY, np.array(leak))
+    np.testing.assert_allclose(weights, want, rtol=0, atol=0.01 * np.abs(want).max())
+    if any(leak):  # the leak matters at that tolerance
+        assert np.abs(want - wiener(PATHS, PRIMARY, np.zeros(J))).max() > 0.05 * np.abs(want).max()
+
+
+def test_every_loudspeaker_keeps_its_rated_power() -> None:
+    """MOV-FxLMS counts on each loudspeaker alone: what they need together is less."""
+    x = noise(40_000)
+    free = run(FxLMS(L, PATHS, step_size=2e-3, n_references=I), x)
+    wanted = output_power(free.control_signal[:, 20_000:])
+    rated = 0.25 * wanted
+    assert np.all(wanted > 2.0 * rated)
+    result = run(MOVFxLMS(L, PATHS, step_size=2e-3, rated_power=rated, n_references=I), x)
+    powers = output_power(result.control_signal[:, 20_000:])
+    assert np.all(powers < rated)
+    assert np.all(powers > 0.05 * rated)
+    assert result.rated_power.tolist() == rated.tolist()
+    factor = result.constraint_factor
+    assert factor.shape == (J, 40_000)
+    assert np.all(factor[:, 20_000:] < 1.0)
+    assert factor[0, -1] != factor[1, -1]
+
+
+# ---- Odd systems
+
+
+@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("dead", ["loudspeaker", "microphone"])
+def test_what_is_unplugged_stays_silent_and_finite(name: str, dead: str) -> None:
+    paths = PATHS.copy()
+    paths[(slice(None), 1) if dead == "loudspeaker" else 1] = 0.0
+    controller = made(name, paths)
+    result = simulate(controller, noise(2000), primary_path=PRIMARY, secondary_path=paths, fs=FS)
+    assert np.isfinite(result.error).all()
+    assert np.isfinite(controller.weights).all()
+    if dead == "loudspeaker":
+        np.testing.assert_array_equal(result.control_signal[1], 0.0)
+        np.testing.assert_array_equal(controller.weights[1], 0.0)
+    assert np.any(result.control_signal[0])
+
+
+def test_two_identical_loudspeakers_share_the_work() -> None:
+    paths = np.repeat(PATHS[:, :1], 2, axis=1)
+    controller = FxLMS(L, paths, step_size=MU / 2, n_references=I)
+    simulate(controller, noise(2000), primary_path=PRIMARY, secondary_path=paths, fs=FS)
+    np.testing.assert_array_equal(controller.weights[0], controller.weights[1])
+    alone = FxLMS(L, paths[:, :1], step_size=MU, n_references=I)
+    simulate(alone, noise(2000), primary_path=PRIMARY, secondary_path=paths[:, :1], fs=FS)
+    np.testing.assert_allclose(2 * controller.weights[0], alone.weights[0], rtol=0, atol=1e-12)
+
+
+def test_a_matrix_of_systems_is_a_secondary_path() -> None:
+    systems = [[control.TransferFunction(row, [1.0, 0.0, 0.0, 0.0], 1 / FS) for row in rows] for rows in ESTIMATE]
+    controller = FxLMS(L, systems, step_size=MU, n_references=I)
+    got, want = run(controller, noise(100)), run(made("FxLMS"), noise(100))
+    np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match="fs is 500 Hz but the controller's secondary path is for 16000 Hz"):
+        simulate(controller, noise(100), primary_path=PRIMARY, secondary_path=PATHS, fs=500.0)
+
+
+def test_several_references_need_no_channel_axes() -> None:
+    one = FxLMS(L, ONE_PATH, step_size=MU, n_references=2)
+    assert one.weights.shape == (1, 2, L)
+    assert repr(one) == "<FxLMS: 1 microphone, 1 loudspeaker, 2 references, 5 taps, constraint factor 1>"
+    assert one.control_signal([1.0, 2.0]).shape == (1,)
+
+
+# ---- Refusals
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: FxLMS(L, np.ones((2, 4)), step_size=MU), ValueError, r"\(K microphones, J loudspeakers, taps\), got \(2, 4\)"),
+        (lambda: FxLMS(L, np.ones((64, 2, 3)), step_size=MU), ValueError, r"taps come last"),
+        (lambda: FxLMS(L, PATHS * np.nan, step_size=MU), ValueError, r"secondary_path must be finite"),
+        (lambda: FxLMS(L, PATHS, step_size=MU, n_references=0), ValueError, "n_references must be at least 1"),
+        (lambda: FxLMS(L, PATHS, step_size=-1.0), ValueError, "step_size must be greater than 0"),
+        (lambda: FxLMS(L, PATHS, step_size=MU, limiter=OutputLimiter(1.0)), TypeError, "2 different OutputLimiters"),
+        (lambda: FxLMS(L, PATHS, step_size=MU, limiter=[OutputLimiter(1.0)] * 2), TypeError, "2 different OutputLimiters"),
+        (lambda: made("clipping FxLMS", ESTIMATE[:, :1]), ValueError, r"one for each of the 1 loudspeakers, \(1,\), got shape \(2,\)"),
+        (lambda: ClippingFxLMS(L, PATHS, step_size=MU, amplitude_limit=[1.0, 0.0]), ValueError, "amplitude_limit must be greater than 0"),
+        (lambda: LeakyFxLMS(L, PATHS, step_size=0.1, leak=[1.0, -1.0]), ValueError, "leak must not be negative"),
+        (lambda: LeakyFxLMS(L, PATHS, step_size=0.1, leak=[1.0, 11.0]), ValueError, r"step_size \* leak must be 1 at most, got 1.1"),
+        (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=[1.0] * 3), ValueError, "one for each of the 2 loudspeakers, got 3"),
+        (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, amplifier=[None]), TypeError, "each of the 2 loudspeakers"),
+        (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, penalty_factor=np.nan), ValueError, "penalty_factor must be finite"),
+        (lambda: MOVFxLMS(L, ONE_PATH, step_size=MU, rated_power=[1.0, 2.0]), ValueError, "must be one for one loudspeaker, got 2"),
+        (lambda: FxNLMS(L, PATHS, step_size=MU), ValueError, "FxNLMS takes one channel: .* FxLMS, LeakyFxLMS, .*SharedGainKalman"),
+        (lambda: kf_anc(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "KalmanController takes one channel"),
+        (lambda: DiagonalKalman(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "DiagonalKalman takes one channel"),
+    ],
+    ids=range(18),
+)  # fmt: skip
+def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: type, message: str) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.update([0.1, np.nan, 0.2]), "error must be finite, but that of microphone 1 is nan"),
+        (lambda c: c.update([0.1, 0.2]), "error must have a value for each of the 3 microphones, got 2"),
+        (lambda c: c.update([0.1, 0.2, 1e200]), "must have finite squares, and one overflows"),
+        (lambda c: c.control_signal([np.inf, 1.0]), "reference must be finite, but that of reference 0 is inf"),
+        (lambda c: c.control_signal(1.0), "reference must have a value for each of the 2 references, got 1"),
+        (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), "with I = 2, K = 3, got"),
+        (lambda c: c.listen(np.ones((2, 9)), np.ones((3, 8))), "with I = 2, K = 3, got"),
+        (lambda c: run(c, noise(9, 1)), r"I = 1 of reference"),
+        (
+            lambda c: simulate(c, noise(9), disturbance=np.ones((2, 9)), secondary_path=PATHS[:2], fs=FS),
+            "made for 3 microphones, but reference and paths of the run have 2",
+        ),
+    ],
+    ids=range(9),
+)
+def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable[[Any], Any], message: str) -> None:
+    refusing, twin = made("MOV-FxLMS"), made("MOV-FxLMS")
+    for one in (refusing, twin):
+        run(one, noise(20))
+    with pytest.raises(ValueError, match=message):
+        call(refusing)
+    assert_same_run(run(refusing, noise(20)), run(twin, noise(20)))
+
+
+def test_an_overflow_in_a_run_names_the_sample() -> None:
+    d = np.ones((K, 50))
+    d[2, 30] = 1e200
+    with pytest.raises(ValueError, match="finite squares") as refused:
+        simulate(made("FxLMS"), noise(50), disturbance=d, secondary_path=PATHS, fs=FS)
+    assert any("sample 30" in note for note in refused.value.__notes__)
+
+
+def test_one_channel_refuses_arrays_and_several_channels_need_paths_with_axes() -> None:
+    with pytest.raises(TypeError, match="error must be a single number"):
+        FxLMS(L, ONE_PATH, step_size=MU).update([1.0, 2.0])
+    with pytest.raises(ValueError, match="controller has one channel: give it secondary paths"):
+        run(FxLMS(L, ONE_PATH, step_size=MU), noise(9))
+
+
+def test_shared_gain_kalman_is_always_multichannel() -> None:
+    """Though its path has no channel axes; it stores no filtered references, and its rate is checked."""
+    one = SharedGainKalman(8, ONE_PATH, rated_power=0.5, fs=FS)
+    assert one.multichannel
+    assert one.control_signal([1.0]).shape == (1,)
+    assert one._state.lines.filtered.size == 0
+    with pytest.raises(ValueError, match="power memory is for 16000 Hz"):
+        one.require_sample_rate(8000.0)
