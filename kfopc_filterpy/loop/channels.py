@@ -251,6 +251,7 @@ def simulate_channels(
     weights[-(-end // (every or 1)) :] = np.nan
     if np.ndim(reference) == 1 and J == K == 1:
         signals = ChannelStretch(*(signal[0] for signal in signals))  # one channel drops its axis, as it was given
+        rated = None if rated is None else float(rated[0])
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,

@@ -186,8 +186,9 @@ def room_paths(
     ... )
     >>> paths.primary.shape, paths.secondary.shape
     ((2, 1, 512), (2, 2, 512))
-    >>> paths
-    <RoomPaths: 1 noise source(s), 2 loudspeaker(s), 2 microphone(s) in 5 x 4 x 2.5 m, 512 taps at 16000 Hz, T60 = 0.25 s, cut off at -8 dB>
+    >>> paths  # doctest: +NORMALIZE_WHITESPACE
+    <RoomPaths: 1 noise source(s), 2 loudspeaker(s), 2 microphone(s) in 5 x 4 x 2.5 m,
+    512 taps at 16000 Hz, T60 = 0.25 s, cut off at -8 dB>
     """
     fs, c = as_positive(fs, "fs", unit="Hz"), as_positive(speed_of_sound, "speed_of_sound", unit="m/s")
     n_taps = as_count(n_taps, "n_taps")
