@@ -24,7 +24,7 @@ from ..power.amplifiers import Amplifier
 from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .base import FilteredReferenceController
+from .base import FilteredReferenceController, listed
 from .channels import ChannelLines, estimate_disturbances
 from .step import adapt, follow
 
@@ -225,14 +225,9 @@ class SharedGainKalman(FilteredReferenceController):
         return np.zeros(self.n_loudspeakers) if penalty is None or self._rated is None else penalty.copy()
 
     def __repr__(self) -> str:
-        counts = [
-            (self.n_microphones, "microphone"),
-            (self.n_loudspeakers, "loudspeaker"),
-            (self.n_references, "reference"),
-        ]
-        parts = [f"{count} {what}{'s' if count > 1 else ''}" for count, what in counts] + [f"{self.n_taps} taps"]
+        parts = [*self._channel_counts(), f"{self.n_taps} taps"]
         if self._rated is not None:
-            parts.append("rated power " + ", ".join(f"{power:g}" for power in self._rated))
+            parts.append(f"rated power {listed(self._rated, 'g')}")
         return f"<{self.name}: {', '.join(parts)}>"
 
     @property

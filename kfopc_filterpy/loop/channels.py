@@ -19,9 +19,16 @@ from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import dot
 from ..paths.channels import is_path_matrix, path_matrix, primary_paths, secondary_paths
 from ..power.amplifiers import amplify, compiled_model
-from .inputs import DIVERGENCE_LIMIT, SensorNoise, naming_sample, switch_on_sample
+from .inputs import (
+    DIVERGENCE_LIMIT,
+    SensorNoise,
+    listen_first,
+    naming_sample,
+    require_one_source,
+    switch_on_sample,
+)
 from .result import SimulationResult
-from .run import DIVERGED, REFUSED, RUNNING
+from .run import DIVERGED, REFUSED, RUNNING, STEP
 
 
 class ChannelPlant(NamedTuple):
@@ -33,8 +40,8 @@ class ChannelPlant(NamedTuple):
     amplifiers: np.ndarray  # (J, 1) records of kind, limit and sharpness
 
 
-class ChannelStretch(NamedTuple):
-    """Signals of a stretch of a run: three inputs, then the results of the loop."""
+class ChannelSignals(NamedTuple):
+    """Signals of a run: three inputs, then the results of the loop."""
 
     reference: np.ndarray  # (I, n)
     disturbance: np.ndarray  # (K, n)
@@ -74,8 +81,8 @@ def play(plant, y, signals, n):
 
 
 @compiled_for_states(nogil=True)
-def run_channels(state, plant, signals, weights, limit, every, first, begin, end):
-    """Run a controller's `state` over the samples from `begin` to `end` of a stretch that starts at sample `first`.
+def run_channels(state, plant, signals, weights, limit, every, begin, end):
+    """Run a controller's `state` over the samples from `begin` to `end` of a run.
 
     Return the status and the first sample not done. The control filters are stored in `weights`, (rows, J, I, L), at
     every `every`-th sample.
@@ -95,8 +102,8 @@ def run_channels(state, plant, signals, weights, limit, every, first, begin, end
             return REFUSED, n
         for j in range(y.size):
             signals.constraint_factor[j, n] = state.lines.constraint_factor[j]
-        if weights.shape[0] > 0 and (first + n) % every == 0:
-            weights[(first + n) // every] = control_filter(state)
+        if weights.shape[0] > 0 and n % every == 0:
+            weights[n // every] = control_filter(state)
     return RUNNING, end
 
 
@@ -114,7 +121,7 @@ def play_once(plant, y, signals, n):
 
 @dataclass
 class ChannelRun:
-    """A run of several channels: a controller, the plant and the signals, stretch by stretch."""
+    """A run of several channels: the controller, the plant, and what is recorded."""
 
     controller: Any
     plant: ChannelPlant
@@ -124,20 +131,20 @@ class ChannelRun:
     amplifiers: list[Any]  # functions of a sample that have no compiled model, or None
     progress: Callable[[int], Any] | None
 
-    def stretch(self, signals: ChannelStretch, first: int, compiled: bool) -> tuple[int, int]:
-        """Run a stretch; return the status and the first sample not done."""
+    def over(self, signals: ChannelSignals, compiled: bool) -> tuple[int, int]:
+        """Run over all samples; return the status and the first sample not done."""
         own = isinstance(self.controller, FilteredReferenceController) and not any(self.amplifiers)
         state = self.controller.compiled_state() if compiled and own else None
-        return self._steps(signals, first) if state is None else self._blocks(state, signals, first)
+        return self._steps(signals) if state is None else self._blocks(state, signals)
 
-    def _blocks(self, state: Any, signals: ChannelStretch, first: int) -> tuple[int, int]:
-        """Run in compiled code, block by block if the controller works between blocks."""
+    def _blocks(self, state: Any, signals: ChannelSignals) -> tuple[int, int]:
+        """Run in compiled code, block by block: a run can be interrupted between blocks, and the controller may work."""
         status, begin, n_samples = RUNNING, 0, signals.error.shape[1]
         while begin < n_samples and status == RUNNING:
-            end = min(begin + (self.controller.samples_to_block() or n_samples), n_samples)
+            end = min(begin + (self.controller.samples_to_block() or STEP), n_samples)
             try:
                 status, done = run_channels(
-                    state, self.plant, signals, self.weights, self.limit, self.every, first, begin, end
+                    state, self.plant, signals, self.weights, self.limit, self.every, begin, end
                 )
             finally:  # even if interrupted, the controller must have the state of its last sample
                 self.controller.after_compiled(state)
@@ -145,16 +152,16 @@ class ChannelRun:
                 self.progress(done - begin)
             begin = done
         if status == REFUSED:
-            with naming_sample(first + begin):
+            with naming_sample(begin):
                 self.controller.update(signals.error[:, begin])  # raises, with the reason
                 raise ValueError("the controller refused the errors")
         return status, begin
 
-    def _steps(self, signals: ChannelStretch, first: int) -> tuple[int, int]:
+    def _steps(self, signals: ChannelSignals) -> tuple[int, int]:
         """Call the controller for each sample."""
         x = np.empty(signals.reference.shape[0])
         for n in range(signals.error.shape[1]):
-            with naming_sample(first + n):
+            with naming_sample(n):
                 hear_once(self.plant, signals, n, x)
                 y = self._control_signal(x)
                 if not np.all(np.abs(y) <= self.limit):
@@ -162,8 +169,8 @@ class ChannelRun:
                 self._play(y, signals, n)
                 self.controller.update(signals.error[:, n].copy())
             signals.constraint_factor[:, n] = getattr(self.controller, "constraint_factor", np.nan)
-            if self.weights.shape[0] > 0 and (first + n) % self.every == 0:
-                self.weights[(first + n) // self.every] = filters_of(self.controller)
+            if self.weights.shape[0] > 0 and n % self.every == 0:
+                self.weights[n // self.every] = filters_of(self.controller)
             if self.progress:
                 self.progress(1)
         return RUNNING, signals.error.shape[1]
@@ -176,7 +183,7 @@ class ChannelRun:
             )
         return np.ascontiguousarray(y)
 
-    def _play(self, y: np.ndarray, signals: ChannelStretch, n: int) -> None:
+    def _play(self, y: np.ndarray, signals: ChannelSignals, n: int) -> None:
         if not any(self.amplifiers):
             play_once(self.plant, y, signals, n)
             return
@@ -231,26 +238,24 @@ def simulate_channels(
     if isinstance(controller, FilteredReferenceController):
         controller.require_sample_rate(fs)
     if on:
-        if not hasattr(controller, "listen"):
-            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
-        controller.listen(x[:, :on].copy(), d[:, :on] + noise.take(K, on))
+        listen_first(controller, x[:, :on].copy(), d[:, :on] + noise.take(K, on))
         x, d = x[:, on:], d[:, on:]
     plant, functions = _plant(secondary, feedback_path, amplifier, fs, len(x))
     weights = _weight_rows(x.shape[1], controller, every)
     limit = DIVERGENCE_LIMIT * np.sqrt(np.ones(J) if rated is None else rated)
     run = ChannelRun(controller, plant, limit, weights, every or 1, functions, progress)
-    signals = ChannelStretch(
+    signals = ChannelSignals(
         *(np.ascontiguousarray(s) for s in (x, d, np.zeros(d.shape) + noise.take(K, d.shape[1]))),
         *np.full((2, *d.shape), np.nan),
         *np.full((3, J, d.shape[1]), np.nan),
     )
-    status, end = run.stretch(signals, 0, compiled)
+    status, end = run.over(signals, compiled)
     if status == DIVERGED:
         for signal in signals[3:]:
             signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
     if np.ndim(reference) == 1 and J == K == 1:
-        signals = ChannelStretch(*(signal[0] for signal in signals))  # one channel drops its axis, as it was given
+        signals = ChannelSignals(*(signal[0] for signal in signals))  # one channel drops its axis, as it was given
         rated = None if rated is None else float(rated[0])
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
@@ -271,8 +276,7 @@ def simulate_channels(
 
 def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, n_microphones: int) -> np.ndarray:
     """Return the disturbances, (K, n_samples), as given or as the sum of p_ki * x_i."""
-    if (primary_path is None) == (disturbance is None):
-        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+    require_one_source(primary_path, disturbance)
     if primary_path is not None:
         primary, _ = primary_paths(primary_path, fs=fs)
         if primary.shape[:2] != (n_microphones, len(x)):

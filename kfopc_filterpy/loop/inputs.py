@@ -16,11 +16,23 @@ DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multipl
 
 def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
     """Return the disturbance d, (n_samples,), as given or as p*x."""
-    if (primary_path is None) == (disturbance is None):
-        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+    require_one_source(primary_path, disturbance)
     if disturbance is not None:
         return as_signal(disturbance, "disturbance", length=x.size)
     return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+
+
+def require_one_source(primary_path: Any, disturbance: Any) -> None:
+    """Raise ValueError unless exactly one of the two is given."""
+    if (primary_path is None) == (disturbance is None):
+        raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+
+
+def listen_first(controller: Any, references: np.ndarray, errors: np.ndarray) -> None:
+    """Let the controller follow the noise before it is switched on."""
+    if not hasattr(controller, "listen"):
+        raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+    controller.listen(references, errors)
 
 
 class SensorNoise:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from ..controllers.base import listed
 from ..metrics import noise_reduction_db, output_power
 
 
@@ -93,10 +93,6 @@ class SimulationResult:
         if self.diverged_at_s is not None:
             return f"{text}, diverged at {self.diverged_at_s:.3g} s>"
         reduction = noise_reduction_db(self.error, self.disturbance)
-        powers = _listed(output_power(self.control_signal), ".3g")
-        rated = "" if self.rated_power is None else f" (rated {_listed(self.rated_power)})"
+        powers = listed(output_power(self.control_signal), ".3g")
+        rated = "" if self.rated_power is None else f" (rated {listed(self.rated_power, 'g')})"
         return f"{text}, noise reduction {reduction:.1f} dB, output power {powers}{rated}>"
-
-
-def _listed(values: Any, form: str = "g") -> str:
-    return ", ".join(format(value, form) for value in np.atleast_1d(values))

@@ -16,7 +16,14 @@ from ..paths.models import path_taps
 from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .channels import is_multichannel, simulate_channels
-from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, naming_sample, switch_on_sample
+from .inputs import (
+    DIVERGENCE_LIMIT,
+    SensorNoise,
+    disturbance_at_microphone,
+    listen_first,
+    naming_sample,
+    switch_on_sample,
+)
 from .result import SimulationResult
 from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
@@ -156,7 +163,7 @@ def simulate(
         controller.require_sample_rate(fs)
     weights = _weight_rows(x.size - on, controller, every)
     if on:
-        _listen(controller, x[:on], d[:on] + noise.take(on))
+        listen_first(controller, x[:on], d[:on] + noise.take(on))
         x, d = x[on:], d[on:]
 
     run_stretch = partial(_run_steps, controller, plant, amplifier)
@@ -191,12 +198,6 @@ def simulate(
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
         diverged_at_s=end / fs if status == DIVERGED else None,
     )
-
-
-def _listen(controller: Controller, x: np.ndarray, errors: np.ndarray) -> None:
-    if not hasattr(controller, "listen"):
-        raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
-    controller.listen(x, errors)
 
 
 def _stretch(x: np.ndarray, d: np.ndarray, noise: SensorNoise) -> Stretch:

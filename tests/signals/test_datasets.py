@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.io
 import soundfile
+from helpers.network import serve
 
 from kfopc_filterpy.signals import (
     DataUnavailableError,
@@ -49,22 +50,8 @@ def own_files(tmp_path, monkeypatch):
 @pytest.fixture
 def network(own_files, monkeypatch):
     """A network that serves `own_files` to pooch, whose cache is a new folder; the addresses asked for."""
-    pooch = pytest.importorskip("pooch")
-    asked = []
-
-    class Downloader:
-        def __init__(self, timeout):
-            self.timeout = timeout
-
-        def __call__(self, url, output_file, _):
-            asked.append((url, self.timeout))
-            (name,) = (name for name in FILES if name.endswith("/" + url.rsplit("/", 1)[1]))
-            Path(output_file).write_bytes((own_files / name).read_bytes())
-
     monkeypatch.delenv("KFOPC_DATA", raising=False)
-    monkeypatch.setattr(pooch, "HTTPDownloader", Downloader)
-    monkeypatch.setattr(pooch, "os_cache", lambda name: own_files / "cache" / name)
-    return asked
+    return serve(own_files, monkeypatch)
 
 
 # ---- the measured duct

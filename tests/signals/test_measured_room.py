@@ -1,11 +1,11 @@
 """The measured room of four loudspeakers and microphones; no test reaches for the network."""
 
 import hashlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
+from helpers.network import serve
 
 from kfopc_filterpy.signals import DataUnavailableError, MeasuredRoom, datasets, load_measured_room
 
@@ -68,19 +68,7 @@ def test_changed_file_of_the_room_is_refused(own_files):
 
 
 def test_download_asks_once_for_each_file_of_the_room(own_files, monkeypatch):
-    pooch = pytest.importorskip("pooch")
-    asked = []
-
-    class Downloader:
-        def __init__(self, timeout):
-            self.timeout = timeout
-
-        def __call__(self, url, output_file, _):
-            asked.append((url, self.timeout))
-            Path(output_file).write_bytes((own_files / "room4x4" / url.rsplit("/", 1)[1]).read_bytes())
-
-    monkeypatch.setattr(pooch, "HTTPDownloader", Downloader)
-    monkeypatch.setattr(pooch, "os_cache", lambda name: own_files / "cache" / name)
+    asked = serve(own_files, monkeypatch)
     for _ in range(2):
         assert load_measured_room(allow_download=True, timeout_s=2.5).secondary[3, 1].tolist() == [4, 2]
     assert sorted(asked) == sorted((f"{SOURCE}/{name}.mat", 2.5) for name in NAMES)
