@@ -19,7 +19,7 @@ from .wiener import WienerSolution, mean_square, reduction_db
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions with less get no weight
 TOLERANCE = 1e-5  # to which a rated power that binds is met
-SWEEPS = 300  # at most; some twenty are usual
+SOLUTIONS = 100  # at most; some ten are usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +97,14 @@ class ChannelCorrelations:
 
     def weights(self, penalty: np.ndarray | float = 0.0, ridge: float = 0.0) -> np.ndarray:
         """Return the solution of (R_x' + blkdiag(penalty_j R_x) + ridge I) w = r, (J, I, n_taps)."""
+        return cho_solve(self._factors(penalty, ridge), self.cross).reshape(self.shape)
+
+    def _factors(self, penalty: np.ndarray | float, ridge: float = 0.0) -> Any:
+        """Return the Cholesky factors of R_x' + blkdiag(penalty_j R_x) + ridge I."""
         J = self.shape[0]
         matrix = self.filtered + block_diag(*(p * self.reference for p in np.broadcast_to(penalty, J)))
         matrix.flat[:: self.cross.size + 1] += ridge + RIDGE * np.trace(self.filtered) / self.cross.size
-        return cho_solve(cho_factor(matrix), self.cross).reshape(self.shape)
+        return cho_factor(matrix, overwrite_a=True)
 
     def powers(self, weights: np.ndarray) -> np.ndarray:
         """Return the powers of the control signals, (J,)."""
@@ -110,25 +114,43 @@ class ChannelCorrelations:
     def constrained_weights(self, rated_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the weights of the least error within the rated powers, and the penalties, (J,).
 
-        Each penalty is multiplied by its power over its rated power until the powers that bind are met: the fixed
-        points of this are the solutions with complementary slackness.
+        Projected Newton steps on the penalties, of which the dual problem is concave. Each is found for
+        1 / sqrt(power), which is nearly linear in the penalty (Moré and Sorensen 1983), and shortened until it gains.
         """
         J = self.shape[0]
         if not np.trace(self.filtered) > 0.0:
             return np.zeros(self.shape), np.zeros(J)
-        weights = self.weights()
-        if np.all(self.powers(weights) <= rated_power):
-            return weights, np.zeros(J)
         natural = np.trace(self.filtered) / np.trace(self.reference) / J
-        penalty = np.full(J, natural)
-        for _ in range(SWEEPS):
-            weights = self.weights(penalty)
-            ratio = self.powers(weights) / rated_power
-            binding = penalty > 1e-9 * natural
-            if np.all(ratio < 1.0 + TOLERANCE) and np.all(np.abs(ratio[binding] - 1.0) < TOLERANCE):
-                break
-            penalty = np.maximum(penalty * np.maximum(ratio, 1e-6), 1e-12 * natural)
-        return weights, np.where(binding, penalty, 0.0)
+        penalty = trial = np.zeros(J)
+        weights = np.zeros(self.shape)
+        gained, step = -np.inf, np.full(J, natural)
+        for _ in range(SOLUTIONS):
+            factors = self._factors(trial)
+            found = cho_solve(factors, self.cross).reshape(self.shape)
+            dual = -self.cross @ found.ravel() - trial @ rated_power
+            if dual < gained:  # the step was too long
+                step = 0.25 * step
+            else:
+                weights, penalty, gained = found, trial, dual
+                ratio = self.powers(weights) / rated_power
+                if np.all(ratio < 1.0 + TOLERANCE) and np.all(np.abs(ratio[penalty > 0.0] - 1.0) < TOLERANCE):
+                    break
+                step = self._newton_step(factors, weights, rated_power, (penalty > 0.0) | (ratio > 1.0))
+            trial = np.maximum(penalty + step, 0.0)
+        return weights, penalty
+
+    def _newton_step(self, factors: Any, weights: np.ndarray, rated_power: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Return a step of the penalties that are `free` towards the rated powers; it raises the dual function."""
+        J = self.shape[0]
+        rows = weights.reshape(J, -1) @ self.reference  # R_x w_j
+        changes = cho_solve(factors, block_diag(*rows).T).reshape(J, -1, J)  # -dw / d penalty_i at [..., i]
+        slopes = np.einsum("ja,jai->ji", rows, changes)[np.ix_(free, free)]  # -d power_j / d penalty_i, halved
+        powers = self.powers(weights)
+        excess, step = (powers - rated_power)[free], np.zeros(J)
+        step[free] = np.linalg.lstsq(slopes, (powers * (np.sqrt(powers / rated_power) - 1.0))[free])[0]
+        if not step[free] @ excess > 0.0:
+            step[free] = np.linalg.lstsq(slopes, 0.5 * excess)[0]
+        return step
 
 
 def block_correlation(signals: np.ndarray, n_taps: int) -> np.ndarray:

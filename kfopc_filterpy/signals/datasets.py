@@ -69,7 +69,7 @@ class DataUnavailableError(FileNotFoundError):
     """Measured data cannot be read or fetched, or are not the published ones; the message says what to do."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MeasuredDuct:
     """Impulse responses of a measured duct, and a noise to run through it.
 
@@ -93,9 +93,8 @@ class MeasuredDuct:
 
     Examples
     --------
-    >>> duct = MeasuredDuct(primary=[0.0, 0.0, 1.0], secondary=[0.0, 1.0], noise=[0.1, -0.2], fs=8000)
-    >>> duct.primary.shape, duct.fs
-    ((3,), 8000.0)
+    >>> MeasuredDuct(primary=[0.0, 0.0, 1.0], secondary=[0.0, 1.0], noise=np.zeros(4000), fs=8000)
+    <MeasuredDuct: primary path 3 taps, secondary path 2 taps, noise 0.5 s, fs 8000 Hz>
     """
 
     primary: np.ndarray
@@ -107,6 +106,10 @@ class MeasuredDuct:
         for name in ("primary", "secondary", "noise"):
             object.__setattr__(self, name, as_signal(getattr(self, name), name))
         object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
+
+    def __repr__(self) -> str:
+        taps = f"primary path {self.primary.size} taps, secondary path {self.secondary.size} taps"
+        return f"<MeasuredDuct: {taps}, noise {self.noise.size / self.fs:.3g} s, fs {self.fs:g} Hz>"
 
 
 def load_measured_duct(
@@ -174,7 +177,7 @@ def load_measured_duct(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MeasuredRoom:
     """Impulse responses between several loudspeakers and microphones.
 
@@ -194,9 +197,8 @@ class MeasuredRoom:
 
     Examples
     --------
-    >>> room = MeasuredRoom(primary=np.ones((2, 1, 8)), secondary=np.ones((2, 3, 4)), fs=8000)
-    >>> room.primary.shape, room.fs
-    ((2, 1, 8), 8000.0)
+    >>> MeasuredRoom(primary=np.ones((2, 1, 8)), secondary=np.ones((2, 3, 4)), fs=8000)
+    <MeasuredRoom: primary paths (2, 1, 8), secondary paths (2, 3, 4), fs 8000 Hz>
     """
 
     primary: np.ndarray
@@ -216,6 +218,9 @@ class MeasuredRoom:
                 f"{len(self.primary)} and {len(self.secondary)}"
             )
         object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
+
+    def __repr__(self) -> str:
+        return f"<MeasuredRoom: primary paths {self.primary.shape}, secondary paths {self.secondary.shape}, fs {self.fs:g} Hz>"
 
 
 def load_measured_room(
