@@ -12,7 +12,7 @@ from textwrap import fill
 
 from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
 
-from .studies import amplifier, broadband, constraint, duct, mismatch, power_budget, tonal, tracking
+from .studies import amplifier, broadband, constraint, duct, mismatch, multichannel, power_budget, tonal, tracking
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
 SPEED, SWEEP = "speed", "sweep"
@@ -29,6 +29,7 @@ FURTHER: dict[str, Study] = {  # beyond the paper
     "mismatch": (mismatch.main, mismatch.planned_runs),
     "tracking": (tracking.main, tracking.planned_runs),
     "amplifier": (amplifier.main, amplifier.planned_runs),
+    "multichannel": (multichannel.main, multichannel.planned_runs),
 }
 
 

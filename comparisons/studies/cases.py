@@ -236,9 +236,9 @@ def louder(scene: Scene, gain: float) -> Scene:
     )
 
 
-def bound_of(scene: Scene) -> PowerConstrainedWiener:
+def bound_of(scene: Scene, segment_s: float = 1.0) -> PowerConstrainedWiener:
     """Return the power-constrained Wiener solutions of a case, of weights that controllers reach."""
-    ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
+    ridge = scene.measurement_noise / (scene.settled[0].shape[-1] * scene.initial_variance)
     with warnings.catch_warnings():
         # In directions without energy very large weights would do better, and no controller reaches them.
         warnings.simplefilter("ignore", np.exceptions.RankWarning)
@@ -248,8 +248,9 @@ def bound_of(scene: Scene) -> PowerConstrainedWiener:
             scene.secondary,
             scene.n_taps,
             scene.rated_power,
-            fs=FS,
-            switch_on_s=SWITCH_ON_S,
+            fs=scene.fs,
+            segment_s=segment_s,
+            switch_on_s=scene.switch_on_s,
             ridge=ridge,
         )
 

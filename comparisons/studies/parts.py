@@ -119,18 +119,21 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
 def tried(trials: Iterable[Trial], digits: int = 4) -> list[tuple[Any, ...]]:
     """Return what was tried for results.json: setting, mean NSE in dB and output power, or that it diverged."""
     return [
-        (t.setting, "diverged") if t.diverged else (t.setting, round(t.mean_nse_db, 3), round(t.output_power, digits))
+        (t.setting, "diverged")
+        if t.diverged
+        else (t.setting, round(t.mean_nse_db, 3), np.round(t.output_power, digits).tolist())
         for t in trials
     ]
 
 
 def tuned_in_words(tuned: Mapping[str, Tuned | None]) -> dict[str, Any]:
     """Return settings for results.json: the best and all that were tried; None if every one diverged."""
+    registry = {**algorithms(), **algorithms(several_channels=True)}
     return {
         name: None
         if best is None
         else {
-            "kind": algorithms()[name].kind,
+            "kind": registry[name].kind,
             "setting": best.setting,
             "within_budget": best.within_budget,
             "at_edge": best.at_edge,

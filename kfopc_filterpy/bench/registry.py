@@ -40,6 +40,7 @@ STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid follows around the best
+MEMORY_GRID = (0.125, 0.25, 0.5, 1.0, 2.0)  # in s
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
@@ -55,7 +56,7 @@ class Algorithm:
         Function of a scene, the first setting in the scene's units, the second setting, and the amplifier known to the
         disturbance estimate. It returns a fresh controller.
     symbol : str
-        Parameter that the first setting sets: "r", "mu" or "1 - lambda".
+        Parameter that the first setting sets: "r", "mu", "1 - lambda" or "memory_s".
     kind : str
         The first setting as a formula, without units.
     first : tuple of float
@@ -76,6 +77,8 @@ class Algorithm:
         Whether its disturbance estimate can know the amplifier.
     may_refuse : bool, default False
         Whether it may find during a run that it cannot go on, which counts as divergence.
+    one_channel, several_channels : bool, default True, False
+        Whether studies of one channel, and of several, compare it.
     """
 
     make: Callable[[Scene, float, float, Amplifier | None], Controller]
@@ -90,6 +93,8 @@ class Algorithm:
     shares_gains: bool = False
     knows_amplifier: bool = False
     may_refuse: bool = False
+    one_channel: bool = True
+    several_channels: bool = False
 
     @property
     def grid(self) -> list[Setting]:
@@ -114,11 +119,19 @@ class Algorithm:
         first = setting[0] if isinstance(setting, tuple) else setting
         if self.symbol == "r":
             return first * scene.measurement_noise / scene.filtered_power
-        return first if self.symbol == "1 - lambda" else first / (scene.n_taps * scene.filtered_power)
+        return first / (scene.n_taps * scene.filtered_power) if self.symbol == "mu" else first
 
 
-def _constraint(scene: Scene) -> OutputPowerConstraint:
+def _constraint(scene: Scene) -> Any:
+    """Return the constraint of the scene, or one for each loudspeaker."""
+    if np.ndim(scene.rated_power):
+        return [OutputPowerConstraint(p, fs=scene.fs, memory_s=scene.power_memory_s) for p in scene.rated_power]
     return OutputPowerConstraint(scene.rated_power, fs=scene.fs, memory_s=scene.power_memory_s)
+
+
+def _references(scene: Scene) -> dict[str, Any]:
+    """Return the number of references as a setting, if there are several channels."""
+    return {"n_references": len(scene.references[0])} if scene.secondary.ndim == 3 else {}
 
 
 def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[..., Controller]:
@@ -140,16 +153,29 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
     return made
 
 
+def _shared_gain(scene: Scene, memory_s: float, _: float, amplifier: Amplifier | None) -> Controller:
+    return kf_pb(
+        scene.n_taps,
+        scene.known_secondary,
+        rated_power=scene.rated_power,
+        form="shared gain",
+        memory_s=memory_s,
+        fs=scene.fs,
+        amplifier=amplifier,
+        **_references(scene),
+    )
+
+
 def _rated(kind: Any, **more: Any) -> Callable[..., Controller]:
     def made(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
-        own: dict[str, Any] = {"constraint": _constraint(scene), "amplifier": amplifier, **more}
+        own: dict[str, Any] = {"constraint": _constraint(scene), "amplifier": amplifier, **_references(scene), **more}
         return kind(scene.n_taps, scene.known_secondary, step_size=mu, **own)
 
     return made
 
 
 def _plain(kind: Any) -> Callable[..., Controller]:
-    return lambda scene, mu, _, amplifier: kind(scene.n_taps, scene.known_secondary, step_size=mu)
+    return lambda scene, mu, _, amplifier: kind(scene.n_taps, scene.known_secondary, step_size=mu, **_references(scene))
 
 
 def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
@@ -159,7 +185,7 @@ def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) 
 
 def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
     leak = min(price * scene.filtered_power, 1.0 / mu)
-    return LeakyFxLMS(scene.n_taps, scene.known_secondary, step_size=mu, leak=leak)
+    return LeakyFxLMS(scene.n_taps, scene.known_secondary, step_size=mu, leak=leak, **_references(scene))
 
 
 def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
@@ -186,6 +212,7 @@ def _mov(scene: Scene, mu: float, gamma: float, amplifier: Amplifier | None, nam
         constraint=_constraint(scene),
         penalty_factor=gamma,
         amplifier=amplifier,
+        **_references(scene),
     )
     controller.name = name
     return controller
@@ -193,9 +220,11 @@ def _mov(scene: Scene, mu: float, gamma: float, amplifier: Amplifier | None, nam
 
 def _peak(kind: Any) -> Callable[..., Controller]:
     def made(scene: Scene, mu: float, share: float, amplifier: Amplifier | None) -> Controller:
-        limit = float(np.sqrt(share * scene.unconstrained_power))
-        more = {"output_step_size": mu * scene.secondary_gain} if kind is TwoGradientFxLMS else {}
-        return kind(scene.n_taps, scene.known_secondary, step_size=mu, amplitude_limit=limit, **more)
+        limit = np.sqrt(share * scene.unconstrained_power)
+        more: dict[str, Any] = {"output_step_size": mu * scene.secondary_gain} if kind is TwoGradientFxLMS else {}
+        return kind(
+            scene.n_taps, scene.known_secondary, step_size=mu, amplitude_limit=limit, **_references(scene), **more
+        )
 
     return made
 
@@ -226,32 +255,53 @@ _PEAK: dict[str, Any] = _STEP | {
 }
 _FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
 _KNOWS: dict[str, Any] = {"knows_amplifier": True}
+_CHANNELS: dict[str, Any] = {"several_channels": True}
+_SHARED_GAIN: dict[str, Any] = {
+    "symbol": "memory_s",
+    "kind": "memory of the references' correlation in s",
+    "first": MEMORY_GRID,
+    "one_channel": False,
+}
 REGISTRY: dict[str, Algorithm] = {
     "KF-ANC": Algorithm(_kalman(kf_anc, free=True), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE),
     "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK),
     "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired), **_RANDOM_WALK),
     "KF-PB": Algorithm(_kalman(kf_pb, budget=True), **_RANDOM_WALK),
+    "KF-PB (shared gain)": Algorithm(_shared_gain, **_SHARED_GAIN, **_KNOWS, **_CHANNELS),
     "diagonal KF": Algorithm(_kalman(DiagonalKalman, free=True), **_DIAGONAL, **_FREE),
     "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman), **_DIAGONAL),
     "FxRLS": Algorithm(_rls, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
-    "FxLMS": Algorithm(_plain(FxLMS), of_paper=True, **_STEP, **_FREE),
+    "FxLMS": Algorithm(_plain(FxLMS), of_paper=True, **_STEP, **_FREE, **_CHANNELS),
     "FxNLMS": Algorithm(_normalised, **_STEP, **_FREE),
-    "leaky FxLMS": Algorithm(_leaky, **_STEP, second_kind="leak over E[x'^2]", second=PRICE_GRID, sees_budget=False),
-    "optimal leaky FxLMS": Algorithm(_rated(OptimalLeakyFxLMS), **_STEP, **_KNOWS),
+    "leaky FxLMS": Algorithm(
+        _leaky, **_STEP, second_kind="leak over E[x'^2]", second=PRICE_GRID, sees_budget=False, **_CHANNELS
+    ),
+    "optimal leaky FxLMS": Algorithm(_rated(OptimalLeakyFxLMS), **_STEP, **_KNOWS, **_CHANNELS),
     "MOV-FxLMS fixed": Algorithm(
-        _mov_fixed, **_STEP, second_kind="penalty factor over G_s", second=PRICE_GRID, sees_budget=False, **_KNOWS
+        _mov_fixed,
+        **_STEP,
+        second_kind="penalty factor over G_s",
+        second=PRICE_GRID,
+        sees_budget=False,
+        **_KNOWS,
+        **_CHANNELS,
     ),
     "MOV-FxLMS by variance": Algorithm(_mov_by_variance, **_STEP, **_KNOWS),
-    "MOV-FxLMS": Algorithm(_rated(MOVFxLMS), of_paper=True, **_STEP, **_KNOWS),
-    "MOV-MFxLMS": Algorithm(_rated(MOVFxLMS, modified=True), **_STEP, **_KNOWS),
-    "two-gradient FxLMS": Algorithm(_peak(TwoGradientFxLMS), **_PEAK),
-    "re-scaling FxLMS": Algorithm(_peak(RescalingFxLMS), **_PEAK),
-    "clipping FxLMS": Algorithm(_peak(ClippingFxLMS), **_PEAK),
+    "MOV-FxLMS": Algorithm(_rated(MOVFxLMS), of_paper=True, **_STEP, **_KNOWS, **_CHANNELS),
+    "MOV-MFxLMS": Algorithm(_rated(MOVFxLMS, modified=True), **_STEP, **_KNOWS, **_CHANNELS),
+    "two-gradient FxLMS": Algorithm(_peak(TwoGradientFxLMS), **_PEAK, **_CHANNELS),
+    "re-scaling FxLMS": Algorithm(_peak(RescalingFxLMS), **_PEAK, **_CHANNELS),
+    "clipping FxLMS": Algorithm(_peak(ClippingFxLMS), **_PEAK, **_CHANNELS),
 }
 
 
-def algorithms() -> Mapping[str, Algorithm]:
+def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
     """Return the registry: every algorithm that studies and sweeps compare, by name.
+
+    Parameters
+    ----------
+    several_channels : bool, default False
+        Whether to return those that are compared with several loudspeakers and microphones, instead of with one.
 
     Returns
     -------
@@ -265,8 +315,11 @@ def algorithms() -> Mapping[str, Algorithm]:
     ['KF-ANC', 'KF-OPC', 'FxLMS', 'MOV-FxLMS']
     >>> algorithms()["KF-PB"].grid
     [1e-08, 1e-07, 1e-06, 1e-05, 0.0001]
+    >>> "KF-PB (shared gain)" in algorithms(), "KF-PB (shared gain)" in algorithms(several_channels=True)
+    (False, True)
     """
-    return MappingProxyType(REGISTRY)
+    wanted = "several_channels" if several_channels else "one_channel"
+    return MappingProxyType({name: own for name, own in REGISTRY.items() if getattr(own, wanted)})
 
 
 def make_controller(scene: Scene, algorithm: str, setting: Setting, *, amplifier: Amplifier | None = None) -> Any:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from kfopc_filterpy import (
     KalmanController,
@@ -22,13 +23,15 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
-from kfopc_filterpy.bounds import measurement_noise_from_run, wiener_solution
+from kfopc_filterpy.bounds import WienerSolution, measurement_noise_from_run, wiener_solution
+from kfopc_filterpy.bounds.channels import channel_record
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
+from kfopc_filterpy.paths.channels import is_path_matrix, primary_paths, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
-from kfopc_filterpy.signals import scaled_to_power
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed
+CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy ask for weights that no controller reaches
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -77,17 +80,18 @@ class Runs:
 class Scene:
     """Noise, paths and amplifier of a study, and what its controllers know of them.
 
-    `make_scene` makes one. There is one reference and one disturbance for each seed, all of equal length.
+    `make_scene` makes one. There is one reference and one disturbance for each seed, all of equal length. With several
+    channels, signals lead with the channel, and powers of loudspeakers are (J,).
 
     Parameters
     ----------
     fs : float
         Sampling frequency in Hz.
-    secondary : ndarray, shape (n_path_taps,)
+    secondary : ndarray, shape (n_path_taps,) or (K, J, n_path_taps)
         True secondary path.
-    references, disturbances : list of ndarray, shape (n_samples,)
+    references, disturbances : list of ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
         One for each seed.
-    rated_power : float
+    rated_power : float or ndarray, shape (J,)
         Rated output power, a mean square.
     n_taps : int
         Taps of the control filter.
@@ -103,9 +107,9 @@ class Scene:
         q of the Kalman filters.
     initial_variance : float
         P0 of the Kalman filters.
-    unconstrained_power : float
+    unconstrained_power : float or ndarray, shape (J,)
         Output power that the noise would need without a constraint.
-    wiener_control_power : float
+    wiener_control_power : float or ndarray, shape (J,)
         Output power of the unconstrained Wiener solution.
     wiener_noise_reduction_db : float
         Its noise reduction in dB.
@@ -123,7 +127,7 @@ class Scene:
     secondary: np.ndarray
     references: list[np.ndarray]
     disturbances: list[np.ndarray]
-    rated_power: float
+    rated_power: Any
     n_taps: int
     sensor_noise_std: float
     switch_on_s: float
@@ -131,8 +135,8 @@ class Scene:
     amplifier: Amplifier | None = None
     measurement_noise: float = 0.0
     initial_variance: float = 0.0
-    unconstrained_power: float = 1.0
-    wiener_control_power: float = 0.0
+    unconstrained_power: Any = 1.0
+    wiener_control_power: Any = 0.0
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
     secondary_estimate: np.ndarray | None = None
@@ -153,7 +157,7 @@ class Scene:
     def settled(self) -> tuple[np.ndarray, np.ndarray]:
         """First reference and disturbance from switch-on on, after the start-up of the primary path."""
         start = int(self.switch_on_s * self.fs)
-        return self.references[0][start:], self.disturbances[0][start:]
+        return self.references[0][..., start:], self.disturbances[0][..., start:]
 
     @property
     def known_secondary(self) -> np.ndarray:
@@ -162,14 +166,19 @@ class Scene:
 
     @property
     def filtered_power(self) -> float:
-        """Power of the filtered reference; it makes step sizes and state noises comparable."""
-        x = self.references[0]
-        return float(np.mean(np.convolve(x, self.known_secondary)[: x.size] ** 2))
+        """Power of the filtered reference; it makes step sizes and state noises comparable.
+
+        With several channels it is the sum over microphones and references, and the mean over loudspeakers.
+        """
+        x, s = np.atleast_2d(self.references[0]), self.known_secondary
+        s = s if s.ndim == 3 else s.reshape(1, 1, -1)
+        filtered = fftconvolve(x[np.newaxis, np.newaxis], s[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
+        return float(np.mean(filtered**2, axis=(1, 3)).sum())
 
     @property
     def secondary_gain(self) -> float:
         """Power gain G_s of the known secondary path for the reference (eq. 11)."""
-        return self.filtered_power / float(np.mean(self.references[0] ** 2))
+        return self.filtered_power / _power(self.references[0])
 
     def run(self, controller: Any, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
@@ -222,16 +231,16 @@ def make_scene(
 
     Parameters
     ----------
-    references : mapping of int to ndarray, shape (n_samples,)
+    references : mapping of int to ndarray, shape (n_samples,) or (I, n_samples)
         Noise for each seed.
     primary, secondary : array_like or control.LTI
-        Primary and secondary path: taps, or a python-control system.
+        Primary and secondary path: taps, or a python-control system. With several channels (K, I, n) and (K, J, n).
     fs : float
         Sampling frequency in Hz.
-    rated_power : float
-        Rated output power, a mean square.
+    rated_power : float or ndarray, shape (J,)
+        Rated output power, a mean square; of all loudspeakers or of each.
     power_multiple : float
-        Unconstrained control power over the rated power.
+        Unconstrained control power over the rated power; of the sums over the loudspeakers.
     n_taps : int
         Taps of the control filter.
     switch_on_s : float, default 0.5
@@ -257,20 +266,19 @@ def make_scene(
     >>> round(float((scene.references[0] ** 2).mean()), 3)  # the path has a gain of 1
     2.0
     """
-    s, p = path_taps(secondary, fs=fs), path_taps(primary, fs=fs)
+    s, p = _taps(secondary, primary, fs)
     first = next(iter(references.values()))
-    settled = slice(int(switch_on_s * fs), None)  # after the start-up of the primary path
-    d = np.convolve(first, p)[: first.size]
-    with _reachable_weights():
-        wiener = wiener_solution(first[settled], d[settled], s, n_taps)
-    power = float(np.mean(first**2)) * power_multiple * rated_power / wiener.control_power
-    scaled = [scaled_to_power(x, power) for x in references.values()]
-    disturbances = [np.convolve(x, p)[: x.size] for x in scaled]
+    settled = (..., slice(int(switch_on_s * fs), None))  # after the start-up of the primary path
+    d = _heard(first, p)
+    wiener = _reachable(first[settled], d[settled], s, n_taps, fs)
+    asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
+    share = wiener.control_power / np.sum(wiener.control_power)
+    power = _power(first) * asked / np.sum(wiener.control_power)
+    scaled = [np.sqrt(power / _power(x)) * x for x in references.values()]
+    disturbances = [_heard(x, p) for x in scaled]
     std = float(np.sqrt(np.mean(disturbances[0][settled] ** 2)) * 10 ** (sensor_noise_db / 20))
     recorded = disturbances[0][settled]
-    recorded = recorded + std * np.random.default_rng(0).standard_normal(recorded.size)
-    with _reachable_weights():
-        measurement_noise = measurement_noise_from_run(scaled[0][settled], recorded, s, n_taps)
+    recorded = recorded + std * np.random.default_rng(0).standard_normal(recorded.shape)
     return Scene(
         fs=fs,
         secondary=s,
@@ -282,13 +290,49 @@ def make_scene(
         switch_on_s=switch_on_s,
         nse_window_s=nse_window_s,
         amplifier=amplifier,
-        measurement_noise=measurement_noise,
-        initial_variance=power_multiple * rated_power / (n_taps * power),
-        unconstrained_power=power_multiple * rated_power,
-        wiener_control_power=power_multiple * rated_power,
+        measurement_noise=_unexplained(scaled[0][settled], recorded, s, n_taps, fs),
+        initial_variance=float(asked / (n_taps * power * np.size(share))),
+        unconstrained_power=asked * share,
+        wiener_control_power=asked * share,
         wiener_noise_reduction_db=wiener.noise_reduction_db,
         seeds=list(references),
     )
+
+
+def _taps(secondary: Any, primary: Any, fs: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the taps of the paths, (K, J, n) and (K, I, n) with several channels."""
+    if is_path_matrix(secondary):
+        return secondary_paths(secondary, fs=fs)[0], primary_paths(primary, fs=fs)[0]
+    return path_taps(secondary, fs=fs), path_taps(primary, fs=fs)
+
+
+def _power(x: np.ndarray) -> float:
+    """Return the mean square of a reference, or the sum of those of several."""
+    return float(np.mean(x**2, axis=-1).sum())
+
+
+def _heard(x: np.ndarray, primary: np.ndarray) -> np.ndarray:
+    """Return the disturbance of a reference, or of several."""
+    if x.ndim == 1:
+        return np.convolve(x, primary)[: x.size]
+    return fftconvolve(x[np.newaxis], primary, axes=-1)[..., : x.shape[1]].sum(axis=1)
+
+
+def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
+    """Return the unconstrained Wiener solution, of weights that a controller reaches."""
+    if s.ndim == 1:
+        with _reachable_weights():
+            return wiener_solution(x, d, s, n_taps)
+    record = channel_record(x, d, s, n_taps, fs).part(n_taps + s.shape[2] - 2, x.shape[1])
+    return record.solution(record.correlations().weights(ridge=CHANNEL_RIDGE * record.filtered_power))
+
+
+def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> float:
+    """Return q, the power of what no control filter explains (eq. 7), per microphone."""
+    if s.ndim == 1:
+        with _reachable_weights():
+            return measurement_noise_from_run(x, d, s, n_taps)
+    return float(_reachable(x, d, s, n_taps, fs).error_power)
 
 
 @contextmanager

@@ -36,8 +36,8 @@ class Trial:
         The setting.
     mean_nse_db : float
         Mean normalised squared error over the whole run in dB; Inf if it diverged.
-    output_power : float
-        Output power over the steady half; Inf if it diverged.
+    output_power : float or ndarray, shape (J,)
+        Output power over the steady half, of each loudspeaker if there are several; Inf if it diverged.
     diverged_at_s : float, optional
         First time at which a run diverged, 0 if the filter refused to go on.
     noise_reduction_db : float
@@ -46,7 +46,7 @@ class Trial:
 
     setting: Setting
     mean_nse_db: float
-    output_power: float
+    output_power: Any
     diverged_at_s: float | None = None
     noise_reduction_db: float = np.nan
 
@@ -235,9 +235,9 @@ def _mean(setting: Setting, trials: Sequence[Trial]) -> Trial:
     times = [trial.diverged_at_s for trial in trials if trial.diverged_at_s is not None]
     if times:
         return Trial(setting, np.inf, np.inf, min(times))
-    figures = [(trial.mean_nse_db, trial.output_power, trial.noise_reduction_db) for trial in trials]
-    nse, power, reduction = (float(mean) for mean in np.mean(figures, axis=0))
-    return Trial(setting, nse, power, None, reduction)
+    nse, reduction = np.mean([(trial.mean_nse_db, trial.noise_reduction_db) for trial in trials], axis=0)
+    power = np.mean([trial.output_power for trial in trials], axis=0)
+    return Trial(setting, float(nse), power if np.ndim(power) else float(power), None, float(reduction))
 
 
 def best_setting(scene: Scene, algorithm: str, trials: Sequence[Trial]) -> Tuned | None:
@@ -281,7 +281,7 @@ def tune(
     """Return the best setting of each algorithm, by one rule for all.
 
     The best setting has the lowest mean NSE over the whole run, start included, among settings that do not diverge and,
-    for constrained methods, keep the budget to 2 % over the steady half. If no setting keeps it, the lowest mean NSE
+    for constrained methods, keep the budget to 2 % over the steady half, each loudspeaker its own. If no setting keeps it, the lowest mean NSE
     wins, and `within_budget` is False. Around the best of a grid of two settings a finer grid is tried. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
 
     Parameters
@@ -336,11 +336,11 @@ def _refined(runs: Runs, scene: Scene, algorithm: str, trials: Sequence[Trial], 
     return best_setting(scene, algorithm, [*trials, *own]) or best
 
 
-def _best(trials: Sequence[Trial], rated_power: float) -> Tuned | None:
+def _best(trials: Sequence[Trial], rated_power: Any) -> Tuned | None:
     stable = [trial for trial in trials if not trial.diverged]
     if not stable:
         return None
-    kept = [trial for trial in stable if trial.output_power <= BUDGET * rated_power]
+    kept = [trial for trial in stable if np.all(trial.output_power <= BUDGET * rated_power)]
     best = min(kept or stable, key=lambda trial: (round(trial.mean_nse_db, 2), trial.setting))
     return Tuned(best.setting, bool(kept), _at_edge(best.setting, trials), list(trials))
 

@@ -50,7 +50,7 @@ def middle(name: str) -> Any:
     return (first, own.second[len(own.second) // 2]) if own.second else first
 
 
-@pytest.mark.parametrize("name", REGISTRY)
+@pytest.mark.parametrize("name", algorithms.algorithms())
 def test_each_is_made_as_the_registry_says(name: str, scene: Scene) -> None:
     estimate = 0.5 * scene.secondary
     model = HardClipAmplifier(3.0) if REGISTRY[name].knows_amplifier else None

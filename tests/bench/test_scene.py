@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.channels import dense_systems, random_paths, through
 
-from kfopc_filterpy.bench import algorithms, make_controller, make_scene
+from kfopc_filterpy.bench import (
+    Scene,
+    Trial,
+    algorithms,
+    best_setting,
+    make_controller,
+    make_scene,
+    run_setting,
+)
 from kfopc_filterpy.signals import tone
 
 FS = 16000.0
@@ -86,3 +95,71 @@ def test_seeds_of_one_scene_are_scaled_alike():
     scene = make_scene(noises, [0.0, 1.0], [1.0], fs=FS, rated_power=1.0, power_multiple=2.0, n_taps=8, switch_on_s=0.1)
     # Not quite 2: the Wiener solution is of the record after switch-on, the power of the whole record.
     assert [np.mean(x**2) for x in scene.references] == pytest.approx([2.0] * 3, rel=2e-3)
+
+
+# ---- Several channels
+
+
+@pytest.fixture(scope="module")
+def channels() -> Scene:
+    """Two references, three microphones, two loudspeakers of unlike ratings; the second noise is twice as loud."""
+    primary, secondary = random_paths(3, 2, 20, seed=1, delay=6), random_paths(3, 2, 12, seed=2)
+    noises = {k: k * np.random.default_rng(k).standard_normal((2, 4000)) for k in (1, 2)}
+    return make_scene(
+        noises,
+        primary,
+        secondary,
+        fs=FS,
+        rated_power=np.array([0.2, 0.6]),
+        power_multiple=3.0,
+        n_taps=8,
+        switch_on_s=0.1,
+    )
+
+
+def test_level_of_several_channels_asks_for_a_multiple_of_all_ratings(channels):
+    """Against a batch least-squares fit; 1e-3 for the ridge of 1e-6 of the filtered power."""
+    assert np.sum(channels.wiener_control_power) == pytest.approx(3.0 * 0.8, rel=1e-12)
+    x, d = channels.settled
+    R, of_x, r = dense_systems(x, d, channels.secondary, 8, start=18)
+    w = np.linalg.solve(R, r).reshape(2, -1)
+    power = np.einsum("ja,ab,jb->j", w, of_x, w)
+    np.testing.assert_allclose(channels.unconstrained_power, power, rtol=1e-3)
+    unexplained = (np.mean(d[:, 18:] ** 2, axis=1).sum() - r @ w.ravel()) / 3
+    assert channels.measurement_noise == pytest.approx(unexplained + channels.sensor_noise_std**2, rel=1e-2)
+
+
+def test_signals_of_several_channels(channels):
+    x = channels.references[1]
+    np.testing.assert_allclose(np.sum(np.mean(x**2, axis=1)), np.sum(np.mean(channels.references[0] ** 2, axis=1)))
+    primary = random_paths(3, 2, 20, seed=1, delay=6)
+    np.testing.assert_allclose(channels.disturbances[1], through(primary, x), atol=1e-10)
+    filtered = [
+        [np.convolve(s, one)[:4000] for one in channels.references[0]] for s in channels.secondary.reshape(6, -1)
+    ]
+    power = np.mean(np.square(filtered), axis=-1).sum() / 2
+    assert channels.filtered_power == pytest.approx(power, rel=1e-10)
+    assert channels.secondary_gain == pytest.approx(
+        power / np.mean(channels.references[0] ** 2, axis=1).sum(), rel=1e-10
+    )
+
+
+@pytest.mark.parametrize("name", algorithms(several_channels=True))
+def test_each_algorithm_of_several_channels_is_made_and_runs(channels, name):
+    own = algorithms(several_channels=True)[name]
+    second = (own.second[0],) if own.second else ()
+    setting = (own.first[-1], *second) if own.second else own.first[-1]
+    result = run_setting(channels, name, setting)
+    assert result.algorithm == name
+    assert result.control_signal.shape == (2, 2400)
+    assert np.all(np.isfinite(result.error))
+
+
+def test_budget_is_kept_if_every_loudspeaker_keeps_its_own(channels):
+    both, one = (
+        Trial(setting, nse, np.array(power))
+        for setting, nse, power in ((0.1, -5.0, [0.2, 0.6]), (0.2, -9.0, [0.3, 0.1]))
+    )
+    assert best_setting(channels, "MOV-FxLMS", [both, one]).setting == 0.1
+    assert best_setting(channels, "FxLMS", [both, one]).setting == 0.2
+    assert not best_setting(channels, "MOV-FxLMS", [one]).within_budget

@@ -1,0 +1,200 @@
+"""The multichannel study on a small scale, and its verdicts from rows made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons.__main__ import FURTHER
+from comparisons.studies import multichannel, rooms
+from comparisons.studies.multichannel import BOUND, EQUAL, KF_PB, SCALED, ChannelRow, claims
+from comparisons.studies.rooms import MEASURED, Place, level_map_db
+from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener, simulate
+from kfopc_filterpy.bench import Runs, StudyReport, algorithms, make_controller, write_report
+from kfopc_filterpy.bench import registry as registered
+
+KEPT = ("KF-PB (shared gain)", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
+
+
+def through(paths: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return np.array([[np.convolve(p, x)[: x.size] for p in row] for row in paths]).sum(axis=1)
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """The 2 x 2 room of 16 taps and two noises of two seconds, five algorithms and few settings."""
+    pytest.importorskip("pyroomacoustics")
+    with pytest.MonkeyPatch.context() as patch:
+        room = rooms.built_in_room(2)
+        noises = {name: own for name, own in rooms._noises(rooms.FS, rooms.BAND_HZ).items() if name != "tones"}
+        place = Place("2 x 2", rooms.FS, 16, room.primary[..., :100], room.secondary[..., :60], noises)
+        patch.setattr(multichannel, "places", lambda: {"2 x 2": place})
+        patch.setattr(multichannel, "DURATION_S", 2.0)
+        patch.setattr(multichannel, "SHOWN", ("2 x 2", "band noise"))
+        patch.setattr(rooms, "MAP_SPACING_M", 1.0)
+        for name, own in list(registered.REGISTRY.items()):
+            kept = replace(own, first=own.first[1:8:3], second=own.second[1:8:3], several_channels=name in KEPT)
+            patch.setitem(registered.REGISTRY, name, kept)
+        runs = Runs()
+        report = multichannel.main(runs)
+        rooms._paths_to_plane.cache_clear()
+        yield report, runs.done, multichannel.planned_runs(), place
+
+
+def test_study_is_a_further_one() -> None:
+    assert FURTHER["multichannel"] == (multichannel.main, multichannel.planned_runs)
+
+
+def test_report_has_every_algorithm_in_every_place(small: Any, tmp_path: Any) -> None:
+    report, done, planned, _ = small
+    assert isinstance(report, StudyReport)
+    assert done == planned
+    rows = [row for row in report.extra["rows"] if row["rating"] != EQUAL]
+    expected = {(name, noise) for name in (*KEPT, BOUND, SCALED, "no limit") for noise in ("band noise", "compressor")}
+    assert {(row["algorithm"], row["noise"]) for row in rows} == expected
+    write_report([report], tmp_path)
+    assert {path.stem for path in (tmp_path / "figures").glob("*.png")} == {
+        f"multichannel-{stem}" for stem in ("reduction", "course", "powers", "map")
+    }
+
+
+def test_rows_are_what_a_run_by_hand_gives(small: Any) -> None:
+    """The same scene, made again from the paths; noise reduction and powers by the metrics."""
+    report, _, _, place = small
+    rows = {(row["algorithm"], row["noise"], row["rating"]): row for row in report.extra["rows"]}
+    scene = rooms.make_rated_scene(place, "band noise", 2.0)
+    x = scene.references[0]
+    np.testing.assert_allclose(scene.disturbances[0], through(place.primary, x[0]), atol=1e-12 * np.abs(x).max())
+    for name in (KF_PB, "FxLMS"):
+        row = rows[name, "band noise", "a quarter each"]
+        result = simulate(
+            make_controller(scene, name, row["setting"]),
+            x,
+            primary_path=place.primary,
+            secondary_path=place.secondary,
+            fs=place.fs,
+            switch_on_s=scene.switch_on_s,
+            sensor_noise_std=scene.sensor_noise_std,
+            rng=scene.sensor_noise_seeds[0],
+        )
+        assert row["noise_reduction_db"] == pytest.approx(
+            noise_reduction_db(result.error, result.disturbance), abs=1e-6
+        )
+        np.testing.assert_allclose(row["powers"], output_power(result.control_signal) / scene.rated_power, rtol=1e-6)
+
+
+def test_ratings_are_a_quarter_of_what_each_would_like(small: Any) -> None:
+    _, _, _, place = small
+    quarter, equal = (rooms.make_rated_scene(place, "compressor", 2.0, equal) for equal in (False, True))
+    np.testing.assert_allclose(quarter.rated_power, 0.25 * quarter.unconstrained_power)
+    np.testing.assert_allclose(equal.rated_power, np.mean(quarter.rated_power))
+    assert np.ptp(quarter.rated_power) > 0.0
+
+
+def test_bound_is_that_of_the_steady_half(small: Any) -> None:
+    report, _, _, place = small
+    scene = rooms.make_rated_scene(place, "compressor", 2.0)
+    bound = power_constrained_wiener(
+        scene.references[0],
+        scene.disturbances[0],
+        place.secondary,
+        place.n_taps,
+        scene.rated_power,
+        fs=place.fs,
+        segment_s=2.0,
+        switch_on_s=scene.switch_on_s,
+    )
+    row = next(row for row in report.extra["rows"] if row["algorithm"] == BOUND and row["noise"] == "compressor")
+    assert row["noise_reduction_db"] == pytest.approx(bound.noise_reduction_over(1.0)["whole"], abs=1e-6)
+
+
+def test_level_map_is_the_sound_at_its_points() -> None:
+    """Against paths to one point of the plane, computed and convolved on their own."""
+    pytest.importorskip("pyroomacoustics")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rooms, "MAP_SPACING_M", 1.0)
+        rooms._paths_to_plane.cache_clear()
+        rng = np.random.default_rng(0)
+        x = rng.standard_normal((1, int(rooms.FS) + 600))
+        y = 0.3 * rng.standard_normal((2, x.shape[1]))
+        room = rooms.built_in_room(2)
+        result: Any = type("Run", (), {"control_signal": y})
+        before, (along, across) = level_map_db(2, x, None)
+        after, _ = level_map_db(2, x, result)
+        rooms._paths_to_plane.cache_clear()
+    point = room.at([[along[4], across[1], rooms.HEIGHT_M]])
+    n = int(rooms.FS)
+    quiet = through(point.primary, x[0])[0]
+    played = quiet - sum(np.convolve(point.secondary[0, j], y[j])[: y.shape[1]] for j in range(2))
+    levels = [10 * np.log10(np.mean(sound[-n:] ** 2)) for sound in (quiet, played)]
+    assert after[1, 4] - before[1, 4] == pytest.approx(levels[1] - levels[0], abs=1e-9)
+    assert 10 * np.log10(np.mean(10 ** (before / 10))) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_without_rooms_the_study_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multichannel, "places", dict)
+    report = multichannel.main(Runs())
+    assert isinstance(report, str)
+    assert "pyroomacoustics" in report
+
+
+# ---- Verdicts
+
+
+def rows_of(
+    loss_db: float = 0.2, power: float = 1.0, rival_db: float = 5.0, rival_power: float = 1.0
+) -> list[ChannelRow]:
+    """Rows of a steady noise and of a recording; the second loudspeaker's rating does not bind."""
+    rows = []
+    for path, noise in (("4 x 4", "tones"), (MEASURED, "recorded motor")):
+        bound = {BOUND: 8.0, SCALED: 4.0}
+        rows += [
+            ChannelRow(path=path, noise=noise, algorithm=name, noise_reduction_db=db, powers=[1.0, 0.5], power=1.0)
+            for name, db in bound.items()
+        ]
+        for name, db, own in ((KF_PB, 8.0 - loss_db, power), ("MOV-FxLMS", rival_db, rival_power)):
+            kept = own <= 1.02
+            rows.append(
+                ChannelRow(
+                    path=path, noise=noise, algorithm=name, noise_reduction_db=db, powers=[own, 0.4], power=own,
+                    within_budget=kept,
+                )
+            )  # fmt: skip
+    return rows
+
+
+def held(**changes: float) -> list[bool]:
+    return [verdict.reproduced for verdict in claims(rows_of(**changes))]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, [True, True, True, True, True]),
+        ({"power": 0.96}, [False, True, True, True, True]),
+        ({"power": 1.03}, [False, True, True, True, True]),
+        ({"power": 1.06}, [False, True, False, True, True]),
+        ({"loss_db": 0.6}, [True, False, True, True, True]),
+        ({"loss_db": 1.1}, [True, False, True, False, True]),
+        ({"rival_db": 8.2}, [True, True, True, True, False]),
+        ({"rival_db": 8.2, "rival_power": 1.1}, [True, True, True, True, True]),
+        ({"rival_db": 8.05}, [True, True, True, True, True]),
+    ],
+)
+def test_verdicts_on_both_sides_of_each_threshold(changes: dict[str, float], expected: list[bool]) -> None:
+    assert held(**changes) == expected
+
+
+def test_without_recordings_there_is_no_verdict_on_them() -> None:
+    assert len(claims([row for row in rows_of() if row.path != MEASURED])) == 3
+
+
+def test_direct_forms_run_in_small_systems_only() -> None:
+    big = Place("8 x 8", 4000.0, 128, np.zeros((8, 1, 256)), np.zeros((8, 8, 256)), {})
+    small = Place("2 x 2", 4000.0, 128, np.zeros((2, 1, 256)), np.zeros((2, 2, 256)), {})
+    direct = set(multichannel.DIRECT) & set(algorithms(several_channels=True))
+    assert direct <= set(multichannel.names(small))
+    assert not direct & set(multichannel.names(big))
