@@ -99,13 +99,19 @@ def per_loudspeaker(
     value: Any, n_loudspeakers: int, name: str, check: Callable[[Any, str], float] = as_positive
 ) -> np.ndarray:
     """Return one number, or one for each loudspeaker, as (J,); each must pass `check`."""
+    return per_channel(value, n_loudspeakers, "loudspeakers", name, check)
+
+
+def per_channel(
+    value: Any, size: int, what: str, name: str, check: Callable[[Any, str], float] = as_positive
+) -> np.ndarray:
+    """Return one number, or one for each channel, as (size,); each must pass `check`. `what` names the channels."""
     numbers = as_real_array(value, name)
-    if numbers.shape not in ((), (n_loudspeakers,)):
+    if numbers.shape not in ((), (size,)):
         raise ValueError(
-            f"{name} must be one number or one for each of the {n_loudspeakers} loudspeakers, ({n_loudspeakers},), "
-            f"got shape {numbers.shape}"
+            f"{name} must be one number or one for each of the {size} {what}, ({size},), got shape {numbers.shape}"
         )
-    return np.array([check(number, name) for number in np.broadcast_to(numbers, n_loudspeakers)])
+    return np.array([check(number, name) for number in np.broadcast_to(numbers, size)])
 
 
 def as_nonnegative(value: Any, name: str, *, unit: str = "") -> float:

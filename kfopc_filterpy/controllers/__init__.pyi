@@ -1,4 +1,6 @@
 from .base import Controller as Controller
+from .direct import DirectKalman as DirectKalman
+from .direct import DirectPowerBudget as DirectPowerBudget
 from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
 from .power_budget import PowerBudgetController as PowerBudgetController

@@ -31,10 +31,6 @@ OVERFLOW = (
 )
 
 
-MULTICHANNEL = (
-    "FxLMS, LeakyFxLMS, OptimalLeakyFxLMS, MOVFxLMS, TwoGradientFxLMS, RescalingFxLMS, ClippingFxLMS, SharedGainKalman"
-)
-
 Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
 
@@ -162,7 +158,8 @@ class FilteredReferenceController:
         if several and n_references is None:
             raise ValueError(
                 f"{type(self).__name__} takes one channel: secondary_path must be one-dimensional, (taps,), or a system "
-                f"of one input and one output. These take several channels: {MULTICHANNEL}"
+                "of one input and one output. Controllers with the setting n_references take several channels, for "
+                "example kf_anc, kf_opc, kf_pb and FxLMS"
             )
         self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
         self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel

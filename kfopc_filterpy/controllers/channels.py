@@ -16,7 +16,7 @@ from ..kernels.compiling import inlined
 from ..kernels.delay_lines import delay_line, latest, newest, push
 from ..kernels.vectors import at, dot
 from ..power.amplifiers import LinearAmplifier, amplify, compiled_model
-from ..power.constraint import advance_squares
+from ..power.constraint import advance_squares, preview_squares
 from ..power.limiter import LimiterState, limit_sample
 from .step import (
     advance_powers,
@@ -152,6 +152,15 @@ def estimate_disturbances(lines, error):
 @advance_powers.register(ChannelLines)
 def advance_channel_powers(lines, constraint, error):
     """Add a sample to the powers of each loudspeaker: sums over microphones and references, as if it were alone."""
+    finite, d, x = squares_of_sample(lines, error)
+    if finite:
+        add_squares(lines, constraint, d, x)
+    return finite, lines.disturbance, lines.constraint_factor
+
+
+@inlined
+def squares_of_sample(lines, error):
+    """Set d^(n); return whether all squares are finite, the sum of d^_k(n)^2 and that of x_i(n)^2."""
     finite, d, x = estimate_disturbances(lines, error), 0.0, 0.0
     for k in range(lines.disturbance.size):
         d += lines.disturbance[k] ** 2
@@ -160,10 +169,31 @@ def advance_channel_powers(lines, constraint, error):
     finite &= np.isfinite(d) and np.isfinite(x)
     for j in range(lines.output.shape[0]):
         finite &= np.isfinite(filtered_square(lines, j))
-    if finite:
-        for j in range(lines.output.shape[0]):
-            lines.constraint_factor[j] = advance_squares(at(constraint, j), d, filtered_square(lines, j), x)
-    return finite, lines.disturbance, lines.constraint_factor
+    return finite, d, x
+
+
+@inlined
+def add_squares(lines, constraint, d, x):
+    """Add the sums of squares to the powers of each loudspeaker, and set their constraint factors."""
+    for j in range(lines.output.shape[0]):
+        lines.constraint_factor[j] = advance_squares(at(constraint, j), d, filtered_square(lines, j), x)
+
+
+@inlined
+def least_factor(lines, constraint, d, x):
+    """Return the least constraint factor with this sample included; nothing is changed.
+
+    A loudspeaker whose gain is zero, which no microphone hears, is left out: its control filters stay zero. If there is
+    no other, its factor is returned.
+    """
+    heard, unheard = np.inf, np.inf
+    for j in range(lines.output.shape[0]):
+        factor, _, gain, _, _, _ = preview_squares(at(constraint, j), d, filtered_square(lines, j), x)
+        if gain == 0.0:
+            unheard = min(unheard, factor)
+        else:
+            heard = min(heard, factor)
+    return heard if heard < np.inf else unheard
 
 
 @inlined

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_number
+from .._validate import as_count, as_number
 from ..filters.kfopc import KFOPC
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..filters.random_walk import RandomWalkKFOPC, new_numbers
 from ..kernels.compiling import inlined
 from ..kernels.covariance import Covariance, kalman_step, new_covariance
 from ..kernels.delay_lines import latest, newest
+from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.constraint import (
     ConstraintState,
@@ -24,6 +25,7 @@ from ..power.constraint import (
 )
 from ..power.limiter import OutputLimiter
 from .base import NO_SOLUTION, FilteredReferenceController, calls_of, constraint_for
+from .direct import DirectKalman
 from .step import Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
 
 
@@ -131,7 +133,10 @@ class KalmanController(FilteredReferenceController):
         if not isinstance(estimator, KalmanFilter):
             raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
         if estimator.dim_z != 1:
-            raise ValueError(f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}")
+            raise ValueError(
+                f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}; "
+                "kf_anc and kf_opc take several microphones"
+            )
         if isinstance(estimator, PowerBudgetKalmanFilter):
             raise TypeError("estimator has a power budget: use PowerBudgetController, or kf_pb")
 
@@ -271,32 +276,41 @@ def kf_anc(
     secondary_path: Any,
     *,
     state_noise: float,
-    measurement_noise: float,
+    measurement_noise: Any,
     initial_variance: float = 1.0,
-    amplifier: Amplifier | None = None,
-    limiter: OutputLimiter | None = None,
+    n_references: int = 1,
+    amplifier: Any = None,
+    limiter: Any = None,
     dtype: Any = np.float64,
-) -> KalmanController:
+) -> KalmanController | DirectKalman:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
 
     Parameters
     ----------
     n_taps : int
-        Taps L of the control filter.
-    secondary_path : array_like or control.TransferFunction
-        Estimated secondary path.
-    state_noise, measurement_noise, initial_variance
-        r, q and P(0|0), see `KFOPC.random_walk`.
-    amplifier : callable, optional
-    limiter : OutputLimiter, optional
-        See `KalmanController`.
+        Taps L of the control filter, or of each of them.
+    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+        Estimated secondary path, or those from J loudspeakers to K microphones.
+    state_noise, initial_variance
+        r and P(0|0), see `KFOPC.random_walk`.
+    measurement_noise : float or array_like, shape (K,)
+        q of all microphones, or of each.
+    n_references : int, default 1
+        Number of references I.
+    amplifier, limiter : optional
+        See `KalmanController`; with several loudspeakers, a sequence with one for each.
     dtype : {numpy.float64, numpy.float32}, default numpy.float64
         See `KFOPC.random_walk`.
 
     Returns
     -------
-    KalmanController
-        A controller named KF-ANC.
+    KalmanController or DirectKalman
+        A controller named KF-ANC; with several channels a `DirectKalman`, whose signals and weights have channel axes.
+
+    Raises
+    ------
+    ValueError, TypeError
+        A setting that is out of range, or that does not fit the number of channels.
 
     Examples
     --------
@@ -304,57 +318,97 @@ def kf_anc(
     >>> kf_anc(8, [1.0], state_noise=1e-6, measurement_noise=0.1).name
     'KF-ANC'
     """
-    estimator = KFOPC.random_walk(
-        n_taps,
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        initial_variance=initial_variance,
-        dtype=dtype,
-    )
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
+    settings = {
+        "state_noise": state_noise,
+        "measurement_noise": measurement_noise,
+        "initial_variance": initial_variance,
+        "dtype": dtype,
+    }
+    return _kalman(n_taps, secondary_path, n_references, amplifier, limiter, None, settings)
 
 
 def kf_opc(
     n_taps: int,
     secondary_path: Any,
     *,
-    rated_power: float | None = None,
-    constraint: OutputPowerConstraint | None = None,
+    rated_power: Any = None,
+    constraint: Any = None,
     state_noise: float,
-    measurement_noise: float,
+    measurement_noise: Any,
     initial_variance: float = 1.0,
-    amplifier: Amplifier | None = None,
-    limiter: OutputLimiter | None = None,
+    n_references: int = 1,
+    amplifier: Any = None,
+    limiter: Any = None,
     dtype: Any = np.float64,
-) -> KalmanController:
+) -> KalmanController | DirectKalman:
     """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter, dtype
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter, dtype
         As for `kf_anc`.
-    rated_power : float, optional
-        Rated output power rho_o.
-    constraint : OutputPowerConstraint, optional
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power rho_o of all loudspeakers, or of each.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
 
     Returns
     -------
-    KalmanController
-        A controller named KF-OPC.
+    KalmanController or DirectKalman
+        A controller named KF-OPC; with several channels a `DirectKalman`, which scales all measurements by the least
+        of the loudspeakers' factors.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Neither a rated power nor a constraint, or both; a setting that is out of range, or that does not fit the number
+        of channels.
 
     Examples
     --------
+    >>> import numpy as np
     >>> from kfopc_filterpy import kf_opc
     >>> kf_opc(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).rated_power
     0.5
+    >>> paths = np.zeros((2, 2, 8))  # two loudspeakers, two microphones
+    >>> paths[:, :, 1] = [[1.0, 0.3], [0.2, 1.0]]
+    >>> kf_opc(8, paths, rated_power=[0.5, 0.2], state_noise=1e-6, measurement_noise=0.1).rated_power
+    array([0.5, 0.2])
     """
-    estimator = KFOPC.random_walk(
-        n_taps,
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        initial_variance=initial_variance,
-        constraint=constraint_for(rated_power, constraint),
-        dtype=dtype,
-    )
+    settings = {
+        "state_noise": state_noise,
+        "measurement_noise": measurement_noise,
+        "initial_variance": initial_variance,
+        "dtype": dtype,
+    }
+    own = constraint_for(rated_power, constraint)
+    return _kalman(n_taps, secondary_path, n_references, amplifier, limiter, own, settings)
+
+
+def _kalman(
+    n_taps: int,
+    secondary_path: Any,
+    n_references: int,
+    amplifier: Any,
+    limiter: Any,
+    constraint: Any,
+    settings: dict[str, Any],
+) -> KalmanController | DirectKalman:
+    """Return the controller for one channel or for several."""
+    if is_multichannel(secondary_path, n_references):
+        return DirectKalman(
+            n_taps,
+            secondary_path,
+            n_references=n_references,
+            constraint=constraint,
+            amplifier=amplifier,
+            limiter=limiter,
+            **settings,
+        )
+    estimator = KFOPC.random_walk(n_taps, constraint=constraint, **settings)
     return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
+
+
+def is_multichannel(secondary_path: Any, n_references: int) -> bool:
+    """Return whether signals have a channel axis: the secondary path has channel axes, or there are more references."""
+    return is_path_matrix(secondary_path) or as_count(n_references, "n_references") > 1

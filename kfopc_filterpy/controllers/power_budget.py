@@ -11,12 +11,12 @@ from .._validate import as_choice
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
-from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, take_correlations
 from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
-from .kalman import KalmanController, correct_constrained
+from .direct import DirectPowerBudget
+from .kalman import KalmanController, correct_constrained, is_multichannel
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
 
@@ -147,14 +147,15 @@ def kf_pb(
     *,
     rated_power: Any,
     state_noise: float | None = None,
-    measurement_noise: float | None = None,
+    measurement_noise: Any = None,
     initial_variance: float = 1.0,
+    n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
     dtype: Any = np.float64,
     form: str | None = None,
     **settings: Any,
-) -> PowerBudgetController | SharedGainKalman:
+) -> PowerBudgetController | DirectPowerBudget | SharedGainKalman:
     """Return KF-PB, the power-budgeted Kalman filter, which has the least error within the rated power.
 
     Parameters
@@ -167,25 +168,25 @@ def kf_pb(
         Rated output power, of all loudspeakers or of each.
     state_noise, measurement_noise, initial_variance, dtype
         Of the direct form, as for `kf_anc`; the shared-gain form does not need them.
-    amplifier, limiter
-        As for `kf_anc`; with several loudspeakers, a sequence with one for each.
+    n_references, amplifier, limiter
+        As for `kf_anc`.
     form : {"direct", "shared gain"}, optional
-        "direct" estimates the control filter (the paper's equations), "shared gain" the primary paths
-        (`SharedGainKalman`). By default direct for one channel, shared gain for several.
+        "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample; "shared gain" the
+        primary paths (`SharedGainKalman`). By default direct for one channel, shared gain for several.
     **settings
-        Of the direct form: `fs`, `memory_s`, `credit_s`, see `PowerBudget`. Of the shared-gain form: see
-        `SharedGainKalman`.
+        Of the direct form for one channel: `fs`, `memory_s`, `credit_s`, see `PowerBudget`; for several: `fs`,
+        `memory_s`, see `DirectPowerBudget`. Of the shared-gain form: see `SharedGainKalman`.
 
     Returns
     -------
-    PowerBudgetController or SharedGainKalman
+    PowerBudgetController, DirectPowerBudget or SharedGainKalman
         A controller. Its `control_filter` generates the control signal. The `weights` of a direct form are the estimate
         of the unconstrained control filter.
 
     Raises
     ------
     ValueError, TypeError
-        The direct form for several channels, or without its noises; noises for the shared-gain form; see the classes.
+        The direct form without its noises; noises for the shared-gain form; see the classes.
 
     Examples
     --------
@@ -198,25 +199,22 @@ def kf_pb(
     >>> kf_pb(32, paths, rated_power=[0.5, 0.2])
     <KF-PB (shared gain): 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2>
     """
-    several = is_path_matrix(secondary_path)
+    several = is_multichannel(secondary_path, n_references)
     form = as_choice(form or FORMS[several], "form", FORMS)
+    common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
     if form == "shared gain":
         if state_noise is not None or measurement_noise is not None:
             raise TypeError("the shared-gain form takes path_memory_s instead of state_noise and measurement_noise")
-        return SharedGainKalman(
-            n_taps, secondary_path, rated_power=rated_power, amplifier=amplifier, limiter=limiter, **settings
-        )
-    if several:
-        raise ValueError("the direct form has one channel; use form='shared gain' for several")
+        return SharedGainKalman(n_taps, secondary_path, n_references=n_references, **common, **settings)
     if state_noise is None or measurement_noise is None:
         raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
-    estimator = PowerBudgetKalmanFilter(
-        n_taps,
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        rated_power=rated_power,
-        initial_variance=initial_variance,
-        dtype=dtype,
-        **settings,
-    )
+    settings |= {
+        "state_noise": state_noise,
+        "measurement_noise": measurement_noise,
+        "initial_variance": initial_variance,
+        "dtype": dtype,
+    }
+    if several:
+        return DirectPowerBudget(n_taps, secondary_path, n_references=n_references, **common, **settings)
+    estimator = PowerBudgetKalmanFilter(n_taps, rated_power=rated_power, **settings)
     return PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)

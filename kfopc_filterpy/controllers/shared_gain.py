@@ -16,7 +16,7 @@ import numpy as np
 from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
 from ..kernels.compiling import inlined
 from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_covariance
-from ..kernels.delay_lines import latest, newest
+from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
 from ..paths.channels import secondary_paths
@@ -24,12 +24,11 @@ from ..power.amplifiers import Amplifier
 from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .base import FilteredReferenceController, listed
+from .blocks import DEFAULT_MEMORY_S, BlockController, RecentCorrelation, add_correlation
 from .channels import ChannelLines, estimate_disturbances
 from .step import adapt, follow
 
 PRIOR = 1e3  # energy of the reference in the unknown paths, relative to the measurement noise
-BLOCK_S = 0.032  # time between two solutions
 
 
 class SharedGainState(NamedTuple):
@@ -40,10 +39,8 @@ class SharedGainState(NamedTuple):
     paths: np.ndarray  # (K, I L_p) estimated primary paths
     gains: Covariance  # of a row of `paths`; the measurement noise is 1
     row: np.ndarray  # (I L_p,) references, newest first
-    correlation: np.ndarray  # (M, I, I) running sum of x_i(n - m) x_k(n)
-    numbers: (
-        np.ndarray
-    )  # record: state_noise, keep (of the correlation), mass, waiting (samples since the last solution)
+    recent: RecentCorrelation  # of the references
+    numbers: np.ndarray  # record: state_noise
 
 
 @adapt.register(SharedGainState)
@@ -57,7 +54,7 @@ def adapt_shared_gain(state, error, control_signal):
         return False
     for k in range(1, paths.shape[0]):
         correct_weights(paths[k], state.gains.gain_direction, (d[k] - dot(h, paths[k])) / S)
-    add_correlation(state)
+    add_correlation(state.recent, state.lines.reference)
     return True
 
 
@@ -66,7 +63,7 @@ def follow_shared_gain(state, error):
     """Add the sample to the correlation."""
     if not estimate_disturbances(state.lines, error):
         return False
-    add_correlation(state)
+    add_correlation(state.recent, state.lines.reference)
     return True
 
 
@@ -80,21 +77,7 @@ def reference_row(state):
     return row
 
 
-@inlined
-def add_correlation(state):
-    """Add the newest sample to the correlation of the references; older samples fade."""
-    r, lines, numbers = state.correlation, state.lines.reference, state.numbers[0]
-    for i in range(lines.shape[0]):
-        past = newest(lines[i], r.shape[0])
-        for k in range(lines.shape[0]):
-            x = latest(lines[k])
-            for m in range(r.shape[0]):
-                r[m, i, k] = numbers.keep * r[m, i, k] + past[m] * x
-    numbers.mass = numbers.keep * numbers.mass + 1.0
-    numbers.waiting += 1
-
-
-class SharedGainKalman(FilteredReferenceController):
+class SharedGainKalman(BlockController):
     """KF-PB for several channels, in real time: primary paths by a Kalman filter, control filters within the powers.
 
     Parameters
@@ -152,7 +135,7 @@ class SharedGainKalman(FilteredReferenceController):
         n_references: int = 1,
         n_primary: int | None = None,
         path_memory_s: float = 1.0,
-        memory_s: float = 0.5,
+        memory_s: float = DEFAULT_MEMORY_S,
         fs: float = DEFAULT_FS,
         microphone_weights: Any = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
@@ -172,9 +155,8 @@ class SharedGainKalman(FilteredReferenceController):
             filtered_taps=0,
             history=n_lags,
         )
-        self.fs = as_positive(fs, "fs", unit="Hz")
+        recent = self._new_correlation(n_lags, memory_s, fs)
         self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
-        self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self._rated = None if rated_power is None else per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
         weights = self._microphone_weights(microphone_weights)
         unlimited = np.full(self.n_loudspeakers, np.inf)
@@ -186,7 +168,6 @@ class SharedGainKalman(FilteredReferenceController):
             unlimited if self._rated is None else self._rated,
         )
         self._path_weights = np.sqrt(weights)[:, np.newaxis, np.newaxis]
-        self.block = max(round(BLOCK_S * self.fs), 1)
         size = self.n_references * n_primary
         self._state = SharedGainState(
             lines=self._lines,
@@ -194,8 +175,8 @@ class SharedGainKalman(FilteredReferenceController):
             paths=np.zeros((self.n_microphones, size)),
             gains=new_covariance(np.zeros((size, size))),
             row=np.zeros(size),
-            correlation=np.zeros((n_lags, self.n_references, self.n_references)),
-            numbers=new_record(state_noise=0.0, keep=np.exp(-1.0 / (self.memory_s * self.fs)), mass=0.0, waiting=0),
+            recent=recent,
+            numbers=new_record(state_noise=0.0),
         )
 
     def _microphone_weights(self, weights: Any) -> np.ndarray:
@@ -209,53 +190,15 @@ class SharedGainKalman(FilteredReferenceController):
         return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
 
     @property
-    def rated_power(self) -> np.ndarray | None:
-        """Rated output power of each loudspeaker, (J,); None if unlimited."""
-        return None if self._rated is None else self._rated.copy()
-
-    @property
     def primary_path(self) -> np.ndarray:
         """Estimated primary paths, (K, I, L_p); a copy."""
         return self._state.paths.reshape(self.n_microphones, self.n_references, -1).copy()
 
-    @property
-    def power_weight(self) -> np.ndarray:
-        """Weight lambda of each loudspeaker's control power, (J,)."""
-        penalty = self._budget.penalty
-        return np.zeros(self.n_loudspeakers) if penalty is None or self._rated is None else penalty.copy()
-
-    def __repr__(self) -> str:
-        parts = [*self._channel_counts(), f"{self.n_taps} taps"]
-        if self._rated is not None:
-            parts.append(f"rated power {listed(self._rated, 'g')}")
-        return f"<{self.name}: {', '.join(parts)}>"
-
-    @property
-    def _powers_fs(self) -> float:
-        return self.fs
-
-    def samples_to_block(self) -> int:
-        """Return the number of samples until the next solution."""
-        return max(self.block - int(self._state.numbers["waiting"][0]), 1)
-
-    def after_compiled(self, state: SharedGainState) -> None:
-        """Solve for the control filters if a block has passed."""
-        if state.numbers["waiting"][0] >= self.block:
-            state.numbers["waiting"] = 0
-            self._solve()
-
-    def _solve(self) -> None:
+    def _solve(self, correlation: np.ndarray) -> None:
         """Find the control filters for the present paths and correlation."""
         state = self._state
-        mass, keep = state.numbers["mass"][0], state.numbers["keep"][0]
-        # Faded like this, it is the correlation of a signal that fades, which is positive definite.
-        fade = np.sqrt(keep) ** np.arange(len(state.correlation))
-        correlation = state.correlation * fade[:, np.newaxis, np.newaxis] / mass
-        power = np.trace(correlation[0]) / self.n_references
-        if not power > 0.0:
-            return
         if state.numbers["state_noise"][0] == 0.0:
-            self._scale(power)
+            self._scale(np.trace(correlation[0]) / self.n_references)
         self._budget.solve(correlation, self._path_weights * self.primary_path)
         state.weights[...] = self._budget.weights
 

@@ -27,6 +27,7 @@ from .guards import (
 
 if TYPE_CHECKING:
     from ..power.constraint import OutputPowerConstraint
+    from ..power.shared_constraint import SharedConstraint
     from .random_walk import RandomWalkKFOPC
 
 MOST_STATES_SHOWN = 8  # with more, `repr` is a summary: filterpy's shows every matrix
@@ -73,14 +74,14 @@ class KFOPC(KalmanFilter):
     Parameters
     ----------
     dim_x : int
-        Number of states; for active noise control the taps of the control filter.
+        Number of states; for active noise control the taps of the control filter, or of all control filters.
     dim_z : int, default 1
-        Number of measurements; 1 with a rated power.
+        Number of measurements; for active noise control the number of error microphones.
     dim_u : int, default 0
         Number of control inputs.
-    rated_power : float, optional
-        Rated output power (mean square of the control signal). None: no constraint.
-    constraint : OutputPowerConstraint, optional
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power (mean square of the control signal), or that of each of J loudspeakers. None: no constraint.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
         Given instead of `rated_power` to set also the sample rate, the memory of the power estimates or a known
         secondary-path gain. The filter keeps a copy. By default the gain is estimated from the newest sample of H and
         the `reference` given to `update` (eq. 11).
@@ -98,8 +99,8 @@ class KFOPC(KalmanFilter):
     TypeError
         A dimension that is not a whole number.
     ValueError
-        A dimension out of range, a rated power with ``dim_z > 1``, a power that is not positive, both a rated power and
-        a constraint.
+        A dimension out of range, a `dim_x` that is not a multiple of the number of loudspeakers, a power that is not
+        positive, both a rated power and a constraint.
 
     See Also
     --------
@@ -108,6 +109,15 @@ class KFOPC(KalmanFilter):
     Notes
     -----
     filterpy's ``alpha`` is its fading memory; the paper's :math:`\alpha` is `constraint_factor` here.
+
+    With J loudspeakers, I references and K microphones, the states are the control filters in the order (J, I, taps),
+    newest-sample tap first, and row k of H is the filtered references x'_kji of microphone k in that order. All
+    measurements are scaled by one factor, the least that eq. 13 gives any loudspeaker as if it were alone: the
+    disturbance power is summed over microphones, and the gain is the power of the loudspeaker's filtered references,
+    summed over microphones, over that of the references. This extension is the package's, not the paper's. `rated_power`,
+    `disturbance_power` and `secondary_path_gain` are then (J,).
+
+    See also `kf_opc`, whose filter for several channels takes O(K dim_x^2) per sample.
 
     References
     ----------
@@ -125,6 +135,15 @@ class KFOPC(KalmanFilter):
     0.25
     >>> kf.y  # 0.25 * 4 - 0
     array([[1.]])
+
+    Two loudspeakers of two taps each, and one microphone:
+
+    >>> kf = KFOPC(dim_x=4, rated_power=[1.0, 0.25])
+    >>> kf.update(4.0, H=np.array([1.0, 0.0, 2.0, 0.0]), reference=1.0)
+    >>> kf.secondary_path_gain
+    array([1., 4.])
+    >>> kf.constraint_factor  # the lesser of sqrt(1 * 1 / 16) and sqrt(0.25 * 4 / 16)
+    0.25
     """
 
     if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
@@ -144,11 +163,11 @@ class KFOPC(KalmanFilter):
         dim_z: int = 1,
         dim_u: int = 0,
         *,
-        rated_power: float | None = None,
-        constraint: OutputPowerConstraint | None = None,
+        rated_power: Any = None,
+        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
     ) -> None:
-        self._constraint: OutputPowerConstraint | None = None
-        self._lifted: OutputPowerConstraint | None = None  # the constraint before it was lifted, for its settings
+        self._constraint: Any = None
+        self._lifted: Any = None  # the constraint before it was lifted, for its settings
         self._unconstrained_factor = 1.0
         self._batch_references: BatchReferences | None = None
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
@@ -229,38 +248,56 @@ class KFOPC(KalmanFilter):
     # The constraint: its values can be read, or supplied by the caller.
 
     @property
-    def rated_power(self) -> float | None:
-        """Rated output power; assign another, or None to lift the constraint."""
+    def rated_power(self) -> Any:
+        """Rated output power, or that of each loudspeaker, (J,); assign another, or None to lift the constraint."""
         return None if self._constraint is None else self._constraint.rated_power
 
     @rated_power.setter
-    def rated_power(self, value: float | None) -> None:
+    def rated_power(self, value: Any) -> None:
+        one = np.ndim(value) == 0
         if value is None:
             self._lifted, self._constraint = self._constraint or self._lifted, None
-        elif self._constraint is not None:
+        elif self._constraint is not None and (one or isinstance(self._constraint, tuple)):
             self._constraint.rated_power = value
         else:
             from ..power.constraint import OutputPowerConstraint  # numba, only if it is needed
 
-            self.constraint = OutputPowerConstraint(value) if self._lifted is None else self._lifted.fresh(value)
+            settings = self._constraint or self._lifted or OutputPowerConstraint(1.0)
+            together = one or isinstance(settings, tuple)
+            self.constraint = settings.fresh(value) if together else [settings.fresh(power) for power in value]
 
     @property
-    def constraint(self) -> OutputPowerConstraint | None:
-        """Constraint that computes the powers and the factor; None without a rated power. Assignment stores a copy."""
+    def constraint(self) -> Any:
+        """Constraint that computes the powers and the factor; None without a rated power. Assignment stores a copy.
+
+        For several loudspeakers it is a tuple, one for each.
+        """
         return self._constraint
 
     @constraint.setter
-    def constraint(self, value: OutputPowerConstraint | None) -> None:
+    def constraint(self, value: Any) -> None:
         if value is None:
             self.rated_power = None
-            return
-        from ..power.constraint import OutputPowerConstraint
+        else:
+            self._constraint = self._own_constraint(value)
 
-        if not isinstance(value, OutputPowerConstraint):
-            raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {value!r}")
-        if self.dim_z != 1:
-            raise ValueError(f"a rated power needs one measurement, dim_z = 1, got dim_z = {self.dim_z}")
-        self._constraint = deepcopy(value)
+    def _own_constraint(self, value: Any) -> Any:
+        """Return a copy of a constraint, or of one for each loudspeaker."""
+        from ..power.constraint import OutputPowerConstraint
+        from ..power.shared_constraint import SharedConstraint
+
+        each = value if isinstance(value, list | tuple) else [value]
+        if not each or not all(isinstance(one, OutputPowerConstraint) for one in each):
+            raise TypeError(
+                f"constraint must be an OutputPowerConstraint or None, got {value!r}; "
+                "for several loudspeakers, a sequence of them"
+            )
+        if self.dim_x % len(each):
+            raise ValueError(
+                f"dim_x = {self.dim_x} states cannot be the control filters of {len(each)} loudspeakers: "
+                "they have equal lengths, in the order (loudspeakers, references, taps)"
+            )
+        return SharedConstraint(deepcopy(one) for one in each) if each is value else deepcopy(value)
 
     @property
     def constraint_factor(self) -> float:
@@ -275,24 +312,24 @@ class KFOPC(KalmanFilter):
             self._unconstrained_factor = 1.0 if value is None else as_nonnegative(value, "constraint_factor")
 
     @property
-    def disturbance_power(self) -> float | None:
+    def disturbance_power(self) -> Any:
         """Disturbance power delta_d^2 last used (eq. 10), None without a rated power; can be supplied."""
         return None if self._constraint is None else self._constraint.disturbance_power
 
     @disturbance_power.setter
-    def disturbance_power(self, value: float | None) -> None:
+    def disturbance_power(self, value: Any) -> None:
         self._require_constraint("disturbance_power").disturbance_power = value
 
     @property
-    def secondary_path_gain(self) -> float | None:
+    def secondary_path_gain(self) -> Any:
         """Secondary-path power gain G_s last used (eq. 11), None before any is known; can be supplied."""
         return None if self._constraint is None else self._constraint.secondary_path_gain
 
     @secondary_path_gain.setter
-    def secondary_path_gain(self, value: float | None) -> None:
+    def secondary_path_gain(self, value: Any) -> None:
         self._require_constraint("secondary_path_gain").secondary_path_gain = value
 
-    def _require_constraint(self, name: str) -> OutputPowerConstraint:
+    def _require_constraint(self, name: str) -> Any:
         if self._constraint is None:
             raise ValueError(f"{name} needs a constraint: set rated_power first")
         return self._constraint
@@ -315,7 +352,7 @@ class KFOPC(KalmanFilter):
         with self._all_or_nothing("predict_steadystate", u=u, B=self.B if B is None else B):
             super().predict_steadystate(u, B)
 
-    def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
+    def update(self, z: Any, R: Any = None, H: Any = None, *, reference: Any = None) -> None:
         """Correct the state with a measurement, scaled by the constraint factor (eq. 9).
 
         Parameters
@@ -326,17 +363,18 @@ class KFOPC(KalmanFilter):
         R : float or array_like, optional
             Measurement noise variance of this step; by default `self.R`.
         H : array_like, optional
-            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power its first
-            element is the newest filtered reference x'(n).
-        reference : float, optional
-            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11).
+            Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power, the first element of
+            each control filter's part is the newest filtered reference x'(n).
+        reference : float or array_like, shape (I,), optional
+            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11). Several references need rated
+            powers in a sequence, be it of one.
 
         Raises
         ------
         ValueError
             NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, no H given or
             assigned, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
-            gain. The filter is unchanged and can continue.
+            gain, or with only some of the measurements. The filter is unchanged and can continue.
         TypeError
             A measurement that is not a real number.
         """
@@ -347,7 +385,7 @@ class KFOPC(KalmanFilter):
         z, R, H = checked_measurement(self, z, R, H)
         self._scaled_step("update", lambda scaled: KalmanFilter.update(self, scaled, R, H), z, H, reference)
 
-    def update_steadystate(self, z: Any, *, reference: float | None = None) -> None:
+    def update_steadystate(self, z: Any, *, reference: Any = None) -> None:
         """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
         if z is None:
             super().update_steadystate(None)
@@ -357,7 +395,7 @@ class KFOPC(KalmanFilter):
         step = super().update_steadystate
         self._scaled_step("update_steadystate", step, z, None, reference)
 
-    def update_correlated(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
+    def update_correlated(self, z: Any, R: Any = None, H: Any = None, *, reference: Any = None) -> None:
         """Run filterpy's `update_correlated` with the measurement scaled; see `update`."""
         if z is None:
             super().update_correlated(None)
@@ -368,7 +406,7 @@ class KFOPC(KalmanFilter):
         self._scaled_step("update_correlated", lambda scaled: step(scaled, R, H), z, H, reference)
 
     def update_sequential(
-        self, start: int, z_i: Any, R_i: Any = None, H_i: Any = None, *, reference: float | None = None
+        self, start: int, z_i: Any, R_i: Any = None, H_i: Any = None, *, reference: Any = None
     ) -> None:
         """Run filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
         if not hasattr(KalmanFilter, "update_sequential"):
@@ -419,7 +457,7 @@ class KFOPC(KalmanFilter):
         Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional
-            (len(zs),) reference samples x(n), for a filter with a rated power.
+            (len(zs),) reference samples x(n), or (len(zs), I), for a filter with a rated power.
 
         Returns
         -------
@@ -442,7 +480,7 @@ class KFOPC(KalmanFilter):
         array([0.67, 0.67, 0.91])
         """
         if references is not None:
-            references = BatchReferences(as_signal(references, "references", length=len(zs)))
+            references = BatchReferences(self._checked_references(references, len(zs)))
         for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
             if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
                 raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
@@ -514,9 +552,12 @@ class KFOPC(KalmanFilter):
 
     def _power_settings(self) -> list[str]:
         """Return the rated power for the summary, and the settings of the constraint that keeps it."""
-        parts = [] if self.rated_power is None else [f"rated power {self.rated_power:g}"]
+        if self.rated_power is None:
+            return []
+        parts = ["rated power " + ", ".join(f"{power:g}" for power in np.ravel(self.rated_power))]
         if self._constraint is not None:
-            parts += [f"fs {self._constraint.fs:g} Hz", f"memory {self._constraint.memory_s:g} s"]
+            first = self._constraint[0] if isinstance(self._constraint, tuple) else self._constraint
+            parts += [f"fs {first.fs:g} Hz", f"memory {first.memory_s:g} s"]
         return parts
 
     def _noises(self) -> list[str]:
@@ -525,10 +566,26 @@ class KFOPC(KalmanFilter):
 
     # All or nothing: a step is checked first, and undone if it fails.
 
-    def _next_reference(self, z: Any, reference: float | None) -> float | None:
+    def _next_reference(self, z: Any, reference: Any) -> Any:
         if reference is None and self._batch_references is not None:
             reference = self._batch_references.next()
-        return None if z is None or reference is None else as_number(reference, "reference")
+        return None if z is None or reference is None else self._checked_reference(reference)
+
+    def _checked_reference(self, reference: Any) -> Any:
+        """Return a reference as a number, or several as (I,) if the rated powers are listed for loudspeakers."""
+        one = np.size(reference) == 1 or not isinstance(self._constraint, tuple)
+        return as_number(reference, "reference") if one else as_signal(reference, "reference")
+
+    @staticmethod
+    def _checked_references(references: Any, n_samples: int) -> np.ndarray:
+        """Return the references of a batch, (n_samples,) or (n_samples, I)."""
+        samples = as_real_array(references, "references")
+        if samples.ndim != 2:
+            return as_signal(samples, "references", length=n_samples)
+        if len(samples) != n_samples:
+            raise ValueError(f"references must have {n_samples} values, got shape {samples.shape}")
+        require_finite(samples, "references")
+        return samples
 
     def _presently_scaled(self, z: Any) -> Any:
         require_measurement(z, self.dim_z)
@@ -544,17 +601,14 @@ class KFOPC(KalmanFilter):
         step: Callable[[Any], None],
         z: Any,
         H: np.ndarray | None,
-        reference: float | None,
+        reference: Any,
         start: int | None = None,
     ) -> None:
         """Run `step` on the scaled measurement, then update the powers; an error leaves the filter unchanged."""
-        sample, factor = None, self.constraint_factor
+        factor = self.constraint_factor
         if self._constraint is not None:
-            row = np.asarray(self.H if H is None else H)
-            if row.size != self.dim_x:
-                raise ValueError(f"a rated power needs one measurement, one row of H, got {row.shape[0]} rows")
-            sample = (np.asarray(z).item(), row.flat[0], reference)
-            factor = self._constraint.preview(*sample)
+            shared, sample = self._powers_sample(z, self.H if H is None else H, reference)
+            factor = shared.preview(*sample)
         with self._all_or_nothing(name):
             step(self._scaled(z, factor))
         if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
@@ -562,8 +616,27 @@ class KFOPC(KalmanFilter):
                 self.z = np.reshape(z, np.shape(self.z)).copy()
             else:
                 self.z[start : start + np.size(z)] = np.reshape(z, (-1, 1))
-        if sample is not None and self._constraint is not None:
-            self._constraint.advance(*sample)
+        if self._constraint is not None:
+            shared.advance(*sample)
+
+    def _powers_sample(self, z: Any, H: Any, reference: Any) -> tuple[SharedConstraint, tuple[Any, Any, Any]]:
+        """Return the constraint, and what it takes: measurements, newest filtered references, references."""
+        from ..power.shared_constraint import SharedConstraint
+
+        shared = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
+        rows = np.reshape(H, (-1, self.dim_x))
+        if len(rows) != self.dim_z:
+            raise ValueError(
+                f"a rated power needs all measurements at once, dim_z = {self.dim_z} rows of H, got {len(rows)}"
+            )
+        filters = len(shared), 1 if reference is None else np.size(reference)
+        if self.dim_x % (filters[0] * filters[1]):
+            raise ValueError(
+                f"reference must have one sample for each reference, but dim_x = {self.dim_x} states cannot be the "
+                f"control filters of {filters[0]} loudspeaker(s) for {filters[1]} reference(s)"
+            )
+        newest = rows.reshape(self.dim_z, *filters, -1)[..., 0].swapaxes(0, 1)
+        return shared, (z, newest, reference)
 
     def _take_in_edits(self) -> None:
         """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, require_finite
+from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..kernels.compiling import compiled_for_states, part
 from ..kernels.covariance import Covariance, project_covariance, update_weights
 from ..kernels.records import new_record
@@ -154,7 +154,7 @@ class RandomWalkKFOPC(KFOPC):
         dtype: Any = np.float64,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
-        precision = _precision(dtype)
+        precision = as_precision(dtype)
         self._F: np.ndarray | None = None  # None: the identity
         self._Q: np.ndarray | None = None  # None: state_noise I
         self._views: dict[str, np.ndarray] = {}  # read-only F, Q, R, made when read
@@ -433,6 +433,19 @@ class RandomWalkKFOPC(KFOPC):
             raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
         raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
 
+    def _own_constraint(self, value: Any) -> OutputPowerConstraint:
+        """Return a copy of a constraint; there is one loudspeaker."""
+        if isinstance(value, list | tuple):
+            raise TypeError(
+                f"this filter has one loudspeaker, got {len(value)} rated powers or constraints: for several, use "
+                "KFOPC(dim_x, dim_z), or kf_opc, which takes O(n^2) per sample and microphone"
+            )
+        return super()._own_constraint(value)
+
+    def _checked_reference(self, reference: Any) -> float:
+        """Return a reference as a number; there is one."""
+        return as_number(reference, "reference")
+
     def _weights(self) -> np.ndarray:
         """Return x as a new array, (n,)."""
         weights = np.array(self.x, dtype=np.float64).reshape(-1)
@@ -476,7 +489,8 @@ class RandomWalkKFOPC(KFOPC):
         self._record(weights.reshape(np.shape(self.x)))
 
 
-def _precision(dtype: Any) -> np.dtype:
+def as_precision(dtype: Any) -> np.dtype:
+    """Return the precision of a covariance, float64 or float32, or raise a clear error."""
     try:
         precision = np.dtype(dtype)
     except TypeError as error:

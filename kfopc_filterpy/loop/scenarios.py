@@ -259,7 +259,7 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
     states = []
     for i, controller in enumerate(controllers):
         if not isinstance(controller, FilteredReferenceController) or not controller.has_gains:
-            raise TypeError(f"controllers[{i}] must be a KalmanController, got {controller!r}")
+            raise TypeError(f"controllers[{i}] must be a KalmanController, of one channel, got {controller!r}")
         if any(controller is other or _filter(controller) is _filter(other) for other in controllers[:i]):
             raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs its own controller")
         controller.require_sample_rate(fs)

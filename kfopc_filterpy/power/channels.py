@@ -5,7 +5,8 @@ For estimated primary paths P, known secondary paths S and the correlation of th
     (R_x' + blkdiag(lambda_j R_x)) v = r,    lambda_j >= 0,    lambda_j (v_j' R_x v_j - rho_j) = 0,
 
 where R_x' is the correlation of the filtered references, summed over the microphones, and r their cross-correlation with
-the disturbances. Both follow from the paths and R_x alone, as products of spectra.
+the disturbances. Both follow from the paths and R_x alone, as products of spectra. If instead of the primary paths the
+control filters w that are best without a limit are known, r = R_x' w.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class ChannelBudget:
     secondary : ndarray, shape (K, J, n_secondary)
         Secondary paths, each microphone's row weighted as its error counts.
     n_taps, n_primary : int
-        Taps of a control filter, and of an estimated primary path.
+        Taps of a control filter, and of an estimated primary path; 0 if the control filters are estimated.
     n_references : int
         Number of references I.
     rated_power : ndarray, shape (J,)
@@ -56,7 +57,7 @@ class ChannelBudget:
         self.penalty: np.ndarray | None = None  # lambda, (J,)
 
     def solve(self, correlation: np.ndarray, primary: np.ndarray) -> None:
-        """Move `weights` and `penalty` towards the solution.
+        """Move `weights` and `penalty` towards the solution for primary paths.
 
         Parameters
         ----------
@@ -65,9 +66,25 @@ class ChannelBudget:
         primary : ndarray, shape (K, I, n_primary)
             Primary paths.
         """
-        J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
-        r = self._right_side(correlation, primary)
+        self._move(correlation, self._filtered_lags(correlation), self._right_side(correlation, primary))
+
+    def solve_near(self, correlation: np.ndarray, free: np.ndarray) -> None:
+        """Move `weights` and `penalty` towards the solution for control filters that are best without a limit.
+
+        Parameters
+        ----------
+        correlation : ndarray, shape (n_lags, I, I)
+            As for `solve`.
+        free : ndarray, shape (J, I, n_taps)
+            Control filters w, from which the right-hand side follows: r = R_x' w.
+        """
         lags = self._filtered_lags(correlation)
+        product = toeplitz_product(circulant_spectrum(lags, self.n_taps), self.n_taps)
+        self._move(correlation, lags, product(free.reshape(-1, self.n_taps)))
+
+    def _move(self, correlation: np.ndarray, lags: np.ndarray, r: np.ndarray) -> None:
+        """Move `weights` and `penalty` towards the solution for R_x' of these `lags` and the right-hand side r."""
+        J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
         of_x = _two_sided(correlation[:n], 2 * n)
         natural = np.trace(lags[0]) / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
         ridge = RIDGE * np.trace(lags[0]) / (J * n_references)

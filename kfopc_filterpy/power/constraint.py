@@ -77,13 +77,14 @@ def preview_constraint(state, disturbance, filtered_reference, reference):
     Also return the disturbance power and the gain that it was computed from, and the three mean squares. If `reference`
     is NaN (none given), the powers of the reference and the filtered reference stay as they are.
     """
-    return _preview_squares(
+    return preview_squares(
         state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
     )
 
 
 @inlined
-def _preview_squares(state, disturbance, filtered_reference, reference):
+def preview_squares(state, disturbance, filtered_reference, reference):
+    """Return what `preview_constraint` does, for squares, which can be sums over channels."""
     numbers = state.numbers[0]
     mean_d = _next_mean(state, DISTURBANCE, disturbance)
     mean_xf, mean_x = state.powers[FILTERED_REFERENCE].mean_square, state.powers[REFERENCE].mean_square
@@ -99,13 +100,14 @@ def _preview_squares(state, disturbance, filtered_reference, reference):
 @inlined
 def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
     """Add the sample to the running powers; `previewed` is what `preview_constraint` returned for it."""
-    _commit_squares(
+    commit_squares(
         state, previewed, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
     )
 
 
 @inlined
-def _commit_squares(state, previewed, disturbance, filtered_reference, reference):
+def commit_squares(state, previewed, disturbance, filtered_reference, reference):
+    """Add squares to the running powers; `previewed` is what `preview_squares` returned for them."""
     factor, power, gain, mean_d, mean_xf, mean_x = previewed
     _take(state, DISTURBANCE, disturbance, mean_d)
     if not np.isnan(reference):
@@ -126,8 +128,8 @@ def advance_constraint(state, disturbance, filtered_reference, reference):
 @inlined
 def advance_squares(state, disturbance, filtered_reference, reference):
     """Add squares, which can be sums over channels, to the running powers and return the constraint factor."""
-    previewed = _preview_squares(state, disturbance, filtered_reference, reference)
-    _commit_squares(state, previewed, disturbance, filtered_reference, reference)
+    previewed = preview_squares(state, disturbance, filtered_reference, reference)
+    commit_squares(state, previewed, disturbance, filtered_reference, reference)
     return previewed[0]
 
 
@@ -155,14 +157,15 @@ def _take(state, signal, square, mean):
 
 @compiled()
 def preview_sample(state, disturbance, filtered_reference, reference):
-    """Return the factor of `preview_constraint`; called from Python."""
-    return preview_constraint(state, disturbance, filtered_reference, reference)[0]
+    """Return the factor and the gain of `preview_squares`; called from Python."""
+    factor, _, gain, _, _, _ = preview_squares(state, disturbance, filtered_reference, reference)
+    return factor, gain
 
 
 @compiled()
 def advance_sample(state, disturbance, filtered_reference, reference):
-    """Call `advance_constraint` from Python."""
-    return advance_constraint(state, disturbance, filtered_reference, reference)
+    """Call `advance_squares` from Python."""
+    return advance_squares(state, disturbance, filtered_reference, reference)
 
 
 class OutputPowerConstraint:
@@ -288,7 +291,7 @@ class OutputPowerConstraint:
 
     def preview(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Return the constraint factor that `advance` would return for this sample; nothing is changed."""
-        return float(preview_sample(self._state, *self._sample(disturbance, filtered_reference, reference)))
+        return self.preview_sums(*self._squares(disturbance, filtered_reference, reference))[0]
 
     def advance(self, disturbance: float, filtered_reference: float = 0.0, reference: float | None = None) -> float:
         """Add one sample to the powers and return the constraint factor.
@@ -312,20 +315,33 @@ class OutputPowerConstraint:
         ValueError
             NaN, Inf or a value whose square overflows; no reference although the gain must be estimated.
         """
-        return float(advance_sample(self._state, *self._sample(disturbance, filtered_reference, reference)))
+        return self.advance_sums(*self._squares(disturbance, filtered_reference, reference))
 
-    def _sample(self, disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float]:
+    def preview_sums(self, disturbance: float, filtered: float, reference: float | None) -> tuple[float, float]:
+        """Return the factor and the gain (NaN: unknown) for squares, which can be sums over channels."""
+        factor, gain = preview_sample(self._state, disturbance, filtered, self._known(reference))
+        return float(factor), float(gain)
+
+    def advance_sums(self, disturbance: float, filtered: float, reference: float | None) -> float:
+        """Add squares, which can be sums over channels, to the powers and return the factor."""
+        return float(advance_sample(self._state, disturbance, filtered, self._known(reference)))
+
+    def _known(self, reference: float | None) -> float:
+        """Return the square of the reference, NaN if none is given and none is needed."""
         if reference is None and self.needs_reference:
             raise ValueError(
                 "the secondary-path gain is unknown: pass reference=, the newest reference sample x(n), "
                 "or set secondary_path_gain"
             )
-        values = (
-            _squarable(disturbance, "the measurement"),
-            _squarable(filtered, "the newest filtered reference"),
-            math.nan if reference is None else _squarable(reference, "reference"),
+        return math.nan if reference is None else reference
+
+    @staticmethod
+    def _squares(disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float | None]:
+        return (
+            squared(disturbance, "the measurement"),
+            squared(filtered, "the newest filtered reference"),
+            None if reference is None else squared(reference, "reference"),
         )
-        return values
 
     def _read(self, name: str) -> float:
         supplied = self._state.numbers[f"supplied_{name}"][0]
@@ -335,9 +351,10 @@ class OutputPowerConstraint:
         self._state.numbers[f"supplied_{name}"] = math.nan if value is None else value
 
 
-def _squarable(value: Any, name: str) -> float:
-    """Return `value` as a float with a finite square: an infinite power would never be forgotten."""
+def squared(value: Any, name: str) -> float:
+    """Return the square of a number; it must be finite: an infinite power would never be forgotten."""
     number = as_number(value, name)
-    if math.isinf(number * number):
+    square = number * number
+    if math.isinf(square):
         raise ValueError(f"{name} must have a finite square, got {number:g}")
-    return number
+    return square

@@ -235,7 +235,7 @@ def test_settings_that_do_not_fit_are_refused(changed: dict, error: type[Excepti
 @pytest.mark.parametrize(
     ("arguments", "error", "match"),
     [
-        ({"form": "direct"}, ValueError, "one channel"),
+        ({"form": "direct"}, TypeError, "give state_noise and measurement_noise"),
         ({"state_noise": 1e-6}, TypeError, "path_memory_s instead"),
         ({"form": "other"}, ValueError, "form must be one of"),
     ],

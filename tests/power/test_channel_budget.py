@@ -56,6 +56,27 @@ def test_it_converges_to_the_dense_solution_with_complementary_slackness() -> No
     assert np.abs(residual).max() < 1e-9 * np.abs(r).max()
 
 
+def test_from_the_control_filters_without_a_limit_it_finds_the_same_as_from_the_paths() -> None:
+    """r = R_x' w, for any w; for the w that is best without a limit it is the r of the primary paths."""
+    secondary, primary, x = scene()
+    rated = np.array([0.1, 0.2, 50.0])
+    D = correlation(x, TAPS + PATH + PRIMARY)
+    R, of_x, r = dense(secondary, primary, D)
+    best = np.linalg.solve(R, r)
+    other = best * np.random.default_rng(3).uniform(0.5, 1.5, r.size)
+    for free, right in ((best, r), (other, R @ other)):
+        budget = ChannelBudget(secondary, TAPS, 0, REFERENCES, rated)
+        for _ in range(60):
+            budget.solve_near(D[: budget.n_lags], free.reshape(J, REFERENCES, TAPS))
+        w, penalty, power = constrained_filters(R, of_x, right, rated, RIDGE)
+        np.testing.assert_allclose(budget.weights.reshape(J, -1), w, rtol=1e-5, atol=1e-5 * np.abs(w).max())
+        np.testing.assert_allclose(power[:2], rated[:2], rtol=1e-5)
+        assert budget.penalty is not None
+        np.testing.assert_allclose(budget.penalty[:2], penalty[:2], rtol=1e-4)
+        assert power[2] < 0.9 * rated[2]
+        assert budget.penalty[2] < 1e-4 * budget.penalty[0]  # the power that is not used up has no price
+
+
 @pytest.mark.parametrize("fault", ["unplugged", "identical", "silent"])
 def test_a_singular_case_stays_finite(fault: str) -> None:
     secondary, primary, x = scene()

@@ -1,0 +1,133 @@
+"""One constraint factor for several loudspeakers: the least of theirs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_nonnegative, as_positive, as_signal, per_loudspeaker
+from .constraint import OutputPowerConstraint
+
+
+class SharedConstraint(tuple[OutputPowerConstraint, ...]):
+    r"""Constraints of J loudspeakers; the least of their factors scales the measurements of all microphones.
+
+    .. math:: \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\}
+
+    The disturbance power is summed over microphones. :math:`G_j` is the power of loudspeaker j's filtered references,
+    summed over microphones and references, over the power of the references: each loudspeaker counts as if it were
+    alone. One that no microphone hears, with a gain of zero, is left out: its control filters stay zero. With one
+    loudspeaker, microphone and reference this is eq. 13. The extension is this package's, not the paper's. Properties
+    have a value for each loudspeaker, (J,), except `factor`.
+    """
+
+    @property
+    def rated_power(self) -> np.ndarray:
+        """Rated powers, (J,); can be assigned, one number for all of them too."""
+        return self._of_each("rated_power")
+
+    @rated_power.setter
+    def rated_power(self, value: Any) -> None:
+        self._assign("rated_power", value, as_positive)
+
+    @property
+    def factor(self) -> float:
+        """Least factor; assign a value to fix it, None to compute it again."""
+        return _least([(one.factor, one.secondary_path_gain) for one in self])
+
+    @factor.setter
+    def factor(self, value: float | None) -> None:
+        self._assign("factor", value, as_nonnegative)
+
+    @property
+    def disturbance_power(self) -> np.ndarray:
+        """Disturbance powers last used, (J,), which differ only if the memories do; can be supplied."""
+        return self._of_each("disturbance_power")
+
+    @disturbance_power.setter
+    def disturbance_power(self, value: Any) -> None:
+        self._assign("disturbance_power", value, as_nonnegative)
+
+    @property
+    def secondary_path_gain(self) -> np.ndarray:
+        """Power gains last used, (J,), NaN if unknown; can be supplied."""
+        return self._of_each("secondary_path_gain")
+
+    @secondary_path_gain.setter
+    def secondary_path_gain(self, value: Any) -> None:
+        self._assign("secondary_path_gain", value, as_positive)
+
+    def fresh(self, rated_power: Any) -> SharedConstraint:
+        """Return constraints with the same settings and no samples yet, for other rated powers."""
+        powers = per_loudspeaker(rated_power, len(self), "rated_power")
+        return SharedConstraint(one.fresh(power) for one, power in zip(self, powers, strict=True))
+
+    def preview(self, disturbance: Any, filtered_reference: Any, reference: Any = None) -> float:
+        """Return the factor that `advance` would return for this sample; nothing is changed."""
+        return self._preview(*self._sums(disturbance, filtered_reference, reference))
+
+    def advance(self, disturbance: Any, filtered_reference: Any, reference: Any = None) -> float:
+        """Add one sample to the powers and return the factor.
+
+        Parameters
+        ----------
+        disturbance : array_like, shape (K,)
+            Disturbances.
+        filtered_reference : array_like, shape (J, K, I)
+            Newest filtered references.
+        reference : array_like, shape (I,), optional
+            Newest references; can be omitted if every gain or factor was supplied.
+
+        Returns
+        -------
+        float
+            Factor, 0 to 1.
+
+        Raises
+        ------
+        ValueError
+            NaN, Inf or values whose squares overflow; no reference although a gain must be estimated. Nothing was
+            changed.
+        """
+        d, filtered, x = self._sums(disturbance, filtered_reference, reference)
+        factor = self._preview(d, filtered, x)  # raises before any of them changes
+        for one, xf in zip(self, filtered, strict=True):
+            one.advance_sums(d, xf, x)
+        return factor
+
+    def _preview(self, d: float, filtered: list[float], x: float | None) -> float:
+        return _least([one.preview_sums(d, xf, x) for one, xf in zip(self, filtered, strict=True)])
+
+    def _sums(self, disturbance: Any, filtered: Any, reference: Any) -> tuple[float, list[float], float | None]:
+        """Return the sums of squares: of the disturbances, of each loudspeaker's filtered references, of the references."""
+        return (
+            _sum_of_squares(disturbance, "the measurement"),
+            [_sum_of_squares(one, "the newest filtered reference") for one in filtered],
+            None if reference is None else _sum_of_squares(reference, "reference"),
+        )
+
+    def _of_each(self, name: str) -> np.ndarray:
+        return np.array([getattr(one, name) for one in self], dtype=np.float64)
+
+    def _assign(self, name: str, value: Any, check: Callable[[Any, str], float]) -> None:
+        values = [None] * len(self) if value is None else per_loudspeaker(value, len(self), name, check)
+        for one, own in zip(self, values, strict=True):
+            setattr(one, name, own)
+
+
+def _least(factors: list[tuple[float, float | None]]) -> float:
+    """Return the least of the factors, each with its gain, whose gain is not zero; if all gains are, of all."""
+    return float(min([factor for factor, gain in factors if gain != 0.0] or [factor for factor, _ in factors]))
+
+
+def _sum_of_squares(values: Any, name: str) -> float:
+    """Return the sum of the squares of several channels' samples; it must be finite."""
+    each = as_signal(np.ravel(values), name)
+    with np.errstate(over="ignore"):
+        square = float(each @ each)
+    if math.isinf(square):
+        raise ValueError(f"{name} must have a finite square, summed over channels, got {each}")
+    return square

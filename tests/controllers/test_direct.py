@@ -1,0 +1,381 @@
+"""The direct form for several channels: against filterpy's own filter of K measurements, dense solves and the bound."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from helpers.channels import constrained_filters, delayed, dense_systems, random_paths, through
+from helpers.comparing import assert_same_run
+
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    OutputLimiter,
+    OutputPowerConstraint,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    noise_reduction_db,
+    output_power,
+    power_constrained_wiener,
+    simulate,
+    simulate_scenarios,
+)
+from kfopc_filterpy.controllers import DirectPowerBudget
+
+K, J, I, L = 3, 2, 2, 5  # microphones, loudspeakers, references, taps  # noqa: E741
+FS = 16000.0
+PATHS = random_paths(K, J, 6, seed=1)  # true secondary paths
+ESTIMATE = 0.9 * PATHS[:, :, :4]  # what the controllers know of them
+PRIMARY = random_paths(K, I, 9, seed=2, delay=3)
+NOISE = np.array([0.01, 0.1, 0.03])
+RATED, MEMORY = np.array([0.02, 0.05]), 60
+SETTINGS: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": NOISE, "n_references": I}
+ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
+
+
+def noise(n_samples: int = 400, n_references: int = I) -> np.ndarray:
+    return np.random.default_rng(3).standard_normal((n_references, n_samples))
+
+
+def constraints() -> list[OutputPowerConstraint]:
+    """The rated powers, the powers with a memory of `MEMORY` samples."""
+    return [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY / FS) for power in RATED]
+
+
+MAKE: dict[str, Callable[..., Any]] = {
+    "KF-ANC": lambda path=ESTIMATE, **o: kf_anc(L, path, **(SETTINGS | o)),
+    "KF-OPC": lambda path=ESTIMATE, **o: kf_opc(L, path, constraint=constraints(), **(SETTINGS | o)),
+    "KF-PB": lambda path=ESTIMATE, **o: kf_pb(L, path, rated_power=RATED, form="direct", **(SETTINGS | o)),
+}
+
+
+def run(controller: Any, x: np.ndarray, **options: Any) -> Any:
+    return simulate(controller, x, **({"primary_path": PRIMARY, "secondary_path": PATHS, "fs": FS} | options))
+
+
+# ---- The estimate
+
+
+def mean_square(squares: np.ndarray) -> float:
+    """A plain mean until the window is full, then forgetting."""
+    mean = 0.0
+    for k, square in enumerate(squares):
+        mean += max(-np.expm1(-1.0 / MEMORY), 1.0 / (k + 1)) * (square - mean)
+    return mean
+
+
+def transcribed(
+    x: np.ndarray, d: np.ndarray, rated: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The modified structure around filterpy's filter of K measurements, with eq. 10-13 and the least factor."""
+    n_samples, size = x.shape[1], ESTIMATE.shape[2]
+    kf = KalmanFilter(dim_x=J * I * L, dim_z=K)
+    kf.Q, kf.R = SETTINGS["state_noise"] * np.eye(J * I * L), np.diag(NOISE)
+    y, e, d_hat = np.zeros((J, n_samples)), np.zeros((K, n_samples)), np.zeros((K, n_samples))
+    past = np.array([delayed(x[i : i + 1], L) for i in range(I)])  # (I, L, n)
+    xf = np.array(
+        [[[through(s.reshape(1, 1, -1), x[i : i + 1])[0] for i in range(I)] for s in row] for row in ESTIMATE]
+    )
+    factors, gains = np.ones((J, n_samples)), np.ones((J, n_samples))
+    for n in range(n_samples):
+        w = kf.x.reshape(J, I, L)
+        y[:, n] = np.einsum("jil,il->j", w, past[:, :, n])
+        for k in range(K):
+            e[k, n] = d[k, n] - sum(
+                PATHS[k, j, m] * y[j, n - m] for j in range(J) for m in range(PATHS.shape[2]) if m <= n
+            )
+            d_hat[k, n] = e[k, n] + sum(
+                ESTIMATE[k, j, m] * y[j, n - m] for j in range(J) for m in range(size) if m <= n
+            )
+        if rated is not None:
+            delta2 = mean_square(np.sum(d_hat[:, : n + 1] ** 2, axis=0))
+            for j in range(J):
+                of_xf = mean_square(np.sum(xf[:, j, :, : n + 1] ** 2, axis=(0, 1)))
+                gains[j, n] = of_xf / mean_square(np.sum(x[:, : n + 1] ** 2, axis=0))
+                factors[j, n] = min(np.sqrt(rated[j] * gains[j, n] / delta2), 1.0)
+        H = np.array(
+            [
+                [xf[k, j, i, n - m] if n >= m else 0.0 for j in range(J) for i in range(I) for m in range(L)]
+                for k in range(K)
+            ]
+        )
+        kf.predict()
+        kf.update(factors[gains[:, n] > 0.0, n].min(initial=1.0) * d_hat[:, n].reshape(-1, 1), H=H)
+    return e, y, kf.x.reshape(J, I, L), factors
+
+
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+def test_a_run_is_filterpys_filter_of_all_weights(name: str) -> None:
+    """To 1e-10 of the largest value: the same equations, with scalar updates in place of an inverse of K x K."""
+    x = noise()
+    controller = MAKE[name]()
+    result = run(controller, x)
+    e, y, w, factors = transcribed(x, result.disturbance, RATED if name == "KF-OPC" else None)
+    for got, want in (
+        (result.error, e),
+        (result.control_signal, y),
+        (controller.weights, w),
+        (result.constraint_factor, factors),
+    ):
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-10 * np.abs(want).max())
+    assert result.algorithm == name
+    if name == "KF-OPC":  # the factor acts, and at times one loudspeaker decides, at times the other
+        assert factors[:, 100:].min() < 0.5
+        assert np.ptp(factors.argmin(axis=0)) == 1
+    else:
+        assert np.mean(e[:, -100:] ** 2) < 0.5 * np.mean(result.disturbance[:, -100:] ** 2)
+
+
+def test_the_estimate_of_kf_pb_is_kf_ancs() -> None:
+    """With an exact path the disturbance estimate is d, whatever is emitted."""
+    free, budget = MAKE["KF-ANC"](PATHS), MAKE["KF-PB"](PATHS, fs=FS)
+    for one in (free, budget):
+        run(one, noise(1500))
+    np.testing.assert_allclose(budget.weights, free.weights, rtol=0, atol=1e-9 * np.abs(free.weights).max())
+    np.testing.assert_array_equal(free.control_filter, free.weights)
+    assert np.abs(budget.control_filter - budget.weights).max() > 0.1 * np.abs(budget.weights).max()  # it is limited
+
+
+# ---- KF-PB
+
+
+def test_the_control_filters_of_kf_pb_are_the_dense_solution_for_its_estimate() -> None:
+    """Within 1 %: the signals' own correlations have other ends. Errors count with 1/q, as they do in the estimate."""
+    x, weights = noise(8000), np.sqrt(NOISE.mean() / NOISE)
+    controller = MAKE["KF-PB"](PATHS, memory_s=1e6, initial_variance=10.0, state_noise=0.0)  # remembers all alike
+    result = run(controller, x)
+    R, of_x, r = dense_systems(
+        x, weights[:, np.newaxis] * result.disturbance, weights[:, np.newaxis, np.newaxis] * PATHS, L, 0
+    )
+    w = controller.weights.ravel()
+    np.testing.assert_allclose(w, np.linalg.solve(R, r), rtol=0, atol=0.01 * np.abs(w).max())
+    v, penalty, power = constrained_filters(R, of_x, R @ w, RATED)
+    np.testing.assert_allclose(controller.control_filter.reshape(J, -1), v, rtol=0, atol=0.01 * np.abs(v).max())
+    np.testing.assert_allclose(controller.power_weight, penalty, rtol=0.02)
+    np.testing.assert_allclose(power, RATED, rtol=1e-6)
+    unweighted = dense_systems(x, result.disturbance, PATHS, L, 0)
+    other, _, _ = constrained_filters(unweighted[0], of_x, unweighted[2], RATED)
+    assert np.abs(other - v).max() > 0.05 * np.abs(v).max()  # the weights matter at that tolerance
+
+
+@pytest.mark.parametrize(("share", "binds"), [([0.25, 0.25], [0, 1]), ([0.25, 1.5], [0])], ids=["both", "one"])
+def test_steady_noise_each_power_is_kept_and_the_error_is_close_to_the_bound(share: list, binds: list) -> None:
+    n_samples, taps = 64000, 24
+    secondary, primary = random_paths(2, 2, 8, seed=1), random_paths(2, 1, 20, seed=2, delay=6)
+    x = noise(n_samples, 1)
+    d, half = through(primary, x), n_samples // 2
+    steady: dict[str, Any] = {"n_taps": taps, "fs": FS}
+    wanted = power_constrained_wiener(x, d, secondary, rated_power=1e6, **steady).whole.control_power
+    rated = np.array(share) * wanted
+    controller = kf_pb(
+        taps, secondary, rated_power=rated, form="direct", fs=FS, state_noise=1e-9, measurement_noise=0.01
+    )
+    result = simulate(controller, x, primary_path=primary, secondary_path=secondary, fs=FS)
+    bound = power_constrained_wiener(x[:, half:], d[:, half:], secondary, rated_power=rated, **steady).whole
+    spent = output_power(result.control_signal[:, half:]) / rated
+    assert np.all((spent[binds] > 0.97) & (spent[binds] < 1.02)), spent
+    assert np.all(spent < 1.02)
+    reduction = noise_reduction_db(result.error[:, half:], result.disturbance[:, half:])
+    assert abs(bound.noise_reduction_db - reduction) < 0.5
+    slack = [j for j in range(2) if j not in binds]
+    assert np.all(controller.power_weight[slack] < 1e-4 * controller.power_weight[binds].max())  # no price for slack
+
+
+# ---- One definition of the step
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
+    """With feedback, amplifiers, limiters, sensor noise, and a controller that first listens; and they go on alike."""
+
+    def made() -> Any:
+        return MAKE[name](limiter=[OutputLimiter(power, fs=FS, window_s=0.002) for power in RATED])
+
+    options: dict[str, Any] = {
+        "feedback_path": 0.02 * random_paths(I, J, 5, seed=4),
+        "amplifier": [HardClipAmplifier(1.0), None],
+        "record_weights_every": 7,
+        "sensor_noise_std": 0.01,
+        "rng": 1,
+        "switch_on_s": 20 / FS,
+    }
+    fast, slow = made(), made()
+    assert_same_run(run(fast, noise(700), **options), run(slow, noise(700), compiled=False, **options))
+    np.testing.assert_array_equal(fast.weights, slow.weights)
+    for twin in (copy.deepcopy(fast), pickle.loads(pickle.dumps(fast))):
+        assert_same_run(run(twin, noise(50)), run(copy.deepcopy(slow), noise(50)))
+    assert any(one.gain < 1.0 or one.clipped for one in fast.limiter)  # they did limit
+
+
+@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+def test_channels_of_one_are_the_single_channel_bit_for_bit(name: str, dtype: Any) -> None:
+    x, other = noise(300)
+    d = np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:300] + 0.1 * other
+    settings: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": 0.01, "dtype": dtype}
+
+    def made(path: np.ndarray) -> Any:
+        return kf_anc(L, path, **settings) if name == "KF-ANC" else kf_opc(L, path, rated_power=0.1, **settings)
+
+    single, many = made(ONE_PATH), made(ONE_PATH.reshape(1, 1, -1))
+    options: dict[str, Any] = {"secondary_path": ONE_PATH, "fs": FS, "record_weights_every": 5}
+    want, got = simulate(single, x, disturbance=d, **options), simulate(many, x, disturbance=d, **options)
+    for signal in ("error", "control_signal", "anti_noise", "constraint_factor"):
+        np.testing.assert_array_equal(getattr(got, signal), getattr(want, signal), err_msg=signal)
+    np.testing.assert_array_equal(got.weights[:, 0, 0], want.weights)
+    np.testing.assert_array_equal(many.covariance, single.estimator.P)
+    for attribute in ("weights", "disturbance_power", "secondary_path_gain", "constraint_factor", "rated_power"):
+        np.testing.assert_array_equal(np.ravel(getattr(many, attribute)), getattr(single, attribute), err_msg=attribute)
+    assert got.algorithm == want.algorithm
+
+
+def test_kf_pb_with_channels_of_one_estimates_what_the_single_channel_does() -> None:
+    """The estimates to 1e-9; the budgets are different ones, so that the powers agree to 2 %, the reductions to 0.2 dB."""
+    x = noise(32000, 1)[0]
+    d = np.convolve(x, [0.0, 0.0, 1.2, 0.5])[: x.size]
+    settings: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 0.01, "rated_power": 0.3, "form": "direct"}
+    results, controllers = [], [kf_pb(16, path, **settings) for path in (ONE_PATH, ONE_PATH.reshape(1, 1, -1))]
+    for one in controllers:
+        result = simulate(one, x, disturbance=d, secondary_path=ONE_PATH, fs=FS)
+        e, y = result.error[16000:], result.control_signal[16000:]
+        results.append((noise_reduction_db(e, result.disturbance[16000:]), output_power(y) / 0.3))
+    np.testing.assert_allclose(controllers[1].weights[0, 0], controllers[0].weights, rtol=0, atol=1e-9)
+    assert abs(results[0][0] - results[1][0]) < 0.2
+    np.testing.assert_allclose([power for _, power in results], 1.0, atol=0.02)
+
+
+# ---- Odd systems
+
+
+@pytest.mark.parametrize("name", MAKE)
+@pytest.mark.parametrize("dead", ["loudspeaker", "microphone"])
+def test_what_is_unplugged_stays_silent_and_finite(name: str, dead: str) -> None:
+    paths = PATHS.copy()
+    paths[(slice(None), 1) if dead == "loudspeaker" else 1] = 0.0
+    controller = MAKE[name](paths)
+    result = run(controller, noise(2000), secondary_path=paths)
+    assert np.isfinite(result.error).all()
+    assert np.isfinite(controller.weights).all()
+    if dead == "loudspeaker":
+        np.testing.assert_allclose(result.control_signal[1], 0.0, atol=1e-9)
+        np.testing.assert_array_equal(controller.weights[1], 0.0)
+    assert np.any(result.control_signal[0])
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_two_identical_loudspeakers_share_the_work(name: str) -> None:
+    paths = np.repeat(PATHS[:, :1], 2, axis=1)
+    controller = MAKE[name](paths, **({} if name != "KF-PB" else {"fs": FS}))
+    if name == "KF-PB":
+        controller = kf_pb(L, paths, rated_power=RATED[0], form="direct", **SETTINGS)
+    result = run(controller, noise(2000), secondary_path=paths)
+    np.testing.assert_allclose(controller.weights[0], controller.weights[1], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.control_signal[0], result.control_signal[1], rtol=0, atol=1e-6)
+    assert np.any(result.control_signal)
+
+
+def test_silence_is_waited_for() -> None:
+    controller = MAKE["KF-PB"]()
+    result = run(controller, np.zeros((I, 1100)))
+    np.testing.assert_array_equal(result.control_signal, 0.0)
+    result = run(controller, noise(4000))
+    assert noise_reduction_db(result.error, result.disturbance) > 0.5
+
+
+# ---- Refusals
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_a_dead_microphone_is_refused_by_name_with_nothing_changed(name: str) -> None:
+    refusing, twin = MAKE[name](), MAKE[name]()
+    for one in (refusing, twin):
+        run(one, noise(60))
+        one.control_signal([0.1, 0.2])
+    with pytest.raises(ValueError, match="that of microphone 1 is nan"):
+        refusing.update([0.1, np.nan, 0.2])
+    with pytest.raises(ValueError, match="must have finite squares, and one overflows"):
+        refusing.update([0.1, 0.2, 1e200])
+    assert_same_run(run(refusing, noise(20)), run(twin, noise(20)))
+
+
+def test_an_update_without_a_solution_names_the_microphone_and_changes_nothing() -> None:
+    """Sound reaches microphone 2 later than the others: until then, without measurement noise, it tells nothing.
+
+    The corrections of the other microphones are taken back: P to rounding, all else exactly.
+    """
+    paths = ESTIMATE.copy()
+    paths[2] = np.roll(ESTIMATE[2], 2, axis=-1) * [0.0, 0.0, 0.0, 1.0]
+    settings = {"measurement_noise": [0.01, 0.01, 0.0], "initial_variance": 100.0, "state_noise": 1e-3}
+    refusing, twin = MAKE["KF-OPC"](paths, **settings), MAKE["KF-OPC"](paths, **settings)
+    start = refusing.covariance
+    heard = 0
+    for n, x in enumerate(noise(40).T):
+        for one in (refusing, twin):
+            one.control_signal(x)
+        if n < 3:
+            if np.any(refusing._state.lines.filtered[:2]):
+                heard += 1
+            with pytest.raises(ValueError, match=r"no solution for microphone 2: .* give measurement_noise > 0"):
+                refusing.update([1.0, 2.0, 3.0])
+            np.testing.assert_array_equal(refusing.weights, 0.0)
+            np.testing.assert_array_equal(refusing.disturbance_power, 0.0)
+            np.testing.assert_allclose(refusing.covariance, start, rtol=0, atol=1e-10)
+        else:
+            for one in (refusing, twin):
+                one.update([1.0, 2.0, 3.0])
+    assert heard > 0  # corrections were taken back
+    np.testing.assert_allclose(refusing.weights, twin.weights, rtol=0, atol=1e-9 * np.abs(twin.weights).max())
+    assert np.any(twin.weights)
+
+
+def test_the_loop_names_the_sample_of_an_update_without_a_solution() -> None:
+    paths = ESTIMATE.copy()
+    paths[1] = 0.0
+    with pytest.raises(ValueError, match="no solution for microphone 1") as refused:
+        run(MAKE["KF-ANC"](paths, measurement_noise=[0.1, 0.0, 0.1]), noise(20))
+    assert any("sample 0" in note for note in refused.value.__notes__)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: MAKE["KF-ANC"](measurement_noise=[0.1, 0.1]), ValueError, r"each of the 3 microphones, \(3,\), got shape \(2,\)"),
+        (lambda: MAKE["KF-ANC"](measurement_noise=-0.1), ValueError, "measurement_noise must not be negative"),
+        (lambda: MAKE["KF-PB"](measurement_noise=[0.1, 0.0, 0.1]), ValueError, "measurement_noise must be greater than 0"),
+        (lambda: MAKE["KF-ANC"](state_noise=-1.0), ValueError, "state_noise must not be negative"),
+        (lambda: MAKE["KF-ANC"](initial_variance=np.nan), ValueError, "initial_variance must be finite"),
+        (lambda: MAKE["KF-ANC"](dtype=int), ValueError, "dtype must be numpy.float64 or numpy.float32"),
+        (lambda: MAKE["KF-ANC"](n_references=0), ValueError, "n_references must be at least 1"),
+        (lambda: MAKE["KF-OPC"](ESTIMATE[:, :1]), ValueError, "one for each of the 1 loudspeakers, got 2"),
+        (lambda: kf_opc(L, ESTIMATE, **SETTINGS), ValueError, "give either rated_power= or constraint="),
+        (lambda: kf_opc(L, ONE_PATH, rated_power=[1.0, 2.0], state_noise=0.0, measurement_noise=0.1), TypeError, "this filter has one loudspeaker"),
+        (lambda: kf_pb(L, ESTIMATE, rated_power=[1.0] * 3, form="direct", **SETTINGS), ValueError, "each of the 2 loudspeakers"),
+        (lambda: kf_pb(L, ESTIMATE, rated_power=1.0, form="direct"), TypeError, "give state_noise and measurement_noise"),
+        (lambda: MAKE["KF-ANC"](np.ones((2, 4))), ValueError, r"\(K microphones, J loudspeakers, taps\), got \(2, 4\)"),
+        (lambda: MAKE["KF-ANC"](limiter=OutputLimiter(1.0)), TypeError, "2 different OutputLimiters"),
+        (lambda: run(MAKE["KF-PB"](fs=8000.0), noise(9)), ValueError, "power memory is for 8000 Hz"),
+        (lambda: run(MAKE["KF-ANC"](), noise(9, 1)), ValueError, "I = 1 of reference"),
+        (lambda: simulate_scenarios([MAKE["KF-ANC"]()], noise(9)[0], primary_path=ONE_PATH, secondary_path=ONE_PATH), (TypeError, ValueError), "channel"),
+    ],
+    ids=range(17),
+)  # fmt: skip
+def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+def test_each_name_makes_the_form_for_its_channels() -> None:
+    two = kf_anc(L, ONE_PATH, state_noise=0.0, measurement_noise=0.1, n_references=2)
+    assert two.weights.shape == (1, 2, L)
+    assert repr(two) == "<KF-ANC: 1 microphone, 1 loudspeaker, 2 references, 5 taps, constraint factor 1>"
+    assert repr(MAKE["KF-PB"]()) == (
+        "<KF-PB: 3 microphones, 2 loudspeakers, 2 references, 5 taps, rated power 0.02, 0.05>"
+    )
+    assert isinstance(MAKE["KF-PB"](), DirectPowerBudget)
+    assert kf_pb(L, ONE_PATH, rated_power=1.0, n_references=2).name == "KF-PB (shared gain)"

@@ -1,0 +1,226 @@
+"""KFOPC with several measurements and a rated power for each loudspeaker: against eq. 9-13 around filterpy's filter."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from kfopc_filterpy import KFOPC, OutputPowerConstraint
+
+K, J, I, L = 3, 2, 2, 4  # microphones, loudspeakers, references, taps  # noqa: E741
+N, FS, MEMORY = J * I * L, 16000.0, 40
+RATED = np.array([0.5, 2.0])
+
+
+def signals(n_samples: int = 150, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Measurements (n, K), observations (n, K, N), references (n, I)."""
+    rng = np.random.default_rng(seed)
+    z, xf = rng.standard_normal((n_samples, K)), rng.standard_normal((n_samples, K, J, I)) * [[[2.0], [0.7]]]
+    rows = np.zeros((n_samples, K, J, I, L))
+    for m in range(L):
+        rows[m:, ..., m] = xf[: n_samples - m]
+    return 2.0 * z, rows.reshape(n_samples, K, N), rng.standard_normal((n_samples, I))
+
+
+def constraints() -> list[OutputPowerConstraint]:
+    return [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY / FS) for power in RATED]
+
+
+def made(**changed: Any) -> KFOPC:
+    kf = KFOPC(N, K, **({"constraint": constraints()} | changed))
+    kf.Q, kf.R = 1e-4 * np.eye(N), np.diag([0.1, 0.2, 0.3])
+    return kf
+
+
+def mean_square(squares: np.ndarray) -> float:
+    """A plain mean until the window is full, then forgetting."""
+    mean = 0.0
+    for k, square in enumerate(squares):
+        mean += max(-np.expm1(-1.0 / MEMORY), 1.0 / (k + 1)) * (square - mean)
+    return mean
+
+
+def expected_factors(z: np.ndarray, rows: np.ndarray, x: np.ndarray, n: int) -> np.ndarray:
+    """sqrt(rho_j G_j / delta^2), 1 at most, of each loudspeaker at sample n."""
+    newest = rows.reshape(-1, K, J, I, L)[: n + 1, ..., 0]
+    delta2, of_x = mean_square(np.sum(z[: n + 1] ** 2, axis=1)), mean_square(np.sum(x[: n + 1] ** 2, axis=1))
+    gains = np.array([mean_square(np.sum(newest[:, :, j] ** 2, axis=(1, 2))) for j in range(J)]) / of_x
+    return np.minimum(np.sqrt(RATED * gains / delta2), 1.0)
+
+
+def test_each_step_is_filterpys_of_the_measurements_scaled_by_the_least_factor() -> None:
+    """Bit for bit given the factor, which agrees to 1e-12."""
+    z, rows, x = signals()
+    ours, theirs = made(), KalmanFilter(N, K)
+    theirs.Q, theirs.R = ours.Q, ours.R
+    deciding = set()
+    for n in range(len(z)):
+        for kf in (ours, theirs):
+            kf.predict()
+        ours.update(z[n], H=rows[n], reference=x[n])
+        factors = expected_factors(z, rows, x, n)
+        assert ours.constraint_factor == pytest.approx(factors.min(), rel=1e-12)
+        deciding.add(int(factors.argmin()))
+        theirs.update(ours.constraint_factor * z[n].reshape(-1, 1), H=rows[n])
+        np.testing.assert_array_equal(ours.x, theirs.x)
+        np.testing.assert_array_equal(ours.z, z[n].reshape(-1, 1))
+    np.testing.assert_array_equal(ours.P, theirs.P)
+    assert deciding == {0, 1}  # at times one loudspeaker decides, at times the other
+    assert ours.constraint_factor < 0.9
+    np.testing.assert_allclose(ours.disturbance_power, mean_square(np.sum(z**2, axis=1)), rtol=1e-12)
+
+
+def test_one_rated_power_for_several_measurements_is_one_loudspeaker() -> None:
+    """Squares are summed over measurements, and over references."""
+    z, rows, x = signals()
+    one, listed, two = KFOPC(N, K, rated_power=0.5), KFOPC(N, K, rated_power=[0.5]), KFOPC(N, K, rated_power=[0.5])
+    for n in range(20):
+        for kf, reference in ((one, x[n, 0]), (listed, x[n, 0]), (two, x[n])):
+            kf.predict()
+            kf.update(z[n], H=rows[n], reference=reference)
+    for kf, n_references in ((one, 1), (two, 2)):
+        newest = rows.reshape(-1, K, 1, n_references, N // n_references)[:20, ..., 0]
+        gain = np.sum(newest**2) / np.sum(x[:20, :n_references] ** 2)
+        factor = np.sqrt(0.5 * gain / np.mean(np.sum(z[:20] ** 2, axis=1)))
+        np.testing.assert_allclose(kf.secondary_path_gain, gain, rtol=1e-12)
+        assert kf.constraint_factor == pytest.approx(factor, rel=1e-12)
+        assert factor < 1.0
+    np.testing.assert_array_equal(one.x, listed.x)
+    assert isinstance(one.rated_power, float)
+    assert listed.rated_power.tolist() == [0.5]
+
+
+def test_a_list_of_one_rated_power_is_the_single_channel_bit_for_bit() -> None:
+    rng = np.random.default_rng(2)
+    one, listed = KFOPC(4, rated_power=0.2), KFOPC(4, rated_power=[0.2])
+    for row in rng.standard_normal((50, 4)):
+        for kf in (one, listed):
+            kf.predict()
+            kf.update(3.0 * row[1] + row[0], H=row, reference=row[2])
+    np.testing.assert_array_equal(one.x, listed.x)
+    assert one.constraint_factor == listed.constraint_factor < 1.0
+
+
+def test_a_loudspeaker_that_no_microphone_hears_is_left_out() -> None:
+    z, rows, x = signals()
+    unplugged = rows.reshape(-1, K, J, I, L).copy()
+    unplugged[:, :, 1] = 0.0
+    kf = made()
+    for n in range(len(z)):
+        kf.predict()
+        kf.update(z[n], H=unplugged[n].reshape(K, N), reference=x[n])
+    np.testing.assert_array_equal(kf.x.reshape(J, -1)[1], 0.0)
+    assert kf.constraint_factor == pytest.approx(expected_factors(z, rows, x, len(z) - 1)[0], rel=1e-12)
+    kf = KFOPC(N, K, rated_power=RATED)  # none is heard: eq. 13 gives 0, as with one loudspeaker
+    kf.update(z[0], H=np.zeros((K, N)), reference=x[0])
+    assert kf.constraint_factor == 0.0
+
+
+def test_supplied_values_need_no_reference() -> None:
+    z, rows, _ = signals()
+    kf = KFOPC(N, K, rated_power=RATED)
+    kf.disturbance_power, kf.secondary_path_gain = 4.0, [1.0, 0.125]
+    kf.update(z[0], H=rows[0])
+    assert kf.constraint_factor == 0.25  # the least of sqrt(0.5 / 4) and sqrt(2 * 0.125 / 4)
+    np.testing.assert_array_equal(kf.secondary_path_gain, [1.0, 0.125])
+    kf.constraint_factor = 0.5
+    kf.update(z[0], H=rows[0])
+    assert kf.constraint_factor == 0.5
+    kf.constraint_factor = None
+    kf.secondary_path_gain = None
+    with pytest.raises(ValueError, match="secondary-path gain is unknown"):
+        kf.update(z[0], H=rows[0])
+
+
+def test_the_rated_powers_can_be_changed_and_lifted_and_the_settings_stay() -> None:
+    z, rows, x = signals()
+    kf = made()
+    assert [one.memory_s for one in kf.constraint] == [MEMORY / FS] * 2
+    kf.update(z[0], H=rows[0], reference=x[0])
+    kf.rated_power = 3.0
+    assert kf.rated_power.tolist() == [3.0, 3.0]
+    kf.rated_power = [4.0, 5.0]
+    assert kf.rated_power.tolist() == [4.0, 5.0]
+    assert kf.disturbance_power[0] > 0.0  # the powers stay
+    with pytest.raises(ValueError, match="each of the 2 loudspeakers"):
+        kf.rated_power = [1.0, 2.0, 3.0]
+    with pytest.raises(ValueError, match="rated_power must be greater than 0"):
+        kf.rated_power = [1.0, 0.0]
+    assert kf.rated_power.tolist() == [4.0, 5.0]
+    kf.rated_power = None
+    assert (kf.rated_power, kf.constraint, kf.constraint_factor) == (None, None, 1.0)
+    kf.rated_power = 1.0
+    assert [one.memory_s for one in kf.constraint] == [MEMORY / FS] * 2
+    assert kf.disturbance_power.tolist() == [0.0, 0.0]  # new powers
+    single = KFOPC(N, K, constraint=constraints()[0])
+    single.rated_power = RATED
+    assert [one.memory_s for one in single.constraint] == [MEMORY / FS] * 2
+
+
+def test_copies_stand_alone_and_batches_are_the_steps() -> None:
+    z, rows, x = signals()
+    kf = made()
+    steps = copy.deepcopy(kf)
+    given = constraints()
+    given[0].rated_power = 99.0
+    assert kf.rated_power[0] == RATED[0]
+    kf.batch_filter(list(z[:30, :, np.newaxis]), Hs=list(rows[:30]), references=x[:30])
+    for n in range(30):
+        steps.predict()
+        steps.update(z[n], H=rows[n], reference=x[n])
+    np.testing.assert_array_equal(kf.x, steps.x)
+    assert kf.constraint_factor == steps.constraint_factor
+    for twin in (copy.copy(kf), copy.deepcopy(kf), pickle.loads(pickle.dumps(kf))):
+        before = twin.constraint_factor
+        kf.update(z[30], H=rows[30], reference=x[30])
+        assert twin.constraint_factor == before != kf.constraint_factor
+        assert type(twin.constraint) is type(kf.constraint)
+    assert "rated power 0.5, 2, fs 16000 Hz" in repr(made())
+
+
+FAULTS: dict[str, tuple[Callable[[KFOPC], Any], type[Exception], str]] = {
+    "NaN": (lambda kf: kf.update([1.0, np.nan, 1.0], H=np.ones((K, N)), reference=[1.0, 1.0]), ValueError, "z must be finite"),
+    "overflow": (lambda kf: kf.update([1.0, 1e200, 1.0], H=np.ones((K, N)), reference=[1.0, 1.0]), ValueError, "the measurement must have a finite square"),
+    "no reference": (lambda kf: kf.update(np.ones(K), H=np.ones((K, N))), ValueError, "pass reference="),
+    "NaN reference": (lambda kf: kf.update(np.ones(K), H=np.ones((K, N)), reference=[1.0, np.nan]), ValueError, "reference must be finite"),
+    "three references": (lambda kf: kf.update(np.ones(K), H=np.ones((K, N)), reference=np.ones(3)), ValueError, r"2 loudspeaker\(s\) for 3 reference\(s\)"),
+    "two rows": (lambda kf: kf.update(np.ones(2), R=1.0, H=np.ones((2, N)), reference=np.ones(2)), ValueError, "all measurements at once, dim_z = 3 rows of H, got 2"),
+    "short batch": (lambda kf: kf.batch_filter([np.ones((K, 1))] * 3, references=np.ones((2, I))), ValueError, "references must have 3 values"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_does_not_fit_is_refused_with_nothing_changed(name: str) -> None:
+    z, rows, x = signals()
+    kf, twin = made(), made()
+    for one in (kf, twin):
+        one.update(z[0], H=rows[0], reference=x[0])
+    call, error, message = FAULTS[name]
+    with pytest.raises(error, match=message):
+        call(kf)
+    for one in (kf, twin):
+        one.update(z[1], H=rows[1], reference=x[1])
+    np.testing.assert_array_equal(kf.x, twin.x)
+    np.testing.assert_array_equal(kf.disturbance_power, twin.disturbance_power)
+
+
+def test_settings_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="dim_x = 5 states cannot be the control filters of 2 loudspeakers"):
+        KFOPC(5, rated_power=[1.0, 2.0])
+    for bad in ([], [1.0, "loud"]):
+        with pytest.raises(TypeError):
+            KFOPC(4, rated_power=bad)
+    with pytest.raises(TypeError, match="constraint must be an OutputPowerConstraint or None"):
+        KFOPC(4, constraint=[OutputPowerConstraint(1.0), 2.0])
+    fast = KFOPC.random_walk(4, state_noise=0.0, measurement_noise=1.0)
+    with pytest.raises(TypeError, match="this filter has one loudspeaker, got 2"):
+        fast.rated_power = [1.0, 2.0]
+    fast.rated_power = 1.0
+    with pytest.raises(TypeError, match="reference must be a single number"):
+        fast.update(1.0, H=np.ones(4), reference=[1.0, 2.0])
