@@ -24,7 +24,7 @@ from ..power.amplifiers import Amplifier
 from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS, ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import OVERFLOW, FilteredReferenceController
+from .base import OVERFLOW, FilteredReferenceController, constraint_or_none
 from .blocks import DEFAULT_MEMORY_S, BlockController, RecentCorrelation, add_correlation
 from .channels import ChannelLines, add_squares, least_factor, squares_of_sample
 from .step import adapt, advance_powers, control_filter, follow
@@ -182,8 +182,10 @@ class DirectKalman(FilteredReferenceController):
         Variance of each tap before the first sample.
     n_references : int, default 1
         Number of references I.
-    constraint : OutputPowerConstraint or tuple of J of them, optional
-        Constraint of KF-OPC; None for KF-ANC.
+    rated_power : float or array_like, shape (J,), optional
+        Rated output power of all loudspeakers, or of each, for KF-OPC; None for KF-ANC.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
+        Given instead of `rated_power`: rated powers with the settings of their power estimates. Copies are kept.
     amplifier, limiter
         As for `SharedGainKalman`.
     dtype : {numpy.float64, numpy.float32}, default numpy.float64
@@ -222,23 +224,25 @@ class DirectKalman(FilteredReferenceController):
         measurement_noise: Any,
         initial_variance: float = 1.0,
         n_references: int = 1,
-        constraint: OutputPowerConstraint | tuple[OutputPowerConstraint, ...] | None = None,
+        rated_power: Any = None,
+        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Sequence[OutputLimiter] | None = None,
         dtype: Any = np.float64,
     ) -> None:
+        own = constraint_or_none(rated_power, constraint)
         super().__init__(
             n_taps,
             secondary_path,
             n_references=n_references,
             multichannel=True,
-            constraint=constraint,
+            constraint=own,
             amplifier=amplifier,
             limiter=limiter,
         )
         noise = per_channel(measurement_noise, self.n_microphones, "microphones", "measurement_noise", as_nonnegative)
         self._state = DirectState(*self._common(), new_correction(self, state_noise, noise, initial_variance, dtype))
-        self.name = "KF-ANC" if constraint is None else "KF-OPC"
+        self.name = "KF-ANC" if own is None else "KF-OPC"
 
     @property
     def covariance(self) -> np.ndarray:

@@ -318,13 +318,17 @@ def kf_anc(
     >>> kf_anc(8, [1.0], state_noise=1e-6, measurement_noise=0.1).name
     'KF-ANC'
     """
-    settings = {
-        "state_noise": state_noise,
-        "measurement_noise": measurement_noise,
-        "initial_variance": initial_variance,
-        "dtype": dtype,
-    }
-    return _kalman(n_taps, secondary_path, n_references, amplifier, limiter, None, settings)
+    return _kalman(
+        n_taps,
+        secondary_path,
+        n_references,
+        amplifier,
+        limiter,
+        state_noise=state_noise,
+        measurement_noise=measurement_noise,
+        initial_variance=initial_variance,
+        dtype=dtype,
+    )
 
 
 def kf_opc(
@@ -375,38 +379,28 @@ def kf_opc(
     >>> kf_opc(8, paths, rated_power=[0.5, 0.2], state_noise=1e-6, measurement_noise=0.1).rated_power
     array([0.5, 0.2])
     """
-    settings = {
-        "state_noise": state_noise,
-        "measurement_noise": measurement_noise,
-        "initial_variance": initial_variance,
-        "dtype": dtype,
-    }
-    own = constraint_for(rated_power, constraint)
-    return _kalman(n_taps, secondary_path, n_references, amplifier, limiter, own, settings)
+    return _kalman(
+        n_taps,
+        secondary_path,
+        n_references,
+        amplifier,
+        limiter,
+        constraint=constraint_for(rated_power, constraint),
+        state_noise=state_noise,
+        measurement_noise=measurement_noise,
+        initial_variance=initial_variance,
+        dtype=dtype,
+    )
 
 
 def _kalman(
-    n_taps: int,
-    secondary_path: Any,
-    n_references: int,
-    amplifier: Any,
-    limiter: Any,
-    constraint: Any,
-    settings: dict[str, Any],
+    n_taps: int, secondary_path: Any, n_references: int, amplifier: Any, limiter: Any, **settings: Any
 ) -> KalmanController | DirectKalman:
     """Return the controller for one channel or for several."""
+    outside = {"amplifier": amplifier, "limiter": limiter}
     if is_multichannel(secondary_path, n_references):
-        return DirectKalman(
-            n_taps,
-            secondary_path,
-            n_references=n_references,
-            constraint=constraint,
-            amplifier=amplifier,
-            limiter=limiter,
-            **settings,
-        )
-    estimator = KFOPC.random_walk(n_taps, constraint=constraint, **settings)
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
+        return DirectKalman(n_taps, secondary_path, n_references=n_references, **outside, **settings)
+    return KalmanController(KFOPC.random_walk(n_taps, **settings), secondary_path, **outside)
 
 
 def is_multichannel(secondary_path: Any, n_references: int) -> bool:

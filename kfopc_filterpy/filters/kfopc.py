@@ -623,7 +623,7 @@ class KFOPC(KalmanFilter):
         """Return the constraint, and what it takes: measurements, newest filtered references, references."""
         from ..power.shared_constraint import SharedConstraint
 
-        shared = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
+        shared: Any = self._constraint if isinstance(self._constraint, tuple) else SharedConstraint([self._constraint])
         rows = np.reshape(H, (-1, self.dim_x))
         if len(rows) != self.dim_z:
             raise ValueError(

@@ -437,8 +437,8 @@ class RandomWalkKFOPC(KFOPC):
         """Return a copy of a constraint; there is one loudspeaker."""
         if isinstance(value, list | tuple):
             raise TypeError(
-                f"this filter has one loudspeaker, got {len(value)} rated powers or constraints: for several, use "
-                "KFOPC(dim_x, dim_z), or kf_opc, which takes O(n^2) per sample and microphone"
+                "this filter has one loudspeaker, so its rated power or constraint must be one, not a sequence of "
+                f"{len(value)}: for several, use KFOPC(dim_x, dim_z), or kf_opc with secondary paths (K, J, taps)"
             )
         return super()._own_constraint(value)
 

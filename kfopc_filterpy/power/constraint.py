@@ -317,23 +317,26 @@ class OutputPowerConstraint:
         """
         return self.advance_sums(*self._squares(disturbance, filtered_reference, reference))
 
-    def preview_sums(self, disturbance: float, filtered: float, reference: float | None) -> tuple[float, float]:
-        """Return the factor and the gain (NaN: unknown) for squares, which can be sums over channels."""
-        factor, gain = preview_sample(self._state, disturbance, filtered, self._known(reference))
+    def preview_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> tuple[float, float]:
+        """Return the factor and the gain (NaN: unknown) for the squares of a sample.
+
+        `d_squared`, `xf_squared` and `x_squared` are those of `advance`'s arguments, or their sums over channels.
+        """
+        factor, gain = preview_sample(self._state, d_squared, xf_squared, self._known(x_squared))
         return float(factor), float(gain)
 
-    def advance_sums(self, disturbance: float, filtered: float, reference: float | None) -> float:
-        """Add squares, which can be sums over channels, to the powers and return the factor."""
-        return float(advance_sample(self._state, disturbance, filtered, self._known(reference)))
+    def advance_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> float:
+        """Add the squares of a sample, `d_squared`, `xf_squared` and `x_squared`, to the powers; return the factor."""
+        return float(advance_sample(self._state, d_squared, xf_squared, self._known(x_squared)))
 
-    def _known(self, reference: float | None) -> float:
+    def _known(self, x_squared: float | None) -> float:
         """Return the square of the reference, NaN if none is given and none is needed."""
-        if reference is None and self.needs_reference:
+        if x_squared is None and self.needs_reference:
             raise ValueError(
                 "the secondary-path gain is unknown: pass reference=, the newest reference sample x(n), "
                 "or set secondary_path_gain"
             )
-        return math.nan if reference is None else reference
+        return math.nan if x_squared is None else x_squared
 
     @staticmethod
     def _squares(disturbance: Any, filtered: Any, reference: Any) -> tuple[float, float, float | None]:

@@ -192,11 +192,7 @@ def test_steady_noise_each_power_is_kept_and_the_error_is_close_to_the_bound(sha
 
 @pytest.mark.parametrize("name", MAKE)
 def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
-    """With feedback, amplifiers, limiters, sensor noise, and a controller that first listens; and they go on alike."""
-
-    def made() -> Any:
-        return MAKE[name](limiter=[OutputLimiter(power, fs=FS, window_s=0.002) for power in RATED])
-
+    """With feedback, an amplifier, sensor noise, and a controller that first listens; and they go on alike."""
     options: dict[str, Any] = {
         "feedback_path": 0.02 * random_paths(I, J, 5, seed=4),
         "amplifier": [HardClipAmplifier(1.0), None],
@@ -205,12 +201,11 @@ def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
         "rng": 1,
         "switch_on_s": 20 / FS,
     }
-    fast, slow = made(), made()
+    fast, slow = MAKE[name](), MAKE[name]()
     assert_same_run(run(fast, noise(700), **options), run(slow, noise(700), compiled=False, **options))
     np.testing.assert_array_equal(fast.weights, slow.weights)
     for twin in (copy.deepcopy(fast), pickle.loads(pickle.dumps(fast))):
         assert_same_run(run(twin, noise(50)), run(copy.deepcopy(slow), noise(50)))
-    assert any(one.gain < 1.0 or one.clipped for one in fast.limiter)  # they did limit
 
 
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])

@@ -407,7 +407,11 @@ AGREE = r"controllers\[0\] and controllers\[1\] must agree in "
 REFUSED = [
     (lambda: [], ValueError, "controllers must hold one controller at least"),
     (lambda: [*filters(2), FxLMS(7, S_HAT, step_size=0.1)], TypeError, r"controllers\[2\] must be a KalmanController"),
-    (lambda: [*filters(2), "KF-OPC"], TypeError, r"controllers\[2\] must be a KalmanController, got 'KF-OPC'"),
+    (
+        lambda: [*filters(2), "KF-OPC"],
+        TypeError,
+        r"controllers\[2\] must be a KalmanController, of one channel, got 'KF-OPC'",
+    ),
     (lambda: filters(1) * 3, ValueError, TWICE),
     (lambda: [KalmanController(k, S) for k in [filters(1)[0].estimator] * 3], ValueError, TWICE),
     (lambda: one_of_three(n_taps=6), ValueError, AGREE + "n_taps"),
