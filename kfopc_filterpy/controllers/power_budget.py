@@ -16,7 +16,9 @@ from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, take_correlations
 from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
+from .frequency_domain import FrequencyDomainKalman
 from .kalman import KalmanController, correct_constrained
+from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
 
@@ -138,7 +140,8 @@ class PowerBudgetController(KalmanController):
         self.estimator.update(d, H=h, reference=x, control_signal=self._y)
 
 
-FORMS = ("direct", "shared gain")
+FORMS = ("direct", "shared gain", "frequency domain")
+CHANNEL_FORMS = {"shared gain": SharedGainKalman, "frequency domain": FrequencyDomainKalman}
 
 
 def kf_pb(
@@ -154,7 +157,7 @@ def kf_pb(
     dtype: Any = np.float64,
     form: str | None = None,
     **settings: Any,
-) -> PowerBudgetController | SharedGainKalman:
+) -> PowerBudgetController | PrimaryPathController:
     """Return KF-PB, the power-budgeted Kalman filter, which has the least error within the rated power.
 
     Parameters
@@ -200,10 +203,10 @@ def kf_pb(
     """
     several = is_path_matrix(secondary_path)
     form = as_choice(form or FORMS[several], "form", FORMS)
-    if form == "shared gain":
+    if form in CHANNEL_FORMS:
         if state_noise is not None or measurement_noise is not None:
-            raise TypeError("the shared-gain form takes path_memory_s instead of state_noise and measurement_noise")
-        return SharedGainKalman(
+            raise TypeError(f"the {form} form takes path_memory_s instead of state_noise and measurement_noise")
+        return CHANNEL_FORMS[form](
             n_taps, secondary_path, rated_power=rated_power, amplifier=amplifier, limiter=limiter, **settings
         )
     if several:

@@ -13,23 +13,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
 from ..kernels.compiling import inlined
 from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_covariance
 from ..kernels.delay_lines import latest, newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
-from ..paths.channels import secondary_paths
 from ..power.amplifiers import Amplifier
-from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .base import FilteredReferenceController, listed
 from .channels import ChannelLines, estimate_disturbances
+from .primary_paths import PrimaryPathController
 from .step import adapt, follow
 
-PRIOR = 1e3  # energy of the reference in the unknown paths, relative to the measurement noise
-BLOCK_S = 0.032  # time between two solutions
+PRIOR = 1e3  # energy of the references in the unknown paths, relative to the measurement noise
 
 
 class SharedGainState(NamedTuple):
@@ -94,7 +90,7 @@ def add_correlation(state):
     numbers.waiting += 1
 
 
-class SharedGainKalman(FilteredReferenceController):
+class SharedGainKalman(PrimaryPathController):
     """KF-PB for several channels, in real time: primary paths by a Kalman filter, control filters within the powers.
 
     Parameters
@@ -158,109 +154,43 @@ class SharedGainKalman(FilteredReferenceController):
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Sequence[OutputLimiter] | None = None,
     ) -> None:
-        secondary, _ = secondary_paths(secondary_path)
-        n_taps = as_count(n_taps, "n_taps")
-        n_primary = n_taps + secondary.shape[2] if n_primary is None else as_count(n_primary, "n_primary")
-        n_lags = n_taps + secondary.shape[2] + n_primary
         super().__init__(
             n_taps,
             secondary_path,
+            rated_power=rated_power,
             n_references=n_references,
-            multichannel=True,
+            n_primary=n_primary,
+            path_memory_s=path_memory_s,
+            memory_s=memory_s,
+            fs=fs,
+            microphone_weights=microphone_weights,
             amplifier=amplifier,
             limiter=limiter,
-            filtered_taps=0,
-            history=n_lags,
         )
-        self.fs = as_positive(fs, "fs", unit="Hz")
-        self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
-        self.memory_s = as_positive(memory_s, "memory_s", unit="s")
-        self._rated = None if rated_power is None else per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
-        weights = self._microphone_weights(microphone_weights)
-        unlimited = np.full(self.n_loudspeakers, np.inf)
-        self._budget = ChannelBudget(
-            np.sqrt(weights)[:, np.newaxis, np.newaxis] * secondary,
-            self.n_taps,
-            n_primary,
-            self.n_references,
-            unlimited if self._rated is None else self._rated,
-        )
-        self._path_weights = np.sqrt(weights)[:, np.newaxis, np.newaxis]
-        self.block = max(round(BLOCK_S * self.fs), 1)
-        size = self.n_references * n_primary
+        size = self.n_references * self._budget.n_primary
         self._state = SharedGainState(
             lines=self._lines,
             weights=np.zeros((self.n_loudspeakers, self.n_references, self.n_taps)),
             paths=np.zeros((self.n_microphones, size)),
             gains=new_covariance(np.zeros((size, size))),
             row=np.zeros(size),
-            correlation=np.zeros((n_lags, self.n_references, self.n_references)),
+            correlation=np.zeros((self._budget.n_lags, self.n_references, self.n_references)),
             numbers=new_record(state_noise=0.0, keep=np.exp(-1.0 / (self.memory_s * self.fs)), mass=0.0, waiting=0),
         )
-
-    def _microphone_weights(self, weights: Any) -> np.ndarray:
-        if weights is None:
-            return np.ones(self.n_microphones)
-        if np.shape(weights) != (self.n_microphones,):
-            raise ValueError(
-                f"microphone_weights must have one weight for each of the {self.n_microphones} microphones, "
-                f"got shape {np.shape(weights)}"
-            )
-        return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
-
-    @property
-    def rated_power(self) -> np.ndarray | None:
-        """Rated output power of each loudspeaker, (J,); None if unlimited."""
-        return None if self._rated is None else self._rated.copy()
 
     @property
     def primary_path(self) -> np.ndarray:
         """Estimated primary paths, (K, I, L_p); a copy."""
         return self._state.paths.reshape(self.n_microphones, self.n_references, -1).copy()
 
-    @property
-    def power_weight(self) -> np.ndarray:
-        """Weight lambda of each loudspeaker's control power, (J,)."""
-        penalty = self._budget.penalty
-        return np.zeros(self.n_loudspeakers) if penalty is None or self._rated is None else penalty.copy()
-
-    def __repr__(self) -> str:
-        parts = [*self._channel_counts(), f"{self.n_taps} taps"]
-        if self._rated is not None:
-            parts.append(f"rated power {listed(self._rated, 'g')}")
-        return f"<{self.name}: {', '.join(parts)}>"
-
-    @property
-    def _powers_fs(self) -> float:
-        return self.fs
-
-    def samples_to_block(self) -> int:
-        """Return the number of samples until the next solution."""
-        return max(self.block - int(self._state.numbers["waiting"][0]), 1)
-
-    def after_compiled(self, state: SharedGainState) -> None:
-        """Solve for the control filters if a block has passed."""
-        if state.numbers["waiting"][0] >= self.block:
-            state.numbers["waiting"] = 0
-            self._solve()
-
-    def _solve(self) -> None:
-        """Find the control filters for the present paths and correlation."""
-        state = self._state
-        mass, keep = state.numbers["mass"][0], state.numbers["keep"][0]
-        # Faded like this, it is the correlation of a signal that fades, which is positive definite.
-        fade = np.sqrt(keep) ** np.arange(len(state.correlation))
-        correlation = state.correlation * fade[:, np.newaxis, np.newaxis] / mass
+    def _end_block(self) -> None:
+        """Solve for the control filters."""
+        state, numbers = self._state, self._state.numbers
+        correlation = state.correlation / numbers["mass"][0]
         power = np.trace(correlation[0]) / self.n_references
         if not power > 0.0:
             return
-        if state.numbers["state_noise"][0] == 0.0:
-            self._scale(power)
-        self._budget.solve(correlation, self._path_weights * self.primary_path)
-        state.weights[...] = self._budget.weights
-
-    def _scale(self, power: float) -> None:
-        """Set the state noise and the initial variance for references of a power."""
-        state = self._state
-        state.numbers["state_noise"] = 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
-        state.gains.triangle.flat[:: state.gains.triangle.shape[1] + 1] = PRIOR / (state.row.size * power)
+        if numbers["state_noise"][0] == 0.0:
+            numbers["state_noise"], variance = self._path_noise(power, PRIOR)
+            state.gains.triangle.flat[:: state.gains.triangle.shape[1] + 1] = variance
+        self._solve(correlation, numbers["keep"][0])
