@@ -35,7 +35,9 @@ def made(form: str, secondary: np.ndarray = SECONDARY, **changed: Any) -> Any:
 
 @pytest.mark.parametrize("share", [0.25, 0.5])
 @pytest.mark.parametrize("noise", ["white", "coloured"])
-def test_each_loudspeaker_keeps_its_power_and_the_error_is_close_to_the_bound(noise: str, share: float, form: str) -> None:
+def test_each_loudspeaker_keeps_its_power_and_the_error_is_close_to_the_bound(
+    noise: str, share: float, form: str
+) -> None:
     """Steady noise: powers within 0.97 to 1.02 of the ratings where they bind, noise reduction within 0.5 dB."""
     n_samples = 24000
     x = references(n_samples, count=1) if noise == "coloured" else references(n_samples, 1)[:, ::-1]
@@ -175,5 +177,3 @@ def test_silence_is_waited_for(form: str) -> None:
 def test_settings_that_do_not_fit_are_refused(form: str, changed: dict, error: type[Exception], match: str) -> None:
     with pytest.raises(error, match=match):
         made(form, **changed)
-
-

@@ -75,7 +75,9 @@ def test_the_variance_follows_the_recursion_of_each_frequency() -> None:
         S = (wave.conj() @ matrix @ wave).real / BLOCK + 1.0
         for i in range(REFERENCES):
             for p in range(3):
-                expected[i, p, f] = before[i, p, f] * (1 - SHARE * 0.5 * before[i, p, f] * abs(frames[i, p, f]) ** 2 / S)
+                expected[i, p, f] = before[i, p, f] * (
+                    1 - SHARE * 0.5 * before[i, p, f] * abs(frames[i, p, f]) ** 2 / S
+                )
     assert kalman.learn(np.zeros((K, BLOCK)))
     np.testing.assert_allclose(kalman.variance, expected, rtol=1e-10)
 
