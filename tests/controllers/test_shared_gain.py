@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from helpers.channels import constrained_filters, dense_systems, random_paths, through
+from helpers.channels import random_paths, through
 
-from kfopc_filterpy import HardClipAmplifier, OutputLimiter, kf_pb, noise_reduction_db, output_power, simulate
+from kfopc_filterpy import kf_pb, noise_reduction_db, output_power, simulate
 from kfopc_filterpy.controllers import SharedGainKalman
 
 FS = 4000.0
