@@ -169,26 +169,26 @@ def kf_pb(
     rated_power : float or array_like, shape (J,)
         Rated output power, of all loudspeakers or of each.
     state_noise, measurement_noise, initial_variance, dtype
-        Of the direct form, as for `kf_anc`; the shared-gain form does not need them.
+        Of the direct form, as for `kf_anc`; the other forms do not need them.
     amplifier, limiter
         As for `kf_anc`; with several loudspeakers, a sequence with one for each.
-    form : {"direct", "shared gain"}, optional
+    form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filter (the paper's equations), "shared gain" the primary paths
-        (`SharedGainKalman`). By default direct for one channel, shared gain for several.
+        (`SharedGainKalman`), "frequency domain" the primary paths too, if they are long (`FrequencyDomainKalman`). By
+        default direct for one channel, shared gain for several.
     **settings
-        Of the direct form: `fs`, `memory_s`, `credit_s`, see `PowerBudget`. Of the shared-gain form: see
-        `SharedGainKalman`.
+        Of the direct form: `fs`, `memory_s`, `credit_s`, see `PowerBudget`. Of the other forms: see their classes.
 
     Returns
     -------
-    PowerBudgetController or SharedGainKalman
+    PowerBudgetController, SharedGainKalman or FrequencyDomainKalman
         A controller. Its `control_filter` generates the control signal. The `weights` of a direct form are the estimate
         of the unconstrained control filter.
 
     Raises
     ------
     ValueError, TypeError
-        The direct form for several channels, or without its noises; noises for the shared-gain form; see the classes.
+        The direct form for several channels, or without its noises; noises for another form; see the classes.
 
     Examples
     --------
