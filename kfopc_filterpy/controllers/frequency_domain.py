@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import fft
 
 from ..kernels.compiling import inlined
 from ..kernels.correlation import FadingCorrelation
@@ -25,7 +26,7 @@ from .primary_paths import PrimaryPathController
 from .step import adapt, follow
 
 PRIOR = 10.0  # energy of the references in the unknown paths, relative to the measurement noise
-PARTITIONS = 4  # of a long primary path: the work per sample then grows with the logarithm of the taps
+PARTITIONS = 2  # of a long primary path: the work per sample then grows with the logarithm of the taps
 
 
 class FrequencyDomainState(NamedTuple):
@@ -97,8 +98,8 @@ class FrequencyDomainKalman(PrimaryPathController):
     fs : float, default 16000
         Sample rate in Hz.
     block : int, optional
-        Samples B of a block, and taps of a partition; by default 32 ms, or a quarter of a primary path if that is
-        longer.
+        Samples B of a block, and taps of a partition; by default 32 ms, or half a primary path if that is longer,
+        rounded up to a length that suits the FFT.
     microphone_weights : array_like, shape (K,), optional
         Weight of each microphone's squared error; 0 leaves a microphone out. By default 1.
     amplifier, limiter
@@ -119,10 +120,15 @@ class FrequencyDomainKalman(PrimaryPathController):
     for diagonal over frequencies, partitions and references, and is the same for all microphones. Unlike there, the
     covariance of the innovation is not: each block is a system of B unknowns per microphone, solved by conjugate
     gradients. So a tone or a band of noise, whose frequencies are not independent of each other within a block, is
-    learned about as fast as by the exact filter.
+    learned about as fast as by `SharedGainKalman`: the loss of noise reduction in the steady half is at most 0.1 dB for
+    white noise, a band, tones and a compressor (``tests/controllers/test_frequency_domain.py``).
 
     State noise and initial variance are those of `SharedGainKalman`, with 10 in place of 1000 in the latter: a diagonal
-    covariance averages out a measurement noise more slowly, so it should not begin with too large a gain.
+    covariance averages out the measurement noise more slowly after too large a gain.
+
+    The control signals cost J I L multiplications per sample, which take a few tenths of a nanosecond each. What is
+    learned and solved comes as a burst between two blocks. ``python -m comparisons speed`` prints the time per sample
+    with everything included, and that of the longest block over its duration.
 
     References
     ----------
@@ -141,7 +147,7 @@ class FrequencyDomainKalman(PrimaryPathController):
     >>> controller
     <KF-PB (frequency domain): 2 microphones, 2 loudspeakers, 1 reference, 2048 taps, rated power 0.5, 0.5>
     >>> controller.block, controller.primary_path.shape
-    (640, (2, 1, 2560))
+    (1280, (2, 1, 2560))
     """
 
     name = "KF-PB (frequency domain)"
@@ -187,7 +193,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         )
 
     def _usual_block(self, n_primary: int) -> int:
-        return max(super()._usual_block(n_primary), -(-n_primary // PARTITIONS))
+        return fft.next_fast_len(max(super()._usual_block(n_primary), -(-n_primary // PARTITIONS)), real=True)
 
     @property
     def primary_path(self) -> np.ndarray:

@@ -108,7 +108,7 @@ def test_what_is_heard_before_control_is_not_learned_but_remembered() -> None:
 def test_defaults_grow_with_the_paths() -> None:
     short, long = FrequencyDomainKalman(256, np.ones((1, 1, 256))), FrequencyDomainKalman(4096, np.ones((1, 1, 256)))
     assert (short.block, short.path_memory_s, short.memory_s) == (512, 1.0, 0.5)
-    assert (long.block, long.path_memory_s, long.memory_s) == (1088, 16 * 4352 / 16000, 16 * 4096 / 16000)
+    assert (long.block, long.path_memory_s, long.memory_s) == (2187, 16 * 4352 / 16000, 16 * 4096 / 16000)
 
 
 def test_what_overflows_is_refused() -> None:
