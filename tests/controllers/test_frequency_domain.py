@@ -98,7 +98,6 @@ def test_what_is_heard_before_control_is_not_learned_but_remembered() -> None:
     np.testing.assert_array_equal(controller.weights, 0.0)
     begun = 1000 // controller.block * controller.block
     found = controller._correlation.total / controller._correlation.mass
-    np.testing.assert_allclose(found[0], np.cov(x[:, :begun], bias=True), atol=0.2)
     shared = kf_pb(TAPS, SECONDARY, rated_power=0.3, n_references=2, n_primary=PRIMARY, fs=FS)
     shared.listen(x[:, :begun], d[:, :begun])
     of_shared = shared._state.correlation / shared._state.numbers["mass"][0]
