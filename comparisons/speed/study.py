@@ -153,7 +153,7 @@ def channel_times(taps: int = 512) -> list[dict[str, Any]]:
         run, block = variants.channel_blocks(*sizes)
         reference = min(seconds(single) for _ in range(3)) / samples
         blocks = [seconds(run) for _ in range(CHANNEL_BLOCKS)]
-        names = ("references", "loudspeakers", "microphones", "n_taps", "n_primary")
+        names = ("form", "references", "loudspeakers", "microphones", "n_taps", "n_primary")
         rows.append(
             dict(zip(names, sizes, strict=True))
             | {
@@ -167,12 +167,12 @@ def channel_times(taps: int = 512) -> list[dict[str, Any]]:
 
 def channel_table(rows: list[dict[str, Any]], taps: int = 512) -> str:
     """Return the times of several channels for the terminal."""
-    title = f"KF-PB, shared gain: I x J x K, taps L, L_p   µs a sample   times one channel of {taps} taps   worst block / its duration"
+    title = f"KF-PB: I x J x K, taps L, L_p                 µs a sample   times one channel of {taps} taps   worst block / its duration"
     return "\n".join(
         [
             title,
             *(
-                f"{row['references']:22} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}, {row['n_primary']:4}"
+                f"{row['form']:16}{row['references']:6} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}, {row['n_primary']:4}"
                 f"{row['us_per_sample']:14.1f}{row['times_one_channel']:22.2f}{row['worst_block_share']:36.2f}"
                 for row in rows
             ),

@@ -67,29 +67,34 @@ CONTROLLERS: dict[str, Callable[[int], Any]] = {
 }
 
 
-# ---- Several channels: references, loudspeakers, microphones, taps of a control filter, taps of a primary path.
+# ---- Several channels: form, references, loudspeakers, microphones, taps of a control filter, taps of a primary path.
 
 CHANNELS = [
-    (1, 1, 1, 256, 512),
-    (1, 2, 2, 256, 512),
-    (1, 6, 6, 256, 512),
-    (1, 16, 16, 256, 512),
-    (1, 6, 6, 256, 256),
-    (1, 6, 6, 512, 1024),
-    (2, 6, 6, 256, 512),
+    ("shared gain", 1, 1, 1, 256, 512),
+    ("shared gain", 1, 2, 2, 256, 512),
+    ("shared gain", 1, 6, 6, 256, 512),
+    ("shared gain", 1, 16, 16, 256, 512),
+    ("shared gain", 1, 6, 6, 256, 256),
+    ("shared gain", 1, 6, 6, 512, 1024),
+    ("shared gain", 2, 6, 6, 256, 512),
+    ("shared gain", 1, 4, 4, 512, 512),
+    ("frequency domain", 1, 4, 4, 512, 512),
+    ("frequency domain", 1, 4, 4, 2048, 2048),
+    ("frequency domain", 1, 4, 4, 4096, 4096),
+    ("frequency domain", 1, 16, 16, 512, 512),
 ]
 CHANNEL_SECONDARY_TAPS = 256
 
 
 def channel_blocks(
-    references: int, loudspeakers: int, microphones: int, n_taps: int, n_primary: int
+    form: str, references: int, loudspeakers: int, microphones: int, n_taps: int, n_primary: int
 ) -> tuple[Callable[[], Any], int]:
-    """Return a function that runs KF-PB, in the shared-gain form, over the next block, and the samples of a block."""
+    """Return a function that runs a form of KF-PB over the next block, and the samples of a block."""
     rng = np.random.default_rng(3)
     decay = np.exp(-np.arange(CHANNEL_SECONDARY_TAPS) / 40)
     secondary = rng.standard_normal((microphones, loudspeakers, CHANNEL_SECONDARY_TAPS)) * decay
     controller: Any = kf_pb(
-        n_taps, secondary, rated_power=1e-3, n_references=references, n_primary=n_primary, form="shared gain"
+        n_taps, secondary, rated_power=1e-3, n_references=references, n_primary=n_primary, form=form
     )
     x, d = (rng.standard_normal((channels, controller.block)) for channels in (references, microphones))
 

@@ -374,13 +374,17 @@ class FilteredReferenceController:
             x = as_signal(references, "references")
             e = as_signal(errors, "errors", length=x.size)
             self._require_finite_squares(x, e)
-        taken = listen(self._state, x, e)
+        taken = self._listen(x, e)
         if taken < len(x):
             refused = ValueError(OVERFLOW if self.multichannel else self._refusal)
             refused.add_note(f"in sample {taken} of those listened to")
             raise refused
         if self.multichannel:
             self.after_compiled(self._state)  # a solution may be due
+
+    def _listen(self, references: np.ndarray, errors: np.ndarray) -> int:
+        """Follow signals whose first axis is time; return the number of samples before a refusal."""
+        return listen(self._state, references, errors)
 
     def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return references and errors with a sample in each row."""

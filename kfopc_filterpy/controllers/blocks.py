@@ -1,19 +1,18 @@
 """Controllers of several channels that solve for the control filters within the rated powers, block by block.
 
-Between the blocks a Kalman filter estimates, sample by sample, what the solution needs. Here is what the forms of KF-PB
-have in common: the recent correlation of the references, and the solutions.
+Sample by sample a Kalman filter estimates what the solution needs, or stores what it will learn from. Here is what the
+forms of KF-PB have in common: the blocks, the recent correlation of the references, and the rated powers.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .._validate import as_positive
-from ..kernels.compiling import inlined
-from ..kernels.delay_lines import latest, newest
-from ..kernels.records import new_record
+from .._validate import as_count, as_positive, per_loudspeaker
+from ..kernels.correlation import FadingCorrelation
+from ..kernels.delay_lines import newest
 from ..power.channels import ChannelBudget
 from .base import FilteredReferenceController, listed
 
@@ -21,50 +20,46 @@ BLOCK_S = 0.032  # time between two solutions
 DEFAULT_MEMORY_S = 0.5
 
 
-class RecentCorrelation(NamedTuple):
-    """Correlation of the references, whose older samples fade."""
-
-    sums: np.ndarray  # (lags, I, I) running sum of x_i(n - m) x_k(n)
-    numbers: np.ndarray  # record: keep (share kept in a sample), mass, waiting (samples since the last solution)
-
-
-@inlined
-def add_correlation(recent, references):
-    """Add the newest sample of the delay lines `references` to their correlation."""
-    r, numbers = recent.sums, recent.numbers[0]
-    for i in range(references.shape[0]):
-        past = newest(references[i], r.shape[0])
-        for k in range(references.shape[0]):
-            x = latest(references[k])
-            for m in range(r.shape[0]):
-                r[m, i, k] = numbers.keep * r[m, i, k] + past[m] * x
-    numbers.mass = numbers.keep * numbers.mass + 1.0
-    numbers.waiting += 1
-
-
 class BlockController(FilteredReferenceController):
-    """A controller whose control filters keep each loudspeaker's rated power, found anew in each block.
+    """A controller whose control filters keep each loudspeaker's rated power, found anew after each block.
 
-    A subclass sets `_state`, with a field `recent`, and `_budget`, and solves in `_solve`.
+    A subclass sets `_budget`, and `_state`, whose record `numbers` counts in `waiting` the samples since the last block
+    ended. It defines `_end_block`.
     """
 
-    _rated: np.ndarray | None
     _budget: ChannelBudget
+    _state: Any
 
-    def _new_correlation(self, n_lags: int, memory_s: float, fs: float) -> RecentCorrelation:
-        """Set the sample rate, the memory and the block length; return the correlation before the first sample."""
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        rated_power: Any,
+        n_lags: int,
+        memory_s: float,
+        fs: float,
+        block: int | None = None,
+        **settings: Any,
+    ) -> None:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
-        self.block = max(round(BLOCK_S * self.fs), 1)
-        return RecentCorrelation(
-            np.zeros((n_lags, self.n_references, self.n_references)),
-            new_record(keep=np.exp(-1.0 / (self.memory_s * self.fs)), mass=0.0, waiting=0),
-        )
+        self.block = max(round(BLOCK_S * self.fs), 1) if block is None else as_count(block, "block")
+        history = n_lags - 1 + self.block
+        super().__init__(n_taps, secondary_path, multichannel=True, history=history, **settings)
+        self._rated = None if rated_power is None else per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
+        keep = np.exp(-1.0 / (self.memory_s * self.fs))
+        self._correlation = FadingCorrelation(n_lags, self.n_references, keep)
 
     @property
     def rated_power(self) -> np.ndarray | None:
         """Rated output power of each loudspeaker, (J,); None if unlimited."""
         return None if self._rated is None else self._rated.copy()
+
+    @property
+    def _limits(self) -> np.ndarray:
+        """Rated power of each loudspeaker, infinite if unlimited."""
+        return np.full(self.n_loudspeakers, np.inf) if self._rated is None else self._rated
 
     @property
     def power_weight(self) -> np.ndarray:
@@ -83,21 +78,31 @@ class BlockController(FilteredReferenceController):
         return self.fs
 
     def samples_to_block(self) -> int:
-        """Return the number of samples until the next solution."""
-        return max(self.block - int(self._state.recent.numbers["waiting"][0]), 1)
+        """Return the number of samples until the end of the block."""
+        return max(self.block - int(self._state.numbers["waiting"][0]), 1)
 
     def after_compiled(self, state: Any) -> None:
-        """Solve for the control filters if a block has passed."""
-        recent = state.recent
-        if recent.numbers["waiting"][0] < self.block:
+        """Learn from the block and solve for the control filters if it has ended."""
+        if state.numbers["waiting"][0] < self.block:
             return
-        recent.numbers["waiting"] = 0
-        # Faded like this, it is the correlation of a signal that fades, which is positive definite.
-        fade = np.sqrt(recent.numbers["keep"][0]) ** np.arange(len(recent.sums))
-        correlation = recent.sums * fade[:, np.newaxis, np.newaxis] / recent.numbers["mass"][0]
-        if np.trace(correlation[0]) > 0.0:
-            self._solve(correlation)
+        state.numbers["waiting"] = 0
+        samples = len(self._correlation.total) - 1 + self.block
+        references = np.array([newest(line, samples)[::-1] for line in self._lines.reference])
+        self._correlation.add(references)
+        self._end_block(references[:, -self.block :])
 
-    def _solve(self, correlation: np.ndarray) -> None:
-        """Set the control filters for the present estimate and the correlation of the references, (lags, I, I)."""
+    def _end_block(self, references: np.ndarray) -> None:
+        """Learn from a block of references, (I, B), and set the control filters."""
         raise NotImplementedError
+
+    def _listen(self, references: np.ndarray, errors: np.ndarray) -> int:
+        """Follow block by block."""
+        taken = 0
+        while taken < len(references):
+            block = slice(taken, taken + self.samples_to_block())
+            done = super()._listen(references[block], errors[block])
+            self.after_compiled(self._state)
+            taken += done
+            if done < len(references[block]):
+                break
+        return taken

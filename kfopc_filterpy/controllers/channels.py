@@ -173,6 +173,15 @@ def squares_of_sample(lines, error):
 
 
 @inlined
+def references_are_finite(lines):
+    """Return whether the newest references have finite squares."""
+    finite = True
+    for i in range(lines.reference.shape[0]):
+        finite &= np.isfinite(latest(lines.reference[i]) ** 2)
+    return finite
+
+
+@inlined
 def add_squares(lines, constraint, d, x):
     """Add the sums of squares to the powers of each loudspeaker, and set their constraint factors."""
     for j in range(lines.output.shape[0]):

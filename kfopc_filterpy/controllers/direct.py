@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, per_channel, per_loudspeaker
+from .._validate import as_count, as_nonnegative, per_channel
 from ..filters.random_walk import as_precision
 from ..kernels.compiling import inlined, part
 from ..kernels.covariance import Covariance, covariance_matrix, kalman_step, new_covariance
@@ -25,7 +25,7 @@ from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS, ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import OVERFLOW, FilteredReferenceController, constraint_or_none
-from .blocks import DEFAULT_MEMORY_S, BlockController, RecentCorrelation, add_correlation
+from .blocks import DEFAULT_MEMORY_S, BlockController
 from .channels import ChannelLines, add_squares, least_factor, squares_of_sample
 from .step import adapt, advance_powers, control_filter, follow
 
@@ -59,7 +59,7 @@ class DirectBudgetState(NamedTuple):
     constraint: tuple[ConstraintState, ...]  # computes the powers; its factors are fixed at 1
     correction: Correction
     control_filter: np.ndarray  # (J, I, L)
-    recent: RecentCorrelation  # of the references
+    numbers: np.ndarray  # record: waiting (samples since the last solution)
 
 
 @adapt.register(DirectState)
@@ -70,19 +70,19 @@ def adapt_direct(state, error, control_signal):
 
 @adapt.register(DirectBudgetState)
 def adapt_direct_budget(state, error, control_signal):
-    """Apply eq. 2-8, and add the sample to the correlation."""
+    """Apply eq. 2-8."""
     if not correct_constrained(state, error):
         return False
-    add_correlation(state.recent, state.lines.reference)
+    state.numbers[0].waiting += 1
     return True
 
 
 @follow.register(DirectBudgetState)
 def follow_direct_budget(state, error):
-    """Add the sample to the powers and the correlation."""
+    """Add the sample to the powers."""
     finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        add_correlation(state.recent, state.lines.reference)
+        state.numbers[0].waiting += 1
     return finite
 
 
@@ -320,21 +320,20 @@ class DirectPowerBudget(BlockController):
         dtype: Any = np.float64,
     ) -> None:
         secondary, _ = secondary_paths(secondary_path)
-        n_taps = as_count(n_taps, "n_taps")
-        n_lags = n_taps + secondary.shape[2]
         super().__init__(
             n_taps,
             secondary_path,
+            rated_power=rated_power,
+            n_lags=as_count(n_taps, "n_taps") + secondary.shape[2],
+            memory_s=memory_s,
+            fs=fs,
             n_references=n_references,
-            multichannel=True,
             amplifier=amplifier,
             limiter=limiter,
-            history=n_lags,
         )
-        self._rated = per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
         noise = per_channel(measurement_noise, self.n_microphones, "microphones", "measurement_noise")
         weights = np.sqrt(noise.mean() / noise)[:, np.newaxis, np.newaxis]  # the estimate weighs the errors likewise
-        self._budget = ChannelBudget(weights * secondary, self.n_taps, 0, self.n_references, self._rated)
+        self._budget = ChannelBudget(weights * secondary, self.n_taps, 0, self.n_references, self._limits)
         lines, free, constraint = self._common()
         self._state = DirectBudgetState(
             lines,
@@ -342,7 +341,7 @@ class DirectPowerBudget(BlockController):
             constraint,
             new_correction(self, state_noise, noise, initial_variance, dtype),
             np.zeros(free.shape),
-            self._new_correlation(n_lags, memory_s, fs),
+            new_record(waiting=0),
         )
 
     @property
@@ -350,9 +349,9 @@ class DirectPowerBudget(BlockController):
         """Control filters within the rated powers, which generate y, (J, I, L); a copy."""
         return self._state.control_filter.copy()
 
-    def _solve(self, correlation: np.ndarray) -> None:
+    def _end_block(self, references: np.ndarray) -> None:
         """Find the control filters for the present estimate and correlation."""
-        self._budget.solve_near(correlation, self._state.weights)
+        self._budget.solve_near(self._correlation.faded, self._state.weights)
         self._state.control_filter[...] = self._budget.weights
 
     def _reason(self, error: Any) -> str:

@@ -16,7 +16,9 @@ from ..power.budget import BudgetState, advance_budget, take_correlations
 from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
+from .frequency_domain import FrequencyDomainKalman
 from .kalman import KalmanController, correct_constrained, is_multichannel
+from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
 
@@ -138,7 +140,8 @@ class PowerBudgetController(KalmanController):
         self.estimator.update(d, H=h, reference=x, control_signal=self._y)
 
 
-FORMS = ("direct", "shared gain")
+FORMS = ("direct", "shared gain", "frequency domain")
+PRIMARY_PATH_FORMS: dict[str, Any] = {"shared gain": SharedGainKalman, "frequency domain": FrequencyDomainKalman}
 
 
 def kf_pb(
@@ -155,7 +158,7 @@ def kf_pb(
     dtype: Any = np.float64,
     form: str | None = None,
     **settings: Any,
-) -> PowerBudgetController | DirectPowerBudget | SharedGainKalman:
+) -> PowerBudgetController | DirectPowerBudget | PrimaryPathController:
     """Return KF-PB, the power-budgeted Kalman filter, which has the least error within the rated power.
 
     Parameters
@@ -167,26 +170,27 @@ def kf_pb(
     rated_power : float or array_like, shape (J,)
         Rated output power, of all loudspeakers or of each.
     state_noise, measurement_noise, initial_variance, dtype
-        Of the direct form, as for `kf_anc`; the shared-gain form does not need them.
+        Of the direct form, as for `kf_anc`; the other forms do not need them.
     n_references, amplifier, limiter
         As for `kf_anc`.
-    form : {"direct", "shared gain"}, optional
+    form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample; "shared gain" the
-        primary paths (`SharedGainKalman`). By default direct for one channel, shared gain for several.
+        primary paths (`SharedGainKalman`); "frequency domain" these too, if they are long (`FrequencyDomainKalman`). By
+        default direct for one channel, shared gain for several.
     **settings
         Of the direct form for one channel: `fs`, `memory_s`, `credit_s`, see `PowerBudget`; for several: `fs`,
-        `memory_s`, see `DirectPowerBudget`. Of the shared-gain form: see `SharedGainKalman`.
+        `memory_s`, see `DirectPowerBudget`. Of the other forms: see their classes.
 
     Returns
     -------
-    PowerBudgetController, DirectPowerBudget or SharedGainKalman
+    PowerBudgetController, DirectPowerBudget, SharedGainKalman or FrequencyDomainKalman
         A controller. Its `control_filter` generates the control signal. The `weights` of a direct form are the estimate
         of the unconstrained control filter.
 
     Raises
     ------
     ValueError, TypeError
-        The direct form without its noises; noises for the shared-gain form; see the classes.
+        The direct form without its noises; noises for another form; see the classes.
 
     Examples
     --------
@@ -202,10 +206,10 @@ def kf_pb(
     several = is_multichannel(secondary_path, n_references)
     form = as_choice(form or FORMS[several], "form", FORMS)
     common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
-    if form == "shared gain":
+    if form in PRIMARY_PATH_FORMS:
         if state_noise is not None or measurement_noise is not None:
-            raise TypeError("the shared-gain form takes path_memory_s instead of state_noise and measurement_noise")
-        return SharedGainKalman(n_taps, secondary_path, n_references=n_references, **common, **settings)
+            raise TypeError(f"the {form} form takes path_memory_s instead of state_noise and measurement_noise")
+        return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, n_references=n_references, **common, **settings)
     if state_noise is None or measurement_noise is None:
         raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
     settings |= {

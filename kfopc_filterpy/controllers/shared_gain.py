@@ -13,22 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_positive, per_loudspeaker
 from ..kernels.compiling import inlined
 from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_covariance
 from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
-from ..paths.channels import secondary_paths
 from ..power.amplifiers import Amplifier
-from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .blocks import DEFAULT_MEMORY_S, BlockController, RecentCorrelation, add_correlation
-from .channels import ChannelLines, estimate_disturbances
+from .blocks import DEFAULT_MEMORY_S
+from .channels import ChannelLines, estimate_disturbances, references_are_finite
+from .primary_paths import DEFAULT_PATH_MEMORY_S, PrimaryPathController
 from .step import adapt, follow
 
-PRIOR = 1e3  # energy of the reference in the unknown paths, relative to the measurement noise
+PRIOR = 1e3  # energy of the references in the unknown paths, relative to the measurement noise
 
 
 class SharedGainState(NamedTuple):
@@ -39,8 +37,7 @@ class SharedGainState(NamedTuple):
     paths: np.ndarray  # (K, I L_p) estimated primary paths
     gains: Covariance  # of a row of `paths`; the measurement noise is 1
     row: np.ndarray  # (I L_p,) references, newest first
-    recent: RecentCorrelation  # of the references
-    numbers: np.ndarray  # record: state_noise
+    numbers: np.ndarray  # record: state_noise, waiting (samples since the last solution)
 
 
 @adapt.register(SharedGainState)
@@ -54,16 +51,16 @@ def adapt_shared_gain(state, error, control_signal):
         return False
     for k in range(1, paths.shape[0]):
         correct_weights(paths[k], state.gains.gain_direction, (d[k] - dot(h, paths[k])) / S)
-    add_correlation(state.recent, state.lines.reference)
+    numbers.waiting += 1
     return True
 
 
 @follow.register(SharedGainState)
 def follow_shared_gain(state, error):
-    """Add the sample to the correlation."""
-    if not estimate_disturbances(state.lines, error):
+    """Count the sample; its references are in the delay lines."""
+    if not (estimate_disturbances(state.lines, error) and references_are_finite(state.lines)):
         return False
-    add_correlation(state.recent, state.lines.reference)
+    state.numbers[0].waiting += 1
     return True
 
 
@@ -77,7 +74,7 @@ def reference_row(state):
     return row
 
 
-class SharedGainKalman(BlockController):
+class SharedGainKalman(PrimaryPathController):
     """KF-PB for several channels, in real time: primary paths by a Kalman filter, control filters within the powers.
 
     Parameters
@@ -112,7 +109,8 @@ class SharedGainKalman(BlockController):
     -----
     Only the ratio of the state noise to the measurement noise matters here. The state noise is
     ``1 / (E[x^2] (path_memory_s fs)^2)`` and the initial variance ``1000 / (I L_p E[x^2])``, for a measurement noise of
-    1. The power of the references is taken from the first block.
+    1. The power of the references is taken from the first block that is not silent, and again if it has grown to more
+    than four times: a recording may begin softly.
 
     Examples
     --------
@@ -134,76 +132,48 @@ class SharedGainKalman(BlockController):
         rated_power: Any = None,
         n_references: int = 1,
         n_primary: int | None = None,
-        path_memory_s: float = 1.0,
+        path_memory_s: float = DEFAULT_PATH_MEMORY_S,
         memory_s: float = DEFAULT_MEMORY_S,
         fs: float = DEFAULT_FS,
         microphone_weights: Any = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Sequence[OutputLimiter] | None = None,
     ) -> None:
-        secondary, _ = secondary_paths(secondary_path)
-        n_taps = as_count(n_taps, "n_taps")
-        n_primary = n_taps + secondary.shape[2] if n_primary is None else as_count(n_primary, "n_primary")
-        n_lags = n_taps + secondary.shape[2] + n_primary
         super().__init__(
             n_taps,
             secondary_path,
+            rated_power=rated_power,
             n_references=n_references,
-            multichannel=True,
+            n_primary=n_primary,
+            path_memory_s=path_memory_s,
+            memory_s=memory_s,
+            fs=fs,
+            microphone_weights=microphone_weights,
             amplifier=amplifier,
             limiter=limiter,
-            filtered_taps=0,
-            history=n_lags,
         )
-        recent = self._new_correlation(n_lags, memory_s, fs)
-        self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
-        self._rated = None if rated_power is None else per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
-        weights = self._microphone_weights(microphone_weights)
-        unlimited = np.full(self.n_loudspeakers, np.inf)
-        self._budget = ChannelBudget(
-            np.sqrt(weights)[:, np.newaxis, np.newaxis] * secondary,
-            self.n_taps,
-            n_primary,
-            self.n_references,
-            unlimited if self._rated is None else self._rated,
-        )
-        self._path_weights = np.sqrt(weights)[:, np.newaxis, np.newaxis]
-        size = self.n_references * n_primary
+        size = self.n_references * self._budget.n_primary
         self._state = SharedGainState(
             lines=self._lines,
             weights=np.zeros((self.n_loudspeakers, self.n_references, self.n_taps)),
             paths=np.zeros((self.n_microphones, size)),
             gains=new_covariance(np.zeros((size, size))),
             row=np.zeros(size),
-            recent=recent,
-            numbers=new_record(state_noise=0.0),
+            numbers=new_record(state_noise=0.0, waiting=0),
         )
-
-    def _microphone_weights(self, weights: Any) -> np.ndarray:
-        if weights is None:
-            return np.ones(self.n_microphones)
-        if np.shape(weights) != (self.n_microphones,):
-            raise ValueError(
-                f"microphone_weights must have one weight for each of the {self.n_microphones} microphones, "
-                f"got shape {np.shape(weights)}"
-            )
-        return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
 
     @property
     def primary_path(self) -> np.ndarray:
         """Estimated primary paths, (K, I, L_p); a copy."""
         return self._state.paths.reshape(self.n_microphones, self.n_references, -1).copy()
 
-    def _solve(self, correlation: np.ndarray) -> None:
-        """Find the control filters for the present paths and correlation."""
-        state = self._state
-        if state.numbers["state_noise"][0] == 0.0:
-            self._scale(np.trace(correlation[0]) / self.n_references)
-        self._budget.solve(correlation, self._path_weights * self.primary_path)
-        state.weights[...] = self._budget.weights
-
-    def _scale(self, power: float) -> None:
-        """Set the state noise and the initial variance for references of a power."""
-        state = self._state
-        state.numbers["state_noise"] = 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
-        state.gains.triangle.flat[:: state.gains.triangle.shape[1] + 1] = PRIOR / (state.row.size * power)
+    def _end_block(self, references: np.ndarray) -> None:
+        """Solve for the control filters."""
+        power, numbers = self._reference_power(), self._state.numbers
+        if not power > 0.0:
+            return
+        if numbers["state_noise"][0] == 0.0:
+            triangle = self._state.gains.triangle
+            triangle.flat[:: triangle.shape[1] + 1] = self._first_variance(PRIOR, power)
+        numbers["state_noise"] = self._state_noise(numbers["state_noise"][0], power)
+        self._solve()

@@ -59,19 +59,31 @@ def circulant_inverse(spectrum: np.ndarray, n: int) -> Operator:
 
 
 def conjugate_gradients(
-    product: Operator, precondition: Operator, b: np.ndarray, x: np.ndarray, steps: int
+    product: Operator, precondition: Operator, b: np.ndarray, x: np.ndarray, steps: int, *, axis: int | None = None
 ) -> np.ndarray:
-    """Return `x` after some preconditioned steps towards the solution of ``product(x) = b``."""
+    """Return `x` after some preconditioned steps towards the solution of ``product(x) = b``.
+
+    With an axis, each vector along it is a system of its own, and the operators treat them alike.
+    """
+
+    def inner(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.sum(a * b, axis=axis, keepdims=True)
+
     residual = b - product(x)
     direction = preconditioned = precondition(residual)
-    size = np.vdot(residual, preconditioned)
+    size = inner(residual, preconditioned)
     for _ in range(steps):
-        if not size > 0.0:  # solved
+        if not np.any(size > 0.0):  # solved
             break
         moved = product(direction)
-        step = size / np.vdot(direction, moved)
+        step = _ratio(size, inner(direction, moved))
         x, residual = x + step * direction, residual - step * moved
         preconditioned = precondition(residual)
-        size, before = np.vdot(residual, preconditioned), size
-        direction = preconditioned + size / before * direction
+        size, before = inner(residual, preconditioned), size
+        direction = preconditioned + _ratio(size, before) * direction
     return x
+
+
+def _ratio(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+    """Return ``above / below``, and 0 where a system is solved already."""
+    return np.divide(above, below, out=np.zeros_like(above), where=below > 0.0)

@@ -46,7 +46,7 @@ class ChannelBudget:
     def __init__(
         self, secondary: np.ndarray, n_taps: int, n_primary: int, n_references: int, rated_power: np.ndarray
     ) -> None:
-        self.n_taps, self.n_references, self.rated_power = n_taps, n_references, rated_power
+        self.n_taps, self.n_primary, self.n_references, self.rated_power = n_taps, n_primary, n_references, rated_power
         _, self.n_loudspeakers, n_secondary = secondary.shape
         self.n_lags = n_taps + n_secondary + n_primary  # lags of R_x that the right-hand side depends on
         self._inner = n_taps + n_secondary  # lags that R_x' depends on

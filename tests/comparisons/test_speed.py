@@ -14,6 +14,8 @@ from comparisons.speed import variants as speed_variants
 from kfopc_filterpy import MOVFxLMS, kf_opc, simulate, simulate_scenarios
 from kfopc_filterpy.power.constraint import OutputPowerConstraint, preview_constraint
 
+FORMS = ("shared gain", "frequency domain")
+
 
 @pytest.fixture
 def small(monkeypatch):
@@ -26,7 +28,7 @@ def small(monkeypatch):
         "CHANNEL_BLOCKS": 2,
     }.items():
         monkeypatch.setattr(speed, name, value)
-    monkeypatch.setattr(speed_variants, "CHANNELS", [(1, 2, 3, 16, 32)])
+    monkeypatch.setattr(speed_variants, "CHANNELS", [(form, 1, 2, 3, 16, 32) for form in FORMS])
     monkeypatch.setattr(speed, "first_use_s", lambda name: 1.0)
     monkeypatch.setattr(speed, "find_spec", lambda name: None)  # the same wherever it runs
     monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
@@ -58,11 +60,13 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
     assert rows["filterpy", 256]["times_filterpy"] == rows["numpy rank-1", 256]["times_numpy"] == 1.0
     # An O(L^3) filter is slower than an O(L^2) one at 256 taps on any machine.
     assert rows["filterpy API of KFOPC", 256]["times_filterpy"] > 5
-    (channels,) = result["channels"]
-    assert (channels["references"], channels["loudspeakers"], channels["microphones"]) == (1, 2, 3)
-    assert channels["us_per_sample"] > 0
+    for form, channels in zip(FORMS, result["channels"], strict=True):
+        assert channels["form"] == form
+        assert (channels["references"], channels["loudspeakers"], channels["microphones"]) == (1, 2, 3)
+        assert channels["us_per_sample"] > 0
     printed = capsys.readouterr().out
-    assert "1 x  2 x  3,   16,   32" in printed
+    for form in FORMS:
+        assert f"{form:16}     1 x  2 x  3,   16,   32" in printed
     assert "times as fast as filterpy" in printed
     assert "16 taps, 200 samples" in printed
     assert "1.0 s for `simulate`" in printed

@@ -1,0 +1,87 @@
+"""What two forms of KF-PB share: they estimate the primary paths, and control filters follow from these."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_nonnegative, as_positive
+from ..paths.channels import secondary_paths
+from ..power.channels import ChannelBudget
+from .blocks import BlockController
+
+DEFAULT_PATH_MEMORY_S = 1.0
+GROWN = 4.0  # growth of the references' power from which the state noise follows it: they began soft or silent
+
+
+class PrimaryPathController(BlockController):
+    """Base class: estimated primary paths, and control filters within the rated power of each loudspeaker.
+
+    A subclass defines `primary_path` and `_end_block`, which calls `_solve`. Its arguments are described in
+    `SharedGainKalman`.
+    """
+
+    def __init__(
+        self,
+        n_taps: int,
+        secondary_path: Any,
+        *,
+        n_primary: int | None,
+        path_memory_s: float,
+        microphone_weights: Any,
+        **settings: Any,
+    ) -> None:
+        secondary, _ = secondary_paths(secondary_path)
+        n_taps = as_count(n_taps, "n_taps")
+        n_primary = usual_primary(n_taps, secondary) if n_primary is None else as_count(n_primary, "n_primary")
+        n_lags = n_taps + secondary.shape[2] + n_primary
+        super().__init__(n_taps, secondary_path, n_lags=n_lags, filtered_taps=0, **settings)
+        self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
+        self._path_weights = np.sqrt(self._microphone_weights(microphone_weights))[:, np.newaxis, np.newaxis]
+        weighted = self._path_weights * secondary
+        self._budget = ChannelBudget(weighted, self.n_taps, n_primary, self.n_references, self._limits)
+
+    def _microphone_weights(self, weights: Any) -> np.ndarray:
+        if weights is None:
+            return np.ones(self.n_microphones)
+        if np.shape(weights) != (self.n_microphones,):
+            raise ValueError(
+                f"microphone_weights must have one weight for each of the {self.n_microphones} microphones, "
+                f"got shape {np.shape(weights)}"
+            )
+        return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
+
+    @property
+    def primary_path(self) -> np.ndarray:
+        """Estimated primary paths, (K, I, L_p); a copy."""
+        raise NotImplementedError
+
+    def _solve(self) -> None:
+        """Find the control filters for the present paths and correlation."""
+        self._budget.solve(self._correlation.faded, self._path_weights * self.primary_path)
+        self._state.weights[...] = self._budget.weights
+
+    def _reference_power(self) -> float:
+        """Return the mean power of the references; in silence, the correlation begins anew with the first sound."""
+        power = float(np.trace(self._correlation.faded[0])) / self.n_references
+        if not power > 0.0:
+            self._correlation.mass = 0.0
+        return power
+
+    def _state_noise(self, now: float, power: float) -> float:
+        """Return the state noise for references of a power: as it is now, unless they have grown much louder."""
+        wanted = 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
+        return wanted if now == 0.0 or wanted < now / GROWN else now
+
+    def _first_variance(self, prior: float, power: float) -> float:
+        """Return the variance of an unknown tap for references of a power.
+
+        `prior` is the energy of the references in the unknown paths, relative to the measurement noise.
+        """
+        return prior / (self.n_references * self._budget.n_primary * power)
+
+
+def usual_primary(n_taps: int, secondary: np.ndarray) -> int:
+    """Return the taps of a primary path that control filters and secondary paths can cancel."""
+    return n_taps + secondary.shape[2]

@@ -1,0 +1,47 @@
+"""The correlation of signals over an exponential window, a block of samples at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import fft
+
+
+class FadingCorrelation:
+    """Correlation of I signals, with products by FFT.
+
+    Parameters
+    ----------
+    n_lags, n_signals : int
+        Number of lags M, and I.
+    keep : float
+        Factor by which a product fades per sample.
+
+    Attributes
+    ----------
+    total : ndarray, shape (M, I, I)
+        Sum of the faded products x_i(n - m) x_k(n), at [m, i, k].
+    mass : float
+        Sum of the weights of the products of a lag.
+    """
+
+    def __init__(self, n_lags: int, n_signals: int, keep: float) -> None:
+        self.keep, self.mass = keep, 0.0
+        self.total = np.zeros((n_lags, n_signals, n_signals))
+
+    def add(self, signals: np.ndarray) -> None:
+        """Add the samples of a block, the last B of `signals`, (I, M - 1 + B)."""
+        n_lags = len(self.total)
+        block = signals.shape[1] - (n_lags - 1)
+        weights = np.zeros(signals.shape[1])
+        weights[n_lags - 1 :] = self.keep ** np.arange(block - 1, -1, -1.0)
+        size = fft.next_fast_len(signals.shape[1], real=True)
+        spectra, of_late = fft.rfft(signals, size), fft.rfft(signals * weights, size)
+        products = fft.irfft(spectra[:, np.newaxis].conj() * of_late, size)  # of lag m at [i, k, m]
+        self.total = self.keep**block * self.total + products[..., :n_lags].transpose(2, 0, 1)
+        self.mass = self.keep**block * self.mass + weights.sum()
+
+    @property
+    def faded(self) -> np.ndarray:
+        """Mean products, (M, I, I), as of a signal that fades, which makes them positive definite; zero in silence."""
+        lags = np.arange(len(self.total))
+        return self.total * (np.sqrt(self.keep) ** lags / max(self.mass, 1.0))[:, np.newaxis, np.newaxis]
