@@ -32,7 +32,8 @@ OVERFLOW = (
 
 
 MULTICHANNEL = (
-    "FxLMS, LeakyFxLMS, OptimalLeakyFxLMS, MOVFxLMS, TwoGradientFxLMS, RescalingFxLMS, ClippingFxLMS, SharedGainKalman"
+    "FxLMS, FxNLMS, LeakyFxLMS, OptimalLeakyFxLMS, MOVFxLMS, TwoGradientFxLMS, RescalingFxLMS, ClippingFxLMS, "
+    "SharedGainKalman"
 )
 
 Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]

@@ -26,6 +26,7 @@ from kfopc_filterpy import (
     OutputPowerConstraint,
     RescalingFxLMS,
     TwoGradientFxLMS,
+    fx_rls,
     kf_anc,
     output_power,
     simulate,
@@ -43,6 +44,7 @@ PRIMARY = _rng.standard_normal((K, I, 7)) * 0.5
 A = np.array([0.3, 0.6])  # amplitude limits
 LEAK = np.array([0.4, 0.1])
 PENALTY = np.array([0.7, 0.2])
+EPSILON = 2.0  # regularization of the normalised step
 RATED, MEMORY = np.array([0.4, 0.8]), 60
 
 
@@ -126,6 +128,11 @@ EVERY: dict[str, tuple[Callable[..., Any], Any, Any]] = {
     "FxLMS": (
         lambda path, **o: FxLMS(L, path, step_size=MU, **o),
         lambda w, j, i, at: w + gradient(at, j, i),
+        as_it_is,
+    ),
+    "FxNLMS": (
+        lambda path, **o: FxNLMS(L, path, step_size=40 * MU, regularization=EPSILON, **o),
+        lambda w, j, i, at: w + 40 * gradient(at, j, i) / (EPSILON + np.sum(at["xf"] ** 2)),
         as_it_is,
     ),
     "clipping FxLMS": (
@@ -217,6 +224,7 @@ def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
 ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
 ONE: dict[str, Callable[..., Any]] = {
     "FxLMS": lambda path, **o: FxLMS(L, path, step_size=MU, **o),
+    "FxNLMS": lambda path, **o: FxNLMS(L, path, step_size=10 * MU, **o),
     "clipping FxLMS": lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
     "re-scaling FxLMS": lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
     "leaky FxLMS": lambda path, **o: LeakyFxLMS(L, path, step_size=MU, leak=0.4, **o),
@@ -316,6 +324,20 @@ def test_it_settles_at_the_regularised_wiener_solution(make: Callable[..., Any],
         assert np.abs(want - wiener(PATHS, PRIMARY, np.zeros(J))).max() > 0.05 * np.abs(want).max()
 
 
+def test_a_normalised_step_does_not_depend_on_the_level_and_is_stable_up_to_2() -> None:
+    """On paths without delay, where the error power cannot grow within a step that is below 2, and does above."""
+    flat = np.random.default_rng(8).standard_normal((K, J, 1)) * np.eye(1, 3)
+    x, level = noise(3000), np.repeat([1.0, 30.0], 1500)
+    d = np.einsum("kj,ji,in->kn", flat[:, :, 0], [[0.5, 0.2], [-0.3, 0.4]], x)
+    errors = []
+    for mu in (0.5, 1.9, 2.5):
+        controller = FxNLMS(1, flat, step_size=mu, n_references=I)
+        errors.append(simulate(controller, level * x, disturbance=level * d, secondary_path=flat, fs=FS).error)
+    for error in errors[:2]:
+        assert np.mean(error[:, -200:] ** 2) < 1e-6 * np.mean(d[:, -200:] ** 2)  # loud or soft
+    assert np.nanmax(np.abs(errors[2])) > 10.0 * np.abs(level * d).max()
+
+
 def test_every_loudspeaker_keeps_its_rated_power() -> None:
     """MOV-FxLMS counts on each loudspeaker alone: what they need together is less."""
     x = noise(40_000)
@@ -399,11 +421,12 @@ def test_several_references_need_no_channel_axes() -> None:
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, amplifier=[None]), TypeError, "each of the 2 loudspeakers"),
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, penalty_factor=np.nan), ValueError, "penalty_factor must be finite"),
         (lambda: MOVFxLMS(L, ONE_PATH, step_size=MU, rated_power=[1.0, 2.0]), ValueError, "must be one for one loudspeaker, got 2"),
-        (lambda: FxNLMS(L, PATHS, step_size=MU), ValueError, "FxNLMS takes one channel: .* FxLMS, LeakyFxLMS, .*SharedGainKalman"),
+        (lambda: FxNLMS(L, PATHS, step_size=MU, regularization=0.0), ValueError, "regularization must be greater than 0"),
+        (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use controllers.SharedGainKalman, .* FxNLMS"),
         (lambda: kf_anc(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "KalmanController takes one channel"),
-        (lambda: DiagonalKalman(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "DiagonalKalman takes one channel"),
+        (lambda: DiagonalKalman(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "DiagonalKalman takes one channel: .* FxLMS, FxNLMS, LeakyFxLMS, .*SharedGainKalman"),
     ],
-    ids=range(18),
+    ids=range(19),
 )  # fmt: skip
 def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: type, message: str) -> None:
     with pytest.raises(error, match=message):
