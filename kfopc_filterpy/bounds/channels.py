@@ -7,7 +7,7 @@ channel as the leading axis.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
@@ -19,7 +19,9 @@ from .wiener import WienerSolution, mean_square, reduction_db
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions with less get no weight
 TOLERANCE = 1e-5  # to which a rated power that binds is met
-SWEEPS = 300  # at most; some twenty are usual
+STEPS = 100  # of Newton's method, at most; some five are usual
+HALVINGS = 12  # of a step
+NEARLY, SWEEPS = 1e-3, 300  # if the rated powers are missed by more, they are approached in so many slow steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,38 +99,106 @@ class ChannelCorrelations:
 
     def weights(self, penalty: np.ndarray | float = 0.0, ridge: float = 0.0) -> np.ndarray:
         """Return the solution of (R_x' + blkdiag(penalty_j R_x) + ridge I) w = r, (J, I, n_taps)."""
-        J = self.shape[0]
-        matrix = self.filtered + block_diag(*(p * self.reference for p in np.broadcast_to(penalty, J)))
+        return cho_solve(self._factors(penalty, ridge), self.cross).reshape(self.shape)
+
+    def _factors(self, penalty: np.ndarray | float, ridge: float = 0.0) -> Any:
+        """Return the Cholesky factors of that matrix."""
+        matrix = self.filtered + block_diag(*(p * self.reference for p in np.broadcast_to(penalty, self.shape[0])))
         matrix.flat[:: self.cross.size + 1] += ridge + RIDGE * np.trace(self.filtered) / self.cross.size
-        return cho_solve(cho_factor(matrix), self.cross).reshape(self.shape)
+        return cho_factor(matrix)
 
     def powers(self, weights: np.ndarray) -> np.ndarray:
         """Return the powers of the control signals, (J,)."""
         rows = weights.reshape(self.shape[0], -1)
         return np.einsum("ja,ab,jb->j", rows, self.reference, rows)
 
-    def constrained_weights(self, rated_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def antinoise(self, weights: np.ndarray) -> float:
+        """Return by how much the weights lower the error's power, summed over microphones: 2 w'r - w' R_x' w."""
+        w = weights.ravel()
+        return float(2.0 * w @ self.cross - w @ self.filtered @ w)
+
+    def constrained_weights(
+        self, rated_power: np.ndarray, start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the weights of the least error within the rated powers, and the penalties, (J,).
 
-        Each penalty is multiplied by its power over its rated power until the powers that bind are met: the fixed
-        points of this are the solutions with complementary slackness.
+        The penalties maximise the dual, ``-r'w - penalty'rated_power``, which is concave: its gradient is the power beyond
+        the rated one. Newton's method finds them. Its usual step solves for 1 / sqrt(power), nearly linear in the
+        penalties (Hebden; More and Sorensen); a step that does not climb is halved, or made for the dual itself.
+        `start`, penalties of similar powers, saves some of the steps.
         """
         J = self.shape[0]
         if not np.trace(self.filtered) > 0.0:
             return np.zeros(self.shape), np.zeros(J)
-        weights = self.weights()
-        if np.all(self.powers(weights) <= rated_power):
-            return weights, np.zeros(J)
-        natural = np.trace(self.filtered) / np.trace(self.reference) / J
-        penalty = np.full(J, natural)
+        now = self._highest(self._dual(np.zeros(J) if start is None else np.array(start), rated_power))
+        if now.missed > NEARLY:
+            now = min(now, self._swept(rated_power), key=lambda one: one.missed)
+        return now.weights, now.penalty
+
+    def _swept(self, rated_power: np.ndarray) -> _Dual:
+        """Return the dual where each penalty has been multiplied by its power over its rated power, time and again.
+
+        This is slow, but it works for loudspeakers that are nearly alike, where the dual is flat to rounding. The ratio
+        is damped, because far below the power that is wanted the power falls as the inverse square of the penalty.
+        """
+        natural = np.trace(self.filtered) / np.trace(self.reference) / rated_power.size
+        penalty = np.full(rated_power.size, natural)
         for _ in range(SWEEPS):
-            weights = self.weights(penalty)
-            ratio = self.powers(weights) / rated_power
-            binding = penalty > 1e-9 * natural
-            if np.all(ratio < 1.0 + TOLERANCE) and np.all(np.abs(ratio[binding] - 1.0) < TOLERANCE):
+            now = self._dual(penalty, rated_power)
+            if now.missed < TOLERANCE:
                 break
-            penalty = np.maximum(penalty * np.maximum(ratio, 1e-6), 1e-12 * natural)
-        return weights, np.where(binding, penalty, 0.0)
+            penalty = penalty * np.sqrt(np.maximum(now.power / rated_power, 1e-6))
+            penalty[penalty < 1e-12 * natural] = 0.0  # not needed
+        return now
+
+    def _highest(self, now: _Dual) -> _Dual:
+        """Return the dual after all steps."""
+        for _ in range(STEPS):
+            if now.missed < TOLERANCE or (higher := self._higher(now)) is None:
+                break
+            now = higher
+        return now
+
+    def _dual(self, penalty: np.ndarray, rated_power: np.ndarray) -> _Dual:
+        """Return the dual at some penalties."""
+        factors = self._factors(penalty)
+        weights = cho_solve(factors, self.cross).reshape(self.shape)
+        value = -float(self.cross @ weights.ravel() + penalty @ rated_power)
+        return _Dual(penalty, weights, self.powers(weights), value, rated_power, factors)
+
+    def _higher(self, now: _Dual) -> _Dual | None:
+        """Return the dual after a step, or None if rounding leaves nothing to gain."""
+        free = (now.penalty > 0.0) | (now.power > now.rated_power)
+        spread = block_diag(*(now.weights.reshape(self.shape[0], -1) @ self.reference)).T  # column j: R_x w_j
+        curvature = (spread.T @ cho_solve(now.factors, spread))[np.ix_(free, free)]
+        curvature.flat[:: len(curvature) + 1] *= 1.0 + 1e-9  # loudspeakers may be alike
+        power, rated = now.power[free], now.rated_power[free]
+        secular = power**1.5 * (1.0 / np.sqrt(rated) - 1.0 / np.sqrt(power))
+        for right in (secular, 0.5 * (power - rated)):
+            step = np.zeros(now.penalty.size)
+            step[free] = np.linalg.solve(curvature, right)
+            for share in 0.5 ** np.arange(HALVINGS):
+                tried = self._dual(np.maximum(now.penalty + share * step, 0.0), now.rated_power)
+                if tried.value >= now.value - 1e-14 * abs(now.value):
+                    return tried
+        return None
+
+
+class _Dual(NamedTuple):
+    """The dual problem at some penalties, (J,)."""
+
+    penalty: np.ndarray
+    weights: np.ndarray
+    power: np.ndarray
+    value: float
+    rated_power: np.ndarray
+    factors: Any
+
+    @property
+    def missed(self) -> float:
+        """The largest relative deviation of a power that is beyond its rated power, or has a penalty and is below it."""
+        deviation = self.power / self.rated_power - 1.0
+        return float(np.max(np.where(self.penalty > 0.0, np.abs(deviation), deviation), initial=0.0))
 
 
 def block_correlation(signals: np.ndarray, n_taps: int) -> np.ndarray:

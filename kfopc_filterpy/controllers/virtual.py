@@ -151,14 +151,14 @@ class KalmanObserver:
         )
 
     def estimate(self, disturbance: np.ndarray) -> np.ndarray:
-        """Return the disturbance at the virtual microphones, (K_v,), from the newest sample at the physical ones, (K_p,).
+        """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
 
-        Nothing is changed.
+        `disturbance` is the newest sample at the physical microphones, (K_p,).
         """
         return self._Cv @ self._state + self._M @ (disturbance - self._Cp @ self._state)
 
     def advance(self, disturbance: np.ndarray) -> None:
-        """Take the newest sample at the physical microphones, (K_p,), into the state."""
+        """Take `disturbance`, the newest sample at the physical microphones, (K_p,), into the state."""
         self._state = self._A @ self._state + self._K @ (disturbance - self._Cp @ self._state)
 
 
