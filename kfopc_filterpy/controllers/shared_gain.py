@@ -30,6 +30,7 @@ from .step import adapt, follow
 
 PRIOR = 1e3  # energy of the reference in the unknown paths, relative to the measurement noise
 BLOCK_S = 0.032  # time between two solutions
+GROWN = 4.0  # growth of the references' power from which the state noise follows it: they began soft or silent
 
 
 class SharedGainState(NamedTuple):
@@ -129,7 +130,8 @@ class SharedGainKalman(FilteredReferenceController):
     -----
     Only the ratio of the state noise to the measurement noise matters here. The state noise is
     ``1 / (E[x^2] (path_memory_s fs)^2)`` and the initial variance ``1000 / (I L_p E[x^2])``, for a measurement noise of
-    1. The power of the references is taken from the first block.
+    1. The power of the references is taken from the first block that is not silent, and again if it has grown to more
+    than four times: a recording may begin softly.
 
     Examples
     --------
@@ -253,14 +255,17 @@ class SharedGainKalman(FilteredReferenceController):
         correlation = state.correlation * fade[:, np.newaxis, np.newaxis] / mass
         power = np.trace(correlation[0]) / self.n_references
         if not power > 0.0:
+            state.numbers["mass"] = 0.0  # the correlation begins with the first sound
             return
-        if state.numbers["state_noise"][0] == 0.0:
-            self._scale(power)
+        self._scale(power)
         self._budget.solve(correlation, self._path_weights * self.primary_path)
         state.weights[...] = self._budget.weights
 
     def _scale(self, power: float) -> None:
-        """Set the state noise and the initial variance for references of a power."""
+        """Set the state noise and the initial variance for references of a power, or lower the state noise if it grew."""
         state = self._state
-        state.numbers["state_noise"] = 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
-        state.gains.triangle.flat[:: state.gains.triangle.shape[1] + 1] = PRIOR / (state.row.size * power)
+        now, wanted = state.numbers["state_noise"][0], 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
+        if now == 0.0:
+            state.gains.triangle.flat[:: state.gains.triangle.shape[1] + 1] = PRIOR / (state.row.size * power)
+        if now == 0.0 or wanted < now / GROWN:
+            state.numbers["state_noise"] = wanted

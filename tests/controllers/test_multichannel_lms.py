@@ -286,6 +286,44 @@ def test_each_loudspeaker_has_its_own_limiter_and_amplifier_model() -> None:
         assert np.abs(want.control_signal - want.amplifier_output).max() > 0.01  # and the amplifier clipped
 
 
+# ---- Loudspeakers and microphones that are not what they should be
+
+
+@pytest.mark.parametrize("name", ["FxLMS", "FxNLMS"])
+def test_an_unplugged_loudspeaker_stays_silent_and_the_other_is_not_disturbed(name: str) -> None:
+    unplugged = PATHS.copy()
+    unplugged[:, 1] = 0.0
+    both, alone = made(name, unplugged), made(name, unplugged[:, :1])
+    options: dict[str, Any] = {"primary_path": PRIMARY, "fs": FS}
+    with_it = simulate(both, noise(), secondary_path=unplugged, **options)
+    without = simulate(alone, noise(), secondary_path=unplugged[:, :1], **options)
+    np.testing.assert_array_equal(with_it.control_signal[1], 0.0)
+    np.testing.assert_array_equal(with_it.control_signal[0], without.control_signal[0])
+    np.testing.assert_array_equal(with_it.error, without.error)
+
+
+def test_a_microphone_that_no_loudspeaker_reaches_is_left_as_it_is() -> None:
+    deaf = np.concatenate([PATHS, np.zeros((1, J, PATHS.shape[2]))])
+    x = noise()
+    d = np.concatenate([run(made("FxLMS", PATHS), x).disturbance, 5.0 * np.ones((1, x.shape[1]))])
+    with_it = simulate(made("FxLMS", deaf), x, disturbance=d, secondary_path=deaf, fs=FS)
+    without = simulate(made("FxLMS", PATHS), x, disturbance=d[:K], secondary_path=PATHS, fs=FS)
+    np.testing.assert_array_equal(with_it.control_signal, without.control_signal)
+    np.testing.assert_array_equal(with_it.error[K], 5.0)
+
+
+@pytest.mark.parametrize("difference", [0.0, 1e-8], ids=["identical", "nearly identical"])
+def test_identical_loudspeakers_share_the_work_of_one(difference: float) -> None:
+    """Singular, and yet the gradient from zero leads to the least weights: each plays half of what one alone would."""
+    alike = np.stack([PATHS[:, 0], PATHS[:, 0] + difference * PATHS[:, 1]], axis=1)
+    x, options = noise(3000), {"primary_path": PRIMARY, "fs": FS}
+    two, one = made("FxLMS", alike), FxLMS(L, alike[:, :1], step_size=2 * MU, n_references=I)
+    shared = simulate(two, x, secondary_path=alike, **options)
+    alone = simulate(one, x, secondary_path=alike[:, :1], **options)
+    np.testing.assert_allclose(shared.control_signal[0], shared.control_signal[1], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(shared.control_signal.sum(axis=0), alone.control_signal[0], rtol=0, atol=1e-4)
+
+
 # ---- Where it settles
 
 

@@ -42,7 +42,7 @@ def test_it_converges_to_the_dense_solution_with_complementary_slackness() -> No
     rated = np.array([0.1, 0.2, 50.0])  # the last one does not bind
     budget = ChannelBudget(secondary, TAPS, PRIMARY, REFERENCES, rated)
     D = correlation(x, budget.n_lags)
-    for _ in range(40):
+    for _ in range(60):
         budget.solve(D, primary)
     R, of_x, r = dense(secondary, primary, D)
     w, _, power = constrained_filters(R, of_x, r, rated, RIDGE)
@@ -54,6 +54,21 @@ def test_it_converges_to_the_dense_solution_with_complementary_slackness() -> No
     penalties = block_diag(*(p * of_x for p in budget.penalty)) + RIDGE * np.trace(R) / len(R) * np.eye(len(R))
     residual = (R + penalties) @ budget.weights.ravel() - r
     assert np.abs(residual).max() < 1e-9 * np.abs(r).max()
+
+
+@pytest.mark.parametrize("coupling", [0.0, 0.9, 0.99, 0.99999])
+def test_coupled_loudspeakers_settle_within_ten_solves(coupling: float) -> None:
+    """One takes over what the other leaves: their penalties must not swing."""
+    secondary, primary, x = scene()
+    secondary[:, 1] = coupling * secondary[:, 0] + (1.0 - coupling) * secondary[:, 1]
+    secondary, rated = secondary[:, :2], np.array([0.05, 0.05])
+    budget = ChannelBudget(secondary, TAPS, PRIMARY, REFERENCES, rated)
+    D = correlation(x, budget.n_lags)
+    for _ in range(10):
+        budget.solve(D, primary)
+    filters = budget.weights.reshape(2, -1)
+    _, of_x, _ = dense(np.repeat(secondary, 2, axis=1)[:, :J], primary, D)
+    np.testing.assert_allclose(np.einsum("ja,ab,jb->j", filters, of_x, filters), rated, rtol=0.02)
 
 
 @pytest.mark.parametrize("fault", ["unplugged", "identical", "silent"])
