@@ -98,10 +98,11 @@ class ChannelBudget:
         """
         assert self.penalty is not None
         ratio = np.log(np.clip(power / self.rated_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE))
-        common = np.average(ratio, weights=self.penalty)
+        floor = SMALLEST_WEIGHT * natural  # there, a power is not used up, and its ratio does not count
+        common = np.average(ratio, weights=np.maximum(self.penalty - floor, np.finfo(float).tiny))
         exponent = min(0.5 + 0.5 * natural / self.penalty.mean(), 1.0)
         change = np.exp(exponent * common + 0.5 * (ratio - common))
-        self.penalty = np.maximum(self.penalty * change, SMALLEST_WEIGHT * natural)
+        self.penalty = np.maximum(self.penalty * change, floor)
 
     def _right_side(self, correlation: np.ndarray, primary: np.ndarray) -> np.ndarray:
         """Return r, (J I, n_taps)."""

@@ -42,7 +42,7 @@ def test_it_converges_to_the_dense_solution_with_complementary_slackness() -> No
     rated = np.array([0.1, 0.2, 50.0])  # the last one does not bind
     budget = ChannelBudget(secondary, TAPS, PRIMARY, REFERENCES, rated)
     D = correlation(x, budget.n_lags)
-    for _ in range(60):
+    for _ in range(40):
         budget.solve(D, primary)
     R, of_x, r = dense(secondary, primary, D)
     w, _, power = constrained_filters(R, of_x, r, rated, RIDGE)
