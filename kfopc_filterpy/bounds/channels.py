@@ -122,9 +122,9 @@ class ChannelCorrelations:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the weights of the least error within the rated powers, and the penalties, (J,).
 
-        The penalties maximise the dual, ``-r'w - penalty'rated_power``, which is concave: its gradient is the power beyond
-        the rated one. Newton's method finds them. Its usual step solves for 1 / sqrt(power), nearly linear in the
-        penalties (Hebden; More and Sorensen); a step that does not climb is halved, or made for the dual itself.
+        The penalties maximise the dual, ``-r'w - penalty'rated_power``, which is concave: its gradient is the power
+        beyond the rated one. Newton's method finds them. Its usual step solves for 1 / sqrt(power), nearly linear in
+        the penalties (Hebden; More and Sorensen); a step that does not climb is halved, or made for the dual itself.
         `start`, penalties of similar powers, saves some of the steps.
         """
         J = self.shape[0]
@@ -196,7 +196,7 @@ class _Dual(NamedTuple):
 
     @property
     def missed(self) -> float:
-        """The largest relative deviation of a power that is beyond its rated power, or has a penalty and is below it."""
+        """Largest relative deviation of a power that is beyond its rated power, or below it and has a penalty."""
         deviation = self.power / self.rated_power - 1.0
         return float(np.max(np.where(self.penalty > 0.0, np.abs(deviation), deviation), initial=0.0))
 

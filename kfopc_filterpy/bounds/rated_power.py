@@ -26,8 +26,8 @@ class RatedPower:
     constraint_factor : numpy.ndarray
         Scaling α of the Wiener filter that reaches each; 1 if it is out of reach.
     rated_power : numpy.ndarray
-        Rated power (mean square) that it takes; infinite if it is out of reach. With several loudspeakers, the last axis
-        is the loudspeaker.
+        Rated power (mean square) that it takes; infinite if it is out of reach. With several loudspeakers, the last
+        axis is the loudspeaker.
     """
 
     noise_reduction_db: np.ndarray

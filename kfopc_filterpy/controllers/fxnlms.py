@@ -76,8 +76,8 @@ class FxNLMS(LMSController):
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
 
-    One step size therefore suits soft and loud noise. With several channels, all filters are divided by the same energy,
-    that of all filtered references, so that the direction stays that of the multiple-error LMS:
+    One step size therefore suits soft and loud noise. With several channels, all filters are divided by the same
+    energy, that of all filtered references, so that the direction stays that of the multiple-error LMS:
 
     .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
        {\epsilon + \sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
@@ -98,9 +98,9 @@ class FxNLMS(LMSController):
 
     References
     ----------
-    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999. For several
-    channels, S. J. Elliott, Signal Processing for Active Control, Academic Press 2001, ch. 5; the energy of all channels is
-    the trace of the matrix whose largest eigenvalue bounds the step size there.
+    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999. For several channels,
+    S. J. Elliott, Signal Processing for Active Control, Academic Press 2001, ch. 5; the energy of all channels is the
+    trace of the matrix whose largest eigenvalue bounds the step size there.
 
     Examples
     --------

@@ -262,7 +262,7 @@ class SharedGainKalman(FilteredReferenceController):
         state.weights[...] = self._budget.weights
 
     def _scale(self, power: float) -> None:
-        """Set the state noise and the initial variance for references of a power, or lower the state noise if it grew."""
+        """Set the state noise and the initial variance for a power of the references; if it grew, the former only."""
         state = self._state
         now, wanted = state.numbers["state_noise"][0], 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
         if now == 0.0:

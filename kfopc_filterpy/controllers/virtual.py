@@ -20,9 +20,9 @@ class Observer(Protocol):
     """What `VirtualMicrophones` asks of the estimator of the disturbance."""
 
     def estimate(self, disturbance: np.ndarray) -> np.ndarray:
-        """Return the disturbance at the virtual microphones, (K_v,), from its newest sample at the physical ones, (K_p,).
+        """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
 
-        Nothing is changed.
+        `disturbance` is its newest sample at the physical microphones, (K_p,).
         """
         ...
 
@@ -71,9 +71,10 @@ class KalmanObserver:
     Parameters
     ----------
     model : control.StateSpace
-        Model of the disturbance, discrete in time with ``dt = 1/fs`` and stable. Inputs: the noise sources. Outputs: the
-        physical microphones, then the virtual ones. `realize_paths` makes one of primary paths; the colour of the noise
-        is part of the model. Of a model with the control signals as further inputs, pass ``model[:, :n_sources]``.
+        Model of the disturbance, discrete in time with ``dt = 1/fs`` and stable. Inputs: the noise sources. Outputs:
+        the physical microphones, then the virtual ones. `realize_paths` makes one of primary paths; the colour of the
+        noise is part of the model. If the control signals are further inputs of a model, pass
+        ``model[:, :n_sources]``.
     n_physical : int
         Number of physical microphones K_p; the other outputs are virtual.
     sensor_noise_std : float or array_like, shape (K_p,)
@@ -103,9 +104,9 @@ class KalmanObserver:
 
     References
     ----------
-    C. D. Petersen, R. Fraanje, B. S. Cazzolato, A. C. Zander, C. H. Hansen, "A Kalman filter approach to virtual sensing
-    for active noise control", Mechanical Systems and Signal Processing 22(2), 2008. The correlation of process and
-    measurement noise: T. Kailath, A. H. Sayed, B. Hassibi, Linear Estimation, Prentice Hall 2000, ch. 9.
+    C. D. Petersen, R. Fraanje, B. S. Cazzolato, A. C. Zander, C. H. Hansen, "A Kalman filter approach to virtual
+    sensing for active noise control", Mechanical Systems and Signal Processing 22(2), 2008. The correlation of process
+    and measurement noise: T. Kailath, A. H. Sayed, B. Hassibi, Linear Estimation, Prentice Hall 2000, ch. 9.
 
     Examples
     --------
@@ -208,9 +209,9 @@ class VirtualMicrophones(WrappedController):
     secondary_path : array_like, shape (K, J, taps), or nested sequence of control systems
         Estimated secondary paths to all microphones of the plant, physical and virtual.
     observer : ObservationFilters, array_like of shape (K_v, K_p, n_taps), KalmanObserver, or an object like it
-        What estimates the disturbance. An object has two methods: ``estimate(disturbance)`` returns (K_v,) for the newest
-        sample (K_p,) and changes nothing, ``advance(disturbance)`` takes the sample into its memory. It is not shared
-        with another controller.
+        What estimates the disturbance. An object has two methods: ``estimate(disturbance)`` returns (K_v,) for the
+        newest sample (K_p,) and changes nothing, ``advance(disturbance)`` takes the sample into its memory. It is not
+        shared with another controller.
     physical : sequence of int
         Indices of the microphones that exist, in the order in which the observer takes them.
     virtual : sequence of int, optional
@@ -231,8 +232,8 @@ class VirtualMicrophones(WrappedController):
 
     Notes
     -----
-    `simulate` calls it sample by sample, which costs some 30 microseconds more than such calls of `controller` alone, and
-    these cost more than its compiled loop. The multiplications are K J taps for the secondary paths, and
+    `simulate` calls it sample by sample, which costs some tens of microseconds more than such calls of `controller`
+    alone, and these cost more than its compiled loop; the tutorial prints the time. The multiplications are K J taps for the secondary paths, and
     K_v K_p n_taps for observation filters.
 
     References
@@ -404,7 +405,7 @@ class VirtualMicrophones(WrappedController):
         self.controller.listen(references, virtual_errors)
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the secondary path, the observer or the controller is for another rate than `fs` in Hz."""
+        """Raise ValueError if secondary path, observer or controller are for another rate than `fs` in Hz."""
         require_rates(fs, {"secondary path": self._path_fs, "observer": getattr(self.observer, "fs", None)})
         if hasattr(self.controller, "require_sample_rate"):
             self.controller.require_sample_rate(fs)

@@ -65,8 +65,8 @@ def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRea
     References
     ----------
     J.-N. Juang, R. S. Pappa, "An eigensystem realization algorithm for modal parameter identification and model
-    reduction", J. Guidance 8(5), 1985. S.-Y. Kung, "A new identification and model reduction algorithm via singular value
-    decomposition", Asilomar Conf. 1978.
+    reduction", J. Guidance 8(5), 1985. S.-Y. Kung, "A new identification and model reduction algorithm via singular
+    value decomposition", Asilomar Conf. 1978.
 
     Examples
     --------
