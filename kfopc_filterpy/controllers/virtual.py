@@ -233,8 +233,8 @@ class VirtualMicrophones(WrappedController):
     Notes
     -----
     `simulate` calls it sample by sample, which costs some tens of microseconds more than such calls of `controller`
-    alone, and these cost more than its compiled loop; the tutorial prints the time. The multiplications are K J taps for the secondary paths, and
-    K_v K_p n_taps for observation filters.
+    alone, and these cost more than its compiled loop; the tutorial prints the time. The multiplications are K J taps
+    for the secondary paths, and K_v K_p n_taps for observation filters.
 
     References
     ----------
