@@ -16,7 +16,7 @@ def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None 
     if array.ndim != 1:
         raise ValueError(
             f"{name} must be one-dimensional, (n,), got shape {array.shape}; "
-            f"pass one channel, e.g. {name}[0] or {name}.ravel()"
+            f"pass one channel, e.g. {name}[{', '.join('0' * (array.ndim - 1)) or 0}] or {name}.ravel()"
         )
     if length is not None and array.size != length:
         raise ValueError(f"{name} must have {length} values, got {array.size}")

@@ -111,17 +111,25 @@ class ChannelCorrelations:
         rows = weights.reshape(self.shape[0], -1)
         return np.einsum("ja,ab,jb->j", rows, self.reference, rows)
 
-    def constrained_weights(self, rated_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def antinoise(self, weights: np.ndarray) -> float:
+        """Return by how much the weights lower the error's power, summed over microphones: 2 w'r - w' R_x' w."""
+        w = weights.ravel()
+        return float(2.0 * w @ self.cross - w @ self.filtered @ w)
+
+    def constrained_weights(
+        self, rated_power: np.ndarray, start: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the weights of the least error within the rated powers, and the penalties, (J,).
 
         Projected Newton steps on the penalties, of which the dual problem is concave. Each is found for
         1 / sqrt(power), which is nearly linear in the penalty (Moré and Sorensen 1983), and shortened until it gains.
+        `start`, penalties of similar powers, saves some of the steps.
         """
         J = self.shape[0]
         if not np.trace(self.filtered) > 0.0:
             return np.zeros(self.shape), np.zeros(J)
         natural = np.trace(self.filtered) / np.trace(self.reference) / J
-        penalty = trial = np.zeros(J)
+        penalty = trial = np.zeros(J) if start is None else start.copy()
         weights = np.zeros(self.shape)
         gained, step = -np.inf, np.full(J, natural)
         for _ in range(SOLUTIONS):

@@ -1,4 +1,4 @@
-"""Rated power that KF-OPC needs for a given noise reduction."""
+"""Rated power that a noise reduction takes: if the control filter is scaled, and if the budget is spent best."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_choice, as_positive, require_finite
+from .._validate import as_choice, as_positive, as_real_array, per_loudspeaker, require_finite
+from ..paths.channels import is_path_matrix
+from .channels import ChannelCorrelations, channel_record
+from .wiener import reduction_db, require_sound
+
+ROUNDING_DB = 1e-9  # by which a noise reduction may exceed the largest one: its last digit may have been rounded up
 
 
 @dataclass(frozen=True)
@@ -21,7 +26,8 @@ class RatedPower:
     constraint_factor : numpy.ndarray
         Scaling α of the Wiener filter that reaches each; 1 if it is out of reach.
     rated_power : numpy.ndarray
-        Rated power (mean square) that it takes; infinite if it is out of reach.
+        Rated power (mean square) that it takes; infinite if it is out of reach. With several loudspeakers, the last
+        axis is the loudspeaker.
     """
 
     noise_reduction_db: np.ndarray
@@ -29,12 +35,36 @@ class RatedPower:
     rated_power: np.ndarray
 
 
+@dataclass(frozen=True)
+class BudgetedRatedPower:
+    """Rated power needed for given noise reductions if it is spent best; made by `budgeted_rated_power`.
+
+    Attributes
+    ----------
+    noise_reduction_db : numpy.ndarray
+        Noise reductions wanted, in dB.
+    rated_power : numpy.ndarray
+        Rated power (mean square) of each loudspeaker, of the shape of `noise_reduction_db` with an axis (J,) added;
+        infinite if the noise reduction is out of reach. For one channel without that axis.
+    control_power : numpy.ndarray
+        What each loudspeaker spends of it, of the same shape; NaN if out of reach.
+    penalty : numpy.ndarray
+        Weight of each loudspeaker's power, of the same shape: 0 if its rated power does not bind, NaN if out of reach.
+        Where it is largest, more power would help most.
+    """
+
+    noise_reduction_db: np.ndarray
+    rated_power: np.ndarray
+    control_power: np.ndarray
+    penalty: np.ndarray
+
+
 def required_rated_power(
     noise_reduction_db: Any,
     *,
     disturbance_power: float,
     antinoise_power: float,
-    control_power: float,
+    control_power: Any,
     beyond: str = "raise",
 ) -> RatedPower:
     r"""Return the rated power that KF-OPC needs to reach a noise reduction.
@@ -48,20 +78,28 @@ def required_rated_power(
     ----------
     noise_reduction_db : float or array_like
         Noise reductions wanted in dB, zero or above.
-    disturbance_power, antinoise_power, control_power : float
-        D, A and P_w: the attributes of a `WienerSolution` computed without a penalty.
+    disturbance_power, antinoise_power : float
+        D and A: the attributes of a `WienerSolution` computed without a penalty.
+    control_power : float or array_like, shape (J,)
+        P_w, likewise, of the loudspeaker or of each of several. These need :math:`α^2 P_j`: one factor scales all.
     beyond : {"raise", "inf"}, default "raise"
         Whether noise reductions that the Wiener filter itself does not attain raise an error or need infinite power.
 
     Returns
     -------
     RatedPower
-        Rated power and constraint factor, of the shape of `noise_reduction_db`.
+        Rated power and constraint factor, of the shape of `noise_reduction_db`. With several loudspeakers the rated
+        power has an axis (J,) added.
 
     Raises
     ------
     TypeError, ValueError
-        If a noise reduction is negative or out of reach, or a power is not positive.
+        If a noise reduction is negative or out of reach, or a power is not positive. Of several loudspeakers, some may
+        have no power.
+
+    See Also
+    --------
+    budgeted_rated_power : if the power is spent best, as KF-PB does; with several loudspeakers it is far less.
 
     Examples
     --------
@@ -73,17 +111,14 @@ def required_rated_power(
     """
     disturbance = as_positive(disturbance_power, "disturbance_power")
     antinoise = as_positive(antinoise_power, "antinoise_power")
-    control = as_positive(control_power, "control_power")
+    control = _control_power(control_power)
     as_choice(beyond, "beyond", ("raise", "inf"))
     if antinoise > disturbance * (1 + 1e-9):
         raise ValueError(
             f"antinoise_power must not exceed disturbance_power, got {antinoise:g} and {disturbance:g}: "
             "these are not the powers of a Wiener filter computed without a penalty"
         )
-    wanted = np.asarray(noise_reduction_db, dtype=np.float64)
-    require_finite(wanted, "noise_reduction_db")
-    if np.any(wanted < 0):
-        raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
+    wanted = _wanted(noise_reduction_db)
 
     # 2α - α² = (D - J)/A has the smaller root α = 1 - sqrt(1 - (D - J)/A).
     share = disturbance * (1 - 10 ** (-wanted / 10)) / antinoise
@@ -97,4 +132,156 @@ def required_rated_power(
             "use a longer control filter, or beyond='inf' to mark such values"
         )
     factor = 1 - np.sqrt(np.clip(1 - share, 0, 1))
-    return RatedPower(wanted, factor, np.where(attainable, factor**2 * control, np.inf))
+    each = (slice(None),) * wanted.ndim + (np.newaxis,) * np.ndim(control)
+    return RatedPower(wanted, factor, np.where(attainable[each], factor[each] ** 2 * control, np.inf))
+
+
+def _control_power(value: Any) -> Any:
+    """Return a positive number, or powers (J,) of which one at least is positive."""
+    if np.ndim(value) != 1:
+        return as_positive(value, "control_power")
+    powers = as_real_array(value, "control_power")
+    require_finite(powers, "control_power")
+    if np.any(powers < 0) or not np.any(powers > 0):
+        raise ValueError(f"control_power must not be negative, and one must be greater than 0, got {powers}")
+    return powers
+
+
+def _wanted(noise_reduction_db: Any) -> np.ndarray:
+    """Return the noise reductions wanted, finite and not negative."""
+    wanted = as_real_array(noise_reduction_db, "noise_reduction_db")
+    require_finite(wanted, "noise_reduction_db")
+    if np.any(wanted < 0):
+        raise ValueError(f"noise_reduction_db must not be negative, got {wanted.min():g} dB")
+    return wanted
+
+
+def budgeted_rated_power(
+    noise_reduction_db: Any,
+    reference: Any,
+    disturbance: Any,
+    secondary_path: Any,
+    n_taps: int,
+    *,
+    fs: float,
+    proportions: Any = None,
+    beyond: str = "raise",
+) -> BudgetedRatedPower:
+    """Return the rated power that a noise reduction takes if it is spent best.
+
+    All loudspeakers have the same rated power, or rated powers in given proportions. The smallest ones are found within
+    which `power_constrained_wiener` reaches the noise reduction over the record. KF-PB comes close to that.
+    `required_rated_power` says what it takes if the control filter is only scaled.
+
+    Parameters
+    ----------
+    noise_reduction_db : float or array_like
+        Noise reductions wanted in dB, zero or above, over all microphones.
+    reference : array_like, shape (n_samples,) or (I, n_samples)
+        Reference signal x.
+    disturbance : array_like, shape (n_samples,) or (K, n_samples)
+        Disturbance d at the error microphones.
+    secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
+        Secondary path s, at the signals' sampling rate; with several channels also a matrix of systems.
+    n_taps : int
+        Taps of each control filter.
+    fs : float
+        Sampling rate in Hz.
+    proportions : array_like, shape (J,), optional
+        Proportions of the rated powers, such as ``[1, 1, 4]`` for a third loudspeaker with four times the power of the
+        others; by default all are equal.
+    beyond : {"raise", "inf"}, default "raise"
+        Whether noise reductions that no power attains with these taps raise an error or need infinite power.
+
+    Returns
+    -------
+    BudgetedRatedPower
+        Rated powers, what is spent of them, and what limits.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If a noise reduction is negative or out of reach, signals do not fit the paths, are silent or not finite, or
+        another argument is out of range.
+
+    Notes
+    -----
+    The powers are found by Brent's method on the logarithm of their scale, for one set of correlations: the noise
+    reduction grows with the scale. Each step solves for J I n_taps unknowns a few times.
+
+    Examples
+    --------
+    Two loudspeakers of the same rated power, and two microphones:
+
+    >>> from kfopc_filterpy import power_constrained_wiener
+    >>> from kfopc_filterpy.bounds import budgeted_rated_power
+    >>> x = np.random.default_rng(0).standard_normal((1, 4000))
+    >>> d = np.array([np.convolve(x[0], p)[:4000] for p in ([0, 0, 1.0, 0.5], [0, 0, 0.8, -0.2])])
+    >>> paths = [[[0, 1.0, 0.6], [0, 0.3, 0.3]], [[0, 0.4, 0.1], [0, 1.0, -0.5]]]
+    >>> needed = budgeted_rated_power([3.0, 10.0], x, d, paths, 8, fs=8000.0)
+    >>> needed.rated_power.round(3)
+    array([[0.033, 0.033],
+           [0.194, 0.194]])
+    >>> bound = power_constrained_wiener(x, d, paths, 8, needed.rated_power[1], fs=8000.0)
+    >>> print(f"{bound.whole.noise_reduction_db:.2f} dB, scaled {bound.scaled.noise_reduction_db:.2f} dB")
+    10.00 dB, scaled 5.99 dB
+    """
+    as_choice(beyond, "beyond", ("raise", "inf"))
+    wanted = _wanted(noise_reduction_db)
+    several = is_path_matrix(secondary_path) or np.ndim(reference) > 1
+    record = require_sound(channel_record(reference, disturbance, secondary_path, n_taps, fs))
+    shares = per_loudspeaker(1.0 if proportions is None else proportions, record.shape[0], "proportions")
+    search = _ScaleSearch(record.correlations(), shares, float(np.sum(np.mean(record.d**2, axis=-1))))
+    if beyond == "raise" and np.any(wanted > search.most_db + ROUNDING_DB):
+        raise ValueError(
+            f"noise_reduction_db must not exceed what unlimited power attains, {search.most_db:.2f} dB, got "
+            f"{wanted.max():g} dB; use longer control filters, or beyond='inf' to mark such values"
+        )
+    found = np.array([search.powers(one) for one in wanted.ravel()])  # (n, 3, J)
+    rated, spent, penalty = np.moveaxis(found, 1, 0).reshape(3, *wanted.shape, -1)
+    if not several:
+        rated, spent, penalty = rated[..., 0], spent[..., 0], penalty[..., 0]
+    return BudgetedRatedPower(wanted, rated, spent, penalty)
+
+
+class _ScaleSearch:
+    """The scale of the rated powers that a noise reduction takes."""
+
+    def __init__(self, correlations: ChannelCorrelations, shares: np.ndarray, disturbance_power: float) -> None:
+        self.correlations, self.shares, self.disturbance_power = correlations, shares, disturbance_power
+        free = correlations.weights()
+        self.most = 1.001 * float(np.max(correlations.powers(free) / shares))  # a scale at which no rating binds
+        self.most_db = self._reduction_db(free)
+        self._penalty: np.ndarray | None = None
+
+    def _reduction_db(self, weights: np.ndarray) -> float:
+        left = self.disturbance_power - self.correlations.antinoise(weights)
+        return reduction_db(left, self.disturbance_power)
+
+    def _at(self, log_scale: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return weights and penalties of a scale; the search goes on from the last penalties."""
+        weights, penalty = self.correlations.constrained_weights(np.exp(log_scale) * self.shares, self._penalty)
+        if np.any(penalty):
+            self._penalty = penalty
+        return weights, penalty
+
+    def powers(self, wanted_db: float) -> np.ndarray:
+        """Return rated powers, powers spent and penalties, (3, J)."""
+        from scipy.optimize import brentq
+
+        if wanted_db > self.most_db + ROUNDING_DB:
+            return np.array([np.full(self.shares.size, value) for value in (np.inf, np.nan, np.nan)])
+        if wanted_db == 0.0:
+            return np.zeros((3, self.shares.size))
+        reached_db = min(wanted_db, self.most_db)
+
+        def missing(log_scale: float) -> float:
+            return reached_db - self._reduction_db(self._at(log_scale)[0])
+
+        high = np.log(self.most)
+        low = high - 1.0
+        while missing(low) < 0.0:
+            low -= 3.0
+        scale = brentq(missing, low, high, xtol=1e-7)
+        weights, penalty = self._at(scale)
+        return np.array([np.exp(scale) * self.shares, self.correlations.powers(weights), penalty])

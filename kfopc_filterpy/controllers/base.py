@@ -84,6 +84,21 @@ def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
             )
 
 
+class WrappedController:
+    """Base of a controller that stands around another one; what it lacks itself is the other's."""
+
+    def __init__(self, controller: Controller) -> None:
+        if isinstance(controller, type) or not isinstance(controller, Controller):
+            raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+        self.controller = controller
+
+    def __getattr__(self, name: str) -> Any:
+        """Return any other attribute of the controller, but not Python's special methods, as those for copies."""
+        if name == "controller" or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.controller, name)
+
+
 class FilteredReferenceController:
     """Delay lines, powers and filtered reference that the built-in controllers share.
 

@@ -7,33 +7,68 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_positive
+from ..kernels.compiling import by_type
 from ..kernels.delay_lines import newest
 from ..kernels.vectors import dot
 from ..power.constraint import ConstraintState
-from ..power.limiter import OutputLimiter
-from .lms import LMSController, change_weights
+from .channels import ChannelLines
+from .lms import Limiters, LMSController, change_weights
 from .step import Lines, adapt, advance_powers
 
 
 class FxNLMSState(NamedTuple):
     """State of `FxNLMS`."""
 
-    lines: Lines
+    lines: Lines | ChannelLines
     weights: np.ndarray
-    constraint: ConstraintState
+    constraint: ConstraintState | tuple[ConstraintState, ...]
     step_size: float
     regularization: float
 
 
 @adapt.register(FxNLMSState)
 def adapt_fxnlms(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n))."""
+    """Set w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)); with several channels, both are sums over them."""
     finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
-        row = newest(state.lines.filtered, state.weights.size)
-        energy = state.regularization + dot(row, row)
-        change_weights(state.lines, state.weights, 1.0, 1.0, state.step_size * error / energy, 0.0)
+        energy = state.regularization + filtered_energy(state.lines, state.weights)
+        change_weights(
+            state.lines, state.weights, 1.0, 1.0, step_error(state.lines, error, state.step_size, energy), 0.0
+        )
     return finite
+
+
+@by_type
+def filtered_energy(lines, weights):
+    """Return x'(n)'x'(n)."""
+    row = newest(lines.filtered, weights.size)
+    return dot(row, row)
+
+
+@filtered_energy.register(ChannelLines)
+def channel_energy(lines, weights):
+    """Return its sum over microphones, loudspeakers and references."""
+    energy, filtered = 0.0, lines.filtered
+    for k in range(filtered.shape[0]):
+        for j in range(filtered.shape[1]):
+            for i in range(filtered.shape[2]):
+                row = newest(filtered[k, j, i], weights.shape[2])
+                energy += dot(row, row)
+    return energy
+
+
+@by_type
+def step_error(lines, error, step_size, energy):
+    """Return mu e(n) / energy."""
+    return step_size * error / energy
+
+
+@step_error.register(ChannelLines)
+def channel_step_errors(lines, error, step_size, energy):
+    """Return it for each microphone, (K,)."""
+    for k in range(error.size):
+        lines.modified_error[k] = step_size * error[k] / energy
+    return lines.modified_error
 
 
 class FxNLMS(LMSController):
@@ -41,14 +76,18 @@ class FxNLMS(LMSController):
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
 
-    One step size therefore suits soft and loud noise.
+    One step size therefore suits soft and loud noise. With several channels, all filters are divided by the same
+    energy, that of all filtered references, so that the direction stays that of the multiple-error LMS:
+
+    .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
+       {\epsilon + \sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
 
     Parameters
     ----------
-    n_taps, secondary_path, limiter
+    n_taps, secondary_path, n_references, limiter
         As for `FxLMS`.
     step_size : float
-        Step size mu, above zero; below 2 for a secondary path without delay, and smaller for a longer path.
+        Step size mu, above zero; below 2 for secondary paths without delay, and smaller for longer paths.
     regularization : float, default 1e-10
         Energy epsilon, above zero, that keeps the quotient finite while the reference is silent.
 
@@ -59,7 +98,9 @@ class FxNLMS(LMSController):
 
     References
     ----------
-    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999.
+    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999. For several channels,
+    S. J. Elliott, Signal Processing for Active Control, Academic Press 2001, ch. 5; the energy of all channels is the
+    trace of the matrix whose largest eigenvalue bounds the step size there.
 
     Examples
     --------
@@ -81,9 +122,10 @@ class FxNLMS(LMSController):
         *,
         step_size: float,
         regularization: float = 1e-10,
-        limiter: OutputLimiter | None = None,
+        n_references: int = 1,
+        limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, limiter=limiter)
+        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
         step, epsilon = as_positive(step_size, "step_size"), as_positive(regularization, "regularization")
         self._state = FxNLMSState(*self._common(), step, epsilon)
 

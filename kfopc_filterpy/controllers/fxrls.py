@@ -8,6 +8,7 @@ import numpy as np
 
 from .._validate import as_positive
 from ..filters.kfopc import KFOPC
+from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.limiter import OutputLimiter
 from .kalman import KalmanController
@@ -48,7 +49,8 @@ def fx_rls(
     Raises
     ------
     ValueError
-        A forgetting factor outside (0, 1], or arguments that `kf_anc` refuses. In a run: a P that is no longer positive
+        A forgetting factor outside (0, 1], secondary paths of several channels, or arguments that `kf_anc` refuses. In
+        a run: a P that is no longer positive
         definite. Band-limited noise and tones do not excite all directions of the control filter. In the others P grows
         by 1/lambda per sample until rounding corrupts it, after some 23 time constants of the memory. State noise
         instead of forgetting (`kf_anc`) causes no such growth.
@@ -68,6 +70,12 @@ def fx_rls(
     >>> round(float(controller.weights[0]), 6)  # K = 1 / (0.5 + 1)
     2.0
     """
+    if is_path_matrix(secondary_path):
+        raise ValueError(
+            "fx_rls takes one channel, because with several every microphone would need a covariance of its own: use "
+            "controllers.SharedGainKalman, one least-squares estimate for all microphones whose path_memory_s is the "
+            "memory, or an LMS algorithm such as FxNLMS"
+        )
     forgetting = as_positive(forgetting, "forgetting")
     if forgetting > 1.0:
         raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")

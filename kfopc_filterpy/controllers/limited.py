@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..power.limiter import OutputLimiter
-from .base import Controller, FilteredReferenceController, require_rates
+from .base import Controller, FilteredReferenceController, WrappedController, require_rates
 
 
-class LimitedController:
+class LimitedController(WrappedController):
     """A user-defined controller whose control signal passes through a limiter.
 
     The built-in controllers have their own `limiter`, with which they run at compiled speed.
@@ -48,9 +48,8 @@ class LimitedController:
             raise TypeError(f"limiter must be an OutputLimiter, got {limiter!r}")
         if isinstance(controller, FilteredReferenceController):
             raise ValueError("this controller has a limiter of its own: set controller.limiter, or pass limiter=")
-        if isinstance(controller, type) or not isinstance(controller, Controller):
-            raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
-        self.controller, self.limiter = controller, limiter
+        super().__init__(controller)
+        self.limiter = limiter
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
 
     def __repr__(self) -> str:
@@ -81,9 +80,3 @@ class LimitedController:
             raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
         self.controller.listen(references, errors)
         self.limiter.process(np.zeros(len(references)))
-
-    def __getattr__(self, name: str) -> Any:
-        """Return any other attribute of the controller, but not Python's special methods, as those for copies."""
-        if name == "controller" or name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self.controller, name)

@@ -17,6 +17,10 @@ from .identification import modelling_error_db as modelling_error_db
 from .models import fir_path as fir_path
 from .models import path_taps as path_taps
 from .models import perturbed_path as perturbed_path
+from .observation import ObservationFilters as ObservationFilters
+from .observation import identify_observation_filters as identify_observation_filters
+from .realization import PathRealization as PathRealization
+from .realization import realize_paths as realize_paths
 from .resampling import resample_path as resample_path
 from .rooms import RoomPaths as RoomPaths
 from .rooms import horizontal_plane as horizontal_plane

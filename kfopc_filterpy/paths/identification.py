@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -144,31 +144,33 @@ def estimate_path(
         return PathEstimate(_system(taps, fs), taps, residual_db)
     if sent.ndim == 2 or heard.ndim == 2:
         sent, heard = np.atleast_2d(as_channels(sent, "excitation")), np.atleast_2d(as_channels(heard, "response"))
-        _require_length(sent.shape[1], (len(sent) + 1) * n_taps - 1)
+        require_length(sent.shape[1], (len(sent) + 1) * n_taps - 1)
         if heard.shape[1] != sent.shape[1]:
             raise ValueError(f"response must have {sent.shape[1]} samples, as excitation has, got {heard.shape[1]}")
-        _require_audible(sent, heard, n_taps)
-        taps, residual_db = _fit(sent, heard, n_taps, ridge)
+        require_audible({"excitation": sent, "response": heard}, n_taps)
+        _require_different(sent, n_taps)
+        taps, residual_db = fit_paths(sent, heard, n_taps, ridge)
         return PathEstimate(_system(taps, fs), taps, residual_db)
     sent = as_signal(sent, "excitation", min_length=2 * n_taps - 1)
     heard = as_signal(heard, "response", length=sent.size)
-    _require_audible(sent, heard, n_taps)
-    taps, residual_db = _fit(sent[np.newaxis], heard[np.newaxis], n_taps, ridge)
+    require_audible({"excitation": sent, "response": heard}, n_taps)
+    taps, residual_db = fit_paths(sent[np.newaxis], heard[np.newaxis], n_taps, ridge)
     return PathEstimate(fir_path(taps[0, 0], fs), taps[0, 0], float(residual_db[0]))
 
 
-def _require_audible(sent: np.ndarray, heard: np.ndarray, n_taps: int) -> None:
+def require_audible(recorded: Mapping[str, np.ndarray], n_taps: int) -> None:
     """Raise ValueError if a signal, (..., n_samples), is silent where it is fitted; the message gives its index."""
-    for name, signals in (("excitation", sent), ("response", heard)):
+    for name, signals in recorded.items():
         silent = np.argwhere(~np.any(signals[..., n_taps - 1 :], axis=-1))
         if len(silent):
             index = "".join(f"[{i}]" for i in silent[0])
             raise ValueError(f"{name}{index} must not be silent: it does not reveal the path")
 
 
-def _require_length(n_samples: int, needed: int) -> None:
+def require_length(n_samples: int, needed: int, name: str = "excitation") -> None:
+    """Raise ValueError if a recording is shorter than a fit needs."""
     if n_samples < needed:
-        raise ValueError(f"excitation must have at least {needed} samples for these paths, got {n_samples}")
+        raise ValueError(f"{name} must have at least {needed} samples for these paths, got {n_samples}")
 
 
 def _fit_in_turn(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float) -> tuple[np.ndarray, np.ndarray]:
@@ -184,14 +186,14 @@ def _fit_in_turn(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float)
             f"excitation must be (J loudspeakers, n_samples) = {(len(heard), heard.shape[2])} for a response of shape "
             f"{heard.shape}, got {sent.shape}"
         )
-    _require_length(sent.shape[1], 2 * n_taps - 1)
-    _require_audible(sent, heard, n_taps)
-    fits = [_fit(sent[j : j + 1], responses, n_taps, ridge) for j, responses in enumerate(heard)]
+    require_length(sent.shape[1], 2 * n_taps - 1)
+    require_audible({"excitation": sent, "response": heard}, n_taps)
+    fits = [fit_paths(sent[j : j + 1], responses, n_taps, ridge) for j, responses in enumerate(heard)]
     return np.concatenate([taps for taps, _ in fits], axis=1), np.stack([residual for _, residual in fits], axis=1)
 
 
-def _fit(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return taps (K, J, n_taps) and residuals (K,) in dB of loudspeakers that play at once."""
+def fit_paths(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return taps (K, J, n_taps) and residuals (K,) in dB of K signals that depend on J others."""
     matrix = _normal_matrix(sent, n_taps)
     for j, signal in enumerate(sent):
         diagonal = np.arange(j * n_taps, (j + 1) * n_taps)
@@ -208,8 +210,22 @@ def _fit(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float
     return taps, 10 * np.log10(np.maximum(unexplained, 1e-30))
 
 
+def _require_different(sent: np.ndarray, n_taps: int) -> None:
+    """Raise ValueError if two excitations are the same signal at some delay."""
+    past = sent[:, n_taps - 1 :]
+    for j, signal in enumerate(sent):
+        for i in range(j):
+            size = np.sqrt(np.mean(past[i] ** 2) * np.mean(past[j] ** 2))
+            one, other = cross_correlation(past[i], signal), cross_correlation(past[j], sent[i])
+            if max(np.abs(one).max(), np.abs(other).max()) > _LARGEST_CORRELATION * size:
+                raise ValueError(
+                    f"excitation[{j}] must not be correlated with excitation[{i}], for their paths cannot be told "
+                    "apart: play noises of different seeds, or let the loudspeakers play in turn"
+                )
+
+
 def _normal_matrix(sent: np.ndarray, n_taps: int) -> np.ndarray:
-    """Return the correlations of all delays of all excitations, (J n_taps, J n_taps); refuse excitations that agree."""
+    """Return the correlations of all delays of all excitations, (J n_taps, J n_taps)."""
     J, start = len(sent), n_taps - 1
     blocks = np.empty((J, n_taps, J, n_taps))
     for j, signal in enumerate(sent):
@@ -217,12 +233,6 @@ def _normal_matrix(sent: np.ndarray, n_taps: int) -> np.ndarray:
         for i in range(j):
             blocks[i, :, j] = cross_correlation_matrix(sent[i], signal, n_taps, start)
             blocks[j, :, i] = blocks[i, :, j].T
-            size = np.sqrt(blocks[i, 0, i, 0] * blocks[j, 0, j, 0])
-            if np.abs(blocks[i, :, j]).max() > _LARGEST_CORRELATION * size:
-                raise ValueError(
-                    f"excitation[{j}] must not be correlated with excitation[{i}], for their paths cannot be told "
-                    "apart: play noises of different seeds, or let the loudspeakers play in turn"
-                )
     return blocks.reshape(J * n_taps, J * n_taps)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_signal
+from .._validate import as_positive, as_signal
 from ..bounds.rated_power import required_rated_power
 from ..bounds.wiener import WienerSolution
 from ..paths.analysis import (
@@ -435,7 +435,8 @@ def plot_required_rated_power(
     Parameters
     ----------
     solution : WienerSolution
-        Wiener filter of the reference and disturbance at hand, computed without a penalty.
+        Wiener filter of the reference and disturbance at hand, computed without a penalty. With several loudspeakers,
+        the `unconstrained` one of `power_constrained_wiener`; each has a line.
     rated_power : float, optional
         A rated power to mark.
     ax : matplotlib.axes.Axes, optional
@@ -464,7 +465,8 @@ def plot_required_rated_power(
     ['Wiener filter unconstrained: 20.0 dB', 'Rated power 0.1']
     >>> plt.close(ax.figure)
     """
-    powers = {
+    marked = None if rated_power is None else as_positive(rated_power, "rated_power")
+    known = {
         "disturbance_power": solution.disturbance_power,
         "antinoise_power": min(solution.antinoise_power, solution.disturbance_power),
         "control_power": solution.control_power,
@@ -472,12 +474,15 @@ def plot_required_rated_power(
     limit = solution.noise_reduction_db
     shown = min(limit, 60.0)  # a noiseless tone can be cancelled to rounding
     wanted = np.linspace(0.02, 0.999, 400) * shown
-    needed = required_rated_power(wanted, **powers, beyond="inf")
+    needed = required_rated_power(wanted, **known, beyond="inf")
     ax = new_axes(ax)
-    ax.semilogy(wanted, needed.rated_power, label="Wiener filter scaled by α", **line_style(0))
-    ax.axvline(limit, label=f"Wiener filter unconstrained: {limit:.1f} dB", **line_style(1))
-    if rated_power is not None:
-        ax.axhline(rated_power, label=f"Rated power {rated_power:g}", **line_style(2))
+    each = needed.rated_power.reshape(wanted.size, -1).T
+    for j, powers in enumerate(each):
+        label = "Wiener filter scaled by α" + (f", loudspeaker {j}" if len(each) > 1 else "")
+        ax.semilogy(wanted, np.where(powers > 0, powers, np.nan), label=label, **line_style(j))
+    ax.axvline(limit, label=f"Wiener filter unconstrained: {limit:.1f} dB", **line_style(len(each)))
+    if marked is not None:
+        ax.axhline(marked, label=f"Rated power {marked:g}", **line_style(len(each) + 1))
     ax.set(xlabel="Noise reduction (dB)", ylabel="Rated power needed (mean square)")
     ax.set_xlim(0, 1.05 * shown)
     ax.grid(True, which="major", alpha=0.3)

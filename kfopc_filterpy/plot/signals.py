@@ -285,13 +285,12 @@ def plot_disturbance_and_anti_noise(
     low, high = as_band(band, run.fs)
     disturbance, anti_noise = one_channel(run.disturbance, channel), one_channel(run.anti_noise, channel)
     coherence, gain = coherence_and_gain(disturbance, anti_noise, run.fs, (low, high))
-    powers = ", ".join(f"{power:.5g}" for power in np.atleast_1d(output_power(run.control_signal)))
     text = (
         f"Anti-noise over disturbance, {low:g} to {high:g} Hz: coherence {coherence:.4f}, gain {gain:.3f}\n"
-        f"Output power {powers}"
+        f"Output power {_listed(output_power(run.control_signal), '.5g')}"
     )
     if run.rated_power is not None:
-        text += f", rated power {run.rated_power:g}"
+        text += f", rated power {_listed(run.rated_power, 'g')}"
     ax = new_axes(ax)
     time = times(run, part, span_axis(ax, span_s))
     ax.plot(time, disturbance[part], label="Disturbance", **{**DISTURBANCE, "linewidth": 1.6})
@@ -303,6 +302,11 @@ def plot_disturbance_and_anti_noise(
     assert legend is not None
     legend.set_title(text, prop=FontProperties(size="small"))
     return ax
+
+
+def _listed(powers: Any, form: str) -> str:
+    """Return a number, or one for each loudspeaker, as text."""
+    return ", ".join(format(power, form) for power in np.atleast_1d(powers))
 
 
 def _peak(signal: np.ndarray) -> float:

@@ -102,9 +102,24 @@ class ChannelBudget:
             v = conjugate_gradients(product, inverse, r, v, STEPS)
             filters = v.reshape(J, n_references, n)
             power = np.array([np.vdot(w, power_product(w)) for w in filters])
-            change = np.clip(power / self.rated_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE)
-            self.penalty = np.maximum(self.penalty * change, SMALLEST_WEIGHT * natural)
+            self._adjust_penalty(power, natural)
         self.weights = filters
+
+    def _adjust_penalty(self, power: np.ndarray, natural: float) -> None:
+        """Multiply each penalty by a power of its loudspeaker's power over the rated power.
+
+        The exponent of what all have in common, weighted by the penalties, is the inverse of the slope on a flat path,
+        where the power goes as ``(1 + penalty/natural)^-2``. What they differ in is damped by the root: of loudspeakers
+        that are coupled, one takes over what the other leaves, as the inverse square of their penalties, and undamped
+        they would swing.
+        """
+        assert self.penalty is not None
+        ratio = np.log(np.clip(power / self.rated_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE))
+        floor = SMALLEST_WEIGHT * natural  # there, a power is not used up, and its ratio does not count
+        common = np.average(ratio, weights=np.maximum(self.penalty - floor, np.finfo(float).tiny))
+        exponent = min(0.5 + 0.5 * natural / self.penalty.mean(), 1.0)
+        change = np.exp(exponent * common + 0.5 * (ratio - common))
+        self.penalty = np.maximum(self.penalty * change, floor)
 
     def _right_side(self, correlation: np.ndarray, primary: np.ndarray) -> np.ndarray:
         """Return r, (J I, n_taps)."""

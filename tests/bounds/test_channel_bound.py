@@ -47,6 +47,34 @@ def test_the_bound_meets_dense_solves_and_every_budget() -> None:
     assert bound.unconstrained.noise_reduction_db > bound.whole.noise_reduction_db > bound.scaled.noise_reduction_db
 
 
+@pytest.mark.parametrize("share", [1e-8, 1e-3, 0.5, 0.99])
+def test_the_powers_are_met_however_tight_they_are(share: float) -> None:
+    """With the optimality conditions of the problem, from dense sums: a gradient of zero, and what binds used up."""
+    x, d = signals()
+    R, of_x, r = dense_systems(x, d, SECONDARY, TAPS, 0)
+    free = np.linalg.solve(R, r).reshape(J, -1)
+    rated = share * np.einsum("ja,ab,jb->j", free, of_x, free)
+    bound = power_constrained_wiener(x, d, SECONDARY, TAPS, rated, fs=FS).whole
+    w = bound.weights.reshape(J, -1)
+    left = R @ w.ravel() + np.ravel(bound.penalty[:, np.newaxis] * (w @ of_x)) - r
+    assert np.linalg.norm(left) < 1e-7 * np.linalg.norm(r)
+    assert np.all(bound.penalty > 0)
+    np.testing.assert_allclose(np.einsum("ja,ab,jb->j", w, of_x, w), rated, rtol=2e-5)
+
+
+@pytest.mark.parametrize("difference", [0.0, 1e-5, 1e-3])
+def test_loudspeakers_that_are_alike_keep_their_powers(difference: float) -> None:
+    """The free solution then has powers that mean nothing, up to a million times what the bound spends."""
+    x, d = signals()
+    alike = np.stack([SECONDARY[:, 0], SECONDARY[:, 0] + difference * SECONDARY[:, 1]], axis=1)
+    one = power_constrained_wiener(x, d, SECONDARY[:, :1], TAPS, 0.02, fs=FS).whole
+    two = power_constrained_wiener(x, d, alike, TAPS, 0.01, fs=FS).whole
+    assert np.all(two.control_power < 0.01 * 1.001)
+    assert two.noise_reduction_db > one.noise_reduction_db  # 0.01 from each of two is as loud as 0.04 from one
+    if difference == 0.0:
+        np.testing.assert_allclose(two.weights[0], two.weights[1], rtol=1e-4, atol=1e-8)
+
+
 def test_each_second_keeps_its_budgets() -> None:
     x, d = signals()
     x, d = x * np.repeat([1.0, 3.0, 0.1], 1000), d * np.repeat([1.0, 3.0, 0.1], 1000)

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import scipy.signal
+from helpers.channels import random_paths, through
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy.bounds.rated_power import required_rated_power
+from kfopc_filterpy import power_constrained_wiener
+from kfopc_filterpy.bounds import budgeted_rated_power, required_rated_power
 from kfopc_filterpy.bounds.wiener import wiener_solution
 
 POWERS = {"disturbance_power": 2.0, "antinoise_power": 1.9, "control_power": 5.0}
@@ -67,3 +69,96 @@ def test_limits_and_shapes():
 def test_refuses(wanted, changes, message):
     with pytest.raises(ValueError, match=message):
         required_rated_power(wanted, **{**POWERS, **changes})
+
+
+# ---- Several loudspeakers
+
+FS, TAPS, K, J = 1000.0, 8, 3, 2
+SECONDARY = random_paths(K, J, 7, seed=0)
+
+
+def signals(n_samples=2500):
+    rng = np.random.default_rng(2)
+    x = np.array([np.convolve(row, [1.0, 0.7], "same") for row in rng.standard_normal((2, n_samples))])
+    return x, through(random_paths(K, 2, 12, seed=1, delay=3), x) + 0.1 * rng.standard_normal((K, n_samples))
+
+
+def bound(rated_power):
+    return power_constrained_wiener(*signals(), SECONDARY, TAPS, rated_power, fs=FS)
+
+
+def test_scaled_filters_of_several_loudspeakers_reach_the_reduction_at_those_powers():
+    free = bound(1e6).unconstrained
+    powers = {name: getattr(free, name) for name in ("disturbance_power", "antinoise_power", "control_power")}
+    needed = required_rated_power([0.5, 1.5], **powers)
+    assert needed.rated_power.shape == (2, J)
+    assert required_rated_power(0.5, **powers).rated_power.shape == (J,)
+    for wanted, rated, factor in zip([0.5, 1.5], needed.rated_power, needed.constraint_factor, strict=True):
+        scaled = bound(rated).scaled
+        assert scaled.noise_reduction_db == pytest.approx(wanted, abs=1e-6)
+        assert scaled.constraint_factor == pytest.approx(factor, rel=1e-6)
+        np.testing.assert_allclose(scaled.control_power, rated, rtol=1e-9)
+    silent = required_rated_power(3.0, disturbance_power=2.0, antinoise_power=1.9, control_power=[5.0, 0.0])
+    assert silent.rated_power[1] == 0.0 < silent.rated_power[0]
+    out = required_rated_power([3.0, 40.0], **POWERS | {"control_power": [5.0, 0.0]}, beyond="inf")
+    assert out.rated_power[1].tolist() == [np.inf, np.inf]
+
+
+@pytest.mark.parametrize("proportions", [None, [1.0, 5.0]])
+def test_a_budget_of_that_power_reaches_the_reduction_and_less_does_not(proportions):
+    most = bound(1e6).unconstrained.noise_reduction_db
+    wanted = np.array([[1e-3, 0.3 * most], [0.6 * most, 0.95 * most]])
+    needed = budgeted_rated_power(wanted, *signals(), SECONDARY, TAPS, fs=FS, proportions=proportions)
+    assert needed.rated_power.shape == needed.control_power.shape == needed.penalty.shape == (2, 2, J)
+    np.testing.assert_allclose(needed.rated_power[..., 1] / needed.rated_power[..., 0], (proportions or [1, 1])[1])
+    for index in np.ndindex(2, 2):
+        rated = needed.rated_power[index]
+        reached = bound(rated).whole
+        assert reached.noise_reduction_db == pytest.approx(wanted[index], abs=1e-4)
+        np.testing.assert_allclose(reached.control_power, needed.control_power[index], rtol=1e-3)
+        assert bound(0.9 * rated).whole.noise_reduction_db < wanted[index]
+        assert bound(rated).scaled.noise_reduction_db < wanted[index]  # spent best is better than scaled
+
+
+def test_a_budget_for_one_channel_is_the_single_channel_bounds():
+    x, d = signals()
+    needed = budgeted_rated_power(1.0, x[0], d[0], SECONDARY[0, 0], TAPS, fs=FS)
+    assert needed.rated_power.shape == needed.penalty.shape == ()
+    one = power_constrained_wiener(x[0], d[0], SECONDARY[0, 0], TAPS, float(needed.rated_power), fs=FS).whole
+    assert one.noise_reduction_db == pytest.approx(1.0, abs=1e-3)
+    assert one.penalty == pytest.approx(float(needed.penalty), rel=1e-3)
+
+
+def test_the_limits_of_a_budget():
+    free = bound(1e6).unconstrained
+    most = free.noise_reduction_db
+    needed = budgeted_rated_power([0.0, most, most + 1.0], *signals(), SECONDARY, TAPS, fs=FS, beyond="inf")
+    assert needed.rated_power[0].tolist() == [0.0, 0.0]
+    assert needed.rated_power[1].max() == pytest.approx(free.control_power.max(), rel=0.01)  # no rating binds
+    assert np.isinf(needed.rated_power[2]).all()
+    assert np.isnan(needed.penalty[2]).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"noise_reduction_db": 90.0}, "must not exceed what unlimited power attains, .* dB, got 90 dB; use longer"),
+        ({"noise_reduction_db": -1.0}, "noise_reduction_db must not be negative"),
+        ({"proportions": [1.0, 2.0, 3.0]}, "proportions must be one number or one for each of the 2 loudspeakers"),
+        ({"proportions": [1.0, 0.0]}, "proportions must be greater than 0"),
+        ({"beyond": "nan"}, "beyond must be one of"),
+        ({"disturbance": np.zeros((K, 2500))}, "disturbance must not be silent"),
+    ],
+    ids=["far", "negative", "three", "zero", "beyond", "silent"],
+)
+def test_a_budget_that_cannot_be_is_refused(changed, message):
+    x, d = signals()
+    settings = {"noise_reduction_db": 1.0, "reference": x, "disturbance": d, "secondary_path": SECONDARY} | changed
+    with pytest.raises(ValueError, match=message):
+        budgeted_rated_power(**settings, n_taps=TAPS, fs=FS)
+
+
+def test_powers_of_loudspeakers_that_cannot_be_are_refused():
+    for powers in ([1.0, -1.0], [0.0, 0.0], [1.0, np.nan]):
+        with pytest.raises(ValueError, match="control_power must"):
+            required_rated_power(1.0, **POWERS | {"control_power": powers})

@@ -28,6 +28,7 @@ from kfopc_filterpy import (
     OutputPowerConstraint,
     RescalingFxLMS,
     TwoGradientFxLMS,
+    fx_rls,
     output_power,
     simulate,
 )
@@ -44,6 +45,7 @@ PRIMARY = _rng.standard_normal((K, I, 7)) * 0.5
 A = np.array([0.3, 0.6])  # amplitude limits
 LEAK = np.array([0.4, 0.1])
 PENALTY = np.array([0.7, 0.2])
+EPSILON = 2.0  # regularization of the normalised step
 RATED, MEMORY = np.array([0.4, 0.8]), 60
 
 
@@ -127,6 +129,11 @@ EVERY: dict[str, tuple[Callable[..., Any], Any, Any]] = {
     "FxLMS": (
         lambda path, **o: FxLMS(L, path, step_size=MU, **o),
         lambda w, j, i, at: w + gradient(at, j, i),
+        as_it_is,
+    ),
+    "FxNLMS": (
+        lambda path, **o: FxNLMS(L, path, step_size=40 * MU, regularization=EPSILON, **o),
+        lambda w, j, i, at: w + 40 * gradient(at, j, i) / (EPSILON + np.sum(at["xf"] ** 2)),
         as_it_is,
     ),
     "clipping FxLMS": (
@@ -218,6 +225,7 @@ def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
 ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
 ONE: dict[str, Callable[..., Any]] = {
     "FxLMS": lambda path, **o: FxLMS(L, path, step_size=MU, **o),
+    "FxNLMS": lambda path, **o: FxNLMS(L, path, step_size=10 * MU, **o),
     "clipping FxLMS": lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
     "re-scaling FxLMS": lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
     "leaky FxLMS": lambda path, **o: LeakyFxLMS(L, path, step_size=MU, leak=0.4, **o),
@@ -279,6 +287,44 @@ def test_each_loudspeaker_has_its_own_limiter_and_amplifier_model() -> None:
         assert np.abs(want.control_signal - want.amplifier_output).max() > 0.01  # and the amplifier clipped
 
 
+# ---- Loudspeakers and microphones that are not what they should be
+
+
+@pytest.mark.parametrize("name", ["FxLMS", "FxNLMS"])
+def test_an_unplugged_loudspeaker_stays_silent_and_the_other_is_not_disturbed(name: str) -> None:
+    unplugged = PATHS.copy()
+    unplugged[:, 1] = 0.0
+    both, alone = made(name, unplugged), made(name, unplugged[:, :1])
+    options: dict[str, Any] = {"primary_path": PRIMARY, "fs": FS}
+    with_it = simulate(both, noise(), secondary_path=unplugged, **options)
+    without = simulate(alone, noise(), secondary_path=unplugged[:, :1], **options)
+    np.testing.assert_array_equal(with_it.control_signal[1], 0.0)
+    np.testing.assert_array_equal(with_it.control_signal[0], without.control_signal[0])
+    np.testing.assert_array_equal(with_it.error, without.error)
+
+
+def test_a_microphone_that_no_loudspeaker_reaches_is_left_as_it_is() -> None:
+    deaf = np.concatenate([PATHS, np.zeros((1, J, PATHS.shape[2]))])
+    x = noise()
+    d = np.concatenate([run(made("FxLMS", PATHS), x).disturbance, 5.0 * np.ones((1, x.shape[1]))])
+    with_it = simulate(made("FxLMS", deaf), x, disturbance=d, secondary_path=deaf, fs=FS)
+    without = simulate(made("FxLMS", PATHS), x, disturbance=d[:K], secondary_path=PATHS, fs=FS)
+    np.testing.assert_array_equal(with_it.control_signal, without.control_signal)
+    np.testing.assert_array_equal(with_it.error[K], 5.0)
+
+
+@pytest.mark.parametrize("difference", [0.0, 1e-8], ids=["identical", "nearly identical"])
+def test_identical_loudspeakers_share_the_work_of_one(difference: float) -> None:
+    """Singular, and yet the gradient from zero leads to the least weights: each plays half of what one alone would."""
+    alike = np.stack([PATHS[:, 0], PATHS[:, 0] + difference * PATHS[:, 1]], axis=1)
+    x, options = noise(3000), {"primary_path": PRIMARY, "fs": FS}
+    two, one = made("FxLMS", alike), FxLMS(L, alike[:, :1], step_size=2 * MU, n_references=I)
+    shared = simulate(two, x, secondary_path=alike, **options)
+    alone = simulate(one, x, secondary_path=alike[:, :1], **options)
+    np.testing.assert_allclose(shared.control_signal[0], shared.control_signal[1], rtol=0, atol=1e-4)
+    np.testing.assert_allclose(shared.control_signal.sum(axis=0), alone.control_signal[0], rtol=0, atol=1e-4)
+
+
 # ---- Where it settles
 
 
@@ -315,6 +361,20 @@ def test_it_settles_at_the_regularised_wiener_solution(make: Callable[..., Any],
     np.testing.assert_allclose(weights, want, rtol=0, atol=0.01 * np.abs(want).max())
     if any(leak):  # the leak matters at that tolerance
         assert np.abs(want - wiener(PATHS, PRIMARY, np.zeros(J))).max() > 0.05 * np.abs(want).max()
+
+
+def test_a_normalised_step_does_not_depend_on_the_level_and_is_stable_up_to_2() -> None:
+    """On paths without delay, where the error power cannot grow within a step that is below 2, and does above."""
+    flat = np.random.default_rng(8).standard_normal((K, J, 1)) * np.eye(1, 3)
+    x, level = noise(3000), np.repeat([1.0, 30.0], 1500)
+    d = np.einsum("kj,ji,in->kn", flat[:, :, 0], [[0.5, 0.2], [-0.3, 0.4]], x)
+    errors = []
+    for mu in (0.5, 1.9, 2.5):
+        controller = FxNLMS(1, flat, step_size=mu, n_references=I)
+        errors.append(simulate(controller, level * x, disturbance=level * d, secondary_path=flat, fs=FS).error)
+    for error in errors[:2]:
+        assert np.mean(error[:, -200:] ** 2) < 1e-6 * np.mean(d[:, -200:] ** 2)  # loud or soft
+    assert np.nanmax(np.abs(errors[2])) > 10.0 * np.abs(level * d).max()
 
 
 def test_every_loudspeaker_keeps_its_rated_power() -> None:
@@ -400,11 +460,12 @@ def test_several_references_need_no_channel_axes() -> None:
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, amplifier=[None]), TypeError, "each of the 2 loudspeakers"),
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, penalty_factor=np.nan), ValueError, "penalty_factor must be finite"),
         (lambda: MOVFxLMS(L, ONE_PATH, step_size=MU, rated_power=[1.0, 2.0]), ValueError, "must be one for one loudspeaker, got 2"),
-        (lambda: FxNLMS(L, PATHS, step_size=MU), ValueError, "FxNLMS takes one channel: .* with the setting n_references take several"),
+        (lambda: FxNLMS(L, PATHS, step_size=MU, regularization=0.0), ValueError, "regularization must be greater than 0"),
+        (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use controllers.SharedGainKalman, .* FxNLMS"),
         (lambda: KalmanController(KFOPC(L), PATHS), ValueError, "KalmanController takes one channel"),
-        (lambda: DiagonalKalman(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "DiagonalKalman takes one channel"),
+        (lambda: DiagonalKalman(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "DiagonalKalman takes one channel: .* with the setting n_references take several"),
     ],
-    ids=range(18),
+    ids=range(19),
 )  # fmt: skip
 def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: type, message: str) -> None:
     with pytest.raises(error, match=message):

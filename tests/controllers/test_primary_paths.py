@@ -158,6 +158,70 @@ def test_silence_is_waited_for(form: str) -> None:
     assert noise_reduction_db(result.error, result.disturbance) > 1.0
 
 
+N_QUIET = 4000  # the first second
+BEGINNINGS = {"silent": 0.0, "silent but for a sample of a block": 0.0, "soft": 1e-3, "very soft": 1e-6}
+
+
+@pytest.mark.parametrize("beginning", BEGINNINGS)
+def test_a_noise_that_begins_silent_or_soft_is_then_reduced_as_well_as_one_that_was_always_loud(
+    beginning: str, form: str
+) -> None:
+    """The first second, with noise at the microphones: it must not decide for how long the paths are averaged."""
+    n_samples, until = 3 * N_QUIET, N_QUIET
+    if "block" in beginning:
+        until = N_QUIET // made(form).block * made(form).block - 1
+    level = np.where(np.arange(n_samples) < until, BEGINNINGS[beginning], 1.0)
+    reductions = []
+    for gain in (level, np.ones(n_samples)):
+        result = simulate(
+            made(form, rated_power=10.0),
+            gain * references(n_samples),
+            primary_path=PRIMARY_PATHS,
+            secondary_path=SECONDARY,
+            fs=FS,
+            sensor_noise_std=1.0,
+            rng=1,
+        )
+        assert np.isfinite(result.error).all()
+        reductions.append(noise_reduction_db(result.error, result.disturbance, steady=1 / 3))
+        quiet = result.control_signal[:, :until]
+        assert np.all(np.abs(quiet[:, gain[:until] == 0.0]) == 0.0)
+    assert reductions[0] == pytest.approx(reductions[1], abs=0.15)
+
+
+@pytest.mark.parametrize("coupling", [0.99, 0.99999], ids=["strong", "nearly singular"])
+def test_strong_mutual_coupling_leaves_finite_filters_within_the_powers(coupling: float, form: str) -> None:
+    """Two loudspeakers that all microphones hear nearly alike: they do what one does that stands for both."""
+    secondary = np.stack([SECONDARY[:, 0], coupling * SECONDARY[:, 0] + (1 - coupling) * SECONDARY[:, 1]], axis=1)
+    x, reductions = references(12000), []
+    for paths, rated in ((secondary, 0.05), (SECONDARY[:, :1], 0.2)):  # half the amplitude each, a quarter of the power
+        controller = made(form, paths, rated_power=rated)
+        result = simulate(controller, x, primary_path=PRIMARY_PATHS, secondary_path=paths, fs=FS)
+        assert np.isfinite(controller.weights).all()
+        spent = output_power(result.control_signal) / rated
+        np.testing.assert_allclose(spent, 1.0, atol=0.03)
+        reductions.append(noise_reduction_db(result.error, result.disturbance))
+    assert reductions[0] == pytest.approx(reductions[1], abs=0.2)
+    free = made(form, secondary)
+    result = simulate(free, x, primary_path=PRIMARY_PATHS, secondary_path=secondary, fs=FS)
+    assert np.isfinite(free.weights).all()
+    assert noise_reduction_db(result.error, result.disturbance) > reductions[0]
+
+
+def test_a_microphone_that_no_loudspeaker_reaches_does_not_change_the_control(form: str) -> None:
+    secondary = np.concatenate([SECONDARY, np.zeros((1, J, SECONDARY.shape[2]))])
+    x = references(4000)
+    d = through(PRIMARY_PATHS, x)
+    with_it = np.concatenate([d, 5.0 * np.random.default_rng(3).standard_normal((1, 4000))])
+    results = []
+    for paths, disturbance in ((secondary, with_it), (SECONDARY, d)):
+        controller = made(form, paths, rated_power=0.3)
+        results.append(simulate(controller, x, disturbance=disturbance, secondary_path=paths, fs=FS))
+    scale = np.abs(results[1].control_signal).max()
+    np.testing.assert_allclose(results[0].control_signal, results[1].control_signal, rtol=0, atol=1e-9 * scale)
+    np.testing.assert_array_equal(results[0].error[3], with_it[3])
+
+
 @pytest.mark.parametrize(
     ("changed", "error", "match"),
     [

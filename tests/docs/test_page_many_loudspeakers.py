@@ -16,5 +16,7 @@ def test_the_figures_say_what_the_page_says():
     np.testing.assert_allclose(v.spent, 1.0, atol=0.03)
     assert np.all(v.controller.power_weight > 0.1)  # every budget binds
     np.testing.assert_allclose(output_power(v.scaled.control_signal) / v.rated, 1.0, atol=0.1)
+    steps = v.enough.rated_power[1:] / v.enough.rated_power[:-1]
+    assert np.all((steps > 2) & (steps < 4))  # three decibels more
     np.testing.assert_allclose(v.two.control_signal[1], 0.0, atol=1e-9)
     assert 1 < noise_reduction_db(v.two.error, v.two.disturbance) < budgeted

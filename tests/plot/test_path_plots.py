@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from kfopc_filterpy import power_constrained_wiener
 from kfopc_filterpy.bounds.wiener import wiener_solution
 from kfopc_filterpy.paths.analysis import frequency_response
 from kfopc_filterpy.paths.identification import identify_secondary_path
@@ -137,6 +138,22 @@ def test_required_rated_power_rises_to_the_wiener_filter():
     assert np.all(np.diff(power) > 0)
     assert 0.8 * solution.control_power < power[-1] < solution.control_power
     assert _labels(ax)[2] == "Rated power 0.5"
+
+
+def test_required_rated_power_of_several_loudspeakers_has_a_line_for_each():
+    """The last one is unplugged: it needs none, and a logarithmic axis cannot show that."""
+    x = np.random.default_rng(0).standard_normal((1, 3000))
+    paths = np.zeros((2, 3, 4))
+    paths[:, :2, 1] = [[1.0, 0.3], [0.2, 0.5]]
+    d = np.array([np.roll(x[0], 2), 0.5 * np.roll(x[0], 3)]) + 0.1 * np.random.default_rng(1).standard_normal((2, 3000))
+    free = power_constrained_wiener(x, d, paths, 8, 100.0, fs=8000.0).unconstrained
+    ax = plot_required_rated_power(free, rated_power=0.5)
+    ax.figure.canvas.draw()
+    assert _labels(ax)[:2] == [f"Wiener filter scaled by α, loudspeaker {j}" for j in range(2)]
+    for line, power in zip(ax.get_lines()[:2], free.control_power, strict=False):
+        assert 0.8 * power < line.get_ydata()[-1] < power
+    with pytest.raises(TypeError, match="rated_power must be a single number"):
+        plot_required_rated_power(free, rated_power=[0.5, 0.5])
 
 
 def test_required_rated_power_of_a_perfect_filter_stays_readable():

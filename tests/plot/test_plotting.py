@@ -217,6 +217,13 @@ def test_disturbance_and_anti_noise_say_how_linear_they_are(noise):
     assert _labels(ax) == ["Disturbance", "Anti-noise, KF-OPC"]
 
 
+def test_a_rated_power_of_each_loudspeaker_is_stated():
+    run = multichannel_result(n_samples=32000, rated_power=np.array([0.5, 1.5]))
+    ax = plotting.plot_disturbance_and_anti_noise(run, span_s=(1.0, 1.02), band=(200.0, 2000.0), channel=1)
+    assert "rated power 0.5, 1.5" in ax.get_legend().get_title().get_text()
+    plt.close(ax.figure)
+
+
 def test_output_power_against_the_rated_power(noise, tonal):
     ax = plotting.plot_output_power({"KF-OPC": noise}, window_s=0.25)
     assert _labels(ax) == ["KF-OPC", "Rated power 1"]

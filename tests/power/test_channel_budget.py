@@ -77,6 +77,21 @@ def test_from_the_control_filters_without_a_limit_it_finds_the_same_as_from_the_
         assert budget.penalty[2] < 1e-4 * budget.penalty[0]  # the power that is not used up has no price
 
 
+@pytest.mark.parametrize("coupling", [0.0, 0.9, 0.99, 0.99999])
+def test_coupled_loudspeakers_settle_within_ten_solves(coupling: float) -> None:
+    """One takes over what the other leaves: their penalties must not swing."""
+    secondary, primary, x = scene()
+    secondary[:, 1] = coupling * secondary[:, 0] + (1.0 - coupling) * secondary[:, 1]
+    secondary, rated = secondary[:, :2], np.array([0.05, 0.05])
+    budget = ChannelBudget(secondary, TAPS, PRIMARY, REFERENCES, rated)
+    D = correlation(x, budget.n_lags)
+    for _ in range(10):
+        budget.solve(D, primary)
+    filters = budget.weights.reshape(2, -1)
+    _, of_x, _ = dense(np.repeat(secondary, 2, axis=1)[:, :J], primary, D)
+    np.testing.assert_allclose(np.einsum("ja,ab,jb->j", filters, of_x, filters), rated, rtol=0.02)
+
+
 @pytest.mark.parametrize("fault", ["unplugged", "identical", "silent"])
 def test_a_singular_case_stays_finite(fault: str) -> None:
     secondary, primary, x = scene()

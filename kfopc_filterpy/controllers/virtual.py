@@ -1,0 +1,417 @@
+"""Virtual microphones: a controller reduces the noise where no microphone is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from .._validate import as_channels, as_count, as_positive, as_real_array, require_finite
+from ..paths.channels import secondary_paths
+from ..paths.observation import ObservationFilters
+from .base import Controller, WrappedController, require_rates
+
+if TYPE_CHECKING:
+    import control
+
+
+class Observer(Protocol):
+    """What `VirtualMicrophones` asks of the estimator of the disturbance."""
+
+    def estimate(self, disturbance: np.ndarray) -> np.ndarray:
+        """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
+
+        `disturbance` is its newest sample at the physical microphones, (K_p,).
+        """
+        ...
+
+    def advance(self, disturbance: np.ndarray) -> None:
+        """Take that sample into the memory."""
+        ...
+
+
+class FilterObserver:
+    """Observation filters, sample by sample: the remote-microphone technique."""
+
+    def __init__(self, taps: np.ndarray) -> None:
+        self.n_virtual, self.n_physical, n_taps = taps.shape
+        self._now = np.ascontiguousarray(taps[:, :, 0])
+        self._before = np.ascontiguousarray(np.moveaxis(taps[:, :, 1:], 2, 1).reshape(self.n_virtual, -1))
+        self._past = np.zeros((n_taps - 1) * self.n_physical)  # newest first, all microphones of a sample together
+
+    def estimate(self, disturbance: np.ndarray) -> np.ndarray:
+        """Return (O * d_p)(n)."""
+        return self._now @ disturbance + self._before @ self._past
+
+    def advance(self, disturbance: np.ndarray) -> None:
+        """Add d_p(n) to the delay lines."""
+        push_sample(self._past, disturbance)
+
+
+class KalmanObserver:
+    r"""Kalman filter that estimates the disturbance at virtual microphones from that at physical ones.
+
+    The noise sources are white, and a state-space model leads from them to all microphones:
+
+    .. math:: z(n+1) = A z(n) + B v(n), \quad d_p(n) = C_p z(n) + D_p v(n) + \eta(n), \quad d_v(n) = C_v z(n) + D_v v(n)
+
+    With the covariances Q of v and R of the microphones' own noise :math:`\eta`, and the solution P of the Riccati
+    equation, the best estimate from the present and the past is
+
+    .. math:: \epsilon = d_p - C_p \hat z, \quad \hat d_v = C_v \hat z + M \epsilon, \quad
+       \hat z \leftarrow A \hat z + K \epsilon
+
+    .. math:: S = C_p P C_p^T + D_p Q D_p^T + R, \quad K = (A P C_p^T + B Q D_p^T) S^{-1}, \quad
+       M = (C_v P C_p^T + D_v Q D_p^T) S^{-1}
+
+    Petersen et al. have the control signals as further inputs of the model. Their part of the state is known, so no
+    filter is needed for it, and `VirtualMicrophones` computes it with the secondary paths: the estimates are the same.
+
+    Parameters
+    ----------
+    model : control.StateSpace
+        Model of the disturbance, discrete in time with ``dt = 1/fs`` and stable. Inputs: the noise sources. Outputs:
+        the physical microphones, then the virtual ones. `realize_paths` makes one of primary paths; the colour of the
+        noise is part of the model. If the control signals are further inputs of a model, pass
+        ``model[:, :n_sources]``.
+    n_physical : int
+        Number of physical microphones K_p; the other outputs are virtual.
+    sensor_noise_std : float or array_like, shape (K_p,)
+        Standard deviation of the noise of the physical microphones, and of whatever else the model does not explain.
+        Above zero.
+    source_power : float or array_like, shape (n_sources,), default 1
+        Power of each noise source, the mean square of v.
+
+    Attributes
+    ----------
+    n_physical, n_virtual : int
+        Numbers of microphones K_p and K_v.
+    virtual_variance : numpy.ndarray, shape (K_v,)
+        Variance of the error of the estimate at each virtual microphone, by the Riccati equation.
+    residual_db : numpy.ndarray, shape (K_v,)
+        The same over the power of the disturbance there, in dB, as in `ObservationFilters`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the model is no discrete-time state space, is unstable or has no output for a virtual microphone, or a
+        variance is not positive.
+
+    Notes
+    -----
+    A sample takes about n^2 multiplications for n states.
+
+    References
+    ----------
+    C. D. Petersen, R. Fraanje, B. S. Cazzolato, A. C. Zander, C. H. Hansen, "A Kalman filter approach to virtual
+    sensing for active noise control", Mechanical Systems and Signal Processing 22(2), 2008. The correlation of process
+    and measurement noise: T. Kailath, A. H. Sayed, B. Hassibi, Linear Estimation, Prentice Hall 2000, ch. 9.
+
+    Examples
+    --------
+    White noise reaches the physical microphone at once, and the virtual one a sample later, half as loud:
+
+    >>> import control
+    >>> from kfopc_filterpy.controllers import KalmanObserver
+    >>> model = control.StateSpace([[0.0]], [[1.0]], [[0.0], [0.5]], [[1.0], [0.0]], 1 / 8000)
+    >>> KalmanObserver(model, n_physical=1, sensor_noise_std=0.1).virtual_variance.round(5)  # 0.5^2 * 0.01 / 1.01
+    array([0.00248])
+    """
+
+    def __init__(
+        self, model: control.StateSpace, n_physical: int, *, sensor_noise_std: Any, source_power: Any = 1.0
+    ) -> None:
+        from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+        self.n_physical = as_count(n_physical, "n_physical")
+        A, B, C, D, self.fs = _matrices(model, self.n_physical)
+        self.n_virtual = len(C) - self.n_physical
+        Q = np.diag(_each(source_power, B.shape[1], "source_power"))
+        R = np.diag(_each(sensor_noise_std, self.n_physical, "sensor_noise_std") ** 2)
+        physical, virtual = slice(None, self.n_physical), slice(self.n_physical, None)
+        self._A, self._Cp, self._Cv = A, C[physical], C[virtual]
+        white, shared = D[physical] @ Q @ D[physical].T + R, B @ Q @ D[physical].T
+        P = solve_discrete_are(A.T, self._Cp.T, B @ Q @ B.T, white, s=shared)
+        S = self._Cp @ P @ self._Cp.T + white
+        cross = self._Cv @ P @ self._Cp.T + D[virtual] @ Q @ D[physical].T
+        self._K = np.linalg.solve(S, (A @ P @ self._Cp.T + shared).T).T
+        self._M = np.linalg.solve(S, cross.T).T
+        own = D[virtual] @ Q @ D[virtual].T
+        self.virtual_variance = np.diag(self._Cv @ P @ self._Cv.T + own - self._M @ cross.T).clip(min=0.0)
+        power = np.diag(self._Cv @ solve_discrete_lyapunov(A, B @ Q @ B.T) @ self._Cv.T + own)
+        share = self.virtual_variance / np.maximum(power, np.finfo(float).tiny)
+        self.residual_db = 10 * np.log10(np.maximum(share, 1e-30))
+        self._state = np.zeros(len(A))
+
+    def __repr__(self) -> str:
+        residual = ", ".join(f"{value:.1f}" for value in self.residual_db)
+        return (
+            f"<KalmanObserver: {self._state.size} states, {self.n_physical} physical and {self.n_virtual} virtual "
+            f"microphone(s), residual {residual} dB>"
+        )
+
+    def estimate(self, disturbance: np.ndarray) -> np.ndarray:
+        """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
+
+        `disturbance` is the newest sample at the physical microphones, (K_p,).
+        """
+        return self._Cv @ self._state + self._M @ (disturbance - self._Cp @ self._state)
+
+    def advance(self, disturbance: np.ndarray) -> None:
+        """Take `disturbance`, the newest sample at the physical microphones, (K_p,), into the state."""
+        self._state = self._A @ self._state + self._K @ (disturbance - self._Cp @ self._state)
+
+
+def _matrices(model: Any, n_physical: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return A, B, C, D and the sampling rate in Hz of a model that can be observed."""
+    if not all(hasattr(model, name) for name in "ABCD"):
+        raise TypeError(f"model must be a control.StateSpace, got {type(model).__name__}; control.ss converts a system")
+    if model.dt is None or model.dt is True or model.dt == 0:
+        raise ValueError(f"model must be discrete in time with dt = 1/fs, got dt = {model.dt}")
+    if model.noutputs <= n_physical:
+        raise ValueError(
+            f"model must have outputs for the {n_physical} physical and the virtual microphones, got {model.noutputs}"
+        )
+    largest = np.max(np.abs(model.poles()), initial=0.0)
+    if largest >= 1.0:
+        raise ValueError(f"model must be stable, but has a pole of magnitude {largest:.6g}")
+    A, B, C, D = (np.array(getattr(model, name), dtype=np.float64) for name in "ABCD")
+    return A, B, C, D, 1.0 / float(model.dt)
+
+
+def _each(value: Any, size: int, name: str) -> np.ndarray:
+    """Return a positive number, or one for each, as (size,)."""
+    numbers = as_real_array(value, name)
+    if numbers.shape not in ((), (size,)):
+        raise ValueError(f"{name} must be one number or one for each of the {size}, got shape {numbers.shape}")
+    return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, size)])
+
+
+class VirtualMicrophones(WrappedController):
+    r"""A controller that reduces the error at places without a microphone, such as the ears in front of a headrest.
+
+    It gets the errors of all microphones of the plant and reads the physical ones only. From these it estimates the
+    errors at the virtual microphones, and `controller` adapts to the estimates:
+
+    .. math:: \hat d_p = e_p + \hat s_p * y, \qquad \hat d_v = \mathrm{observer}(\hat d_p), \qquad
+       \hat e_v = \hat d_v - \hat s_v * y
+
+    With observation filters as the observer, :math:`\hat d_v = O * \hat d_p`, this is the remote-microphone technique;
+    with a `KalmanObserver` it is the Kalman filter of Petersen et al. In `simulate` the plant has all microphones, and
+    the result holds the true errors of all.
+
+    Parameters
+    ----------
+    controller : Controller
+        Controller for the virtual microphones: its errors are (K_v,), and its secondary paths are those to the virtual
+        microphones. A controller of your own works too.
+    secondary_path : array_like, shape (K, J, taps), or nested sequence of control systems
+        Estimated secondary paths to all microphones of the plant, physical and virtual.
+    observer : ObservationFilters, array_like of shape (K_v, K_p, n_taps), KalmanObserver, or an object like it
+        What estimates the disturbance. An object has two methods: ``estimate(disturbance)`` returns (K_v,) for the
+        newest sample (K_p,) and changes nothing, ``advance(disturbance)`` takes the sample into its memory. It is not
+        shared with another controller.
+    physical : sequence of int
+        Indices of the microphones that exist, in the order in which the observer takes them.
+    virtual : sequence of int, optional
+        Indices of the virtual microphones, in the order in which the observer gives them; by default all others.
+    amplifier : callable or sequence of J of them, optional
+        Known amplifiers: the disturbance is then estimated from what they deliver, not from y.
+
+    Attributes
+    ----------
+    physical, virtual : numpy.ndarray
+        Indices of the physical and virtual microphones.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Indices that are out of range or occur twice; an observer or a controller for other numbers of microphones or
+        loudspeakers. In a run: an error of a physical microphone that is not finite. Nothing was changed.
+
+    Notes
+    -----
+    `simulate` calls it sample by sample, which costs some tens of microseconds more than such calls of `controller`
+    alone, and these cost more than its compiled loop; the tutorial prints the time. The multiplications are K J taps
+    for the secondary paths, and K_v K_p n_taps for observation filters.
+
+    References
+    ----------
+    D. Moreau, B. Cazzolato, A. Zander, C. Petersen, "A review of virtual sensing algorithms for active noise control",
+    Algorithms 1(2), 2008.
+
+    Examples
+    --------
+    One loudspeaker. The noise passes the physical microphone and reaches the virtual one a sample later:
+
+    >>> import numpy as np
+    >>> from kfopc_filterpy import FxLMS, noise_reduction_db, simulate
+    >>> from kfopc_filterpy.controllers import VirtualMicrophones
+    >>> secondary = np.zeros((2, 1, 4))
+    >>> secondary[:, 0, 1] = [0.5, 1.0]  # physical, virtual
+    >>> primary = np.zeros((2, 1, 8))
+    >>> primary[[0, 1], 0, [4, 5]] = 1.0
+    >>> ears = FxLMS(8, secondary[1:], step_size=0.01)
+    >>> controller = VirtualMicrophones(ears, secondary, [[[0.0, 1.0]]], physical=[0])
+    >>> x = np.random.default_rng(0).standard_normal((1, 4000))
+    >>> result = simulate(controller, x, primary_path=primary, secondary_path=secondary)
+    >>> result.error.shape, bool(noise_reduction_db(result.error[1], result.disturbance[1]) > 60)
+    ((2, 4000), True)
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        secondary_path: Any,
+        observer: Any,
+        *,
+        physical: Sequence[int],
+        virtual: Sequence[int] | None = None,
+        amplifier: Any = None,
+    ) -> None:
+        super().__init__(controller)
+        secondary, self._path_fs = secondary_paths(secondary_path)
+        self.n_microphones, self.n_loudspeakers, _ = secondary.shape
+        self.physical = self._indices(physical, "physical")
+        others = np.setdiff1d(np.arange(self.n_microphones), self.physical)
+        self.virtual = others if virtual is None else self._indices(virtual, "virtual")
+        if not self.virtual.size:
+            raise ValueError(f"virtual must name a microphone: all {self.n_microphones} of secondary_path are physical")
+        self.observer = self._checked_observer(observer)
+        self._require_fitting_controller()
+        self._amplifiers = self._checked_amplifiers(amplifier)
+        self._paths = np.ascontiguousarray(np.moveaxis(secondary, 2, 1).reshape(self.n_microphones, -1))
+        self._played = np.zeros(self._paths.shape[1])  # newest first, all loudspeakers of a sample together
+        self._virtual_error = np.zeros(self.virtual.size)
+        self.name = f"{getattr(controller, 'name', type(controller).__name__)} with virtual microphones"
+
+    def _indices(self, value: Any, name: str) -> np.ndarray:
+        indices = np.array([as_count(index, name, minimum=0) for index in value])
+        if not indices.size or indices.max() >= self.n_microphones or np.unique(indices).size < indices.size:
+            raise ValueError(
+                f"{name} must be different indices of the {self.n_microphones} microphones of secondary_path, "
+                f"got {indices.tolist()}"
+            )
+        return indices
+
+    def _checked_observer(self, observer: Any) -> Any:
+        wanted = (self.virtual.size, self.physical.size)
+        if isinstance(observer, ObservationFilters):
+            observer = observer.taps
+        if not (hasattr(observer, "estimate") and hasattr(observer, "advance")):
+            taps = as_real_array(observer, "observer")
+            if taps.ndim != 3 or taps.size == 0:
+                raise ValueError(f"observer must be filters (K_v, K_p, n_taps), got shape {taps.shape}")
+            require_finite(taps, "observer")
+            observer = FilterObserver(taps)
+        own = tuple(getattr(observer, name, n) for name, n in zip(("n_virtual", "n_physical"), wanted, strict=True))
+        if own != wanted:
+            raise ValueError(
+                f"observer must lead from the {wanted[1]} physical to the {wanted[0]} virtual microphones, "
+                f"but it leads from {own[1]} to {own[0]}"
+            )
+        return observer
+
+    def _require_fitting_controller(self) -> None:
+        wanted = {"n_microphones": self.virtual.size, "n_loudspeakers": self.n_loudspeakers}
+        for name, count in wanted.items():
+            own = getattr(self.controller, name, count)
+            if own != count:
+                raise ValueError(
+                    f"controller must be made for the {wanted['n_microphones']} virtual microphones and "
+                    f"{self.n_loudspeakers} loudspeakers, but its {name} is {own}: give it the rows of the virtual "
+                    "microphones of the secondary path"
+                )
+
+    def _checked_amplifiers(self, amplifier: Any) -> list[Any] | None:
+        if amplifier is None:
+            return None
+        each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * self.n_loudspeakers
+        if len(each) != self.n_loudspeakers or not all(callable(one) for one in each):
+            raise TypeError(
+                f"amplifier must be a function of a sample, or one for each of the {self.n_loudspeakers} loudspeakers, "
+                f"got {amplifier!r}"
+            )
+        return each
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.physical.size} physical, {self.virtual.size} virtual>"
+
+    @property
+    def virtual_error(self) -> np.ndarray:
+        """Last estimate of the error at the virtual microphones, (K_v,); a copy."""
+        return self._virtual_error.copy()
+
+    def control_signal(self, reference: Any) -> Any:
+        """Return the control signal y(n), (J,), for the newest reference sample x(n), (I,)."""
+        y = np.asarray(self.controller.control_signal(reference), dtype=np.float64).reshape(-1)
+        if y.size != self.n_loudspeakers:
+            raise ValueError(f"controller must return {self.n_loudspeakers} control signals, got {y.size}")
+        self._play(y)
+        return y
+
+    def _play(self, y: np.ndarray) -> None:
+        if self._amplifiers is not None:
+            y = np.array([amplifier(value) for amplifier, value in zip(self._amplifiers, y, strict=True)])
+        push_sample(self._played, y)
+
+    def update(self, error: Any) -> None:
+        """Let the controller adapt to the errors that the last control signal leaves at the virtual microphones.
+
+        `error` is (K,), of all microphones; only those of the physical ones are read.
+        """
+        heard = as_real_array(error, "error").reshape(-1)
+        if heard.size != self.n_microphones:
+            raise ValueError(
+                f"error must have a value for each of the {self.n_microphones} microphones, got {heard.size}"
+            )
+        for k in self.physical[~np.isfinite(heard[self.physical])]:
+            raise ValueError(f"error must be finite, but that of microphone {k} is {heard[k]}")
+        disturbance, virtual_error = self._estimate(heard)
+        self.controller.update(virtual_error)  # type: ignore[arg-type]  # several channels: arrays
+        self.observer.advance(disturbance)
+        self._virtual_error = virtual_error
+
+    def _estimate(self, heard: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the disturbance at the physical and the error at the virtual microphones."""
+        anti_noise = self._paths @ self._played
+        disturbance = heard[self.physical] + anti_noise[self.physical]
+        return disturbance, self.observer.estimate(disturbance) - anti_noise[self.virtual]
+
+    def listen(self, references: Any, errors: Any) -> None:
+        """Let the controller follow the noise before the control is switched on, with silent loudspeakers.
+
+        Parameters
+        ----------
+        references : ndarray, shape (I, n_samples)
+            References.
+        errors : ndarray, shape (K, n_samples)
+            Signals of all microphones; only those of the physical ones are read.
+        """
+        if not hasattr(self.controller, "listen"):
+            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+        heard = np.atleast_2d(as_channels(errors, "errors"))
+        if len(heard) != self.n_microphones:
+            raise ValueError(
+                f"errors must have a channel for each of the {self.n_microphones} microphones, got {len(heard)}"
+            )
+        virtual_errors = np.empty((self.virtual.size, heard.shape[1]))
+        for n, sample in enumerate(heard.T):
+            push_sample(self._played, np.zeros(self.n_loudspeakers))
+            disturbance, self._virtual_error = self._estimate(sample)
+            virtual_errors[:, n] = self._virtual_error
+            self.observer.advance(disturbance)
+        self.controller.listen(references, virtual_errors)
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if secondary path, observer or controller are for another rate than `fs` in Hz."""
+        require_rates(fs, {"secondary path": self._path_fs, "observer": getattr(self.observer, "fs", None)})
+        if hasattr(self.controller, "require_sample_rate"):
+            self.controller.require_sample_rate(fs)
+
+
+def push_sample(line: np.ndarray, sample: np.ndarray) -> None:
+    """Add a sample of several channels as the newest to a line that holds the channels of each sample together."""
+    line[sample.size :] = line[: line.size - sample.size]
+    line[: sample.size] = sample[: line.size]

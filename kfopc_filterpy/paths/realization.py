@@ -1,0 +1,109 @@
+"""A small state-space model of many paths together, for filters that need states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .._validate import as_count
+from .channels import sampled_path_matrix
+
+if TYPE_CHECKING:
+    import control
+
+
+@dataclass(frozen=True, eq=False)
+class PathRealization:
+    """A state-space model of paths, made by `realize_paths`.
+
+    Attributes
+    ----------
+    system : control.StateSpace
+        The model, with ``dt = 1/fs``.
+    residual_db : numpy.ndarray, shape (outputs,)
+        Energy of the error of each output's impulse responses over the energy of those responses, in dB; at least -300.
+    """
+
+    system: control.StateSpace
+    residual_db: np.ndarray
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.system.nstates
+
+
+def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRealization:
+    """Return a state-space model of a given order whose impulse responses are close to those of the paths.
+
+    It is the eigensystem realization of Ho, Kalman, Juang and Pappa, as python-control computes it. Because the
+    responses end, the model is the balanced one. States are shared by all paths, so paths with the same resonances or
+    the same delay cost little more than one of them. A delay costs a state for each sample. One that all paths share
+    makes no difference to noise of unknown phase, so cut it off before, as in the example.
+
+    Parameters
+    ----------
+    paths : array_like, shape (outputs, inputs, n_taps), or nested sequence of control systems
+        Finite impulse responses from the inputs, such as noise sources, to the outputs, such as microphones.
+    order : int
+        Number of states, at most ``n_taps`` times the smaller of the numbers of outputs and inputs.
+    fs : float, optional
+        Sampling rate in Hz, needed for an array.
+
+    Returns
+    -------
+    PathRealization
+        The model, and how far off it is.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the order is out of range, the paths are silent, or the number of states that the paths have is smaller.
+
+    References
+    ----------
+    J.-N. Juang, R. S. Pappa, "An eigensystem realization algorithm for modal parameter identification and model
+    reduction", J. Guidance 8(5), 1985. S.-Y. Kung, "A new identification and model reduction algorithm via singular
+    value decomposition", Asilomar Conf. 1978.
+
+    Examples
+    --------
+    One source and two microphones, the second 3 samples farther away:
+
+    >>> paths = np.zeros((2, 1, 16))
+    >>> paths[0, 0, 5:] = 0.5 ** np.arange(11)
+    >>> paths[1, 0, 8:] = 0.5 ** np.arange(8)
+    >>> model = realize_paths(paths[..., 4:], 4, fs=8000.0)  # the first of them arrives a sample late
+    >>> model.order, bool(np.all(model.residual_db < -20))
+    (4, True)
+    """
+    from control import StateSpace, eigensys_realization
+
+    taps, fs = sampled_path_matrix(paths, fs, "paths", "(outputs, inputs, taps)")
+    outputs, inputs, n_taps = taps.shape
+    order, most = as_count(order, "order"), n_taps * min(outputs, inputs)
+    if order > most:
+        raise ValueError(f"order must be at most {most} for paths of shape {taps.shape}, got {order}")
+    if not np.any(taps[..., 1:]):
+        raise ValueError("paths must have a tap other than the first that is not zero: there is nothing to store")
+    padded = np.concatenate([taps, np.zeros((outputs, inputs, n_taps + 1))], axis=2)
+    balanced, sizes = eigensys_realization(padded, order, m=n_taps, n=n_taps)
+    if not sizes[order - 1] > 1e-13 * sizes[0]:
+        raise ValueError(f"order must be at most {np.sum(sizes > 1e-13 * sizes[0])}, the states that the paths have")
+    system = StateSpace(balanced.A, balanced.B, balanced.C, balanced.D, 1 / fs)
+    return PathRealization(system, _residual_db(taps, system))
+
+
+def _residual_db(taps: np.ndarray, system: control.StateSpace) -> np.ndarray:
+    """Return the error of the impulse responses over their energy, (outputs,); the model's may go on for longer."""
+    n_samples = 2 * taps.shape[2]
+    response, state = [system.D], system.B
+    for _ in range(n_samples - 1):
+        response.append(system.C @ state)
+        state = system.A @ state
+    error = np.array(np.moveaxis(np.array(response), 0, 2))
+    error[..., : taps.shape[2]] -= taps
+    energy = np.maximum(np.sum(taps**2, axis=(1, 2)), np.finfo(float).tiny)
+    return 10 * np.log10(np.maximum(np.sum(error**2, axis=(1, 2)) / energy, 1e-30))

@@ -1,0 +1,301 @@
+"""Virtual microphones: against the controller that hears the virtual places, filterpy, and dense conditional means."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from helpers.channels import random_paths, through
+
+from kfopc_filterpy import FxLMS, HardClipAmplifier, noise_reduction_db, simulate
+from kfopc_filterpy.controllers import KalmanObserver, SharedGainKalman, VirtualMicrophones
+from kfopc_filterpy.paths import ObservationFilters
+
+FS, TAPS, J = 4000.0, 12, 2
+PHYSICAL, VIRTUAL = [3, 0], [2, 1]
+SECONDARY = random_paths(4, J, 6, seed=1)
+OBSERVATION = random_paths(2, 2, 4, seed=2, delay=0)
+TO_PHYSICAL = random_paths(2, 1, 10, seed=3, delay=4)
+
+
+def primary() -> np.ndarray:
+    """Paths in which the disturbance at the virtual microphones is exactly the observation filters' output."""
+    paths = np.zeros((4, 1, 13))
+    paths[PHYSICAL, :, :10] = TO_PHYSICAL
+    for v, row in zip(VIRTUAL, OBSERVATION, strict=True):
+        paths[v, 0] = sum(np.convolve(o, p[0]) for o, p in zip(row, TO_PHYSICAL, strict=True))
+    return paths
+
+
+def noise(n_samples: int = 1500, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((1, n_samples))
+
+
+def inner(**options: Any) -> FxLMS:
+    return FxLMS(TAPS, SECONDARY[VIRTUAL], step_size=0.003, **options)
+
+
+def made(observer: Any = OBSERVATION, controller: Any = None, **options: Any) -> VirtualMicrophones:
+    controller = inner() if controller is None else controller
+    return VirtualMicrophones(controller, SECONDARY, observer, physical=PHYSICAL, virtual=VIRTUAL, **options)
+
+
+def run(controller: Any, **options: Any) -> Any:
+    return simulate(controller, noise(), primary_path=primary(), secondary_path=SECONDARY, fs=FS, **options)
+
+
+class Recorded:
+    """A controller of a user, which plays given signals and notes the errors it gets."""
+
+    def __init__(self, signals: np.ndarray) -> None:
+        self.signals, self.errors = list(signals.T), []
+
+    def control_signal(self, reference: Any) -> Any:
+        return self.signals.pop(0)
+
+    def update(self, error: Any) -> None:
+        self.errors.append(np.array(error))
+
+
+# ---- The wrapper
+
+
+@pytest.mark.parametrize("switch_on_s", [0.0, 50 / FS], ids=["at once", "after listening"])
+@pytest.mark.parametrize("kind", ["FxLMS", "shared gain"])
+def test_with_exact_filters_it_is_the_controller_that_hears_the_virtual_places(kind: str, switch_on_s: float) -> None:
+    def one() -> Any:
+        return inner() if kind == "FxLMS" else SharedGainKalman(TAPS, SECONDARY[VIRTUAL], rated_power=0.2, fs=FS)
+
+    controller, there = made(controller=one()), one()
+    got = run(controller, switch_on_s=switch_on_s)
+    want = simulate(
+        there,
+        noise(),
+        primary_path=primary()[VIRTUAL],
+        secondary_path=SECONDARY[VIRTUAL],
+        fs=FS,
+        switch_on_s=switch_on_s,
+    )
+    scale = np.abs(want.control_signal).max()
+    np.testing.assert_allclose(got.control_signal, want.control_signal, rtol=0, atol=1e-9 * scale)
+    np.testing.assert_allclose(got.error[VIRTUAL], want.error, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(controller.weights, there.weights, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(controller.virtual_error, got.error[VIRTUAL, -1], atol=1e-9)
+    assert noise_reduction_db(want.error, want.disturbance) > 1.0  # it did something
+    assert got.algorithm == f"{there.name} with virtual microphones"
+
+
+def test_with_other_filters_it_is_not() -> None:
+    exact, wrong = run(made()), run(made(-OBSERVATION))
+    reductions = [noise_reduction_db(r.error[VIRTUAL], r.disturbance[VIRTUAL]) for r in (exact, wrong)]
+    assert reductions[0] > 1.0 > 0.0 > reductions[1]
+
+
+def test_known_amplifiers_keep_the_estimate_right_when_they_clip() -> None:
+    signals = 2.0 * np.random.default_rng(4).standard_normal((J, 300))
+    clip = [HardClipAmplifier(0.5), HardClipAmplifier(1.0)]
+    errors = []
+    for amplifier in (clip, None):
+        controller = made(controller=Recorded(signals), amplifier=amplifier)
+        result = simulate(
+            controller, noise(300), primary_path=primary(), secondary_path=SECONDARY, fs=FS, amplifier=clip
+        )
+        errors.append(np.abs(np.transpose(controller.controller.errors) - result.error[VIRTUAL]).max())
+    assert errors[0] < 1e-12 < 0.1 < errors[1]
+
+
+def test_one_filter_of_one_tap_and_the_default_of_the_virtual_ones() -> None:
+    """And `ObservationFilters` in place of an array."""
+    filters = ObservationFilters(np.array([[[0.5]]]), np.zeros(1))
+    controller = VirtualMicrophones(Recorded(np.zeros((1, 3))), SECONDARY[:2, :1], filters, physical=[1])
+    assert controller.virtual.tolist() == [0]
+    controller.control_signal([1.0])
+    controller.update([np.nan, 4.0])  # the virtual one is not read
+    assert controller.virtual_error.tolist() == [2.0]
+    assert repr(controller) == "<Recorded with virtual microphones: 1 physical, 1 virtual>"
+
+
+def test_a_copy_stands_alone() -> None:
+    whole, parts = made(), made()
+    run(whole)
+    run(parts)
+    copy = deepcopy(parts)
+    run(parts)
+    np.testing.assert_array_equal(copy.weights, whole.weights)
+    assert not np.array_equal(copy.weights, parts.weights)
+
+
+# ---- The Kalman form
+
+
+def random_model(direct: bool) -> control.StateSpace:
+    """Three states, two noise sources and two loudspeakers, two physical and two virtual microphones."""
+    rng = np.random.default_rng(6)
+    A = 0.8 * np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    D = np.zeros((4, 4))
+    D[:, :2] = direct * rng.standard_normal((4, 2))
+    return control.StateSpace(A, rng.standard_normal((3, 4)), rng.standard_normal((4, 3)), D, 1 / FS)
+
+
+def responses(model: control.StateSpace, n_taps: int) -> np.ndarray:
+    taps = [model.D] + [model.C @ np.linalg.matrix_power(model.A, n) @ model.B for n in range(n_taps - 1)]
+    return np.moveaxis(taps, 0, 2)
+
+
+def test_the_estimates_are_those_of_petersens_filter_with_the_control_signals_in_the_state() -> None:
+    """By filterpy, whose gain has settled after some hundred samples; the secondary paths are cut at 1e-15."""
+    model, n_samples, sensor, power = random_model(direct=False), 400, [0.2, 0.3], [1.0, 0.5]
+    taps = responses(model, 160)
+    observer = KalmanObserver(model[:, :2], 2, sensor_noise_std=sensor, source_power=power)
+    signals = np.random.default_rng(7).standard_normal((2, n_samples))
+    controller = VirtualMicrophones(Recorded(signals), taps[:, 2:], observer, physical=[0, 1])
+    rng = np.random.default_rng(8)
+    v = np.sqrt(power)[:, np.newaxis] * rng.standard_normal((2, n_samples))
+    e = through(taps[:, :2], v) - through(taps[:, 2:], signals)
+    e[:2] += np.array(sensor)[:, np.newaxis] * rng.standard_normal((2, n_samples))
+
+    kf = KalmanFilter(dim_x=3, dim_z=2, dim_u=2)
+    kf.F, kf.B, kf.H = model.A, -model.B[:, 2:], model.C[:2]
+    kf.Q, kf.R = model.B[:, :2] @ np.diag(power) @ model.B[:, :2].T, np.diag(np.square(sensor))
+    kf.P = np.linalg.solve(np.eye(9) - np.kron(model.A, model.A), kf.Q.ravel()).reshape(3, 3)
+    for n in range(n_samples):
+        controller.control_signal([0.0])
+        controller.update(e[:, n])
+        kf.update(e[:2, n])
+        if n > 200:
+            np.testing.assert_allclose(controller.virtual_error, model.C[2:] @ kf.x[:, 0], atol=1e-9)
+        kf.predict(u=signals[:, n, np.newaxis])
+    np.testing.assert_allclose(observer.virtual_variance, np.diag(model.C[2:] @ kf.P_post @ model.C[2:].T), rtol=1e-6)
+
+
+@pytest.mark.parametrize("direct", [False, True], ids=["delayed", "direct"])
+def test_the_estimate_is_the_conditional_mean_of_gaussian_signals(direct: bool) -> None:
+    """Given all of 80 samples at the physical microphones, by dense covariances; the model forgets 0.8 a sample."""
+    model, n = random_model(direct)[:, :2], 80
+    observer = KalmanObserver(model, 2, sensor_noise_std=0.3, source_power=[1.0, 0.5])
+    taps = responses(model, n + 200) * np.sqrt([1.0, 0.5])[np.newaxis, :, np.newaxis]
+    lags = np.array([np.einsum("aim,bim->ab", taps[..., m:], taps[..., : taps.shape[2] - m]) for m in range(n)])
+    covariance = np.block([[lags[i - j] if i >= j else lags[j - i].T for j in range(n)] for i in range(n)])
+    heard = np.ravel([[4 * m, 4 * m + 1] for m in range(n)])  # block i is sample i, oldest first
+    last = [4 * n - 2, 4 * n - 1]
+    of_heard = covariance[np.ix_(heard, heard)] + 0.09 * np.eye(2 * n)
+    gain = np.linalg.solve(of_heard, covariance[np.ix_(heard, last)]).T
+    variance = covariance[np.ix_(last, last)] - gain @ covariance[np.ix_(heard, last)]
+    np.testing.assert_allclose(observer.virtual_variance, np.diag(variance), rtol=1e-6)
+    share = np.diag(variance) / np.diag(covariance[np.ix_(last, last)])
+    np.testing.assert_allclose(observer.residual_db, 10 * np.log10(share), atol=1e-5)
+    d = np.random.default_rng(9).standard_normal((n, 2))
+    for sample in d[:-1]:
+        observer.advance(sample)
+    np.testing.assert_allclose(observer.estimate(d[-1]), gain @ d.ravel(), atol=1e-7)
+
+
+def test_the_variance_of_the_virtual_error_is_the_riccati_equations() -> None:
+    """Measured over 60000 samples: to 3 %."""
+    model, n_samples = random_model(direct=True)[:, :2], 60_000
+    observer = KalmanObserver(model, 2, sensor_noise_std=0.3)
+    rng = np.random.default_rng(10)
+    d = through(responses(model, 160), rng.standard_normal((2, n_samples)))
+    heard = d[:2] + 0.3 * rng.standard_normal((2, n_samples))
+    left = np.empty((2, n_samples))
+    for n in range(n_samples):
+        left[:, n] = d[2:, n] - observer.estimate(heard[:, n])
+        observer.advance(heard[:, n])
+    np.testing.assert_allclose(np.mean(left[:, 500:] ** 2, axis=1), observer.virtual_variance, rtol=0.03)
+    assert np.all(observer.residual_db < -1.0)  # and it did estimate something
+    assert repr(observer).startswith("<KalmanObserver: 3 states, 2 physical and 2 virtual microphone(s), residual -")
+
+
+# ---- What is refused
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.update([0.1, np.nan, 0.2, np.inf]), "error must be finite, but that of microphone 3 is inf"),
+        (lambda c: c.update([0.1, 0.2]), "error must have a value for each of the 4 microphones, got 2"),
+        (lambda c: c.update([1e200, 0.0, 0.0, 0.0]), "must have finite squares"),
+        (lambda c: c.listen(np.ones((1, 9)), np.ones((3, 9))), "a channel for each of the 4 microphones, got 3"),
+        (lambda c: c.control_signal([1.0, 2.0]), "reference must have a value for each of the 1 references"),
+    ],
+    ids=["nan", "count", "overflow", "listening", "reference"],
+)
+def test_signals_that_do_not_fit_are_refused_with_nothing_changed(call: Callable[[Any], Any], message: str) -> None:
+    refusing, twin = made(), made()
+    for one in (refusing, twin):
+        run(one)
+    with pytest.raises(ValueError, match=message):
+        call(refusing)
+    np.testing.assert_array_equal(run(refusing).error, run(twin).error)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "message"),
+    [
+        ({"physical": [0, 4]}, ValueError, r"physical must be different indices of the 4 microphones .* got \[0, 4\]"),
+        ({"physical": [1, 1]}, ValueError, "physical must be different indices"),
+        ({"physical": []}, ValueError, "physical must be different indices"),
+        ({"virtual": [-1]}, ValueError, "virtual must be at least 0"),
+        ({"physical": [0, 1, 2, 3], "virtual": None}, ValueError, "virtual must name a microphone"),
+        ({"observer": np.ones((2, 3, 4))}, ValueError, "from the 2 physical to the 2 virtual .* leads from 3 to 2"),
+        ({"observer": np.ones((2, 2))}, ValueError, r"filters \(K_v, K_p, n_taps\), got shape \(2, 2\)"),
+        ({"observer": np.full((2, 2, 1), np.nan)}, ValueError, "observer must be finite"),
+        ({"observer": "none"}, TypeError, "observer must be a sequence of real numbers"),
+        ({"controller": FxLMS(TAPS, SECONDARY, step_size=0.1)}, ValueError, "for the 2 virtual .* n_microphones is 4"),
+        ({"controller": FxLMS(TAPS, SECONDARY[:2, :1], step_size=0.1)}, ValueError, "n_loudspeakers is 1"),
+        ({"controller": FxLMS}, TypeError, "controller must have control_signal"),
+        ({"amplifier": [HardClipAmplifier(1.0)]}, TypeError, "one for each of the 2 loudspeakers"),
+        ({"secondary_path": np.ones((2, 3))}, ValueError, "K microphones, J loudspeakers, taps"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_settings_that_do_not_fit_are_refused(changed: dict[str, Any], error: type[Exception], message: str) -> None:
+    settings = {
+        "controller": inner(),
+        "secondary_path": SECONDARY,
+        "observer": OBSERVATION,
+        "physical": PHYSICAL,
+        "virtual": VIRTUAL,
+    } | changed
+    with pytest.raises(error, match=message):
+        VirtualMicrophones(**settings)
+
+
+@pytest.mark.parametrize(
+    ("model", "changed", "error", "message"),
+    [
+        ([[1.0]], {}, TypeError, "model must be a control.StateSpace, got list"),
+        (control.StateSpace([[0.5]], [[1.0]], [[1.0], [1.0]], 0.0), {}, ValueError, r"dt = 1/fs, got dt = 0"),
+        (control.StateSpace([[1.0]], [[1.0]], [[1.0], [1.0]], 0.0, 1 / FS), {}, ValueError, "pole of magnitude 1"),
+        (control.StateSpace([[0.5]], [[1.0]], [[1.0]], 0.0, 1 / FS), {}, ValueError, "outputs for the 1 physical .* got 1"),
+        (random_model(False)[:2, :2], {"sensor_noise_std": 0.0}, ValueError, "sensor_noise_std must be greater than 0"),
+        (random_model(False)[:2, :2], {"source_power": [1.0]}, ValueError, "source_power must be one .* each of the 2"),
+    ],
+    ids=["list", "continuous", "unstable", "outputs", "sensor noise", "sources"],
+)  # fmt: skip
+def test_models_that_do_not_fit_are_refused(model: Any, changed: dict, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        KalmanObserver(model, 1, **({"sensor_noise_std": 0.1} | changed))
+
+
+def test_a_run_at_another_rate_is_refused() -> None:
+    paths = random_paths(2, 1, 6, seed=1)
+    inner_one = SharedGainKalman(TAPS, paths[1:], rated_power=1.0, fs=FS)
+    controller = VirtualMicrophones(inner_one, paths, [[[1.0]]], physical=[0])
+    with pytest.raises(ValueError, match="power memory is for 4000 Hz"):
+        simulate(controller, noise(), disturbance=np.zeros((2, 1500)), secondary_path=paths, fs=2 * FS)
+    observer = KalmanObserver(random_model(False)[:2, :2], 1, sensor_noise_std=0.1)
+    controller = VirtualMicrophones(Recorded(np.zeros((1, 9))), paths, observer, physical=[0])
+    with pytest.raises(ValueError, match="observer is for 4000 Hz"):
+        simulate(controller, noise(), disturbance=np.zeros((2, 1500)), secondary_path=paths, fs=2 * FS)
+
+
+def test_a_controller_that_cannot_listen_says_so() -> None:
+    controller = VirtualMicrophones(Recorded(np.zeros((1, 9))), SECONDARY[:2, :1], [[[1.0]]], physical=[0])
+    with pytest.raises(ValueError, match="needs a controller with a method listen"):
+        controller.listen(np.zeros((1, 5)), np.zeros((2, 5)))
