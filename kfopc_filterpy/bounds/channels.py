@@ -19,6 +19,7 @@ from .wiener import WienerSolution, mean_square, reduction_db
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions with less get no weight
 TOLERANCE = 1e-5  # to which a rated power that binds is met
+ROUNDING = 1e-14  # of the dual function
 SOLUTIONS = 100  # at most; some ten are usual
 
 
@@ -128,15 +129,16 @@ class ChannelCorrelations:
         J = self.shape[0]
         if not np.trace(self.filtered) > 0.0:
             return np.zeros(self.shape), np.zeros(J)
-        natural = np.trace(self.filtered) / np.trace(self.reference) / J
-        penalty = trial = np.zeros(J) if start is None else start.copy()
-        weights = np.zeros(self.shape)
-        gained, step = -np.inf, np.full(J, natural)
+        weights, penalty = self.weights(), np.zeros(J)
+        if np.all(self.powers(weights) <= rated_power):
+            return weights, penalty
+        natural = np.full(J, np.trace(self.filtered) / np.trace(self.reference) / J)
+        trial, gained, step = natural if start is None else start, -np.inf, natural
         for _ in range(SOLUTIONS):
             factors = self._factors(trial)
             found = cho_solve(factors, self.cross).reshape(self.shape)
             dual = -self.cross @ found.ravel() - trial @ rated_power
-            if dual < gained:  # the step was too long
+            if dual < gained - ROUNDING * abs(dual):  # the step was too long
                 step = 0.25 * step
             else:
                 weights, penalty, gained = found, trial, dual

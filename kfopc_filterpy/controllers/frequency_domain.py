@@ -198,9 +198,10 @@ class FrequencyDomainKalman(PrimaryPathController):
         power = self._reference_power()
         if not power > 0.0:
             return
-        if paths.state_noise == 0.0:
-            paths.variance[...] = self._first_variance(PRIOR, power)
-        paths.state_noise = self._state_noise(paths.state_noise, power)
+        before, paths.state_noise = paths.state_noise, self._state_noise(paths.state_noise, power)
+        if paths.state_noise != before:  # the references are the first, or grown louder
+            most = self._first_variance(PRIOR, power)
+            paths.variance[...] = most if before == 0.0 else np.minimum(paths.variance, most)
         if controlled and not paths.learn(self._state.disturbances):
             raise ValueError(OVERFLOW)
         self._solve()
