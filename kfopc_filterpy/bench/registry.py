@@ -143,9 +143,10 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
             "measurement_noise": scene.measurement_noise,
             "initial_variance": scene.initial_variance,
             "amplifier": amplifier,
+            **_references(scene),
         }
         if budget:
-            settings |= {"rated_power": scene.rated_power, "fs": scene.fs}
+            settings |= {"rated_power": scene.rated_power, "fs": scene.fs, "form": "direct"}
         elif not free:
             settings |= {"constraint": _constraint(scene)}
         return make(scene.n_taps, scene.known_secondary, **settings)
@@ -153,17 +154,22 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
     return made
 
 
-def _shared_gain(scene: Scene, memory_s: float, _: float, amplifier: Amplifier | None) -> Controller:
-    return kf_pb(
-        scene.n_taps,
-        scene.known_secondary,
-        rated_power=scene.rated_power,
-        form="shared gain",
-        memory_s=memory_s,
-        fs=scene.fs,
-        amplifier=amplifier,
-        **_references(scene),
-    )
+def _primary_paths(form: str) -> Callable[..., Controller]:
+    """Return a maker of a form of KF-PB that estimates the primary paths."""
+
+    def made(scene: Scene, memory_s: float, _: float, amplifier: Amplifier | None) -> Controller:
+        return kf_pb(
+            scene.n_taps,
+            scene.known_secondary,
+            rated_power=scene.rated_power,
+            form=form,
+            memory_s=memory_s,
+            fs=scene.fs,
+            amplifier=amplifier,
+            **_references(scene),
+        )
+
+    return made
 
 
 def _rated(kind: Any, **more: Any) -> Callable[..., Controller]:
@@ -180,7 +186,8 @@ def _plain(kind: Any) -> Callable[..., Controller]:
 
 def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
     energy = scene.n_taps * scene.filtered_power  # mu is that of FxLMS; the first rows are short, hence the bottom
-    return FxNLMS(scene.n_taps, scene.known_secondary, step_size=mu * energy, regularization=0.01 * energy)
+    settings: dict[str, Any] = {"step_size": mu * energy, "regularization": 0.01 * energy, **_references(scene)}
+    return FxNLMS(scene.n_taps, scene.known_secondary, **settings)
 
 
 def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
@@ -256,23 +263,28 @@ _PEAK: dict[str, Any] = _STEP | {
 _FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
 _KNOWS: dict[str, Any] = {"knows_amplifier": True}
 _CHANNELS: dict[str, Any] = {"several_channels": True}
-_SHARED_GAIN: dict[str, Any] = {
+_PRIMARY_PATHS: dict[str, Any] = {
     "symbol": "memory_s",
     "kind": "memory of the references' correlation in s",
     "first": MEMORY_GRID,
     "one_channel": False,
+    **_KNOWS,
+    **_CHANNELS,
 }
 REGISTRY: dict[str, Algorithm] = {
-    "KF-ANC": Algorithm(_kalman(kf_anc, free=True), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE),
-    "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK),
+    "KF-ANC": Algorithm(
+        _kalman(kf_anc, free=True), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE, **_CHANNELS
+    ),
+    "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS),
     "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired), **_RANDOM_WALK),
-    "KF-PB": Algorithm(_kalman(kf_pb, budget=True), **_RANDOM_WALK),
-    "KF-PB (shared gain)": Algorithm(_shared_gain, **_SHARED_GAIN, **_KNOWS, **_CHANNELS),
+    "KF-PB": Algorithm(_kalman(kf_pb, budget=True), **_RANDOM_WALK, **_CHANNELS),
+    "KF-PB (shared gain)": Algorithm(_primary_paths("shared gain"), **_PRIMARY_PATHS),
+    "KF-PB (frequency domain)": Algorithm(_primary_paths("frequency domain"), **_PRIMARY_PATHS),
     "diagonal KF": Algorithm(_kalman(DiagonalKalman, free=True), **_DIAGONAL, **_FREE),
     "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman), **_DIAGONAL),
     "FxRLS": Algorithm(_rls, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
     "FxLMS": Algorithm(_plain(FxLMS), of_paper=True, **_STEP, **_FREE, **_CHANNELS),
-    "FxNLMS": Algorithm(_normalised, **_STEP, **_FREE),
+    "FxNLMS": Algorithm(_normalised, **_STEP, **_FREE, **_CHANNELS),
     "leaky FxLMS": Algorithm(
         _leaky, **_STEP, second_kind="leak over E[x'^2]", second=PRICE_GRID, sees_budget=False, **_CHANNELS
     ),

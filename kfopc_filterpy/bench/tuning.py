@@ -135,7 +135,7 @@ def run_settings(
 ) -> list[Outcome]:
     """Return what `measure` makes of each run.
 
-    Runs of algorithms that share gains, of one setting and one noise, go on together.
+    Runs of algorithms that share gains, of one setting and one noise, go on together if there is one channel.
 
     Parameters
     ----------
@@ -166,7 +166,8 @@ def run_settings(
     """
     groups: dict[tuple[object, ...], list[Job]] = {}
     for job in jobs:
-        groups.setdefault(("together", *job[1:]) if REGISTRY[job[0]].shares_gains else job, []).append(job)
+        together = REGISTRY[job[0]].shares_gains and scene.secondary.ndim == 1
+        groups.setdefault(("together", *job[1:]) if together else job, []).append(job)
 
     def run(group: list[Job]) -> list[Outcome]:
         if len(group) == 1:
