@@ -14,6 +14,7 @@ import numpy as np
 from .._validate import as_real_array
 from ..kernels.compiling import inlined
 from ..kernels.delay_lines import delay_line, latest, newest, push
+from ..kernels.records import as_records
 from ..kernels.vectors import at, dot
 from ..power.amplifiers import LinearAmplifier, amplify, compiled_model
 from ..power.constraint import advance_squares, preview_squares
@@ -239,4 +240,4 @@ def amplifier_models(amplifier: Any, n_loudspeakers: int) -> np.ndarray:
             "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "
             f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
         )
-    return np.array(models)
+    return as_records(np.array(models))

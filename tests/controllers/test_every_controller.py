@@ -67,7 +67,9 @@ KNOWS_AN_AMPLIFIER = [
     if not name.startswith(("FxLMS", "FxNLMS", "leaky", "two-gradient", "re-scaling", "clipping"))
 ]
 VARIANTS = [(name, "plain") for name in MAKERS]
-VARIANTS += [(name, "limiter") for name in MAKERS]
+# The limiter acts on what they emit, alike for all; these adapt to it in different ways. Each is compiled anew for it.
+LIMITED = ("KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "FxLMS", "MOV", "two-gradient", "re-scaling", "clipping")
+VARIANTS += [(name, "limiter") for name in LIMITED]
 VARIANTS += [(name, "known amplifier") for name in KNOWS_AN_AMPLIFIER]
 
 

@@ -473,7 +473,7 @@ def test_a_refused_error_changes_nothing(name: str) -> None:
     assert np.all(np.isfinite(controller.weights))
 
 
-@pytest.mark.parametrize("name", EVERY)
+@pytest.mark.parametrize("name", ["FxLMS", "MOV-FxLMS", "two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"])
 def test_behind_a_limiter_no_window_is_above_the_rated_power(name: str) -> None:
     x, d = noise(2000)
     limiter = OutputLimiter(rated_power=0.1, fs=1000, window_s=0.05)
