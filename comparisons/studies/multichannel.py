@@ -390,8 +390,8 @@ def _power_table(rows: Sequence[ChannelRow]) -> Table:
 
 def _settling_table(rows: Sequence[ChannelRow]) -> Table:
     caption = (
-        f"Time in s after which the NSE over {CONVERGENCE_WINDOW_S:g} s stays within {CONVERGENCE_DB:g} dB of its steady "
-        "value; a dash if it never does"
+        f"Time in s after which the NSE over {CONVERGENCE_WINDOW_S:g} s stays within {CONVERGENCE_DB:g} dB of its "
+        "steady value; a dash if it never does"
     )
     ran = [row for row in rows if row.algorithm in algorithms(several_channels=True)]
     return _table("settling", caption, ran, "settled_s", ["a quarter each"])

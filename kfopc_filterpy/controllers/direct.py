@@ -166,8 +166,8 @@ class DirectKalman(FilteredReferenceController):
     .. math:: \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\}, \qquad
         G_j = \frac{\sum_{k,i} E[x_{kji}'^2]}{\sum_i E[x_i^2]}, \qquad \delta_d^2 = \sum_k E[\hat d_k^2]
 
-    This extension is the package's, not the paper's. With one loudspeaker, microphone and reference it reduces to eq.
-    13. A loudspeaker that no microphone hears, :math:`G_j = 0`, is left out: its control filters stay zero.
+    This extension is the package's, not the paper's. With one loudspeaker, microphone and reference it reduces to
+    eq. 13. A loudspeaker that no microphone hears, :math:`G_j = 0`, is left out: its control filters stay zero.
 
     Parameters
     ----------

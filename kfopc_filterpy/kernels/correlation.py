@@ -42,6 +42,6 @@ class FadingCorrelation:
 
     @property
     def faded(self) -> np.ndarray:
-        """Mean products, (M, I, I), as of a signal that fades, which makes them positive definite; zero in silence."""
+        """Mean products, (M, I, I), of signals that fade into the past, so positive definite; zero in silence."""
         lags = np.arange(len(self.total))
         return self.total * (np.sqrt(self.keep) ** lags / max(self.mass, 1.0))[:, np.newaxis, np.newaxis]
