@@ -34,11 +34,11 @@ from .rooms import MEASURED, RECORDINGS, SIZES, Place, level_map_db, make_rated_
 DURATION_S = 10.0
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
 KF_PB = "KF-PB (shared gain)"
-DEFAULT_MEMORY_S = 0.5  # of KF_PB
-DIRECT = ("KF-ANC", "KF-OPC", "KF-PB")  # whose state is all weights
-MOST_WEIGHTS = 256  # of the direct forms: a sample takes K J^2 L^2 operations
+DEFAULT_MEMORY_S = 0.5  # setting of KF_PB by default
+DIRECT = ("KF-ANC", "KF-OPC", "KF-PB")  # their state consists of all weights
+MOST_WEIGHTS = 256  # limit for the direct forms: a sample takes K J^2 L^2 operations
 CONVERGENCE_WINDOW_S, CONVERGENCE_DB = 0.25, 1.0
-SHOWN = ("4 x 4", "band noise")  # of the figures over time and place
+SHOWN = ("4 x 4", "band noise")  # shown in the figures over time and in the map
 EQUAL = "one equal rating"
 
 Where = tuple[str, str]  # a place and a noise
@@ -46,7 +46,7 @@ Where = tuple[str, str]  # a place and a noise
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelRow(Row):
-    """One algorithm in one place; powers are those of each loudspeaker over its rating."""
+    """One algorithm in one place; each power is that of a loudspeaker over its rated power."""
 
     rating: str = "a quarter each"
     powers: list[float] = field(default_factory=list)
@@ -57,7 +57,7 @@ class ChannelRow(Row):
 
 @dataclass
 class Outcome:
-    """All that is known of one place and noise."""
+    """All results for one place and noise."""
 
     place: Place
     scene: Scene
@@ -74,17 +74,17 @@ def names(place: Place) -> list[str]:
 
 
 def wheres() -> list[Where]:
-    """Return the places and noises at hand."""
+    """Return the places and noises that are available."""
     return [(name, noise) for name, place in places().items() for noise in place.noises]
 
 
 def planned_runs() -> int:
-    """Return the number of runs of the grids; those of the finer grids are not planned."""
+    """Return the number of runs of the grids; runs of the finer grids are not counted."""
     return sum(len(own) for name, _ in wheres() for own in coarse_grids(places()[name]).values())
 
 
 def coarse_grids(place: Place) -> dict[str, list[Setting]]:
-    """Return the settings that are tried first: every second one of each of two settings, since a finer grid follows."""
+    """Return the settings to try first: of grids of two settings every second value, since a finer grid follows."""
     registry = algorithms(several_channels=True)
     return {
         name: [(one, two) for one in registry[name].first[::2] for two in registry[name].second[::2]]
@@ -95,7 +95,7 @@ def coarse_grids(place: Place) -> dict[str, list[Setting]]:
 
 
 def main(runs: Runs) -> StudyReport | str:
-    """Run the study in the places at hand."""
+    """Run the study in the places that are available."""
     if not places():
         return (
             "multichannel: left out. The built-in room needs pyroomacoustics (pip install kfopc-filterpy[rooms]), the "
@@ -107,9 +107,10 @@ def main(runs: Runs) -> StudyReport | str:
         name="multichannel",
         title="Several loudspeakers, a rated power for each",
         summary=(
-            "Noise reduction over all microphones, and the power of each loudspeaker, of every algorithm that takes several "
-            "channels, each at its best setting, and of the power-constrained Wiener solution. Each loudspeaker's rated "
-            f"power is {rooms.RATED_SHARE:g} of what it would like to have; the table also has one equal rating for all."
+            "Noise reduction over all microphones and power of each loudspeaker, for every algorithm that takes "
+            "several channels, each at its best setting, and for the power-constrained Wiener solution. Each "
+            f"loudspeaker's rated power is {rooms.RATED_SHARE:g} of the power that it would use without a limit; the "
+            "tables also have a case with one equal rating for all."
         ),
         fs=rooms.FS,
         rated_power=1.0,
@@ -148,7 +149,7 @@ def _final_runs(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> Iterable[t
 
 
 def channel_row(name: str, noise: str, scene: Scene, result: SimulationResult | None, **more: Any) -> ChannelRow:
-    """Return the row of a run; a filter that could not go on diverged at its start."""
+    """Return the row of a run; a filter that could not continue counts as diverged at the start."""
     if result is None or result.diverged_at_s is not None:
         at = 0.0 if result is None else result.diverged_at_s
         return ChannelRow(path=name, noise=noise, diverged_at_s=at, within_budget=False, **more)
@@ -175,7 +176,7 @@ def channel_row(name: str, noise: str, scene: Scene, result: SimulationResult | 
 def _bound_rows(name: str, noise: str, scene: Scene, **more: Any) -> list[ChannelRow]:
     """Return the rows of the bound, of the scaled solution and of the one without a limit, over the steady half.
 
-    They are those of one filter for the record, or of each second's own filter for a recording.
+    The bound and the scaled solution are one filter for the whole record, or for a recording one filter per second.
     """
     recorded = noise in RECORDINGS
     bound = bound_of(scene, 1.0 if recorded else 2 * DURATION_S)
@@ -209,7 +210,7 @@ def _equal_rows(name: str, noise: str, place: Place, setting: Setting) -> list[C
 
 
 def claims(rows: Sequence[ChannelRow]) -> list[Verdict]:
-    """Return the verdicts on what KF-PB aims at."""
+    """Return the verdicts on the aims of KF-PB."""
     own = {_key(row): row for row in rows if row.algorithm == KF_PB}
     bound = {_key(row): row for row in rows if row.algorithm == BOUND}
     steady = [key for key in own if key[1] not in RECORDINGS]
@@ -241,20 +242,20 @@ def _power_verdict(
     bound: dict[Any, ChannelRow],
     keys: Sequence[Any],
 ) -> Verdict:
-    """Judge the power of loudspeakers whose rating binds: those that the bound uses in full."""
+    """Judge the powers, above all of loudspeakers that their rating limits: those that the bound uses in full."""
     binding = [
         power
         for key in keys
         for power, best in zip(own[key].powers, bound[key].powers, strict=True)
-        if best > 0.98  # the bound of a record uses a rating that binds in full; in its steady half, nearly
+        if best > 0.98  # a rating that limits is used in full over the record, and nearly so over half of it
     ]
     free = [power for key in keys for power in own[key].powers]
     kept = bool(binding) and min(binding) >= least and max(free) <= most
     return Verdict(
-        f"{what}: every loudspeaker's power is {aim} of its rating where that binds, and nowhere more",
+        f"{what}: every loudspeaker's power is {aim} of its rating if that limits it, and never more",
         kept,
-        f"{min(binding, default=np.nan):.3f} to {max(binding, default=np.nan):.3f} where it binds, "
-        f"{max(free, default=np.nan):.3f} at most",
+        f"{min(binding, default=np.nan):.3f} to {max(binding, default=np.nan):.3f} if the rating limits, "
+        f"{max(free, default=np.nan):.3f} at most of all",
     )
 
 
@@ -266,12 +267,13 @@ def _loss_verdict(
     return Verdict(
         claim,
         losses[worst] <= most_db,
-        f"{np.mean(list(losses.values())):.2f} dB below it on average, {losses[worst]:.2f} dB at worst ({', '.join(worst)})",
+        f"{np.mean(list(losses.values())):.2f} dB below it on average, "
+        f"{losses[worst]:.2f} dB at worst ({', '.join(worst)})",
     )
 
 
 def _rivals_verdict(rows: Sequence[ChannelRow]) -> Verdict:
-    """Judge KF-PB against the best other method that keeps the budget, in each place."""
+    """Judge KF-PB against the best other method that keeps the budget, for each place and noise."""
     registry = algorithms(several_channels=True)
     ahead = {}
     for row in rows:
@@ -286,7 +288,7 @@ def _rivals_verdict(rows: Sequence[ChannelRow]) -> Verdict:
         ahead[f"{row.case}: {best}"] = row.noise_reduction_db - rivals.get(best, -np.inf)
     worst, most = min(ahead, key=lambda key: ahead[key]), max(ahead.values())
     return Verdict(
-        "No method of another kind that keeps every rating reduces the noise by more than 0.3 dB more",
+        "No method of another kind that keeps every rating is more than 0.3 dB better",
         ahead[worst] >= -0.3,
         f"KF-PB is {np.mean(list(ahead.values())):+.2f} dB ahead of the best other on average, "
         f"{ahead[worst]:+.2f} dB at worst ({worst}), {most:+.2f} dB at best",
@@ -294,7 +296,7 @@ def _rivals_verdict(rows: Sequence[ChannelRow]) -> Verdict:
 
 
 def _is_rival(row: ChannelRow) -> bool:
-    """Return whether a row is of an algorithm, not KF-PB in any form, that kept every rating."""
+    """Return whether a row belongs to an algorithm, other than a form of KF-PB, that kept every rating."""
     return (
         row.algorithm in algorithms(several_channels=True)
         and not row.algorithm.startswith("KF-PB")
@@ -305,40 +307,43 @@ def _is_rival(row: ChannelRow) -> bool:
 
 def _notes(rows: Sequence[ChannelRow], outcomes: dict[Where, Outcome]) -> list[str]:
     notes = [
-        f"The direct forms ({', '.join(DIRECT)}), whose state is all J L weights, run up to {MOST_WEIGHTS} of them. Beyond, "
-        "the scaled Wiener solution stands for KF-OPC, whose steady state it is.",
-        "Without a limit the noise reduction is that of a filter that has the energy of the record's noise in all "
-        "directions of the weights; its power is what the ratings are a quarter of.",
+        f"The direct forms ({', '.join(DIRECT)}), whose state consists of all J L weights, run only in systems of up "
+        f"to {MOST_WEIGHTS} weights. In larger ones, the scaled Wiener solution stands for KF-OPC: it is what KF-OPC "
+        "would reach in the steady state if its factor kept the ratings.",
+        f"'{FREE}' is the Wiener solution without a limit, with a small ridge: directions of the weights in which the "
+        "noise has hardly any energy are left out. The ratings are a quarter of its powers.",
     ]
     lost = [
         _row(outcome, KF_PB).noise_reduction_db - outcome.untuned.noise_reduction_db for outcome in outcomes.values()
     ]
     notes.append(
-        f"{KF_PB} with its default settings is {np.mean(lost):.2f} dB below its best setting on average, {max(lost):.2f} dB at "
-        f"worst; its largest power is {max(outcome.untuned.power for outcome in outcomes.values()):.3f} of a rating."
+        f"{KF_PB} with its default settings is {np.mean(lost):.2f} dB below its best setting on average, "
+        f"{max(lost):.2f} dB at worst; its largest power is "
+        f"{max(outcome.untuned.power for outcome in outcomes.values()):.3f} times the rating."
     )
     left_out = [str(size) for size in SIZES if f"{size} x {size}" not in places()]
     if left_out:
         notes.append("pyroomacoustics is not installed: the built-in rooms are left out.")
     if MEASURED not in places():
-        notes.append("The measured room was not at hand (KFOPC_DATA): it is left out.")
+        notes.append("The measured room was not available (KFOPC_DATA): it is left out.")
     for name, own in algorithms(several_channels=True).items():
         over = [row for row in rows if row.algorithm == name and not row.within_budget and row.diverged_at_s is None]
         count = sum(row.algorithm == name for row in rows)
         if own.keeps_budget and over:
             most = max(row.power for row in over)
             notes.append(
-                f"{name} is above {Tuned.BUDGET:g} of a rating in {len(over)} of {count} cases, up to {most:.2f} of it."
+                f"{name} exceeds {Tuned.BUDGET:g} times a rating in {len(over)} of {count} cases, and reaches "
+                f"{most:.2f} times a rating."
             )
     for name in FREE_ALGORITHMS:
         gained = [row.noise_reduction_db for row in rows if row.algorithm == name]
         if gained:
             notes.append(
-                f"{name} has no constraint: it is judged without one ({min(gained):.1f} to {max(gained):.1f} dB)."
+                f"{name} has no constraint and need not keep the ratings ({min(gained):.1f} to {max(gained):.1f} dB)."
             )
     edges = sorted({name for outcome in outcomes.values() for name, best in outcome.tuned.items() if best.at_edge})
     if edges:
-        notes.append(f"Best at an edge of the grid somewhere: {', '.join(edges)}.")
+        notes.append(f"In at least one case, the best setting is at the edge of the grid: {', '.join(edges)}.")
     return notes
 
 
@@ -353,7 +358,7 @@ def _columns(rows: Sequence[ChannelRow]) -> list[tuple[str, str]]:
 
 
 def _table(stem: str, caption: str, rows: Sequence[ChannelRow], figure: str, ratings: Sequence[str]) -> Table:
-    """Return a table of a line for each rating and algorithm and a column for each place and noise."""
+    """Return a table with a row for each rating and algorithm and a column for each place and noise."""
     columns = _columns(rows)
     found = {(row.rating, row.algorithm, row.path, row.noise): row for row in rows}
     lines: list[list[str | float]] = []
@@ -372,21 +377,21 @@ def _cell(row: ChannelRow, figure: str) -> str | float:
 
 def _reduction_table(rows: Sequence[ChannelRow]) -> Table:
     caption = (
-        "Noise reduction over the steady half in dB, all microphones together. For recordings, the bound and the scaled "
-        "solution are those of each second"
+        "Noise reduction over the steady half in dB, all microphones together. For recordings, the bound and the "
+        "scaled solution have one filter per second"
     )
     return _table("reduction", caption, rows, "noise_reduction_db", ["a quarter each", EQUAL])
 
 
 def _power_table(rows: Sequence[ChannelRow]) -> Table:
-    caption = "Output power over the steady half, over the rated power, of the loudspeaker with the largest"
+    caption = "Output power in the steady half over the rated power, for the loudspeaker with the largest ratio"
     return _table("power", caption, rows, "power", ["a quarter each", EQUAL])
 
 
 def _settling_table(rows: Sequence[ChannelRow]) -> Table:
     caption = (
-        f"Time in s after which the NSE over {CONVERGENCE_WINDOW_S:g} s stays within {CONVERGENCE_DB:g} dB of its steady "
-        "value; a dash if it never does"
+        f"Time in s after which the NSE over {CONVERGENCE_WINDOW_S:g} s stays within {CONVERGENCE_DB:g} dB of its "
+        "steady value; a dash if it never does"
     )
     ran = [row for row in rows if row.algorithm in algorithms(several_channels=True)]
     return _table("settling", caption, ran, "settled_s", ["a quarter each"])
@@ -397,21 +402,21 @@ def _parameters(outcomes: dict[Where, Outcome]) -> dict[str, Parameter]:
     return {
         "fs_hz": Parameter({name: place.fs for name, place in places().items()}, "the measured room's own"),
         "n_taps": Parameter({name: place.n_taps for name, place in places().items()}, "of each control filter"),
-        "duration_s": Parameter(DURATION_S, "from switch-on on; the steady half counts"),
+        "duration_s": Parameter(DURATION_S, "from switch-on; the steady half counts"),
         "rated_power": Parameter(
-            rooms.RATED_SHARE, "of the power that each loudspeaker has without a limit: (R_x' + q/(N P0) I) w = r"
+            rooms.RATED_SHARE, "of the power that each loudspeaker uses without a limit: (R_x' + q/(N P0) I) w = r"
         ),
-        "switch_on_s": Parameter(SWITCH_ON_S, "the noise runs before"),
+        "switch_on_s": Parameter(SWITCH_ON_S, "for which the noise runs before the control"),
         "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "below the disturbance"),
         "room_m": Parameter(list(rooms.SIZE_M), f"built-in room, T60 {rooms.REVERBERATION_S:g} s by Sabine's formula"),
         "tones_hz": Parameter(list(rooms.TONES_HZ), "of equal level"),
         "band_hz": Parameter([list(rooms.BAND_HZ), list(rooms.WIDE_BAND_HZ)], "built-in and measured room"),
         "settings": Parameter(
-            {name: [own.kind, own.second_kind] for name, own in registry.items()}, "what the settings of each are"
+            {name: [own.kind, own.second_kind] for name, own in registry.items()}, "meaning of the settings of each"
         ),
         "tuned": Parameter(
             {", ".join(where): tuned_in_words(outcome.tuned) for where, outcome in outcomes.items()},
-            f"{Tuned.RULE}; of what was tried: setting, mean NSE in dB, power of each loudspeaker",
+            f"{Tuned.RULE}; for each setting tried: the setting, mean NSE in dB, power of each loudspeaker",
         ),
     }
 
@@ -429,7 +434,7 @@ def _figures(outcomes: dict[Where, Outcome], rows: Sequence[ChannelRow]) -> list
 
 
 def _heard(outcome: Outcome) -> list[str]:
-    """Return the algorithms that figures over time show: KF-PB, MEFxLMS, and the best two others that keep the ratings."""
+    """Return the algorithms in the figures over time: KF-PB, FxLMS, and the two best others that keep the ratings."""
     kept = [row for row in outcome.rows if row.rating != EQUAL and _is_rival(row)]
     constrained = [row for row in kept if row.algorithm not in FREE_ALGORITHMS]
     ranked = sorted(constrained, key=lambda row: -row.noise_reduction_db)
@@ -437,7 +442,7 @@ def _heard(outcome: Outcome) -> list[str]:
 
 
 def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
-    """Draw a panel for each place: noise reduction of each algorithm, a mark for each noise."""
+    """Return a figure with a panel for each place: noise reduction of each algorithm, with a mark for each noise."""
     own = [row for row in rows if row.rating != EQUAL]
     shown = list(dict.fromkeys(row.path for row in own))
     order = list(dict.fromkeys(row.algorithm for row in own))[::-1]
@@ -459,8 +464,9 @@ def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
         ax.grid(True, alpha=0.3)
         ax.legend(fontsize="x-small", frameon=True, loc="lower right")
     caption = (
-        "Noise reduction over the steady half, all microphones together, each loudspeaker rated at a quarter of what it "
-        f"would like; hollow if a loudspeaker's power is above {Tuned.BUDGET:g} of its rating."
+        "Noise reduction over the steady half, all microphones together. Each loudspeaker is rated at a quarter of the "
+        "power that it would use without a limit. Hollow marks: a loudspeaker's power exceeds "
+        f"{Tuned.BUDGET:g} times its rating."
     )
     return FigureItem("reduction", caption, figure)
 
@@ -526,8 +532,8 @@ def _map_figure(outcome: Outcome, shown: Sequence[str]) -> FigureItem:
     axes[0, 0].set_ylabel("y (m)")
     figure.colorbar(mesh, ax=axes[0].tolist(), label="Level (dB)", shrink=0.8)
     caption = (
-        f"{_place_in_words()}: sound level over the last second in a plane {rooms.HEIGHT_M:g} m above the floor, in dB over "
-        "the mean without control. Star: noise source; squares: loudspeakers; circles: error microphones."
+        f"{_place_in_words()}: sound level over the last second in a plane {rooms.HEIGHT_M:g} m above the floor, in dB "
+        "relative to the mean without control. Star: noise source; squares: loudspeakers; circles: error microphones."
     )
     return FigureItem("map", caption, figure)
 

@@ -26,7 +26,7 @@ from kfopc_filterpy.signals import (
 
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of
 
-FS = 4000.0  # of the built-in room: twice what a band up to 500 Hz needs, and a quarter of the work of 16 kHz
+FS = 4000.0  # of the built-in room: ample for a band up to 500 Hz, with a quarter of the samples of 16 kHz
 N_TAPS, N_PATH_TAPS = 128, 256
 SIZE_M, HEIGHT_M, REVERBERATION_S = (6.0, 4.0, 2.6), 1.2, 0.25
 SOURCE_M = (0.6, 2.3, 1.4)
@@ -38,26 +38,27 @@ MEASURED = "measured 4 x 4"
 RECORDINGS = ("recorded compressor", "recorded motor")
 FLOOR_DB = -60.0  # white noise below tones and band noise
 SEED = 1
-RATED_SHARE = 0.25  # rated power of each loudspeaker over what it would like to have
+RATED_SHARE = 0.25  # rated power of each loudspeaker over the power that it would use without a limit
 MAP_SPACING_M = 0.125
 
 
 @dataclass(frozen=True)
 class Place:
-    """Paths and noises: what a run of the study is about."""
+    """Paths and noises of one room."""
 
     name: str
     fs: float
     n_taps: int
     primary: np.ndarray
     secondary: np.ndarray
-    noises: dict[str, Callable[[float], np.ndarray]]  # of a duration in s
+    noises: dict[str, Callable[[float], np.ndarray]]  # functions of a duration in s
 
 
 def built_in_room(size: int) -> RoomPaths:
-    """Return the room with as many loudspeakers as microphones, between the noise source and the far wall.
+    """Return the built-in room, with `size` loudspeakers and as many microphones.
 
-    The loudspeakers stand in a row across the room, the microphones in another row 1.2 m behind it.
+    Between the noise source and the far wall, the loudspeakers stand in a row across the room, and the microphones in
+    another row 1.2 m behind it.
     """
     across = np.linspace(0.6, 3.4, size)
     to_and_fro = 0.15 * (-1.0) ** np.arange(size)
@@ -74,7 +75,7 @@ def built_in_room(size: int) -> RoomPaths:
 
 @cache
 def places() -> dict[str, Place]:
-    """Return the built-in rooms if pyroomacoustics is installed, and the measured one if it is at hand."""
+    """Return the built-in rooms if pyroomacoustics is installed, and the measured one if its data are available."""
     made: dict[str, Place] = {}
     for size in SIZES if find_spec("pyroomacoustics") else ():
         room, name = built_in_room(size), f"{size} x {size}"
@@ -101,9 +102,9 @@ def _from_recording(recording: np.ndarray, fs: float, duration_s: float) -> np.n
 
 
 def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[float], np.ndarray]]:
-    """Return the noises that are made; tones and band noise over a floor, as every reference has one.
+    """Return the synthetic noises; tones and band noise are above a noise floor, as any real reference has one.
 
-    Without a floor, a fixed filter can predict them by weights of hundreds in directions without energy.
+    Without a floor, a fixed filter can predict them with very large weights in directions without energy.
     """
 
     def tones(duration: float) -> np.ndarray:
@@ -125,9 +126,9 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
 
 
 def make_rated_scene(place: Place, noise: str, duration_s: float, equal: bool = False) -> Scene:
-    """Return the scene of a noise; each loudspeaker's rating is a quarter of the power it would like to have.
+    """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited.
 
-    With `equal` ratings, all loudspeakers have the mean of these.
+    If `equal`, every loudspeaker gets the mean of these ratings.
     """
     x = place.noises[noise](duration_s + SWITCH_ON_S)
     scene = make_scene(
@@ -151,7 +152,7 @@ def make_rated_scene(place: Place, noise: str, duration_s: float, equal: bool = 
 def level_map_db(size: int, reference: np.ndarray, result: SimulationResult | None) -> tuple[np.ndarray, Any]:
     """Return the sound level in a plane of a built-in room over the last second, and the axes of the plane in m.
 
-    The level is in dB over the mean of the plane without control.
+    The level is in dB relative to the mean over the plane without control.
 
     Parameters
     ----------

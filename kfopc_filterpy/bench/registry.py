@@ -32,14 +32,14 @@ from kfopc_filterpy.power.amplifiers import Amplifier
 from .scene import Scene
 
 # r E[x'^2] / q: the filter forgets over about its inverse square root in samples, 0.6 s to 6 ms at 16 kHz. Less state
-# noise makes it recursive least squares that never forgets, which stationary noise would always favour; the tonal study
-# shows the difference.
+# noise makes it recursive least squares that never forgets, which would always be best for stationary noise; the tonal
+# study shows the difference.
 STATE_NOISE_GRID = (1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 # The diagonal filter learns as slowly as NLMS, and needs less state noise.
 DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
-PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid follows around the best
+PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
 MEMORY_GRID = (0.125, 0.25, 0.5, 1.0, 2.0)  # in s
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
@@ -76,9 +76,9 @@ class Algorithm:
     knows_amplifier : bool, default False
         Whether its disturbance estimate can know the amplifier.
     may_refuse : bool, default False
-        Whether it may find during a run that it cannot go on, which counts as divergence.
+        Whether it may stop during a run because it cannot continue, which counts as divergence.
     one_channel, several_channels : bool, default True, False
-        Whether studies of one channel, and of several, compare it.
+        Whether the studies of one channel, or of several channels, compare it.
     """
 
     make: Callable[[Scene, float, float, Amplifier | None], Controller]
@@ -106,7 +106,7 @@ class Algorithm:
     def finer(self, best: Setting) -> list[Setting]:
         """Return settings around `best`, the best of the grid; none unless there is a second setting.
 
-        The second setting decides how the budget is spent, and needs the finer steps.
+        The second setting decides how the budget is spent, so it needs the finer steps.
         """
         if not isinstance(best, tuple):
             return []
@@ -115,7 +115,7 @@ class Algorithm:
         return [(one, two) for one in (best[0] / 2, best[0], 2 * best[0]) for two in near]
 
     def value(self, scene: Scene, setting: Setting) -> float:
-        """Return the state noise r, step size mu or 1 - lambda that a `setting` means in the units of a `scene`."""
+        """Return the r, mu, 1 - lambda or memory in s that a `setting` stands for, in the units of a `scene`."""
         first = setting[0] if isinstance(setting, tuple) else setting
         if self.symbol == "r":
             return first * scene.measurement_noise / scene.filtered_power
@@ -130,12 +130,12 @@ def _constraint(scene: Scene) -> Any:
 
 
 def _references(scene: Scene) -> dict[str, Any]:
-    """Return the number of references as a setting, if there are several channels."""
+    """Return the number of references as a keyword argument if there are several channels, else none."""
     return {"n_references": len(scene.references[0])} if scene.secondary.ndim == 3 else {}
 
 
 def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[..., Controller]:
-    """Return a maker of Kalman filters: with a constraint, `free` of any, or with a power `budget`."""
+    """Return a function that makes Kalman filters: with a constraint, `free` of one, or with a power `budget`."""
 
     def made(scene: Scene, r: float, _: float, amplifier: Amplifier | None) -> Controller:
         settings: dict[str, Any] = {
@@ -155,7 +155,7 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
 
 
 def _primary_paths(form: str) -> Callable[..., Controller]:
-    """Return a maker of a form of KF-PB that estimates the primary paths."""
+    """Return a function that makes KF-PB in a `form` that estimates the primary paths."""
 
     def made(scene: Scene, memory_s: float, _: float, amplifier: Amplifier | None) -> Controller:
         return kf_pb(
@@ -185,7 +185,7 @@ def _plain(kind: Any) -> Callable[..., Controller]:
 
 
 def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
-    energy = scene.n_taps * scene.filtered_power  # mu is that of FxLMS; the first rows are short, hence the bottom
+    energy = scene.n_taps * scene.filtered_power  # mu compares with FxLMS; the ridge is for the start-up
     settings: dict[str, Any] = {"step_size": mu * energy, "regularization": 0.01 * energy, **_references(scene)}
     return FxNLMS(scene.n_taps, scene.known_secondary, **settings)
 
@@ -202,8 +202,8 @@ def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | Non
 def _mov_by_variance(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
     """Take the penalty from the variance of the whole disturbance, as the public code of its authors does.
 
-    They take the secondary path's gain for the disturbance, from an inverse model of the path; here it is that of eq. 11,
-    as for all algorithms. The penalty hardly depends on it if the noise needs about four times the rated power.
+    They use the secondary path's gain for the disturbance, from an inverse model of the path; here the gain is that of
+    eq. 11, as for all algorithms. The penalty hardly depends on it if the noise needs about four times the rated power.
     """
     variance = float(np.var(scene.settled[1]))
     gamma = penalty_factor(scene.rated_power, disturbance_power=variance, secondary_path_gain=scene.secondary_gain)
@@ -211,7 +211,7 @@ def _mov_by_variance(scene: Scene, mu: float, _: float, amplifier: Amplifier | N
 
 
 def _mov(scene: Scene, mu: float, gamma: float, amplifier: Amplifier | None, name: str) -> Controller:
-    """Return an MOV-FxLMS with a fixed penalty, of another name than the one whose penalty follows the powers."""
+    """Return an MOV-FxLMS with a fixed penalty, named differently from the one whose penalty follows the powers."""
     controller = MOVFxLMS(
         scene.n_taps,
         scene.known_secondary,
@@ -308,12 +308,13 @@ REGISTRY: dict[str, Algorithm] = {
 
 
 def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
-    """Return the registry: every algorithm that studies and sweeps compare, by name.
+    """Return the registry of the algorithms that studies and sweeps compare, by name.
 
     Parameters
     ----------
     several_channels : bool, default False
-        Whether to return those that are compared with several loudspeakers and microphones, instead of with one.
+        Whether to return the algorithms that are compared with several loudspeakers and microphones, or those compared
+        with one of each.
 
     Returns
     -------
@@ -344,7 +345,7 @@ def make_controller(scene: Scene, algorithm: str, setting: Setting, *, amplifier
     algorithm : str
         Name in the registry, see `algorithms`.
     setting : float or tuple of float
-        Setting of its grid, or like it.
+        A setting from its grid, or one of the same kind.
     amplifier : amplifier, optional
         Amplifier that the disturbance estimate knows, for algorithms that can; by default the scene's known one.
 

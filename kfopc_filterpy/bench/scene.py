@@ -31,7 +31,7 @@ from kfopc_filterpy.paths.channels import is_path_matrix, primary_paths, seconda
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed
-CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy ask for weights that no controller reaches
+CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy need weights that no controller reaches
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -40,12 +40,12 @@ Outcome = TypeVar("Outcome")
 class Runs:
     """Jobs on all cores, with one progress bar for all of them.
 
-    Threads do, for the compiled loop releases the interpreter.
+    Threads are enough, because the compiled loop releases Python's global interpreter lock.
 
     Parameters
     ----------
     bar : tqdm bar, optional
-        Bar that is moved on as jobs end.
+        Bar that advances as jobs end.
 
     Examples
     --------
@@ -63,9 +63,9 @@ class Runs:
     def map(
         self, job: Callable[[Item], Outcome], items: Iterable[Item], worth: Callable[[Item], int] = lambda item: 1
     ) -> list[Outcome]:
-        """Return what `job` makes of each of the `items`, in their order.
+        """Return the results of `job` for each of the `items`, in their order.
 
-        `worth` says how many of the planned runs an item counts for.
+        `worth` gives the number of planned runs that an item counts for.
         """
         items, outcomes = list(items), []
         for item, outcome in zip(items, self._pool.map(job, items), strict=True):
@@ -81,7 +81,7 @@ class Scene:
     """Noise, paths and amplifier of a study, and what its controllers know of them.
 
     `make_scene` makes one. There is one reference and one disturbance for each seed, all of equal length. With several
-    channels, signals lead with the channel, and powers of loudspeakers are (J,).
+    channels, the first axis of a signal is the channel, and the powers of loudspeakers are (J,).
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Scene:
     wiener_control_power : float or ndarray, shape (J,)
         Output power of the unconstrained Wiener solution.
     wiener_noise_reduction_db : float
-        Its noise reduction in dB.
+        Noise reduction of that solution in dB.
     seeds : list of int
         Seeds of the noises.
     secondary_estimate : ndarray, optional
@@ -155,7 +155,7 @@ class Scene:
 
     @property
     def settled(self) -> tuple[np.ndarray, np.ndarray]:
-        """First reference and disturbance from switch-on on, after the start-up of the primary path."""
+        """First reference and disturbance from switch-on, after the start-up of the primary path."""
         start = int(self.switch_on_s * self.fs)
         return self.references[0][..., start:], self.disturbances[0][..., start:]
 
@@ -168,7 +168,7 @@ class Scene:
     def filtered_power(self) -> float:
         """Power of the filtered reference; it makes step sizes and state noises comparable.
 
-        With several channels it is the sum over microphones and references, and the mean over loudspeakers.
+        With several channels, it is summed over microphones and references, and averaged over loudspeakers.
         """
         x, s = np.atleast_2d(self.references[0]), self.known_secondary
         s = s if s.ndim == 3 else s.reshape(1, 1, -1)
@@ -222,12 +222,13 @@ def make_scene(
     nse_window_s: float = 0.005,
     amplifier: Amplifier | None = None,
 ) -> Scene:
-    """Return a scene whose noises ask for a multiple of the rated power.
+    """Return a scene whose noises need a multiple of the rated power.
 
     The references get the power at which the unconstrained Wiener control filter of the first one needs
     `power_multiple` times the rated power. q is the estimate of eq. 7 from the first noise without control. P0 is the
-    Wiener control power over the number of taps and the reference power. Directions of the weights in which the reference
-    has hardly any energy count for none of these, see `wiener_solution`: no controller reaches the weights they need.
+    Wiener control power divided by the number of taps and by the reference power. None of these takes account of
+    directions of the weights in which the reference has hardly any energy (see `wiener_solution`), because no
+    controller reaches the weights needed there.
 
     Parameters
     ----------
@@ -240,7 +241,7 @@ def make_scene(
     rated_power : float or ndarray, shape (J,)
         Rated output power, a mean square; of all loudspeakers or of each.
     power_multiple : float
-        Unconstrained control power over the rated power; of the sums over the loudspeakers.
+        Unconstrained control power over the rated power, each summed over the loudspeakers.
     n_taps : int
         Taps of the control filter.
     switch_on_s : float, default 0.5
@@ -312,14 +313,14 @@ def _power(x: np.ndarray) -> float:
 
 
 def _heard(x: np.ndarray, primary: np.ndarray) -> np.ndarray:
-    """Return the disturbance of a reference, or of several."""
+    """Return the disturbance that a reference causes, or several together."""
     if x.ndim == 1:
         return np.convolve(x, primary)[: x.size]
     return fftconvolve(x[np.newaxis], primary, axes=-1)[..., : x.shape[1]].sum(axis=1)
 
 
 def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
-    """Return the unconstrained Wiener solution, of weights that a controller reaches."""
+    """Return the unconstrained Wiener solution whose weights a controller can reach."""
     if s.ndim == 1:
         with _reachable_weights():
             return wiener_solution(x, d, s, n_taps)
@@ -328,7 +329,7 @@ def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: flo
 
 
 def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> float:
-    """Return q, the power of what no control filter explains (eq. 7), per microphone."""
+    """Return q, the power that no control filter explains (eq. 7), per microphone."""
     if s.ndim == 1:
         with _reachable_weights():
             return measurement_noise_from_run(x, d, s, n_taps)
@@ -339,7 +340,7 @@ def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: f
 def _reachable_weights() -> Iterator[None]:
     """Silence the warning that very large weights in directions without energy would do better.
 
-    Level and q are to be those of weights that a controller with the scene's P0 reaches, and none reaches those.
+    Level and q should belong to weights that a controller with the scene's P0 reaches, and none reaches such weights.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)

@@ -13,7 +13,7 @@ from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_
 from .registry import REGISTRY, Setting, make_controller
 from .scene import Outcome, Runs, Scene
 
-BUDGET = 1.02  # a constrained method keeps its budget with up to this share of the rated power
+BUDGET = 1.02  # a constrained method keeps its budget if its power is at most this multiple of the rated power
 RULE = (
     "lowest mean NSE over the whole run, start included, among settings that do not diverge and, for constrained "
     f"methods, keep the budget to {100 * (BUDGET - 1):.0f} % over the steady half; a tie to 0.01 dB goes to the smaller"
@@ -39,7 +39,7 @@ class Trial:
     output_power : float or ndarray, shape (J,)
         Output power over the steady half, of each loudspeaker if there are several; Inf if it diverged.
     diverged_at_s : float, optional
-        First time at which a run diverged, 0 if the filter refused to go on.
+        First time in seconds at which a run diverged; 0 if the filter refused to continue.
     noise_reduction_db : float
         Noise reduction over the steady half in dB; NaN if it diverged.
     """
@@ -60,8 +60,8 @@ class Trial:
 class Tuned:
     """The best setting of an algorithm, and all that were tried.
 
-    ``Tuned.RULE`` states the rule in words; ``Tuned.BUDGET`` is the share of the rated power up to which a constrained
-    method keeps its budget.
+    ``Tuned.RULE`` states the rule in words; ``Tuned.BUDGET`` is the multiple of the rated power up to which a
+    constrained method keeps its budget.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Tuned:
     within_budget : bool
         Whether any setting kept the budget.
     at_edge : bool
-        Whether the best setting, or one of its two, is the least or the largest that was tried.
+        Whether the best setting, or one of its two values, is the smallest or the largest that was tried.
     trials : list of Trial
         Everything that was tried.
     """
@@ -96,16 +96,16 @@ def run_setting(
     algorithm : str
         Name in the registry, see `algorithms`.
     setting : float or tuple of float
-        Setting of its grid, or like it.
+        A setting from its grid, or one of the same kind.
     seed_index : int, default 0
         Index of the scene's seed.
     controller : Controller, optional
-        Controller of the algorithm that is run; by default a fresh one for the scene and the setting.
+        Controller of this algorithm to run; by default a fresh one for the scene and the setting.
 
     Returns
     -------
     SimulationResult or None
-        The result; None if the filter found during the run that it cannot go on, see `Algorithm`.
+        The result; None if the filter could not continue, see `may_refuse` of `Algorithm`.
 
     Examples
     --------
@@ -133,9 +133,9 @@ def run_settings(
     measure: Callable[[SimulationResult | None], Outcome],
     planned: bool = True,
 ) -> list[Outcome]:
-    """Return what `measure` makes of each run.
+    """Return the result of `measure` for each run.
 
-    Runs of algorithms that share gains, of one setting and one noise, go on together if there is one channel.
+    With one channel, runs of algorithms that share gains are made together if their setting and noise are the same.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def run_settings(
     jobs : sequence of tuple
         Algorithm, setting and index of the seed of each run.
     measure : callable
-        Function of a run's result, which is None if the filter could not go on.
+        Function of a run's result, which is None if the filter could not continue.
     planned : bool, default True
         Whether the runs are among those that the progress bar counts.
 
@@ -220,7 +220,7 @@ def try_settings(
     def measured(result: SimulationResult | None) -> Trial:
         if result is None or result.diverged_at_s is not None:
             return Trial(np.nan, np.inf, np.inf, 0.0 if result is None else result.diverged_at_s)
-        # Before the first sound is through the primary path there is no NSE.
+        # There is no NSE until the first sound has passed the primary path.
         nse = np.nanmean(nse_db(result.error, result.disturbance, scene.fs, scene.nse_window_s))
         reduction = noise_reduction_db(result.error, result.disturbance)
         return Trial(np.nan, float(nse), output_power(result.control_signal), None, reduction)
@@ -282,8 +282,9 @@ def tune(
     """Return the best setting of each algorithm, by one rule for all.
 
     The best setting has the lowest mean NSE over the whole run, start included, among settings that do not diverge and,
-    for constrained methods, keep the budget to 2 % over the steady half, each loudspeaker its own. If no setting keeps it, the lowest mean NSE
-    wins, and `within_budget` is False. Around the best of a grid of two settings a finer grid is tried. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
+    for constrained methods, keep the budget of each loudspeaker to within 2 % over the steady half. If no setting keeps
+    it, the lowest mean NSE wins, and `within_budget` is False. If an algorithm has two settings, a finer grid is tried
+    around the best pair. Mean NSEs that agree to 0.01 dB are a tie, which goes to the smaller setting.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""The bound for several loudspeakers: the least error of fixed control filters, each loudspeaker within its rated power.
+"""The bound for several loudspeakers: the least error of fixed control filters within each one's rated power.
 
-It minimises the sum of the squared errors over the microphones. Control filters are (J, I, n_taps), signals have the
-channel as the leading axis.
+The sum of the squared errors over the microphones is minimised. Control filters are (J, I, n_taps); signals have the
+channel as the first axis.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from .._validate import as_channels, as_count
 from ..paths.channels import secondary_paths
 from .wiener import WienerSolution, mean_square, reduction_db
 
-RIDGE = 1e-10  # of the mean energy of a tap: directions with less get no weight
-TOLERANCE = 1e-5  # to which a rated power that binds is met
-ROUNDING = 1e-14  # of the dual function
-SOLUTIONS = 100  # at most; some ten are usual
+RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight
+TOLERANCE = 1e-5  # relative, for a rated power that limits
+ROUNDING = 1e-14  # relative rounding error of the dual function
+SOLUTIONS = 100  # at most; about ten are usual
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelStretch:
-    """Samples that control filters are fitted to. x and x' begin `n_taps` - 1 samples early, to fill the delay lines."""
+    """Samples to which control filters are fitted; x and x' begin `n_taps` - 1 samples early to fill delay lines."""
 
     x: np.ndarray  # (I, n + n_taps - 1)
     filtered: np.ndarray  # (K, J, I, n + n_taps - 1)
@@ -70,7 +70,7 @@ class ChannelStretch:
         return np.array([_sum_of_convolutions(x.reshape(n_signals, -1), filters) for x in self.filtered])
 
     def solution(self, weights: np.ndarray) -> WienerSolution:
-        """Return the weights with their powers; the control power is (J,), the others are means over microphones."""
+        """Return the weights with their powers: the control power is (J,), the others are means over microphones."""
         antinoise = self.antinoise(weights)
         error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
         return WienerSolution(
@@ -89,7 +89,7 @@ def _sum_of_convolutions(signals: np.ndarray, filters: np.ndarray) -> np.ndarray
 
 @dataclass(frozen=True)
 class ChannelCorrelations:
-    """Correlations R_x', R_x and r of a stretch, from which its filters follow for any penalties."""
+    """Correlations R_x', R_x and r of a stretch, which determine the control filters for any penalties."""
 
     filtered: np.ndarray  # (J I n_taps, J I n_taps), summed over microphones
     reference: np.ndarray  # (I n_taps, I n_taps)
@@ -113,7 +113,7 @@ class ChannelCorrelations:
         return np.einsum("ja,ab,jb->j", rows, self.reference, rows)
 
     def antinoise(self, weights: np.ndarray) -> float:
-        """Return by how much the weights lower the error's power, summed over microphones: 2 w'r - w' R_x' w."""
+        """Return the reduction of the error power by the weights, summed over microphones: 2 w'r - w' R_x' w."""
         w = weights.ravel()
         return float(2.0 * w @ self.cross - w @ self.filtered @ w)
 
@@ -122,9 +122,9 @@ class ChannelCorrelations:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the weights of the least error within the rated powers, and the penalties, (J,).
 
-        Projected Newton steps on the penalties, of which the dual problem is concave. Each is found for
-        1 / sqrt(power), which is nearly linear in the penalty (Moré and Sorensen 1983), and shortened until it gains.
-        `start`, penalties of similar powers, saves some of the steps.
+        The dual function is concave in the penalties; projected Newton steps maximise it. Each step is computed for
+        1 / sqrt(power), which is nearly linear in the penalty (Moré and Sorensen 1983), and is shortened until the dual
+        function rises. `start`, the penalties for similar rated powers, saves some of the steps.
         """
         J = self.shape[0]
         if not np.trace(self.filtered) > 0.0:
@@ -150,7 +150,7 @@ class ChannelCorrelations:
         return weights, penalty
 
     def _newton_step(self, factors: Any, weights: np.ndarray, rated_power: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Return a step of the penalties that are `free` towards the rated powers; it raises the dual function."""
+        """Return a Newton step of the `free` penalties towards the rated powers; the dual function rises along it."""
         J = self.shape[0]
         rows = weights.reshape(J, -1) @ self.reference  # R_x w_j
         changes = cho_solve(factors, block_diag(*rows).T).reshape(J, -1, J)  # -dw / d penalty_i at [..., i]
@@ -166,7 +166,8 @@ class ChannelCorrelations:
 def block_correlation(signals: np.ndarray, n_taps: int) -> np.ndarray:
     """Return the mean of ``signals[a, n - i] * signals[b, n - j]`` over n >= n_taps - 1, (C n_taps, C n_taps).
 
-    Each row of a block follows from the one above by the products that enter and leave the window.
+    Each row of a block is computed from the one above by adding the products that enter the window and subtracting
+    those that leave it.
     """
     n_signals, length = signals.shape
     count = length - n_taps + 1

@@ -1,4 +1,4 @@
-"""Rated power that a noise reduction takes: if the control filter is scaled, and if the budget is spent best."""
+"""Rated power needed for a noise reduction: with a scaled control filter, and with the power spent in the best way."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..paths.channels import is_path_matrix
 from .channels import ChannelCorrelations, channel_record
 from .wiener import reduction_db, require_sound
 
-ROUNDING_DB = 1e-9  # by which a noise reduction may exceed the largest one: its last digit may have been rounded up
+ROUNDING_DB = 1e-9  # tolerance above the largest attainable noise reduction: its last digit may have been rounded up
 
 
 @dataclass(frozen=True)
@@ -24,10 +24,10 @@ class RatedPower:
     noise_reduction_db : numpy.ndarray
         Noise reductions wanted, in dB.
     constraint_factor : numpy.ndarray
-        Scaling α of the Wiener filter that reaches each; 1 if it is out of reach.
+        Scaling α of the Wiener filter that reaches each of them; 1 if it is out of reach.
     rated_power : numpy.ndarray
-        Rated power (mean square) that it takes; infinite if it is out of reach. With several loudspeakers, the last
-        axis is the loudspeaker.
+        Rated power (mean square) needed; infinite if the noise reduction is out of reach. With several loudspeakers,
+        the last axis is the loudspeaker.
     """
 
     noise_reduction_db: np.ndarray
@@ -37,7 +37,7 @@ class RatedPower:
 
 @dataclass(frozen=True)
 class BudgetedRatedPower:
-    """Rated power needed for given noise reductions if it is spent best; made by `budgeted_rated_power`.
+    """Rated power needed for given noise reductions if it is spent in the best way; see `budgeted_rated_power`.
 
     Attributes
     ----------
@@ -47,10 +47,10 @@ class BudgetedRatedPower:
         Rated power (mean square) of each loudspeaker, of the shape of `noise_reduction_db` with an axis (J,) added;
         infinite if the noise reduction is out of reach. For one channel without that axis.
     control_power : numpy.ndarray
-        What each loudspeaker spends of it, of the same shape; NaN if out of reach.
+        Power that each loudspeaker uses, of the same shape; NaN if out of reach.
     penalty : numpy.ndarray
-        Weight of each loudspeaker's power, of the same shape: 0 if its rated power does not bind, NaN if out of reach.
-        Where it is largest, more power would help most.
+        Weight of each loudspeaker's power in the cost, of the same shape: 0 if the rated power is not a limit to it,
+        NaN if out of reach. More power would help most at the loudspeaker with the largest weight.
     """
 
     noise_reduction_db: np.ndarray
@@ -81,7 +81,8 @@ def required_rated_power(
     disturbance_power, antinoise_power : float
         D and A: the attributes of a `WienerSolution` computed without a penalty.
     control_power : float or array_like, shape (J,)
-        P_w, likewise, of the loudspeaker or of each of several. These need :math:`α^2 P_j`: one factor scales all.
+        P_w: likewise, for one loudspeaker or for each of several. Each then needs :math:`α^2 P_j`, since one factor
+        scales all.
     beyond : {"raise", "inf"}, default "raise"
         Whether noise reductions that the Wiener filter itself does not attain raise an error or need infinite power.
 
@@ -94,12 +95,12 @@ def required_rated_power(
     Raises
     ------
     TypeError, ValueError
-        If a noise reduction is negative or out of reach, or a power is not positive. Of several loudspeakers, some may
-        have no power.
+        If a noise reduction is negative or out of reach, or a power is not positive. With several loudspeakers, the
+        control power may be zero for some, but not for all.
 
     See Also
     --------
-    budgeted_rated_power : if the power is spent best, as KF-PB does; with several loudspeakers it is far less.
+    budgeted_rated_power : Rated power needed if it is spent in the best way, which KF-PB approaches.
 
     Examples
     --------
@@ -137,13 +138,15 @@ def required_rated_power(
 
 
 def _control_power(value: Any) -> Any:
-    """Return a positive number, or powers (J,) of which one at least is positive."""
+    """Return a positive number, or powers (J,) of which at least one is positive."""
     if np.ndim(value) != 1:
         return as_positive(value, "control_power")
     powers = as_real_array(value, "control_power")
     require_finite(powers, "control_power")
     if np.any(powers < 0) or not np.any(powers > 0):
-        raise ValueError(f"control_power must not be negative, and one must be greater than 0, got {powers}")
+        raise ValueError(
+            f"control_power must not be negative, and at least one value must be greater than 0, got {powers}"
+        )
     return powers
 
 
@@ -167,11 +170,11 @@ def budgeted_rated_power(
     proportions: Any = None,
     beyond: str = "raise",
 ) -> BudgetedRatedPower:
-    """Return the rated power that a noise reduction takes if it is spent best.
+    """Return the rated power needed for a noise reduction if the power is spent in the best way.
 
-    All loudspeakers have the same rated power, or rated powers in given proportions. The smallest ones are found within
-    which `power_constrained_wiener` reaches the noise reduction over the record. KF-PB comes close to that.
-    `required_rated_power` says what it takes if the control filter is only scaled.
+    All loudspeakers have the same rated power, or rated powers in given proportions. The result is the smallest rated
+    power with which `power_constrained_wiener` reaches the noise reduction over the record. KF-PB comes close to this
+    bound. `required_rated_power` gives the rated power needed if the control filter is only scaled.
 
     Parameters
     ----------
@@ -182,7 +185,7 @@ def budgeted_rated_power(
     disturbance : array_like, shape (n_samples,) or (K, n_samples)
         Disturbance d at the error microphones.
     secondary_path : control.TransferFunction or array_like, shape (n_path,) or (K, J, n_path)
-        Secondary path s, at the signals' sampling rate; with several channels also a matrix of systems.
+        Secondary path s, at the signals' sampling rate; with several channels, a matrix of systems is also allowed.
     n_taps : int
         Taps of each control filter.
     fs : float
@@ -191,23 +194,23 @@ def budgeted_rated_power(
         Proportions of the rated powers, such as ``[1, 1, 4]`` for a third loudspeaker with four times the power of the
         others; by default all are equal.
     beyond : {"raise", "inf"}, default "raise"
-        Whether noise reductions that no power attains with these taps raise an error or need infinite power.
+        Whether noise reductions that these taps do not attain with any power raise an error or need infinite power.
 
     Returns
     -------
     BudgetedRatedPower
-        Rated powers, what is spent of them, and what limits.
+        The rated powers, the powers that are used, and the weights that show which rated power limits most.
 
     Raises
     ------
     TypeError, ValueError
-        If a noise reduction is negative or out of reach, signals do not fit the paths, are silent or not finite, or
-        another argument is out of range.
+        If a noise reduction is negative or out of reach, if signals do not fit the paths, are silent or not finite, or
+        if another argument is out of range.
 
     Notes
     -----
-    The powers are found by Brent's method on the logarithm of their scale, for one set of correlations: the noise
-    reduction grows with the scale. Each step solves for J I n_taps unknowns a few times.
+    The noise reduction grows with the rated powers. Brent's method finds the logarithm of their common scale; the
+    correlations are computed once. Each step solves for J I n_taps unknowns a few times.
 
     Examples
     --------
@@ -245,7 +248,7 @@ def budgeted_rated_power(
 
 
 class _ScaleSearch:
-    """The scale of the rated powers that a noise reduction takes."""
+    """Search for the scale of the rated powers that a noise reduction needs."""
 
     def __init__(self, correlations: ChannelCorrelations, shares: np.ndarray, disturbance_power: float) -> None:
         self.correlations, self.shares, self.disturbance_power = correlations, shares, disturbance_power
@@ -259,14 +262,14 @@ class _ScaleSearch:
         return reduction_db(left, self.disturbance_power)
 
     def _at(self, log_scale: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return weights and penalties of a scale; the search goes on from the last penalties."""
+        """Return weights and penalties for a scale; the search starts from the last penalties."""
         weights, penalty = self.correlations.constrained_weights(np.exp(log_scale) * self.shares, self._penalty)
         if np.any(penalty):
             self._penalty = penalty
         return weights, penalty
 
     def powers(self, wanted_db: float) -> np.ndarray:
-        """Return rated powers, powers spent and penalties, (3, J)."""
+        """Return rated powers, powers used and penalties, (3, J)."""
         from scipy.optimize import brentq
 
         if wanted_db > self.most_db + ROUNDING_DB:

@@ -85,7 +85,7 @@ def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
 
 
 class WrappedController:
-    """Base of a controller that stands around another one; what it lacks itself is the other's."""
+    """Base class of a controller that wraps another one and passes on its attributes."""
 
     def __init__(self, controller: Controller) -> None:
         if isinstance(controller, type) or not isinstance(controller, Controller):
@@ -93,7 +93,7 @@ class WrappedController:
         self.controller = controller
 
     def __getattr__(self, name: str) -> Any:
-        """Return any other attribute of the controller, but not Python's special methods, as those for copies."""
+        """Return any other attribute of the inner controller, except special methods such as those for copies."""
         if name == "controller" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.controller, name)

@@ -1,7 +1,7 @@
 """Controllers of several channels that solve for the control filters within the rated powers, block by block.
 
-Sample by sample a Kalman filter estimates what the solution needs, or stores what it will learn from. Here is what the
-forms of KF-PB have in common: the blocks, the recent correlation of the references, and the rated powers.
+In each sample, a Kalman filter either learns or stores what it will learn from at the end of the block. This module has
+what the forms of KF-PB have in common: the blocks, the recent correlation of the references, and the rated powers.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ DEFAULT_MEMORY_S = 0.5
 
 
 class BlockController(FilteredReferenceController):
-    """A controller whose control filters keep each loudspeaker's rated power, found anew after each block.
+    """Base class that computes control filters within each loudspeaker's rated power after every block.
 
-    A subclass sets `_budget`, and `_state`, whose record `numbers` counts in `waiting` the samples since the last block
-    ended. It defines `_end_block`.
+    A subclass sets `_budget` and `_state`, and defines `_end_block`. The state has a record `numbers`, whose field
+    `waiting` counts the samples since the end of the last block.
     """
 
     _budget: ChannelBudget
@@ -82,7 +82,7 @@ class BlockController(FilteredReferenceController):
         return max(self.block - int(self._state.numbers["waiting"][0]), 1)
 
     def after_compiled(self, state: Any) -> None:
-        """Learn from the block and solve for the control filters if it has ended."""
+        """Learn from the block and solve for the control filters, if the block has ended."""
         if state.numbers["waiting"][0] < self.block:
             return
         state.numbers["waiting"] = 0

@@ -1,8 +1,8 @@
 """KF-ANC, KF-OPC and KF-PB for several channels in their direct form: the paper's equations, all weights as one state.
 
-The state is the control filters of all loudspeakers for all references, (J, I, L). The filtered references of each
-microphone are a row, and with a diagonal R the K measurements of a sample can correct the state one after the other:
-O(K (J I L)^2) per sample.
+The state contains the control filters of all loudspeakers for all references, (J, I, L). The filtered references of a
+microphone are its observation row. R is diagonal, so the K measurements of a sample can correct the state one after the
+other, in O(K (J I L)^2) operations per sample.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from .step import adapt, advance_powers, control_filter, follow
 
 
 class Correction(NamedTuple):
-    """A Kalman filter of K measurements, and what takes the corrections of a sample back if one of them fails."""
+    """A Kalman filter of K measurements, with what it takes to undo the corrections of a sample if one fails."""
 
     gains: Covariance  # of all weights
     measurement_noise: np.ndarray  # (K,)
@@ -64,7 +64,7 @@ class DirectBudgetState(NamedTuple):
 
 @adapt.register(DirectState)
 def adapt_direct(state, error, control_signal):
-    """Apply eq. 2-13 with the least of the loudspeakers' factors."""
+    """Apply eq. 2-13 with the smallest of the loudspeakers' factors."""
     return correct_constrained(state, error)
 
 
@@ -138,9 +138,10 @@ def observation(row, filtered, taps):
 
 @part()
 def take_back_corrections(correction, w, count):
-    """Undo the state noise and the first `count` corrections of a sample; P to rounding: P + sum_k g_k g_k'/S_k - r I.
+    """Undo the state noise and the first `count` corrections of a sample.
 
-    With no correction to undo there is nothing to do: `kalman_step` has taken back the state noise.
+    The covariance is restored up to rounding: P + sum_k g_k g_k'/S_k - r I. If there is no correction to undo,
+    `kalman_step` has already taken back the state noise.
     """
     T, g = correction.gains.triangle, correction.directions
     copy_into(w, correction.before)
@@ -154,18 +155,19 @@ def take_back_corrections(correction, w, count):
 
 
 class DirectKalman(FilteredReferenceController):
-    r"""KF-ANC or KF-OPC for several channels, the paper's equations with all control filters as one state.
+    r"""KF-ANC or KF-OPC for several channels: the paper's equations with all control filters as one state.
 
-    `kf_anc` and `kf_opc` make it if there are several channels. The K measurements of a sample, with independent
-    measurement noises, correct the J I L weights one after the other, in O(K (J I L)^2).
+    `kf_anc` and `kf_opc` return it if there are several channels. The K measurements of a sample have independent
+    noises, so they correct the J I L weights one after the other, in O(K (J I L)^2) operations.
 
-    KF-OPC scales them all by one factor, the least that eq. 13 gives any loudspeaker as if it were alone:
+    KF-OPC scales all measurements by one factor. Eq. 13 gives a factor for each loudspeaker as if it were alone; the
+    smallest of them is used:
 
     .. math:: \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\}, \qquad
         G_j = \frac{\sum_{k,i} E[x_{kji}'^2]}{\sum_i E[x_i^2]}, \qquad \delta_d^2 = \sum_k E[\hat d_k^2]
 
-    This extension is the package's, not the paper's. With one loudspeaker, microphone and reference it is eq. 13. A
-    loudspeaker that no microphone hears, :math:`G_j = 0`, is left out: its control filters stay zero.
+    This extension is the package's, not the paper's. With one loudspeaker, microphone and reference it reduces to
+    eq. 13. A loudspeaker that no microphone hears, :math:`G_j = 0`, is left out: its control filters stay zero.
 
     Parameters
     ----------
@@ -176,8 +178,8 @@ class DirectKalman(FilteredReferenceController):
     state_noise : float
         State noise variance r (eq. 4), zero or above.
     measurement_noise : float or array_like, shape (K,)
-        Measurement noise variance q (eq. 7) of all microphones or of each, zero or above. A microphone counts the
-        less, the larger its q.
+        Measurement noise variance q (eq. 7) of all microphones or of each, zero or above. The larger its q, the less a
+        microphone counts.
     initial_variance : float, default 1
         Variance of each tap before the first sample.
     n_references : int, default 1
@@ -185,7 +187,7 @@ class DirectKalman(FilteredReferenceController):
     rated_power : float or array_like, shape (J,), optional
         Rated output power of all loudspeakers, or of each, for KF-OPC; None for KF-ANC.
     constraint : OutputPowerConstraint or sequence of J of them, optional
-        Given instead of `rated_power`: rated powers with the settings of their power estimates. Copies are kept.
+        Alternative to `rated_power`: rated powers with the settings of their power estimates. Copies are kept.
     amplifier, limiter
         As for `SharedGainKalman`.
     dtype : {numpy.float64, numpy.float32}, default numpy.float64
@@ -198,12 +200,12 @@ class DirectKalman(FilteredReferenceController):
 
     See Also
     --------
-    KFOPC : the same equations as a filterpy filter, ``dim_z=K``.
-    SharedGainKalman : a form whose cost hardly depends on the numbers of loudspeakers and microphones.
+    KFOPC : The same equations as a filterpy filter, ``dim_z=K``.
+    SharedGainKalman : A form whose cost hardly depends on the numbers of loudspeakers and microphones.
 
     Notes
     -----
-    `weights` is (J, I, L). `constraint_factor` is (J,), each loudspeaker's own factor; the least one is applied.
+    `weights` is (J, I, L). `constraint_factor` is (J,), each loudspeaker's own factor; the smallest one is applied.
 
     Examples
     --------
@@ -255,11 +257,11 @@ class DirectKalman(FilteredReferenceController):
 
 
 class DirectPowerBudget(BlockController):
-    r"""KF-PB for several channels in its direct form: all control filters as one state, and a budget for each.
+    r"""KF-PB for several channels in its direct form: all control filters as one state, a power budget per loudspeaker.
 
-    The Kalman filter of `DirectKalman`, without a constraint factor, estimates the control filters w that are best
-    without a limit. Every 32 ms, the control filters v within the rated powers follow from them and from the recent
-    correlation of the references,
+    The Kalman filter of `DirectKalman`, without a constraint factor, estimates the optimal control filters w for
+    unlimited power. Every 32 ms, the control filters v within the rated powers are computed from these and from the
+    recent correlation of the references:
 
     .. math:: \Bigl(R_{x'} + \operatorname{blkdiag}_j(\lambda_j R_x)\Bigr) v = R_{x'} \hat w, \qquad
         \lambda_j \ge 0, \qquad \lambda_j (v_j^T R_x v_j - \rho_j) = 0
@@ -285,11 +287,11 @@ class DirectPowerBudget(BlockController):
 
     See Also
     --------
-    kf_pb : makes it with ``form="direct"``.
+    kf_pb : Returns it with ``form="direct"``.
 
     Notes
     -----
-    `weights` is the estimate w, `control_filter` is v; both are (J, I, L).
+    `weights` is the estimate of w, and `control_filter` is v; both are (J, I, L).
 
     Examples
     --------
@@ -332,7 +334,7 @@ class DirectPowerBudget(BlockController):
             limiter=limiter,
         )
         noise = per_channel(measurement_noise, self.n_microphones, "microphones", "measurement_noise")
-        weights = np.sqrt(noise.mean() / noise)[:, np.newaxis, np.newaxis]  # the estimate weighs the errors likewise
+        weights = np.sqrt(noise.mean() / noise)[:, np.newaxis, np.newaxis]  # as the Kalman filter weighs the errors
         self._budget = ChannelBudget(weights * secondary, self.n_taps, 0, self.n_references, self._limits)
         lines, free, constraint = self._common()
         self._state = DirectBudgetState(
@@ -381,7 +383,7 @@ def reason_of(correction: Correction) -> str:
     if microphone < 0:
         return OVERFLOW
     return (
-        f"the update has no solution for microphone {microphone}: S = x' P x' + q must be positive and finite. A "
-        "microphone that no loudspeaker reaches, or a silent reference, with measurement_noise = 0 tells nothing: give "
+        f"the update has no solution for microphone {microphone}: S = x' P x' + q must be positive and finite. With "
+        "measurement_noise = 0, S is zero if no loudspeaker reaches the microphone or the reference is silent: give "
         "measurement_noise > 0. Nothing was changed"
     )

@@ -1,7 +1,7 @@
 """KF-PB for paths of thousands of taps: the primary paths are estimated in the frequency domain, block by block.
 
-The control signals are still computed sample by sample, by convolution with the control filters, so nothing is delayed.
-Only what is learned comes in blocks.
+The control signals are still computed sample by sample, by convolution with the control filters, so they have no delay.
+Only the learning is done in blocks.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from .primary_paths import DEFAULT_PATH_MEMORY_S, PrimaryPathController, usual_p
 from .step import adapt, follow
 
 PRIOR = 10.0  # energy of the references in the unknown paths, relative to the measurement noise
-PARTITIONS = 2  # of a long primary path: the work per sample then grows with the logarithm of the taps
-MEMORY_LENGTHS = 16  # of the unknown taps, at least, in a memory
+PARTITIONS = 2  # of a long primary path; with a fixed number, the work per sample grows with the logarithm of the taps
+MEMORY_LENGTHS = 16  # the shortest default memory, in durations of what is estimated
 
 
 class FrequencyDomainState(NamedTuple):
@@ -36,7 +36,7 @@ class FrequencyDomainState(NamedTuple):
     lines: ChannelLines
     weights: np.ndarray  # (J, I, L) control filters
     disturbances: np.ndarray  # (K, B) estimates of this block
-    numbers: np.ndarray  # record: waiting (samples of this block), silent (those of them without control)
+    numbers: np.ndarray  # record: waiting (samples of this block), silent (how many of them were without control)
 
 
 @adapt.register(FrequencyDomainState)
@@ -63,11 +63,11 @@ def follow_frequency_domain(state, error):
 
 
 class FrequencyDomainKalman(PrimaryPathController):
-    """KF-PB for paths of thousands of taps: primary paths by a Kalman filter in the frequency domain.
+    """KF-PB for paths of thousands of taps: a Kalman filter estimates the primary paths in the frequency domain.
 
-    It does what `SharedGainKalman` does, at a cost per sample that grows with log L instead of L^2. Learning is done in
-    blocks, between samples. The control signals are not: they are convolutions with the control filters, J I L
-    multiplications per sample, and have no delay.
+    It does what `SharedGainKalman` does, but its cost of learning per sample grows with log L instead of L^2. Learning
+    takes place at the end of each block. The control signals do not wait for it: they are computed sample by sample, by
+    convolution with the control filters (J I L multiplications per sample), and have no delay.
 
     Parameters
     ----------
@@ -108,19 +108,20 @@ class FrequencyDomainKalman(PrimaryPathController):
 
     Notes
     -----
-    The filter is the partitioned-block frequency-domain Kalman filter [1]_ [2]_: the covariance of the paths is taken
-    for diagonal over frequencies, partitions and references, and is the same for all microphones. Unlike there, the
-    covariance of the innovation is not: each block is a system of B unknowns per microphone, solved by conjugate
-    gradients. So a tone or a band of noise, whose frequencies are not independent of each other within a block, is
-    learned about as fast as by `SharedGainKalman`: the loss of noise reduction in the steady half is at most 0.1 dB for
-    white noise, a band, tones and a compressor (``tests/controllers/test_frequency_domain.py``).
+    The filter is based on the partitioned-block frequency-domain Kalman filter [1]_ [2]_. As there, the covariance of
+    the paths is assumed to be diagonal over frequencies, partitions and references, and it is the same for all
+    microphones. Unlike there, the covariance of the innovation is not assumed to be diagonal: for each microphone, a
+    block is a system of B unknowns, solved by conjugate gradients. This matters for tones and band noise, whose
+    frequencies are not independent of each other within a block. With 128 taps, the noise reduction in the steady half
+    is at most 0.1 dB below that of `SharedGainKalman` for white noise, band noise, tones and a compressor
+    (``tests/controllers/test_frequency_domain.py``).
 
-    State noise and initial variance are those of `SharedGainKalman`, with 10 in place of 1000 in the latter: a diagonal
-    covariance averages out the measurement noise more slowly after too large a gain.
+    State noise and initial variance are those of `SharedGainKalman`, except that the initial variance has the factor 10
+    instead of 1000: after too large a gain, a diagonal covariance averages out the measurement noise more slowly.
 
-    The control signals cost J I L multiplications per sample, which take a few tenths of a nanosecond each. What is
-    learned and solved comes as a burst between two blocks. ``python -m comparisons speed`` prints the time per sample
-    with everything included, and that of the longest block over its duration.
+    The work of learning and solving comes as a burst at the end of each block. ``python -m comparisons speed`` prints
+    the time per sample with everything included, and the time that the slowest block takes as a fraction of its
+    duration.
 
     References
     ----------
@@ -191,7 +192,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         return self._paths.paths
 
     def _end_block(self, references: np.ndarray) -> None:
-        """Learn from the block, unless it was only listened to, and solve for the control filters."""
+        """Learn from the block, unless the control was off in a part of it, and solve for the control filters."""
         numbers, paths = self._state.numbers, self._paths
         controlled, numbers["silent"] = numbers["silent"][0] == 0, 0
         paths.hear(references)
@@ -199,7 +200,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         if not power > 0.0:
             return
         before, paths.state_noise = paths.state_noise, self._state_noise(paths.state_noise, power)
-        if paths.state_noise != before:  # the references are the first, or grown louder
+        if paths.state_noise != before:  # the first references, or much louder ones
             most = self._first_variance(PRIOR, power)
             paths.variance[...] = most if before == 0.0 else np.minimum(paths.variance, most)
         if controlled and not paths.learn(self._state.disturbances):
@@ -208,10 +209,10 @@ class FrequencyDomainKalman(PrimaryPathController):
 
 
 def _memory_s(shortest: float, duration_s: float) -> float:
-    """Return the memory for unknown taps of a duration: an average over fewer samples would follow chance."""
+    """Return the default memory for filters or paths of a duration; a shorter average would follow chance."""
     return max(shortest, MEMORY_LENGTHS * duration_s)
 
 
 def _block(n_primary: int, fs: float) -> int:
-    """Return the samples of a block, of a length that is fast to transform."""
+    """Return the number of samples of a block, chosen so that its FFT is fast."""
     return fft.next_fast_len(max(round(BLOCK_S * fs), 1, -(-n_primary // PARTITIONS)), real=True)

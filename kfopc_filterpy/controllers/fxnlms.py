@@ -28,7 +28,7 @@ class FxNLMSState(NamedTuple):
 
 @adapt.register(FxNLMSState)
 def adapt_fxnlms(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)); with several channels, both are sums over them."""
+    """Set w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)); several channels: see `FxNLMS` for the sums."""
     finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
         energy = state.regularization + filtered_energy(state.lines, state.weights)
@@ -47,7 +47,7 @@ def filtered_energy(lines, weights):
 
 @filtered_energy.register(ChannelLines)
 def channel_energy(lines, weights):
-    """Return its sum over microphones, loudspeakers and references."""
+    """Return the sum of x'(n)'x'(n) over microphones, loudspeakers and references."""
     energy, filtered = 0.0, lines.filtered
     for k in range(filtered.shape[0]):
         for j in range(filtered.shape[1]):
@@ -65,7 +65,7 @@ def step_error(lines, error, step_size, energy):
 
 @step_error.register(ChannelLines)
 def channel_step_errors(lines, error, step_size, energy):
-    """Return it for each microphone, (K,)."""
+    """Return mu e_k(n) / energy for each microphone, (K,)."""
     for k in range(error.size):
         lines.modified_error[k] = step_size * error[k] / energy
     return lines.modified_error
@@ -76,8 +76,9 @@ class FxNLMS(LMSController):
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
 
-    One step size therefore suits soft and loud noise. With several channels, all filters are divided by the same
-    energy, that of all filtered references, so that the direction stays that of the multiple-error LMS:
+    One step size therefore suits soft and loud noise. With several channels, the steps of all filters are divided by
+    the same energy, that of all filtered references together. So their direction remains that of the multiple-error
+    LMS:
 
     .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
        {\epsilon + \sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
@@ -99,8 +100,8 @@ class FxNLMS(LMSController):
     References
     ----------
     S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999. For several channels,
-    S. J. Elliott, Signal Processing for Active Control, Academic Press 2001, ch. 5; the energy of all channels is the
-    trace of the matrix whose largest eigenvalue bounds the step size there.
+    S. J. Elliott, Signal Processing for Active Control, Academic Press 2001, ch. 5. The energy of all channels is the
+    trace of the matrix whose largest eigenvalue limits the step size there.
 
     Examples
     --------

@@ -305,7 +305,8 @@ def kf_anc(
     Returns
     -------
     KalmanController or DirectKalman
-        A controller named KF-ANC; with several channels a `DirectKalman`, whose signals and weights have channel axes.
+        A controller named KF-ANC. With several channels it is a `DirectKalman`, whose signals and weights have channel
+        axes.
 
     Raises
     ------
@@ -354,13 +355,13 @@ def kf_opc(
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o of all loudspeakers, or of each.
     constraint : OutputPowerConstraint or sequence of J of them, optional
-        Given instead of `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
+        Alternative to `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
 
     Returns
     -------
     KalmanController or DirectKalman
-        A controller named KF-OPC; with several channels a `DirectKalman`, which scales all measurements by the least
-        of the loudspeakers' factors.
+        A controller named KF-OPC. With several channels it is a `DirectKalman`, which scales all measurements by the
+        smallest of the loudspeakers' factors.
 
     Raises
     ------
@@ -404,5 +405,5 @@ def _kalman(
 
 
 def is_multichannel(secondary_path: Any, n_references: int) -> bool:
-    """Return whether signals have a channel axis: the secondary path has channel axes, or there are more references."""
+    """Return whether signals have a channel axis: if the secondary path has, or if there are several references."""
     return is_path_matrix(secondary_path) or as_count(n_references, "n_references") > 1

@@ -170,27 +170,28 @@ def kf_pb(
     rated_power : float or array_like, shape (J,)
         Rated output power, of all loudspeakers or of each.
     state_noise, measurement_noise, initial_variance, dtype
-        Of the direct form, as for `kf_anc`; the other forms do not need them.
+        As for `kf_anc`, for the direct form only. The other forms refuse the first two and ignore the others.
     n_references, amplifier, limiter
         As for `kf_anc`.
     form : {"direct", "shared gain", "frequency domain"}, optional
-        "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample; "shared gain" the
-        primary paths (`SharedGainKalman`); "frequency domain" these too, if they are long (`FrequencyDomainKalman`). By
-        default direct for one channel, shared gain for several.
+        "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
+        estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
+        (`FrequencyDomainKalman`). By default direct for one channel, shared gain for several.
     **settings
-        Of the direct form for one channel: `fs`, `memory_s`, `credit_s`, see `PowerBudget`; for several: `fs`,
-        `memory_s`, see `DirectPowerBudget`. Of the other forms: see their classes.
+        Further settings. The direct form takes `fs`, `memory_s` and `credit_s` for one channel (see `PowerBudget`),
+        `fs` and `memory_s` for several (see `DirectPowerBudget`). For the other forms, see their classes.
 
     Returns
     -------
     PowerBudgetController, DirectPowerBudget, SharedGainKalman or FrequencyDomainKalman
-        A controller. Its `control_filter` generates the control signal. The `weights` of a direct form are the estimate
+        The controller. Its `control_filter` generates the control signal. In the direct form, `weights` is the estimate
         of the unconstrained control filter.
 
     Raises
     ------
     ValueError, TypeError
-        The direct form without its noises; noises for another form; see the classes.
+        The direct form without `state_noise` and `measurement_noise`, another form with one of them, or a setting that
+        the class refuses.
 
     Examples
     --------

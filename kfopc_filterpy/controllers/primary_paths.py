@@ -1,4 +1,4 @@
-"""What two forms of KF-PB share: they estimate the primary paths, and control filters follow from these."""
+"""Base of the two forms of KF-PB that estimate the primary paths and compute the control filters from them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from ..power.channels import ChannelBudget
 from .blocks import BlockController
 
 DEFAULT_PATH_MEMORY_S = 1.0
-GROWN = 4.0  # growth of the references' power from which the state noise follows it: they began soft or silent
+GROWN = 4.0  # growth of the references' power above which the state noise is set anew: the noise began softly
 
 
 class PrimaryPathController(BlockController):
-    """Base class: estimated primary paths, and control filters within the rated power of each loudspeaker.
+    """Base class that estimates primary paths and keeps each loudspeaker within its rated power.
 
     A subclass defines `primary_path` and `_end_block`, which calls `_solve`. Its arguments are described in
     `SharedGainKalman`.
@@ -63,19 +63,19 @@ class PrimaryPathController(BlockController):
         self._state.weights[...] = self._budget.weights
 
     def _reference_power(self) -> float:
-        """Return the mean power of the references; in silence, the correlation begins anew with the first sound."""
+        """Return the mean power of the references; in silence, let the correlation start anew with the first sound."""
         power = float(np.trace(self._correlation.faded[0])) / self.n_references
         if not power > 0.0:
             self._correlation.mass = 0.0
         return power
 
     def _state_noise(self, now: float, power: float) -> float:
-        """Return the state noise for references of a power: as it is now, unless they have grown much louder."""
+        """Return the state noise for references of a power: the present one, unless they have become much louder."""
         wanted = 1.0 / (power * (self.path_memory_s * self.fs) ** 2)
         return wanted if now == 0.0 or wanted < now / GROWN else now
 
     def _first_variance(self, prior: float, power: float) -> float:
-        """Return the variance of an unknown tap for references of a power.
+        """Return the initial variance of a tap for references of a power.
 
         `prior` is the energy of the references in the unknown paths, relative to the measurement noise.
         """
@@ -83,5 +83,5 @@ class PrimaryPathController(BlockController):
 
 
 def usual_primary(n_taps: int, secondary: np.ndarray) -> int:
-    """Return the taps of a primary path that control filters and secondary paths can cancel."""
+    """Return the default number of taps of a primary path: as many as control filter and secondary path can cancel."""
     return n_taps + secondary.shape[2]

@@ -1,9 +1,9 @@
 """KF-PB for several loudspeakers and microphones: the Kalman filter estimates the primary paths.
 
-All microphones hear the same references, so their paths have the same observation row, and one covariance and one gain
-serve them all: O((I L_p)^2 + K I L_p) per sample, whatever the number of loudspeakers. The control filters follow from
-the estimated paths and the recent correlation of the references (certainty equivalence), within the rated power of
-each loudspeaker.
+The primary paths to all microphones have the same references as their inputs, so they share one observation row, and
+one covariance and one gain serve them all: O((I L_p)^2 + K I L_p) operations per sample, whatever the number of
+loudspeakers. The control filters are computed from the estimated paths and the recent correlation of the references
+(certainty equivalence), within the rated power of each loudspeaker.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def reference_row(state):
 
 
 class SharedGainKalman(PrimaryPathController):
-    """KF-PB for several channels, in real time: primary paths by a Kalman filter, control filters within the powers.
+    """KF-PB for several channels: a Kalman filter estimates the primary paths; control filters keep the rated powers.
 
     Parameters
     ----------
@@ -90,7 +90,8 @@ class SharedGainKalman(PrimaryPathController):
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
     path_memory_s : float, default 1
-        Time in seconds over which the primary paths are averaged; longer is more exact, shorter follows changes.
+        Time in seconds over which the primary paths are averaged: a longer one is more exact, a shorter one follows
+        changes faster.
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
     fs : float, default 16000
@@ -109,8 +110,8 @@ class SharedGainKalman(PrimaryPathController):
     -----
     Only the ratio of the state noise to the measurement noise matters here. The state noise is
     ``1 / (E[x^2] (path_memory_s fs)^2)`` and the initial variance ``1000 / (I L_p E[x^2])``, for a measurement noise of
-    1. The power of the references is taken from the first block that is not silent, and again if it has grown to more
-    than four times: a recording may begin softly.
+    1. The power of the references is taken from the first block that is not silent. If the power grows to more than
+    four times that value, the state noise is set anew, because a recording may begin softly.
 
     Examples
     --------

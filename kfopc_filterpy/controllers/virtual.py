@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 
 class Observer(Protocol):
-    """What `VirtualMicrophones` asks of the estimator of the disturbance."""
+    """Methods that `VirtualMicrophones` needs of an observer, which estimates the disturbance."""
 
     def estimate(self, disturbance: np.ndarray) -> np.ndarray:
         """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
 
-        `disturbance` is its newest sample at the physical microphones, (K_p,).
+        `disturbance` is the newest sample at the physical microphones, (K_p,).
         """
         ...
 
     def advance(self, disturbance: np.ndarray) -> None:
-        """Take that sample into the memory."""
+        """Add the newest sample at the physical microphones, (K_p,), to the memory."""
         ...
 
 
@@ -65,21 +65,22 @@ class KalmanObserver:
     .. math:: S = C_p P C_p^T + D_p Q D_p^T + R, \quad K = (A P C_p^T + B Q D_p^T) S^{-1}, \quad
        M = (C_v P C_p^T + D_v Q D_p^T) S^{-1}
 
-    Petersen et al. have the control signals as further inputs of the model. Their part of the state is known, so no
-    filter is needed for it, and `VirtualMicrophones` computes it with the secondary paths: the estimates are the same.
+    In the paper of Petersen et al. the control signals are further inputs of the model. Their contribution to the state
+    is known, so it need not be estimated: `VirtualMicrophones` computes it with the secondary paths. The estimates are
+    the same.
 
     Parameters
     ----------
     model : control.StateSpace
         Model of the disturbance, discrete in time with ``dt = 1/fs`` and stable. Inputs: the noise sources. Outputs:
-        the physical microphones, then the virtual ones. `realize_paths` makes one of primary paths; the colour of the
-        noise is part of the model. If the control signals are further inputs of a model, pass
+        the physical microphones, then the virtual ones. `realize_paths` makes such a model from primary paths; the
+        colour of the noise must be part of it. If the control signals are further inputs of a model, pass
         ``model[:, :n_sources]``.
     n_physical : int
         Number of physical microphones K_p; the other outputs are virtual.
     sensor_noise_std : float or array_like, shape (K_p,)
-        Standard deviation of the noise of the physical microphones, and of whatever else the model does not explain.
-        Above zero.
+        Standard deviation, above zero, of the noise of the physical microphones and of whatever else the model does not
+        explain.
     source_power : float or array_like, shape (n_sources,), default 1
         Power of each noise source, the mean square of v.
 
@@ -88,15 +89,15 @@ class KalmanObserver:
     n_physical, n_virtual : int
         Numbers of microphones K_p and K_v.
     virtual_variance : numpy.ndarray, shape (K_v,)
-        Variance of the error of the estimate at each virtual microphone, by the Riccati equation.
+        Variance of the estimation error at each virtual microphone, from the Riccati equation.
     residual_db : numpy.ndarray, shape (K_v,)
-        The same over the power of the disturbance there, in dB, as in `ObservationFilters`.
+        This variance relative to the power of the disturbance there, in dB, as in `ObservationFilters`.
 
     Raises
     ------
     TypeError, ValueError
-        If the model is no discrete-time state space, is unstable or has no output for a virtual microphone, or a
-        variance is not positive.
+        If the model is not a discrete-time state-space model, is unstable or has no output for a virtual microphone, or
+        if a variance is not positive.
 
     Notes
     -----
@@ -110,7 +111,7 @@ class KalmanObserver:
 
     Examples
     --------
-    White noise reaches the physical microphone at once, and the virtual one a sample later, half as loud:
+    White noise reaches the physical microphone at once, and the virtual one a sample later with half the amplitude:
 
     >>> import control
     >>> from kfopc_filterpy.controllers import KalmanObserver
@@ -159,12 +160,12 @@ class KalmanObserver:
         return self._Cv @ self._state + self._M @ (disturbance - self._Cp @ self._state)
 
     def advance(self, disturbance: np.ndarray) -> None:
-        """Take `disturbance`, the newest sample at the physical microphones, (K_p,), into the state."""
+        """Update the state with `disturbance`, the newest sample at the physical microphones, (K_p,)."""
         self._state = self._A @ self._state + self._K @ (disturbance - self._Cp @ self._state)
 
 
 def _matrices(model: Any, n_physical: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return A, B, C, D and the sampling rate in Hz of a model that can be observed."""
+    """Return A, B, C, D and the sampling rate in Hz of a model; raise an error if no observer can be made for it."""
     if not all(hasattr(model, name) for name in "ABCD"):
         raise TypeError(f"model must be a control.StateSpace, got {type(model).__name__}; control.ss converts a system")
     if model.dt is None or model.dt is True or model.dt == 0:
@@ -181,41 +182,41 @@ def _matrices(model: Any, n_physical: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _each(value: Any, size: int, name: str) -> np.ndarray:
-    """Return a positive number, or one for each, as (size,)."""
+    """Return a positive number, or one number for each channel, as (size,)."""
     numbers = as_real_array(value, name)
     if numbers.shape not in ((), (size,)):
-        raise ValueError(f"{name} must be one number or one for each of the {size}, got shape {numbers.shape}")
+        raise ValueError(f"{name} must be one number or an array of {size} numbers, got shape {numbers.shape}")
     return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, size)])
 
 
 class VirtualMicrophones(WrappedController):
     r"""A controller that reduces the error at places without a microphone, such as the ears in front of a headrest.
 
-    It gets the errors of all microphones of the plant and reads the physical ones only. From these it estimates the
-    errors at the virtual microphones, and `controller` adapts to the estimates:
+    It receives the errors of all microphones of the plant, but uses only those of the physical ones. From these it
+    estimates the errors at the virtual microphones, and `controller` adapts to the estimates:
 
     .. math:: \hat d_p = e_p + \hat s_p * y, \qquad \hat d_v = \mathrm{observer}(\hat d_p), \qquad
        \hat e_v = \hat d_v - \hat s_v * y
 
     With observation filters as the observer, :math:`\hat d_v = O * \hat d_p`, this is the remote-microphone technique;
-    with a `KalmanObserver` it is the Kalman filter of Petersen et al. In `simulate` the plant has all microphones, and
-    the result holds the true errors of all.
+    with a `KalmanObserver` it is the Kalman filter of Petersen et al. In `simulate`, the plant has all microphones, and
+    the result contains the true error at each of them.
 
     Parameters
     ----------
     controller : Controller
-        Controller for the virtual microphones: its errors are (K_v,), and its secondary paths are those to the virtual
+        Controller for the virtual microphones: it takes errors (K_v,), and its secondary paths are those to the virtual
         microphones. A controller of your own works too.
     secondary_path : array_like, shape (K, J, taps), or nested sequence of control systems
         Estimated secondary paths to all microphones of the plant, physical and virtual.
     observer : ObservationFilters, array_like of shape (K_v, K_p, n_taps), KalmanObserver, or an object like it
-        What estimates the disturbance. An object has two methods: ``estimate(disturbance)`` returns (K_v,) for the
-        newest sample (K_p,) and changes nothing, ``advance(disturbance)`` takes the sample into its memory. It is not
-        shared with another controller.
+        Estimator of the disturbance at the virtual microphones. An object of your own needs two methods:
+        ``estimate(disturbance)`` returns (K_v,) for the newest sample (K_p,) and changes nothing;
+        ``advance(disturbance)`` adds the sample to its memory. Do not share it with another controller.
     physical : sequence of int
         Indices of the microphones that exist, in the order in which the observer takes them.
     virtual : sequence of int, optional
-        Indices of the virtual microphones, in the order in which the observer gives them; by default all others.
+        Indices of the virtual microphones, in the order in which the observer returns them; by default all others.
     amplifier : callable or sequence of J of them, optional
         Known amplifiers: the disturbance is then estimated from what they deliver, not from y.
 
@@ -227,14 +228,14 @@ class VirtualMicrophones(WrappedController):
     Raises
     ------
     TypeError, ValueError
-        Indices that are out of range or occur twice; an observer or a controller for other numbers of microphones or
-        loudspeakers. In a run: an error of a physical microphone that is not finite. Nothing was changed.
+        Indices that are out of range or occur twice; an observer or a controller for a different number of microphones
+        or loudspeakers. During a run: an error at a physical microphone that is not finite. Nothing was changed.
 
     Notes
     -----
-    `simulate` calls it sample by sample, which costs some tens of microseconds more than such calls of `controller`
-    alone, and these cost more than its compiled loop; the tutorial prints the time. The multiplications are K J taps
-    for the secondary paths, and K_v K_p n_taps for observation filters.
+    `simulate` calls it from Python sample by sample. This takes some tens of microseconds per sample more than calling
+    `controller` alone in the same way, which itself takes longer than a compiled loop; the tutorial prints the time.
+    The secondary paths take K J taps multiplications per sample, and observation filters K_v K_p n_taps.
 
     References
     ----------
@@ -243,7 +244,7 @@ class VirtualMicrophones(WrappedController):
 
     Examples
     --------
-    One loudspeaker. The noise passes the physical microphone and reaches the virtual one a sample later:
+    With one loudspeaker, the noise passes the physical microphone and reaches the virtual one a sample later:
 
     >>> import numpy as np
     >>> from kfopc_filterpy import FxLMS, noise_reduction_db, simulate
@@ -320,8 +321,8 @@ class VirtualMicrophones(WrappedController):
             if own != count:
                 raise ValueError(
                     f"controller must be made for the {wanted['n_microphones']} virtual microphones and "
-                    f"{self.n_loudspeakers} loudspeakers, but its {name} is {own}: give it the rows of the virtual "
-                    "microphones of the secondary path"
+                    f"{self.n_loudspeakers} loudspeakers, but its {name} is {own}: make it with the secondary "
+                    "paths to the virtual microphones only"
                 )
 
     def _checked_amplifiers(self, amplifier: Any) -> list[Any] | None:
@@ -359,7 +360,7 @@ class VirtualMicrophones(WrappedController):
     def update(self, error: Any) -> None:
         """Let the controller adapt to the errors that the last control signal leaves at the virtual microphones.
 
-        `error` is (K,), of all microphones; only those of the physical ones are read.
+        `error` is (K,), of all microphones; only the values of the physical ones are used.
         """
         heard = as_real_array(error, "error").reshape(-1)
         if heard.size != self.n_microphones:
@@ -380,14 +381,14 @@ class VirtualMicrophones(WrappedController):
         return disturbance, self.observer.estimate(disturbance) - anti_noise[self.virtual]
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Let the controller follow the noise before the control is switched on, with silent loudspeakers.
+        """Let the controller follow the noise before the control is switched on, while the loudspeakers are silent.
 
         Parameters
         ----------
         references : ndarray, shape (I, n_samples)
             References.
         errors : ndarray, shape (K, n_samples)
-            Signals of all microphones; only those of the physical ones are read.
+            Signals of all microphones; only those of the physical ones are used.
         """
         if not hasattr(self.controller, "listen"):
             raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
@@ -405,13 +406,13 @@ class VirtualMicrophones(WrappedController):
         self.controller.listen(references, virtual_errors)
 
     def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if secondary path, observer or controller are for another rate than `fs` in Hz."""
+        """Raise ValueError if secondary path, observer or controller are for a sampling rate other than `fs` in Hz."""
         require_rates(fs, {"secondary path": self._path_fs, "observer": getattr(self.observer, "fs", None)})
         if hasattr(self.controller, "require_sample_rate"):
             self.controller.require_sample_rate(fs)
 
 
 def push_sample(line: np.ndarray, sample: np.ndarray) -> None:
-    """Add a sample of several channels as the newest to a line that holds the channels of each sample together."""
+    """Add the newest sample of several channels to a delay line in which the channels of a sample are adjacent."""
     line[sample.size :] = line[: line.size - sample.size]
     line[: sample.size] = sample[: line.size]

@@ -112,10 +112,10 @@ class KFOPC(KalmanFilter):
 
     With J loudspeakers, I references and K microphones, the states are the control filters in the order (J, I, taps),
     newest-sample tap first, and row k of H is the filtered references x'_kji of microphone k in that order. All
-    measurements are scaled by one factor, the least that eq. 13 gives any loudspeaker as if it were alone: the
-    disturbance power is summed over microphones, and the gain is the power of the loudspeaker's filtered references,
-    summed over microphones, over that of the references. This extension is the package's, not the paper's. `rated_power`,
-    `disturbance_power` and `secondary_path_gain` are then (J,).
+    measurements are scaled by one factor, the smallest of those that eq. 13 gives each loudspeaker as if it were alone.
+    The disturbance power is summed over microphones, and the gain is the power of the loudspeaker's filtered
+    references, summed over microphones, divided by that of the references. This extension is the package's, not the
+    paper's. `rated_power`, `disturbance_power` and `secondary_path_gain` are then (J,).
 
     See also `kf_opc`, whose filter for several channels takes O(K dim_x^2) per sample.
 
@@ -142,7 +142,7 @@ class KFOPC(KalmanFilter):
     >>> kf.update(4.0, H=np.array([1.0, 0.0, 2.0, 0.0]), reference=1.0)
     >>> kf.secondary_path_gain
     array([1., 4.])
-    >>> kf.constraint_factor  # the lesser of sqrt(1 * 1 / 16) and sqrt(0.25 * 4 / 16)
+    >>> kf.constraint_factor  # the smaller of sqrt(1 * 1 / 16) and sqrt(0.25 * 4 / 16)
     0.25
     """
 
@@ -366,8 +366,8 @@ class KFOPC(KalmanFilter):
             Observation of this step, (n,) or (dim_z, n); by default `self.H`. With a rated power, the first element of
             each control filter's part is the newest filtered reference x'(n).
         reference : float or array_like, shape (I,), optional
-            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11). Several references need rated
-            powers in a sequence, be it of one.
+            Newest reference x(n), which with x'(n) gives the secondary-path gain (eq. 11). With several references, the
+            rated powers must be a sequence, even for one loudspeaker.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""The correlation of signals over an exponential window, a block of samples at a time."""
+"""Correlation of signals over an exponential window, updated one block of samples at a time."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from scipy import fft
 
 
 class FadingCorrelation:
-    """Correlation of I signals, with products by FFT.
+    """Correlation of I signals over an exponential window, by FFT.
 
     Parameters
     ----------
     n_lags, n_signals : int
         Number of lags M, and I.
     keep : float
-        Factor by which a product fades per sample.
+        Factor by which the weight of a product falls per sample.
 
     Attributes
     ----------
     total : ndarray, shape (M, I, I)
-        Sum of the faded products x_i(n - m) x_k(n), at [m, i, k].
+        Weighted sum of the products x_i(n - m) x_k(n), at [m, i, k].
     mass : float
-        Sum of the weights of the products of a lag.
+        Sum of the weights.
     """
 
     def __init__(self, n_lags: int, n_signals: int, keep: float) -> None:
@@ -36,12 +36,12 @@ class FadingCorrelation:
         weights[n_lags - 1 :] = self.keep ** np.arange(block - 1, -1, -1.0)
         size = fft.next_fast_len(signals.shape[1], real=True)
         spectra, of_late = fft.rfft(signals, size), fft.rfft(signals * weights, size)
-        products = fft.irfft(spectra[:, np.newaxis].conj() * of_late, size)  # of lag m at [i, k, m]
+        products = fft.irfft(spectra[:, np.newaxis].conj() * of_late, size)  # lag m at [i, k, m]
         self.total = self.keep**block * self.total + products[..., :n_lags].transpose(2, 0, 1)
         self.mass = self.keep**block * self.mass + weights.sum()
 
     @property
     def faded(self) -> np.ndarray:
-        """Mean products, (M, I, I), as of a signal that fades, which makes them positive definite; zero in silence."""
+        """Mean products, (M, I, I), of signals that fade into the past, so positive definite; zero in silence."""
         lags = np.arange(len(self.total))
         return self.total * (np.sqrt(self.keep) ** lags / max(self.mass, 1.0))[:, np.newaxis, np.newaxis]

@@ -1,14 +1,15 @@
-"""A Kalman filter of FIR paths in the frequency domain: partitions, overlap-save, a covariance that is diagonal.
+"""A Kalman filter of FIR paths in the frequency domain: partitions, overlap-save and a diagonal covariance.
 
-The paths from I inputs to K outputs are cut into partitions of B taps. Each has a spectrum of 2B points, as has each
-frame of the last 2B samples of an input, so that the last B samples of their product are a linear convolution
-(overlap-save). The variance of the taps is a spectrum for each input and partition, and one for all outputs, since they
-have the same observation and their measurement noise counts relatively, as 1.
+The paths from I inputs to K outputs are cut into partitions of B taps. Each partition has a spectrum of 2B points, and
+so has each frame of the last 2B samples of an input: the last B samples of their product are a linear convolution
+(overlap-save). The variance of the taps is a spectrum for each input and partition. All outputs share it, since they
+have the same observation rows, and variances are relative to their measurement noise, which counts as 1.
 
-Published forms keep the covariance of the innovation diagonal as well. That takes frequencies for independent which
-leak into each other within a frame: a band of noise converges slowly, and a tone can make the filter diverge. Here the
-innovation's covariance is used as it is, for the taps' diagonal one: a system of B unknowns, solved by a few
-conjugate-gradient steps with the diagonal one as the preconditioner. Its solution never increases the error of the block.
+Published forms assume the covariance of the innovation to be diagonal, too. They neglect that the frequencies of a
+frame leak into each other: for band-limited noise they converge slowly, and a tone can make them diverge. Here only the
+covariance of the taps is diagonal. The covariance of the innovation that follows from it is used in full: a system of B
+unknowns, solved by a few steps of conjugate gradients with the diagonal form as the preconditioner. Its solution never
+increases the error of the block.
 
 References
 ----------
@@ -26,11 +27,11 @@ from scipy import fft
 from .block_toeplitz import conjugate_gradients
 
 STEPS = 6  # of conjugate gradients in a block
-SHARE = 0.5  # block over frame: the part of a frame's information that a diagonal covariance can count on
+SHARE = 0.5  # block over frame: the share of a frame's information that a diagonal covariance may assume
 
 
 class PartitionedKalman:
-    """Kalman filter of the paths from I inputs to K outputs.
+    """Kalman filter that estimates the paths from I inputs to K outputs.
 
     Parameters
     ----------
@@ -53,18 +54,18 @@ class PartitionedKalman:
 
     @property
     def paths(self) -> np.ndarray:
-        """The estimated paths, (K, I, n_taps)."""
+        """Estimated paths, (K, I, n_taps)."""
         taps = fft.irfft(self._spectra)[..., : self.block]
         return taps.reshape(*taps.shape[:2], -1)[..., : self.n_taps]
 
     def hear(self, inputs: np.ndarray) -> None:
-        """Take the inputs of a block, (I, B)."""
+        """Add the inputs of a block, (I, B)."""
         self._frames = np.roll(self._frames, 1, axis=1)
         self._frames[:, 0] = fft.rfft(np.concatenate([self._last, inputs], axis=1))
         self._last = inputs.copy()
 
     def learn(self, outputs: np.ndarray) -> bool:
-        """Correct the paths by the outputs of the block that was heard last, (K, B); return False if that overflows."""
+        """Correct the paths by the outputs of the block added last, (K, B); return False if that overflows."""
         variance = self.variance + self.block * self.state_noise
         spectra, frames = self._spectra, self._frames
         own = 0.5 * variance * np.abs(frames) ** 2  # the variance of the output that each partition explains
@@ -88,7 +89,7 @@ class PartitionedKalman:
         return True
 
     def outputs(self, spectra: np.ndarray) -> np.ndarray:
-        """Return the outputs of paths for the frames heard, (K, B)."""
+        """Return the outputs of paths for the present frames, (K, B)."""
         return fft.irfft(np.einsum("ipf,kipf->kf", self._frames, spectra))[:, self.block :]
 
     def _constrained(self, spectra: np.ndarray) -> np.ndarray:
@@ -99,10 +100,10 @@ class PartitionedKalman:
 
 
 def innovation_spectrum(explained: np.ndarray) -> np.ndarray:
-    """Return the spectrum per sample of the innovation in the later half of a frame; its measurement noise is 1.
+    """Return the spectrum per sample of the innovation in the second half of a frame, with measurement noise of 1.
 
-    `explained`, (B + 1,), is that of the whole frame. Half a frame has fewer pairs of samples at each lag, which spreads
-    a spectral line over its neighbours.
+    `explained`, (B + 1,), is the spectrum for the whole frame, without measurement noise. Half a frame has fewer pairs
+    of samples at each lag, which spreads a spectral line over its neighbours.
     """
     block = explained.size - 1
     lags = fft.irfft(explained)

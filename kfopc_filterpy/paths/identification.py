@@ -168,7 +168,7 @@ def require_audible(recorded: Mapping[str, np.ndarray], n_taps: int) -> None:
 
 
 def require_length(n_samples: int, needed: int, name: str = "excitation") -> None:
-    """Raise ValueError if a recording is shorter than a fit needs."""
+    """Raise ValueError if a recording is too short for a fit."""
     if n_samples < needed:
         raise ValueError(f"{name} must have at least {needed} samples for these paths, got {n_samples}")
 
@@ -193,7 +193,7 @@ def _fit_in_turn(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float)
 
 
 def fit_paths(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return taps (K, J, n_taps) and residuals (K,) in dB of K signals that depend on J others."""
+    """Return the taps (K, J, n_taps) of the paths from J signals to K others, and the residuals (K,) in dB."""
     matrix = _normal_matrix(sent, n_taps)
     for j, signal in enumerate(sent):
         diagonal = np.arange(j * n_taps, (j + 1) * n_taps)
@@ -219,7 +219,7 @@ def _require_different(sent: np.ndarray, n_taps: int) -> None:
             one, other = cross_correlation(past[i], signal), cross_correlation(past[j], sent[i])
             if max(np.abs(one).max(), np.abs(other).max()) > _LARGEST_CORRELATION * size:
                 raise ValueError(
-                    f"excitation[{j}] must not be correlated with excitation[{i}], for their paths cannot be told "
+                    f"excitation[{j}] must not be correlated with excitation[{i}], since their paths cannot be told "
                     "apart: play noises of different seeds, or let the loudspeakers play in turn"
                 )
 

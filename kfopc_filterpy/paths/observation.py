@@ -1,4 +1,4 @@
-"""Virtual microphones: the disturbance where no microphone is, from that at the microphones there are."""
+"""Observation filters: they predict the disturbance at virtual microphones from that at physical ones."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ class ObservationFilters:
     taps : numpy.ndarray, shape (K_v, K_p, n_taps)
         Filter from each physical microphone to each virtual one.
     residual_db : numpy.ndarray, shape (K_v,)
-        Share of the power at each virtual microphone that they do not predict, in dB. At least -300 dB.
+        Share of the power at each virtual microphone that the filters do not predict, in dB; at least -300.
     """
 
     taps: np.ndarray
     residual_db: np.ndarray
 
     def predict(self, physical: Any) -> np.ndarray:
-        """Return the signals at the virtual microphones, (K_v, n_samples), of a recording at the physical ones.
+        """Predict the signals at the virtual microphones, (K_v, n_samples), from a recording at the physical ones.
 
         Parameters
         ----------
         physical : array_like, shape (K_p, n_samples)
-            Recording, which begins in silence.
+            Recording; silence before its first sample is assumed.
 
         Returns
         -------
         numpy.ndarray, shape (K_v, n_samples)
-            Prediction. On another recording than that of the fit, its error says what the filters are worth.
+            Prediction. To judge the filters, look at its error on a recording to which they were not fitted.
 
         Raises
         ------
         TypeError, ValueError
-            If the recording has another number of channels, or is not finite.
+            If the recording has a different number of channels from that of the fit, or is not finite.
 
         Examples
         --------
@@ -63,36 +63,37 @@ def identify_observation_filters(
 ) -> ObservationFilters:
     r"""Fit the filters that predict the noise at virtual microphones from that at physical ones, by least squares.
 
-    This is the first stage of the remote-microphone technique. Microphones stand at the virtual places for as long as
-    it takes to record the noise, without control. Then they are removed, and `VirtualMicrophones` uses the filters O:
+    This is the first stage of the remote-microphone technique. Microphones are placed at the virtual places, just to
+    record the noise without control. Then they are removed, and `VirtualMicrophones` uses the filters O:
 
     .. math:: \hat d_v = O * d_p
 
-    The filters hold as long as the noise comes from where it came from in the recording. They are causal: a place that
-    the noise reaches before it reaches the physical microphones is predicted only as far as the noise can be foretold.
+    The filters are valid as long as the noise comes from the same places as in the recording. They are causal: if the
+    noise reaches a virtual microphone before it reaches the physical ones, the prediction is only as good as the noise
+    is predictable.
 
     Parameters
     ----------
     physical : array_like, shape (K_p, n_samples)
-        Signals of the physical microphones; (n_samples,) of one.
+        Signals of the physical microphones; (n_samples,) is allowed for one.
     virtual : array_like, shape (K_v, n_samples)
         Signals of the microphones at the virtual places, recorded at the same time.
     n_taps : int
         Taps of each filter.
     regularization : float, default 1e-4
-        Ridge relative to the power of each physical microphone. Microphones that hear nearly the same need it, and it
-        bounds how much the filters amplify what the microphones hear beside the noise. With the default, frequencies at
+        Ridge relative to the power at each physical microphone. It is needed if microphones hear nearly the same, and
+        it limits how much the filters amplify whatever else the microphones pick up. With the default, frequencies at
         which the noise is 40 dB below its mean density are hardly predicted.
 
     Returns
     -------
     ObservationFilters
-        The filters, and for each virtual microphone how much of its power they leave unexplained.
+        The filters, and the share of the power at each virtual microphone that they do not predict.
 
     Raises
     ------
     TypeError, ValueError
-        If the recordings differ in length, are shorter than ``(K_p + 1) n_taps - 1``, silent or not finite.
+        If the recordings differ in length, are shorter than ``(K_p + 1) n_taps - 1`` samples, silent or not finite.
 
     References
     ----------
@@ -102,7 +103,7 @@ def identify_observation_filters(
 
     Examples
     --------
-    A virtual microphone that the noise reaches a sample later, half as loud:
+    The noise reaches the virtual microphone one sample later, with half the amplitude:
 
     >>> noise = np.random.default_rng(0).standard_normal(2000)
     >>> found = identify_observation_filters(noise[1:], 0.5 * noise[:-1], n_taps=3)

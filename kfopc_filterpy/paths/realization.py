@@ -1,4 +1,4 @@
-"""A small state-space model of many paths together, for filters that need states."""
+"""State-space models of several paths together, for observers such as the Kalman filter that need states."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ class PathRealization:
     system : control.StateSpace
         The model, with ``dt = 1/fs``.
     residual_db : numpy.ndarray, shape (outputs,)
-        Energy of the error of each output's impulse responses over the energy of those responses, in dB; at least -300.
+        Energy of the error in each output's impulse responses, relative to the energy of these responses, in dB; at
+        least -300.
     """
 
     system: control.StateSpace
@@ -38,10 +39,11 @@ class PathRealization:
 def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRealization:
     """Return a state-space model of a given order whose impulse responses are close to those of the paths.
 
-    It is the eigensystem realization of Ho, Kalman, Juang and Pappa, as python-control computes it. Because the
-    responses end, the model is the balanced one. States are shared by all paths, so paths with the same resonances or
-    the same delay cost little more than one of them. A delay costs a state for each sample. One that all paths share
-    makes no difference to noise of unknown phase, so cut it off before, as in the example.
+    It is the eigensystem realization of Ho, Kalman, Juang and Pappa, as python-control computes it. Because the impulse
+    responses are finite, the model is a balanced one. All paths share the states, so several paths with the same
+    resonances or the same delay need hardly more states than one of them. A delay needs one state for each sample. A
+    delay common to all paths makes no difference if the input is noise of unknown phase: cut it off first, as in the
+    example.
 
     Parameters
     ----------
@@ -55,12 +57,12 @@ def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRea
     Returns
     -------
     PathRealization
-        The model, and how far off it is.
+        The model and its error.
 
     Raises
     ------
     TypeError, ValueError
-        If the order is out of range, the paths are silent, or the number of states that the paths have is smaller.
+        If the order is out of range or exceeds the number of states that the paths have, or the paths are silent.
 
     References
     ----------
@@ -70,12 +72,12 @@ def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRea
 
     Examples
     --------
-    One source and two microphones, the second 3 samples farther away:
+    One source and two microphones, the second of them 3 samples farther away:
 
     >>> paths = np.zeros((2, 1, 16))
     >>> paths[0, 0, 5:] = 0.5 ** np.arange(11)
     >>> paths[1, 0, 8:] = 0.5 ** np.arange(8)
-    >>> model = realize_paths(paths[..., 4:], 4, fs=8000.0)  # the first of them arrives a sample late
+    >>> model = realize_paths(paths[..., 4:], 4, fs=8000.0)  # one sample of the first delay is left
     >>> model.order, bool(np.all(model.residual_db < -20))
     (4, True)
     """
@@ -87,17 +89,21 @@ def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRea
     if order > most:
         raise ValueError(f"order must be at most {most} for paths of shape {taps.shape}, got {order}")
     if not np.any(taps[..., 1:]):
-        raise ValueError("paths must have a tap other than the first that is not zero: there is nothing to store")
+        raise ValueError(
+            "paths must have a tap other than the first that is not zero: paths without memory have no states"
+        )
     padded = np.concatenate([taps, np.zeros((outputs, inputs, n_taps + 1))], axis=2)
     balanced, sizes = eigensys_realization(padded, order, m=n_taps, n=n_taps)
     if not sizes[order - 1] > 1e-13 * sizes[0]:
-        raise ValueError(f"order must be at most {np.sum(sizes > 1e-13 * sizes[0])}, the states that the paths have")
+        raise ValueError(
+            f"order must be at most {np.sum(sizes > 1e-13 * sizes[0])}, the number of states that the paths have"
+        )
     system = StateSpace(balanced.A, balanced.B, balanced.C, balanced.D, 1 / fs)
     return PathRealization(system, _residual_db(taps, system))
 
 
 def _residual_db(taps: np.ndarray, system: control.StateSpace) -> np.ndarray:
-    """Return the error of the impulse responses over their energy, (outputs,); the model's may go on for longer."""
+    """Return the relative error energy of the impulse responses in dB, (outputs,); the model's may be longer."""
     n_samples = 2 * taps.shape[2]
     response, state = [system.D], system.B
     for _ in range(n_samples - 1):

@@ -1,12 +1,13 @@
-"""The control filters of several loudspeakers with the least error, each within its own rated power.
+"""Control filters of least error for several loudspeakers, each within its own rated power.
 
-For estimated primary paths P, known secondary paths S and the correlation of the references, the control filters solve
+Given estimated primary paths P, known secondary paths S and the correlation of the references, the control filters v
+solve
 
     (R_x' + blkdiag(lambda_j R_x)) v = r,    lambda_j >= 0,    lambda_j (v_j' R_x v_j - rho_j) = 0,
 
-where R_x' is the correlation of the filtered references, summed over the microphones, and r their cross-correlation with
-the disturbances. Both follow from the paths and R_x alone, as products of spectra. If instead of the primary paths the
-control filters w that are best without a limit are known, r = R_x' w.
+where R_x' is the correlation of the filtered references, summed over the microphones, and r is their cross-correlation
+with the disturbances. Both follow from the paths and R_x alone, as products of spectra. If the optimal control filters
+w for unlimited power are known instead of the primary paths, r = R_x' w.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from ..kernels.block_toeplitz import (
     toeplitz_product,
 )
 
-SWEEPS, STEPS = 3, 5  # multipliers are adjusted after each sweep of so many conjugate-gradient steps
-RIDGE = 1e-6  # of the mean energy: bounds the weights in directions without energy
-LARGEST_CHANGE = 10.0  # of a multiplier in a sweep
-SMALLEST_WEIGHT = 1e-6  # of the natural weight: a multiplier that is not needed must be able to grow again
+SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
+RIDGE = 1e-6  # of the mean energy: limits the weights in directions without energy
+LARGEST_CHANGE = 10.0  # largest ratio of power to rated power that counts in a sweep
+SMALLEST_WEIGHT = 1e-6  # of the natural weight: a penalty that is not needed must be able to grow again
 
 
 class ChannelBudget:
-    """Control filters of J loudspeakers for I references, followed from solve to solve.
+    """Control filters of J loudspeakers for I references; each solution continues from the last one.
 
     Parameters
     ----------
     secondary : ndarray, shape (K, J, n_secondary)
-        Secondary paths, each microphone's row weighted as its error counts.
+        Secondary paths, the rows of each microphone times the square root of the weight of its squared error.
     n_taps, n_primary : int
-        Taps of a control filter, and of an estimated primary path; 0 if the control filters are estimated.
+        Taps of a control filter, and of an estimated primary path (0 if the control filters are estimated instead).
     n_references : int
         Number of references I.
     rated_power : ndarray, shape (J,)
@@ -57,7 +58,7 @@ class ChannelBudget:
         self.penalty: np.ndarray | None = None  # lambda, (J,)
 
     def solve(self, correlation: np.ndarray, primary: np.ndarray) -> None:
-        """Move `weights` and `penalty` towards the solution for primary paths.
+        """Move `weights` and `penalty` towards the solution for given primary paths.
 
         Parameters
         ----------
@@ -69,7 +70,7 @@ class ChannelBudget:
         self._move(correlation, self._filtered_lags(correlation), self._right_side(correlation, primary))
 
     def solve_near(self, correlation: np.ndarray, free: np.ndarray) -> None:
-        """Move `weights` and `penalty` towards the solution for control filters that are best without a limit.
+        """Move `weights` and `penalty` towards the solution, given the optimal control filters for unlimited power.
 
         Parameters
         ----------
@@ -83,7 +84,7 @@ class ChannelBudget:
         self._move(correlation, lags, product(free.reshape(-1, self.n_taps)))
 
     def _move(self, correlation: np.ndarray, lags: np.ndarray, r: np.ndarray) -> None:
-        """Move `weights` and `penalty` towards the solution for R_x' of these `lags` and the right-hand side r."""
+        """Move `weights` and `penalty` towards the solution for the `lags` of R_x' and the right-hand side r."""
         J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
         of_x = _two_sided(correlation[:n], 2 * n)
         natural = np.trace(lags[0]) / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
@@ -106,16 +107,17 @@ class ChannelBudget:
         self.weights = filters
 
     def _adjust_penalty(self, power: np.ndarray, natural: float) -> None:
-        """Multiply each penalty by a power of its loudspeaker's power over the rated power.
+        """Correct each penalty by the ratio of its loudspeaker's power to the rated power, raised to an exponent.
 
-        The exponent of what all have in common, weighted by the penalties, is the inverse of the slope on a flat path,
-        where the power goes as ``(1 + penalty/natural)^-2``. What they differ in is damped by the root: of loudspeakers
-        that are coupled, one takes over what the other leaves, as the inverse square of their penalties, and undamped
-        they would swing.
+        The logarithm of the ratio is split into the mean over the loudspeakers, weighted by the penalties, and the
+        deviation from it. For the mean, the exponent is the inverse of the slope on a flat path, where the power is
+        proportional to ``(1 + penalty/natural)^-2``. For the deviations it is 1/2: of coupled loudspeakers, one takes
+        over what another gives up, as the inverse square of their penalties, and without this damping they would
+        oscillate.
         """
         assert self.penalty is not None
         ratio = np.log(np.clip(power / self.rated_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE))
-        floor = SMALLEST_WEIGHT * natural  # there, a power is not used up, and its ratio does not count
+        floor = SMALLEST_WEIGHT * natural  # at the floor, the rated power is not used up, and the ratio does not count
         common = np.average(ratio, weights=np.maximum(self.penalty - floor, np.finfo(float).tiny))
         exponent = min(0.5 + 0.5 * natural / self.penalty.mean(), 1.0)
         change = np.exp(exponent * common + 0.5 * (ratio - common))
@@ -137,7 +139,7 @@ class ChannelBudget:
 
 
 def _two_sided(correlation: np.ndarray, size: int) -> np.ndarray:
-    """Return a correlation with its negative lags at the end of `size` samples; that of -m is the transpose of m's."""
+    """Return a correlation with its negative lags at the end of `size` samples: at -m, the transpose of that at m."""
     lags = len(correlation)
     both = np.zeros((size, *correlation.shape[1:]))
     both[:lags] = correlation

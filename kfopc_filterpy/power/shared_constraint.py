@@ -1,4 +1,4 @@
-"""One constraint factor for several loudspeakers: the least of theirs."""
+"""One constraint factor for several loudspeakers: the smallest of their factors."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from .constraint import OutputPowerConstraint
 
 
 class SharedConstraint(tuple[OutputPowerConstraint, ...]):
-    r"""Constraints of J loudspeakers; the least of their factors scales the measurements of all microphones.
+    r"""Constraints of J loudspeakers; the smallest of their factors scales the measurements of all microphones.
 
     .. math:: \alpha = \min_j \min\{\sqrt{\rho_j G_j / \delta_d^2},\ 1\}
 
-    The disturbance power is summed over microphones. :math:`G_j` is the power of loudspeaker j's filtered references,
-    summed over microphones and references, over the power of the references: each loudspeaker counts as if it were
-    alone. One that no microphone hears, with a gain of zero, is left out: its control filters stay zero. With one
-    loudspeaker, microphone and reference this is eq. 13. The extension is this package's, not the paper's. Properties
-    have a value for each loudspeaker, (J,), except `factor`.
+    The disturbance power is summed over microphones. The gain :math:`G_j` is the power of loudspeaker j's filtered
+    references, summed over microphones and references, divided by the power of the references: each loudspeaker is
+    treated as if it were alone. A loudspeaker that no microphone hears has a gain of zero and is left out: its control
+    filters stay zero. With one loudspeaker, microphone and reference this is eq. 13. The extension is this package's,
+    not the paper's. All properties except `factor` have one value for each loudspeaker, (J,).
     """
 
     @property
     def rated_power(self) -> np.ndarray:
-        """Rated powers, (J,); can be assigned, one number for all of them too."""
+        """Rated powers, (J,); can be assigned, also as one number for all."""
         return self._of_each("rated_power")
 
     @rated_power.setter
@@ -35,7 +35,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
 
     @property
     def factor(self) -> float:
-        """Least factor; assign a value to fix it, None to compute it again."""
+        """Smallest factor; assign a value to fix it, or None to compute it again."""
         return _least([(one.factor, one.secondary_path_gain) for one in self])
 
     @factor.setter
@@ -44,7 +44,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
 
     @property
     def disturbance_power(self) -> np.ndarray:
-        """Disturbance powers last used, (J,), which differ only if the memories do; can be supplied."""
+        """Disturbance powers last used, (J,), which differ only if the memories do; can be assigned."""
         return self._of_each("disturbance_power")
 
     @disturbance_power.setter
@@ -53,7 +53,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
 
     @property
     def secondary_path_gain(self) -> np.ndarray:
-        """Power gains last used, (J,), NaN if unknown; can be supplied."""
+        """Power gains last used, (J,), NaN if unknown; can be assigned."""
         return self._of_each("secondary_path_gain")
 
     @secondary_path_gain.setter
@@ -61,7 +61,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         self._assign("secondary_path_gain", value, as_positive)
 
     def fresh(self, rated_power: Any) -> SharedConstraint:
-        """Return constraints with the same settings and no samples yet, for other rated powers."""
+        """Return constraints with the same settings, without samples, for other rated powers."""
         powers = per_loudspeaker(rated_power, len(self), "rated_power")
         return SharedConstraint(one.fresh(power) for one, power in zip(self, powers, strict=True))
 
@@ -79,7 +79,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         filtered_reference : array_like, shape (J, K, I)
             Newest filtered references.
         reference : array_like, shape (I,), optional
-            Newest references; can be omitted if every gain or factor was supplied.
+            Newest references; can be omitted if every gain or factor was assigned.
 
         Returns
         -------
@@ -89,7 +89,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         Raises
         ------
         ValueError
-            NaN, Inf or values whose squares overflow; no reference although a gain must be estimated. Nothing was
+            NaN, Inf or values whose squares overflow; no reference, although a gain must be estimated. Nothing was
             changed.
         """
         d, filtered, x = self._sums(disturbance, filtered_reference, reference)
@@ -102,7 +102,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         return _least([one.preview_sums(d, xf, x) for one, xf in zip(self, filtered, strict=True)])
 
     def _sums(self, disturbance: Any, filtered: Any, reference: Any) -> tuple[float, list[float], float | None]:
-        """Return the sums of squares: of the disturbances, of each loudspeaker's filtered references, of the references."""
+        """Return the sums of squares of the disturbances, each loudspeaker's filtered references and the references."""
         return (
             _sum_of_squares(disturbance, "the measurement"),
             [_sum_of_squares(one, "the newest filtered reference") for one in filtered],
@@ -119,7 +119,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
 
 
 def _least(factors: list[tuple[float, float | None]]) -> float:
-    """Return the least of the factors, each with its gain, whose gain is not zero; if all gains are, of all."""
+    """Return the smallest factor among those with a gain other than zero; if all gains are zero, among all."""
     return float(min([factor for factor, gain in factors if gain != 0.0] or [factor for factor, _ in factors]))
 
 

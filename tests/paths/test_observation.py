@@ -97,7 +97,7 @@ def test_a_system_is_found_again_from_its_responses() -> None:
     assert (found.order, found.system.dt) == (3, 1 / FS)
     np.testing.assert_allclose(np.sort_complex(found.system.poles()), np.sort_complex(true.poles()), atol=1e-9)
     assert np.all(found.residual_db < -180)
-    with pytest.raises(ValueError, match="order must be at most 3, the states that the paths have"):
+    with pytest.raises(ValueError, match="order must be at most 3, the number of states that the paths have"):
         realize_paths(impulse_responses(true, 64), 8, fs=FS)
 
 
