@@ -151,11 +151,11 @@ def kf_pb(
     rated_power: Any,
     state_noise: float | None = None,
     measurement_noise: Any = None,
-    initial_variance: float = 1.0,
+    initial_variance: float | None = None,
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
-    dtype: Any = np.float64,
+    dtype: Any = None,
     form: str | None = None,
     **settings: Any,
 ) -> PowerBudgetController | DirectPowerBudget | PrimaryPathController:
@@ -170,7 +170,7 @@ def kf_pb(
     rated_power : float or array_like, shape (J,)
         Rated output power, of all loudspeakers or of each.
     state_noise, measurement_noise, initial_variance, dtype
-        As for `kf_anc`, for the direct form only. The other forms refuse the first two and ignore the others.
+        As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
         As for `kf_anc`.
     form : {"direct", "shared gain", "frequency domain"}, optional
@@ -190,8 +190,8 @@ def kf_pb(
     Raises
     ------
     ValueError, TypeError
-        The direct form without `state_noise` and `measurement_noise`, another form with one of them, or a setting that
-        the class refuses.
+        The direct form without `state_noise` and `measurement_noise`, another form with a setting of the direct form, or
+        a setting that the class refuses.
 
     Examples
     --------
@@ -207,18 +207,20 @@ def kf_pb(
     several = is_multichannel(secondary_path, n_references)
     form = as_choice(form or FORMS[several], "form", FORMS)
     common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
-    if form in PRIMARY_PATH_FORMS:
-        if state_noise is not None or measurement_noise is not None:
-            raise TypeError(f"the {form} form takes path_memory_s instead of state_noise and measurement_noise")
-        return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, n_references=n_references, **common, **settings)
-    if state_noise is None or measurement_noise is None:
-        raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
-    settings |= {
+    filter_settings = {
         "state_noise": state_noise,
         "measurement_noise": measurement_noise,
         "initial_variance": initial_variance,
         "dtype": dtype,
     }
+    given = {name: value for name, value in filter_settings.items() if value is not None}
+    if form in PRIMARY_PATH_FORMS:
+        if given:
+            raise TypeError(f"the {form} form takes path_memory_s instead of {', '.join(given)}")
+        return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, n_references=n_references, **common, **settings)
+    if state_noise is None or measurement_noise is None:
+        raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
+    settings |= given
     if several:
         return DirectPowerBudget(n_taps, secondary_path, n_references=n_references, **common, **settings)
     estimator = PowerBudgetKalmanFilter(n_taps, rated_power=rated_power, **settings)
