@@ -363,6 +363,10 @@ def make_controller(scene: Scene, algorithm: str, setting: Setting, *, amplifier
     >>> make_controller(scene, "KF-OPC", 1e-6).rated_power
     1.0
     """
+    several = scene.secondary.ndim == 3
+    if algorithm not in algorithms(several_channels=several):
+        channels = "several channels" if several else "one channel"
+        raise ValueError(f"{algorithm} is not compared with {channels}: see algorithms(several_channels={several})")
     second = setting[1] if isinstance(setting, tuple) else np.nan
     amplifier = scene.known_amplifier if amplifier is None else amplifier
     own = REGISTRY[algorithm]

@@ -23,11 +23,13 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
+from kfopc_filterpy._validate import as_channels, as_positive, as_signal, per_loudspeaker
 from kfopc_filterpy.bounds import WienerSolution, measurement_noise_from_run, wiener_solution
 from kfopc_filterpy.bounds.channels import channel_record
+from kfopc_filterpy.loop.channels import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
-from kfopc_filterpy.paths.channels import is_path_matrix, primary_paths, secondary_paths
+from kfopc_filterpy.paths.channels import is_path_matrix, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed
@@ -258,6 +260,12 @@ def make_scene(
     Scene
         The scene, which is not changed by runs.
 
+    Raises
+    ------
+    ValueError, TypeError
+        A rated power that is not positive, a noise that is not longer than `switch_on_s`, or paths and references whose
+        numbers of channels do not fit.
+
     Examples
     --------
     >>> from kfopc_filterpy.bench import make_scene
@@ -267,16 +275,18 @@ def make_scene(
     >>> round(float((scene.references[0] ** 2).mean()), 3)  # the path has a gain of 1
     2.0
     """
-    s, p = _taps(secondary, primary, fs)
-    first = next(iter(references.values()))
+    s = secondary_paths(secondary, fs=fs)[0] if is_path_matrix(secondary) else path_taps(secondary, fs=fs)
+    rated_power = _as_rating(rated_power, s)
+    signals = {seed: _as_reference(x, switch_on_s, fs, s) for seed, x in references.items()}
+    first = next(iter(signals.values()))
     settled = (..., slice(int(switch_on_s * fs), None))  # after the start-up of the primary path
-    d = _heard(first, p)
+    d = _heard(first, primary, s, fs)
     wiener = _reachable(first[settled], d[settled], s, n_taps, fs)
     asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
     share = wiener.control_power / np.sum(wiener.control_power)
     power = _power(first) * asked / np.sum(wiener.control_power)
-    scaled = [np.sqrt(power / _power(x)) * x for x in references.values()]
-    disturbances = [_heard(x, p) for x in scaled]
+    scaled = [np.sqrt(power / _power(x)) * x for x in signals.values()]
+    disturbances = [_heard(x, primary, s, fs) for x in scaled]
     std = float(np.sqrt(np.mean(disturbances[0][settled] ** 2)) * 10 ** (sensor_noise_db / 20))
     recorded = disturbances[0][settled]
     recorded = recorded + std * np.random.default_rng(0).standard_normal(recorded.shape)
@@ -300,11 +310,19 @@ def make_scene(
     )
 
 
-def _taps(secondary: Any, primary: Any, fs: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the taps of the paths, (K, J, n) and (K, I, n) with several channels."""
-    if is_path_matrix(secondary):
-        return secondary_paths(secondary, fs=fs)[0], primary_paths(primary, fs=fs)[0]
-    return path_taps(secondary, fs=fs), path_taps(primary, fs=fs)
+def _as_rating(rated_power: Any, s: np.ndarray) -> Any:
+    """Return a rated power, or one for each loudspeaker if several are given."""
+    if s.ndim == 1 or np.ndim(rated_power) == 0:
+        return as_positive(rated_power, "rated_power")
+    return per_loudspeaker(rated_power, s.shape[1], "rated_power")
+
+
+def _as_reference(x: Any, switch_on_s: float, fs: float, s: np.ndarray) -> np.ndarray:
+    """Return a noise as (n_samples,), or as (I, n_samples) with several channels."""
+    x = as_signal(x, "references") if s.ndim == 1 else np.atleast_2d(as_channels(x, "references"))
+    if x.shape[-1] <= int(switch_on_s * fs):
+        raise ValueError(f"references must be longer than switch_on_s = {switch_on_s:g} s, got {x.shape[-1] / fs:g} s")
+    return x
 
 
 def _power(x: np.ndarray) -> float:
@@ -312,11 +330,11 @@ def _power(x: np.ndarray) -> float:
     return float(np.mean(x**2, axis=-1).sum())
 
 
-def _heard(x: np.ndarray, primary: np.ndarray) -> np.ndarray:
-    """Return the disturbance that a reference causes, or several together."""
-    if x.ndim == 1:
-        return np.convolve(x, primary)[: x.size]
-    return fftconvolve(x[np.newaxis], primary, axes=-1)[..., : x.shape[1]].sum(axis=1)
+def _heard(x: np.ndarray, primary: Any, s: np.ndarray, fs: float) -> np.ndarray:
+    """Return the disturbance of a reference, or of several."""
+    if s.ndim == 1:
+        return np.convolve(x, path_taps(primary, fs=fs))[: x.size]
+    return channel_disturbances(x, primary, None, fs, len(s))
 
 
 def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:

@@ -6,6 +6,7 @@ channel as the first axis.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,7 @@ from .wiener import WienerSolution, mean_square, reduction_db
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight
 TOLERANCE = 1e-5  # relative, for a rated power that limits
+MISSED = 1e-3  # from which a rated power is not met
 ROUNDING = 1e-14  # relative rounding error of the dual function
 SOLUTIONS = 100  # at most; about ten are usual
 
@@ -147,6 +149,14 @@ class ChannelCorrelations:
                     break
                 step = self._newton_step(factors, weights, rated_power, (penalty > 0.0) | (ratio > 1.0))
             trial = np.maximum(penalty + step, 0.0)
+        else:
+            missed = float(np.max(np.where(penalty > 0.0, np.abs(ratio - 1.0), ratio - 1.0)))
+            if missed > MISSED:
+                warnings.warn(
+                    f"the rated powers are met to {100 * missed:.2g} % only: the bound is not exact",
+                    RuntimeWarning,
+                    stacklevel=2,
+                )
         return weights, penalty
 
     def _newton_step(self, factors: Any, weights: np.ndarray, rated_power: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -155,11 +165,16 @@ class ChannelCorrelations:
         rows = weights.reshape(J, -1) @ self.reference  # R_x w_j
         changes = cho_solve(factors, block_diag(*rows).T).reshape(J, -1, J)  # -dw / d penalty_i at [..., i]
         slopes = np.einsum("ja,jai->ji", rows, changes)[np.ix_(free, free)]  # -d power_j / d penalty_i, halved
+        size = 1.0 / np.sqrt(np.maximum(np.diag(slopes), np.finfo(float).tiny))  # of loudspeakers, loud or faint
+
+        def solved(right: np.ndarray) -> np.ndarray:
+            return np.asarray(size * np.linalg.lstsq(size[:, np.newaxis] * slopes * size, size * right)[0])
+
         powers = self.powers(weights)
         excess, step = (powers - rated_power)[free], np.zeros(J)
-        step[free] = np.linalg.lstsq(slopes, (powers * (np.sqrt(powers / rated_power) - 1.0))[free])[0]
+        step[free] = solved((powers * (np.sqrt(powers / rated_power) - 1.0))[free])
         if not step[free] @ excess > 0.0:
-            step[free] = np.linalg.lstsq(slopes, 0.5 * excess)[0]
+            step[free] = solved(0.5 * excess)
         return step
 
 

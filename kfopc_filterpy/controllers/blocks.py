@@ -40,13 +40,14 @@ class BlockController(FilteredReferenceController):
         memory_s: float,
         fs: float,
         block: int | None = None,
+        history: int = 0,
         **settings: Any,
     ) -> None:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.block = max(round(BLOCK_S * self.fs), 1) if block is None else as_count(block, "block")
-        history = n_lags - 1 + self.block
-        super().__init__(n_taps, secondary_path, multichannel=True, history=history, **settings)
+        self._past = max(history, n_lags - 1 + self.block)  # samples of the references that a block needs
+        super().__init__(n_taps, secondary_path, multichannel=True, history=self._past, **settings)
         self._rated = None if rated_power is None else per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
         keep = np.exp(-1.0 / (self.memory_s * self.fs))
         self._correlation = FadingCorrelation(n_lags, self.n_references, keep)
@@ -86,13 +87,12 @@ class BlockController(FilteredReferenceController):
         if state.numbers["waiting"][0] < self.block:
             return
         state.numbers["waiting"] = 0
-        samples = len(self._correlation.total) - 1 + self.block
-        references = np.array([newest(line, samples)[::-1] for line in self._lines.reference])
-        self._correlation.add(references)
-        self._end_block(references[:, -self.block :])
+        references = np.array([newest(line, self._past)[::-1] for line in self._lines.reference])
+        self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
+        self._end_block(references)
 
     def _end_block(self, references: np.ndarray) -> None:
-        """Learn from a block of references, (I, B), and set the control filters."""
+        """Learn from a block and set the control filters; `references`, (I, n), end with those of the block."""
         raise NotImplementedError
 
     def _listen(self, references: np.ndarray, errors: np.ndarray) -> int:

@@ -19,7 +19,6 @@ from ..paths.channels import secondary_paths
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
-from .base import OVERFLOW
 from .blocks import BLOCK_S, DEFAULT_MEMORY_S
 from .channels import ChannelLines, estimate_disturbances, references_are_finite
 from .primary_paths import DEFAULT_PATH_MEMORY_S, PrimaryPathController, usual_primary
@@ -27,6 +26,7 @@ from .step import adapt, follow
 
 PRIOR = 10.0  # energy of the references in the unknown paths, relative to the measurement noise
 PARTITIONS = 2  # of a long primary path; with a fixed number, the work per sample grows with the logarithm of the taps
+LOUDEST = 1e100  # references beyond it were refused, but are still in the delay lines
 MEMORY_LENGTHS = 16  # the shortest default memory, in durations of what is estimated
 
 
@@ -116,6 +116,9 @@ class FrequencyDomainKalman(PrimaryPathController):
     is at most 0.1 dB below that of `SharedGainKalman` for white noise, band noise, tones and a compressor
     (``tests/controllers/test_frequency_domain.py``).
 
+    Errors and references of a block belong together: a block in which `update` refused an error, or was not called once
+    for each reference, is not learned from.
+
     State noise and initial variance are those of `SharedGainKalman`, except that the initial variance has the factor 10
     instead of 1000: after too large a gain, a diagonal covariance averages out the measurement noise more slowly.
 
@@ -164,6 +167,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         secondary, _ = secondary_paths(secondary_path)
         n_taps, fs = as_count(n_taps, "n_taps"), as_positive(fs, "fs", unit="Hz")
         n_primary = usual_primary(n_taps, secondary) if n_primary is None else as_count(n_primary, "n_primary")
+        block = _block(n_primary, fs) if block is None else as_count(block, "block")
         super().__init__(
             n_taps,
             secondary_path,
@@ -173,11 +177,14 @@ class FrequencyDomainKalman(PrimaryPathController):
             path_memory_s=_memory_s(DEFAULT_PATH_MEMORY_S, n_primary / fs) if path_memory_s is None else path_memory_s,
             memory_s=_memory_s(DEFAULT_MEMORY_S, n_taps / fs) if memory_s is None else memory_s,
             fs=fs,
-            block=_block(n_primary, fs) if block is None else block,
+            block=block,
+            history=_frame_samples(n_primary, block),
             microphone_weights=microphone_weights,
             amplifier=amplifier,
             limiter=limiter,
         )
+        self._frame_samples = _frame_samples(n_primary, block)
+        self._last_references = np.zeros((self.n_references, block))
         self._paths = PartitionedKalman(self.n_microphones, self.n_references, self._budget.n_primary, self.block)
         self._state = FrequencyDomainState(
             lines=self._lines,
@@ -194,8 +201,12 @@ class FrequencyDomainKalman(PrimaryPathController):
     def _end_block(self, references: np.ndarray) -> None:
         """Learn from the block, unless the control was off in a part of it, and solve for the control filters."""
         numbers, paths = self._state.numbers, self._paths
-        controlled, numbers["silent"] = numbers["silent"][0] == 0, 0
-        paths.hear(references)
+        heard = references[:, -self._frame_samples :]
+        learnable = (
+            numbers["silent"][0] == 0 and self._is_one_of_each(references) and bool(np.all(np.abs(heard) < LOUDEST))
+        )
+        numbers["silent"], self._last_references = 0, references[:, -self.block :]
+        paths.hear(heard)
         power = self._reference_power()
         if not power > 0.0:
             return
@@ -203,9 +214,20 @@ class FrequencyDomainKalman(PrimaryPathController):
         if paths.state_noise != before:  # the first references, or much louder ones
             most = self._first_variance(PRIOR, power)
             paths.variance[...] = most if before == 0.0 else np.minimum(paths.variance, most)
-        if controlled and not paths.learn(self._state.disturbances):
-            raise ValueError(OVERFLOW)
+        if learnable and not paths.learn(self._state.disturbances):
+            raise ValueError(
+                "nothing was learned from the last block: errors or references are too large to be squared"
+            )
         self._solve()
+
+    def _is_one_of_each(self, references: np.ndarray) -> bool:
+        """Return whether the block had one reference for each error: otherwise the two do not belong together."""
+        return np.array_equal(references[:, -2 * self.block : -self.block], self._last_references)
+
+
+def _frame_samples(n_primary: int, block: int) -> int:
+    """Return the references that the frames of all partitions need."""
+    return (-(-n_primary // block) + 1) * block
 
 
 def _memory_s(shortest: float, duration_s: float) -> float:

@@ -43,7 +43,7 @@ class SharedGainState(NamedTuple):
 @adapt.register(SharedGainState)
 def adapt_shared_gain(state, error, control_signal):
     """Apply eq. 2-8 to the primary path of each microphone, with the reference as the row."""
-    if not estimate_disturbances(state.lines, error):
+    if not (estimate_disturbances(state.lines, error) and references_are_finite(state.lines)):
         return False
     d, h, paths, numbers = state.lines.disturbance, reference_row(state), state.paths, state.numbers[0]
     innovation, S = kalman_step(state.gains, paths[0], h, d[0], numbers.state_noise, 1.0, 1.0)

@@ -49,7 +49,6 @@ class PartitionedKalman:
         self.state_noise = 0.0  # of a tap and sample
         self._spectra = np.zeros((n_outputs, *shape), complex)
         self._frames = np.zeros(shape, complex)  # the newest first
-        self._last = np.zeros((n_inputs, block))
         self._cut = np.arange(partitions * block).reshape(partitions, block) >= n_taps
 
     @property
@@ -59,13 +58,12 @@ class PartitionedKalman:
         return taps.reshape(*taps.shape[:2], -1)[..., : self.n_taps]
 
     def hear(self, inputs: np.ndarray) -> None:
-        """Add the inputs of a block, (I, B)."""
-        self._frames = np.roll(self._frames, 1, axis=1)
-        self._frames[:, 0] = fft.rfft(np.concatenate([self._last, inputs], axis=1))
-        self._last = inputs.copy()
+        """Take the inputs of the present block with those before it, (I, (partitions + 1) B)."""
+        blocks = inputs.reshape(len(inputs), -1, self.block)[:, ::-1]  # the newest first
+        self._frames = fft.rfft(np.concatenate([blocks[:, 1:], blocks[:, :-1]], axis=-1))
 
     def learn(self, outputs: np.ndarray) -> bool:
-        """Correct the paths by the outputs of the block added last, (K, B); return False if that overflows."""
+        """Correct the paths by the outputs of the present block, (K, B); return False if that overflows."""
         variance = self.variance + self.block * self.state_noise
         spectra, frames = self._spectra, self._frames
         own = 0.5 * variance * np.abs(frames) ** 2  # the variance of the output that each partition explains

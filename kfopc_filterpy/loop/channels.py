@@ -230,7 +230,7 @@ def simulate_channels(
     x = np.atleast_2d(as_channels(reference, "reference"))
     secondary, _ = secondary_paths(secondary_path, fs=fs)
     K, J, _ = secondary.shape
-    d = _disturbances(x, primary_path, disturbance, fs, K)
+    d = channel_disturbances(x, primary_path, disturbance, fs, K)
     _require_fit(controller, len(x), J, K)
     rated = getattr(controller, "rated_power", None) if rated_power is None else rated_power
     rated = None if rated is None else per_loudspeaker(rated, J, "rated_power")
@@ -275,7 +275,9 @@ def simulate_channels(
     )
 
 
-def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, n_microphones: int) -> np.ndarray:
+def channel_disturbances(
+    x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, n_microphones: int
+) -> np.ndarray:
     """Return the disturbances, (K, n_samples), as given or as the sum of p_ki * x_i."""
     require_one_source(primary_path, disturbance)
     if primary_path is not None:

@@ -24,6 +24,8 @@ from ..kernels.block_toeplitz import (
 )
 
 SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
+MOST_SWEEPS = 24  # as long as a power is beyond its rated power by more than
+EXCESS = 1.1
 RIDGE = 1e-6  # of the mean energy: limits the weights in directions without energy
 LARGEST_CHANGE = 10.0  # largest ratio of power to rated power that counts in a sweep
 SMALLEST_WEIGHT = 1e-6  # of the natural weight: a penalty that is not needed must be able to grow again
@@ -89,22 +91,25 @@ class ChannelBudget:
         of_x = _two_sided(correlation[:n], 2 * n)
         natural = np.trace(lags[0]) / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
         ridge = RIDGE * np.trace(lags[0]) / (J * n_references)
-        if not natural > 0.0:
-            return  # silence: nothing to solve
+        if not (natural > 0.0 and np.any(r)):
+            return  # silence, or nothing known yet
         if self.penalty is None:
             self.penalty = np.full(J, 1e-3 * natural)
         whole, nearest = circulant_spectrum(lags, n), nearest_circulant_spectrum(lags, n)
         whole_x, nearest_x = circulant_spectrum(of_x, n), nearest_circulant_spectrum(of_x, n)
         power_product = toeplitz_product(whole_x, n)
         v = self.weights.reshape(J * n_references, n)
-        for _ in range(SWEEPS):
+        for sweep in range(1, MOST_SWEEPS + 1):
             product = toeplitz_product(_with_penalty(whole, whole_x, self.penalty, ridge), n)
             inverse = circulant_inverse(_with_penalty(nearest, nearest_x, self.penalty, ridge), n)
             v = conjugate_gradients(product, inverse, r, v, STEPS)
             filters = v.reshape(J, n_references, n)
             power = np.array([np.vdot(w, power_product(w)) for w in filters])
             self._adjust_penalty(power, natural)
-        self.weights = filters
+            if sweep >= SWEEPS and np.all(power <= EXCESS * self.rated_power):
+                break
+        excess = power / (EXCESS * self.rated_power)
+        self.weights = filters / np.sqrt(np.maximum(excess, 1.0))[:, np.newaxis, np.newaxis]
 
     def _adjust_penalty(self, power: np.ndarray, natural: float) -> None:
         """Correct each penalty by the ratio of its loudspeaker's power to the rated power, raised to an exponent.

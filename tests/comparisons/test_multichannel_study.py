@@ -180,12 +180,28 @@ def held(**changes: float) -> list[bool]:
         ({"loss_db": 0.6}, [True, False, True, True, True]),
         ({"loss_db": 1.1}, [True, False, True, False, True]),
         ({"rival_db": 8.2}, [True, True, True, True, False]),
-        ({"rival_db": 8.2, "rival_power": 1.1}, [True, True, True, True, True]),
+        ({"rival_db": 8.2, "rival_power": 1.1}, [True, True, True, True, False]),  # nothing to compare with
         ({"rival_db": 8.05}, [True, True, True, True, True]),
     ],
 )
 def test_verdicts_on_both_sides_of_each_threshold(changes: dict[str, float], expected: list[bool]) -> None:
     assert held(**changes) == expected
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_kf_pb_that_diverges_meets_nothing(place: int) -> None:
+    rows = rows_of()
+    at = [k for k, row in enumerate(rows) if row.algorithm == KF_PB][place]
+    rows[at] = replace(rows[at], diverged_at_s=1.0, noise_reduction_db=np.nan, power=np.nan, powers=[])
+    expected = [place == 1] * 2 + [place == 0] * 2 + [False]
+    assert [verdict.reproduced for verdict in claims(rows)] == expected
+    assert sum("diverged" in verdict.figure for verdict in claims(rows)) == 3
+
+
+def test_without_a_rival_there_is_no_lead() -> None:
+    verdict = claims([row for row in rows_of() if row.algorithm != "MOV-FxLMS"])[-1]
+    assert not verdict.reproduced
+    assert "nothing to compare with" in verdict.figure
 
 
 def test_without_recordings_there_is_no_verdict_on_them() -> None:
