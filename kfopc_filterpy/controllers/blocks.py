@@ -18,6 +18,7 @@ from .base import FilteredReferenceController, listed
 
 BLOCK_S = 0.032  # time between two solutions
 DEFAULT_MEMORY_S = 0.5
+LOUDEST = 1e100  # references beyond it have been refused, but are still in the delay lines
 
 
 class BlockController(FilteredReferenceController):
@@ -88,8 +89,9 @@ class BlockController(FilteredReferenceController):
             return
         state.numbers["waiting"] = 0
         references = np.array([newest(line, self._past)[::-1] for line in self._lines.reference])
-        self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
-        self._end_block(references)
+        if np.all(np.abs(references) < LOUDEST):
+            self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
+            self._end_block(references)
 
     def _end_block(self, references: np.ndarray) -> None:
         """Learn from a block and set the control filters; `references`, (I, n), end with those of the block."""

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, per_channel
+from .._validate import as_count, as_nonnegative, per_channel, per_loudspeaker
 from ..filters.random_walk import as_precision
 from ..kernels.compiling import inlined, part
 from ..kernels.covariance import Covariance, covariance_matrix, kalman_step, new_covariance
@@ -325,7 +325,7 @@ class DirectPowerBudget(BlockController):
         super().__init__(
             n_taps,
             secondary_path,
-            rated_power=rated_power,
+            rated_power=per_loudspeaker(rated_power, secondary.shape[1], "rated_power"),
             n_lags=as_count(n_taps, "n_taps") + secondary.shape[2],
             memory_s=memory_s,
             fs=fs,

@@ -26,7 +26,6 @@ from .step import adapt, follow
 
 PRIOR = 10.0  # energy of the references in the unknown paths, relative to the measurement noise
 PARTITIONS = 2  # of a long primary path; with a fixed number, the work per sample grows with the logarithm of the taps
-LOUDEST = 1e100  # references beyond it were refused, but are still in the delay lines
 MEMORY_LENGTHS = 16  # the shortest default memory, in durations of what is estimated
 
 
@@ -201,12 +200,9 @@ class FrequencyDomainKalman(PrimaryPathController):
     def _end_block(self, references: np.ndarray) -> None:
         """Learn from the block, unless the control was off in a part of it, and solve for the control filters."""
         numbers, paths = self._state.numbers, self._paths
-        heard = references[:, -self._frame_samples :]
-        learnable = (
-            numbers["silent"][0] == 0 and self._is_one_of_each(references) and bool(np.all(np.abs(heard) < LOUDEST))
-        )
+        learnable = numbers["silent"][0] == 0 and self._is_one_of_each(references)
         numbers["silent"], self._last_references = 0, references[:, -self.block :]
-        paths.hear(heard)
+        paths.hear(references[:, -self._frame_samples :])
         power = self._reference_power()
         if not power > 0.0:
             return

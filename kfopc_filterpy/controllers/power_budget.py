@@ -205,7 +205,7 @@ def kf_pb(
     <KF-PB (shared gain): 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2>
     """
     several = is_multichannel(secondary_path, n_references)
-    form = as_choice(form or FORMS[several], "form", FORMS)
+    form = as_choice(form or ("shared gain" if several else "direct"), "form", FORMS)
     common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
     filter_settings = {
         "state_noise": state_noise,

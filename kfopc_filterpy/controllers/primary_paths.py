@@ -50,6 +50,10 @@ class PrimaryPathController(BlockController):
                 f"microphone_weights must have one weight for each of the {self.n_microphones} microphones, "
                 f"got shape {np.shape(weights)}"
             )
+        if not np.any(weights):
+            raise ValueError(
+                "microphone_weights must have one above 0: without any microphone there is nothing to reduce"
+            )
         return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
 
     @property

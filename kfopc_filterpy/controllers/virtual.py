@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -392,18 +393,33 @@ class VirtualMicrophones(WrappedController):
         """
         if not hasattr(self.controller, "listen"):
             raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
-        heard = np.atleast_2d(as_channels(errors, "errors"))
-        if len(heard) != self.n_microphones:
+        if (
+            np.ndim(errors) != 2
+            or len(errors) != self.n_microphones
+            or np.shape(references)[-1:] != np.shape(errors)[-1:]
+        ):
             raise ValueError(
-                f"errors must have a channel for each of the {self.n_microphones} microphones, got {len(heard)}"
+                f"errors must be (K microphones, n_samples) with K = {self.n_microphones}, as many samples as references, "
+                f"got {np.shape(errors)} and {np.shape(references)}"
             )
+        heard = np.zeros(np.shape(errors))  # what the virtual microphones hear is not used, so it may be anything
+        heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
+        before = deepcopy(self._followed())
         virtual_errors = np.empty((self.virtual.size, heard.shape[1]))
         for n, sample in enumerate(heard.T):
             push_sample(self._played, np.zeros(self.n_loudspeakers))
             disturbance, self._virtual_error = self._estimate(sample)
             virtual_errors[:, n] = self._virtual_error
             self.observer.advance(disturbance)
-        self.controller.listen(references, virtual_errors)
+        try:
+            self.controller.listen(references, virtual_errors)
+        except (ValueError, TypeError):
+            self._played, self._virtual_error, self.observer = before
+            raise
+
+    def _followed(self) -> tuple[Any, ...]:
+        """Return what changes in the wrapper with each sample."""
+        return self._played, self._virtual_error, self.observer
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if secondary path, observer or controller are for a sampling rate other than `fs` in Hz."""

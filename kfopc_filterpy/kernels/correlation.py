@@ -29,7 +29,7 @@ class FadingCorrelation:
         self.total = np.zeros((n_lags, n_signals, n_signals))
 
     def add(self, signals: np.ndarray) -> None:
-        """Add the samples of a block, the last B of `signals`, (I, M - 1 + B); leave the block out if a product overflows."""
+        """Add the samples of a block, the last B of `signals`, (I, M - 1 + B)."""
         n_lags = len(self.total)
         block = signals.shape[1] - (n_lags - 1)
         weights = np.zeros(signals.shape[1])
@@ -37,9 +37,8 @@ class FadingCorrelation:
         size = fft.next_fast_len(signals.shape[1], real=True)
         spectra, of_late = fft.rfft(signals, size), fft.rfft(signals * weights, size)
         products = fft.irfft(spectra[:, np.newaxis].conj() * of_late, size)  # of lag m at [i, k, m]
-        total = self.keep**block * self.total + products[..., :n_lags].transpose(2, 0, 1)
-        if np.isfinite(total).all():
-            self.total, self.mass = total, self.keep**block * self.mass + weights.sum()
+        self.total = self.keep**block * self.total + products[..., :n_lags].transpose(2, 0, 1)
+        self.mass = self.keep**block * self.mass + weights.sum()
 
     @property
     def faded(self) -> np.ndarray:

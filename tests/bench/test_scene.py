@@ -163,3 +163,40 @@ def test_budget_is_kept_if_every_loudspeaker_keeps_its_own(channels):
     assert best_setting(channels, "MOV-FxLMS", [both, one]).setting == 0.1
     assert best_setting(channels, "FxLMS", [both, one]).setting == 0.2
     assert not best_setting(channels, "MOV-FxLMS", [one]).within_budget
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"rated_power": [-1.0, 2.0]}, "rated_power must be"),
+        ({"rated_power": np.ones(3)}, "one for each of the 2 loudspeakers"),
+        ({"rated_power": 0.0}, "rated_power must be"),
+        ({"primary": np.ones((3, 1, 20))}, "I = 2 of reference"),
+        ({"switch_on_s": 1.0}, "longer than switch_on_s"),
+    ],
+    ids=["negative", "three", "zero", "one reference", "short"],
+)
+def test_channels_that_do_not_fit_are_refused(changed, match):
+    settings = {
+        "primary": random_paths(3, 2, 20, seed=1),
+        "secondary": random_paths(3, 2, 12, seed=2),
+        "fs": FS,
+        "rated_power": 1.0,
+        "power_multiple": 3.0,
+        "n_taps": 8,
+        "switch_on_s": 0.1,
+    }
+    with pytest.raises(ValueError, match=match):
+        make_scene({0: np.random.default_rng(0).standard_normal((2, 4000))}, **settings | changed)
+
+
+def test_one_channel_has_one_rated_power():
+    with pytest.raises((TypeError, ValueError), match="rated_power"):
+        make_scene(
+            {0: tone(400.0, 1.0, fs=FS)}, [0.0, 1.0], [1.0], fs=FS, rated_power=np.ones(2), power_multiple=1.0, n_taps=4
+        )
+
+
+def test_an_algorithm_of_one_channel_is_refused_by_name(channels):
+    with pytest.raises(ValueError, match="KF-OPC repaired is not compared with several channels"):
+        make_controller(channels, "KF-OPC repaired", 1e-6)

@@ -117,3 +117,14 @@ def test_what_does_not_fit_is_refused(changed: dict, match: str) -> None:
     } | changed
     with pytest.raises(ValueError, match=match):
         power_constrained_wiener(**arguments, fs=FS)
+
+
+@pytest.mark.parametrize("gain", [1e-3, 1e3])
+def test_loudspeakers_of_unlike_gains_meet_the_optimality_conditions(gain: float) -> None:
+    """A gain is a change of units: the same noise reduction and share of the powers, in other units."""
+    x, d = signals()
+    gains, rated = np.r_[gain, np.ones(J - 1)], np.full(J, 0.05)
+    usual = power_constrained_wiener(x, d, SECONDARY, TAPS, rated, fs=FS).whole
+    other = power_constrained_wiener(x, d, SECONDARY * gains[:, np.newaxis], TAPS, rated / gains**2, fs=FS).whole
+    assert other.noise_reduction_db == pytest.approx(usual.noise_reduction_db, abs=1e-3)
+    np.testing.assert_allclose(other.control_power * gains**2, usual.control_power, rtol=1e-3)

@@ -14,6 +14,12 @@ from kfopc_filterpy.kernels.partitioned_kalman import SHARE, PartitionedKalman, 
 K, REFERENCES, TAPS, BLOCK = 2, 2, 42, 16  # the last partition is cut
 
 
+def hear(kalman: PartitionedKalman, x: np.ndarray, begin: int) -> None:
+    """Let the filter hear the block from `begin` on, with the blocks before it, at first zeros."""
+    past = -(-TAPS // BLOCK) * BLOCK
+    kalman.hear(np.pad(x, [(0, 0), (past, 0)])[:, begin : begin + past + BLOCK])
+
+
 def heard(n_blocks: int, variance_seed: int = 3) -> tuple[PartitionedKalman, np.ndarray]:
     """A filter that has heard coloured inputs, with variances that differ, and these inputs."""
     x = np.random.default_rng(1).standard_normal((REFERENCES, n_blocks * BLOCK))
@@ -21,7 +27,7 @@ def heard(n_blocks: int, variance_seed: int = 3) -> tuple[PartitionedKalman, np.
     kalman = PartitionedKalman(K, REFERENCES, TAPS, BLOCK)
     kalman.variance = np.random.default_rng(variance_seed).uniform(0.01, 1.0, kalman.variance.shape)
     for begin in range(0, x.shape[1], BLOCK):
-        kalman.hear(x[:, begin : begin + BLOCK])
+        hear(kalman, x, begin)
     return kalman, x
 
 
@@ -99,7 +105,7 @@ def test_a_block_never_increases_its_own_error(noise: str) -> None:
     kalman.variance[...] = 100.0  # large: every block is cancelled as far as it can be
     for begin in range(0, n.size, BLOCK):
         block = d[:, begin : begin + BLOCK]
-        kalman.hear(x[:, begin : begin + BLOCK])
+        hear(kalman, x, begin)
         before = np.linalg.norm(block - kalman.outputs(kalman._spectra))
         assert kalman.learn(block)
         assert np.linalg.norm(block - kalman.outputs(kalman._spectra)) <= before + 1e-12
@@ -115,7 +121,7 @@ def test_white_noise_is_averaged_nearly_as_by_least_squares() -> None:
     kalman = PartitionedKalman(K, REFERENCES, TAPS, BLOCK)
     kalman.variance[...] = 1.0
     for begin in range(0, n_samples, BLOCK):
-        kalman.hear(x[:, begin : begin + BLOCK])
+        hear(kalman, x, begin)
         kalman.learn(d[:, begin : begin + BLOCK])
     rows = delayed(x, TAPS)
     batch = np.linalg.solve(rows @ rows.T, rows @ d.T).T.reshape(paths.shape)
@@ -129,7 +135,7 @@ def test_what_overflows_is_refused_with_nothing_changed() -> None:
     kalman.learn(np.ones((K, BLOCK)))
     paths, variance = kalman.paths, kalman.variance.copy()
     with np.errstate(over="ignore", invalid="ignore"):
-        kalman.hear(np.full((REFERENCES, BLOCK), 1e200))
+        hear(kalman, np.full((REFERENCES, BLOCK), 1e200), 0)
         assert not kalman.learn(np.ones((K, BLOCK)))
     np.testing.assert_array_equal(kalman.paths, paths)
     np.testing.assert_array_equal(kalman.variance, variance)
