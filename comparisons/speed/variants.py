@@ -78,10 +78,11 @@ CHANNELS = [
     ("shared gain", 1, 6, 6, 512, 1024),
     ("shared gain", 2, 6, 6, 256, 512),
     ("shared gain", 1, 4, 4, 512, 512),
+    ("frequency domain", 1, 6, 6, 256, 512),
+    ("frequency domain", 1, 16, 16, 256, 512),
     ("frequency domain", 1, 4, 4, 512, 512),
     ("frequency domain", 1, 4, 4, 2048, 2048),
     ("frequency domain", 1, 4, 4, 4096, 4096),
-    ("frequency domain", 1, 16, 16, 512, 512),
 ]
 CHANNEL_SECONDARY_TAPS = 256
 
