@@ -83,7 +83,7 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
         assert row["power"] == pytest.approx(output_power(result.control_signal) / 0.1, rel=1e-9)
     assert rows[BOUND, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["whole"], rel=1e-9)
     assert rows[SCALED, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["scaled"], rel=1e-9)
-    assert set(rows) == {(name, share) for name in (*REGISTRY, BOUND, SCALED) for share in SHARES}
+    assert set(rows) == {(name, share) for name in (*algorithms.algorithms(), BOUND, SCALED) for share in SHARES}
     # without a constraint one run serves for all rated powers
     assert rows["FxLMS", -10.0]["power"] == pytest.approx(10 * rows["FxLMS", 0.0]["power"], rel=1e-12)
 
@@ -91,8 +91,8 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
 def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
     report: StudyReport = small[0]
     assert [table.stem for table in report.tables] == ["reduction", "sizing", "tuning"]
-    assert len(report.tables[0].rows) == len(REGISTRY) + 2
-    assert len(report.tables[2].rows) == len(REGISTRY) * len(SHARES)
+    assert len(report.tables[0].rows) == len(algorithms.algorithms()) + 2
+    assert len(report.tables[2].rows) == len(algorithms.algorithms()) * len(SHARES)
     assert [figure.stem for figure in report.figures] == ["duct-band-noise"]
     assert len(report.verdicts) == 3
     assert report.notes[0].startswith("The measured duct was not at hand")
@@ -158,7 +158,7 @@ def test_means_are_over_seeds_and_the_worst_window_is_the_worst() -> None:
 )
 def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
     rows = rows_of(BOUND, (3.0, 12.0)) + rows_of(SCALED, (2.0, 12.0)) + rows_of("KF-PB", own, powers)
-    for name, algorithm in REGISTRY.items():
+    for name, algorithm in algorithms.algorithms().items():
         if name != "KF-PB" and algorithm.keeps_budget:
             rows += rows_of(name, other, other_powers)
     assert [verdict.reproduced for verdict in _claims(rows)] == expected
