@@ -37,6 +37,15 @@ def nearest_circulant_spectrum(lags: np.ndarray, n: int) -> np.ndarray:
     return fft.rfft(nearest, axis=0)
 
 
+def hermitian(pairs: np.ndarray, blocks: int) -> np.ndarray:
+    """Return spectra, (f, B, B), of which the pairs of `np.triu_indices` are given, (f, pairs)."""
+    rows, columns = np.triu_indices(blocks)
+    whole = np.empty((len(pairs), blocks, blocks), pairs.dtype)
+    whole[:, columns, rows] = pairs.conj()
+    whole[:, rows, columns] = pairs
+    return whole
+
+
 def toeplitz_product(spectrum: np.ndarray, n: int) -> Operator:
     """Return the product with the block Toeplitz matrix whose `circulant_spectrum` is given."""
 
@@ -45,6 +54,15 @@ def toeplitz_product(spectrum: np.ndarray, n: int) -> Operator:
         return fft.irfft((spectrum @ transformed)[:, :, 0].T, 2 * n)[:, :n]
 
     return product
+
+
+def toeplitz_energy(spectrum: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return v' T v of each of some vectors, (number, B, n), for the matrix T whose `circulant_spectrum` is given."""
+    n = v.shape[-1]
+    transformed = fft.rfft(v, 2 * n)
+    density = np.einsum("jaf,fab,jbf->jf", transformed.conj(), spectrum, transformed, optimize=True).real
+    density[:, 1:-1] *= 2.0  # the negative frequencies
+    return density.sum(axis=1) / (2 * n)
 
 
 def circulant_inverse(spectrum: np.ndarray, n: int) -> Operator:

@@ -19,7 +19,9 @@ from ..kernels.block_toeplitz import (
     circulant_inverse,
     circulant_spectrum,
     conjugate_gradients,
+    hermitian,
     nearest_circulant_spectrum,
+    toeplitz_energy,
     toeplitz_product,
 )
 
@@ -54,8 +56,10 @@ class ChannelBudget:
         self.n_lags = n_taps + n_secondary + n_primary  # lags of R_x that the right-hand side depends on
         self._inner = n_taps + n_secondary  # lags that R_x' depends on
         self._size = fft.next_fast_len(self.n_lags + max(n_primary, self._inner), real=True)
+        self._inner_size = fft.next_fast_len(2 * self._inner, real=True)
         self._spectra = fft.rfft(secondary, self._size)
-        self._gram = np.einsum("kaf,kbf->fab", self._spectra.conj(), self._spectra)
+        inner = fft.rfft(secondary, self._inner_size)
+        self._gram = np.einsum("kaf,kbf->fab", inner.conj(), inner)
         self.weights = np.zeros((self.n_loudspeakers, n_references, n_taps))
         self.penalty: np.ndarray | None = None  # lambda, (J,)
 
@@ -82,29 +86,32 @@ class ChannelBudget:
             Control filters w, from which the right-hand side follows: r = R_x' w.
         """
         lags = self._filtered_lags(correlation)
-        product = toeplitz_product(circulant_spectrum(lags, self.n_taps), self.n_taps)
-        self._move(correlation, lags, product(free.reshape(-1, self.n_taps)))
+        w = free.reshape(-1, self.n_taps)
+        product = toeplitz_product(hermitian(circulant_spectrum(lags, self.n_taps), len(w)), self.n_taps)
+        self._move(correlation, lags, product(w))
 
     def _move(self, correlation: np.ndarray, lags: np.ndarray, r: np.ndarray) -> None:
         """Move `weights` and `penalty` towards the solution for the `lags` of R_x' and the right-hand side r."""
         J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
         of_x = _two_sided(correlation[:n], 2 * n)
-        natural = np.trace(lags[0]) / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
-        ridge = RIDGE * np.trace(lags[0]) / (J * n_references)
+        blocks = J * n_references
+        energy = lags[0, np.equal(*np.triu_indices(blocks))].sum()
+        natural = energy / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
+        ridge = RIDGE * energy / blocks
         if not (natural > 0.0 and np.any(r)):
             return  # silence, or nothing known yet
         if self.penalty is None:
             self.penalty = np.full(J, 1e-3 * natural)
-        whole, nearest = circulant_spectrum(lags, n), nearest_circulant_spectrum(lags, n)
+        whole = hermitian(circulant_spectrum(lags, n), blocks)
+        nearest = hermitian(nearest_circulant_spectrum(lags, n), blocks)
         whole_x, nearest_x = circulant_spectrum(of_x, n), nearest_circulant_spectrum(of_x, n)
-        power_product = toeplitz_product(whole_x, n)
-        v = self.weights.reshape(J * n_references, n)
+        inverse = circulant_inverse(_with_penalty(nearest, nearest_x, self.penalty, ridge), n)
+        v = self.weights.reshape(blocks, n)
         for sweep in range(1, MOST_SWEEPS + 1):
             product = toeplitz_product(_with_penalty(whole, whole_x, self.penalty, ridge), n)
-            inverse = circulant_inverse(_with_penalty(nearest, nearest_x, self.penalty, ridge), n)
             v = conjugate_gradients(product, inverse, r, v, STEPS)
             filters = v.reshape(J, n_references, n)
-            power = np.array([np.vdot(w, power_product(w)) for w in filters])
+            power = toeplitz_energy(whole_x, filters)
             self._adjust_penalty(power, natural)
             if sweep >= SWEEPS and np.all(power <= EXCESS * self.rated_power):
                 break
@@ -136,11 +143,14 @@ class ChannelBudget:
         return fft.irfft(r, self._size)[..., : self.n_taps].reshape(-1, self.n_taps)
 
     def _filtered_lags(self, correlation: np.ndarray) -> np.ndarray:
-        """Return the correlation of the filtered references, summed over microphones, (lags, J I, J I)."""
-        of_x = fft.rfft(_two_sided(correlation[: self._inner], self._size), axis=0)
-        spectrum = self._gram[:, :, np.newaxis, :, np.newaxis] * of_x[:, np.newaxis, :, np.newaxis, :]
-        blocks = self.n_loudspeakers * self.n_references
-        return fft.irfft(spectrum.reshape(-1, blocks, blocks), self._size, axis=0)
+        """Return the correlation of the filtered references, summed over microphones, (lags, pairs).
+
+        The pairs are those of `np.triu_indices`; the others follow by symmetry, see `hermitian`.
+        """
+        of_x = fft.rfft(_two_sided(correlation[: self._inner], self._inner_size), axis=0)
+        rows, columns = np.triu_indices(self.n_loudspeakers * self.n_references)
+        (j, i), (other_j, other_i) = np.divmod(rows, self.n_references), np.divmod(columns, self.n_references)
+        return fft.irfft(self._gram[:, j, other_j] * of_x[:, i, other_i], self._inner_size, axis=0)
 
 
 def _two_sided(correlation: np.ndarray, size: int) -> np.ndarray:

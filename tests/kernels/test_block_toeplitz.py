@@ -11,7 +11,9 @@ from kfopc_filterpy.kernels.block_toeplitz import (
     circulant_inverse,
     circulant_spectrum,
     conjugate_gradients,
+    hermitian,
     nearest_circulant_spectrum,
+    toeplitz_energy,
     toeplitz_product,
 )
 
@@ -36,6 +38,23 @@ def test_the_product_is_that_of_the_dense_matrix(blocks: int, n: int, seed: int)
     v = np.random.default_rng(seed).standard_normal((blocks, n))
     product = toeplitz_product(circulant_spectrum(lags, n), n)(v)
     np.testing.assert_allclose(product.ravel(), dense(lags, n) @ v.ravel(), atol=1e-11)
+
+
+@given(blocks=st.integers(1, 4), n=st.integers(2, 12), seed=st.integers(0, 1000))
+def test_half_of_the_pairs_tell_the_whole_spectrum(blocks: int, n: int, seed: int) -> None:
+    lags = lags_of(blocks, n, 64, seed)
+    pairs = lags[:, *np.triu_indices(blocks)]
+    for spectrum in (circulant_spectrum, nearest_circulant_spectrum):
+        np.testing.assert_allclose(hermitian(spectrum(pairs, n), blocks), spectrum(lags, n), atol=1e-11)
+
+
+@given(number=st.integers(1, 3), blocks=st.integers(1, 4), n=st.integers(2, 12), seed=st.integers(0, 1000))
+def test_the_energy_is_the_quadratic_form_of_the_dense_matrix(number: int, blocks: int, n: int, seed: int) -> None:
+    lags = lags_of(blocks, n, 64, seed)
+    v = np.random.default_rng(seed).standard_normal((number, blocks, n))
+    flat = v.reshape(number, -1)
+    expected = np.einsum("ja,ab,jb->j", flat, dense(lags, n), flat)
+    np.testing.assert_allclose(toeplitz_energy(circulant_spectrum(lags, n), v), expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("n", [7, 16])
