@@ -29,7 +29,7 @@ from kfopc_filterpy.plot import curve_style, plot_nse
 from . import rooms
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Row, Setting, bound_of
 from .parts import MARK, first_second_db, new_figure, tuned_in_words
-from .rooms import MEASURED, RECORDINGS, SIZES, Place, level_map_db, make_rated_scene, places
+from .rooms import MEASURED, RECORDINGS, SIZES, Place, equally_rated, level_map_db, make_rated_scene, places
 
 DURATION_S = 8.0
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
@@ -138,7 +138,7 @@ def _outcome(runs: Runs, name: str, noise: str) -> Outcome:
         channel_row(name, noise, scene, results.get(own), algorithm=own, setting=best.setting)
         for own, best in tuned.items()
     ]
-    rows += _equal_rows(name, noise, place, tuned[KF_PB].setting)
+    rows += _equal_rows(name, noise, equally_rated(scene), tuned[KF_PB].setting)
     untuned = channel_row(name, noise, scene, run_setting(scene, KF_PB, DEFAULT_MEMORY_S), algorithm=KF_PB)
     return Outcome(place, scene, rows, tuned, untuned, results if (name, noise) == SHOWN else {})
 
@@ -198,9 +198,8 @@ def _bound_rows(name: str, noise: str, scene: Scene, **more: Any) -> list[Channe
     return rows
 
 
-def _equal_rows(name: str, noise: str, place: Place, setting: Setting) -> list[ChannelRow]:
-    """Return the rows of the bounds and of KF-PB with one equal rating for all loudspeakers."""
-    scene = make_rated_scene(place, noise, DURATION_S, equal=True)
+def _equal_rows(name: str, noise: str, scene: Scene, setting: Setting) -> list[ChannelRow]:
+    """Return the rows of the bounds and of KF-PB in a scene with one equal rating for all loudspeakers."""
     more = {"rating": EQUAL}
     own = channel_row(name, noise, scene, run_setting(scene, KF_PB, setting), algorithm=KF_PB, **more)
     return [*_bound_rows(name, noise, scene, **more), own]

@@ -125,11 +125,8 @@ def _noises(fs: float, band_hz: tuple[float, float]) -> dict[str, Callable[[floa
     }
 
 
-def make_rated_scene(place: Place, noise: str, duration_s: float, equal: bool = False) -> Scene:
-    """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited.
-
-    If `equal`, every loudspeaker gets the mean of these ratings.
-    """
+def make_rated_scene(place: Place, noise: str, duration_s: float) -> Scene:
+    """Return the scene of a noise; each loudspeaker is rated at a quarter of the power that it would use unlimited."""
     x = place.noises[noise](duration_s + SWITCH_ON_S)
     scene = make_scene(
         {SEED: x[np.newaxis]},
@@ -145,8 +142,12 @@ def make_rated_scene(place: Place, noise: str, duration_s: float, equal: bool = 
     )
     free = replace(scene, rated_power=1e12)
     wanted = bound_of(free, segment_s=2 * duration_s).unconstrained.control_power
-    rated = RATED_SHARE * (np.full_like(wanted, np.mean(wanted)) if equal else wanted)
-    return replace(scene, rated_power=rated, unconstrained_power=wanted)
+    return replace(scene, rated_power=RATED_SHARE * wanted, unconstrained_power=wanted)
+
+
+def equally_rated(scene: Scene) -> Scene:
+    """Return a scene in which every loudspeaker has the mean of their rated powers."""
+    return replace(scene, rated_power=np.full_like(scene.rated_power, np.mean(scene.rated_power)))
 
 
 def level_map_db(size: int, reference: np.ndarray, result: SimulationResult | None) -> tuple[np.ndarray, Any]:

@@ -337,9 +337,11 @@ def power_constrained_wiener(
     def solve(start: int, stop: int) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
         return _solve(record.part(start, stop), rated_power, ridge, (start - first) / fs, (stop - first) / fs)
 
-    whole, unconstrained, scaled = solve(first, n_samples)
+    over_record = solve(first, n_samples)
+    whole, unconstrained, scaled = over_record
     warn_of_loss(max(_losses_db(counted, whole, unconstrained, ridge)))
-    each = [solve(start, stop) for start, stop in zip(edges, [*edges[1:], n_samples], strict=True)]
+    segments = zip(edges, [*edges[1:], n_samples], strict=True)
+    each = [over_record] if len(edges) == 1 else [solve(start, stop) for start, stop in segments]
     return PowerConstrainedWiener(
         whole=whole,
         per_second=ControlFilters(tuple(constrained for constrained, _, _ in each)),

@@ -150,6 +150,12 @@ def estimate_disturbances(lines, error):
     return finite
 
 
+@inlined
+def sample_is_finite(lines, error):
+    """Set d^(n); return whether disturbances and references have finite squares."""
+    return estimate_disturbances(lines, error) and references_are_finite(lines)
+
+
 @advance_powers.register(ChannelLines)
 def advance_channel_powers(lines, constraint, error):
     """Add a sample to the powers of each loudspeaker: sums over microphones and references, as if it were alone."""

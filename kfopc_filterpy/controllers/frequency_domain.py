@@ -15,13 +15,12 @@ from scipy import fft
 from .._validate import as_count, as_positive
 from ..kernels.partitioned_kalman import PartitionedKalman
 from ..kernels.records import new_record
-from ..paths.channels import secondary_paths
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
 from .blocks import BLOCK_S, DEFAULT_MEMORY_S
-from .channels import ChannelLines, estimate_disturbances, references_are_finite
-from .primary_paths import DEFAULT_PATH_MEMORY_S, PrimaryPathController, usual_primary
+from .channels import ChannelLines, sample_is_finite
+from .primary_paths import DEFAULT_PATH_MEMORY_S, PrimaryPathController, read_paths
 from .step import adapt, follow
 
 PRIOR = 10.0  # energy of the references in the unknown paths, relative to the measurement noise
@@ -41,7 +40,7 @@ class FrequencyDomainState(NamedTuple):
 @adapt.register(FrequencyDomainState)
 def adapt_frequency_domain(state, error, control_signal):
     """Store the disturbance estimates until the block has ended."""
-    if not (estimate_disturbances(state.lines, error) and references_are_finite(state.lines)):
+    if not sample_is_finite(state.lines, error):
         return False
     numbers = state.numbers[0]
     for k in range(state.disturbances.shape[0]):
@@ -53,7 +52,7 @@ def adapt_frequency_domain(state, error, control_signal):
 @follow.register(FrequencyDomainState)
 def follow_frequency_domain(state, error):
     """Count the sample; its references are in the delay lines."""
-    if not (estimate_disturbances(state.lines, error) and references_are_finite(state.lines)):
+    if not sample_is_finite(state.lines, error):
         return False
     numbers = state.numbers[0]
     numbers.waiting += 1
@@ -163,10 +162,10 @@ class FrequencyDomainKalman(PrimaryPathController):
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Sequence[OutputLimiter] | None = None,
     ) -> None:
-        secondary, _ = secondary_paths(secondary_path)
-        n_taps, fs = as_count(n_taps, "n_taps"), as_positive(fs, "fs", unit="Hz")
-        n_primary = usual_primary(n_taps, secondary) if n_primary is None else as_count(n_primary, "n_primary")
+        secondary, n_taps, n_primary = read_paths(secondary_path, n_taps, n_primary)
+        fs = as_positive(fs, "fs", unit="Hz")
         block = _block(n_primary, fs) if block is None else as_count(block, "block")
+        paths = PartitionedKalman(len(secondary), n_references, n_primary, block)
         super().__init__(
             n_taps,
             secondary_path,
@@ -177,14 +176,13 @@ class FrequencyDomainKalman(PrimaryPathController):
             memory_s=_memory_s(DEFAULT_MEMORY_S, n_taps / fs) if memory_s is None else memory_s,
             fs=fs,
             block=block,
-            history=_frame_samples(n_primary, block),
+            history=paths.span,
             microphone_weights=microphone_weights,
             amplifier=amplifier,
             limiter=limiter,
         )
-        self._frame_samples = _frame_samples(n_primary, block)
         self._last_references = np.zeros((self.n_references, block))
-        self._paths = PartitionedKalman(self.n_microphones, self.n_references, self._budget.n_primary, self.block)
+        self._paths = paths
         self._state = FrequencyDomainState(
             lines=self._lines,
             weights=np.zeros((self.n_loudspeakers, self.n_references, self.n_taps)),
@@ -202,7 +200,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         numbers, paths = self._state.numbers, self._paths
         learnable = numbers["silent"][0] == 0 and self._is_one_of_each(references)
         numbers["silent"], self._last_references = 0, references[:, -self.block :]
-        paths.hear(references[:, -self._frame_samples :])
+        paths.hear(references)
         power = self._reference_power()
         if not power > 0.0:
             return
@@ -219,11 +217,6 @@ class FrequencyDomainKalman(PrimaryPathController):
     def _is_one_of_each(self, references: np.ndarray) -> bool:
         """Return whether the block had one reference for each error: otherwise the two do not belong together."""
         return np.array_equal(references[:, -2 * self.block : -self.block], self._last_references)
-
-
-def _frame_samples(n_primary: int, block: int) -> int:
-    """Return the references that the frames of all partitions need."""
-    return (-(-n_primary // block) + 1) * block
 
 
 def _memory_s(shortest: float, duration_s: float) -> float:

@@ -32,9 +32,7 @@ class PrimaryPathController(BlockController):
         microphone_weights: Any,
         **settings: Any,
     ) -> None:
-        secondary, _ = secondary_paths(secondary_path)
-        n_taps = as_count(n_taps, "n_taps")
-        n_primary = usual_primary(n_taps, secondary) if n_primary is None else as_count(n_primary, "n_primary")
+        secondary, n_taps, n_primary = read_paths(secondary_path, n_taps, n_primary)
         n_lags = n_taps + secondary.shape[2] + n_primary
         super().__init__(n_taps, secondary_path, n_lags=n_lags, filtered_taps=0, **settings)
         self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
@@ -86,6 +84,12 @@ class PrimaryPathController(BlockController):
         return prior / (self.n_references * self._budget.n_primary * power)
 
 
-def usual_primary(n_taps: int, secondary: np.ndarray) -> int:
-    """Return the default number of taps of a primary path: as many as control filter and secondary path can cancel."""
-    return n_taps + secondary.shape[2]
+def read_paths(secondary_path: Any, n_taps: int, n_primary: int | None) -> tuple[np.ndarray, int, int]:
+    """Return the secondary paths (K, J, taps), the taps of a control filter and those of a primary path.
+
+    By default, a primary path has as many taps as control filter and secondary path can cancel.
+    """
+    secondary, _ = secondary_paths(secondary_path)
+    n_taps = as_count(n_taps, "n_taps")
+    usual = n_taps + secondary.shape[2]
+    return secondary, n_taps, usual if n_primary is None else as_count(n_primary, "n_primary")

@@ -22,7 +22,7 @@ from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
 from .blocks import DEFAULT_MEMORY_S
-from .channels import ChannelLines, estimate_disturbances, references_are_finite
+from .channels import ChannelLines, sample_is_finite
 from .primary_paths import DEFAULT_PATH_MEMORY_S, PrimaryPathController
 from .step import adapt, follow
 
@@ -43,7 +43,7 @@ class SharedGainState(NamedTuple):
 @adapt.register(SharedGainState)
 def adapt_shared_gain(state, error, control_signal):
     """Apply eq. 2-8 to the primary path of each microphone, with the reference as the row."""
-    if not (estimate_disturbances(state.lines, error) and references_are_finite(state.lines)):
+    if not sample_is_finite(state.lines, error):
         return False
     d, h, paths, numbers = state.lines.disturbance, reference_row(state), state.paths, state.numbers[0]
     innovation, S = kalman_step(state.gains, paths[0], h, d[0], numbers.state_noise, 1.0, 1.0)
@@ -58,7 +58,7 @@ def adapt_shared_gain(state, error, control_signal):
 @follow.register(SharedGainState)
 def follow_shared_gain(state, error):
     """Count the sample; its references are in the delay lines."""
-    if not (estimate_disturbances(state.lines, error) and references_are_finite(state.lines)):
+    if not sample_is_finite(state.lines, error):
         return False
     state.numbers[0].waiting += 1
     return True

@@ -44,6 +44,7 @@ class PartitionedKalman:
     def __init__(self, n_outputs: int, n_inputs: int, n_taps: int, block: int) -> None:
         self.block, self.n_taps = block, n_taps
         partitions = -(-n_taps // block)
+        self.span = (partitions + 1) * block  # samples of the inputs that the frames of all partitions need
         shape = (n_inputs, partitions, block + 1)
         self.variance = np.zeros(shape)  # of a tap, at each frequency
         self.state_noise = 0.0  # of a tap and sample
@@ -58,8 +59,8 @@ class PartitionedKalman:
         return taps.reshape(*taps.shape[:2], -1)[..., : self.n_taps]
 
     def hear(self, inputs: np.ndarray) -> None:
-        """Take the inputs of the present block with those before it, (I, (partitions + 1) B)."""
-        blocks = inputs.reshape(len(inputs), -1, self.block)[:, ::-1]  # the newest first
+        """Take the inputs, (I, n), which end with those of the present block; n is at least `span`."""
+        blocks = inputs[:, -self.span :].reshape(len(inputs), -1, self.block)[:, ::-1]  # the newest first
         self._frames = fft.rfft(np.concatenate([blocks[:, 1:], blocks[:, :-1]], axis=-1))
 
     def learn(self, outputs: np.ndarray) -> bool:

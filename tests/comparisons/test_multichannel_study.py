@@ -88,7 +88,8 @@ def test_rows_are_what_a_run_by_hand_gives(small: Any) -> None:
 
 def test_ratings_are_a_quarter_of_what_each_would_like(small: Any) -> None:
     _, _, _, place = small
-    quarter, equal = (rooms.make_rated_scene(place, "compressor", 2.0, equal) for equal in (False, True))
+    quarter = rooms.make_rated_scene(place, "compressor", 2.0)
+    equal = rooms.equally_rated(quarter)
     np.testing.assert_allclose(quarter.rated_power, 0.25 * quarter.unconstrained_power)
     np.testing.assert_allclose(equal.rated_power, np.mean(quarter.rated_power))
     assert np.ptp(quarter.rated_power) > 0.0

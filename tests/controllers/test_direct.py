@@ -229,6 +229,24 @@ def test_channels_of_one_are_the_single_channel_bit_for_bit(name: str) -> None:
     assert got.algorithm == want.algorithm
 
 
+def test_kf_pb_whose_second_loudspeaker_is_unplugged_is_the_single_channel() -> None:
+    """The estimates to 1e-9; the budgets are different ones, so that the powers agree to 2 %, the reductions to 0.2 dB."""
+    x = noise(32000, 1)
+    d = np.convolve(x[0], [0.0, 0.0, 1.2, 0.5])[: x.size]
+    plugged = np.stack([ONE_PATH, np.zeros_like(ONE_PATH)])[np.newaxis]
+    settings: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 0.01, "rated_power": 0.3, "form": "direct"}
+    results, controllers = [], [kf_pb(16, path, **settings) for path in (ONE_PATH, plugged)]
+    for own, path in zip(controllers, (ONE_PATH, plugged), strict=True):
+        signals = (x[0], d) if path is ONE_PATH else (x, d[np.newaxis])
+        result = simulate(own, signals[0], disturbance=signals[1], secondary_path=path, fs=FS)
+        e, y = result.error[..., 16000:], np.atleast_2d(result.control_signal)[:, 16000:]
+        results.append((noise_reduction_db(e, result.disturbance[..., 16000:]), output_power(y[0]) / 0.3))
+    np.testing.assert_allclose(controllers[1].weights[0, 0], controllers[0].weights, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(controllers[1].weights[1], 0.0)
+    assert abs(results[0][0] - results[1][0]) < 0.2
+    np.testing.assert_allclose([power for _, power in results], 1.0, atol=0.02)
+
+
 # ---- Odd systems
 
 
@@ -249,13 +267,16 @@ def test_what_is_unplugged_stays_silent_and_finite(name: str, dead: str) -> None
 
 @pytest.mark.parametrize("name", MAKE)
 def test_two_identical_loudspeakers_share_the_work(name: str) -> None:
+    """Nothing but rounding tells them apart; where hardly anything is known, in the first block of KF-PB, it grows."""
     paths = np.repeat(PATHS[:, :1], 2, axis=1)
     controller = MAKE[name](paths, **({} if name != "KF-PB" else {"fs": FS}))
     if name == "KF-PB":
         controller = kf_pb(L, paths, rated_power=RATED[0], form="direct", **SETTINGS)
     result = run(controller, noise(2000), secondary_path=paths)
     np.testing.assert_allclose(controller.weights[0], controller.weights[1], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(result.control_signal[0], result.control_signal[1], rtol=0, atol=1e-6)
+    difference = np.abs(result.control_signal[0] - result.control_signal[1])
+    assert difference.max() < 1e-3
+    assert difference[1024:].max() < 1e-9
     assert np.any(result.control_signal)
 
 

@@ -82,9 +82,7 @@ def test_python_steps_and_the_compiled_loop_agree_to_the_bit(form: str) -> None:
     feedback = 0.02 * random_paths(2, J, 5, seed=4)
     results = []
     for compiled in (True, False):
-        limiters = (
-            [OutputLimiter(power, fs=FS, window_s=0.02) for power in (0.4, 0.2)] if form == "shared gain" else None
-        )
+        limiters = [OutputLimiter(power, fs=FS, window_s=0.02) for power in (0.4, 0.2)]
         results.append(
             simulate(
                 made(form, rated_power=[0.3, 0.1], limiter=limiters),
@@ -106,8 +104,6 @@ def test_python_steps_and_the_compiled_loop_agree_to_the_bit(form: str) -> None:
 
 
 def test_a_limiter_holds_each_loudspeaker(form: str) -> None:
-    if form == "frequency domain":
-        pytest.skip("the forms emit alike, and a limiter compiles each anew")
     limiters = [OutputLimiter(p, fs=FS, window_s=0.05) for p in (0.02, 0.01)]
     result = simulate(
         made(form, limiter=limiters), references(4000), primary_path=PRIMARY_PATHS, secondary_path=SECONDARY, fs=FS
