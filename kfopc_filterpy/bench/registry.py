@@ -146,7 +146,9 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
             **_references(scene),
         }
         if budget:
+            uncertainty = scene.secondary_path_uncertainty
             settings |= {"rated_power": scene.rated_power, "fs": scene.fs, "form": "direct"}
+            settings |= {"secondary_path_uncertainty": uncertainty}
         elif not free:
             settings |= {"constraint": _constraint(scene)}
         return make(scene.n_taps, scene.known_secondary, **settings)
@@ -162,6 +164,7 @@ def _primary_paths(form: str) -> Callable[..., Controller]:
             scene.n_taps,
             scene.known_secondary,
             rated_power=scene.rated_power,
+            secondary_path_uncertainty=scene.secondary_path_uncertainty,
             form=form,
             memory_s=memory_s,
             fs=scene.fs,

@@ -119,6 +119,8 @@ class Scene:
         Seeds of the noises.
     secondary_estimate : ndarray, optional
         Secondary path that controllers know; by default the true one.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        Uncertainty of that path that KF-PB takes account of, see `paths.path_uncertainty`; by default none.
     known_amplifier : amplifier, optional
         Amplifier that disturbance estimates know; by default they take it to be linear.
     power_memory_s : float, default 0.5
@@ -142,6 +144,7 @@ class Scene:
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
     secondary_estimate: np.ndarray | None = None
+    secondary_path_uncertainty: Any = None
     known_amplifier: Amplifier | None = None
     power_memory_s: float = 0.5
 

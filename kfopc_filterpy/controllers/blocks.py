@@ -13,6 +13,8 @@ import numpy as np
 from .._validate import as_count, as_positive, per_loudspeaker
 from ..kernels.correlation import FadingCorrelation
 from ..kernels.delay_lines import newest
+from ..paths.channels import secondary_paths
+from ..paths.uncertainty import guard_against
 from ..power.channels import ChannelBudget
 from .base import FilteredReferenceController, listed
 
@@ -24,11 +26,10 @@ LOUDEST = 1e100  # references beyond it have been refused, but are still in the 
 class BlockController(FilteredReferenceController):
     """Base class that computes control filters within each loudspeaker's rated power after every block.
 
-    A subclass sets `_budget` and `_state`, and defines `_end_block`. The state has a record `numbers`, whose field
+    A subclass sets `_state` and defines `_end_block`. The state has a record `numbers`, whose field
     `waiting` counts the samples since the end of the last block.
     """
 
-    _budget: ChannelBudget
     _state: Any
 
     def __init__(
@@ -37,31 +38,38 @@ class BlockController(FilteredReferenceController):
         secondary_path: Any,
         *,
         rated_power: Any,
-        n_lags: int,
+        secondary_path_uncertainty: Any,
+        microphone_weights: np.ndarray,
+        n_primary: int,
+        n_references: int,
         memory_s: float,
         fs: float,
         block: int | None = None,
         history: int = 0,
         **settings: Any,
     ) -> None:
+        secondary, _ = secondary_paths(secondary_path)
+        n_taps, n_references = as_count(n_taps, "n_taps"), as_count(n_references, "n_references")
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.block = max(round(BLOCK_S * self.fs), 1) if block is None else as_count(block, "block")
+        self._rated = None if rated_power is None else per_loudspeaker(rated_power, secondary.shape[1], "rated_power")
+        limits = np.full(secondary.shape[1], np.inf) if self._rated is None else self._rated
+        self._path_weights = np.sqrt(microphone_weights)[:, np.newaxis, np.newaxis]
+        guard = guard_against(secondary_path_uncertainty, secondary)
+        self._budget = ChannelBudget(self._path_weights * secondary, n_taps, n_primary, n_references, limits, guard)
+        n_lags = self._budget.n_lags
         self._past = max(history, n_lags - 1 + self.block)  # samples of the references that a block needs
-        super().__init__(n_taps, secondary_path, multichannel=True, history=self._past, **settings)
-        self._rated = None if rated_power is None else per_loudspeaker(rated_power, self.n_loudspeakers, "rated_power")
+        super().__init__(
+            n_taps, secondary_path, n_references=n_references, multichannel=True, history=self._past, **settings
+        )
         keep = np.exp(-1.0 / (self.memory_s * self.fs))
-        self._correlation = FadingCorrelation(n_lags, self.n_references, keep)
+        self._correlation = FadingCorrelation(n_lags, n_references, keep)
 
     @property
     def rated_power(self) -> np.ndarray | None:
         """Rated output power of each loudspeaker, (J,); None if unlimited."""
         return None if self._rated is None else self._rated.copy()
-
-    @property
-    def _limits(self) -> np.ndarray:
-        """Rated power of each loudspeaker, infinite if unlimited."""
-        return np.full(self.n_loudspeakers, np.inf) if self._rated is None else self._rated
 
     @property
     def power_weight(self) -> np.ndarray:

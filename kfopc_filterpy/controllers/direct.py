@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, per_channel, per_loudspeaker
+from .._validate import as_nonnegative, per_channel, per_loudspeaker
 from ..filters.random_walk import as_precision
 from ..kernels.compiling import inlined, part
 from ..kernels.covariance import Covariance, covariance_matrix, kalman_step, new_covariance
@@ -20,8 +20,8 @@ from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into
 from ..paths.channels import secondary_paths
+from ..paths.uncertainty import HALF_A_SAMPLE
 from ..power.amplifiers import Amplifier
-from ..power.channels import ChannelBudget
 from ..power.constraint import DEFAULT_FS, ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import OVERFLOW, FilteredReferenceController, constraint_or_none
@@ -275,6 +275,9 @@ class DirectPowerBudget(BlockController):
         is minimised, a microphone's weight is inversely proportional to its q.
     rated_power : float or array_like, shape (J,)
         Rated power of each loudspeaker.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default half a sample of delay, None: the
+        paths are exact.
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
     fs : float, default 16000
@@ -315,6 +318,7 @@ class DirectPowerBudget(BlockController):
         measurement_noise: Any,
         initial_variance: float = 1.0,
         n_references: int = 1,
+        secondary_path_uncertainty: Any = HALF_A_SAMPLE,
         memory_s: float = DEFAULT_MEMORY_S,
         fs: float = DEFAULT_FS,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
@@ -322,20 +326,20 @@ class DirectPowerBudget(BlockController):
         dtype: Any = np.float64,
     ) -> None:
         secondary, _ = secondary_paths(secondary_path)
+        noise = per_channel(measurement_noise, len(secondary), "microphones", "measurement_noise")
         super().__init__(
             n_taps,
             secondary_path,
             rated_power=per_loudspeaker(rated_power, secondary.shape[1], "rated_power"),
-            n_lags=as_count(n_taps, "n_taps") + secondary.shape[2],
+            secondary_path_uncertainty=secondary_path_uncertainty,
+            microphone_weights=noise.mean() / noise,  # as the Kalman filter weighs the errors
+            n_primary=0,
             memory_s=memory_s,
             fs=fs,
             n_references=n_references,
             amplifier=amplifier,
             limiter=limiter,
         )
-        noise = per_channel(measurement_noise, self.n_microphones, "microphones", "measurement_noise")
-        weights = np.sqrt(noise.mean() / noise)[:, np.newaxis, np.newaxis]  # as the Kalman filter weighs the errors
-        self._budget = ChannelBudget(weights * secondary, self.n_taps, 0, self.n_references, self._limits)
         lines, free, constraint = self._common()
         self._state = DirectBudgetState(
             lines,

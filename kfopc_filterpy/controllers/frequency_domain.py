@@ -15,6 +15,7 @@ from scipy import fft
 from .._validate import as_count, as_positive
 from ..kernels.partitioned_kalman import PartitionedKalman
 from ..kernels.records import new_record
+from ..paths.uncertainty import HALF_A_SAMPLE
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
@@ -79,6 +80,9 @@ class FrequencyDomainKalman(PrimaryPathController):
         Number of references I.
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default half a sample of delay, None: the
+        paths are exact.
     path_memory_s : float, optional
         Time in seconds over which the primary paths are averaged; by default 1 s, or the duration of 16 primary paths
         if that is longer.
@@ -154,6 +158,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         rated_power: Any = None,
         n_references: int = 1,
         n_primary: int | None = None,
+        secondary_path_uncertainty: Any = HALF_A_SAMPLE,
         path_memory_s: float | None = None,
         memory_s: float | None = None,
         fs: float = DEFAULT_FS,
@@ -172,6 +177,7 @@ class FrequencyDomainKalman(PrimaryPathController):
             rated_power=rated_power,
             n_references=n_references,
             n_primary=n_primary,
+            secondary_path_uncertainty=secondary_path_uncertainty,
             path_memory_s=_memory_s(DEFAULT_PATH_MEMORY_S, n_primary / fs) if path_memory_s is None else path_memory_s,
             memory_s=_memory_s(DEFAULT_MEMORY_S, n_taps / fs) if memory_s is None else memory_s,
             fs=fs,

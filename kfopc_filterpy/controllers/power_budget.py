@@ -11,6 +11,7 @@ from .._validate import as_choice
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
+from ..paths.uncertainty import HALF_A_SAMPLE, guard_against
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, take_correlations
 from ..power.constraint import ConstraintState, advance_constraint
@@ -156,6 +157,7 @@ def kf_pb(
     amplifier: Any = None,
     limiter: Any = None,
     dtype: Any = None,
+    secondary_path_uncertainty: Any = HALF_A_SAMPLE,
     form: str | None = None,
     **settings: Any,
 ) -> PowerBudgetController | DirectPowerBudget | PrimaryPathController:
@@ -173,6 +175,11 @@ def kf_pb(
         As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
         As for `kf_anc`.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default half a
+        sample of delay. The control filter is weaker where the path is less certain, and zero where the error may
+        exceed 100 % (with half a sample of delay, above a third of the sample rate), so that the noise never becomes
+        louder than without control. None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
@@ -207,6 +214,7 @@ def kf_pb(
     several = is_multichannel(secondary_path, n_references)
     form = as_choice(form or ("shared gain" if several else "direct"), "form", FORMS)
     common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
+    channels = {"n_references": n_references, "secondary_path_uncertainty": secondary_path_uncertainty}
     filter_settings = {
         "state_noise": state_noise,
         "measurement_noise": measurement_noise,
@@ -217,11 +225,12 @@ def kf_pb(
     if form in PRIMARY_PATH_FORMS:
         if given:
             raise TypeError(f"the {form} form takes path_memory_s instead of {', '.join(given)}")
-        return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, n_references=n_references, **common, **settings)
+        return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, **channels, **common, **settings)
     if state_noise is None or measurement_noise is None:
         raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
     settings |= given
     if several:
-        return DirectPowerBudget(n_taps, secondary_path, n_references=n_references, **common, **settings)
-    estimator = PowerBudgetKalmanFilter(n_taps, rated_power=rated_power, **settings)
+        return DirectPowerBudget(n_taps, secondary_path, **channels, **common, **settings)
+    guard = guard_against(secondary_path_uncertainty, secondary_path)
+    estimator = PowerBudgetKalmanFilter(n_taps, rated_power=rated_power, guard=guard, **settings)
     return PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)

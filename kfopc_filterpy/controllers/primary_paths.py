@@ -8,7 +8,6 @@ import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_positive
 from ..paths.channels import secondary_paths
-from ..power.channels import ChannelBudget
 from .blocks import BlockController
 
 DEFAULT_PATH_MEMORY_S = 1.0
@@ -32,27 +31,12 @@ class PrimaryPathController(BlockController):
         microphone_weights: Any,
         **settings: Any,
     ) -> None:
-        secondary, n_taps, n_primary = read_paths(secondary_path, n_taps, n_primary)
-        n_lags = n_taps + secondary.shape[2] + n_primary
-        super().__init__(n_taps, secondary_path, n_lags=n_lags, filtered_taps=0, **settings)
         self.path_memory_s = as_positive(path_memory_s, "path_memory_s", unit="s")
-        self._path_weights = np.sqrt(self._microphone_weights(microphone_weights))[:, np.newaxis, np.newaxis]
-        weighted = self._path_weights * secondary
-        self._budget = ChannelBudget(weighted, self.n_taps, n_primary, self.n_references, self._limits)
-
-    def _microphone_weights(self, weights: Any) -> np.ndarray:
-        if weights is None:
-            return np.ones(self.n_microphones)
-        if np.shape(weights) != (self.n_microphones,):
-            raise ValueError(
-                f"microphone_weights must have one weight for each of the {self.n_microphones} microphones, "
-                f"got shape {np.shape(weights)}"
-            )
-        if not np.any(weights):
-            raise ValueError(
-                "microphone_weights must have one above 0: without any microphone there is nothing to reduce"
-            )
-        return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
+        secondary, n_taps, n_primary = read_paths(secondary_path, n_taps, n_primary)
+        weights = weights_of_microphones(microphone_weights, len(secondary))
+        super().__init__(
+            n_taps, secondary_path, microphone_weights=weights, n_primary=n_primary, filtered_taps=0, **settings
+        )
 
     @property
     def primary_path(self) -> np.ndarray:
@@ -82,6 +66,20 @@ class PrimaryPathController(BlockController):
         `prior` is the energy of the references in the unknown paths, relative to the measurement noise.
         """
         return prior / (self.n_references * self._budget.n_primary * power)
+
+
+def weights_of_microphones(weights: Any, n_microphones: int) -> np.ndarray:
+    """Return the weight of each microphone, (K,); by default 1."""
+    if weights is None:
+        return np.ones(n_microphones)
+    if np.shape(weights) != (n_microphones,):
+        raise ValueError(
+            f"microphone_weights must have one weight for each of the {n_microphones} microphones, "
+            f"got shape {np.shape(weights)}"
+        )
+    if not np.any(weights):
+        raise ValueError("microphone_weights must have one above 0: without any microphone there is nothing to reduce")
+    return np.array([as_nonnegative(weight, "microphone_weights") for weight in weights])
 
 
 def read_paths(secondary_path: Any, n_taps: int, n_primary: int | None) -> tuple[np.ndarray, int, int]:

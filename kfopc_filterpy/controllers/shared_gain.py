@@ -18,6 +18,7 @@ from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_c
 from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
+from ..paths.uncertainty import HALF_A_SAMPLE
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
@@ -89,6 +90,9 @@ class SharedGainKalman(PrimaryPathController):
         Number of references I.
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default half a sample of delay, None: the
+        paths are exact.
     path_memory_s : float, default 1
         Time in seconds over which the primary paths are averaged: a longer one is more exact, a shorter one follows
         changes faster.
@@ -133,6 +137,7 @@ class SharedGainKalman(PrimaryPathController):
         rated_power: Any = None,
         n_references: int = 1,
         n_primary: int | None = None,
+        secondary_path_uncertainty: Any = HALF_A_SAMPLE,
         path_memory_s: float = DEFAULT_PATH_MEMORY_S,
         memory_s: float = DEFAULT_MEMORY_S,
         fs: float = DEFAULT_FS,
@@ -146,6 +151,7 @@ class SharedGainKalman(PrimaryPathController):
             rated_power=rated_power,
             n_references=n_references,
             n_primary=n_primary,
+            secondary_path_uncertainty=secondary_path_uncertainty,
             path_memory_s=path_memory_s,
             memory_s=memory_s,
             fs=fs,

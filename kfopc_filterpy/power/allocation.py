@@ -84,6 +84,29 @@ def constrained_filter(of_x, of_xf, w, power, weight, v):
 
 
 @part()
+def guarded(of_xf, of_guard, w):
+    """Return the first row of R_x' + R_Wx' and the filter v that minimises E[(d - v'x')^2] + E[(v'Wx')^2].
+
+    With that row in place of R_x' and that filter in place of w, `constrained_filter` adds the rated power. `of_xf` has
+    n_guard - 1 lags more than w has taps: R_Wx' is the correlation of x' after W, which depends on them. It is
+    positive semidefinite as R_x' is, because the whole of W counts.
+    """
+    L = w.size
+    sum_of_both, right, free = np.empty(L), np.empty(L), np.empty(L)
+    for k in range(L):
+        sum_of_both[k] = of_xf[k] + of_guard[0] * of_xf[k]
+        for m in range(1, of_guard.size):
+            sum_of_both[k] += of_guard[m] * (of_xf[k + m] + of_xf[abs(k - m)])
+    toeplitz_times(of_xf[:L], w, right)
+    add_scaled(right, RIDGE * of_xf[0], w, 0, L)
+    sum_of_both[0] += RIDGE * of_xf[0]
+    if not solve_toeplitz(sum_of_both, right, free):
+        copy_into(free, w)
+    sum_of_both[0] -= RIDGE * of_xf[0]
+    return sum_of_both, free
+
+
+@part()
 def scaled_filter(w, factor, v):
     """Set v to `factor` times w, and return Inf, the lambda of a scaled estimate."""
     for i in range(w.size):

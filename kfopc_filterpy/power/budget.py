@@ -16,7 +16,7 @@ from ..kernels.compiling import compiled, part
 from ..kernels.delay_lines import delay_line, newest, push
 from ..kernels.records import new_record
 from ..kernels.vectors import FAST, add_scaled
-from .allocation import constrained_filter
+from .allocation import constrained_filter, guarded
 from .constraint import DEFAULT_FS, SILENCE
 
 DEFAULT_CORRELATION_MEMORY_S = 1.25
@@ -43,9 +43,10 @@ class BudgetState(NamedTuple):
     control_filter: np.ndarray  # (L,) v, which makes the control signal
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x'
-    own: np.ndarray  # (2, LONG + 1, L) for x and x': sums of products of a segment's samples at lags 0 ... L - 1
-    across: np.ndarray  # (2, LONG + 1, L) the same, of its samples with samples before it
+    own: np.ndarray  # (2, LONG + 1, lags) for x and x': sums of products of a segment's samples at lags 0, 1, ...
+    across: np.ndarray  # (2, LONG + 1, lags) the same, of its samples with samples before it
     counts: np.ndarray  # (LONG + 1,) samples in each segment
+    guard: np.ndarray  # correlation of the guard filter W at lags 0, 1, ...; one zero without a guard
     numbers: np.ndarray  # record: rated power, account, lambda, ...; see `PowerBudget`
 
 
@@ -58,22 +59,22 @@ def take_correlations(budget, x, xf):
     """
     push(budget.reference, x)
     push(budget.filtered, xf)
-    L, numbers = budget.control_filter.size, budget.numbers[0]
+    lags, numbers = budget.own.shape[2], budget.numbers[0]
     if budget.counts[numbers.current] >= numbers.segment:
         numbers.current = (numbers.current + 1) % len(budget.counts)
         budget.counts[numbers.current] = 0.0
         for signal in (X, XF):
-            for k in range(L):
+            for k in range(lags):
                 budget.own[signal, numbers.current, k] = budget.across[signal, numbers.current, k] = 0.0
     current = numbers.current
     budget.counts[current] += 1.0
-    own = min(int(budget.counts[current]), L)
-    before, filtered_before = newest(budget.reference, L), newest(budget.filtered, L)
+    own = min(int(budget.counts[current]), lags)
+    before, filtered_before = newest(budget.reference, lags), newest(budget.filtered, lags)
     add_scaled(budget.own[X, current], x, before, 0, own)
     add_scaled(budget.own[XF, current], xf, filtered_before, 0, own)
-    if own < L:
-        add_scaled(budget.across[X, current], x, before, own, L)
-        add_scaled(budget.across[XF, current], xf, filtered_before, own, L)
+    if own < lags:
+        add_scaled(budget.across[X, current], x, before, own, lags)
+        add_scaled(budget.across[XF, current], xf, filtered_before, own, lags)
 
 
 @part()
@@ -231,14 +232,17 @@ def unspent(numbers):
 @compiled()
 def allocate(budget, w):
     """Set the control filter for the estimate w."""
-    of_x, of_xf = np.empty(budget.control_filter.size), np.empty(budget.control_filter.size)
+    L, lags = budget.control_filter.size, budget.own.shape[2]
+    of_x, of_xf = np.empty(lags), np.empty(lags)
     choose_span(budget)
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
     power = target_power(budget, level_forecast(budget, of_xf[0]))
+    if lags > L:
+        of_xf, w = guarded(of_xf, budget.guard, w)
     budget.numbers[0].weight = constrained_filter(
-        of_x, of_xf, w, power, budget.numbers[0].weight, budget.control_filter
+        of_x[:L], of_xf, w, power, budget.numbers[0].weight, budget.control_filter
     )
 
 
@@ -281,6 +285,14 @@ def listen_sample(budget, x, xf):
     take_correlations(budget, x, xf)
 
 
+def correlation_of(guard: Any) -> np.ndarray:
+    """Return the correlation of a guard filter at lags 0, 1, ..., (n_guard,); one zero without a guard."""
+    if guard is None:
+        return np.zeros(1)
+    taps = as_signal(guard, "guard")
+    return np.correlate(taps, taps, "full")[taps.size - 1 :]
+
+
 class PowerBudget:
     r"""Best use of a rated power: the power-constrained control filter for an estimate of the unconstrained one.
 
@@ -320,11 +332,14 @@ class PowerBudget:
         times as long, a long one 2.4 times.
     credit_s : float, default 0.1
         Seconds of rated power that can be saved while the noise needs less.
+    guard : array_like, shape (n_guard,), optional
+        Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
+        term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
 
     Raises
     ------
     ValueError
-        A power, rate or time that is not positive and finite, fewer than one tap.
+        A power, rate or time that is not positive and finite, fewer than one tap, a guard with NaN or Inf.
 
     See Also
     --------
@@ -358,24 +373,28 @@ class PowerBudget:
         fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         credit_s: float = DEFAULT_CREDIT_S,
+        guard: Any = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
+        of_guard = correlation_of(guard)
+        lags = n_taps + of_guard.size - 1
         rated_power = as_positive(rated_power, "rated_power")
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
-            reference=delay_line(n_taps),
-            filtered=delay_line(n_taps),
-            own=np.zeros((2, LONG + 1, n_taps)),
-            across=np.zeros((2, LONG + 1, n_taps)),
+            reference=delay_line(lags),
+            filtered=delay_line(lags),
+            own=np.zeros((2, LONG + 1, lags)),
+            across=np.zeros((2, LONG + 1, lags)),
             counts=np.zeros(LONG + 1),
+            guard=of_guard,
             numbers=new_record(
                 rated_power=rated_power,
                 fs=self.fs,
                 credit=self.credit_s,
-                segment=float(max(round(self.memory_s * self.fs / USUAL), n_taps)),  # samples
+                segment=float(max(round(self.memory_s * self.fs / USUAL), lags)),  # samples
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
                 waited=0.0,  # of these, since the last solution

@@ -46,20 +46,30 @@ class ChannelBudget:
         Number of references I.
     rated_power : ndarray, shape (J,)
         Rated power of each loudspeaker.
+    guard : ndarray, shape (n_guard,), optional
+        Guard filter W against uncertain secondary paths; by default none.
     """
 
     def __init__(
-        self, secondary: np.ndarray, n_taps: int, n_primary: int, n_references: int, rated_power: np.ndarray
+        self,
+        secondary: np.ndarray,
+        n_taps: int,
+        n_primary: int,
+        n_references: int,
+        rated_power: np.ndarray,
+        guard: np.ndarray | None = None,
     ) -> None:
         self.n_taps, self.n_primary, self.n_references, self.rated_power = n_taps, n_primary, n_references, rated_power
         _, self.n_loudspeakers, n_secondary = secondary.shape
-        self.n_lags = n_taps + n_secondary + n_primary  # lags of R_x that the right-hand side depends on
-        self._inner = n_taps + n_secondary  # lags that R_x' depends on
+        guard = np.zeros(1) if guard is None else guard
+        self._inner = n_taps + n_secondary + guard.size - 1  # lags of R_x that the left side depends on
+        self.n_lags = max(n_taps + n_secondary + n_primary, self._inner)  # and the right side
         self._size = fft.next_fast_len(self.n_lags + max(n_primary, self._inner), real=True)
         self._inner_size = fft.next_fast_len(2 * self._inner, real=True)
         self._spectra = fft.rfft(secondary, self._size)
         inner = fft.rfft(secondary, self._inner_size)
         self._gram = np.einsum("kaf,kbf->fab", inner.conj(), inner)
+        self._guarded = 1.0 + np.abs(fft.rfft(guard, self._inner_size)[:, np.newaxis]) ** 2
         self.weights = np.zeros((self.n_loudspeakers, n_references, n_taps))
         self.penalty: np.ndarray | None = None  # lambda, (J,)
 
@@ -73,7 +83,7 @@ class ChannelBudget:
         primary : ndarray, shape (K, I, n_primary)
             Primary paths.
         """
-        self._move(correlation, self._filtered_lags(correlation), self._right_side(correlation, primary))
+        self._move(correlation, self._right_side(correlation, primary))
 
     def solve_near(self, correlation: np.ndarray, free: np.ndarray) -> None:
         """Move `weights` and `penalty` towards the solution, given the optimal control filters for unlimited power.
@@ -85,13 +95,13 @@ class ChannelBudget:
         free : ndarray, shape (J, I, n_taps)
             Control filters w, from which the right-hand side follows: r = R_x' w.
         """
-        lags = self._filtered_lags(correlation)
-        w = free.reshape(-1, self.n_taps)
+        lags, w = self._lags_of(self._filtered_spectrum(correlation)), free.reshape(-1, self.n_taps)
         product = toeplitz_product(hermitian(circulant_spectrum(lags, self.n_taps), len(w)), self.n_taps)
-        self._move(correlation, lags, product(w))
+        self._move(correlation, product(w))
 
-    def _move(self, correlation: np.ndarray, lags: np.ndarray, r: np.ndarray) -> None:
-        """Move `weights` and `penalty` towards the solution for the `lags` of R_x' and the right-hand side r."""
+    def _move(self, correlation: np.ndarray, r: np.ndarray) -> None:
+        """Move `weights` and `penalty` towards the solution for the right-hand side r."""
+        lags = self._lags_of(self._guarded * self._filtered_spectrum(correlation))
         J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
         of_x = _two_sided(correlation[:n], 2 * n)
         blocks = J * n_references
@@ -142,15 +152,19 @@ class ChannelBudget:
         r = np.einsum("kjf,kif->jif", self._spectra.conj(), disturbances)
         return fft.irfft(r, self._size)[..., : self.n_taps].reshape(-1, self.n_taps)
 
-    def _filtered_lags(self, correlation: np.ndarray) -> np.ndarray:
-        """Return the correlation of the filtered references, summed over microphones, (lags, pairs).
+    def _filtered_spectrum(self, correlation: np.ndarray) -> np.ndarray:
+        """Return the spectrum of R_x', the correlation of the filtered references, summed over microphones, (f, pairs).
 
         The pairs are those of `np.triu_indices`; the others follow by symmetry, see `hermitian`.
         """
         of_x = fft.rfft(_two_sided(correlation[: self._inner], self._inner_size), axis=0)
         rows, columns = np.triu_indices(self.n_loudspeakers * self.n_references)
         (j, i), (other_j, other_i) = np.divmod(rows, self.n_references), np.divmod(columns, self.n_references)
-        return fft.irfft(self._gram[:, j, other_j] * of_x[:, i, other_i], self._inner_size, axis=0)
+        return self._gram[:, j, other_j] * of_x[:, i, other_i]
+
+    def _lags_of(self, spectrum: np.ndarray) -> np.ndarray:
+        """Return the lags of a spectrum, (lags, pairs)."""
+        return fft.irfft(spectrum, self._inner_size, axis=0)
 
 
 def _two_sided(correlation: np.ndarray, size: int) -> np.ndarray:
