@@ -3,6 +3,8 @@ from .direct import DirectKalman as DirectKalman
 from .direct import DirectPowerBudget as DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman as FrequencyDomainKalman
 from .leaky import leak_factor as leak_factor
+from .monitored import HealthEvent as HealthEvent
+from .monitored import MonitoredController as MonitoredController
 from .mov import penalty_factor as penalty_factor
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .shared_gain import SharedGainKalman as SharedGainKalman

@@ -1,0 +1,244 @@
+"""A monitor for any controller: if the noise is louder with control than without, the loudspeakers are muted."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_channels, as_nonnegative, as_positive, as_sample_count
+from ..power.constraint import DEFAULT_FS
+from .base import Controller, WrappedController
+
+LONGEST_PAUSE = 64.0  # of the first pause
+
+
+@dataclass(frozen=True)
+class HealthEvent:
+    """Something that a monitor noticed.
+
+    Attributes
+    ----------
+    time_s : float
+        Time of the event, in seconds since the first sample.
+    what : str
+        "louder": the control made the noise louder and was stopped; "not louder": it was suspected wrongly and goes on;
+        "not finite": the control signal was NaN or Inf, and the control was stopped; "retry": the control starts anew.
+    change_db : float
+        How much louder the noise was with control than without, in dB; NaN if that was not measured.
+    """
+
+    time_s: float
+    what: str
+    change_db: float = np.nan
+
+
+class MonitoredController(WrappedController):
+    """A controller with a monitor that mutes the loudspeakers if the control makes the noise louder.
+
+    A secondary path with a flipped sign, or a delay that is wrong by several samples, makes any controller louder than no
+    control. Its own estimates do not show it, because they rely on the same path. So the monitor compares the power of
+    the error, relative to that of the reference, with what it was in silence. If it exceeds that by `margin_db`, the
+    loudspeakers are muted for `window_s`, which shows whether the control is to blame. If so, the controller is replaced
+    by a fresh copy, which starts after a pause; each further failure doubles the pause. If not, the control goes on, and
+    the margin is widened by half, because the noise evidently fluctuates.
+
+    Parameters
+    ----------
+    controller : Controller
+        Any controller that can be copied, before its first sample. While muted, it follows the noise if it has a method
+        ``listen(references, errors)``, as the built-in ones have.
+    fs : float, default 16000
+        Sample rate in Hz.
+    window_s : float, default 0.5
+        Time over which powers are compared, in seconds. Control begins after a window of silence, unless `listen` was
+        called with as much.
+    margin_db : float, default 1.5
+        Rise of the error's power in dB that causes a test.
+    pause_s : float, default 2
+        First pause after a failure, in seconds.
+
+    Attributes
+    ----------
+    health : list of HealthEvent
+        What was noticed, in the order of time.
+    muted : bool
+        Whether the loudspeakers are muted now.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An object that is not a controller, a time or margin out of range.
+
+    Notes
+    -----
+    The monitor is stepped from Python, which `simulate` does for any object with these methods.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import kf_pb, simulate
+    >>> from kfopc_filterpy.controllers import MonitoredController
+    >>> path = np.array([0.0, 1.0, 0.4])
+    >>> controller = kf_pb(8, -path, rated_power=1.0, fs=2000.0, state_noise=1e-8, measurement_noise=1e-3)  # wrong sign
+    >>> monitored = MonitoredController(controller, fs=2000.0)
+    >>> x = np.random.default_rng(0).standard_normal(6000)
+    >>> result = simulate(monitored, x, primary_path=[0.0, 0.0, 0.5], secondary_path=path, fs=2000.0)
+    >>> [event.what for event in monitored.health], monitored.muted
+    (['louder'], True)
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        *,
+        fs: float = DEFAULT_FS,
+        window_s: float = 0.5,
+        margin_db: float = 1.5,
+        pause_s: float = 2.0,
+    ) -> None:
+        super().__init__(controller)
+        self.fs = as_positive(fs, "fs", unit="Hz")
+        self._window = as_sample_count(window_s, fs, "window_s")
+        self._pause = self._first_pause = as_sample_count(pause_s, fs, "pause_s")
+        self.margin_db = as_nonnegative(margin_db, "margin_db", unit="dB")
+        self.name = f"{getattr(controller, 'name', type(controller).__name__)} monitored"
+        self.health: list[HealthEvent] = []
+        self._fresh = deepcopy(controller)
+        self._samples = 0
+        self._silent_ratio = np.nan  # power of the error over that of the reference, without control
+        self._suspicious_ratio = np.nan  # the same with control, while a test is under way
+        self._muted_for = self._window  # samples left of a silence
+        self._after_silence: Callable[[float], None] = self._learn
+        self._references: deque[Any] = deque(maxlen=self._window)
+        self._errors: deque[Any] = deque(maxlen=self._window)
+        self._begin_window()
+
+    @property
+    def muted(self) -> bool:
+        """Whether the loudspeakers are muted now."""
+        return self._muted_for > 0
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {'muted' if self.muted else 'running'}, {len(self.health)} events>"
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if the monitor or its controller is for another sample rate than `fs` in Hz."""
+        if abs(fs - self.fs) > 1e-9 * fs:
+            raise ValueError(f"fs is {fs:g} Hz but the monitor is for {self.fs:g} Hz: make it with the fs of the run")
+        inner = getattr(self.controller, "require_sample_rate", None)
+        if inner is not None:
+            inner(fs)
+
+    def control_signal(self, reference: Any) -> Any:
+        """Return the control signal y(n) for the newest reference, or silence."""
+        self._newest = reference
+        if not self.muted:
+            y = self.controller.control_signal(reference)
+            if np.all(np.isfinite(y)):
+                return y
+            self._note("not finite")
+            self._stop()
+        return self._silence()
+
+    def update(self, error: Any) -> None:
+        """Pass the error e(n) on to the controller, and compare powers at the end of a window."""
+        if self.muted:
+            self._references.append(self._newest)
+            self._errors.append(error)
+        else:
+            self.controller.update(error)
+        self._samples += 1
+        self._reference_energy += float(np.sum(np.square(self._newest)))
+        self._error_energy += float(np.sum(np.square(error)))
+        self._counted += 1
+        if self.muted:
+            self._muted_for -= 1
+            if not self.muted:
+                self._end_silence()
+        elif self._counted == self._window:
+            self._compare()
+
+    def listen(self, references: Any, errors: Any) -> None:
+        """Follow the noise before the control is switched on, with silent output."""
+        x, e = as_channels(references, "references"), as_channels(errors, "errors")
+        self._follow(x, e)
+        if x.shape[-1] >= self._window:
+            self._learn(_ratio(float(np.sum(e**2)), float(np.sum(x**2))))
+            self._muted_for = 0
+        self._begin_window()
+
+    # ---- The decisions, each at the end of a window
+
+    def _compare(self) -> None:
+        """Mute for a test if the error is louder than in silence, or if that is not known yet."""
+        ratio = _ratio(self._error_energy, self._reference_energy)
+        self._begin_window()
+        allowed = self._silent_ratio * 10.0 ** (self.margin_db / 10.0)
+        if np.isfinite(ratio) and not ratio <= allowed < np.inf:
+            self._suspicious_ratio = ratio
+            self._muted_for, self._after_silence = self._window, self._judge
+
+    def _judge(self, ratio: float) -> None:
+        """Stop the control if the noise is quieter without it."""
+        change_db = float(10.0 * np.log10(self._suspicious_ratio / ratio)) if ratio > 0.0 else np.inf
+        if change_db > 0.5 * self.margin_db:
+            self._note("louder", change_db)
+            self._stop()
+        else:
+            self._note("not louder", change_db)
+            self.margin_db *= 1.5
+        self._learn(ratio)
+
+    def _learn(self, ratio: float) -> None:
+        """Take over the ratio of powers that was measured in silence."""
+        self._silent_ratio = ratio
+
+    def _stop(self) -> None:
+        """Start a pause, after which a fresh controller begins."""
+        self.controller = deepcopy(self._fresh)
+        self._muted_for, self._after_silence = self._pause, self._retry
+        self._pause = min(2 * self._pause, round(LONGEST_PAUSE * self._first_pause))
+        self._references.clear()
+        self._errors.clear()
+        self._begin_window()
+
+    def _retry(self, ratio: float) -> None:
+        self._learn(ratio)
+        self._note("retry")
+
+    # ---- Silence
+
+    def _end_silence(self) -> None:
+        """Let the controller follow what was heard in silence, and decide."""
+        self._follow(np.array(self._references).T, np.array(self._errors).T)
+        self._references.clear()
+        self._errors.clear()
+        ratio = _ratio(self._error_energy, self._reference_energy)
+        self._begin_window()
+        self._after_silence(ratio)
+
+    def _follow(self, references: np.ndarray, errors: np.ndarray) -> None:
+        listen = getattr(self.controller, "listen", None)
+        if listen is not None:
+            listen(references, errors)
+
+    def _silence(self) -> Any:
+        loudspeakers = getattr(self.controller, "n_loudspeakers", 1)
+        return np.zeros(loudspeakers) if getattr(self.controller, "multichannel", False) else 0.0
+
+    def _begin_window(self) -> None:
+        self._reference_energy = self._error_energy = 0.0
+        self._counted = 0
+
+    def _note(self, what: str, change_db: float = np.nan) -> None:
+        self.health.append(HealthEvent(self._samples / self.fs, what, change_db))
+
+
+def _ratio(above: float, below: float) -> float:
+    """Return a ratio of powers; infinite if the reference is silent."""
+    return above / below if below > 0.0 else np.inf
