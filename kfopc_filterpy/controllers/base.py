@@ -13,11 +13,12 @@ from ..kernels.delay_lines import delay_line, latest, newest
 from ..kernels.holding import Held
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
+from ..paths.uncertainty import GUARD_TAPS, guard_against, path_uncertainty
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .channels import channel_lines, channel_sample
-from .step import Lines, adapt_once, emit_once, estimate_once, listen
+from .step import GuardLine, Lines, adapt_once, emit_once, estimate_once, listen
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
@@ -141,6 +142,7 @@ class FilteredReferenceController:
     name = "controller"
     has_gains = False  # True if it has Kalman gains, which scenarios can share
     unshared = ""  # the part that prevents sharing, if any
+    _uncertainty: np.ndarray | None = None
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
     _holding: Held | None = None
@@ -203,10 +205,11 @@ class FilteredReferenceController:
         return Lines(
             secondary_estimate=secondary,
             reference=delay_line(max(reference_taps, secondary.size)),
-            filtered=delay_line(filtered_taps),
+            filtered=delay_line(max(filtered_taps, GUARD_TAPS)),
             output=delay_line(secondary.size),
             amplifier=model,
             limiter=states_of(self._limiter),
+            guard=None,
         )
 
     def _checked_limiter(self, limiter: Any) -> Any:
@@ -264,6 +267,36 @@ class FilteredReferenceController:
         self._limiter = self._checked_limiter(value)
         lines = self._state.lines._replace(limiter=states_of(self._limiter))
         self._state = self._state._replace(lines=lines)
+
+    @property
+    def secondary_path_uncertainty(self) -> Any:
+        """Largest relative error of the secondary path, (257,) from 0 to fs/2, or None; can be assigned.
+
+        Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
+        :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
+        LMS algorithm gets a leak shaped in frequency, whose energy counts in the stability of its step size, and a Kalman
+        filter a second observation. It has a meaning for KF-ANC, KF-OPC and the LMS family of one channel, except FxNLMS;
+        `kf_pb` takes it as a setting.
+        """
+        return None if self._uncertainty is None else self._uncertainty.copy()
+
+    @secondary_path_uncertainty.setter
+    def secondary_path_uncertainty(self, value: Any) -> None:
+        if self.multichannel or not self._takes_guard():
+            raise ValueError(
+                f"{self.name} takes no secondary_path_uncertainty: use kf_pb(..., secondary_path_uncertainty=...), or "
+                "KF-ANC, KF-OPC, FxLMS, leaky FxLMS or MOV-FxLMS of one channel"
+            )
+        lines = self._state.lines
+        uncertainty = path_uncertainty(value, lines.secondary_estimate)
+        taps = guard_against(value, lines.secondary_estimate)
+        guard = None if taps is None else GuardLine(taps, delay_line(self.n_taps))
+        self._uncertainty = None if guard is None else uncertainty
+        self._state = self._state._replace(lines=lines._replace(guard=guard))
+
+    def _takes_guard(self) -> bool:
+        """Return whether the algorithm's step takes account of an uncertain secondary path."""
+        return False
 
     @property
     def weights(self) -> np.ndarray:

@@ -134,3 +134,6 @@ class FxNLMS(LMSController):
     def regularization(self) -> float:
         """Regularization epsilon."""
         return self._state.regularization
+
+    def _takes_guard(self) -> bool:
+        return False  # its step is scaled with the energy of x' alone

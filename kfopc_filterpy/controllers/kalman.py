@@ -11,7 +11,7 @@ from .._validate import as_count, as_number
 from ..filters.kfopc import KFOPC
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..filters.random_walk import RandomWalkKFOPC, new_numbers
-from ..kernels.compiling import inlined
+from ..kernels.compiling import inlined, part
 from ..kernels.covariance import Covariance, kalman_step, new_covariance
 from ..kernels.delay_lines import latest, newest
 from ..paths.channels import is_path_matrix
@@ -67,7 +67,18 @@ def correct(state, measurement, scaled):
     if not np.isfinite(y):
         return False
     numbers.measurement, numbers.residual, numbers.variance = measurement, y, S
+    observe_guarded(state.lines.guard, state.gains, w, numbers.measurement_noise)
     return True
+
+
+@part()
+def observe_guarded(guard, gains, w, noise):
+    """Correct w as if w'x'' with x'' = W * x' had been measured as zero, if there is a guard.
+
+    A Kalman filter then minimises E[(d - w'x')^2] + E[(w'x'')^2].
+    """
+    if guard is not None:
+        kalman_step(gains, w, newest(guard.filtered, w.size), 0.0, 0.0, noise, 1.0)
 
 
 class KalmanController(FilteredReferenceController):
@@ -146,6 +157,9 @@ class KalmanController(FilteredReferenceController):
     def _family(self) -> type[KalmanController]:
         """Return the class whose `control_signal` and `update` the compiled step implements."""
         return KalmanController
+
+    def _takes_guard(self) -> bool:
+        return type(self.estimator) is self._filter_type  # their steps are compiled
 
     def _usual_name(self) -> str:
         return "KF-ANC" if self.rated_power is None else "KF-OPC"

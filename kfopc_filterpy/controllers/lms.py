@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from ..kernels.compiling import by_type, inlined, part
 from ..kernels.delay_lines import newest
-from ..kernels.vectors import FAST, add_scaled
+from ..kernels.vectors import FAST, add_scaled, dot
 from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController
 from .channels import ChannelLines
@@ -23,6 +23,9 @@ class LMSController(FilteredReferenceController):
         """Step size mu."""
         return self._state.step_size
 
+    def _takes_guard(self) -> bool:
+        return True
+
 
 @inlined
 def change_weights(lines, weights, keep, mu, error, penalty):
@@ -35,6 +38,7 @@ def change_weights(lines, weights, keep, mu, error, penalty):
 def change_filter(lines, weights, j, keep, mu, error, penalty):
     """Set w(n+1) = keep w(n) + mu e(n) x'(n) - penalty x(n) for loudspeaker j, with e x' summed over microphones."""
     filtered, x = newest(lines.filtered, weights.size), newest(lines.reference, weights.size)
+    leak_guarded(lines.guard, weights, mu)
     change(weights, filtered, x, keep, mu * error, penalty)
 
 
@@ -47,6 +51,14 @@ def change_channel(lines, weights, j, keep, mu, error, penalty):
         change(w, newest(lines.filtered[0, j, i], taps), x, keep, mu * error[0], penalty)
         for k in range(1, lines.filtered.shape[0]):
             add_scaled(w, mu * error[k], newest(lines.filtered[k, j, i], taps), 0, taps)
+
+
+@part()
+def leak_guarded(guard, w, mu):
+    """Subtract mu (w'x'') x'' with x'' = W * x', if there is a guard: a leak where the secondary path is uncertain."""
+    if guard is not None:
+        row = newest(guard.filtered, w.size)
+        add_scaled(w, -mu * dot(w, row), row, 0, w.size)
 
 
 @part(fastmath=FAST)

@@ -120,6 +120,9 @@ class PowerBudgetController(KalmanController):
     def _family(self) -> type[KalmanController]:
         return PowerBudgetController
 
+    def _takes_guard(self) -> bool:
+        return False  # the budget's control filter takes account of it
+
     def _usual_name(self) -> str:
         return "KF-PB"
 

@@ -25,6 +25,13 @@ from ..power.constraint import advance_constraint, squares_are_finite
 from ..power.limiter import LimiterState, limit_sample
 
 
+class GuardLine(NamedTuple):
+    """The guard against an uncertain secondary path, see `paths.uncertainty`."""
+
+    taps: np.ndarray  # of W
+    filtered: np.ndarray  # delay line of W * x'
+
+
 class Lines(NamedTuple):
     """Signals that a controller uses, and its models."""
 
@@ -34,6 +41,7 @@ class Lines(NamedTuple):
     output: np.ndarray  # delay line of y, after the limiter and the amplifier model
     amplifier: np.ndarray  # record of that model; linear: d^ = e + s^ * y as published
     limiter: LimiterState | None
+    guard: GuardLine | None
 
 
 # Functions chosen by the type of the state.
@@ -97,6 +105,7 @@ def take_reference(lines, x):
     push(lines.reference, x)
     s = lines.secondary_estimate
     push(lines.filtered, dot(s, newest(lines.reference, s.size)))
+    take_guarded(lines.guard, lines.filtered)
 
 
 @by_type
@@ -148,6 +157,13 @@ def limited(limiter, y):
     if limiter is None:
         return y
     return limit_sample(limiter, y)
+
+
+@part()
+def take_guarded(guard, filtered):
+    """Add (W * x')(n) to its delay line, if there is a guard."""
+    if guard is not None:
+        push(guard.filtered, dot(guard.taps, newest(filtered, guard.taps.size)))
 
 
 @inlined

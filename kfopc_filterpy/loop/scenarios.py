@@ -269,7 +269,8 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
                 f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
                 "KalmanControllers of filters from KFOPC.random_walk"
             )
-        for what in (controller.unshared, "limiter" if state.lines.limiter is not None else ""):
+        limiter, guard = state.lines.limiter is not None, state.lines.guard is not None
+        for what in (controller.unshared, "limiter" * limiter, "secondary-path uncertainty" * guard):
             if what:
                 raise ValueError(f"controllers[{i}] has a {what}, which scenarios do not run: use simulate for it")
         states.append(state)
