@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -15,8 +16,7 @@ from ..power.constraint import DEFAULT_FS
 from .wiener import ERROR_THAT_MATTERS, Correlations, Stretch, full_stretch, mean_square, reduction_db
 
 # A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the
-# constraint factor when the noise gets louder or softer. KF-ANC's best memory is 0.2 s on a recorded motor, and the
-# longest on a steady noise, where this one costs up to 0.4 dB at 256 taps.
+# constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one costs.
 DEFAULT_MEMORY_S = 0.25
 LONGEST = 256
 GAIN_THAT_MATTERS_DB = 0.1
@@ -66,8 +66,11 @@ class SuggestedSettings:
         return f"<SuggestedSettings: n_taps={self.n_taps}, {values}, at {self.fs:g} Hz>"
 
     def __str__(self) -> str:
-        values = {"n_taps": self.n_taps, **self.settings}
-        return "\n".join(f"{name} = {value:.3g}: {self.reasons[name]}" for name, value in values.items())
+        lines = []
+        for name, value in {"n_taps": self.n_taps, **self.settings}.items():
+            lines.append(f"{name} = {value:.3g}")
+            lines += textwrap.wrap(self.reasons[name], 100, initial_indent="    ", subsequent_indent="    ")
+        return "\n".join(lines)
 
 
 def suggest_settings(
@@ -138,7 +141,8 @@ def suggest_settings(
     - :math:`P_0 = E[d^2] / (L\, E[x'^2])`: with independent weights of this variance and a white filtered reference, the
       anti-noise is as strong as the disturbance.
 
-    Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`.
+    Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`. q contains neither
+    what a clipping amplifier cuts off nor the errors of the path estimate, which a silent run does not show.
 
     Examples
     --------
@@ -184,7 +188,7 @@ def suggest_settings(
             "state_noise": _why_memory(memory / fs, lengthened / fs, taps / lengthened),
             "initial_variance": (
                 f"E[d^2] / (L E[x'^2]) with E[d^2] = {d_power:.3g} and E[x'^2] = {filtered_power:.3g}: independent "
-                "weights of this variance make an anti-noise as strong as the disturbance"
+                "weights of this variance would make an anti-noise as strong as the disturbance"
             ),
         },
     )
