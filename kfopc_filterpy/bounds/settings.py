@@ -155,8 +155,8 @@ def suggest_settings(
     >>> suggested = suggest_settings(x, d, path)
     >>> suggested
     <SuggestedSettings: n_taps=24, state_noise=9.77e-10, measurement_noise=0.01, initial_variance=0.0821, at 16000 Hz>
-    >>> print(suggested.reasons["n_taps"])
-    the best fixed filter of this length reduces the noise by 21.0 dB, and a longer one of up to 256 taps gains less than 0.1 dB
+    >>> print(suggested.reasons["state_noise"])
+    the filter averages over 0.25 s; that costs up to 0.03 dB, and a shorter time follows faster
     >>> kf_opc(suggested.n_taps, path, rated_power=1.0, **suggested.settings).name
     'KF-OPC'
     """
