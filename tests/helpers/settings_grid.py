@@ -51,7 +51,7 @@ class Comparison(NamedTuple):
 
     suggested: SuggestedSettings
     own: np.ndarray
-    best: np.ndarray  # of the grid; KF-OPC only with settings that take no more power than the suggested ones
+    best: np.ndarray  # of the grid; KF-OPC only with settings that keep its power, see `compare`
 
 
 def white(duration: float, seed: int) -> np.ndarray:
@@ -109,8 +109,8 @@ def compare(
     """Suggest settings from one run of the noise, and compare them on another with a grid.
 
     The grid has the given lengths, each with its suggested q and P0, and the given factors of its suggested r. A setting
-    with which KF-OPC takes more power is not counted as better: while the level changes, weights that lag behind the
-    factor reduce more noise, with power that they should not take.
+    with which KF-OPC exceeds the rated power, and the power with the suggested ones, by 2 % is not counted: while the
+    level changes, weights that lag behind the factor reduce more noise, with power that they should not take.
     """
     x, d, std = signals(primary, noise, 1, duration)
     silent = x[ON:], d[ON:] + std * np.random.default_rng(5).standard_normal(d.size - ON)
@@ -121,9 +121,11 @@ def compare(
     x, d, std = signals(primary, noise, 2, duration)
     options: dict[str, Any] = {"disturbance": d, "secondary_path": s, "fs": FS, "switch_on_s": ON / FS}
 
+    rated = RATED_SHARE * fixed.control_power
+
     def run(n_taps: int, settings: dict[str, float]) -> tuple[np.ndarray, float]:
         free = kf_anc(n_taps, s, **settings)
-        constrained = kf_opc(n_taps, s, rated_power=RATED_SHARE * fixed.control_power, **settings)
+        constrained = kf_opc(n_taps, s, rated_power=rated, **settings)
         results = simulate_scenarios([free, constrained], x, sensor_noise_std=std, rng=[6, 6], **options)
         merits = [
             (noise_reduction_db(r.error, r.disturbance), -float(np.mean(nse_db(r.error, r.disturbance, FS, 0.05))))
@@ -138,7 +140,7 @@ def compare(
         for factor in factors:
             merits, used = run(n_taps, dataclasses.replace(at, state_noise=factor * at.state_noise).settings)
             best[0] = np.maximum(best[0], merits[0])
-            if used <= 1.02 * power:
+            if used <= 1.02 * max(power, rated):
                 best[1] = np.maximum(best[1], merits[1])
     return Comparison(suggested, own, best)
 
