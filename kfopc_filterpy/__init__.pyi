@@ -23,6 +23,7 @@ from . import (
     signals as signals,
 )
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener
+from .bounds.settings import suggest_settings as suggest_settings
 from .controllers.clipping import ClippingFxLMS as ClippingFxLMS
 from .controllers.diagonal import DiagonalKalman as DiagonalKalman
 from .controllers.fast_array import FastArrayKalman as FastArrayKalman

@@ -8,6 +8,7 @@ from .rated_power import BudgetedRatedPower as BudgetedRatedPower
 from .rated_power import RatedPower as RatedPower
 from .rated_power import budgeted_rated_power as budgeted_rated_power
 from .rated_power import required_rated_power as required_rated_power
+from .settings import SuggestedSettings as SuggestedSettings
 from .wiener import WienerSolution as WienerSolution
 from .wiener import coherence_bound as coherence_bound
 from .wiener import wiener_solution as wiener_solution

@@ -289,8 +289,8 @@ def kf_anc(
     n_taps: int,
     secondary_path: Any,
     *,
-    state_noise: float,
-    measurement_noise: Any,
+    state_noise: float | None = None,
+    measurement_noise: Any = None,
     initial_variance: float = 1.0,
     n_references: int = 1,
     amplifier: Any = None,
@@ -305,10 +305,12 @@ def kf_anc(
         Taps L of the control filter, or of each of them.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
-    state_noise, initial_variance
-        r and P(0|0), see `KFOPC.random_walk`.
+    state_noise : float
+        r, see `KFOPC.random_walk`. It must be given; `suggest_settings` finds it and the next two for a noise.
     measurement_noise : float or array_like, shape (K,)
-        q of all microphones, or of each.
+        q of all microphones, or of each. It must be given.
+    initial_variance : float, default 1
+        P(0|0) of each tap. It has the unit of a squared weight, so 1 may be far too much.
     n_references : int, default 1
         Number of references I.
     amplifier, limiter : optional
@@ -325,7 +327,7 @@ def kf_anc(
     Raises
     ------
     ValueError, TypeError
-        A setting that is out of range, or that does not fit the number of channels.
+        No state noise or measurement noise; a setting that is out of range, or that does not fit the number of channels.
 
     Examples
     --------
@@ -352,8 +354,8 @@ def kf_opc(
     *,
     rated_power: Any = None,
     constraint: Any = None,
-    state_noise: float,
-    measurement_noise: Any,
+    state_noise: float | None = None,
+    measurement_noise: Any = None,
     initial_variance: float = 1.0,
     n_references: int = 1,
     amplifier: Any = None,
@@ -380,8 +382,8 @@ def kf_opc(
     Raises
     ------
     ValueError, TypeError
-        Neither a rated power nor a constraint, or both; a setting that is out of range, or that does not fit the number
-        of channels.
+        Neither a rated power nor a constraint, or both; no state noise or measurement noise; a setting that is out of
+        range, or that does not fit the number of channels.
 
     Examples
     --------
@@ -412,10 +414,20 @@ def _kalman(
     n_taps: int, secondary_path: Any, n_references: int, amplifier: Any, limiter: Any, **settings: Any
 ) -> KalmanController | DirectKalman:
     """Return the controller for one channel or for several."""
+    require_noises(settings["state_noise"], settings["measurement_noise"])
     outside = {"amplifier": amplifier, "limiter": limiter}
     if is_multichannel(secondary_path, n_references):
         return DirectKalman(n_taps, secondary_path, n_references=n_references, **outside, **settings)
     return KalmanController(KFOPC.random_walk(n_taps, **settings), secondary_path, **outside)
+
+
+def require_noises(state_noise: Any, measurement_noise: Any, instead: str = "") -> None:
+    """Raise TypeError if one of the noises is missing; the message says how to find them, or what to give `instead`."""
+    if state_noise is None or measurement_noise is None:
+        raise TypeError(
+            f"give state_noise and measurement_noise{instead}; for one channel, "
+            "suggest_settings(reference, disturbance, secondary_path) finds them from a run with a silent loudspeaker"
+        )
 
 
 def is_multichannel(secondary_path: Any, n_references: int) -> bool:

@@ -135,7 +135,7 @@ class MonitoredController(WrappedController):
             inner(fs)
 
     def control_signal(self, reference: Any) -> Any:
-        """Return the control signal y(n) for the newest reference, or silence."""
+        """Return the control signal y(n) for the newest `reference` x(n), or silence."""
         self._newest = reference
         if not self.muted:
             y = self.controller.control_signal(reference)
@@ -146,7 +146,7 @@ class MonitoredController(WrappedController):
         return self._silence()
 
     def update(self, error: Any) -> None:
-        """Pass the error e(n) on to the controller, and compare powers at the end of a window."""
+        """Pass the `error` e(n) on to the controller, and compare powers at the end of a window."""
         if self.muted:
             self._references.append(self._newest)
             self._errors.append(error)
@@ -164,7 +164,7 @@ class MonitoredController(WrappedController):
             self._compare()
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Follow the noise before the control is switched on, with silent output."""
+        """Follow `references` and `errors` before the control is switched on, with silent output."""
         x, e = as_channels(references, "references"), as_channels(errors, "errors")
         self._follow(x, e)
         if x.shape[-1] >= self._window:

@@ -18,7 +18,7 @@ from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman
-from .kalman import KalmanController, correct_constrained, is_multichannel
+from .kalman import KalmanController, correct_constrained, is_multichannel, require_noises
 from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
@@ -229,8 +229,7 @@ def kf_pb(
         if given:
             raise TypeError(f"the {form} form takes path_memory_s instead of {', '.join(given)}")
         return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, **channels, **common, **settings)
-    if state_noise is None or measurement_noise is None:
-        raise TypeError("give state_noise and measurement_noise, or form='shared gain', which does not need them")
+    require_noises(state_noise, measurement_noise, ", or form='shared gain', which does not need them")
     settings |= given
     if several:
         return DirectPowerBudget(n_taps, secondary_path, **channels, **common, **settings)

@@ -36,6 +36,7 @@ PRIMARY = random_paths(K, I, 9, seed=2, delay=3)
 NOISE = np.array([0.01, 0.1, 0.03])
 RATED, MEMORY = np.array([0.02, 0.05]), 60
 SETTINGS: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": NOISE, "n_references": I}
+EXACT: dict[str, Any] = {"secondary_path_uncertainty": None}
 ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
 
 
@@ -51,7 +52,7 @@ def constraints() -> list[OutputPowerConstraint]:
 MAKE: dict[str, Callable[..., Any]] = {
     "KF-ANC": lambda path=ESTIMATE, **o: kf_anc(L, path, **(SETTINGS | o)),
     "KF-OPC": lambda path=ESTIMATE, **o: kf_opc(L, path, constraint=constraints(), **(SETTINGS | o)),
-    "KF-PB": lambda path=ESTIMATE, **o: kf_pb(L, path, rated_power=RATED, form="direct", **(SETTINGS | o)),
+    "KF-PB": lambda path=ESTIMATE, **o: kf_pb(L, path, rated_power=RATED, form="direct", **(SETTINGS | EXACT | o)),
 }
 
 
@@ -174,7 +175,7 @@ def test_steady_noise_each_power_is_kept_and_the_error_is_close_to_the_bound(sha
     wanted = power_constrained_wiener(x, d, secondary, rated_power=1e6, **steady).whole.control_power
     rated = np.array(share) * wanted
     controller = kf_pb(
-        taps, secondary, rated_power=rated, form="direct", fs=FS, state_noise=1e-9, measurement_noise=0.01
+        taps, secondary, rated_power=rated, form="direct", fs=FS, state_noise=1e-9, measurement_noise=0.01, **EXACT
     )
     result = simulate(controller, x, primary_path=primary, secondary_path=secondary, fs=FS)
     bound = power_constrained_wiener(x[:, half:], d[:, half:], secondary, rated_power=rated, **steady).whole
@@ -234,7 +235,12 @@ def test_kf_pb_whose_second_loudspeaker_is_unplugged_is_the_single_channel() -> 
     x = noise(32000, 1)
     d = np.convolve(x[0], [0.0, 0.0, 1.2, 0.5])[: x.size]
     plugged = np.stack([ONE_PATH, np.zeros_like(ONE_PATH)])[np.newaxis]
-    settings: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 0.01, "rated_power": 0.3, "form": "direct"}
+    settings: dict[str, Any] = {
+        "state_noise": 1e-9,
+        "measurement_noise": 0.01,
+        "rated_power": 0.3,
+        "form": "direct",
+    } | EXACT
     results, controllers = [], [kf_pb(16, path, **settings) for path in (ONE_PATH, plugged)]
     for own, path in zip(controllers, (ONE_PATH, plugged), strict=True):
         signals = (x[0], d) if path is ONE_PATH else (x, d[np.newaxis])

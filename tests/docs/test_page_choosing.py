@@ -9,6 +9,15 @@ from helpers.pages import Page
 def test_the_figures_say_what_the_page_says():
     page = Page("choosing")
 
+    v = page.run(until="L: the length of the control filter")
+    assert list(v.suggested.settings) == ["state_noise", "measurement_noise", "initial_variance"]
+    assert v.suggested.n_taps == 256
+    assert "as long as max_taps allows" in v.suggested.reasons["n_taps"]
+    assert "over 0.25 s" in v.suggested.reasons["state_noise"]
+    best = {n: max(values) for n, values in v.grid.items()}
+    assert best[256] == max(best.values()) < v.own + 0.5
+    assert min(v.grid[256]) < v.own - 2  # a grid wide enough to lose on
+
     v = page.run(until="q: what no weights explain")
     reach = v.reach
     assert reach[0] < 3 < 6 < reach[1]

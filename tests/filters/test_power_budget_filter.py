@@ -216,7 +216,7 @@ SETTINGS_IN_LOOP = {
 
 def controller(n_taps: int = 10, **options: Any) -> PowerBudgetController:
     """As those of `loop/test_loop.py`; a usual window of 80 samples, or ten times the taps."""
-    return kf_pb(n_taps, S_HAT, **SETTINGS_IN_LOOP | options)
+    return kf_pb(n_taps, S_HAT, **SETTINGS_IN_LOOP | {"secondary_path_uncertainty": None} | options)
 
 
 @pytest.mark.parametrize("feedback", [None, FEEDBACK], ids=["", "feedback"])

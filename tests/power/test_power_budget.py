@@ -635,7 +635,14 @@ def test_what_is_heard_before_it_is_switched_on_counts_for_the_correlations_only
 def of_known_estimate(rated_power: float, **budget: float) -> PowerBudgetController:
     """KF-PB whose estimate is W and stays it: no variance, no gain."""
     controller = kf_pb(
-        W.size, S, rated_power=rated_power, state_noise=0.0, measurement_noise=1.0, initial_variance=0.0, **budget
+        W.size,
+        S,
+        rated_power=rated_power,
+        state_noise=0.0,
+        measurement_noise=1.0,
+        initial_variance=0.0,
+        secondary_path_uncertainty=None,
+        **budget,
     )
     controller.estimator.x = W.reshape(-1, 1)
     return controller

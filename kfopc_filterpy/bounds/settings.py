@@ -1,0 +1,276 @@
+"""Settings of a single-channel Kalman controller from a recording made while the loudspeaker is silent."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_positive, as_signal
+from ..paths.least_squares import RANK_TOLERANCE
+from ..paths.models import path_taps
+from ..power.constraint import DEFAULT_FS
+from .wiener import ERROR_THAT_MATTERS, Correlations, Stretch, full_stretch, mean_square, reduction_db
+
+# A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the
+# constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one costs.
+DEFAULT_MEMORY_S = 0.25
+LONGEST = 256
+GAIN_THAT_MATTERS_DB = 0.1
+MULTIPLE = 8  # lengths are rounded up to it
+SAMPLES_PER_TAP = 10  # of the record, at least; fewer would fit too much by chance
+BURST_S = 0.01  # powers over this time show whether a noise is impulsive
+LITTLE = 0.5  # share of the disturbance's power that is left, above which the reasons say where to look for the cause
+NOTABLY_LONGER = 1.2
+
+
+@dataclass(frozen=True)
+class SuggestedSettings:
+    """Settings of `kf_anc`, `kf_opc` and `kf_pb`, with the reason for each; made by `suggest_settings`.
+
+    ``print(suggested)`` explains all of them.
+
+    Attributes
+    ----------
+    n_taps : int
+        Taps L of the control filter.
+    measurement_noise, state_noise, initial_variance : float
+        q, r and P0.
+    fs : float
+        Sample rate of the signals in Hz.
+    reasons : mapping of str to str
+        A sentence on each of the four settings, by its name.
+    """
+
+    n_taps: int
+    measurement_noise: float
+    state_noise: float
+    initial_variance: float
+    fs: float
+    reasons: Mapping[str, str]
+
+    @property
+    def settings(self) -> dict[str, float]:
+        """Keyword arguments r, q and P0 of a controller: ``kf_anc(s.n_taps, path, **s.settings)``."""
+        return {
+            "state_noise": self.state_noise,
+            "measurement_noise": self.measurement_noise,
+            "initial_variance": self.initial_variance,
+        }
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={value:.3g}" for name, value in self.settings.items())
+        return f"<SuggestedSettings: n_taps={self.n_taps}, {values}, at {self.fs:g} Hz>"
+
+    def __str__(self) -> str:
+        lines = []
+        for name, value in {"n_taps": self.n_taps, **self.settings}.items():
+            lines.append(f"{name} = {value:.3g}")
+            lines += textwrap.wrap(self.reasons[name], 100, initial_indent="    ", subsequent_indent="    ")
+        return "\n".join(lines)
+
+
+def suggest_settings(
+    reference: Any,
+    disturbance: Any,
+    secondary_path: Any,
+    *,
+    fs: float = DEFAULT_FS,
+    memory_s: float = DEFAULT_MEMORY_S,
+    n_taps: int | None = None,
+    max_taps: int = LONGEST,
+) -> SuggestedSettings:
+    r"""Return the length L and the settings q, r and P0 that suit a noise, with the reason for each.
+
+    The signals are those of a silent run: the noise runs, the loudspeaker does not. A few seconds are enough if they
+    contain what the noise usually does. The settings are for one reference, one loudspeaker and one microphone.
+
+    Parameters
+    ----------
+    reference : array_like, shape (n_samples,)
+        Reference x of the silent run.
+    disturbance : array_like, shape (n_samples,)
+        Signal of the error microphone, the disturbance d. Leave out its start-up transient.
+    secondary_path : array_like, shape (n_path,), or control.TransferFunction
+        Estimated secondary path.
+    fs : float, default 16000
+        Sample rate of the signals in Hz.
+    memory_s : float, default 0.25
+        Memory of the filter in seconds. A longer one leaves less error, a shorter one follows changes of the noise and of
+        the paths faster.
+    n_taps : int, optional
+        Length L of the control filter, if you have chosen it. By default it follows from the signals.
+    max_taps : int, default 256
+        Longest control filter to consider. The cost per sample grows with the square of the length.
+
+    Returns
+    -------
+    SuggestedSettings
+        The settings; its `settings` are keyword arguments of `kf_anc`, `kf_opc` and `kf_pb`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the signals differ in length, are too short, silent or not finite; if the secondary path has several channels
+        or another sample rate; if a setting is out of range.
+
+    See Also
+    --------
+    measurement_noise_from_run : q alone, for a given length.
+    wiener_solution : the best fixed filter.
+    causality_margin : whether the paths leave enough time.
+
+    Notes
+    -----
+    :math:`J(L)` is the error power of the best fixed filter of L taps over the N samples of the record, and M the memory
+    in samples.
+
+    - L is the shortest length, rounded up to a multiple of 8, at which
+      :math:`J'(L)\, \frac{N}{N - L}\, (1 + \frac{L}{M})` is within 0.1 dB of its least value. :math:`J' = J` plus
+      :math:`q/(M P_0)\, \|w\|^2` at the best w (with q and :math:`P_0` of the longest filter), because a Kalman filter
+      does not learn within M samples what needs larger weights. The first fraction corrects for what L weights fit by
+      chance. The second one is the price of forgetting: for a white filtered reference, P settles at
+      :math:`\sqrt{rq/E[x'^2]}` in each direction, and so the error power is :math:`qL/M` above q.
+    - :math:`q = J(L)\, N / (N - L)`, but at least -60 dB of the disturbance, because a microphone is hardly ever quieter.
+    - :math:`r = q / (k\, E[x'^2] M^2)`. If the noise comes in bursts, so does what no filter explains, and it disturbs the
+      weights when their gain is largest. The memory is then lengthened by :math:`\sqrt{k}`: k is the mean square of the
+      power over 10 ms, divided by that of the power over the memory, and 1 for a steady noise.
+    - :math:`P_0 = E[d^2] / (L\, E[x'^2])`: with independent weights of this variance and a white filtered reference, the
+      anti-noise is as strong as the disturbance.
+
+    Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`. q contains neither
+    what a clipping amplifier cuts off nor the errors of the path estimate, which a silent run does not show.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import kf_opc, suggest_settings
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal(32000)
+    >>> d = np.convolve(x, [0.0] * 19 + [1.0, 0.5])[:32000] + 0.1 * rng.standard_normal(32000)
+    >>> path = [0.0, 0.0, 0.8]
+    >>> suggested = suggest_settings(x, d, path)
+    >>> suggested
+    <SuggestedSettings: n_taps=24, state_noise=9.77e-10, measurement_noise=0.01, initial_variance=0.0821, at 16000 Hz>
+    >>> print(suggested.reasons["state_noise"])
+    the filter averages over 0.25 s; that costs up to 0.03 dB, and a shorter time follows faster
+    >>> kf_opc(suggested.n_taps, path, rated_power=1.0, **suggested.settings).name
+    'KF-OPC'
+    """
+    fs = as_positive(fs, "fs", unit="Hz")
+    memory = as_positive(memory_s, "memory_s", unit="s") * fs
+    s = path_taps(secondary_path, fs=fs, name="secondary_path")
+    longest = _longest(as_signal(reference, "reference").size, s.size, n_taps, max_taps)
+    stretch = full_stretch(reference, disturbance, s, longest)
+    correlations, d_power, filtered_power = stretch.correlations(), mean_square(stretch.d), stretch.filtered_power
+    errors, quietest = _error_powers(stretch, correlations, 0.0), ERROR_THAT_MATTERS * d_power
+    if n_taps is None:
+        learned = max(float(errors[-1]), quietest) * longest * filtered_power / (memory * d_power)  # q / (M P0)
+        reached = np.maximum(_error_powers(stretch, correlations, learned), quietest)
+        taps = _shortest(reached * (1 + np.arange(1, longest + 1) / memory))
+    else:
+        taps = longest
+    q = max(float(errors[taps - 1]), quietest)
+    lengthened = memory * np.sqrt(_burstiness(stretch.filtered, fs, memory))
+    initial_variance = d_power / (taps * filtered_power)
+    return SuggestedSettings(
+        n_taps=taps,
+        measurement_noise=q,
+        state_noise=float(q / (filtered_power * lengthened**2)),
+        initial_variance=initial_variance,
+        fs=fs,
+        reasons={
+            "n_taps": _why_length(errors, taps, d_power, n_taps, max_taps),
+            "measurement_noise": _why_noise(errors[taps - 1], taps, d_power, stretch.d.size / fs),
+            "state_noise": _why_memory(memory / fs, lengthened / fs, taps / lengthened),
+            "initial_variance": (
+                f"E[d^2] / (L E[x'^2]) with E[d^2] = {d_power:.3g} and E[x'^2] = {filtered_power:.3g}: independent "
+                "weights of this variance would make an anti-noise as strong as the disturbance"
+            ),
+        },
+    )
+
+
+def _longest(n_samples: int, n_path: int, n_taps: int | None, max_taps: int) -> int:
+    """Return the longest control filter to fit: the given one, or the longest that the record supports."""
+    max_taps = as_count(max_taps, "max_taps")
+    supported = (n_samples - n_path + 2) // (SAMPLES_PER_TAP + 1)  # for each tap 10 samples with full delay lines
+    wanted = 1 if n_taps is None else as_count(n_taps, "n_taps")
+    if supported < wanted:
+        needed = n_path - 2 + (SAMPLES_PER_TAP + 1) * wanted
+        raise ValueError(
+            f"reference must have at least {needed} samples for {wanted} control and {n_path} path taps, got {n_samples}; "
+            "record a longer silent run"
+        )
+    return min(max_taps, supported) if n_taps is None else wanted
+
+
+def _error_powers(stretch: Stretch, correlations: Correlations, ridge: float) -> np.ndarray:
+    """Return the error power of the best fixed filter of 1, 2, ... `n_taps` taps, corrected for what they fit by chance.
+
+    With a ridge, the error power includes ridge |w|^2. All lengths are fitted to the same samples, so each correlation
+    matrix is the first part of the largest, and its Cholesky factor too: one triangular system solves all lengths.
+    """
+    from scipy.linalg import cholesky, solve_triangular
+
+    n_taps, n_samples = stretch.n_taps, stretch.d.size
+    least = RANK_TOLERANCE * n_taps * stretch.filtered_power  # the trace bounds the largest eigenvalue
+    factor = cholesky(correlations.matrix(0.0, max(ridge, least)), lower=True)
+    explained = np.cumsum(solve_triangular(factor, correlations.cross, lower=True) ** 2)
+    left = np.maximum(mean_square(stretch.d) - explained, 0.0)
+    return left * n_samples / (n_samples - np.arange(1, n_taps + 1))
+
+
+def _shortest(costs: np.ndarray) -> int:
+    """Return the shortest length whose cost is nearly the least, rounded up."""
+    enough = int(np.argmax(costs <= costs.min() * 10 ** (GAIN_THAT_MATTERS_DB / 10))) + 1
+    return min(-(-enough // MULTIPLE) * MULTIPLE, costs.size)
+
+
+def _burstiness(filtered: np.ndarray, fs: float, memory: float) -> float:
+    """Return the mean square of the power over 10 ms, divided by that of the power over the memory; at least 1."""
+    block = max(round(BURST_S * fs), 1)
+    blocks = max(min(round(memory / block), filtered.size // block), 1)  # in a memory
+    whole = filtered[: filtered.size // (blocks * block) * blocks * block]
+    if not np.any(whole):
+        return 1.0
+    powers = np.mean(whole.reshape(-1, blocks, block) ** 2, axis=2)
+    return float(np.mean(powers**2) / np.mean(powers.mean(axis=1) ** 2))
+
+
+def _why_length(errors: np.ndarray, taps: int, d_power: float, n_taps: int | None, max_taps: int) -> str:
+    def reach(n: int) -> str:
+        return f"{max(reduction_db(errors[n - 1], d_power), 0.0):.1f} dB"
+
+    reached = f"the best fixed filter of this length reduces the noise by {reach(taps)}"
+    if n_taps is not None:
+        reason = f"as given; {reached}"
+    elif taps < errors.size:
+        reason = f"{reached}, and a longer one of up to {errors.size} taps gains less than {GAIN_THAT_MATTERS_DB:g} dB"
+    else:
+        limit = "max_taps allows" if errors.size == max_taps else "this record supports"
+        reason = f"as long as {limit}; {reached}, one of half the length by {reach(-(-taps // 2))}"
+    if errors[taps - 1] > LITTLE * d_power:
+        reason += "; if that is too little, see causality_margin and coherence_bound for the cause"
+    return reason
+
+
+def _why_noise(error_power: float, taps: int, d_power: float, record_s: float) -> str:
+    if error_power < ERROR_THAT_MATTERS * d_power:
+        level = -10 * np.log10(ERROR_THAT_MATTERS)
+        return f"{level:.0f} dB below the disturbance's power of {d_power:.3g}: a microphone is hardly ever quieter"
+    level = max(reduction_db(error_power, d_power), 0.0)
+    return (
+        f"the power that the best fixed filter of {taps} taps leaves in {record_s:.3g} s of the record, "
+        f"{level:.1f} dB below the disturbance's power of {d_power:.3g}"
+    )
+
+
+def _why_memory(memory_s: float, lengthened_s: float, taps_per_memory: float) -> str:
+    reason = f"the filter averages over {memory_s:.3g} s"
+    if lengthened_s > NOTABLY_LONGER * memory_s:
+        reason += f", lengthened to {lengthened_s:.3g} s because the noise comes in bursts"
+    return f"{reason}; that costs up to {10 * np.log10(1 + taps_per_memory):.2f} dB, and a shorter time follows faster"

@@ -1,0 +1,285 @@
+"""The suggested settings: each value against an independent computation, and how good they are in runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+
+import numpy as np
+import pytest
+import scipy.signal
+from helpers.settings_grid import FS, NOISES, ON, compare, made_paths, signals
+
+from kfopc_filterpy import (
+    bandpass_path,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    noise_reduction_db,
+    simulate,
+    suggest_settings,
+)
+from kfopc_filterpy.bounds import measurement_noise_from_run, settings
+from kfopc_filterpy.bounds.wiener import full_stretch
+from kfopc_filterpy.signals import bursty_noise, tone
+
+S = np.array([0.0, 0.0, 0.8, 0.3])
+
+
+def silent_run(delay=20, n=32000, q=0.01, seed=0):
+    """Return a white reference, and a disturbance that a control filter of about `delay` taps explains but for q."""
+    rng = np.random.default_rng(seed)
+    x = rng.standard_normal(n)
+    return x, np.convolve(x, np.concatenate([np.zeros(delay), S[2:]]))[:n] + np.sqrt(q) * rng.standard_normal(n)
+
+
+X, D = silent_run()
+
+
+# ---- Each value
+
+
+@pytest.mark.parametrize("delay", [5, 20, 60, 100])
+def test_the_length_is_that_of_the_true_filter(delay):
+    """w is one weight, `delay` - 2 samples late: only filters that reach it reduce the noise, longer ones gain nothing."""
+    x, d = silent_run(delay)
+    suggested = suggest_settings(x, d, S)
+    needed = delay - 2 + 1
+    assert needed <= suggested.n_taps < needed + settings.MULTIPLE
+    assert suggested.n_taps % settings.MULTIPLE == 0
+    assert suggested.measurement_noise == pytest.approx(0.01, rel=5 * np.sqrt(2 / 32000))
+
+
+@pytest.mark.parametrize("ridge", [0.0, 0.01])
+@pytest.mark.parametrize("pole", [0.0, 0.9], ids=["white", "coloured"])
+def test_the_error_powers_of_all_lengths_are_those_of_separate_least_squares_fits(pole, ridge):
+    x = scipy.signal.lfilter([1.0], [1.0, -pole], X[:4000])
+    d = np.convolve(x, 0.9 ** np.arange(30))[:4000] + D[:4000]
+    stretch = full_stretch(x, d, S, 40)
+    errors = settings._error_powers(stretch, stretch.correlations(), ridge)
+    rows = np.lib.stride_tricks.sliding_window_view(stretch.filtered, 40)[:, ::-1]
+    right = np.concatenate([stretch.d, np.zeros(40)])
+    for n in (1, 2, 7, 24, 40):
+        below = np.sqrt(ridge * len(rows)) * np.eye(40)[:, :n]  # the ridge as 40 samples more
+        left = np.concatenate([rows[:, :n], below])
+        residual = right - left @ np.linalg.lstsq(left, right)[0]
+        # without a ridge there is one of 1e-11, which float64 correlations need: it costs less than 1e-6
+        assert errors[n - 1] == pytest.approx(residual @ residual / (len(rows) - n), rel=1e-6)
+
+
+def long_tail():
+    """Return a noise of which each tap more explains a little."""
+    tail = np.convolve(X, np.concatenate([np.zeros(5), 0.97 ** np.arange(200)]))[: X.size]
+    return X, tail + 3.0 * np.random.default_rng(2).standard_normal(X.size)
+
+
+def test_the_noises_and_the_variance_are_those_of_the_formulas():
+    suggested = suggest_settings(X, D, S, n_taps=24, memory_s=0.5)
+    filtered = np.convolve(X, S)[: X.size]
+    q = measurement_noise_from_run(X, D, S, 24)
+    assert suggested.n_taps == 24
+    assert suggested.measurement_noise == pytest.approx(q, rel=1e-6)  # but for the ridge of 1e-11
+    # mean squares over the samples with full delay lines, or over all: 0.2 % of the record
+    assert suggested.initial_variance == pytest.approx(np.mean(D**2) / (24 * np.mean(filtered**2)), rel=0.01)
+    memory = np.sqrt(q / (suggested.state_noise * np.mean(filtered**2))) / FS
+    assert memory == pytest.approx(0.5, rel=0.02)  # white noise: its power over 10 ms varies by 160 samples' chance
+    assert memory > 0.5
+
+
+def test_a_longer_memory_means_less_state_noise_with_its_square():
+    one, two = (suggest_settings(X, D, S, n_taps=24, memory_s=memory) for memory in (0.25, 1.0))
+    assert one.state_noise / two.state_noise == pytest.approx(16.0, rel=0.01)
+    assert one.measurement_noise == two.measurement_noise
+
+
+def test_a_short_memory_makes_a_long_filter_not_worth_while():
+    """Weights that gain little each pay at a long memory, and cost more than they gain at a short one."""
+    lengths = [suggest_settings(*long_tail(), S, memory_s=memory).n_taps for memory in (0.02, 0.1, 10.0)]
+    assert lengths[0] < lengths[1] < lengths[2]
+
+
+def test_a_length_at_which_tones_need_huge_weights_is_passed_over():
+    """32 taps cancel four tones with weights that no filter learns within its memory."""
+    x = sum(tone(f, 2.0, fs=FS, phase_rad=f) for f in (120.0, 240.0, 480.0, 730.0))
+    d = np.concatenate([np.zeros(50), x])[: x.size] + 0.1 * np.random.default_rng(0).standard_normal(x.size)
+    x, d = x[2000:], d[2000:]
+    suggested, shorter = suggest_settings(x, d, S), suggest_settings(x, d, S, n_taps=32)
+    assert shorter.measurement_noise < 1.02 * suggested.measurement_noise  # 0.1 dB: long enough for a fixed filter
+    reached = [
+        noise_reduction_db(result.error, result.disturbance)
+        for given in (suggested, shorter)
+        for result in [simulate(kf_anc(given.n_taps, S, **given.settings), x, disturbance=d, secondary_path=S)]
+    ]
+    assert reached[0] > 22.5  # of 23 dB that the microphone's noise allows
+    assert reached[1] < 10.0
+
+
+def test_a_steady_noise_is_not_bursty_and_its_bursts_lengthen_the_memory():
+    """Bursts of a tenth of the time, with all of the power: the mean square of the power is ten times its square."""
+    fs, tenth = 1000.0, (np.arange(20000) // 20) % 10 == 0  # bursts of 20 ms each 200 ms
+    signal = np.where(tenth, 1.0, 0.0) * (-1.0) ** np.arange(20000)
+    assert settings._burstiness(np.ones(20000), fs, 200.0) == 1.0
+    assert settings._burstiness(signal, fs, 200.0) == pytest.approx(10.0)
+    assert settings._burstiness(signal, fs, 20.0) == pytest.approx(1.0)  # a memory as short as a burst follows it
+    assert settings._burstiness(np.zeros(100), fs, 20.0) == 1.0
+    assert settings._burstiness(signal[:15], fs, 200.0) == pytest.approx(1.0)  # a record of one block
+
+
+def test_all_follows_the_units():
+    """Volts or pascals: weights scale with d over x', so r and P0 with its square, q with d's."""
+    one, two = suggest_settings(X, D, S), suggest_settings(4.0 * X, 2.0 * D, 8.0 * S)
+    assert two.n_taps == one.n_taps
+    assert two.measurement_noise == pytest.approx(4 * one.measurement_noise, rel=1e-9)
+    for name in ("state_noise", "initial_variance"):
+        assert getattr(two, name) == pytest.approx(getattr(one, name) * (2 / 32) ** 2, rel=1e-9)
+
+
+def test_without_any_noise_of_a_microphone_q_is_60_db_down():
+    x, d = silent_run(q=0.0)
+    suggested = suggest_settings(x, d, S)
+    assert suggested.measurement_noise == pytest.approx(1e-6 * np.mean(d**2), rel=0.01)
+    assert "60 dB below" in suggested.reasons["measurement_noise"]
+    assert "60 dB" not in suggest_settings(X, D, S).reasons["measurement_noise"]
+
+
+def test_a_tone_needs_few_taps():
+    x = tone(300.0, 2.0, fs=FS)
+    d = 2.0 * tone(300.0, 2.0, fs=FS, phase_rad=1.0) + 0.1 * np.random.default_rng(0).standard_normal(x.size)
+    suggested = suggest_settings(x, d, S)
+    assert suggested.n_taps <= 16  # 2 taps are enough, with larger weights
+    assert suggested.measurement_noise == pytest.approx(0.01, rel=0.05)
+
+
+# ---- What it says
+
+
+def test_it_explains_each_value_with_its_figures():
+    suggested = suggest_settings(X, D, S)
+    values = {"n_taps": suggested.n_taps, **suggested.settings}
+    assert set(suggested.reasons) == set(values)
+    words = " ".join(f"{name} = {value:.3g} {suggested.reasons[name]}" for name, value in values.items())
+    assert str(suggested).split() == words.split()
+    assert max(map(len, str(suggested).splitlines())) <= 100
+    reduction = 10 * np.log10(np.mean(D**2) / suggested.measurement_noise)
+    assert f"by {reduction:.1f} dB" in suggested.reasons["n_taps"]
+    assert f"{reduction:.1f} dB below" in suggested.reasons["measurement_noise"]
+    assert "over 0.25 s; that costs up to 0.03 dB" in suggested.reasons["state_noise"]  # 10 log10(1 + 24 / 4000)
+    assert "n_taps=24" in repr(suggested)
+    assert "\n" not in repr(suggested)
+    assert pickle.loads(pickle.dumps(suggested)) == suggested
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        suggested.n_taps = 8
+
+
+def test_it_says_what_limits_the_length():
+    x, d = long_tail()
+    assert "as long as max_taps allows" in suggest_settings(x, d, S, max_taps=32).reasons["n_taps"]
+    short = suggest_settings(x[:400], d[:400], S)
+    assert "as long as this record supports" in short.reasons["n_taps"]
+    assert short.n_taps == (400 - S.size + 2) // 11
+    assert "as given" in suggest_settings(x, d, S, n_taps=64).reasons["n_taps"]
+    assert "gains less than 0.1 dB" in suggest_settings(X, D, S).reasons["n_taps"]
+
+
+def test_a_noise_that_cannot_be_controlled_is_called_so():
+    other = np.random.default_rng(9).standard_normal(X.size)
+    suggested = suggest_settings(X, other, S)
+    assert suggested.n_taps == settings.MULTIPLE
+    assert "causality_margin" in suggested.reasons["n_taps"]
+    assert "by 0.0 dB" in suggested.reasons["n_taps"]
+    assert "causality_margin" not in suggest_settings(X, D, S).reasons["n_taps"]
+
+
+def test_the_noise_in_bursts_is_called_so():
+    x = bursty_noise(2.0, fs=FS, rng=0)
+    d = np.convolve(x, np.eye(30)[25])[: x.size] + 0.01 * np.random.default_rng(0).standard_normal(x.size)
+    assert "because the noise comes in bursts" in suggest_settings(x, d, S).reasons["state_noise"]
+    assert "bursts" not in suggest_settings(X, D, S).reasons["state_noise"]
+
+
+# ---- What it refuses
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        ({"reference": X[:-1]}, ValueError, "disturbance must have 31999 values"),
+        ({"reference": np.zeros(X.size)}, ValueError, "must not be silent"),
+        ({"disturbance": np.zeros(X.size)}, ValueError, "disturbance must not be silent"),
+        ({"disturbance": np.where(X > 2, np.nan, D)}, ValueError, "disturbance must be finite"),
+        ({"reference": np.stack([X, X])}, ValueError, "reference must be one-dimensional"),
+        ({"secondary_path": np.zeros((2, 2, 4))}, ValueError, "secondary_path must be one-dimensional"),
+        ({"secondary_path": bandpass_path(32, fs=12000.0)}, ValueError, "sampled at 12000 Hz but fs is 16000 Hz"),
+        ({"fs": 0.0}, ValueError, "fs must be greater than 0"),
+        ({"memory_s": -1.0}, ValueError, "memory_s must be greater than 0"),
+        ({"n_taps": 0}, ValueError, "n_taps must be at least 1"),
+        ({"n_taps": 2.5}, TypeError, "n_taps must be a whole number"),
+        ({"max_taps": 0}, ValueError, "max_taps must be at least 1"),
+        ({"n_taps": 2909}, ValueError, "at least 32001 samples for 2909 control and 4 path taps, got 32000; record"),
+        ({"reference": X[:12], "disturbance": D[:12]}, ValueError, "at least 13 samples for 1 control"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_it_refuses(change, kind, message):
+    with pytest.raises(kind, match=message):
+        suggest_settings(**{"reference": X, "disturbance": D, "secondary_path": S} | change)
+
+
+def test_the_shortest_record_and_the_longest_filter_that_it_supports():
+    assert suggest_settings(X[:13], D[:13], S).n_taps == 1
+    assert suggest_settings(X[:332], D[:332], S, n_taps=30).n_taps == 30
+
+
+@pytest.mark.parametrize("make", [kf_anc, lambda *a, **k: kf_opc(*a, rated_power=1.0, **k)], ids=["KF-ANC", "KF-OPC"])
+@pytest.mark.parametrize("given", [{}, {"state_noise": 1e-9}, {"measurement_noise": 0.1}], ids=["none", "r", "q"])
+def test_controllers_without_the_noises_point_to_it(make, given):
+    with pytest.raises(
+        TypeError, match=r"^give state_noise and measurement_noise; for one channel, suggest_settings\("
+    ):
+        make(8, S, **given)
+
+
+def test_kf_pb_without_the_noises_points_to_it():
+    with pytest.raises(TypeError, match=r"or form='shared gain', which does not need them; .* suggest_settings\("):
+        kf_pb(8, S, rated_power=1.0)
+
+
+# ---- How good they are: within 0.5 dB of the best of a grid over length and state noise
+
+
+@pytest.mark.parametrize(
+    ("path", "noise"),
+    [
+        ("band-pass", "white"),
+        ("band-pass", "tone"),
+        ("band-pass", "bursts"),
+        ("duct", "band noise"),
+        ("duct", "compressor"),
+    ],
+)
+def test_no_setting_of_a_grid_is_better_by_half_a_decibel(path, noise):
+    """`python tests/helpers/settings_grid.py` tries all cases and longer filters."""
+    primary, s = made_paths()[path]
+    found = compare(primary, s, NOISES[noise], duration=2.0, lengths=(64, 128), factors=(0.01, 1.0, 100.0))
+    assert np.all(found.own > found.best - 0.5), f"{found.own} against {found.best}"
+    assert np.all(found.own[0] > 5.0)  # there is something to lose
+
+
+def test_a_large_initial_variance_diverges_where_the_suggested_one_does_not():
+    """The path estimate is wrong by 10 % of its energy's root: weak directions with a large variance follow the error."""
+    primary, s = made_paths()["band-pass"]
+    x, d, std = signals(primary, NOISES["band noise"], 1, 1.75)
+    wrong = np.random.default_rng(3).standard_normal(s.size)
+    estimate = s + 0.1 * np.linalg.norm(s) / np.linalg.norm(wrong) * wrong
+    suggested = suggest_settings(x[ON:], d[ON:] + std * np.random.default_rng(5).standard_normal(d.size - ON), s)
+    reached = {}
+    for factor in (1.0, 1e4):
+        given = suggested.settings | {"initial_variance": factor * suggested.initial_variance}
+        result = simulate(
+            kf_anc(suggested.n_taps, estimate, **given), x, disturbance=d, secondary_path=s, fs=FS,
+            sensor_noise_std=std, rng=6, switch_on_s=ON / FS,
+        )  # fmt: skip
+        diverged = result.diverged_at_s is not None
+        reached[factor] = -np.inf if diverged else noise_reduction_db(result.error, result.disturbance)
+    assert reached[1.0] > 35.0
+    assert reached[1e4] < 0.0
