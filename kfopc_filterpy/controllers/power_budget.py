@@ -172,7 +172,8 @@ def kf_pb(
     state_noise, measurement_noise, initial_variance, dtype
         As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
-        As for `kf_anc`.
+        As for `kf_anc`. The direct form for one channel asks for no more power than pays behind its limiter (see
+        `PowerBudget`).
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths

@@ -15,8 +15,9 @@ from .._validate import as_count, as_number, as_positive, as_signal
 from ..kernels.compiling import compiled, part
 from ..kernels.delay_lines import delay_line, newest, push
 from ..kernels.records import new_record
-from ..kernels.vectors import FAST, add_scaled
+from ..kernels.vectors import FAST, add_scaled, dot
 from .allocation import constrained_filter
+from .ceiling import balance_of_power
 from .constraint import DEFAULT_FS, SILENCE
 
 DEFAULT_CORRELATION_MEMORY_S = 1.25
@@ -30,6 +31,13 @@ LARGEST_CHANCE_S = 0.5
 UNSPENT_S = 4.0  # memory of the share of the rated power that was spent
 UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # an unspent share raises the target by ten times itself, 30 % at most
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
+LIMITER_MEMORY_S = 1.0  # memory of what a limiter took
+CEILING_S, CEILING_RATE = (
+    10.0,
+    2.0,
+)  # the ceiling moves by the factor exp(2 dt / T) at most, T = 10 s or the time so far
+SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
+LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
 INTERVAL = 128  # samples between two solutions; fewer at the start
 STEADY = 6.0  # a trend counts if it is larger than sqrt(STEADY) times its standard error
 SHORTEST_PART = 0.25  # of a segment: a shorter part is ignored
@@ -207,6 +215,8 @@ def _power(budget, j):
 def target_power(budget, forecast):
     """Return the power to solve for: the rated one, corrected by the account, over the forecast change of level.
 
+    A limiter that acts sets a ceiling, which holds whatever credit the account has.
+
     Repayment of debt starts at once, but is slower the larger `chance` is. Credit of up to half of `chance` is left to
     even out by itself: to react to chance would cost noise reduction.
     """
@@ -214,7 +224,7 @@ def target_power(budget, forecast):
     account, chance = numbers.account, numbers.chance
     excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
     share = unspent(numbers) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
-    return numbers.rated_power * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
+    return numbers.rated_power * min(max(share, TARGET_LEAST), numbers.ceiling) / forecast
 
 
 @part()
@@ -236,10 +246,51 @@ def allocate(budget, w):
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
-    power = target_power(budget, level_forecast(budget, of_xf[0]))
+    forecast = level_forecast(budget, of_xf[0])
+    power = target_power(budget, forecast)
     budget.numbers[0].weight = constrained_filter(
         of_x, of_xf, w, power, budget.numbers[0].weight, budget.control_filter
     )
+    if budget.numbers[0].limited > 0.0:
+        move_ceiling(budget, of_x, of_xf, forecast)
+        budget.numbers[0].acts = False
+
+
+@part()
+def hear_limiter(budget, y):
+    """Add the newest sample to the means of what a limiter left as it was, and of what it took (see `ceiling`)."""
+    numbers, v = budget.numbers[0], budget.control_filter
+    amplitude = math.sqrt(numbers.rated_power)
+    asked = min(max(dot(v, newest(budget.reference, v.size)) / amplitude, -LOUDEST), LOUDEST)
+    played = min(max(y / amplitude, -LOUDEST), LOUDEST)
+    passed, limited = asked * asked, 0.0
+    if abs(asked - played) > SAME:
+        passed, limited, numbers.acts = 0.0, played * (asked - played), True
+    share = 1.0 / min(numbers.taken + 1.0, LIMITER_MEMORY_S * numbers.fs + 1.0)
+    numbers.passed += share * (passed - numbers.passed)
+    numbers.limited += share * (limited - numbers.limited)
+
+
+@part()
+def move_ceiling(budget, of_x, of_xf, forecast):
+    """Move the ceiling to where the limiter takes as much from the noise reduction as more power would add.
+
+    It moves fast at the start and then slowly, so that single bursts do not move it. It falls from the power in use,
+    because a ceiling above that has no effect. If the whole estimate fits, it falls only if the limiter acts now: what
+    the limiter took from a louder noise says nothing about a quiet one.
+    """
+    numbers = budget.numbers[0]
+    balance, power = balance_of_power(
+        of_x, of_xf, numbers.weight, budget.control_filter, numbers.passed, numbers.limited
+    )
+    if not abs(balance) <= 1.0:
+        return
+    if balance < 0.0:
+        if numbers.weight == 0.0 and not numbers.acts:
+            return
+        numbers.ceiling = min(numbers.ceiling, power * forecast / numbers.rated_power)
+    step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, CEILING_S * numbers.fs)
+    numbers.ceiling = min(max(numbers.ceiling * math.exp(step), TARGET_LEAST), TARGET_MOST)
 
 
 @part()
@@ -247,6 +298,7 @@ def advance_budget(budget, w, x, xf, y):
     """Process a sample of reference, filtered reference and emitted control signal; solve again if it is due."""
     numbers = budget.numbers[0]
     take_correlations(budget, x, xf)
+    hear_limiter(budget, y)
     spent = numbers.account + (y * y / numbers.rated_power - 1.0) / numbers.fs
     numbers.account = min(max(spent, -numbers.credit - numbers.chance), DEBT_S)
     if numbers.weight > 0.0:
@@ -255,7 +307,7 @@ def advance_budget(budget, w, x, xf, y):
     numbers.waited += 1.0
     # At the start the estimate grows fast, so the interval is an eighth of the time so far.
     if numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
-        numbers.waited = 0.0
+        numbers.interval, numbers.waited = numbers.waited, 0.0
         allocate(budget, w)
 
 
@@ -306,6 +358,10 @@ class PowerBudget:
       level give to the account within a second. It enlarges the credit that can be saved, and credit up to half of it
       is left to even out. If more power than chance explains was left unspent over some four seconds, although it could
       have been used, the target rises by up to 30 %.
+
+    A limiter behind the budget (`control_signal` of `advance` differs from the budget's own) sets a ceiling to the
+    target. At the ceiling, more power would lower the error in samples that pass the limiter by as much as it would raise
+    it in the others (see `power.ceiling`). The ceiling is found within seconds and then changes slowly.
 
     Parameters
     ----------
@@ -379,10 +435,15 @@ class PowerBudget:
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
                 waited=0.0,  # of these, since the last solution
+                interval=0.0,  # and between the last two
                 account=0.0,  # seconds of rated power spent beyond the rated power
                 weight=0.0,  # lambda
                 span=USUAL,  # segments in the window
                 chance=0.0,  # seconds of rated power: std that the scatter of levels gives the account in a second
+                ceiling=TARGET_MOST,  # of the target over the rated power, behind a limiter
+                passed=0.0,  # recent mean, over the rated power, of what a limiter left as it was
+                limited=0.0,  # the same, of y (u - y) for what it changed from u to y
+                acts=False,  # whether it changed anything since the last solution
                 spent=1.0,  # recent mean share of the rated power spent while the noise needed all of it
             ),
         )
@@ -415,6 +476,11 @@ class PowerBudget:
     def power_weight(self) -> float:
         """Weight lambda of the control power; 0: the estimate fits the budget as it is, Inf: it was scaled to fit."""
         return float(self._state.numbers["weight"][0])
+
+    @property
+    def ceiling(self) -> float:
+        """Largest target power over the rated power that pays behind a limiter; 3 if none ever acts."""
+        return float(self._state.numbers["ceiling"][0])
 
     @property
     def account_s(self) -> float:
