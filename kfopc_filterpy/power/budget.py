@@ -22,20 +22,18 @@ from .constraint import DEFAULT_FS, SILENCE
 
 DEFAULT_CORRELATION_MEMORY_S = 1.25
 DEFAULT_CREDIT_S = 0.1
+DEFAULT_AVERAGING_S = 10.0
 SHORT, USUAL, LONG = 6, 10, 24  # complete segments in a window; one more is being filled
 AGREEMENT = 1.0  # levels differ if their squared difference exceeds this multiple of the sum of their variances
-DEBT_S = 1.0  # seconds of rated power; more debt is forgotten, so that no burst can wind up the account
 REPAYMENT = 3.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account / (1 + PATIENCE chance))
 PATIENCE = 6.0  # 1/s: repayment is slower if much of the account is due to chance
 LARGEST_CHANCE_S = 0.5
-UNSPENT_S = 4.0  # memory of the share of the rated power that was spent
+UNSPENT = 0.4  # of the averaging time: memory of the share of the rated power that was spent
 UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # an unspent share raises the target by ten times itself, 30 % at most
+PACE = 0.5  # of the rated power at most repays a debt, more only if the debt exceeds a quarter of the averaging time
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
 LIMITER_MEMORY_S = 1.0  # memory of what a limiter took
-CEILING_S, CEILING_RATE = (
-    10.0,
-    2.0,
-)  # the ceiling moves by the factor exp(2 dt / T) at most, T = 10 s or the time so far
+CEILING_RATE = 2.0  # the ceiling moves by exp(2 dt / T) at most, with T = averaging time, or the time so far if shorter
 SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
 LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
 INTERVAL = 128  # samples between two solutions; fewer at the start
@@ -217,14 +215,16 @@ def target_power(budget, forecast):
 
     A limiter that acts sets a ceiling, which holds whatever credit the account has.
 
-    Repayment of debt starts at once, but is slower the larger `chance` is. Credit of up to half of `chance` is left to
+    Repayment of debt starts at once, but is slower the larger `chance` is. The error is convex in the power, so a large
+    debt costs least if it is repaid evenly, in what is left of the averaging time. Credit of up to half of `chance` is left to
     even out by itself: to react to chance would cost noise reduction.
     """
     numbers = budget.numbers[0]
     account, chance = numbers.account, numbers.chance
     excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
     share = unspent(numbers) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
-    return numbers.rated_power * min(max(share, TARGET_LEAST), numbers.ceiling) / forecast
+    repaid = max(PACE, 2.0 * account / numbers.averaging)
+    return numbers.rated_power * min(max(share, 1.0 - repaid, TARGET_LEAST), numbers.ceiling) / forecast
 
 
 @part()
@@ -234,7 +234,7 @@ def unspent(numbers):
     The account loses credit that could not be spent in time. A noise that swells loses a part of the power at each
     swell, since falls of the level are followed slowly. How large a part is measured from the noise's own past.
     """
-    left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT_S)
+    left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT * numbers.averaging)
     return min(1.0 + UNSPENT_GAIN * max(left, 0.0), UNSPENT_MOST)
 
 
@@ -289,7 +289,7 @@ def move_ceiling(budget, of_x, of_xf, forecast):
         if numbers.weight == 0.0 and not numbers.acts:
             return
         numbers.ceiling = min(numbers.ceiling, power * forecast / numbers.rated_power)
-    step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, CEILING_S * numbers.fs)
+    step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, numbers.averaging * numbers.fs)
     numbers.ceiling = min(max(numbers.ceiling * math.exp(step), TARGET_LEAST), TARGET_MOST)
 
 
@@ -300,9 +300,9 @@ def advance_budget(budget, w, x, xf, y):
     take_correlations(budget, x, xf)
     hear_limiter(budget, y)
     spent = numbers.account + (y * y / numbers.rated_power - 1.0) / numbers.fs
-    numbers.account = min(max(spent, -numbers.credit - numbers.chance), DEBT_S)
+    numbers.account = min(max(spent, -numbers.credit - numbers.chance), numbers.averaging)
     if numbers.weight > 0.0:
-        numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT_S * numbers.fs)
+        numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT * numbers.averaging * numbers.fs)
     numbers.taken += 1.0
     numbers.waited += 1.0
     # At the start the estimate grows fast, so the interval is an eighth of the time so far.
@@ -353,10 +353,11 @@ class PowerBudget:
     - a forecast of the level. If a straight line through the logarithm of the power differs significantly from a
       constant, its present value replaces the mean of the window;
     - an account of the power spent beyond the rated power, in seconds of rated power. The target is the rated power
-      times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending, up
-      to a second of rated power. `chance` is the standard deviation, in seconds, that random changes of the noise's
+      times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending. A
+      large debt is repaid evenly within the averaging time, because the error is convex in the power: with half of the
+      rated power, or more if the debt exceeds a quarter of the averaging time, up to 90 %. `chance` is the standard deviation, in seconds, that random changes of the noise's
       level give to the account within a second. It enlarges the credit that can be saved, and credit up to half of it
-      is left to even out. If more power than chance explains was left unspent over some four seconds, although it could
+      is left to even out. If more power than chance explains was left unspent over some 0.4 averaging times, although it could
       have been used, the target rises by up to 30 %.
 
     A limiter behind the budget (`control_signal` of `advance` differs from the budget's own) sets a ceiling to the
@@ -376,6 +377,9 @@ class PowerBudget:
         times as long, a long one 2.4 times.
     credit_s : float, default 0.1
         Seconds of rated power that can be saved while the noise needs less.
+    averaging_s : float, default 10
+        Time in seconds over which the mean power is kept to the rated one, also when the noise gets louder at once.
+        Larger debts than this many seconds of rated power are forgotten.
 
     Raises
     ------
@@ -414,12 +418,14 @@ class PowerBudget:
         fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         credit_s: float = DEFAULT_CREDIT_S,
+        averaging_s: float = DEFAULT_AVERAGING_S,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
         rated_power = as_positive(rated_power, "rated_power")
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
+        self.averaging_s = as_positive(averaging_s, "averaging_s", unit="s")
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(n_taps),
@@ -431,6 +437,7 @@ class PowerBudget:
                 rated_power=rated_power,
                 fs=self.fs,
                 credit=self.credit_s,
+                averaging=self.averaging_s,
                 segment=float(max(round(self.memory_s * self.fs / USUAL), n_taps)),  # samples
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
