@@ -177,7 +177,8 @@ def kf_pb(
     state_noise, measurement_noise, initial_variance, dtype
         As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
-        As for `kf_anc`.
+        As for `kf_anc`. The direct form for one channel asks for no more power than pays behind its limiter (see
+        `PowerBudget`).
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
         How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default half a
         sample of delay. The control filter is weaker where the path is less certain, and zero where the error may
@@ -188,8 +189,8 @@ def kf_pb(
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
         (`FrequencyDomainKalman`). By default direct for one channel, shared gain for several.
     **settings
-        Further settings. The direct form takes `fs`, `memory_s` and `credit_s` for one channel (see `PowerBudget`),
-        `fs` and `memory_s` for several (see `DirectPowerBudget`). For the other forms, see their classes.
+        Further settings. The direct form takes `fs`, `memory_s`, `credit_s` and `averaging_s` for one channel (see
+        `PowerBudget`), `fs` and `memory_s` for several (see `DirectPowerBudget`). For the other forms, see their classes.
 
     Returns
     -------

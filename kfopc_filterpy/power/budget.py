@@ -15,21 +15,27 @@ from .._validate import as_count, as_number, as_positive, as_signal
 from ..kernels.compiling import compiled, part
 from ..kernels.delay_lines import delay_line, newest, push
 from ..kernels.records import new_record
-from ..kernels.vectors import FAST, add_scaled
+from ..kernels.vectors import FAST, add_scaled, dot
 from .allocation import constrained_filter, guarded
+from .ceiling import balance_of_power
 from .constraint import DEFAULT_FS, SILENCE
 
 DEFAULT_CORRELATION_MEMORY_S = 1.25
 DEFAULT_CREDIT_S = 0.1
+DEFAULT_AVERAGING_S = 10.0
 SHORT, USUAL, LONG = 6, 10, 24  # complete segments in a window; one more is being filled
 AGREEMENT = 1.0  # levels differ if their squared difference exceeds this multiple of the sum of their variances
-DEBT_S = 1.0  # seconds of rated power; more debt is forgotten, so that no burst can wind up the account
 REPAYMENT = 3.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account / (1 + PATIENCE chance))
 PATIENCE = 6.0  # 1/s: repayment is slower if much of the account is due to chance
 LARGEST_CHANCE_S = 0.5
-UNSPENT_S = 4.0  # memory of the share of the rated power that was spent
+UNSPENT = 0.4  # of the averaging time: memory of the share of the rated power that was spent
 UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # an unspent share raises the target by ten times itself, 30 % at most
+PACE = 0.5  # of the rated power at most repays a debt, more only if the debt exceeds a quarter of the averaging time
 TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
+LIMITER_MEMORY_S = 1.0  # memory of what a limiter took
+CEILING_RATE = 2.0  # the ceiling moves by exp(2 dt / T) at most, with T = averaging time, or the time so far if shorter
+SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
+LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
 INTERVAL = 128  # samples between two solutions; fewer at the start
 STEADY = 6.0  # a trend counts if it is larger than sqrt(STEADY) times its standard error
 SHORTEST_PART = 0.25  # of a segment: a shorter part is ignored
@@ -208,14 +214,18 @@ def _power(budget, j):
 def target_power(budget, forecast):
     """Return the power to solve for: the rated one, corrected by the account, over the forecast change of level.
 
-    Repayment of debt starts at once, but is slower the larger `chance` is. Credit of up to half of `chance` is left to
+    A limiter that acts sets a ceiling, which holds whatever credit the account has.
+
+    Repayment of debt starts at once, but is slower the larger `chance` is. The error is convex in the power, so a large
+    debt costs least if it is repaid evenly, in what is left of the averaging time. Credit of up to half of `chance` is left to
     even out by itself: to react to chance would cost noise reduction.
     """
     numbers = budget.numbers[0]
     account, chance = numbers.account, numbers.chance
     excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
     share = unspent(numbers) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
-    return numbers.rated_power * min(max(share, TARGET_LEAST), TARGET_MOST) / forecast
+    repaid = max(PACE, 2.0 * account / numbers.averaging)
+    return numbers.rated_power * min(max(share, 1.0 - repaid, TARGET_LEAST), numbers.ceiling) / forecast
 
 
 @part()
@@ -225,7 +235,7 @@ def unspent(numbers):
     The account loses credit that could not be spent in time. A noise that swells loses a part of the power at each
     swell, since falls of the level are followed slowly. How large a part is measured from the noise's own past.
     """
-    left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT_S)
+    left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT * numbers.averaging)
     return min(1.0 + UNSPENT_GAIN * max(left, 0.0), UNSPENT_MOST)
 
 
@@ -238,12 +248,53 @@ def allocate(budget, w):
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
-    power = target_power(budget, level_forecast(budget, of_xf[0]))
+    forecast = level_forecast(budget, of_xf[0])
+    power = target_power(budget, forecast)
     if lags > L:
         of_xf, w = guarded(of_xf, budget.guard, w)
     budget.numbers[0].weight = constrained_filter(
         of_x[:L], of_xf, w, power, budget.numbers[0].weight, budget.control_filter
     )
+    if budget.numbers[0].limited > 0.0:
+        move_ceiling(budget, of_x[:L], of_xf, forecast)
+        budget.numbers[0].acts = False
+
+
+@part()
+def hear_limiter(budget, y):
+    """Add the newest sample to the means of what a limiter left as it was, and of what it took (see `ceiling`)."""
+    numbers, v = budget.numbers[0], budget.control_filter
+    amplitude = math.sqrt(numbers.rated_power)
+    asked = min(max(dot(v, newest(budget.reference, v.size)) / amplitude, -LOUDEST), LOUDEST)
+    played = min(max(y / amplitude, -LOUDEST), LOUDEST)
+    passed, limited = asked * asked, 0.0
+    if abs(asked - played) > SAME:
+        passed, limited, numbers.acts = 0.0, played * (asked - played), True
+    share = 1.0 / min(numbers.taken + 1.0, LIMITER_MEMORY_S * numbers.fs + 1.0)
+    numbers.passed += share * (passed - numbers.passed)
+    numbers.limited += share * (limited - numbers.limited)
+
+
+@part()
+def move_ceiling(budget, of_x, of_xf, forecast):
+    """Move the ceiling to where the limiter takes as much from the noise reduction as more power would add.
+
+    It moves fast at the start and then slowly, so that single bursts do not move it. It falls from the power in use,
+    because a ceiling above that has no effect. If the whole estimate fits, it falls only if the limiter acts now: what
+    the limiter took from a louder noise says nothing about a quiet one.
+    """
+    numbers = budget.numbers[0]
+    balance, power = balance_of_power(
+        of_x, of_xf, numbers.weight, budget.control_filter, numbers.passed, numbers.limited
+    )
+    if not abs(balance) <= 1.0:
+        return
+    if balance < 0.0:
+        if numbers.weight == 0.0 and not numbers.acts:
+            return
+        numbers.ceiling = min(numbers.ceiling, power * forecast / numbers.rated_power)
+    step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, numbers.averaging * numbers.fs)
+    numbers.ceiling = min(max(numbers.ceiling * math.exp(step), TARGET_LEAST), TARGET_MOST)
 
 
 @part()
@@ -251,15 +302,16 @@ def advance_budget(budget, w, x, xf, y):
     """Process a sample of reference, filtered reference and emitted control signal; solve again if it is due."""
     numbers = budget.numbers[0]
     take_correlations(budget, x, xf)
+    hear_limiter(budget, y)
     spent = numbers.account + (y * y / numbers.rated_power - 1.0) / numbers.fs
-    numbers.account = min(max(spent, -numbers.credit - numbers.chance), DEBT_S)
+    numbers.account = min(max(spent, -numbers.credit - numbers.chance), numbers.averaging)
     if numbers.weight > 0.0:
-        numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT_S * numbers.fs)
+        numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT * numbers.averaging * numbers.fs)
     numbers.taken += 1.0
     numbers.waited += 1.0
     # At the start the estimate grows fast, so the interval is an eighth of the time so far.
     if numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
-        numbers.waited = 0.0
+        numbers.interval, numbers.waited = numbers.waited, 0.0
         allocate(budget, w)
 
 
@@ -313,11 +365,16 @@ class PowerBudget:
     - a forecast of the level. If a straight line through the logarithm of the power differs significantly from a
       constant, its present value replaces the mean of the window;
     - an account of the power spent beyond the rated power, in seconds of rated power. The target is the rated power
-      times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending, up
-      to a second of rated power. `chance` is the standard deviation, in seconds, that random changes of the noise's
+      times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending. A
+      large debt is repaid evenly within the averaging time, because the error is convex in the power: with half of the
+      rated power, or more if the debt exceeds a quarter of the averaging time, up to 90 %. `chance` is the standard deviation, in seconds, that random changes of the noise's
       level give to the account within a second. It enlarges the credit that can be saved, and credit up to half of it
-      is left to even out. If more power than chance explains was left unspent over some four seconds, although it could
+      is left to even out. If more power than chance explains was left unspent over some 0.4 averaging times, although it could
       have been used, the target rises by up to 30 %.
+
+    A limiter behind the budget (`control_signal` of `advance` differs from the budget's own) sets a ceiling to the
+    target. At the ceiling, more power would lower the error in samples that pass the limiter by as much as it would raise
+    it in the others (see `power.ceiling`). The ceiling is found within seconds and then changes slowly.
 
     Parameters
     ----------
@@ -332,6 +389,9 @@ class PowerBudget:
         times as long, a long one 2.4 times.
     credit_s : float, default 0.1
         Seconds of rated power that can be saved while the noise needs less.
+    averaging_s : float, default 10
+        Time in seconds over which the mean power is kept to the rated one, also when the noise gets louder at once.
+        Larger debts than this many seconds of rated power are forgotten.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
@@ -373,6 +433,7 @@ class PowerBudget:
         fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         credit_s: float = DEFAULT_CREDIT_S,
+        averaging_s: float = DEFAULT_AVERAGING_S,
         guard: Any = None,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
@@ -382,6 +443,7 @@ class PowerBudget:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.credit_s = as_positive(credit_s, "credit_s", unit="s")
+        self.averaging_s = as_positive(averaging_s, "averaging_s", unit="s")
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(lags),
@@ -394,14 +456,20 @@ class PowerBudget:
                 rated_power=rated_power,
                 fs=self.fs,
                 credit=self.credit_s,
+                averaging=self.averaging_s,
                 segment=float(max(round(self.memory_s * self.fs / USUAL), lags)),  # samples
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
                 waited=0.0,  # of these, since the last solution
+                interval=0.0,  # and between the last two
                 account=0.0,  # seconds of rated power spent beyond the rated power
                 weight=0.0,  # lambda
                 span=USUAL,  # segments in the window
                 chance=0.0,  # seconds of rated power: std that the scatter of levels gives the account in a second
+                ceiling=TARGET_MOST,  # of the target over the rated power, behind a limiter
+                passed=0.0,  # recent mean, over the rated power, of what a limiter left as it was
+                limited=0.0,  # the same, of y (u - y) for what it changed from u to y
+                acts=False,  # whether it changed anything since the last solution
                 spent=1.0,  # recent mean share of the rated power spent while the noise needed all of it
             ),
         )
@@ -434,6 +502,11 @@ class PowerBudget:
     def power_weight(self) -> float:
         """Weight lambda of the control power; 0: the estimate fits the budget as it is, Inf: it was scaled to fit."""
         return float(self._state.numbers["weight"][0])
+
+    @property
+    def ceiling(self) -> float:
+        """Largest target power over the rated power that pays behind a limiter; 3 if none ever acts."""
+        return float(self._state.numbers["ceiling"][0])
 
     @property
     def account_s(self) -> float:

@@ -24,13 +24,14 @@ from kfopc_filterpy.power import PowerBudget
 from kfopc_filterpy.power.allocation import POWER_TOLERANCE, RIDGE
 from kfopc_filterpy.power.budget import (
     AGREEMENT,
-    DEBT_S,
+    DEFAULT_AVERAGING_S,
     DEFAULT_CREDIT_S,
     FORECAST_LEAST,
     FORECAST_MOST,
     INTERVAL,
     LARGEST_CHANCE_S,
     LONG,
+    PACE,
     PATIENCE,
     REPAYMENT,
     SHORT,
@@ -423,10 +424,12 @@ def test_a_burst_is_averaged_and_silence_foretells_nothing() -> None:
 
 # ---- The account and the target
 
+DEBT_S = 1.0  # the most that is remembered: an averaging time of 1 s
+
 
 def test_the_account_is_what_was_spent_beyond_what_was_due() -> None:
     """In seconds of rated power, to the bit; a rated power assigned counts from there on. Nothing is left to chance."""
-    budget = PowerBudget(2, 0.7, fs=50.0, credit_s=0.4)
+    budget = PowerBudget(2, 0.7, fs=50.0, credit_s=0.4, averaging_s=DEBT_S)
     rng, account, clipped = np.random.default_rng(7), 0.0, set()
     for n, y in enumerate(rng.standard_normal(600) * np.repeat([0.5, 4.0, 0.1], 200)):
         if n == 100:
@@ -455,7 +458,7 @@ def solutions(n: int) -> list[int]:
 
 def test_chance_adds_to_the_credit_and_not_to_the_debt() -> None:
     """As it was at the last solution; where it shrinks, what was saved beyond it is lost."""
-    budget = PowerBudget(1, 0.7, fs=80.0, credit_s=0.05)  # segments of ten samples
+    budget = PowerBudget(1, 0.7, fs=80.0, credit_s=0.05, averaging_s=DEBT_S)  # segments of ten samples
     rng, account, chance, limits = np.random.default_rng(12), 0.0, 0.0, []
     xf = np.repeat(10 ** (np.repeat([0.0, 0.25, 1.0, 0.0], 15) * rng.standard_normal(60)), 10)
     xf *= rng.standard_normal(600)
@@ -488,7 +491,8 @@ def test_the_target_repays_what_the_account_holds(spent: float, rated_power: flo
     """Of a single sample nothing is chance."""
     budget = PowerBudget(1, rated_power, fs=1.0, credit_s=2.0)
     budget.advance(1.0, 1.0, [1.0], control_signal=math.sqrt(max(spent + 1.0, 0.0) * rated_power))
-    share = np.clip(math.exp(-3.0 * budget.account_s), TARGET_LEAST, TARGET_MOST)
+    least = max(TARGET_LEAST, 1.0 - max(0.5, 2.0 * budget.account_s / 10.0))
+    share = np.clip(math.exp(-3.0 * budget.account_s), least, TARGET_MOST)
     assert target_power(budget.state, forecast) == pytest.approx(rated_power * share / forecast, rel=1e-12)
 
 
@@ -546,7 +550,7 @@ def target(account: float, chance: float, forecast: float = 1.0, rated_power: fl
 
 
 @given(
-    account=st.floats(-(DEFAULT_CREDIT_S + LARGEST_CHANCE_S), DEBT_S),
+    account=st.floats(-(DEFAULT_CREDIT_S + LARGEST_CHANCE_S), DEFAULT_AVERAGING_S),
     chance=st.floats(0.0, LARGEST_CHANCE_S),
     rated_power=st.floats(1e-6, 1e6),
     forecast=st.floats(FORECAST_LEAST, FORECAST_MOST),
@@ -556,7 +560,8 @@ def test_the_target_is_patient_with_what_chance_makes(
 ) -> None:
     beyond = 0.0 if -account <= chance / 2 else account + chance / 2
     excess = account if account >= 0.0 else beyond
-    share = np.clip(np.exp(-REPAYMENT * excess / (1 + PATIENCE * chance)), TARGET_LEAST, TARGET_MOST)
+    least = max(TARGET_LEAST, 1.0 - max(PACE, 2.0 * account / DEFAULT_AVERAGING_S))
+    share = np.clip(np.exp(-REPAYMENT * excess / (1 + PATIENCE * chance)), least, TARGET_MOST)
     got = target(account, chance, forecast, rated_power)
     assert got == pytest.approx(rated_power * share / forecast, rel=1e-12)
 
@@ -564,14 +569,16 @@ def test_the_target_is_patient_with_what_chance_makes(
 def test_debt_is_repaid_at_once_and_credit_spent_beyond_half_of_chance() -> None:
     assert target(0.0, 0.0) == target(0.0, 0.4) == 1.0
     assert target(0.01, 0.2) == pytest.approx(math.exp(-0.03 / 2.2), rel=1e-12)  # however little
-    assert target(0.4, 0.0) == pytest.approx(math.exp(-1.2), rel=1e-12)
+    assert target(0.2, 0.0) == pytest.approx(math.exp(-0.6), rel=1e-12)
     assert target(0.4, 0.5) == pytest.approx(math.exp(-0.3), rel=1e-12)  # four times as patiently
     assert target(-0.05, 0.0) == pytest.approx(math.exp(0.15), rel=1e-12)
     assert target(-0.05, 0.2) == target(-0.1, 0.2) == 1.0
     assert target(-0.3, 0.2) == pytest.approx(math.exp(0.6 / 2.2), rel=1e-12)
-    assert target(1.0, 0.0) == 0.1  # exp(-3) is less
+    assert target(1.0, 0.0) == target(2.4, 0.0) == 0.5  # evenly, in the averaging time
+    assert target(3.0, 0.0) == pytest.approx(0.4, rel=1e-12)  # which takes more
+    assert target(8.0, 0.0) == 0.1
     assert target(-1.0, 0.0) == 3.0  # exp(3) is more
-    assert target(1.0, 0.0, forecast=4.0, rated_power=8.0) == pytest.approx(0.2, rel=1e-12)  # over the forecast
+    assert target(1.0, 0.0, forecast=4.0, rated_power=8.0) == pytest.approx(1.0, rel=1e-12)  # over the forecast
 
 
 @pytest.mark.parametrize(
@@ -625,7 +632,7 @@ def test_what_is_heard_before_it_is_switched_on_counts_for_the_correlations_only
     assert span_and_chance(ours) == span_and_chance(other)
     assert (ours.account_s, ours.power_weight) == (0.0, 0.0)
     np.testing.assert_array_equal(ours.control_filter, 0.0)
-    assert other.account_s == DEBT_S
+    assert other.account_s == pytest.approx(250 * (3.0**2 - 1.0) / 1000.0)
     assert other.power_weight > 0.0
 
 
@@ -648,9 +655,9 @@ def of_known_estimate(rated_power: float, **budget: float) -> PowerBudgetControl
     return controller
 
 
-def run(x: np.ndarray, rated_power: float = 0.25) -> SimulationResult:
+def run(x: np.ndarray, rated_power: float = 0.25, **budget: float) -> SimulationResult:
     """W would cancel all. Switched on after 0.1 s: result times are 0.1 s less than those of x."""
-    controller, d = of_known_estimate(rated_power), np.convolve(x, np.convolve(W, S))[: x.size]
+    controller, d = of_known_estimate(rated_power, **budget), np.convolve(x, np.convolve(W, S))[: x.size]
     result = simulate(controller, x, disturbance=d, secondary_path=S, record_powers=True, switch_on_s=0.1)
     np.testing.assert_array_equal(controller.weights, W)
     return result
@@ -663,6 +670,7 @@ def between(result: SimulationResult, begin_s: float, end_s: float) -> tuple[flo
     return float(np.mean(result.control_signal[q] ** 2)), float(reduction), result.power_weight[q]
 
 
+LONG_NOISE = band_limited_noise((100.0, 5000.0), 13.1, fs=FS, rng=1)
 STEADY_NOISE = band_limited_noise((100.0, 5000.0), 7.1, fs=FS, rng=1)  # W asks for a power of 1.05
 
 
@@ -688,29 +696,40 @@ def test_steady_noise_is_given_its_rated_power_and_lambda_keeps_still() -> None:
 
 
 @pytest.mark.parametrize("gain_db", [20.0, -20.0])
-def test_two_seconds_after_a_level_jump_nothing_is_left_of_it(gain_db: float) -> None:
+def test_after_a_level_jump_that_is_paid_for_nothing_is_left_of_it(gain_db: float) -> None:
     """No winding up, no swinging: lambda and the noise reduction are those of the noise without a jump."""
-    jumped = STEADY_NOISE.copy()
+    jumped = LONG_NOISE.copy()
     jumped[: round(3.1 * FS)] *= 10 ** (-gain_db / 20)
-    result, steady = run(jumped), run(STEADY_NOISE)
+    result, steady = run(jumped), run(LONG_NOISE)
     before, usual_before = (np.mean(between(r, 2.0, 3.0)[2]) for r in (result, steady))
     assert not usual_before / 3 < before < 3 * usual_before
-    (power, reduction, weight), (_, usual, usual_weight) = (between(r, 5.0, 7.0) for r in (result, steady))
+    (power, reduction, weight), (_, usual, usual_weight) = (between(r, 10.0, 12.0) for r in (result, steady))
     assert np.max(np.abs(10 * np.log10(weight / usual_weight))) < 0.5
     assert reduction == pytest.approx(usual, abs=0.3)
     assert power == pytest.approx(0.25, rel=0.06)
 
 
 @pytest.mark.parametrize(("seconds", "gain_db"), [(0.05, 20.0), (0.5, 20.0), (1.0, 20.0), (0.5, -math.inf)])
-def test_two_seconds_after_a_burst_or_a_pause_nothing_is_left_of_it(seconds: float, gain_db: float) -> None:
+def test_after_a_burst_that_is_paid_for_or_a_pause_nothing_is_left_of_it(seconds: float, gain_db: float) -> None:
     """Although the long window reaches back to it: it is not chosen while it does."""
-    jumped = STEADY_NOISE.copy()
+    jumped = LONG_NOISE.copy()
     jumped[round(3.1 * FS) : round((3.1 + seconds) * FS)] *= 10 ** (gain_db / 20)
-    result, steady = run(jumped), run(STEADY_NOISE)
+    result, steady = run(jumped), run(LONG_NOISE)
     assert np.all(np.isfinite(result.error))
-    (_, reduction, weight), (_, usual, usual_weight) = (between(r, 5.0 + seconds, 7.0) for r in (result, steady))
+    (_, reduction, weight), (_, usual, usual_weight) = (between(r, 10.0, 12.0) for r in (result, steady))
     assert np.max(np.abs(10 * np.log10(weight / usual_weight))) < 1.0
     assert reduction == pytest.approx(usual, abs=0.5)
+
+
+@pytest.mark.parametrize(("averaging_s", "kept"), [(DEFAULT_AVERAGING_S, True), (1.0, False)])
+def test_the_mean_over_the_averaging_time_is_kept_after_a_loud_second(averaging_s: float, kept: bool) -> None:
+    """20 dB louder for a second, which spends more than two seconds' power before the budget knows. Every 10 s count."""
+    x = LONG_NOISE.copy()
+    x[round(2.1 * FS) : round(3.1 * FS)] *= 10.0
+    spent = np.concatenate([[0.0], np.cumsum(run(x, averaging_s=averaging_s).control_signal ** 2)]) / FS / 0.25
+    over_ten, loud = spent[10 * FS :] - spent[: -10 * FS], spent[3 * FS] - spent[2 * FS]
+    assert loud > 2.0
+    assert (over_ten.max() / 10.0 < 1.02) == kept
 
 
 def test_in_silence_nothing_happens() -> None:
@@ -769,7 +788,7 @@ def test_listening_and_playing_refuse_a_bad_sample(method: str, bad: object) -> 
     assert pickle.dumps(budget) == before
 
 
-@pytest.mark.parametrize("name", ["rated_power", "fs", "memory_s", "credit_s"])
+@pytest.mark.parametrize("name", ["rated_power", "fs", "memory_s", "credit_s", "averaging_s"])
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf, None])
 def test_settings_out_of_range(name: str, bad: object) -> None:
     with pytest.raises((ValueError, TypeError), match=name):
@@ -799,7 +818,8 @@ def test_a_copy_goes_on_by_itself(clone) -> None:
     ahead = go_on(budget, 700, 1500)
     for now, then in zip(numbers_of(twin.state), state, strict=True):
         np.testing.assert_array_equal(now, then)
-    assert (twin.fs, twin.memory_s, twin.credit_s) == (budget.fs, budget.memory_s, budget.credit_s)
+    for name in ("fs", "memory_s", "credit_s", "averaging_s"):
+        assert getattr(twin, name) == getattr(budget, name)
     assert go_on(twin, 700, 1500) == ahead
     assert (twin.account_s, twin.power_weight) == (budget.account_s, budget.power_weight)
     twin.control_filter[:] = 0.0  # a copy
