@@ -473,13 +473,13 @@ def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
         ax.set_title(name, fontsize="medium")
         ax.set_xlabel("Noise reduction (dB)")
         ax.set_yticks(range(len(order)), order)
-        ax.set_xlim(left=0.0)
+        ax.set_xlim(0.0, 1.1 * max(row.noise_reduction_db for row in here if row.algorithm == BOUND or _within(row)))
         ax.grid(True, alpha=0.3)
         ax.legend(fontsize="x-small", frameon=True, loc="lower right")
     caption = (
         "Noise reduction over the steady half, all microphones together. Each loudspeaker is rated at a quarter of the "
         "power that it would use without a limit. Hollow marks: a loudspeaker's power exceeds "
-        f"{Tuned.BUDGET:g} times its rating."
+        f"{Tuned.BUDGET:g} times its rating; those beyond the axis are in the table."
     )
     return FigureItem("reduction", caption, figure)
 

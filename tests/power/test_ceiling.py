@@ -127,6 +127,7 @@ def run(secondary: np.ndarray, x: np.ndarray, rated_power: float, limited: bool)
     controller = kf_pb(
         N_TAPS,
         secondary,
+        secondary_path_uncertainty=None,
         rated_power=rated_power,
         limiter=limiter,
         state_noise=0.0,
