@@ -355,18 +355,7 @@ def _constraint() -> Iterator[Quote]:
         "| KF-ANC, output power over the rated one | {:.0f} | {:.1f} | {:.1f} | {:.1f} |",
         lambda r: r.clipped("KF-ANC", "power"),
     )
-    yield quote(
-        "noise reduction is within {:.2f} dB and $\\lambda$ within {:.2f} dB of the run",
-        lambda r: r.said("constraint", "Two seconds after")[1:3],
-    )
     yield quote("rated power in any of {:.0f} runs", lambda r: r.said("constraint", "With the limiter")[:1])
-    yield quote(
-        "by {:.2f} dB more than KF-OPC behind it on average, by {:.2f} dB less at worst",
-        lambda r: [abs(x) for x in r.said("constraint", "Behind the limiter KF-PB")[:2]],
-    )
-    yield quote(
-        "a tone to within {:.2f} dB of the bound", lambda r: r.said("constraint", "Behind the limiter a tone")[1:2]
-    )
     yield quote(
         "converges in {:.2f} of KF-ANC's time on average, {:.2f} at most",
         lambda r: r.said("constraint", "KF-PB converges")[:2],

@@ -60,8 +60,8 @@ LIMITED = ("KF-OPC", "KF-PB")  # also run behind the limiter
 CLIPPED_NOISES = ("tone", "band noise")
 JUMPS_DB = (20.0, -20.0)
 JUMP_S = (6.0, 7.0)  # of a run of JUMP_RUN_S, from switch-on on
-JUMP_RUN_S = 12.0
-BACK_S = 2.0  # after which all is to be as without the jump
+JUMP_RUN_S = 18.0
+BACK_S = 8.0  # after which what the jump overspent is repaid, and all is to be as without the jump
 LONGEST_KEPT_S = 10.0  # a run whose signals are kept for its convergence time
 COURSE_S = 30.0
 
@@ -380,7 +380,7 @@ def _worst(rows: Sequence[ConstraintRow]) -> str:
 def _jump_claim(jumps: Sequence[Jump]) -> Verdict:
     loss, weight = (float(np.max(np.abs([getattr(jump, name) for jump in jumps]))) for name in ("loss_db", "weight_db"))
     return Verdict(
-        f"Two seconds after a jump of ±{max(JUMPS_DB):g} dB, one second long, noise reduction and lambda are those without "
+        f"{BACK_S:g} seconds after a jump of ±{max(JUMPS_DB):g} dB, one second long, noise reduction and lambda are those without "
         "the jump, to 1 dB",
         loss <= 1.0 and weight <= 1.0,
         f"{len(jumps)} runs: noise reduction off by {loss:.2f} dB and lambda by {weight:.2f} dB at most",
@@ -716,7 +716,7 @@ def _jumps(jumps: Sequence[Jump]) -> FigureItem:
             label = jump.case.path if jump is next(j for j in own if j.case.path == jump.case.path) else None
             ax.semilogy(jump.time_s, np.maximum(jump.power_weight, 1e-4), linewidth=1, label=label, **style)
         ax.axvspan(*JUMP_S, color=MARK, alpha=0.15)
-        ax.set_xlim(JUMP_S[0] - 2, JUMP_S[1] + 4)
+        ax.set_xlim(JUMP_S[0] - 2, JUMP_S[1] + BACK_S)
         ax.set_ylim(1e-3, None)
         ax.set_xlabel("Time (s)")
         ax.set_title(f"{gain_db:+g} dB for a second", fontsize="medium")
