@@ -4,6 +4,8 @@ from .direct import DirectPowerBudget as DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman as FrequencyDomainKalman
 from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
+from .path_tracker import PathChange as PathChange
+from .path_tracker import PathTracker as PathTracker
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .shared_gain import SharedGainKalman as SharedGainKalman
 from .virtual import KalmanObserver as KalmanObserver

@@ -10,7 +10,6 @@ import numpy as np
 
 from .._validate import as_count, as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
-from ..controllers.limited import LimitedController
 from ..kernels.delay_lines import delay_line
 from ..paths.models import path_taps
 from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
@@ -159,7 +158,7 @@ def simulate(
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.size)
     plant = _plant(secondary_path, feedback_path, amplifier, fs)
-    if isinstance(controller, FilteredReferenceController | LimitedController):
+    if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
     weights = _weight_rows(x.size - on, controller, every)
     if on:
