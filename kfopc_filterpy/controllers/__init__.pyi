@@ -1,6 +1,7 @@
 from .base import Controller as Controller
 from .direct import DirectKalman as DirectKalman
 from .direct import DirectPowerBudget as DirectPowerBudget
+from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .frequency_domain import FrequencyDomainKalman as FrequencyDomainKalman
 from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor

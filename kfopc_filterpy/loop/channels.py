@@ -13,7 +13,6 @@ from .._validate import as_channels, as_count, as_positive, per_loudspeaker
 from ..controllers.base import FilteredReferenceController
 from ..controllers.channels import amplifier_models, delay_lines
 from ..controllers.step import adapt, control_filter, emit
-from ..controllers.virtual import VirtualMicrophones
 from ..kernels.borrowing import borrowed
 from ..kernels.compiling import compiled, compiled_for_states, inlined
 from ..kernels.delay_lines import newest, push
@@ -236,7 +235,7 @@ def simulate_channels(
     rated = None if rated is None else per_loudspeaker(rated, J, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
-    if isinstance(controller, FilteredReferenceController | VirtualMicrophones):
+    if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
     if on:
         listen_first(controller, x[:, :on].copy(), d[:, :on] + noise.take(K, on))
