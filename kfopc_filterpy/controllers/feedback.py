@@ -117,7 +117,7 @@ class FeedbackNeutralizer(WrappedController):
         """Return the control signal y(n), or (J,), for the newest sample x(n), or (I,), of the reference microphones."""
         if self._several:
             x = channel_sample(reference, self._n_references, "reference", "references")
-            y = self.controller.control_signal(x - self._paths @ self._played)  # type: ignore[arg-type]
+            y = self.controller.control_signal(x - self._paths @ self._played)
         else:
             y = self.controller.control_signal(as_number(reference, "reference") - float(self._paths[0] @ self._played))
         self._play(np.asarray(y, dtype=np.float64).reshape(-1))

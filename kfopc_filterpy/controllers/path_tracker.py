@@ -278,6 +278,8 @@ class PathTracker(WrappedController):
     True
     """
 
+    controller: Any  # a FilteredReferenceController
+
     def __init__(
         self,
         controller: FilteredReferenceController,
@@ -476,7 +478,7 @@ class PathTracker(WrappedController):
             evidence.forget()
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Let the controller and the fits follow the noise before the control is switched on."""
+        """Let the controller and the fits follow `references` and `errors`, (n_samples,), while the output is silent."""
         self.controller.listen(references, errors)
         for x, e in zip(references, errors, strict=True):
             at = self._past + self._n

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MU, N_TAPS, P0, S_HAT, Q, R, S, noises
 
-from kfopc_filterpy import FxLMS, LimitedController, OutputLimiter, OutputPowerConstraint, kf_anc, kf_opc, kf_pb, simulate
+from kfopc_filterpy import (
+    FxLMS,
+    LimitedController,
+    OutputLimiter,
+    OutputPowerConstraint,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    simulate,
+)
 from kfopc_filterpy.controllers import FeedbackNeutralizer, PathTracker
 from kfopc_filterpy.paths import fir_path
 

@@ -69,7 +69,7 @@ def test_the_filtered_reference_is_the_whole_past_filtered_again() -> None:
     controller.secondary_path = NEW
     controller.control_signal(x[200])
     controller.update(1.0)
-    filtered = np.convolve(x[:201], NEW)[: 201][::-1][:N_TAPS]
+    filtered = np.convolve(x[:201], NEW)[:201][::-1][:N_TAPS]
     np.testing.assert_allclose(controller.weights - w, MU * filtered, rtol=0, atol=1e-15)
 
 

@@ -170,9 +170,7 @@ def test_the_fit_is_least_squares(source: str) -> None:
         np.testing.assert_allclose(model.secondary[source], theta[P:], rtol=1e-6, atol=1e-7)
     else:
         left = e - rx @ theta[:P] - ry @ theta[P:]
-        probed, *_ = np.linalg.lstsq(
-            np.vstack((rv, penalty)), np.concatenate((left, penalty @ known)), rcond=None
-        )
+        probed, *_ = np.linalg.lstsq(np.vstack((rv, penalty)), np.concatenate((left, penalty @ known)), rcond=None)
         np.testing.assert_allclose(model.secondary[source], probed, rtol=1e-6, atol=1e-7)
     unexplained = np.sum((e - A[: e.size] @ theta) ** 2) / (n * 1.96)
     assert fit.noise == pytest.approx(unexplained, rel=1e-6)

@@ -14,7 +14,9 @@ N_PATH = 32
 def resonant_path(delay: float, frequency_hz: float, decay: float, gain: float) -> np.ndarray:
     """Return a delay, of whole samples or not, followed by a resonance; `gain` is the root of its energy."""
     n = np.arange(N_PATH)
-    arrival = np.sinc(n - delay) * np.clip(0.5 + 0.5 * np.cos(np.pi * (n - delay) / 6), 0.0, None) * (abs(n - delay) < 6)
+    arrival = (
+        np.sinc(n - delay) * np.clip(0.5 + 0.5 * np.cos(np.pi * (n - delay) / 6), 0.0, None) * (abs(n - delay) < 6)
+    )
     ringing = decay**n * np.cos(2 * np.pi * frequency_hz / FS * n)
     path = np.convolve(arrival, ringing)[:N_PATH]
     return gain * path / np.linalg.norm(path)
