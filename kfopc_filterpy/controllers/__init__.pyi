@@ -1,11 +1,14 @@
 from .base import Controller as Controller
 from .direct import DirectKalman as DirectKalman
 from .direct import DirectPowerBudget as DirectPowerBudget
+from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .frequency_domain import FrequencyDomainKalman as FrequencyDomainKalman
 from .leaky import leak_factor as leak_factor
 from .monitored import HealthEvent as HealthEvent
 from .monitored import MonitoredController as MonitoredController
 from .mov import penalty_factor as penalty_factor
+from .path_tracker import PathChange as PathChange
+from .path_tracker import PathTracker as PathTracker
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .shared_gain import SharedGainKalman as SharedGainKalman
 from .virtual import KalmanObserver as KalmanObserver

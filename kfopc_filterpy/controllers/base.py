@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
-from ..kernels.delay_lines import delay_line, latest, newest
+from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
 from ..kernels.holding import Held
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
@@ -202,10 +202,11 @@ class FilteredReferenceController:
         model = compiled_model(amplifier)
         if model is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
+        filtered_taps = max(filtered_taps, GUARD_TAPS)  # a guard can be assigned later
         return Lines(
-            secondary_estimate=secondary,
-            reference=delay_line(max(reference_taps, secondary.size)),
-            filtered=delay_line(max(filtered_taps, GUARD_TAPS)),
+            secondary_estimate=secondary.copy(),  # a new estimate is written into it
+            reference=delay_line(max(reference_taps, filtered_taps + secondary.size - 1)),  # enough to filter it again
+            filtered=delay_line(filtered_taps),
             output=delay_line(secondary.size),
             amplifier=model,
             limiter=states_of(self._limiter),
@@ -297,6 +298,57 @@ class FilteredReferenceController:
     def _takes_guard(self) -> bool:
         """Return whether the algorithm's step takes account of an uncertain secondary path."""
         return False
+
+    @property
+    def secondary_path(self) -> np.ndarray:
+        """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
+
+        A controller of one channel takes a new estimate between two samples, also during a run: assign taps or an FIR
+        system, as long as the present estimate or shorter. The reference is filtered again with it, so the next update
+        knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's covariance
+        grows, because its weights belong to the old path. Running powers, and KF-PB's correlations, forget the old path
+        within their memory.
+        """
+        return self._lines.secondary_estimate.copy()
+
+    @secondary_path.setter
+    def secondary_path(self, path: Any) -> None:
+        before = self.secondary_path
+        self._lines.secondary_estimate[:] = self._checked_estimate(path)
+        self._filter_again()
+        self._after_new_path(before)
+
+    def _checked_estimate(self, path: Any) -> np.ndarray:
+        """Return the taps of a new estimate, filled with zeros to the length of the present one."""
+        if self.multichannel:
+            raise ValueError(
+                "a controller of several channels cannot take a new secondary path: make a new one with it"
+            )
+        taps, size = path_taps(path, name="secondary_path"), self._lines.secondary_estimate.size
+        if taps.size > size:
+            raise ValueError(
+                f"secondary_path must have at most the {size} taps of the present estimate, got {taps.size}: make the "
+                "controller with an estimate filled with zeros to the longest path"
+            )
+        rate = sampling_rate(path, name="secondary_path") if is_system(path) else None
+        if self._path_fs is not None:
+            require_rates(self._path_fs, {"new secondary path": rate})
+        return np.pad(taps, (0, size - taps.size))
+
+    def _filter_again(self) -> None:
+        """Filter the stored reference with the present estimate."""
+        lines = self._lines
+        n, s = int(lines.filtered[TAPS]), lines.secondary_estimate
+        refill(lines.filtered, np.correlate(newest(lines.reference, n + s.size - 1), s, mode="valid"))
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Adapt what the algorithm knows to the new estimate; `before` is the last one, (n_path,)."""
+
+    def _variance_by_new_path(self, before: np.ndarray) -> float:
+        """Return the variance of each weight after a new path: they are wrong by the share by which the path changed."""
+        after, w = self._lines.secondary_estimate, self.weights
+        energy = max(before @ before, after @ after)
+        return float(np.sum((after - before) ** 2) / energy * (w @ w) / w.size) if energy > 0.0 else 0.0
 
     @property
     def weights(self) -> np.ndarray:

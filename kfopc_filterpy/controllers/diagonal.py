@@ -147,3 +147,7 @@ class DiagonalKalman(FilteredReferenceController):
     def variances(self) -> np.ndarray:
         """Diagonal of P, (L,); a copy."""
         return self._state.variances.copy()
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let the variances grow by that which the new path gives to the weights."""
+        self._state.variances[:] += self._variance_by_new_path(before)

@@ -234,3 +234,6 @@ class FastArrayKalman(FilteredReferenceController):
     def forgetting(self) -> float:
         """Forgetting factor lambda."""
         return float(self._state.array.numbers["forgetting"][0])
+
+    def _filter_again(self) -> None:
+        """Keep the filtered reference: the array needs each row to be the last one, shifted by a sample."""

@@ -194,6 +194,12 @@ class KalmanController(FilteredReferenceController):
         """Constraint factor of the last sample."""
         return getattr(self.estimator, "constraint_factor", 1.0)
 
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let P grow by the variance that the new path gives to the weights."""
+        variance = self._variance_by_new_path(before)
+        if variance > 0.0:
+            self.estimator.P = self.estimator.P + variance * np.eye(self.n_taps)
+
     # Two calls per sample. A random-walk filter uses the compiled step; any other filter uses its own `update`.
 
     def control_signal(self, reference: float) -> float:

@@ -45,17 +45,19 @@ def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarra
     return np.triu(matrix) + np.triu(matrix, 1).T
 
 
-def cross_correlation_matrix(first: np.ndarray, second: np.ndarray, n_taps: int, start: int) -> np.ndarray:
-    """Return the mean of ``first[n - i] * second[n - j]`` over n >= start, shape (n_taps, n_taps).
+def cross_correlation_matrix(
+    first: np.ndarray, second: np.ndarray, n_taps: int, start: int, n_second: int | None = None
+) -> np.ndarray:
+    """Return the mean of ``first[n - i] * second[n - j]`` over n >= start, shape (n_taps, n_second or n_taps).
 
     As in `correlation_matrix`, each entry follows from the one above it to the left.
     """
-    count = first.size - start
-    matrix = np.empty((n_taps, n_taps))
-    matrix[0] = cross_correlation(first[start:], second[start - n_taps + 1 :])
+    count, n_second = first.size - start, n_taps if n_second is None else n_second
+    matrix = np.empty((n_taps, n_second))
+    matrix[0] = cross_correlation(first[start:], second[start - n_second + 1 :])
     matrix[:, 0] = cross_correlation(second[start:], first[start - n_taps + 1 :])
-    entering = [signal[start - n_taps + 1 : start][::-1] for signal in (first, second)]
-    leaving = [signal[::-1][: n_taps - 1] for signal in (first, second)]
+    entering = [signal[start - taps + 1 : start][::-1] for signal, taps in ((first, n_taps), (second, n_second))]
+    leaving = [signal[::-1][: taps - 1] for signal, taps in ((first, n_taps), (second, n_second))]
     for i in range(n_taps - 1):
         change = entering[0][i] * entering[1] - leaving[0][i] * leaving[1]
         matrix[i + 1, 1:] = matrix[i, :-1] + change / count

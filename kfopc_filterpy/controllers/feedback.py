@@ -1,0 +1,156 @@
+"""Acoustic feedback: what the loudspeakers add to the reference microphones is subtracted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_channels, as_number
+from ..paths.channels import is_path_matrix, path_matrix
+from ..paths.models import is_system, path_taps, sampling_rate
+from .base import Controller, WrappedController, require_rates
+from .channels import channel_sample
+from .virtual import push_sample
+
+
+class FeedbackNeutralizer(WrappedController):
+    r"""A controller whose reference is freed of the sound that the loudspeakers send back to the reference microphone.
+
+    The reference microphone hears the noise and, through the feedback path f, the control signal. The controller gets
+
+    .. math:: x(n) - \sum_{k \ge 1} \hat f_k\, y(n - k)
+
+    This is feedback neutralisation by the identified path. What :math:`f - \hat f` leaves closes a loop through the
+    control filter; `paths.feedback_margin` says how far it is from instability.
+
+    Parameters
+    ----------
+    controller : Controller
+        Any controller: a built-in one, a wrapped one such as a `PathTracker`, or one of your own.
+    feedback_path : array_like, shape (taps,) or (I, J, taps), or control system
+        Identified path from the loudspeaker to the reference microphone, or those from J loudspeakers to I reference
+        microphones, see `paths.estimate_path`. Its first tap must be 0: sound takes time.
+    amplifier : callable or sequence of J of them, optional
+        Known amplifiers: the feedback is then computed from what they deliver, not from y.
+
+    Raises
+    ------
+    TypeError
+        An object that is not a controller, or an amplifier that is not a function.
+    ValueError
+        A path without delay, or one for other numbers of channels than the controller.
+
+    Notes
+    -----
+    `simulate` calls it from Python sample by sample. The subtraction takes I J taps multiplications per sample.
+
+    References
+    ----------
+    S. M. Kuo, D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999, section II.D.
+
+    Examples
+    --------
+    The same result as without feedback, if the path is known exactly:
+
+    >>> import numpy as np
+    >>> from kfopc_filterpy import FxLMS, simulate
+    >>> from kfopc_filterpy.controllers import FeedbackNeutralizer
+    >>> x = np.random.default_rng(0).standard_normal(2000)
+    >>> feedback = [0.0, 0.9, -0.5]
+    >>> plant = {"primary_path": [0.0, 0.0, 0.0, 1.0], "secondary_path": [0.0, 1.0]}
+    >>> free = simulate(FxLMS(8, [0.0, 1.0], step_size=0.01), x, **plant)
+    >>> controller = FeedbackNeutralizer(FxLMS(8, [0.0, 1.0], step_size=0.01), feedback)
+    >>> result = simulate(controller, x, feedback_path=feedback, **plant)
+    >>> bool(np.allclose(result.error, free.error))
+    True
+    """
+
+    def __init__(self, controller: Controller, feedback_path: Any, *, amplifier: Any = None) -> None:
+        super().__init__(controller)
+        self._several = is_path_matrix(feedback_path)
+        if self._several:
+            paths, self._path_fs = path_matrix(feedback_path, fs=None, name="feedback_path")
+        else:
+            paths = path_taps(feedback_path, name="feedback_path").reshape(1, 1, -1)
+            self._path_fs = sampling_rate(feedback_path, name="feedback_path") if is_system(feedback_path) else None
+        if np.any(paths[..., 0]):
+            raise ValueError("feedback_path must have a delay of a sample at least: a first tap is not 0")
+        self._require_fitting_controller(paths)
+        self._n_references, self._n_loudspeakers, taps = paths.shape
+        self._amplifiers = self._checked_amplifiers(amplifier)
+        self._paths = np.ascontiguousarray(np.moveaxis(paths[..., 1:], 2, 1).reshape(self._n_references, -1))
+        self._played = np.zeros((taps - 1) * self._n_loudspeakers)  # newest first, loudspeakers of a sample together
+        self.name = f"{getattr(controller, 'name', type(controller).__name__)} with feedback neutralisation"
+
+    def _require_fitting_controller(self, paths: np.ndarray) -> None:
+        """Raise ValueError if a controller that tells its numbers of channels has others than the paths."""
+        if not self._several and getattr(self.controller, "multichannel", False):
+            raise ValueError("feedback_path must be (I references, J loudspeakers, taps) for this controller, got taps")
+        if self._several and not getattr(self.controller, "multichannel", True):
+            raise ValueError("feedback_path must be (taps,) for a controller of one channel")
+        wanted = {"n_references": paths.shape[0], "n_loudspeakers": paths.shape[1]}
+        for name, count in wanted.items():
+            own = getattr(self.controller, name, count)
+            if own != count:
+                raise ValueError(
+                    f"feedback_path must be (I references, J loudspeakers, taps) with the controller's {name} of {own}, "
+                    f"got {paths.shape}"
+                )
+
+    def _checked_amplifiers(self, amplifier: Any) -> list[Any] | None:
+        if amplifier is None:
+            return None
+        each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * self._n_loudspeakers
+        if len(each) != self._n_loudspeakers or not all(callable(one) for one in each):
+            raise TypeError(
+                f"amplifier must be a function of a sample, or one for each of the {self._n_loudspeakers} loudspeakers, "
+                f"got {amplifier!r}"
+            )
+        return each
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self._played.size // self._n_loudspeakers + 1} taps, {self.controller!r}>"
+
+    def control_signal(self, reference: Any) -> Any:
+        """Return the control signal y(n), or (J,), for the newest sample x(n), or (I,), of the reference microphones."""
+        if self._several:
+            x = channel_sample(reference, self._n_references, "reference", "references")
+            y = self.controller.control_signal(x - self._paths @ self._played)
+        else:
+            y = self.controller.control_signal(as_number(reference, "reference") - float(self._paths[0] @ self._played))
+        self._play(np.asarray(y, dtype=np.float64).reshape(-1))
+        return y
+
+    def _play(self, y: np.ndarray) -> None:
+        if y.size != self._n_loudspeakers:
+            raise ValueError(f"controller must return {self._n_loudspeakers} control signals, got {y.size}")
+        if self._amplifiers is not None and np.isfinite(y).all():
+            y = np.array([amplifier(value) for amplifier, value in zip(self._amplifiers, y, strict=True)])
+        push_sample(self._played, y)
+
+    def update(self, error: Any) -> None:
+        """Pass the error to the controller's `update`."""
+        self.controller.update(error)
+
+    def listen(self, references: Any, errors: Any) -> None:
+        """Let the controller follow `references` and `errors` while the loudspeakers are silent.
+
+        What the loudspeakers played before is still subtracted.
+        """
+        if not hasattr(self.controller, "listen"):
+            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+        x = np.array(np.atleast_2d(as_channels(references, "references")))
+        played = self._played.copy()
+        for n in range(x.shape[1]):
+            x[:, n] -= self._paths @ played
+            push_sample(played, np.zeros(self._n_loudspeakers))
+        self.controller.listen(x if self._several else x[0], errors)
+        self._played = played
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if the feedback path or the controller is for another sample rate than `fs` in Hz."""
+        require_rates(fs, {"feedback path": self._path_fs})
+        if hasattr(self.controller, "require_sample_rate"):
+            self.controller.require_sample_rate(fs)

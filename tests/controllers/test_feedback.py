@@ -1,0 +1,148 @@
+"""Acoustic feedback, neutralised by an estimate of its path."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MU, N_TAPS, P0, S_HAT, Q, R, S, noises
+
+from kfopc_filterpy import (
+    FxLMS,
+    LimitedController,
+    OutputLimiter,
+    OutputPowerConstraint,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    simulate,
+)
+from kfopc_filterpy.controllers import FeedbackNeutralizer, PathTracker
+from kfopc_filterpy.paths import fir_path
+
+KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+
+
+class Proportional:
+    """A controller of one's own."""
+
+    def control_signal(self, reference: float) -> float:
+        return 0.3 * reference
+
+    def update(self, error: float) -> None:
+        pass
+
+
+MAKERS: dict[str, Any] = {
+    "FxLMS": lambda: FxLMS(N_TAPS, S_HAT, step_size=MU),
+    "KF-ANC": lambda: kf_anc(N_TAPS, S_HAT, **KALMAN),
+    "KF-OPC": lambda: kf_opc(N_TAPS, S_HAT, constraint=OutputPowerConstraint(0.3, fs=FS), **KALMAN),
+    "KF-PB": lambda: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, **KALMAN),
+    "path tracker": lambda: PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), rng=1, fs=FS),
+    "limited": lambda: LimitedController(Proportional(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
+    "own": Proportional,
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_with_the_true_path_nothing_is_left_of_the_feedback(name: str) -> None:
+    x, d, _ = noises()
+    plant: dict[str, Any] = {"disturbance": d, "secondary_path": S, "fs": FS}
+    if name not in ("own", "limited"):
+        plant["switch_on_s"] = 20 / FS
+    free = simulate(MAKERS[name](), x, **plant)
+    neutral = simulate(FeedbackNeutralizer(MAKERS[name](), FEEDBACK), x, feedback_path=FEEDBACK, **plant)
+    np.testing.assert_allclose(neutral.error, free.error, rtol=0, atol=1e-10)
+    fed_back = simulate(MAKERS[name](), x, feedback_path=FEEDBACK, **plant)
+    assert np.abs(fed_back.error - free.error).max() > 1e-3
+
+
+def test_several_channels() -> None:
+    rng = np.random.default_rng(0)
+    x, d = rng.standard_normal((2, 400)), rng.standard_normal((2, 400))
+    s = 0.5 * rng.standard_normal((2, 3, 6))  # two microphones, three loudspeakers
+    feedback = 0.2 * rng.standard_normal((2, 3, 5))  # to two reference microphones
+    feedback[:, :, 0] = 0.0
+
+    def made() -> FxLMS:
+        return FxLMS(7, s, step_size=2e-3, n_references=2)
+
+    free = simulate(made(), x, disturbance=d, secondary_path=s, fs=FS)
+    neutral = FeedbackNeutralizer(made(), feedback)
+    result = simulate(neutral, x, disturbance=d, secondary_path=s, feedback_path=feedback, fs=FS)
+    np.testing.assert_allclose(result.error, free.error, rtol=0, atol=1e-10)
+    assert np.abs(free.control_signal).max() > 0.1
+
+
+def test_a_loop_that_would_diverge_is_stable() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.standard_normal(6000)
+    feedback = np.concatenate((np.zeros(3), 1.5 * 0.7 ** np.arange(12)))
+    estimate = feedback + 0.02 * rng.standard_normal(feedback.size) * (np.arange(feedback.size) > 0)
+    plant: dict[str, Any] = {"primary_path": np.eye(12)[8], "secondary_path": [0.0, 1.0], "fs": FS}
+    alone = simulate(FxLMS(16, [0.0, 1.0], step_size=0.003), x, feedback_path=feedback, **plant)
+    assert alone.diverged_at_s is not None or np.mean(alone.error[-1000:] ** 2) > 0.3
+    neutral = FeedbackNeutralizer(FxLMS(16, [0.0, 1.0], step_size=0.003), estimate)
+    result = simulate(neutral, x, feedback_path=feedback, **plant)
+    assert np.mean(result.error[-1000:] ** 2) < 0.02
+
+
+def test_it_subtracts_what_a_known_amplifier_delivers() -> None:
+    x, d, _ = noises()
+    clip = AMPLIFIERS["hard"][0]
+    plant: dict[str, Any] = {"disturbance": 5 * d, "secondary_path": S, "fs": FS, "amplifier": clip}
+    free = simulate(MAKERS["FxLMS"](), x, **plant)
+    known = FeedbackNeutralizer(MAKERS["FxLMS"](), FEEDBACK, amplifier=clip)
+    result = simulate(known, x, feedback_path=FEEDBACK, **plant)
+    np.testing.assert_allclose(result.error, free.error, rtol=0, atol=1e-10)
+    unknown = simulate(FeedbackNeutralizer(MAKERS["FxLMS"](), FEEDBACK), x, feedback_path=FEEDBACK, **plant)
+    assert not np.allclose(unknown.error, free.error, atol=1e-3)
+
+
+def test_what_was_played_before_a_pause_is_still_subtracted() -> None:
+    one, other = FeedbackNeutralizer(Recorder(), [0.0, 0.5, 0.25]), Recorder()
+    one.control_signal(1.0)  # plays 1
+    one.update(0.0)
+    one.listen([0.5, 0.25, 0.0], [0.0, 0.0, 0.0])  # just the feedback
+    np.testing.assert_array_equal(one.controller.heard, np.zeros(3))
+    assert copy.deepcopy(one).control_signal(2.0) == 2.0
+    with pytest.raises(ValueError, match="listen"):
+        FeedbackNeutralizer(Proportional(), [0.0, 1.0]).listen([0.0], [0.0])
+    other.listen(np.ones(1), np.ones(1))
+
+
+class Recorder:
+    """A controller that emits its reference and keeps what it listens to."""
+
+    def control_signal(self, reference: float) -> float:
+        return reference
+
+    def update(self, error: float) -> None:
+        pass
+
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+        self.heard = references
+
+
+def test_what_is_refused() -> None:
+    one, several = MAKERS["FxLMS"](), FxLMS(4, np.ones((2, 3, 4)), step_size=0.1, n_references=2)
+    with pytest.raises(ValueError, match="delay of a sample at least"):
+        FeedbackNeutralizer(one, [0.1, 0.2])
+    with pytest.raises(ValueError, match=r"must be \(taps,\) for a controller of one channel"):
+        FeedbackNeutralizer(one, np.zeros((1, 1, 4)))
+    with pytest.raises(ValueError, match=r"must be \(I references, J loudspeakers, taps\)"):
+        FeedbackNeutralizer(several, [0.0, 1.0])
+    with pytest.raises(ValueError, match=r"n_references of 2, got \(1, 3, 4\)"):
+        FeedbackNeutralizer(several, np.zeros((1, 3, 4)))
+    with pytest.raises(ValueError, match=r"n_loudspeakers of 3, got \(2, 2, 4\)"):
+        FeedbackNeutralizer(several, np.zeros((2, 2, 4)))
+    with pytest.raises(TypeError, match="amplifier must be a function"):
+        FeedbackNeutralizer(one, [0.0, 1.0], amplifier=2.0)
+    with pytest.raises(TypeError, match="controller must have control_signal"):
+        FeedbackNeutralizer(3, [0.0, 1.0])  # type: ignore[arg-type]
+    neutral = FeedbackNeutralizer(one, fir_path([0.0, 1.0], FS))
+    with pytest.raises(ValueError, match="feedback path is for 8000 Hz"):
+        simulate(neutral, np.ones(5), primary_path=[1.0], secondary_path=[1.0], fs=16000.0)
+    assert repr(neutral).startswith("<FxLMS with feedback neutralisation: 2 taps, <FxLMS: 10 taps")

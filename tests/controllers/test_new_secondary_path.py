@@ -1,0 +1,196 @@
+"""A controller that gets another estimate of its secondary path during a run."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from helpers.loop import FS, MU, N_TAPS, P0, S_HAT, Q, R, noises
+
+from kfopc_filterpy import (
+    DiagonalKalman,
+    FastArrayKalman,
+    FxLMS,
+    FxNLMS,
+    KalmanController,
+    OutputPowerConstraint,
+    fx_rls,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
+    kf_pb,
+)
+from kfopc_filterpy.paths import fir_path
+
+NEW = np.array([0.0, 0.0, -0.7, 0.2])
+KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+MAKERS: dict[str, Any] = {
+    "FxLMS": lambda s: FxLMS(N_TAPS, s, step_size=MU),
+    "FxNLMS": lambda s: FxNLMS(N_TAPS, s, step_size=0.1),
+    "FxRLS": lambda s: fx_rls(N_TAPS, s, forgetting=0.999),
+    "KF-ANC": lambda s: kf_anc(N_TAPS, s, **KALMAN),
+    "KF-OPC repaired": lambda s: kf_opc_repaired(N_TAPS, s, rated_power=1e6, **KALMAN),
+    "filterpy": lambda s: KalmanController(KalmanFilter(N_TAPS, 1), s),
+    "diagonal KF": lambda s: DiagonalKalman(N_TAPS, s, **KALMAN),
+}
+
+
+def drive(controller: Any, first: int, last: int) -> np.ndarray:
+    """Return the control signal for samples that do not depend on it."""
+    x, d, _ = noises()
+    emitted = []
+    for n in range(first, last):
+        emitted.append(controller.control_signal(x[n]))
+        controller.update(d[n])
+    return np.array(emitted)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_it_goes_on_as_if_it_had_always_had_the_new_path(name: str) -> None:
+    """After listening no weight has moved yet, so nothing but the powers may remember the old path."""
+    x, d, _ = noises()
+    one, other = MAKERS[name](S_HAT), MAKERS[name](NEW)
+    for controller in (one, other):
+        controller.listen(x[:100], d[:100])
+    one.secondary_path = NEW
+    np.testing.assert_array_equal(one.secondary_path, NEW)
+    np.testing.assert_allclose(drive(one, 100, 400), drive(other, 100, 400), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(one.weights, other.weights, rtol=1e-9, atol=1e-12)
+    assert np.abs(one.weights).max() > 0.01
+
+
+def test_the_filtered_reference_is_the_whole_past_filtered_again() -> None:
+    x, _, _ = noises()
+    controller = FxLMS(N_TAPS, S_HAT, step_size=MU)
+    drive(controller, 0, 200)
+    w = controller.weights
+    controller.secondary_path = NEW
+    controller.control_signal(x[200])
+    controller.update(1.0)
+    filtered = np.convolve(x[:201], NEW)[:201][::-1][:N_TAPS]
+    np.testing.assert_allclose(controller.weights - w, MU * filtered, rtol=0, atol=1e-15)
+
+
+def test_neither_weights_nor_control_signal_jump() -> None:
+    one, other = (kf_anc(N_TAPS, S_HAT, **KALMAN) for _ in range(2))
+    drive(one, 0, 200), drive(other, 0, 200)
+    one.secondary_path = NEW
+    np.testing.assert_array_equal(one.weights, other.weights)
+    assert one.control_signal(0.7) == other.control_signal(0.7)
+    one.update(0.3), other.update(0.3)
+    assert np.abs(one.weights - other.weights).max() > 1e-4  # from here on they differ
+
+
+@pytest.mark.parametrize("name", ["KF-ANC", "filterpy"])
+def test_a_kalman_filter_trusts_its_weights_less(name: str) -> None:
+    controller = MAKERS[name](S_HAT)
+    controller.secondary_path = NEW  # no weight can be wrong yet
+    start = np.array(controller.estimator.P)
+    drive(controller, 0, 200)
+    before, w = np.array(controller.estimator.P), controller.weights
+    controller.secondary_path = S_HAT
+    share = np.sum((NEW - S_HAT) ** 2) / max(NEW @ NEW, S_HAT @ S_HAT)
+    expected = before + share * np.mean(w**2) * np.eye(N_TAPS)
+    np.testing.assert_allclose(controller.estimator.P, expected, rtol=1e-10, atol=1e-14)
+    np.testing.assert_array_equal(start, np.diag(np.diagonal(start)))
+    controller.secondary_path = S_HAT  # the same path tells nothing
+    np.testing.assert_allclose(controller.estimator.P, expected, rtol=1e-10, atol=1e-14)
+
+
+def test_the_diagonal_filter_trusts_its_weights_less() -> None:
+    controller = DiagonalKalman(N_TAPS, S_HAT, **KALMAN)
+    drive(controller, 0, 200)
+    before = controller.variances
+    controller.secondary_path = 0.5 * S_HAT  # a quarter of the energy of the change, over that of the larger
+    np.testing.assert_allclose(controller.variances - before, 0.25 * np.mean(controller.weights**2), rtol=1e-9)
+
+
+def test_the_fast_array_keeps_its_shift_structure() -> None:
+    """Its rows must be shifted copies, so samples before the change stay filtered with the old path."""
+    controller = FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, forgetting=0.999)
+    drive(controller, 0, 200)
+    controller.secondary_path = NEW
+    emitted = drive(controller, 200, 500)
+    assert np.isfinite(emitted).all()
+    oracle = fx_rls_on_rows(controller.n_taps)
+    np.testing.assert_allclose(controller.weights, oracle, rtol=1e-6, atol=1e-8)
+
+
+def fx_rls_on_rows(n_taps: int) -> np.ndarray:
+    """Return the weights of exponentially weighted least squares on the rows of that test, in batch."""
+    x, d, _ = noises()
+    old, new = np.convolve(x, S_HAT)[: x.size], np.convolve(x, NEW)[: x.size]
+    filtered = np.where(np.arange(x.size) < 200, old, new)
+    weights, emitted = np.zeros(n_taps), np.zeros(x.size)
+    shrink = 0.999 ** np.arange(2, n_taps + 2)  # P(0) of the fast array
+    inverse = np.diag(Q * 0.999 / shrink)
+    right = np.zeros(n_taps)
+    for n in range(x.size):
+        past = np.array([x[n - k] if n >= k else 0.0 for k in range(n_taps)])
+        row = np.array([filtered[n - k] if n >= k else 0.0 for k in range(n_taps)])
+        emitted[n] = weights @ past
+        path = S_HAT if n < 200 else NEW
+        estimate = d[n] + sum(path[k] * emitted[n - k] for k in range(path.size) if n >= k)
+        inverse = 0.999 * inverse + np.outer(row, row)
+        right = 0.999 * right + row * estimate
+        weights = np.linalg.solve(inverse, right)
+    return weights
+
+
+def test_the_running_gain_forgets_the_old_path() -> None:
+    """KF-OPC's G_s is a running mean, so after five times its memory that of the new path is left."""
+    x, d, _ = noises(4000)
+    constraint = OutputPowerConstraint(0.3, fs=FS, memory_s=0.05)  # 400 samples
+    controller = kf_opc(N_TAPS, S_HAT, constraint=constraint, **KALMAN)
+    controller.listen(x[:1000], d[:1000])
+    assert controller.secondary_path_gain == pytest.approx(S_HAT @ S_HAT, rel=0.2)
+    controller.secondary_path = 0.5 * S_HAT
+    controller.listen(x[1000:], d[1000:])
+    assert controller.secondary_path_gain == pytest.approx(0.25 * (S_HAT @ S_HAT), rel=0.2)
+
+
+def test_kf_pb_solves_for_the_new_path() -> None:
+    """After the window of its correlations, KF-PB spends its power as one that was made with the new path."""
+    x, d, _ = noises(6000)
+    made = [
+        kf_pb(N_TAPS, path, rated_power=0.1, fs=FS, memory_s=0.05, credit_s=0.05, **KALMAN)
+        for path in (S_HAT, 0.5 * S_HAT)
+    ]
+    for controller in made:
+        controller.listen(x[:500], d[:500])
+    made[0].secondary_path = 0.5 * S_HAT
+    for n in range(500, 6000):
+        for controller in made:
+            controller.control_signal(x[n])
+            controller.update(d[n])
+    np.testing.assert_allclose(made[0].control_filter, made[1].control_filter, rtol=0.05, atol=1e-3)
+
+
+def test_a_shorter_path_is_filled_with_zeros_and_the_users_array_is_not_touched() -> None:
+    given = S_HAT.copy()
+    controller = FxLMS(N_TAPS, given, step_size=MU)
+    controller.secondary_path = [0.0, 0.5]
+    np.testing.assert_array_equal(controller.secondary_path, [0.0, 0.5, 0.0, 0.0])
+    np.testing.assert_array_equal(given, S_HAT)
+    controller.secondary_path = fir_path([0.0, 0.25], FS)
+    np.testing.assert_array_equal(controller.secondary_path, [0.0, 0.25, 0.0, 0.0])
+    controller.secondary_path[1] = 9.0  # a copy
+    assert controller.secondary_path[1] == 0.25
+
+
+def test_what_is_refused_changes_nothing() -> None:
+    controller = FxLMS(N_TAPS, fir_path(S_HAT, FS), step_size=MU)
+    for bad, message in (
+        (np.ones(5), "at most the 4 taps of the present estimate, got 5"),
+        ([0.0, np.nan], "secondary_path"),
+        (fir_path([0.0, 1.0], 2 * FS), "secondary path is for 16000 Hz"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            controller.secondary_path = bad
+    np.testing.assert_array_equal(controller.secondary_path, S_HAT)
+    several = FxLMS(N_TAPS, [[S_HAT]], step_size=MU)
+    assert several.secondary_path.shape == (1, 1, 4)
+    with pytest.raises(ValueError, match="several channels cannot take a new secondary path"):
+        several.secondary_path = S_HAT
