@@ -372,14 +372,14 @@ class _GainSequence:
         self._reference = np.concatenate((heard, x))
         filtered = np.convolve(self._reference, lines.secondary_estimate)[heard.size : heard.size + x.size]
         self.n_taps, self.n_samples = n, x.size
-        self._filtered = np.concatenate(
-            (newest(lines.filtered, n - 1)[::-1], filtered)
-        )  # n - 1 samples before the first
+        older = newest(lines.filtered, int(lines.filtered[TAPS]))[::-1]
+        self._all_filtered = np.concatenate((older, filtered))
+        self._filtered = self._all_filtered[older.size - (n - 1) :]  # from n - 1 samples before the first on
 
     def refill(self, lines: Lines) -> None:
         """Fill the delay lines with the end of the run."""
         refill(lines.reference, self._reference[::-1])
-        refill(lines.filtered, self._filtered[::-1])
+        refill(lines.filtered, self._all_filtered[::-1])
 
     def blocks(self) -> Iterator[tuple[int, SharedGains, int]]:
         """Yield the first sample of each block, its gains, and how many of them were computed before a failure."""

@@ -177,7 +177,7 @@ def guard_filter(uncertainty: np.ndarray) -> np.ndarray:
     >>> guard = guard_filter(path_uncertainty(PathTolerance(delay_samples=1.0), [1.0]))
     >>> share = 1 / (1 + np.abs(np.fft.rfft(guard, 512)) ** 2)  # g
     >>> share[[16, 32, 64, 128]].round(2)  # at 1/32, 1/16, 1/8 and 1/4 of the sample rate
-    array([1.  , 0.99, 0.68, 0.01])
+    array([1.  , 0.99, 0.75, 0.03])
     """
     share = np.clip(1.0 - np.asarray(uncertainty) ** SHARPNESS, LEAST_SHARE, 1.0)
     penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
