@@ -23,7 +23,7 @@ GAIN_THAT_MATTERS_DB = 0.1
 MULTIPLE = 8  # lengths are rounded up to it
 SAMPLES_PER_TAP = 10  # of the record, at least; fewer would fit too much by chance
 BURST_S = 0.01  # powers over this time show whether a noise is impulsive
-LITTLE = 0.5  # share of the disturbance's power that is left, above which the reasons say where to look for the cause
+LITTLE = 0.5  # if a larger share of the disturbance's power is left, the reasons say where to look for the cause
 NOTABLY_LONGER = 1.2
 
 
@@ -136,8 +136,8 @@ def suggest_settings(
       :math:`\sqrt{rq/E[x'^2]}` in each direction, and so the error power is :math:`qL/M` above q.
     - :math:`q = J(L)\, N / (N - L)`, but at least -60 dB of the disturbance, because a microphone is hardly ever quieter.
     - :math:`r = q / (k\, E[x'^2] M^2)`. If the noise comes in bursts, so does what no filter explains, and it disturbs the
-      weights when their gain is largest. The memory is then lengthened by :math:`\sqrt{k}`: k is the mean square of the
-      power over 10 ms, divided by that of the power over the memory, and 1 for a steady noise.
+      weights when the filter's gain is largest. The memory is then lengthened by :math:`\sqrt{k}`: k is the mean square
+      of the power over 10 ms, divided by that of the power over the memory. It is 1 for a steady noise.
     - :math:`P_0 = E[d^2] / (L\, E[x'^2])`: with independent weights of this variance and a white filtered reference, the
       anti-noise is as strong as the disturbance.
 

@@ -275,9 +275,9 @@ class FilteredReferenceController:
 
         Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
-        LMS algorithm gets a leak shaped in frequency, whose energy counts in the stability of its step size, and a Kalman
-        filter a second observation. It has a meaning for KF-ANC, KF-OPC and the LMS family of one channel, except FxNLMS;
-        `kf_pb` takes it as a setting.
+        LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
+        second observation. An uncertainty can be assigned for KF-ANC, KF-OPC and the LMS family of one channel, except
+        FxNLMS; `kf_pb` takes it as a setting.
         """
         return None if self._uncertainty is None else self._uncertainty.copy()
 
@@ -304,7 +304,7 @@ class FilteredReferenceController:
         """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
         A controller of one channel takes a new estimate between two samples, also during a run: assign taps or an FIR
-        system, as long as the present estimate or shorter. The reference is filtered again with it, so the next update
+        system, no longer than the present estimate. The stored reference is filtered again with it, so the next update
         knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's covariance
         grows, because its weights belong to the old path. Running powers, and KF-PB's correlations, forget the old path
         within their memory.

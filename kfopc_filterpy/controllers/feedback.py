@@ -1,4 +1,4 @@
-"""Acoustic feedback: what the loudspeakers add to the reference microphones is subtracted."""
+"""Acoustic feedback: what the reference microphones hear of the loudspeakers is subtracted."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class FeedbackNeutralizer(WrappedController):
 
     .. math:: x(n) - \sum_{k \ge 1} \hat f_k\, y(n - k)
 
-    This is feedback neutralisation by the identified path. What :math:`f - \hat f` leaves closes a loop through the
-    control filter; `paths.feedback_margin` says how far it is from instability.
+    This is feedback neutralisation with the identified path. The difference :math:`f - \hat f` closes a loop through
+    the control filter; `paths.feedback_margin` says how far this loop is from instability.
 
     Parameters
     ----------
@@ -40,11 +40,11 @@ class FeedbackNeutralizer(WrappedController):
     TypeError
         An object that is not a controller, or an amplifier that is not a function.
     ValueError
-        A path without delay, or one for other numbers of channels than the controller.
+        A path without delay, or one whose numbers of channels differ from the controller's.
 
     Notes
     -----
-    `simulate` calls it from Python sample by sample. The subtraction takes I J taps multiplications per sample.
+    `simulate` calls it from Python sample by sample. The subtraction takes ``I * J * taps`` multiplications per sample.
 
     References
     ----------
@@ -85,7 +85,7 @@ class FeedbackNeutralizer(WrappedController):
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} with feedback neutralisation"
 
     def _require_fitting_controller(self, paths: np.ndarray) -> None:
-        """Raise ValueError if a controller that tells its numbers of channels has others than the paths."""
+        """Raise ValueError if the controller states numbers of channels that differ from those of the paths."""
         if not self._several and getattr(self.controller, "multichannel", False):
             raise ValueError("feedback_path must be (I references, J loudspeakers, taps) for this controller, got taps")
         if self._several and not getattr(self.controller, "multichannel", True):

@@ -26,8 +26,9 @@ class HealthEvent:
     time_s : float
         Time of the event, in seconds since the first sample.
     what : str
-        "louder": the control made the noise louder and was stopped; "not louder": it was suspected wrongly and goes on;
-        "not finite": the control signal was NaN or Inf, and the control was stopped; "retry": the control starts anew.
+        "louder": the control made the noise louder and was stopped; "not louder": the control was suspected wrongly and
+        goes on; "not finite": the control signal was NaN or Inf, and the control was stopped; "retry": the control
+        starts anew.
     change_db : float
         How much louder the noise was with control than without, in dB; NaN if that was not measured.
     """
@@ -41,31 +42,32 @@ class MonitoredController(WrappedController):
     """A controller with a monitor that mutes the loudspeakers if the control makes the noise louder.
 
     A secondary path with a flipped sign, or a delay that is wrong by several samples, makes any controller louder than no
-    control. Its own estimates do not show it, because they rely on the same path. So the monitor compares the power of
-    the error, relative to that of the reference, with what it was in silence. If it exceeds that by `margin_db`, the
-    loudspeakers are muted for `window_s`, which shows whether the control is to blame. If so, the controller is replaced
-    by a fresh copy, which starts after a pause; each further failure doubles the pause. If not, the control goes on, and
-    the margin is widened by half, because the noise evidently fluctuates.
+    control. The controller's own estimates do not show this, because they rely on the same path. So the monitor
+    compares the power of the error, relative to that of the reference, with what it was while the loudspeakers were
+    silent. If it exceeds that by `margin_db`, the loudspeakers are muted for `window_s`, which shows whether the
+    control is to blame. If so, the controller is replaced by a fresh copy, which starts after a pause; each further
+    failure doubles the pause. If not, the control goes on, and the margin is widened by half, because the noise
+    evidently fluctuates.
 
     Parameters
     ----------
     controller : Controller
-        Any controller that can be copied, before its first sample. While muted, it follows the noise if it has a method
-        ``listen(references, errors)``, as the built-in ones have.
+        Any controller that can be copied and has not processed a sample yet. While muted, it follows the noise if it
+        has a method ``listen(references, errors)``, as the built-in ones have.
     fs : float, default 16000
         Sample rate in Hz.
     window_s : float, default 0.5
-        Time over which powers are compared, in seconds. Control begins after a window of silence, unless `listen` was
-        called with as much.
+        Time over which powers are compared, in seconds. Control begins after a window of silence, unless `listen` has
+        already been given at least that much.
     margin_db : float, default 1.5
-        Rise of the error's power in dB that causes a test.
+        Rise of this relative power of the error, in dB, that causes a test.
     pause_s : float, default 2
         First pause after a failure, in seconds.
 
     Attributes
     ----------
     health : list of HealthEvent
-        What was noticed, in the order of time.
+        What was noticed, in order of time.
     muted : bool
         Whether the loudspeakers are muted now.
 

@@ -16,9 +16,9 @@ from ..paths.least_squares import correlation_matrix, cross_correlation, cross_c
 from ..power.constraint import DEFAULT_FS
 from .base import FilteredReferenceController, WrappedController, require_rates
 
-FRAME_S = 0.02  # the error's power is measured over frames of this length, at least that of the secondary path
-SHORT = 1 / 8  # of the memory: that of the fit which follows fast changes
-FEWEST_FRAMES = 8  # on which a better prediction can be significant
+FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
+SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
+FEWEST_FRAMES = 8  # with fewer, no better prediction is significant
 RIDGE = 1e-9  # relative to the mean power of the regressors, so that a narrow-band reference has a solution
 
 
@@ -33,7 +33,7 @@ class PathChange:
     change_db : float
         ``10 log10(sum (new - old)^2 / sum old^2)``: by how much the estimate changed.
     prediction_gain_db : float
-        By how much less of the error the new estimate left unexplained on samples that it had not been fitted to.
+        By how many dB less of the error the new estimate left unexplained, on samples that it had not been fitted to.
     memory_s : float
         Memory of the fit that it comes from.
     source : str
@@ -88,8 +88,8 @@ class JointFit:
         r"""Return p and the estimates of s by source; None without a signal.
 
         "control signal": p and s are fitted together, with the samples of y and v alike. "probe": s is fitted to v alone,
-        after what p * x and s * y explain was subtracted. Both are drawn towards the `known` path, with as much weight as
-        a path has that may change by all of its energy: :math:`\sigma_e^2 / (|s|^2 / n)` for the noise that the last fit
+        after subtracting what p * x and s * y explain. Both are drawn towards the `known` path. The weight is right for
+        a path that may change by all of its energy: :math:`\sigma_e^2 / (|s|^2 / n)`, with the noise that the last fit
         left.
         """
         P, S = self.n_primary, self.n_secondary
@@ -137,7 +137,7 @@ def block_sums(
 
 
 class Evidence:
-    """Comparison of two predictions, frame by frame, since the second one began to be the better one."""
+    """Comparison of two predictions, frame by frame, since the second one began to lead."""
 
     def __init__(self) -> None:
         self.forget()
@@ -184,22 +184,23 @@ class PathTracker(WrappedController):
 
     .. math:: e = p * x - s * (y + v)
 
-    Each fit offers two estimates of s. "control signal" is that of the fit, to which the control signal y contributes
-    as much as the probe. It is exact if only the secondary path changes. If the primary path changes and the controller
-    follows it, y and the change of p cannot be told apart, and this estimate is wrong. "probe" is a fit of s to v
-    alone, of what :math:`p * x - s * y` leaves. The probe is independent of everything else, so this estimate holds in
-    any case, but it takes longer.
+    Each fit offers two estimates of s. "control signal" is the s of the fit itself, in which the samples of the control
+    signal y count like those of the probe. It is exact if only the secondary path changes. If the primary path changes
+    and the controller follows it, y and the change of p cannot be told apart, and this estimate is wrong. "probe" is a
+    fit of s to v alone, after subtracting :math:`p * x - s * y` from the error. The probe is independent of everything
+    else, so this estimate holds in any case, but it takes longer.
 
     A new estimate is taken over only if a test says that it is better. The test uses samples that no fit has seen yet,
-    and only the probe: an estimate is better if, over the frames of 20 ms since it began to lead, it leaves less of the
-    error unexplained than the one in use, by a difference that has a probability below `p_value` by chance. Then the
-    controller's `secondary_path` is set. Its weights stay, so the control signal does not jump.
+    and only the probe. Over the frames of 20 ms since the new estimate began to lead, it must leave less of the error
+    unexplained than the one in use, and the probability of such a difference by chance must be below `p_value`. Then
+    the controller's `secondary_path` is set. Its weights stay, so the control signal does not jump.
 
-    The controller does not hear the probe: what it contributes to the error by the estimate in use is subtracted.
+    The controller does not hear the probe: what the probe contributes to the error, according to the estimate in use,
+    is subtracted.
 
-    Between a jump of the path and its discovery, the controller may diverge. So if the error becomes louder than
-    `hold_db` above what is to be expected without control, its updates are left out, until the error is 3 dB softer than
-    that or another path is taken over.
+    Between a jump of the path and its discovery, the controller may diverge. So if the error becomes more than
+    `hold_db` louder than expected without control, the controller's updates are skipped until the error is 3 dB below
+    that threshold or another path is taken over.
 
     Parameters
     ----------
@@ -224,7 +225,7 @@ class PathTracker(WrappedController):
     use_control_signal : bool, default True
         Whether the estimates "control signal" take part.
     hold_db : float, default 6
-        See above; a large number leaves the updates in.
+        See above; with a large number, no update is skipped.
     amplifier : callable, optional
         Known amplifier, a function of a sample, as for the controller. An unknown one that clips distorts the fits.
 
@@ -236,20 +237,20 @@ class PathTracker(WrappedController):
     Raises
     ------
     TypeError
-        A controller that is not built in, or has several channels; an amplifier that is not a function.
+        A controller that is not built in or has several channels; an amplifier that is not a function.
     ValueError
         A setting that is out of range, `memory_s` below eight times `check_s`, or a probe filter that is all zeros.
 
     Notes
     -----
-    The estimate has as many taps as the controller's: make the controller with one that is filled with zeros to the
-    longest path that may occur. The probe is added after the controller's limiter.
+    The estimate has as many taps as the controller's. So make the controller with an estimate that is padded with zeros
+    to the length of the longest path that may occur. The probe is added after the controller's limiter.
 
     `simulate` calls it from Python sample by sample. For L taps of the control filter and n of the path, a test takes
     about :math:`(L + 2n)^3 / 3` multiplications for each fit.
 
     The path must be heard in the error. Where neither probe nor control signal reaches the microphone above its noise,
-    the estimate is drawn to the one in use.
+    the estimate is drawn towards the one in use.
 
     References
     ----------
@@ -320,7 +321,7 @@ class PathTracker(WrappedController):
     def _allocate(self, check_s: float) -> None:
         """Set the lengths, and make the fits and the room for a block of signals."""
         S = self.controller.secondary_path.size
-        P = self.controller.n_taps + S - 1  # what the control filter and the path can delay: y tells no more of x
+        P = self.controller.n_taps + S - 1  # length of control filter and path in series: s * y has no older x in it
         self._frame = max(round(FRAME_S * self.fs), S)
         self._block = self._frame * max(round(check_s * self.fs / self._frame), 1)
         if self.memory_s * SHORT * self.fs < self._block:
@@ -403,7 +404,7 @@ class PathTracker(WrappedController):
         self._held = power > max(bound, 2.0 * self._recovering_from)
 
     def _power_without_control(self, begin: int) -> float:
-        """Return the power that the error would have without control, in the frame that begins there.
+        """Return the power that the error would have without control, in the frame that starts at sample `begin`.
 
         It is the power of the reference, times the mean ratio of disturbance and reference over the memory. The
         disturbance estimate grows if the path is wrong, so a frame counts as `hold_db` above the mean at most.
@@ -471,7 +472,7 @@ class PathTracker(WrappedController):
         )
         self._know(new)
         self._held, self._recovering_from = False, float(np.mean(self._e[-self._frame :] ** 2))
-        for fit in self._fits[i + 1 :]:  # the longer memories know a path that is no more
+        for fit in self._fits[i + 1 :]:  # the longer memories hold a path that no longer exists
             fit.take_from(self._fits[i])
         self._models = [fit.solve(new) for fit in self._fits]
         for evidence in self._evidence.values():

@@ -177,13 +177,13 @@ def kf_pb(
     state_noise, measurement_noise, initial_variance, dtype
         As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
-        As for `kf_anc`. The direct form for one channel asks for no more power than pays behind its limiter (see
-        `PowerBudget`).
+        As for `kf_anc`. Behind its limiter, the direct form for one channel asks for more power only if that lowers the
+        error (see `PowerBudget`).
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
         How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default half a
-        sample of delay. The control filter is weaker where the path is less certain, and zero where the error may
-        exceed 100 % (with half a sample of delay, above a third of the sample rate), so that the noise never becomes
-        louder than without control. None: the path is exact.
+        sample of delay. The control filter is weaker where the path is less certain, and almost zero where the error
+        may exceed 100 % (with half a sample of delay, above a third of the sample rate), so that the noise never
+        becomes louder than without control. None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths

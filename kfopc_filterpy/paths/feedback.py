@@ -28,8 +28,8 @@ class FeedbackMargin:
         Whether the loop is stable.
     disk_margin : float
         Disk margin alpha of the balanced sensitivity: the loop stays stable if its response is multiplied by any complex
-        factor in the disk around 1 that `gain_margin_db` spans on the real axis. 2 is the largest, without any feedback;
-        0 if the loop is unstable.
+        factor in the disk that reaches from minus to plus `gain_margin_db` on the real axis. It is 2, the largest
+        value, without any feedback, and 0 if the loop is unstable.
     gain_margin_db : float
         By how many dB the gain of the loop may rise or fall, at any frequency.
     phase_margin_deg : float
@@ -74,7 +74,7 @@ def feedback_margin(
     feedback_path : array_like or control.TransferFunction
         Path f from the loudspeaker to the reference microphone; its first tap must be 0.
     feedback_estimate : array_like or control.TransferFunction, optional
-        Estimate of it that is subtracted; by default none.
+        Estimate of this path, which is subtracted; by default none.
     fs : float, optional
         Sampling rate in Hz, needed for tap arrays.
 
@@ -91,8 +91,8 @@ def feedback_margin(
     Notes
     -----
     The loop has a finite impulse response, so by Nyquist's criterion it is stable if ``1 - W (F - F^)`` does not
-    encircle the origin. The margins are those of `control.disk_margins` at the worst frequency of a fine grid, fs/65536
-    or less. The adaptation changes w, so the margin holds for this control filter only.
+    encircle the origin. The margins are those of `control.disk_margins` at the worst frequency of a grid with a spacing
+    of fs/65536 or less. The adaptation changes w, so the margin holds for this control filter only.
 
     References
     ----------
@@ -100,7 +100,8 @@ def feedback_margin(
 
     Examples
     --------
-    A gain of 0.5 once around the loop, then an estimate of the path that is 10 % too small:
+    A gain of 0.5 once around the loop, then the same with an estimate of the path that is 10 % too small, then a gain
+    of 2 without an estimate:
 
     >>> from kfopc_filterpy.paths import feedback_margin
     >>> feedback_margin([0.5], [0.0, 1.0], fs=8000.0)

@@ -5,9 +5,10 @@ g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y
 
 .. math:: E = D\,\frac{1 - g}{1 + g\Delta}
 
-This is stable if :math:`g\delta < 1`, and it is never louder than without control if :math:`\delta \le 1`, whatever g is.
-Where :math:`\delta \ge 1`, only g = 0 is safe. Therefore :math:`g = 1 - \delta^6`: it costs next to nothing where the
-path is known well, it vanishes where :math:`\delta` reaches 1, and :math:`g\delta` is at most 0.62.
+This is stable if :math:`g\delta < 1`. It is never louder than without control if :math:`\delta \le 1`, for any g from 0
+to 1.
+Where :math:`\delta \ge 1`, only g = 0 is safe. Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the
+path is known well, g vanishes where :math:`\delta` reaches 1, and :math:`g\delta` is at most 0.62.
 
 A controller gets this g from a penalty on the control signal through the filter W with :math:`|W|^2 = (1 - g)/g`:
 
@@ -85,7 +86,7 @@ def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     uncertainty : PathTolerance, float or array_like, optional
         Tolerances; or one relative error for all frequencies; or its values at evenly spaced frequencies from 0 to
         fs/2, (n_frequencies,); or measured paths, (M, n_taps) or (M, K, J, n_taps), whose largest distance from
-        `secondary_path` counts. None is no uncertainty.
+        `secondary_path` counts. None means no uncertainty.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path.
 

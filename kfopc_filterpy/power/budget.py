@@ -217,8 +217,8 @@ def target_power(budget, forecast):
     A limiter that acts sets a ceiling, which holds whatever credit the account has.
 
     Repayment of debt starts at once, but is slower the larger `chance` is. The error is convex in the power, so a large
-    debt costs least if it is repaid evenly, in what is left of the averaging time. Credit of up to half of `chance` is left to
-    even out by itself: to react to chance would cost noise reduction.
+    debt costs least if it is repaid evenly, in what is left of the averaging time. Credit of up to half of `chance` is
+    left to even out by itself: to react to chance would cost noise reduction.
     """
     numbers = budget.numbers[0]
     account, chance = numbers.account, numbers.chance
@@ -366,15 +366,17 @@ class PowerBudget:
       constant, its present value replaces the mean of the window;
     - an account of the power spent beyond the rated power, in seconds of rated power. The target is the rated power
       times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending. A
-      large debt is repaid evenly within the averaging time, because the error is convex in the power: with half of the
-      rated power, or more if the debt exceeds a quarter of the averaging time, up to 90 %. `chance` is the standard deviation, in seconds, that random changes of the noise's
-      level give to the account within a second. It enlarges the credit that can be saved, and credit up to half of it
-      is left to even out. If more power than chance explains was left unspent over some 0.4 averaging times, although it could
-      have been used, the target rises by up to 30 %.
+      large debt is repaid evenly within the averaging time, because the error is convex in the power. Half of the rated
+      power repays it, or up to 90 % if the debt exceeds a quarter of the averaging time. `chance` is the standard
+      deviation, in seconds, that random changes of the noise's level give to the account within a second. It enlarges
+      the credit that can be saved, and a credit of up to half of `chance` is left to even out by itself. If more power
+      than chance explains was left unspent over about 0.4 of the averaging time, although it could have been used, the
+      target rises by up to 30 %.
 
-    A limiter behind the budget (`control_signal` of `advance` differs from the budget's own) sets a ceiling to the
-    target. At the ceiling, more power would lower the error in samples that pass the limiter by as much as it would raise
-    it in the others (see `power.ceiling`). The ceiling is found within seconds and then changes slowly.
+    If a limiter follows the budget (the `control_signal` given to `advance` then differs from the budget's own), the
+    target has a ceiling. At the ceiling, more power would lower the error in samples that pass the limiter by as much
+    as it would raise it in the others (see `power.ceiling`). The ceiling is found within seconds and then changes
+    slowly.
 
     Parameters
     ----------
@@ -390,8 +392,8 @@ class PowerBudget:
     credit_s : float, default 0.1
         Seconds of rated power that can be saved while the noise needs less.
     averaging_s : float, default 10
-        Time in seconds over which the mean power is kept to the rated one, also when the noise gets louder at once.
-        Larger debts than this many seconds of rated power are forgotten.
+        Time in seconds over which the mean power is kept to the rated one, even if the noise suddenly gets louder. Debt
+        beyond this many seconds of rated power is forgotten.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
@@ -505,7 +507,7 @@ class PowerBudget:
 
     @property
     def ceiling(self) -> float:
-        """Largest target power over the rated power that pays behind a limiter; 3 if none ever acts."""
+        """Ceiling of the target power behind a limiter, over the rated power; 3 if no limiter ever acts."""
         return float(self._state.numbers["ceiling"][0])
 
     @property
