@@ -45,7 +45,7 @@ class MonitoredController(WrappedController):
     control. The controller's own estimates do not show this, because they rely on the same path. So the monitor
     compares the power of the error, relative to that of the reference, with what it was while the loudspeakers were
     silent. If it exceeds that by `margin_db`, the loudspeakers are muted for `window_s`, which shows whether the
-    control is to blame. If so, the controller is replaced by a fresh copy, which starts after a pause; each further
+    control is to blame: it is if the error has fallen by more than half the margin. If so, the controller is replaced by a fresh copy, which starts after a pause; each further
     failure doubles the pause. If not, the control goes on, and the margin is widened by half, because the noise
     evidently fluctuates.
 

@@ -183,7 +183,7 @@ def kf_pb(
         How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default half a
         sample of delay. The control filter is weaker where the path is less certain, and almost zero where the error
         may exceed 100 % (with half a sample of delay, above a third of the sample rate), so that the noise never
-        becomes louder than without control. None: the path is exact.
+        becomes louder than without control if the error is within the uncertainty. None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths

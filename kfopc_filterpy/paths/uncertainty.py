@@ -7,7 +7,7 @@ g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y
 
 This is stable if :math:`g\delta < 1`. It is never louder than without control if :math:`\delta \le 1`, for any g from 0
 to 1.
-Where :math:`\delta \ge 1`, only g = 0 is safe. Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the
+Where :math:`\delta > 1`, only g = 0 is safe. Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the
 path is known well, g vanishes where :math:`\delta` reaches 1, and :math:`g\delta` is at most 0.62.
 
 A controller gets this g from a penalty on the control signal through the filter W with :math:`|W|^2 = (1 - g)/g`:
