@@ -28,7 +28,7 @@ from kfopc_filterpy.plot import curve_style, plot_nse
 
 from . import rooms
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Row, Setting, bound_of
-from .parts import MARK, first_second_db, new_figure, tuned_in_words
+from .parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
 from .rooms import MEASURED, RECORDINGS, SIZES, Place, equally_rated, level_map_db, make_rated_scene, places
 
 DURATION_S = 8.0
@@ -462,7 +462,7 @@ def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
     figure, axes = new_figure((3.1 * len(shown) + 1.6, 5.4), 1, len(shown), sharey=True)
     for name, ax in zip(shown, axes[0], strict=True):
         here = [row for row in own if row.path == name]
-        for i, noise in enumerate(dict.fromkeys(row.noise for row in here)):
+        for i, noise in enumerate(dict.fromkeys(row.noise for row in own)):
             mine = [row for row in here if row.noise == noise and row.noise_reduction_db > 0.0]
             style = curve_style(i) | {"linestyle": "", "label": noise}
             places_of = [order.index(row.algorithm) for row in mine]
@@ -475,7 +475,7 @@ def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
         ax.set_yticks(range(len(order)), order)
         ax.set_xlim(0.0, 1.1 * max(row.noise_reduction_db for row in here if row.algorithm == BOUND or _within(row)))
         ax.grid(True, alpha=0.3)
-        ax.legend(fontsize="x-small", frameon=True, loc="lower right")
+    legend_of(figure, axes[0])
     caption = (
         "Noise reduction over the steady half, all microphones together. Each loudspeaker is rated at a quarter of the "
         "power that it would use without a limit. Hollow marks: a loudspeaker's power exceeds "

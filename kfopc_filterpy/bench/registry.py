@@ -146,9 +146,8 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
             **_references(scene),
         }
         if budget:
-            uncertainty = scene.secondary_path_uncertainty
             settings |= {"rated_power": scene.rated_power, "fs": scene.fs, "form": "direct"}
-            settings |= {"secondary_path_uncertainty": uncertainty}
+            settings |= {"secondary_path_uncertainty": scene.secondary_path_uncertainty}
         elif not free:
             settings |= {"constraint": _constraint(scene)}
         return make(scene.n_taps, scene.known_secondary, **settings)

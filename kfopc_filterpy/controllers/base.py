@@ -13,7 +13,7 @@ from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
 from ..kernels.holding import Held
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.uncertainty import GUARD_TAPS, guard_against, path_uncertainty
+from ..paths.uncertainty import GUARD_TAPS, guard_filter, path_uncertainty
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
@@ -85,6 +85,13 @@ def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
             )
 
 
+def listening(controller: Any) -> Any:
+    """Return a controller, or raise ValueError if it cannot follow the noise before the control is switched on."""
+    if not hasattr(controller, "listen"):
+        raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+    return controller
+
+
 class WrappedController:
     """Base class of a controller that wraps another one and passes on its attributes."""
 
@@ -98,6 +105,17 @@ class WrappedController:
         if name == "controller" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.controller, name)
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if a part of the wrapper or the controller is for another sample rate than `fs` in Hz."""
+        require_rates(fs, self._rates())
+        inner = getattr(self.controller, "require_sample_rate", None)
+        if inner is not None:
+            inner(fs)
+
+    def _rates(self) -> dict[str, float | None]:
+        """Return the sample rates in Hz of the wrapper's own parts, by name; None for a part without one."""
+        return {}
 
 
 class FilteredReferenceController:
@@ -277,7 +295,7 @@ class FilteredReferenceController:
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
         LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
         second observation. An uncertainty can be assigned for KF-ANC, KF-OPC and the LMS family of one channel, except
-        FxNLMS; `kf_pb` takes it as a setting.
+        FxNLMS. `kf_pb` takes it as a setting, and then it is None here.
         """
         return None if self._uncertainty is None else self._uncertainty.copy()
 
@@ -290,9 +308,9 @@ class FilteredReferenceController:
             )
         lines = self._state.lines
         uncertainty = path_uncertainty(value, lines.secondary_estimate)
-        taps = guard_against(value, lines.secondary_estimate)
-        guard = None if taps is None else GuardLine(taps, delay_line(self.n_taps))
-        self._uncertainty = None if guard is None else uncertainty
+        exact = not np.any(uncertainty)
+        guard = None if exact else GuardLine(guard_filter(uncertainty), delay_line(self.n_taps))
+        self._uncertainty = None if exact else uncertainty
         self._state = self._state._replace(lines=lines._replace(guard=guard))
 
     def _takes_guard(self) -> bool:

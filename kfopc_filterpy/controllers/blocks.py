@@ -26,8 +26,8 @@ LOUDEST = 1e100  # references beyond it have been refused, but are still in the 
 class BlockController(FilteredReferenceController):
     """Base class that computes control filters within each loudspeaker's rated power after every block.
 
-    A subclass sets `_state` and defines `_end_block`. The state has a record `numbers`, whose field
-    `waiting` counts the samples since the end of the last block.
+    A subclass sets `_state` and defines `_end_block`. The state has a record `numbers`, whose field `waiting` counts the
+    samples since the end of the last block.
     """
 
     _state: Any

@@ -247,3 +247,22 @@ def amplifier_models(amplifier: Any, n_loudspeakers: int) -> np.ndarray:
             f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
         )
     return as_records(np.array(models))
+
+
+def amplifier_functions(amplifier: Any, n_loudspeakers: int) -> list[Any] | None:
+    """Return the functions of a sample that stand for the amplifiers, one for each loudspeaker; None without any."""
+    if amplifier is None:
+        return None
+    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
+    if len(each) != n_loudspeakers or not all(callable(one) for one in each):
+        raise TypeError(
+            f"amplifier must be a function of a sample, or one for each of the {n_loudspeakers} loudspeakers, "
+            f"got {amplifier!r}"
+        )
+    return each
+
+
+def push_sample(line: np.ndarray, sample: np.ndarray) -> None:
+    """Add the newest sample of several channels to a delay line in which the channels of a sample are adjacent."""
+    line[sample.size :] = line[: line.size - sample.size]
+    line[: sample.size] = sample[: line.size]

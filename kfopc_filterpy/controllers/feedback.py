@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,8 @@ import numpy as np
 from .._validate import as_channels, as_number
 from ..paths.channels import is_path_matrix, path_matrix
 from ..paths.models import is_system, path_taps, sampling_rate
-from .base import Controller, WrappedController, require_rates
-from .channels import channel_sample
-from .virtual import push_sample
+from .base import Controller, WrappedController, listening
+from .channels import amplifier_functions, channel_sample, push_sample
 
 
 class FeedbackNeutralizer(WrappedController):
@@ -79,7 +77,7 @@ class FeedbackNeutralizer(WrappedController):
             raise ValueError("feedback_path must have a delay of a sample at least: a first tap is not 0")
         self._require_fitting_controller(paths)
         self._n_references, self._n_loudspeakers, taps = paths.shape
-        self._amplifiers = self._checked_amplifiers(amplifier)
+        self._amplifiers = amplifier_functions(amplifier, self._n_loudspeakers)
         self._paths = np.ascontiguousarray(np.moveaxis(paths[..., 1:], 2, 1).reshape(self._n_references, -1))
         self._played = np.zeros((taps - 1) * self._n_loudspeakers)  # newest first, loudspeakers of a sample together
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} with feedback neutralisation"
@@ -98,17 +96,6 @@ class FeedbackNeutralizer(WrappedController):
                     f"feedback_path must be (I references, J loudspeakers, taps) with the controller's {name} of {own}, "
                     f"got {paths.shape}"
                 )
-
-    def _checked_amplifiers(self, amplifier: Any) -> list[Any] | None:
-        if amplifier is None:
-            return None
-        each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * self._n_loudspeakers
-        if len(each) != self._n_loudspeakers or not all(callable(one) for one in each):
-            raise TypeError(
-                f"amplifier must be a function of a sample, or one for each of the {self._n_loudspeakers} loudspeakers, "
-                f"got {amplifier!r}"
-            )
-        return each
 
     def __repr__(self) -> str:
         return f"<{self.name}: {self._played.size // self._n_loudspeakers + 1} taps, {self.controller!r}>"
@@ -139,18 +126,14 @@ class FeedbackNeutralizer(WrappedController):
 
         What the loudspeakers played before is still subtracted.
         """
-        if not hasattr(self.controller, "listen"):
-            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+        controller = listening(self.controller)
         x = np.array(np.atleast_2d(as_channels(references, "references")))
         played = self._played.copy()
         for n in range(x.shape[1]):
             x[:, n] -= self._paths @ played
             push_sample(played, np.zeros(self._n_loudspeakers))
-        self.controller.listen(x if self._several else x[0], errors)
+        controller.listen(x if self._several else x[0], errors)
         self._played = played
 
-    def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the feedback path or the controller is for another sample rate than `fs` in Hz."""
-        require_rates(fs, {"feedback path": self._path_fs})
-        if hasattr(self.controller, "require_sample_rate"):
-            self.controller.require_sample_rate(fs)
+    def _rates(self) -> dict[str, float | None]:
+        return {"feedback path": self._path_fs}

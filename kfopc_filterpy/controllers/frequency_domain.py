@@ -170,7 +170,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         secondary, n_taps, n_primary = read_paths(secondary_path, n_taps, n_primary)
         fs = as_positive(fs, "fs", unit="Hz")
         block = _block(n_primary, fs) if block is None else as_count(block, "block")
-        paths = PartitionedKalman(len(secondary), n_references, n_primary, block)
+        paths = PartitionedKalman(len(secondary), as_count(n_references, "n_references"), n_primary, block)
         super().__init__(
             n_taps,
             secondary_path,

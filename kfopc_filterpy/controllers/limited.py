@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..power.limiter import OutputLimiter
-from .base import Controller, FilteredReferenceController, WrappedController, require_rates
+from .base import Controller, FilteredReferenceController, WrappedController, listening
 
 
 class LimitedController(WrappedController):
@@ -66,9 +66,8 @@ class LimitedController(WrappedController):
             emitted(y)
         return y
 
-    def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the limiter is for another sample rate than `fs` in Hz."""
-        require_rates(fs, {"limiter": self.limiter.fs})
+    def _rates(self) -> dict[str, float | None]:
+        return {"limiter": self.limiter.fs}
 
     def update(self, error: float) -> None:
         """Pass the error e(n) to the controller's `update`."""
@@ -76,7 +75,5 @@ class LimitedController(WrappedController):
 
     def listen(self, references: Any, errors: Any) -> None:
         """Let the controller follow `references` and `errors` before the control is switched on, with silent output."""
-        if not hasattr(self.controller, "listen"):
-            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
-        self.controller.listen(references, errors)
+        listening(self.controller).listen(references, errors)
         self.limiter.process(np.zeros(len(references)))

@@ -41,13 +41,13 @@ class HealthEvent:
 class MonitoredController(WrappedController):
     """A controller with a monitor that mutes the loudspeakers if the control makes the noise louder.
 
-    A secondary path with a flipped sign, or a delay that is wrong by several samples, makes any controller louder than no
-    control. The controller's own estimates do not show this, because they rely on the same path. So the monitor
+    A secondary path with a flipped sign, or a delay that is wrong by several samples, makes the noise louder with any
+    controller. The controller's own estimates do not show this, because they rely on the same path. So the monitor
     compares the power of the error, relative to that of the reference, with what it was while the loudspeakers were
-    silent. If it exceeds that by `margin_db`, the loudspeakers are muted for `window_s`, which shows whether the
-    control is to blame: it is if the error has fallen by more than half the margin. If so, the controller is replaced by a fresh copy, which starts after a pause; each further
-    failure doubles the pause. If not, the control goes on, and the margin is widened by half, because the noise
-    evidently fluctuates.
+    silent. If it exceeds that by `margin_db`, the loudspeakers are muted for `window_s`. The control is to blame if
+    this lowers the power by more than half the margin. It is then replaced by a fresh copy, which starts after a pause,
+    and each further failure doubles the pause. Otherwise the control goes on, and the margin is widened by half,
+    because the noise evidently fluctuates.
 
     Parameters
     ----------
@@ -128,13 +128,8 @@ class MonitoredController(WrappedController):
     def __repr__(self) -> str:
         return f"<{self.name}: {'muted' if self.muted else 'running'}, {len(self.health)} events>"
 
-    def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the monitor or its controller is for another sample rate than `fs` in Hz."""
-        if abs(fs - self.fs) > 1e-9 * fs:
-            raise ValueError(f"fs is {fs:g} Hz but the monitor is for {self.fs:g} Hz: make it with the fs of the run")
-        inner = getattr(self.controller, "require_sample_rate", None)
-        if inner is not None:
-            inner(fs)
+    def _rates(self) -> dict[str, float | None]:
+        return {"monitor": self.fs}
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest `reference` x(n), or silence."""

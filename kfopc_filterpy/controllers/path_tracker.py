@@ -14,7 +14,7 @@ from scipy.special import stdtr
 from .._validate import as_generator, as_number, as_positive, as_signal
 from ..paths.least_squares import correlation_matrix, cross_correlation, cross_correlation_matrix
 from ..power.constraint import DEFAULT_FS
-from .base import FilteredReferenceController, WrappedController, require_rates
+from .base import FilteredReferenceController, WrappedController
 
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
@@ -406,8 +406,9 @@ class PathTracker(WrappedController):
     def _power_without_control(self, begin: int) -> float:
         """Return the power that the error would have without control, in the frame that starts at sample `begin`.
 
-        It is the power of the reference, times the mean ratio of disturbance and reference over the memory. The
-        disturbance estimate grows if the path is wrong, so a frame counts as `hold_db` above the mean at most.
+        It is the mean power of the disturbance estimate over the memory, times the ratio of the reference's power to its
+        own mean if that is above 1. The estimate grows if the path is wrong, so a frame counts as `hold_db` above what
+        was expected of it at most.
         """
         samples = slice(self._past + begin, self._past + begin + self._frame)
         played = (self._y + self._v)[samples.start - self._path.size + 1 : samples.stop]
@@ -486,7 +487,5 @@ class PathTracker(WrappedController):
             self._x[at], self._y[at], self._v[at] = x, 0.0, 0.0
             self._take(float(e))
 
-    def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if the tracker or the controller is for another sample rate than `fs` in Hz."""
-        require_rates(fs, {"path tracker": self.fs})
-        self.controller.require_sample_rate(fs)
+    def _rates(self) -> dict[str, float | None]:
+        return {"path tracker": self.fs}

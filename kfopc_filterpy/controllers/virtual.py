@@ -11,7 +11,8 @@ import numpy as np
 from .._validate import as_channels, as_count, as_positive, as_real_array, require_finite
 from ..paths.channels import secondary_paths
 from ..paths.observation import ObservationFilters
-from .base import Controller, WrappedController, require_rates
+from .base import Controller, WrappedController, listening
+from .channels import amplifier_functions, push_sample
 
 if TYPE_CHECKING:
     import control
@@ -282,7 +283,7 @@ class VirtualMicrophones(WrappedController):
             raise ValueError(f"virtual must name a microphone: all {self.n_microphones} of secondary_path are physical")
         self.observer = self._checked_observer(observer)
         self._require_fitting_controller()
-        self._amplifiers = self._checked_amplifiers(amplifier)
+        self._amplifiers = amplifier_functions(amplifier, self.n_loudspeakers)
         self._paths = np.ascontiguousarray(np.moveaxis(secondary, 2, 1).reshape(self.n_microphones, -1))
         self._played = np.zeros(self._paths.shape[1])  # newest first, all loudspeakers of a sample together
         self._virtual_error = np.zeros(self.virtual.size)
@@ -325,17 +326,6 @@ class VirtualMicrophones(WrappedController):
                     f"{self.n_loudspeakers} loudspeakers, but its {name} is {own}: make it with the secondary "
                     "paths to the virtual microphones only"
                 )
-
-    def _checked_amplifiers(self, amplifier: Any) -> list[Any] | None:
-        if amplifier is None:
-            return None
-        each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * self.n_loudspeakers
-        if len(each) != self.n_loudspeakers or not all(callable(one) for one in each):
-            raise TypeError(
-                f"amplifier must be a function of a sample, or one for each of the {self.n_loudspeakers} loudspeakers, "
-                f"got {amplifier!r}"
-            )
-        return each
 
     def __repr__(self) -> str:
         return f"<{self.name}: {self.physical.size} physical, {self.virtual.size} virtual>"
@@ -391,8 +381,7 @@ class VirtualMicrophones(WrappedController):
         errors : ndarray, shape (K, n_samples)
             Signals of all microphones; only those of the physical ones are used.
         """
-        if not hasattr(self.controller, "listen"):
-            raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
+        controller = listening(self.controller)
         if (
             np.ndim(errors) != 2
             or len(errors) != self.n_microphones
@@ -412,7 +401,7 @@ class VirtualMicrophones(WrappedController):
             virtual_errors[:, n] = self._virtual_error
             self.observer.advance(disturbance)
         try:
-            self.controller.listen(references, virtual_errors)
+            controller.listen(references, virtual_errors)
         except (ValueError, TypeError):
             self._played, self._virtual_error, self.observer = before
             raise
@@ -421,14 +410,5 @@ class VirtualMicrophones(WrappedController):
         """Return what changes in the wrapper with each sample."""
         return self._played, self._virtual_error, self.observer
 
-    def require_sample_rate(self, fs: float) -> None:
-        """Raise ValueError if secondary path, observer or controller are for a sampling rate other than `fs` in Hz."""
-        require_rates(fs, {"secondary path": self._path_fs, "observer": getattr(self.observer, "fs", None)})
-        if hasattr(self.controller, "require_sample_rate"):
-            self.controller.require_sample_rate(fs)
-
-
-def push_sample(line: np.ndarray, sample: np.ndarray) -> None:
-    """Add the newest sample of several channels to a delay line in which the channels of a sample are adjacent."""
-    line[sample.size :] = line[: line.size - sample.size]
-    line[: sample.size] = sample[: line.size]
+    def _rates(self) -> dict[str, float | None]:
+        return {"secondary path": self._path_fs, "observer": getattr(self.observer, "fs", None)}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_generator, as_nonnegative, as_signal
+from ..controllers.base import listening
 from ..paths.models import path_taps
 
 DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
@@ -30,9 +31,7 @@ def require_one_source(primary_path: Any, disturbance: Any) -> None:
 
 def listen_first(controller: Any, references: np.ndarray, errors: np.ndarray) -> None:
     """Let the controller follow the noise before it is switched on."""
-    if not hasattr(controller, "listen"):
-        raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
-    controller.listen(references, errors)
+    listening(controller).listen(references, errors)
 
 
 class SensorNoise:

@@ -269,8 +269,8 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
                 f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
                 "KalmanControllers of filters from KFOPC.random_walk"
             )
-        limiter, guard = state.lines.limiter is not None, state.lines.guard is not None
-        for what in (controller.unshared, "limiter" * limiter, "secondary-path uncertainty" * guard):
+        parts = {"limiter": state.lines.limiter, "secondary-path uncertainty": state.lines.guard}
+        for what in (controller.unshared, *(name for name, part in parts.items() if part is not None)):
             if what:
                 raise ValueError(f"controllers[{i}] has a {what}, which scenarios do not run: use simulate for it")
         states.append(state)

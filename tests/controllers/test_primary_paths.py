@@ -286,6 +286,7 @@ def test_a_microphone_that_no_loudspeaker_reaches_does_not_change_the_control(fo
         ({"microphone_weights": [1.0, -1.0, 1.0]}, ValueError, "negative"),
         ({"path_memory_s": 0.0}, ValueError, "path_memory_s"),
         ({"n_references": 0}, ValueError, "n_references"),
+        ({"n_references": -1}, ValueError, "n_references must be at least 1"),
         ({"limiter": [OutputLimiter(1.0)]}, TypeError, "one for each loudspeaker"),
         ({"amplifier": [HardClipAmplifier(1.0)]}, TypeError, "each of the 2 loudspeakers"),
     ],

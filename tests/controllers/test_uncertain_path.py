@@ -34,7 +34,7 @@ DIRECT: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 1e-3}
 ONE_CHANNEL: dict[str, Any] = {"form": "shared gain"}
 
 
-def reduction(settings: dict[str, Any], estimate: np.ndarray, x: np.ndarray, **more: Any) -> Any:
+def run(settings: dict[str, Any], estimate: np.ndarray, x: np.ndarray, **more: Any) -> Any:
     settings = {"rated_power": 1e3, "fs": FS} | settings | more
     controller = kf_pb(24, estimate, **settings)
     shaped = x if settings.get("form") is None else x[np.newaxis]
@@ -46,7 +46,7 @@ def reduction(settings: dict[str, Any], estimate: np.ndarray, x: np.ndarray, **m
 def test_a_tone_settles_at_the_closed_form(settings: dict[str, Any], frequency: float) -> None:
     """E/D = (1 - g)/(1 + g Delta), to 1 dB, with the g that the guard filter has at the tone and Delta of one sample."""
     x = tone(frequency, 6.0, fs=FS) + 1e-3 * np.random.default_rng(0).standard_normal(int(6 * FS))
-    result = reduction(settings, LATE, x, secondary_path_uncertainty=TOLERANCE)
+    result = run(settings, LATE, x, secondary_path_uncertainty=TOLERANCE)
     omega = 2 * np.pi * frequency / FS
     guard = guard_filter(path_uncertainty(TOLERANCE, LATE))
     share = 1 / (1 + np.abs(np.sum(guard * np.exp(-1j * omega * np.arange(guard.size)))) ** 2)
@@ -64,7 +64,7 @@ def test_white_noise_is_never_louder_although_the_path_is_a_sample_off(
     x = np.random.default_rng(1).standard_normal(int(5 * FS))
 
     def seconds(uncertainty: Any) -> list[float]:
-        result = reduction(settings, estimate, x, rated_power=0.3, secondary_path_uncertainty=uncertainty)
+        result = run(settings, estimate, x, rated_power=0.3, secondary_path_uncertainty=uncertainty)
         parts = [slice(int(k * FS), int((k + 1) * FS)) for k in range(1, 5)]
         error, disturbance = np.atleast_2d(result.error), np.atleast_2d(result.disturbance)
         return [-10 * np.log10(np.sum(error[:, part] ** 2) / np.sum(disturbance[:, part] ** 2)) for part in parts]
@@ -80,8 +80,8 @@ def test_an_exact_path_costs_little(settings: dict[str, Any]) -> None:
     x = band_limited_noise((200.0, 1200.0), 5.0, fs=FS, rng=2) + 1e-3 * np.random.default_rng(3).standard_normal(
         int(5 * FS)
     )
-    with_guard = reduction(settings, TRUE, x, rated_power=0.3)
-    without = reduction(settings, TRUE, x, rated_power=0.3, secondary_path_uncertainty=None)
+    with_guard = run(settings, TRUE, x, rated_power=0.3)
+    without = run(settings, TRUE, x, rated_power=0.3, secondary_path_uncertainty=None)
     loss = noise_reduction_db(without.error, without.disturbance) - noise_reduction_db(
         with_guard.error, with_guard.disturbance
     )

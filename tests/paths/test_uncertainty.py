@@ -46,10 +46,8 @@ def test_what_can_be_given() -> None:
 def test_measured_paths_give_their_largest_distance() -> None:
     measured = np.array([PATH, 1.1 * PATH, 0.7 * PATH])
     np.testing.assert_allclose(path_uncertainty(measured, PATH), 0.3, rtol=1e-9)
-    late = np.array([np.roll(PATH, 1)])[:, :4]
-    expected = 2 * np.sin(OMEGA / 2)
-    np.testing.assert_allclose(path_uncertainty(np.array([[0.0, 0.0, *PATH[1:]]]), PATH), expected, atol=1e-9)
-    assert late.shape == (1, 4)
+    late = np.concatenate([[0.0], PATH])[np.newaxis]
+    np.testing.assert_allclose(path_uncertainty(late, PATH), 2 * np.sin(OMEGA / 2), atol=1e-9)
 
 
 def test_matrices_are_measured_by_their_norm() -> None:
