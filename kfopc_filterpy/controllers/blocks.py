@@ -43,6 +43,7 @@ class BlockController(FilteredReferenceController):
         n_primary: int,
         n_references: int,
         memory_s: float,
+        averaging_s: float,
         fs: float,
         block: int | None = None,
         history: int = 0,
@@ -57,7 +58,15 @@ class BlockController(FilteredReferenceController):
         limits = np.full(secondary.shape[1], np.inf) if self._rated is None else self._rated
         self._path_weights = np.sqrt(microphone_weights)[:, np.newaxis, np.newaxis]
         guard = guard_against(secondary_path_uncertainty, secondary)
-        self._budget = ChannelBudget(self._path_weights * secondary, n_taps, n_primary, n_references, limits, guard)
+        self._budget = ChannelBudget(
+            self._path_weights * secondary,
+            n_taps,
+            n_primary,
+            n_references,
+            limits,
+            guard,
+            as_positive(averaging_s, "averaging_s", unit="s"),
+        )
         n_lags = self._budget.n_lags
         self._past = max(history, n_lags - 1 + self.block)  # samples of the references that a block needs
         super().__init__(
@@ -97,7 +106,11 @@ class BlockController(FilteredReferenceController):
             return
         state.numbers["waiting"] = 0
         references = np.array([newest(line, self._past)[::-1] for line in self._lines.reference])
+        energy = self._lines.energy.copy()
+        self._lines.energy[:] = 0.0
         if np.all(np.abs(references) < LOUDEST):
+            if np.any(energy):  # otherwise the control was off
+                self._budget.spend(energy / self.block, self.block / self.fs)
             self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
             self._end_block(references)
 

@@ -41,6 +41,7 @@ class ChannelLines(NamedTuple):
     amplifier: np.ndarray  # (J, 1) records of those models
     limiter: tuple[LimiterState, ...] | None
     control_signal: np.ndarray  # (J,) the last y
+    energy: np.ndarray  # (J,) sum of y^2 since the start of the block; without blocks, of all samples
     disturbance: np.ndarray  # (K,) the last estimate d^
     modified_error: np.ndarray  # (K,) room for an algorithm that adapts to another error
     constraint_factor: np.ndarray  # (J,) the last factors
@@ -67,6 +68,7 @@ def channel_lines(
         amplifier=amplifier_models(amplifier, J),
         limiter=limiter,
         control_signal=np.zeros(J),
+        energy=np.zeros(J),
         disturbance=np.zeros(K),
         modified_error=np.zeros(K),
         constraint_factor=np.ones(J),
@@ -126,6 +128,7 @@ def emit_channel(lines, j, y):
     """Set the control signal of a loudspeaker to y after its limiter, if there is one."""
     y = limited_channel(lines.limiter, j, y)
     lines.control_signal[j] = y
+    lines.energy[j] += y * y
     push(lines.output[j], amplify(lines.amplifier[j], y))
 
 

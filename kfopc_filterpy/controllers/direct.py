@@ -22,6 +22,7 @@ from ..kernels.vectors import copy_into
 from ..paths.channels import secondary_paths
 from ..paths.uncertainty import HALF_A_SAMPLE
 from ..power.amplifiers import Amplifier
+from ..power.budget import DEFAULT_AVERAGING_S
 from ..power.constraint import DEFAULT_FS, ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import OVERFLOW, FilteredReferenceController, constraint_or_none
@@ -280,6 +281,8 @@ class DirectPowerBudget(BlockController):
         paths are exact.
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
+    averaging_s : float, default 10
+        Time in seconds over which the mean powers are kept to the rated ones, see `PowerBudget`.
     fs : float, default 16000
         Sample rate in Hz.
 
@@ -320,6 +323,7 @@ class DirectPowerBudget(BlockController):
         n_references: int = 1,
         secondary_path_uncertainty: Any = HALF_A_SAMPLE,
         memory_s: float = DEFAULT_MEMORY_S,
+        averaging_s: float = DEFAULT_AVERAGING_S,
         fs: float = DEFAULT_FS,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Sequence[OutputLimiter] | None = None,
@@ -335,6 +339,7 @@ class DirectPowerBudget(BlockController):
             microphone_weights=noise.mean() / noise,  # as the Kalman filter weighs the errors
             n_primary=0,
             memory_s=memory_s,
+            averaging_s=averaging_s,
             fs=fs,
             n_references=n_references,
             amplifier=amplifier,

@@ -17,6 +17,7 @@ from ..kernels.partitioned_kalman import PartitionedKalman
 from ..kernels.records import new_record
 from ..paths.uncertainty import HALF_A_SAMPLE
 from ..power.amplifiers import Amplifier
+from ..power.budget import DEFAULT_AVERAGING_S
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
 from .blocks import BLOCK_S, DEFAULT_MEMORY_S
@@ -89,6 +90,8 @@ class FrequencyDomainKalman(PrimaryPathController):
     memory_s : float, optional
         Memory of the correlation of the references in seconds; by default 0.5 s, or the duration of 16 control filters
         if that is longer.
+    averaging_s : float, default 10
+        Time in seconds over which the mean powers are kept to the rated ones, see `PowerBudget`.
     fs : float, default 16000
         Sample rate in Hz.
     block : int, optional
@@ -161,6 +164,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         secondary_path_uncertainty: Any = HALF_A_SAMPLE,
         path_memory_s: float | None = None,
         memory_s: float | None = None,
+        averaging_s: float = DEFAULT_AVERAGING_S,
         fs: float = DEFAULT_FS,
         block: int | None = None,
         microphone_weights: Any = None,
@@ -180,6 +184,7 @@ class FrequencyDomainKalman(PrimaryPathController):
             secondary_path_uncertainty=secondary_path_uncertainty,
             path_memory_s=_memory_s(DEFAULT_PATH_MEMORY_S, n_primary / fs) if path_memory_s is None else path_memory_s,
             memory_s=_memory_s(DEFAULT_MEMORY_S, n_taps / fs) if memory_s is None else memory_s,
+            averaging_s=averaging_s,
             fs=fs,
             block=block,
             history=paths.span,

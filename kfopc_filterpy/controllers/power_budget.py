@@ -190,7 +190,8 @@ def kf_pb(
         (`FrequencyDomainKalman`). By default direct for one channel, shared gain for several.
     **settings
         Further settings. The direct form takes `fs`, `memory_s`, `credit_s` and `averaging_s` for one channel (see
-        `PowerBudget`), `fs` and `memory_s` for several (see `DirectPowerBudget`). For the other forms, see their classes.
+        `PowerBudget`), `fs`, `memory_s` and `averaging_s` for several (see `DirectPowerBudget`). For the other forms, see
+        their classes.
 
     Returns
     -------

@@ -20,6 +20,7 @@ from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
 from ..paths.uncertainty import HALF_A_SAMPLE
 from ..power.amplifiers import Amplifier
+from ..power.budget import DEFAULT_AVERAGING_S
 from ..power.constraint import DEFAULT_FS
 from ..power.limiter import OutputLimiter
 from .blocks import DEFAULT_MEMORY_S
@@ -98,6 +99,8 @@ class SharedGainKalman(PrimaryPathController):
         changes faster.
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
+    averaging_s : float, default 10
+        Time in seconds over which the mean powers are kept to the rated ones, see `PowerBudget`.
     fs : float, default 16000
         Sample rate in Hz.
     microphone_weights : array_like, shape (K,), optional
@@ -140,6 +143,7 @@ class SharedGainKalman(PrimaryPathController):
         secondary_path_uncertainty: Any = HALF_A_SAMPLE,
         path_memory_s: float = DEFAULT_PATH_MEMORY_S,
         memory_s: float = DEFAULT_MEMORY_S,
+        averaging_s: float = DEFAULT_AVERAGING_S,
         fs: float = DEFAULT_FS,
         microphone_weights: Any = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
@@ -154,6 +158,7 @@ class SharedGainKalman(PrimaryPathController):
             secondary_path_uncertainty=secondary_path_uncertainty,
             path_memory_s=path_memory_s,
             memory_s=memory_s,
+            averaging_s=averaging_s,
             fs=fs,
             microphone_weights=microphone_weights,
             amplifier=amplifier,

@@ -24,6 +24,7 @@ from ..kernels.block_toeplitz import (
     toeplitz_energy,
     toeplitz_product,
 )
+from .budget import DEFAULT_AVERAGING_S, DEFAULT_CREDIT_S, PACE, TARGET_LEAST
 
 SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
 MOST_SWEEPS = 24  # as long as a power is beyond its rated power by more than
@@ -31,6 +32,7 @@ EXCESS = 1.1
 RIDGE = 1e-6  # of the mean energy: limits the weights in directions without energy
 LARGEST_CHANGE = 10.0  # largest ratio of power to rated power that counts in a sweep
 SMALLEST_WEIGHT = 1e-6  # of the natural weight: a penalty that is not needed must be able to grow again
+REPAYMENT = 1.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account)
 
 
 class ChannelBudget:
@@ -48,6 +50,8 @@ class ChannelBudget:
         Rated power of each loudspeaker.
     guard : ndarray, shape (n_guard,), optional
         Guard filter W against uncertain secondary paths; by default none.
+    averaging_s : float, optional
+        Time in seconds over which the mean powers are kept to the rated ones, see `spend`.
     """
 
     def __init__(
@@ -58,8 +62,12 @@ class ChannelBudget:
         n_references: int,
         rated_power: np.ndarray,
         guard: np.ndarray | None = None,
+        averaging_s: float = DEFAULT_AVERAGING_S,
     ) -> None:
         self.n_taps, self.n_primary, self.n_references, self.rated_power = n_taps, n_primary, n_references, rated_power
+        self.averaging_s = averaging_s
+        self.account = np.zeros(len(rated_power))  # seconds of rated power spent beyond the rated power
+        self.target_power = rated_power.copy()
         _, self.n_loudspeakers, n_secondary = secondary.shape
         guard = np.zeros(1) if guard is None else guard
         self._inner = n_taps + n_secondary + guard.size - 1  # lags of R_x that the left side depends on
@@ -72,6 +80,27 @@ class ChannelBudget:
         self._guarded = 1.0 + np.abs(fft.rfft(guard, self._inner_size)[:, np.newaxis]) ** 2
         self.weights = np.zeros((self.n_loudspeakers, n_references, n_taps))
         self.penalty: np.ndarray | None = None  # lambda, (J,)
+
+    def spend(self, power: np.ndarray, duration_s: float) -> None:
+        """Add what each loudspeaker spent in a time to its account, and set the powers to solve for.
+
+        The recent correlation predicts the power only roughly. The account corrects the mean: a target is the rated
+        power times ``exp(-account)``, with the account in seconds of rated power. As for one loudspeaker (see
+        `PowerBudget`), half of the rated power at most repays a debt, more only if the debt exceeds a quarter of the
+        averaging time, and debt beyond the averaging time is forgotten.
+
+        Parameters
+        ----------
+        power : ndarray, shape (J,)
+            Mean power of each control signal.
+        duration_s : float
+            The time in seconds.
+        """
+        spent = self.account + (power / self.rated_power - 1.0) * duration_s
+        self.account = np.clip(spent, -DEFAULT_CREDIT_S, self.averaging_s)
+        repaid = np.maximum(PACE, 2.0 * self.account / self.averaging_s)
+        share = np.maximum(np.exp(-REPAYMENT * self.account), np.maximum(1.0 - repaid, TARGET_LEAST))
+        self.target_power = self.rated_power * share
 
     def solve(self, correlation: np.ndarray, primary: np.ndarray) -> None:
         """Move `weights` and `penalty` towards the solution for given primary paths.
@@ -123,9 +152,9 @@ class ChannelBudget:
             filters = v.reshape(J, n_references, n)
             power = toeplitz_energy(whole_x, filters)
             self._adjust_penalty(power, natural)
-            if sweep >= SWEEPS and np.all(power <= EXCESS * self.rated_power):
+            if sweep >= SWEEPS and np.all(power <= EXCESS * self.target_power):
                 break
-        excess = power / (EXCESS * self.rated_power)
+        excess = power / (EXCESS * self.target_power)
         self.weights = filters / np.sqrt(np.maximum(excess, 1.0))[:, np.newaxis, np.newaxis]
 
     def _adjust_penalty(self, power: np.ndarray, natural: float) -> None:
@@ -138,7 +167,7 @@ class ChannelBudget:
         oscillate.
         """
         assert self.penalty is not None
-        ratio = np.log(np.clip(power / self.rated_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE))
+        ratio = np.log(np.clip(power / self.target_power, 1.0 / LARGEST_CHANGE, LARGEST_CHANGE))
         floor = SMALLEST_WEIGHT * natural  # at the floor, the rated power is not used up, and the ratio does not count
         common = np.average(ratio, weights=np.maximum(self.penalty - floor, np.finfo(float).tiny))
         exponent = min(0.5 + 0.5 * natural / self.penalty.mean(), 1.0)

@@ -153,7 +153,15 @@ def rows_of(
     for path, noise in (("4 x 4", "tones"), (MEASURED, "recorded motor")):
         bound = {BOUND: 8.0, SCALED: 4.0}
         rows += [
-            ChannelRow(path=path, noise=noise, algorithm=name, noise_reduction_db=db, powers=[1.0, 0.5], power=1.0)
+            ChannelRow(
+                path=path,
+                noise=noise,
+                algorithm=name,
+                noise_reduction_db=db,
+                powers=[1.0, 0.5],
+                power=1.0,
+                limited=[True, False],
+            )
             for name, db in bound.items()
         ]
         for name, db, own in ((KF_PB, 8.0 - loss_db, power), ("MOV-FxLMS", rival_db, rival_power)):

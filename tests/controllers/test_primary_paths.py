@@ -228,7 +228,7 @@ def test_a_noise_that_begins_silent_or_soft_is_then_reduced_as_well_as_one_that_
     reductions = []
     for gain in (level, np.ones(n_samples)):
         result = simulate(
-            made(form, rated_power=10.0),
+            made(form),  # without a rated power: what is spent when the noise sets in would have to be repaid
             gain * references(n_samples),
             primary_path=PRIMARY_PATHS,
             secondary_path=SECONDARY,
