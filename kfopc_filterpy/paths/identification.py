@@ -30,10 +30,15 @@ from .least_squares import (
     minimum_norm_solve,
 )
 from .models import fir_path, path_taps, sampling_rate
+from .uncertainty import relative_to
 
 if TYPE_CHECKING:
     import control
 
+
+SEGMENT = 512  # samples of a segment of the spectra; its frequencies are those of `path_uncertainty`
+CORRELATED = 1.3  # times what chance gives: a residual is correlated with the excitation
+CONFIDENCE = 2.5  # standard deviations; a complex Gaussian error exceeds them at 0.2 % of the frequencies
 
 # Excitations at once whose correlation coefficient exceeds this at some delay count as the same signal.
 _LARGEST_CORRELATION = 0.9
@@ -53,11 +58,16 @@ class PathEstimate:
         Share of the response's power that the fit leaves unexplained, in dB: noise, distortion by the amplifier, and the
         part of the path beyond `n_taps`. At least -300 dB. With several paths one for each response: (K,) if all
         loudspeakers played at once, (K, J) if in turn.
+    uncertainty : numpy.ndarray, shape (257,)
+        Relative error of the fit that must be expected at evenly spaced frequencies from 0 to fs/2, because of noise,
+        distortion and the part of the path beyond `n_taps`: a controller's ``secondary_path_uncertainty``. With several
+        paths it bounds the matrix norm, see `path_uncertainty`. It knows nothing of what changes after the recording.
     """
 
     estimate: control.TransferFunction
     taps: np.ndarray
     residual_db: Any
+    uncertainty: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,7 @@ class IdentificationResult(PathEstimate):
 
     Attributes
     ----------
-    estimate, taps, residual_db
+    estimate, taps, residual_db, uncertainty
         As in `PathEstimate`.
     frequencies_hz : numpy.ndarray, shape (n_frequencies,)
         Frequencies of the modelling error in Hz.
@@ -112,7 +122,7 @@ def estimate_path(
     Returns
     -------
     PathEstimate
-        The path as a system, its taps and the residual. Of paths (K, J, n_taps) unless both signals are (n_samples,).
+        The path as a system, its taps, the residual and the uncertainty. Of paths (K, J, n_taps) unless both signals are (n_samples,).
 
     Raises
     ------
@@ -127,6 +137,14 @@ def estimate_path(
     >>> estimate_path(excitation, response, n_taps=4, fs=8000.0).taps.round(4) + 0.0
     array([ 0. ,  0.8, -0.2,  0. ])
 
+    With noise, the fit says how far it may be from the path:
+
+    >>> noise = 0.1 * np.random.default_rng(1).standard_normal(1000)
+    >>> fitted = estimate_path(excitation, response + noise, n_taps=4, fs=8000.0)
+    >>> error = modelling_error_db([0.0, 0.8, -0.2], fitted.taps, np.linspace(0.0, 4000.0, 257), fs=8000.0)
+    >>> bool(np.all(10 ** (error / 20) < fitted.uncertainty)), bool(fitted.uncertainty.max() < 0.05)
+    (True, True)
+
     Two loudspeakers at once:
 
     >>> noises = np.random.default_rng(0).standard_normal((2, 1000))
@@ -140,8 +158,8 @@ def estimate_path(
     ridge = as_nonnegative(regularization, "regularization")
     sent, heard = as_real_array(excitation, "excitation"), as_real_array(response, "response")
     if heard.ndim == 3:
-        taps, residual_db = _fit_in_turn(sent, heard, n_taps, ridge)
-        return PathEstimate(_system(taps, fs), taps, residual_db)
+        taps, residual_db, variance = _fit_in_turn(sent, heard, n_taps, ridge)
+        return PathEstimate(_system(taps, fs), taps, residual_db, relative_to(taps, variance))
     if sent.ndim == 2 or heard.ndim == 2:
         sent, heard = np.atleast_2d(as_channels(sent, "excitation")), np.atleast_2d(as_channels(heard, "response"))
         require_length(sent.shape[1], (len(sent) + 1) * n_taps - 1)
@@ -149,13 +167,16 @@ def estimate_path(
             raise ValueError(f"response must have {sent.shape[1]} samples, as excitation has, got {heard.shape[1]}")
         require_audible({"excitation": sent, "response": heard}, n_taps)
         _require_different(sent, n_taps)
-        taps, residual_db = fit_paths(sent, heard, n_taps, ridge)
-        return PathEstimate(_system(taps, fs), taps, residual_db)
+        taps, left, residual_db = fit_paths(sent, heard, n_taps, ridge)
+        variance = squared_error(sent, left, taps, ridge)
+        return PathEstimate(_system(taps, fs), taps, residual_db, relative_to(taps, variance))
     sent = as_signal(sent, "excitation", min_length=2 * n_taps - 1)
     heard = as_signal(heard, "response", length=sent.size)
     require_audible({"excitation": sent, "response": heard}, n_taps)
-    taps, residual_db = fit_paths(sent[np.newaxis], heard[np.newaxis], n_taps, ridge)
-    return PathEstimate(fir_path(taps[0, 0], fs), taps[0, 0], float(residual_db[0]))
+    sent = sent[np.newaxis]
+    taps, left, residual_db = fit_paths(sent, heard[np.newaxis], n_taps, ridge)
+    uncertainty = relative_to(taps, squared_error(sent, left, taps, ridge))
+    return PathEstimate(fir_path(taps[0, 0], fs), taps[0, 0], float(residual_db[0]), uncertainty)
 
 
 def require_audible(recorded: Mapping[str, np.ndarray], n_taps: int) -> None:
@@ -173,8 +194,13 @@ def require_length(n_samples: int, needed: int, name: str = "excitation") -> Non
         raise ValueError(f"{name} must have at least {needed} samples for these paths, got {n_samples}")
 
 
-def _fit_in_turn(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return taps (K, J, n_taps) and residuals (K, J) in dB of loudspeakers that play alone, one after the other."""
+def _fit_in_turn(
+    sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit the paths of loudspeakers that play alone, one after the other.
+
+    Return the taps (K, J, n_taps), the residuals (K, J) in dB, and the squared errors to be expected, (K, J, 257).
+    """
     if 0 in heard.shape:
         raise ValueError(f"response must be (J loudspeakers, K microphones, n_samples), got shape {heard.shape}")
     require_channels_lead(heard, "response")
@@ -189,11 +215,21 @@ def _fit_in_turn(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float)
     require_length(sent.shape[1], 2 * n_taps - 1)
     require_audible({"excitation": sent, "response": heard}, n_taps)
     fits = [fit_paths(sent[j : j + 1], responses, n_taps, ridge) for j, responses in enumerate(heard)]
-    return np.concatenate([taps for taps, _ in fits], axis=1), np.stack([residual for _, residual in fits], axis=1)
+    errors = [squared_error(sent[j : j + 1], left, taps, ridge) for j, (taps, left, _) in enumerate(fits)]
+    return (
+        np.concatenate([taps for taps, _, _ in fits], axis=1),
+        np.stack([residual_db for _, _, residual_db in fits], axis=1),
+        np.concatenate(errors, axis=1),
+    )
 
 
-def fit_paths(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the taps (K, J, n_taps) of the paths from J signals to K others, and the residuals (K,) in dB."""
+def fit_paths(
+    sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fit the paths from J signals to K others.
+
+    Return the taps (K, J, n_taps), what they leave unexplained, (K, n_samples - n_taps + 1), and its power in dB, (K,).
+    """
     matrix = _normal_matrix(sent, n_taps)
     for j, signal in enumerate(sent):
         diagonal = np.arange(j * n_taps, (j + 1) * n_taps)
@@ -207,7 +243,54 @@ def fit_paths(sent: np.ndarray, heard: np.ndarray, n_taps: int, regularization: 
         sum(np.convolve(signal, path, mode="valid") for signal, path in zip(sent, paths, strict=True)) for paths in taps
     ]
     unexplained = np.mean(left**2, axis=1) / np.mean(settled**2, axis=1)
-    return taps, 10 * np.log10(np.maximum(unexplained, 1e-30))
+    return taps, left, 10 * np.log10(np.maximum(unexplained, 1e-30))
+
+
+def squared_error(sent: np.ndarray, left: np.ndarray, taps: np.ndarray, regularization: float) -> np.ndarray:
+    """Return the squared error to be expected of fitted responses, (K, J, 257) from 0 to fs/2.
+
+    Parameters
+    ----------
+    sent : ndarray, shape (J, n_samples)
+        Excitations.
+    left : ndarray, shape (K, n_samples - n_taps + 1)
+        What the fit leaves unexplained.
+    taps : ndarray, shape (K, J, n_taps)
+        The fitted paths.
+    regularization : float
+        Ridge of the fit, relative to the power of the excitations.
+
+    Notes
+    -----
+    The error has three parts. Noise of spectral density R, not correlated with the excitation of density X, gives a fit of
+    L taps to N samples the variance ``L R / (N X)`` [1]_; it counts `CONFIDENCE` times. The path beyond L taps is the
+    part of the residual that is correlated with the excitation, the cross-spectrum over X; it counts if it is larger
+    than chance makes it. The ridge makes the response too small by its share of X.
+
+    References
+    ----------
+    .. [1] L. Ljung, "System Identification: Theory for the User", 2nd ed., Prentice Hall, 1999, eq. 9.62.
+    """
+    from scipy.ndimage import maximum_filter1d
+    from scipy.signal import csd, welch
+
+    n_samples = left.shape[1]
+    finer = max(1, min(max(8, -(-8 * taps.shape[2] // SEGMENT)), n_samples // (8 * SEGMENT)))  # to hold what is beyond
+    size = min(finer * SEGMENT, max(n_samples // 16, 1))  # of few segments, a spectrum is known badly
+    sent = sent[:, -n_samples:]
+    shape: Any = {"nperseg": size, "nfft": finer * SEGMENT, "detrend": False}
+    _, excitation = welch(sent, **shape)
+    _, residual = welch(left, **shape)
+    _, cross = csd(sent[np.newaxis], left[:, np.newaxis], **shape)
+    excitation = np.maximum(excitation, np.finfo(float).tiny)
+    ratio = np.maximum(residual, np.finfo(float).tiny)[:, np.newaxis] / excitation
+    chance = ratio * size / (1.9 * n_samples)  # there are 1.9 independent Hann windows in the length of one
+    beyond = np.abs(cross / excitation) ** 2
+    beyond *= np.mean(beyond / chance, axis=-1, keepdims=True) > CORRELATED
+    ridge = regularization * np.mean(sent**2, axis=-1, keepdims=True) / (0.5 * excitation)  # the spectra are one-sided
+    bias = ridge * np.abs(np.fft.rfft(taps, finer * SEGMENT))
+    error = (CONFIDENCE * np.sqrt(taps.shape[2] / n_samples * ratio) + np.sqrt(beyond) + bias) ** 2
+    return maximum_filter1d(error, 2 * (finer // 2) + 1, axis=-1)[..., ::finer]
 
 
 def _require_different(sent: np.ndarray, n_taps: int) -> None:
@@ -370,6 +453,7 @@ def identify_secondary_path(
         estimate=fitted.estimate,
         taps=fitted.taps,
         residual_db=fitted.residual_db,
+        uncertainty=fitted.uncertainty,
         frequencies_hz=as_signal(frequencies_hz, "frequencies_hz"),
         modelling_error_db=errors if several else errors[0, 0],
         misalignment_db=misalignments if several else float(misalignments[0, 0]),

@@ -117,4 +117,5 @@ def identify_observation_filters(
         raise ValueError(f"virtual must have {heard.shape[1]} samples, as physical has, got {wanted.shape[1]}")
     require_length(heard.shape[1], (len(heard) + 1) * n_taps - 1, "physical")
     require_audible({"physical": heard, "virtual": wanted}, n_taps)
-    return ObservationFilters(*fit_paths(heard, wanted, n_taps, ridge))
+    taps, _, residual_db = fit_paths(heard, wanted, n_taps, ridge)
+    return ObservationFilters(taps, residual_db)

@@ -148,6 +148,17 @@ def _distance(measured: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     return np.maximum(relative, least).max(axis=0)
 
 
+def relative_to(paths: np.ndarray, squared_error: np.ndarray) -> np.ndarray:
+    """Return a bound on the relative error of paths (K, J, taps) from the squared errors of their responses.
+
+    `squared_error` is (K, J, 257). With several paths the bound is ``||E||_F ||pinv(S^)||`` with the matrix E of the
+    errors, as their phases are not known.
+    """
+    known = _response(paths, np.linspace(0.0, np.pi, N_FREQUENCIES))
+    smallest = np.linalg.svd(known, compute_uv=False)[..., -1]  # 1/||pinv(S^)||
+    return np.sqrt(squared_error.sum(axis=(0, 1))) / np.maximum(smallest, np.finfo(float).tiny)
+
+
 def _norm(matrices: np.ndarray) -> np.ndarray:
     return np.linalg.norm(matrices, ord=2, axis=(-2, -1))
 

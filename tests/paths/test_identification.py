@@ -12,6 +12,7 @@ from kfopc_filterpy.paths.identification import (
     modelling_error_db,
 )
 from kfopc_filterpy.paths.models import bandpass_path, path_taps
+from kfopc_filterpy.paths.uncertainty import path_uncertainty
 
 FS = 16000.0
 PATH = bandpass_path(32)
@@ -161,3 +162,46 @@ def test_level_is_the_root_mean_square_of_the_excitation(excitation, peak):
     # 32000 samples: noise within 1 %; a sweep's first, partial period weighs about as much.
     assert np.sqrt(np.mean(sent[0] ** 2)) == pytest.approx(2.0, rel=0.02)
     assert np.abs(sent[0]).max() <= peak * (1 + 1e-12)
+
+
+SHORT_PATH = np.concatenate([np.zeros(3), np.random.default_rng(8).standard_normal(29) * np.exp(-np.arange(29) / 8)])
+TWO_BY_TWO = np.random.default_rng(9).standard_normal((2, 2, 24)) * np.exp(-np.arange(24) / 6)
+
+
+@pytest.mark.parametrize("loudspeakers", ["in turn", "at once"])
+@pytest.mark.parametrize("n_taps", ["all", "half"])
+@pytest.mark.parametrize("noise", [0.0, 0.02, 0.3])
+@pytest.mark.parametrize("path", [SHORT_PATH, TWO_BY_TWO], ids=["one", "two by two"])
+def test_the_uncertainty_bounds_the_true_error_and_is_of_its_size(path, noise, n_taps, loudspeakers):
+    """Over 257 frequencies and five seeds. The bound of a matrix adds all its errors, so it is wider."""
+    taps = path.shape[-1] // (2 if n_taps == "half" else 1)
+    ratios = []
+    for seed in range(5):
+        result = identify_secondary_path(
+            path, n_taps=taps, duration_s=1.0, rng=seed, fs=8000.0, sensor_noise_std=noise, loudspeakers=loudspeakers
+        )
+        assert result.uncertainty.shape == (257,)
+        error = path_uncertainty(np.reshape(path, (1, *path.shape)), result.taps)  # the true path as a measured one
+        ratios.append(result.uncertainty / error)
+    # What lies beyond the taps is found by its cross-spectrum with the excitation, which scatters.
+    assert np.mean(np.array(ratios) < (1.0 if n_taps == "all" else 0.85)) < 0.02
+    assert np.median(ratios) < (5.0 if path.ndim == 1 else 10.0)
+
+
+def test_an_excitation_without_high_frequencies_leaves_them_uncertain():
+    sent = scipy.signal.lfilter(*scipy.signal.butter(6, 0.25), np.random.default_rng(2).standard_normal(16000))
+    heard = np.convolve(sent, SHORT_PATH)[: sent.size]
+    uncertainty = estimate_path(sent, heard, 32, 8000.0).uncertainty
+    assert uncertainty[:50].max() < 0.01  # up to 0.78 kHz
+    assert uncertainty[150:].min() > 0.5  # above 2.3 kHz the ridge decides
+    true = path_uncertainty(SHORT_PATH[np.newaxis], estimate_path(sent, heard, 32, 8000.0).taps)
+    assert np.mean(uncertainty < true) < 0.02
+
+
+def test_the_uncertainty_falls_with_the_root_of_the_duration():
+    def mean(duration_s):
+        return identify_secondary_path(
+            SHORT_PATH, n_taps=32, duration_s=duration_s, rng=3, fs=8000.0, sensor_noise_std=0.2
+        ).uncertainty.mean()
+
+    assert mean(16.0) / mean(4.0) == pytest.approx(0.5, rel=0.1)
