@@ -17,7 +17,7 @@ from ..paths.uncertainty import GUARD_TAPS, guard_filter, path_uncertainty
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .channels import channel_lines, channel_sample
+from .channels import ChannelGuard, channel_lines, channel_sample, new_channel_guard
 from .step import GuardLine, Lines, adapt_once, emit_once, estimate_once, listen
 
 NO_SOLUTION = (
@@ -161,6 +161,7 @@ class FilteredReferenceController:
     has_gains = False  # True if it has Kalman gains, which scenarios can share
     unshared = ""  # the part that prevents sharing, if any
     _uncertainty: np.ndarray | None = None
+    _stated_uncertainty: Any = None  # as it was assigned
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
     _holding: Held | None = None
@@ -208,6 +209,7 @@ class FilteredReferenceController:
         return secondary
 
     def _new_lines(self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int) -> Any:
+        filtered_taps = max(filtered_taps, GUARD_TAPS) if filtered_taps else 0  # a guard can be assigned later
         if self.multichannel:
             return channel_lines(
                 secondary,
@@ -220,10 +222,11 @@ class FilteredReferenceController:
         model = compiled_model(amplifier)
         if model is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
-        filtered_taps = max(filtered_taps, GUARD_TAPS)  # a guard can be assigned later
         return Lines(
             secondary_estimate=secondary.copy(),  # a new estimate is written into it
-            reference=delay_line(max(reference_taps, filtered_taps + secondary.size - 1)),  # enough to filter it again
+            reference=delay_line(
+                max(reference_taps, filtered_taps + secondary.size + GUARD_TAPS - 2)
+            ),  # to filter again
             filtered=delay_line(filtered_taps),
             output=delay_line(secondary.size),
             amplifier=model,
@@ -294,24 +297,33 @@ class FilteredReferenceController:
         Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
         LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
-        second observation. An uncertainty can be assigned for KF-ANC, KF-OPC and the LMS family of one channel, except
-        FxNLMS. `kf_pb` takes it as a setting, and then it is None here.
+        second observation. An uncertainty can be assigned for KF-ANC, KF-OPC, the diagonal Kalman filter and the LMS
+        family, with one channel or several; not for the fast-array filter, which takes one observation. `kf_pb` takes
+        it as a setting, and then it is None here.
         """
         return None if self._uncertainty is None else self._uncertainty.copy()
 
     @secondary_path_uncertainty.setter
     def secondary_path_uncertainty(self, value: Any) -> None:
-        if self.multichannel or not self._takes_guard():
+        if not self._takes_guard():
             raise ValueError(
                 f"{self.name} takes no secondary_path_uncertainty: use kf_pb(..., secondary_path_uncertainty=...), or "
-                "KF-ANC, KF-OPC, FxLMS, leaky FxLMS or MOV-FxLMS of one channel"
+                "KF-ANC, KF-OPC, the diagonal Kalman filter or an LMS algorithm"
             )
         lines = self._state.lines
         uncertainty = path_uncertainty(value, lines.secondary_estimate)
         exact = not np.any(uncertainty)
-        guard = None if exact else GuardLine(guard_filter(uncertainty), delay_line(self.n_taps))
-        self._uncertainty = None if exact else uncertainty
+        guard = None if exact else self._new_guard(guard_filter(uncertainty))
+        self._uncertainty, self._stated_uncertainty = None if exact else uncertainty, value
         self._state = self._state._replace(lines=lines._replace(guard=guard))
+        if not self.multichannel:
+            self._filter_again()
+
+    def _new_guard(self, taps: np.ndarray) -> GuardLine | ChannelGuard:
+        """Return a guard that has heard nothing yet."""
+        if self.multichannel:
+            return new_channel_guard(taps, (self.n_microphones, self.n_loudspeakers, self.n_references), self.n_taps)
+        return GuardLine(taps, delay_line(self.n_taps))
 
     def _takes_guard(self) -> bool:
         """Return whether the algorithm's step takes account of an uncertain secondary path."""
@@ -333,7 +345,10 @@ class FilteredReferenceController:
     def secondary_path(self, path: Any) -> None:
         before = self.secondary_path
         self._lines.secondary_estimate[:] = self._checked_estimate(path)
-        self._filter_again()
+        if self._uncertainty is None:
+            self._filter_again()
+        else:  # measured paths, for example, have another distance from the new path
+            self.secondary_path_uncertainty = self._stated_uncertainty
         self._after_new_path(before)
 
     def _checked_estimate(self, path: Any) -> np.ndarray:
@@ -354,10 +369,13 @@ class FilteredReferenceController:
         return np.pad(taps, (0, size - taps.size))
 
     def _filter_again(self) -> None:
-        """Filter the stored reference with the present estimate."""
-        lines = self._lines
+        """Filter the stored reference with the present estimate, and the result with the guard."""
+        lines, guard = self._lines, self._state.lines.guard
         n, s = int(lines.filtered[TAPS]), lines.secondary_estimate
-        refill(lines.filtered, np.correlate(newest(lines.reference, n + s.size - 1), s, mode="valid"))
+        filtered = np.correlate(newest(lines.reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
+        refill(lines.filtered, filtered)
+        if guard is not None:
+            refill(guard.filtered, np.correlate(filtered, guard.taps, mode="valid"))
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Adapt what the algorithm knows to the new estimate; `before` is the last one, (n_path,)."""

@@ -35,7 +35,15 @@ def adapt_diagonal(state, error, control_signal):
     if finite:
         row = newest(state.lines.filtered, state.weights.size)
         correct_diagonal(state.variances, state.weights, row, factor * d, state.state_noise, state.measurement_noise)
+        observe_guarded(state.lines.guard, state.variances, state.weights, state.measurement_noise)
     return finite
+
+
+@part()
+def observe_guarded(guard, variances, w, noise):
+    """Correct w as if w'x'' with x'' = W * x' had been measured as zero, if there is a guard."""
+    if guard is not None:
+        correct_diagonal(variances, w, newest(guard.filtered, w.size), 0.0, 0.0, noise)
 
 
 @part(fastmath=FAST)
@@ -147,6 +155,9 @@ class DiagonalKalman(FilteredReferenceController):
     def variances(self) -> np.ndarray:
         """Diagonal of P, (L,); a copy."""
         return self._state.variances.copy()
+
+    def _takes_guard(self) -> bool:
+        return True
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Let the variances grow by that which the new path gives to the weights."""

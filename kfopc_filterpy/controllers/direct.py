@@ -123,7 +123,17 @@ def correct(correction, w, lines, factor, taps):
             return False
         copy_into(correction.directions[k], gains.gain_direction)
         correction.variances[k] = S
+    observe_guarded(lines.guard, correction, w, taps)
     return True
+
+
+@part()
+def observe_guarded(guard, correction, w, taps):
+    """Correct w as if the sums of w_ji'x''_kji had been measured as zero, if there is a guard."""
+    if guard is not None:
+        for k in range(guard.filtered.shape[0]):
+            row, noise = observation(correction.row, guard.filtered[k], taps), correction.measurement_noise[k]
+            kalman_step(correction.gains, w, row, 0.0, 0.0, noise, 1.0)
 
 
 @inlined
@@ -246,6 +256,9 @@ class DirectKalman(FilteredReferenceController):
         noise = per_channel(measurement_noise, self.n_microphones, "microphones", "measurement_noise", as_nonnegative)
         self._state = DirectState(*self._common(), new_correction(self, state_noise, noise, initial_variance, dtype))
         self.name = "KF-ANC" if own is None else "KF-OPC"
+
+    def _takes_guard(self) -> bool:
+        return True
 
     @property
     def covariance(self) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_positive
-from ..kernels.compiling import by_type
+from ..kernels.compiling import by_type, part
 from ..kernels.delay_lines import newest
 from ..kernels.vectors import dot
 from ..power.constraint import ConstraintState
@@ -32,43 +32,49 @@ def adapt_fxnlms(state, error, control_signal):
     finite, _, _ = advance_powers(state.lines, state.constraint, error)
     if finite:
         energy = state.regularization + filtered_energy(state.lines, state.weights)
-        change_weights(
-            state.lines, state.weights, 1.0, 1.0, step_error(state.lines, error, state.step_size, energy), 0.0
-        )
+        change_weights(state.lines, state.weights, 1.0, state.step_size / energy, error, 0.0)
     return finite
 
 
 @by_type
 def filtered_energy(lines, weights):
-    """Return x'(n)'x'(n)."""
+    """Return x'(n)'x'(n), with a guard also that of x'' = W * x'."""
     row = newest(lines.filtered, weights.size)
+    return dot(row, row) + guarded_energy(lines.guard, weights.size)
+
+
+@part()
+def guarded_energy(guard, taps):
+    """Return x''(n)'x''(n), or 0 without a guard."""
+    if guard is None:
+        return 0.0
+    row = newest(guard.filtered, taps)
     return dot(row, row)
 
 
 @filtered_energy.register(ChannelLines)
 def channel_energy(lines, weights):
-    """Return the sum of x'(n)'x'(n) over microphones, loudspeakers and references."""
-    energy, filtered = 0.0, lines.filtered
-    for k in range(filtered.shape[0]):
-        for j in range(filtered.shape[1]):
-            for i in range(filtered.shape[2]):
-                row = newest(filtered[k, j, i], weights.shape[2])
+    """Return the sum of both energies over microphones, loudspeakers and references."""
+    taps = weights.shape[2]
+    return energy_of_lines(lines.filtered, taps) + guarded_channel_energy(lines.guard, taps)
+
+
+@part()
+def guarded_channel_energy(guard, taps):
+    """Return the sum of x''(n)'x''(n), or 0 without a guard."""
+    return 0.0 if guard is None else energy_of_lines(guard.filtered, taps)
+
+
+@part()
+def energy_of_lines(lines, taps):
+    """Return the energy of the newest samples of delay lines (K, J, I, size)."""
+    energy = 0.0
+    for k in range(lines.shape[0]):
+        for j in range(lines.shape[1]):
+            for i in range(lines.shape[2]):
+                row = newest(lines[k, j, i], taps)
                 energy += dot(row, row)
     return energy
-
-
-@by_type
-def step_error(lines, error, step_size, energy):
-    """Return mu e(n) / energy."""
-    return step_size * error / energy
-
-
-@step_error.register(ChannelLines)
-def channel_step_errors(lines, error, step_size, energy):
-    """Return mu e_k(n) / energy for each microphone, (K,)."""
-    for k in range(error.size):
-        lines.modified_error[k] = step_size * error[k] / energy
-    return lines.modified_error
 
 
 class FxNLMS(LMSController):
@@ -134,6 +140,3 @@ class FxNLMS(LMSController):
     def regularization(self) -> float:
         """Regularization epsilon."""
         return self._state.regularization
-
-    def _takes_guard(self) -> bool:
-        return False  # its step is scaled with the energy of x' alone

@@ -46,6 +46,7 @@ def change_filter(lines, weights, j, keep, mu, error, penalty):
 def change_channel(lines, weights, j, keep, mu, error, penalty):
     """Do so for the references one by one."""
     taps = weights.shape[2]
+    leak_channel_guarded(lines.guard, weights, j, mu)
     for i in range(weights.shape[1]):
         w, x = weights[j, i], newest(lines.reference[i], taps)
         change(w, newest(lines.filtered[0, j, i], taps), x, keep, mu * error[0], penalty)
@@ -59,6 +60,31 @@ def leak_guarded(guard, w, mu):
     if guard is not None:
         row = newest(guard.filtered, w.size)
         add_scaled(w, -mu * dot(w, row), row, 0, w.size)
+
+
+@part()
+def leak_channel_guarded(guard, weights, j, mu):
+    """Subtract mu sum_k (sum_ji w_ji'x''_kji) x''_kji from the weights of loudspeaker j, if there is a guard.
+
+    The sums are computed for the first loudspeaker, before any weight changes.
+    """
+    if guard is not None:
+        taps = weights.shape[2]
+        for k in range(guard.output.size if j == 0 else 0):
+            guard.output[k] = guarded_output(guard, weights, k)
+        for i in range(weights.shape[1]):
+            for k in range(guard.output.size):
+                add_scaled(weights[j, i], -mu * guard.output[k], newest(guard.filtered[k, j, i], taps), 0, taps)
+
+
+@part()
+def guarded_output(guard, weights, k):
+    """Return sum_ji w_ji'x''_kji for microphone k."""
+    total = 0.0
+    for j in range(weights.shape[0]):
+        for i in range(weights.shape[1]):
+            total += dot(weights[j, i], newest(guard.filtered[k, j, i], weights.shape[2]))
+    return total
 
 
 @part(fastmath=FAST)

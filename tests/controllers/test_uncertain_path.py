@@ -9,6 +9,8 @@ import pytest
 
 from kfopc_filterpy import (
     KFOPC,
+    DiagonalKalman,
+    FastArrayKalman,
     FxLMS,
     FxNLMS,
     KalmanController,
@@ -139,6 +141,112 @@ def test_a_guarded_lms_filter_is_its_literal_equation() -> None:
     np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-12)
 
 
+def guarded_rows(filtered: np.ndarray, estimate: np.ndarray, taps: int) -> np.ndarray:
+    """The delayed x'' = W * x', (n_samples, taps)."""
+    guard = guard_filter(path_uncertainty(TOLERANCE, estimate))
+    return rows(np.convolve(filtered, guard)[: filtered.size], taps)
+
+
+def test_a_guarded_normalised_lms_filter_is_its_literal_equation() -> None:
+    """Both terms are divided by the energy of both rows. The errors do not depend on the output here."""
+    n_samples, taps, mu = 300, 8, 0.05
+    x, e = np.random.default_rng(4).standard_normal((2, n_samples))
+    controller = FxNLMS(taps, TRUE, step_size=mu)
+    controller.secondary_path_uncertainty = TOLERANCE
+    filtered = np.convolve(x, TRUE)[:n_samples]
+    F, G, w = rows(filtered, taps), guarded_rows(filtered, TRUE, taps), np.zeros(taps)
+    for n in range(n_samples):
+        controller.control_signal(x[n])
+        controller.update(e[n])
+        step = mu / (controller.regularization + F[n] @ F[n] + G[n] @ G[n])
+        w = w - step * (w @ G[n]) * G[n] + step * e[n] * F[n]
+    np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-12)
+
+
+def test_a_guarded_diagonal_filter_is_its_literal_equations() -> None:
+    """A correction by d^ seen through x', then one by 0 seen through x''. No control signal, so d^ = e."""
+    n_samples, taps, q, r, P0 = 300, 8, 0.01, 1e-5, 2.0
+    x, e = np.random.default_rng(4).standard_normal((2, n_samples))
+    controller = DiagonalKalman(taps, TRUE, state_noise=r, measurement_noise=q, initial_variance=P0)
+    controller.secondary_path_uncertainty = TOLERANCE
+    filtered = np.convolve(x, TRUE)[:n_samples]
+    F, G, w, p, y = rows(filtered, taps), guarded_rows(filtered, TRUE, taps), np.zeros(taps), np.full(taps, P0), []
+    for n in range(n_samples):
+        y.append(controller.control_signal(x[n]))
+        controller.update(e[n])
+        d = e[n] + TRUE[: n + 1] @ np.array(y)[::-1][: TRUE.size]
+        p = p + r
+        for row, z in ((F[n], d), (G[n], 0.0)):
+            gain = p * row / (q + np.sum(p * row**2))
+            w, p = w + gain * (z - w @ row), p * (1 - gain * row)
+    np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(controller.variances, p, rtol=1e-9)
+
+
+SEVERAL = np.random.default_rng(6).standard_normal((2, 3, 5))  # two microphones, three loudspeakers
+CHANNEL_TAPS = 6
+
+
+def channel_rows(x: np.ndarray, signal_of: Any) -> np.ndarray:
+    """The rows of both microphones, (n_samples, K, J L): `signal_of` x' with their delays."""
+    filtered = [[rows(signal_of(np.convolve(x, s)[: x.size]), CHANNEL_TAPS) for s in each] for each in SEVERAL]
+    return np.moveaxis(np.array(filtered), (0, 1, 2, 3), (1, 2, 0, 3)).reshape(x.size, len(SEVERAL), -1)
+
+
+def both_rows(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    guard = guard_filter(path_uncertainty(TOLERANCE, SEVERAL))
+    return channel_rows(x, lambda s: s), channel_rows(x, lambda s: np.convolve(s, guard)[: s.size])
+
+
+@pytest.mark.parametrize("normalised", [False, True], ids=["FxLMS", "FxNLMS"])
+def test_guarded_lms_filters_of_several_channels_are_their_literal_equation(normalised: bool) -> None:
+    n_samples, mu = 200, 0.01 if normalised else 1e-5
+    rng = np.random.default_rng(7)
+    x, e = rng.standard_normal(n_samples), rng.standard_normal((n_samples, len(SEVERAL)))
+    controller = (FxNLMS if normalised else FxLMS)(CHANNEL_TAPS, SEVERAL, step_size=mu)
+    controller.secondary_path_uncertainty = TOLERANCE
+    F, G = both_rows(x)
+    w = np.zeros(F.shape[2])
+    for n in range(n_samples):
+        controller.control_signal([x[n]])
+        controller.update(e[n])
+        step = mu / (1e-10 + np.sum(F[n] ** 2) + np.sum(G[n] ** 2)) if normalised else mu
+        w = w - step * G[n].T @ (G[n] @ w) + step * F[n].T @ e[n]
+    np.testing.assert_allclose(controller.weights.ravel(), w, rtol=0, atol=1e-12)
+
+
+def test_a_guarded_kalman_filter_of_several_channels_is_the_batch_solution() -> None:
+    n_samples, q, P0 = 300, 0.01, 2.0
+    x = np.random.default_rng(7).standard_normal((1, n_samples))
+    d = np.random.default_rng(8).standard_normal((2, n_samples))
+    controller = kf_anc(CHANNEL_TAPS, SEVERAL, state_noise=0.0, measurement_noise=q, initial_variance=P0)
+    controller.secondary_path_uncertainty = TOLERANCE
+    simulate(controller, x, disturbance=d, secondary_path=SEVERAL, fs=FS)
+    F, G = (each.reshape(-1, each.shape[2]) for each in both_rows(x[0]))
+    expected = np.linalg.solve((F.T @ F + G.T @ G) / q + np.eye(F.shape[1]) / P0, F.T @ d.T.ravel() / q)
+    np.testing.assert_allclose(controller.weights.ravel(), expected, rtol=0, atol=1e-9)
+
+
+def test_a_new_path_is_guarded_as_if_it_had_always_been_there() -> None:
+    """Measured paths have another distance from the new estimate, and the stored reference is filtered again."""
+    rng = np.random.default_rng(9)
+    x, e = rng.standard_normal((2, 200))
+    measured = TRUE + 0.1 * rng.standard_normal((3, TRUE.size))
+    new = np.array([0.0, 0.0, 0.9, -0.5, 0.1])
+    one, other = (FxLMS(8, estimate, step_size=1e-3) for estimate in (TRUE, new))
+    for controller in (one, other):
+        controller.secondary_path_uncertainty = measured
+        controller.listen(x[:100], e[:100])
+    one.secondary_path = new
+    np.testing.assert_array_equal(one.secondary_path_uncertainty, path_uncertainty(measured, new))
+    for n in range(100, 200):
+        for controller in (one, other):
+            controller.control_signal(x[n])
+            controller.update(e[n])
+    np.testing.assert_allclose(one.weights, other.weights, rtol=1e-9, atol=1e-15)
+    assert np.abs(one.weights).max() > 1e-3
+
+
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC", "leaky FxLMS"])
 def test_a_tone_at_which_the_path_is_reversed_is_left_alone(name: str) -> None:
     """Three samples late at fs/6 is half a period: without the guard it diverges, with it nothing is done."""
@@ -163,8 +271,8 @@ def test_a_tone_at_which_the_path_is_reversed_is_left_alone(name: str) -> None:
 def test_what_takes_no_uncertainty_says_what_does() -> None:
     settings: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": 0.1}
     for controller in (
-        FxNLMS(4, TRUE, step_size=0.1),
-        FxLMS(4, TRUE.reshape(1, 1, -1), step_size=0.1),
+        FastArrayKalman(4, TRUE, measurement_noise=0.1),
+        kf_pb(4, TRUE.reshape(1, 1, -1), rated_power=1.0),
         kf_pb(4, TRUE, rated_power=1.0, **settings),
         KalmanController(KFOPC(dim_x=4, dim_z=1), TRUE),
     ):
