@@ -78,7 +78,10 @@ class RandomWalkCovariance:
 
     def edited(self) -> np.ndarray | None:
         """Return the newest array from `show` that was written into, None if none was."""
-        return next((P for P, shown in reversed(self._shown) if not np.array_equal(P, shown)), None)
+        for P, shown in reversed(self._shown):
+            if not np.array_equal(P, shown):
+                return P
+        return None
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
         other = memo[id(self)] = object.__new__(type(self))

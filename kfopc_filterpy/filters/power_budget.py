@@ -219,7 +219,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
             newest = row.flat[0] if row.size == self.dim_x else 0.0  # the step refuses any other size
             emitted = self.budget.checked_sample(reference, newest, control_signal)
             step()
-            self.budget.advance(reference, newest, self._weights(), emitted)
+            self.budget.advance(reference, newest, self._weights().reshape(-1), emitted)
         finally:
             self._batch_references = references
 

@@ -353,12 +353,12 @@ class RandomWalkKFOPC(KFOPC):
         F = self._F if F is None or F is self._views.get("F") else F
         Q = self._Q if Q is None or Q is self._views.get("Q") else Q
         moved = u is not None and (self.B if B is None else B) is not None
-        if moved or F is not None or np.ndim(Q) != 0:
+        if moved or F is not None or (Q is not None and np.ndim(Q) != 0):
             super().predict(u, B, F, self._numbers["state_noise"][0] if Q is None else Q)
             return
         state_noise = self._numbers["state_noise"][0] if Q is None else as_nonnegative(Q, "Q")
         self._take_in_edits()
-        x = self._weights().reshape(np.shape(self.x))
+        x = self._weights()
         self._covariance.predict(self._alpha_sq, state_noise)
         self.x, self.x_prior = x, x.copy()
 
@@ -384,7 +384,7 @@ class RandomWalkKFOPC(KFOPC):
         else:
             measurement, noise, h = self._checked(z, R, row)
         weights = self._corrected(measurement, noise, h, reference)
-        self._record(weights.reshape(np.shape(self.x)))
+        self._record(weights)
         if measurement is not z:
             self.z = np.array(z).reshape(self.y.shape)
 
@@ -404,12 +404,12 @@ class RandomWalkKFOPC(KFOPC):
             if reference is None and constraint.needs_reference:
                 constraint.preview(z, h[0], reference)  # raises, with the reason
             state, factor = constraint.state, 1.0
-        weights = np.array(self.x, dtype=np.float64).reshape(-1)
+        weights = np.array(self.x, dtype=np.float64)
         if weights.size != self.dim_x:
             self._weights()  # raises, with the reason
         held, before, prior = self._covariance.before_update(state)
         x = np.nan if reference is None else reference
-        outcome, y, S = correct_once.with_held(held, weights, z, h, x, noise, factor)
+        outcome, y, S = correct_once.with_held(held, weights.reshape(-1), z, h, x, noise, factor)
         if outcome not in UNTOUCHED:
             self._covariance.projected(before, prior)
         if outcome != CORRECTED:
@@ -447,10 +447,10 @@ class RandomWalkKFOPC(KFOPC):
         return as_number(reference, "reference")
 
     def _weights(self) -> np.ndarray:
-        """Return x as a new array, (n,)."""
-        weights = np.array(self.x, dtype=np.float64).reshape(-1)
+        """Return x as a new array of its shape."""
+        weights = np.array(self.x, dtype=np.float64)
         # A finite sum of squares is quick to compute and implies finite weights. If it overflows, check each weight.
-        if weights.size != self.dim_x or not (isfinite(weights @ weights) or np.isfinite(weights).all()):
+        if weights.size != self.dim_x or not (isfinite(np.vdot(weights, weights)) or np.isfinite(weights).all()):
             raise ValueError(f"x must have {self.dim_x} finite values, got shape {np.shape(self.x)}: {self.x!r}")
         return weights
 
