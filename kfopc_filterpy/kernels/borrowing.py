@@ -9,49 +9,42 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import carray, errors, types
+from numba import errors, types
+from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
 from .compiling import OPTIONS
 
 
-@intrinsic
-def _pointer(typing_context: Any, address: Any) -> Any:
-    """Return an address as a pointer (numba's documentation has this as its example of an intrinsic)."""
-    if not isinstance(address, types.Integer):
-        return None
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
-
-    return types.voidptr(types.uintp), generate
-
-
 def borrowed(value):
-    """Return a NamedTuple, possibly nested, or a tuple of them, with every array borrowed; called from Python, return the value itself."""
+    """Return a NamedTuple, possibly nested, or a tuple of them, with every array borrowed; in Python, the value itself."""
     return value
 
 
 @overload(borrowed, jit_options=OPTIONS)
 def _borrowed(value):
-    if isinstance(value, types.Array):
-        if value.layout != "C":
+    return lambda value: _without_owner(value)
+
+
+@intrinsic
+def _without_owner(typing_context: Any, value: Any) -> Any:
+    """Return a value whose arrays have no owner."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _disown(context, builder, value, arguments[0])
+
+    return value(value), generate
+
+
+def _disown(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Set the owners in the arrays of an LLVM value to null."""
+    if isinstance(kind, types.Array):
+        if kind.layout != "C":
             raise errors.TypingError("arrays of a state must be contiguous: numpy.ascontiguousarray makes them so")
-        return lambda value: carray(_pointer(value.ctypes.data), value.shape, value.dtype)  # type: ignore[call-arg]
-    if isinstance(value, types.BaseNamedTuple):
-        kind = value.instance_class  # type: ignore[attr-defined]
-        return lambda value: kind(*_borrowed_items(tuple(value)))
-    if isinstance(value, types.UniTuple):  # of NamedTuples, one for each loudspeaker
-        return lambda value: _borrowed_items(value)
-    return lambda value: value
-
-
-def _borrowed_items(items):
-    return items
-
-
-@overload(_borrowed_items, jit_options=OPTIONS)
-def _borrowed_tuple(items):
-    if len(items) == 1:
-        return lambda items: (borrowed(items[0]),)
-    return lambda items: (borrowed(items[0]),) + _borrowed_items(items[1:])  # noqa: RUF005
+        array = cgutils.create_struct_proxy(kind)(context, builder, value=value)
+        array.meminfo, array.parent = array.meminfo.type(None), array.parent.type(None)
+        return array._getvalue()
+    if isinstance(kind, types.BaseTuple):
+        for i, item in enumerate(kind):
+            value = builder.insert_value(value, _disown(context, builder, item, builder.extract_value(value, i)), i)
+    return value
