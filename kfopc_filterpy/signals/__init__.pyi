@@ -9,8 +9,9 @@ from .generators import band_limited_noise as band_limited_noise
 from .generators import bursty_noise as bursty_noise
 from .generators import compressor_noise as compressor_noise
 from .generators import tone as tone
-from .recordings import read_mat_vector as read_mat_vector
-from .recordings import read_wav as read_wav
+from .recordings import Recording as Recording
+from .recordings import calibration_factor as calibration_factor
+from .recordings import read_recording as read_recording
 from .recordings import write_wav as write_wav
 from .shaping import level_jump as level_jump
 from .shaping import looped as looped

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from .._validate import as_choice, as_positive, as_real_array, as_signal, require_finite
-from .recordings import read_mat_vector
+from .recordings import read_content
 
 _FOLDER_VARIABLE = "KFOPC_DATA"
 
@@ -73,7 +73,7 @@ class DataUnavailableError(FileNotFoundError):
 class MeasuredDuct:
     """Impulse responses of a measured duct, and a noise to run through it.
 
-    Build one from files of your own, for instance with `read_mat_vector` and `read_wav`.
+    Build one from files of your own, for instance with `read_recording` and `paths.read_path`.
 
     Attributes
     ----------
@@ -289,7 +289,7 @@ def _vector_reader(
 
     def vector(name: str, variable: str) -> np.ndarray:
         path = _fetched_file(name, timeout_s) if chosen is None else _checked_file(Path(chosen), name)
-        return read_mat_vector(path, variable)
+        return read_content(path, variable=variable).samples
 
     return vector
 
