@@ -31,7 +31,7 @@ def read_text(path: str | os.PathLike[str]) -> Content:
     if head and head[0].startswith(_REW):
         return _read_rew(path, head)
     layout = _layout(path, head)
-    lines = islice(_lines(path), layout.first, None)
+    lines: Iterator[str] = islice(_lines(path), layout.first, None)
     if layout.has_decimal_comma:
         lines = (line.replace(",", ".") for line in lines)
     table = np.loadtxt(lines, delimiter=layout.delimiter, ndmin=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -96,7 +97,9 @@ def write_uff(path: Path, channels: np.ndarray, *, start_s: float = 0.0, binary:
             orddenom_spec_data_type=0, abscissa_min=start_s, abscissa_inc=1 / FS, num_pts=channel.size,
             ord_data_type=4,
         )  # fmt: skip
-        pyuff.UFF(str(path)).write_sets(data, mode="add")
+        with warnings.catch_warnings():  # it leaves a binary file to the garbage collector
+            warnings.simplefilter("ignore", ResourceWarning)
+            pyuff.UFF(str(path)).write_sets(data, mode="add")
 
 
 def _uff(path: Path) -> None:
