@@ -301,15 +301,13 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         raise ValueError(f"{path} is {kind}, which has no named variables: leave out variable")
     with reading(path, kind):
         content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
-        samples = channels_first(np.asarray(content.samples))
-        if channel is not None:
-            samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
-        name = f"the signal of {path}"
-        samples = as_real_array(samples, name)
-        require_finite(samples, name)
-        if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
-            raise ValueError(f"{path} states a sampling rate of {content.fs:g} Hz, expected one above 0")
-        return content._replace(samples=np.ascontiguousarray(samples))
+    if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
+        raise ValueError(f"{path} states a sampling rate of {content.fs:g} Hz, expected one above 0")
+    samples = channels_first(content.samples)
+    if channel is not None:
+        samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
+    require_finite(samples, f"the signal of {path}")
+    return content._replace(samples=np.ascontiguousarray(samples, dtype=np.float64))
 
 
 def as_channel(channel: int, samples: np.ndarray, name: object) -> int:

@@ -14,6 +14,8 @@ from .content import Content, rate_of_step
 
 _LONGEST_HEADER = 100  # lines
 _REW = "* Impulse Response data saved by REW"
+_ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
+_NO_SIGNAL = 100  # rows: no signal rises for so long
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -70,10 +72,17 @@ def _are_numbers(line: str, delimiter: str | None, has_decimal_comma: bool) -> b
 def _without_time(path: str | os.PathLike[str], table: np.ndarray) -> Content:
     """Return the channels (rows are samples); leave out a column that counts samples or time, which gives the rate."""
     times = table[:, 0]
-    if table.shape[1] < 2 or len(table) < 3 or not np.all(np.diff(times) > 0):
+    steps = np.diff(times)
+    if table.shape[1] < 2 or len(table) < 3 or not np.all(steps > 0):
         return Content(table)
     step = (times[-1] - times[0]) / (len(times) - 1)
-    if not np.max(np.abs(times - times[0] - step * np.arange(len(times)))) < 0.5 * step:
+    drift = np.max(np.abs(times - times[0] - step * np.arange(len(times))))
+    if not (np.max(np.abs(steps - step)) <= _ROUNDED * step and drift <= step):
+        if len(table) >= _NO_SIGNAL:
+            raise ValueError(
+                f"{path} has a first column that rises in uneven steps, from {steps.min():g} to {steps.max():g}: export it "
+                "with a constant sampling rate, or without the times"
+            )
         return Content(table)
     if step == 1:  # the number of each sample
         return Content(table[:, 1:])

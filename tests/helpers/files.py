@@ -64,7 +64,11 @@ def _text(path: Path) -> None:
 
 def _timed(path: Path) -> None:
     np.savetxt(
-        path, np.column_stack([np.arange(300) / FS, signal()]), fmt=["%.7f", "%.17g"], delimiter=";", header="t;p"
+        path,
+        np.column_stack([np.arange(signal().size) / FS, signal()]),
+        fmt=["%.7f", "%.17g"],
+        delimiter=";",
+        header="t;p",
     )
 
 
