@@ -15,8 +15,8 @@ from .content import Content, chosen_variable, require_room, room_of
 from .hdf5 import NUMERIC_CLASSES, read_mat73
 
 _COMPRESSED, _MATRIX = 15, 14  # MATLAB's numbers for these elements
-_NUMBER_TYPES = (1, 2, 3, 4, 5, 6, 7, 9, 12, 13)  # of the numbers in an element
-_NUMBER_CLASSES = [bytes([kind]) for kind in range(6, 16)]  # of a variable, double to uint64
+_UINT32, _NUMBER_TYPES = 6, {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}  # of the numbers in an element
+_NUMBER_CLASSES, _COMPLEX = range(6, 16), 0x800  # of a variable: double to uint64, and the flag beside it
 _HEADER = 128  # bytes
 
 
@@ -96,24 +96,31 @@ def _elements(path: str | os.PathLike[str], content: Any, order: str) -> Iterato
 
 
 def _require_honest_parts(path: str | os.PathLike[str], body: bytes, order: str) -> None:
-    """Raise ValueError if a part of a matrix claims more bytes than the matrix has, or numbers of no known type.
+    """Raise ValueError if a part of a matrix claims more bytes than the matrix has, or if a variable lacks parts.
 
-    A type that scipy does not know (it is the index into a table of its own) ends the process.
+    scipy ends the process for numbers of a type that it does not know, which is the index into a table of its own. It
+    would also take the imaginary part of a variable that has none from what follows.
     """
-    kind, size = struct.unpack_from(f"{order}II", body) if len(body) >= 8 else (0, 0)
-    if kind != _MATRIX or 8 + size > len(body):
+    if len(body) < 24:
+        raise ValueError(f"{path} is damaged: a variable of {len(body)} bytes")
+    kind, size, flags_type, flags_size, flags = struct.unpack_from(f"{order}5I", body)
+    if kind != _MATRIX or 8 + size > len(body) or (flags_type, flags_size) != (_UINT32, 8):
         raise ValueError(
             f"{path} is damaged: {len(body)} bytes claim to be type {kind} of {size} bytes, expected a variable"
         )
-    begin, end, count = 8, 8 + size, 0
-    is_numeric = body[16 if order == "<" else 19 : 20][:1] in _NUMBER_CLASSES
+    is_numeric = (flags & 0xFF) in _NUMBER_CLASSES
+    begin, end, types = 8, 8 + size, []
     while begin + 8 <= end:
         kind, part = struct.unpack_from(f"{order}II", body, begin)
         if kind >> 16:  # a part of up to four bytes, its size beside its type
             kind, part = kind & 0xFFFF, 0
         if begin + 8 + part > end:
             raise ValueError(f"{path} is damaged: a part of {part} bytes in a variable of {size}")
-        if kind not in _NUMBER_TYPES and (is_numeric or count < 3):  # flags, dimensions and name come first
-            raise ValueError(f"{path} is damaged: a variable has numbers of the unknown type {kind}")
+        types.append(kind)
         begin += 8 + part + (-part) % 8
-        count += 1
+    # Flags, dimensions and name; then, of numbers, the real part and the imaginary part.
+    needed = 3 if not is_numeric else 5 if flags & _COMPLEX else 4
+    if len(types) < needed or not set(types[:needed]) <= _NUMBER_TYPES:
+        raise ValueError(
+            f"{path} is damaged: a variable has parts of the types {types[:8]}, expected {needed} with numbers"
+        )

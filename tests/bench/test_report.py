@@ -179,7 +179,9 @@ def test_figures_and_sounds_are_files_too(written):
 def test_a_residual_far_louder_than_the_disturbance_does_not_silence_it(tmp_path):
     made = study(sounds=[Sound("disturbance", "Disturbance", D), Sound("fxlms", "Residual", 1e6 * D)])
     page = write_report([made], tmp_path).read_text(encoding="utf-8")
-    assert np.max(np.abs(read_recording(tmp_path / "audio" / "tonal-disturbance.wav").samples)) == pytest.approx(0.25, abs=1e-3)
+    assert np.max(np.abs(read_recording(tmp_path / "audio" / "tonal-disturbance.wav").samples)) == pytest.approx(
+        0.25, abs=1e-3
+    )
     assert "louder than full scale: clipped" in page
     silent = study(sounds=[Sound("disturbance", "Disturbance", 0 * D)], figures=[])
     write_report([silent], tmp_path)

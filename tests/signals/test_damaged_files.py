@@ -109,7 +109,7 @@ def test_damaged_files_are_read_or_refused_with_a_message(name, originals, tmp_p
     path = tmp_path_factory.mktemp("damaged") / name
     outcomes = []
 
-    @settings(max_examples=EXAMPLES)
+    @settings(max_examples=EXAMPLES, deadline=None)
     @given(st.lists(EDIT, min_size=1, max_size=4))
     def search(edits):
         path.write_bytes(damaged(originals(name), edits))
@@ -117,6 +117,24 @@ def test_damaged_files_are_read_or_refused_with_a_message(name, originals, tmp_p
 
     search()
     assert not all(outcomes)  # some damage was found
+
+
+@pytest.mark.parametrize(
+    ("at", "what"),
+    [
+        (b"fs\0\0\x09", b"fs\0\0\x00"),  # numbers of type 0
+        (b"\x06\0\0\0\x08\0\0\0\x06\0", b"\x06\0\0\0\x08\0\0\0\x06\x08"),  # complex, without an imaginary part
+        (b"\x06\0\0\0\x08\0\0\0\x06", b"\x06\0\0\0\x10\0\0\0\x06"),  # flags of another size
+    ],
+)
+def test_what_the_search_found_to_end_the_process_within_scipy_is_refused(at, what, tmp_path):
+    path = tmp_path / "plain.mat"
+    WRITERS["plain.mat"](path)
+    content = path.read_bytes()
+    assert at in content
+    path.write_bytes(content.replace(at, what, 1))
+    with pytest.raises(ValueError, match=r"plain\.mat is damaged: "):
+        read_recording(path)
 
 
 # ---- memory: what comes of a small file is bounded, whatever it claims
