@@ -115,18 +115,21 @@ def _uff_binary(path: Path) -> None:
 
 
 def write_sofa(path: Path, responses: np.ndarray, *, delay: object = 0.0) -> None:
-    """Write impulse responses (measurements, receivers, taps)."""
+    """Write impulse responses (measurements, receivers, taps), or (measurements, receivers, taps, emitters)."""
     sofar = pytest.importorskip("sofar")
-    sofa = sofar.Sofa("GeneralFIR")
+    sofa = sofar.Sofa("GeneralFIR" if responses.ndim == 3 else "GeneralFIR-E")
     sofa.Data_IR, sofa.Data_SamplingRate = responses, float(FS)
-    sofa.Data_Delay = np.full((1, responses.shape[1]), delay) if np.ndim(delay) == 0 else delay
+    shape = (1, responses.shape[1], *responses.shape[3:])
+    sofa.Data_Delay = np.full(shape, delay) if np.ndim(delay) == 0 else delay
     sofa.ReceiverPosition = np.zeros((responses.shape[1], 3))
     sofa.SourcePosition = np.array([[1.0, 0.0, 0.0]])
+    if responses.ndim == 4:
+        sofa.EmitterPosition = np.zeros((responses.shape[3], 3))
     sofar.write_sofa(str(path), sofa)
 
 
 def _sofa(path: Path) -> None:
-    write_sofa(path, np.moveaxis(np.stack([signal(2), signal(2)[::-1]]), 0, 0)[:, :, :64])
+    write_sofa(path, np.stack([signal(2), signal(2)[::-1]])[:, :, :64])
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {

@@ -129,6 +129,22 @@ def test_sofa_has_receivers_before_sources_and_its_delays(tmp_path):
     assert read_path(tmp_path / "x.sofa").samples.shape == (40,)
 
 
+def test_sofa_of_several_emitters_has_them_as_loudspeakers(tmp_path):
+    responses = np.random.default_rng(3).standard_normal((1, 2, 40, 3))  # (measurements, receivers, taps, emitters)
+    delays = np.arange(6.0).reshape(1, 2, 3)
+    write_sofa(tmp_path / "x.sofa", responses, delay=delays)
+    paths = read_path(tmp_path / "x.sofa").samples
+    assert paths.shape == (2, 3, 45)
+    for r in range(2):
+        for e in range(3):
+            begin = int(delays[0, r, e])
+            np.testing.assert_array_equal(paths[r, e, begin : begin + 40], responses[0, r, :, e])
+            assert np.count_nonzero(paths[r, e]) == 40
+    write_sofa(tmp_path / "x.sofa", np.repeat(responses, 2, axis=0))
+    with pytest.raises(ValueError, match=r"x\.sofa has several emitters in each of 2 measurements, expected one"):
+        read_path(tmp_path / "x.sofa")
+
+
 def test_a_matrix_of_taps_keeps_its_axes_and_has_no_channels(tmp_path):
     taps = np.random.default_rng(3).standard_normal((2, 3, 40))
     taps[..., :12] = 0.0
