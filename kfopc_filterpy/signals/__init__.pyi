@@ -3,6 +3,7 @@ from .datasets import DatasetFile as DatasetFile
 from .datasets import DataUnavailableError as DataUnavailableError
 from .datasets import dataset_folder as dataset_folder
 from .datasets import fetch_dataset as fetch_dataset
+from .datasets import has_dataset as has_dataset
 from .datasets import list_datasets as list_datasets
 from .generators import Bursts as Bursts
 from .generators import Compressor as Compressor

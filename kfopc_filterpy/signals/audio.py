@@ -11,7 +11,8 @@ from .content import Content, require_room
 
 # A size that a WAV file's header states if its writer could not know it (it wrote to a pipe), or in RF64.
 _SIZE_UNKNOWN = 0xFFFFFFFF
-_LOSSLESS = ("WAV", "WAVEX", "RF64", "AIFF", "FLAC")
+_FORMATS = ("WAV", "WAVEX", "RF64", "AIFF", "FLAC")
+_LOSSLESS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE")  # codings of samples
 _MOST_CHUNKS = 10_000
 _CONTAINERS = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">", b"FORM": ">"}  # and their byte order
 
@@ -22,10 +23,10 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
 
     _require_whole(path)
     with soundfile.SoundFile(path) as file:
-        if file.format not in _LOSSLESS:
+        if file.format not in _FORMATS or file.subtype not in _LOSSLESS:
             raise ValueError(
-                f"{path} is {file.format_info}, expected WAV, AIFF or FLAC: record it again in one of these, or convert "
-                "it (lossy formats, such as MP3 and Ogg, have left out what an ear would not miss)"
+                f"{path} is {file.format_info}, {file.subtype_info}, expected WAV, AIFF or FLAC without loss: record it "
+                "again in one of these, or convert it (MP3, Ogg, ADPCM and others have left out what an ear would not miss)"
             )
         # Before anything is read: soundfile makes room for as many frames as the header claims.
         require_room(path, float(file.frames) * file.channels)

@@ -228,6 +228,37 @@ def dataset_folder() -> Path:
     return Path(named) if named else Path(_pooch().os_cache("kfopc_filterpy"))
 
 
+def has_dataset(name: str, folder: str | os.PathLike[str] | None = None) -> bool:
+    """Return whether a whole dataset is in the folder, checked by SHA-256, so that it can be read without a network.
+
+    Parameters
+    ----------
+    name : {"duct", "motor", "compressor", "room"}
+        The dataset, see `list_datasets`.
+    folder : path, optional
+        Folder to look in, `dataset_folder` by default.
+
+    Returns
+    -------
+    bool
+        False if a file is missing.
+
+    Raises
+    ------
+    DataUnavailableError
+        If a file is there but is not the published one, or no folder is named and pooch is not installed.
+    ValueError
+        If there is no such dataset.
+
+    Examples
+    --------
+    >>> has_dataset("duct", "no/such/folder")
+    False
+    """
+    place = Path(folder) if folder is not None else dataset_folder()
+    return all(_is_published(place, file) for file in named_dataset(name).files)
+
+
 def fetch_dataset(name: str, folder: str | os.PathLike[str] | None = None, *, timeout_s: float = 5.0) -> Path:
     """Fetch what is missing of a dataset, and return the folder.
 
@@ -299,15 +330,15 @@ def find_or_fetch(name: str, folder: str | os.PathLike[str] | None, *, allow_dow
 
 def _cached(dataset: Dataset) -> Path:
     try:
-        place = dataset_folder()
-    except DataUnavailableError:
-        place = None
-    if place is None or not all(_is_published(place, file) for file in dataset.files):
-        raise DataUnavailableError(
-            f"no folder with the measured {dataset.name} is named, and none is in the cache: pass folder, set "
-            f"{_FOLDER_VARIABLE}, or pass allow_download=True to fetch it from its public sources"
-        )
-    return place
+        if has_dataset(dataset.name):
+            return dataset_folder()
+        reason = ""
+    except DataUnavailableError as error:  # pooch is not installed, or a file of the cache is damaged
+        reason = f" ({error})"
+    raise DataUnavailableError(
+        f"no folder with the measured {dataset.name} is named, and none is in the cache{reason}: pass folder, set "
+        f"{_FOLDER_VARIABLE}, or pass allow_download=True to fetch it from its public sources"
+    )
 
 
 def _is_published(folder: Path, file: DatasetFile) -> bool:

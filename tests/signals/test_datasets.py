@@ -17,6 +17,7 @@ from kfopc_filterpy.signals import (
     dataset_folder,
     datasets,
     fetch_dataset,
+    has_dataset,
     list_datasets,
     load_measured_duct,
 )
@@ -159,7 +160,10 @@ def left_in(folder: Path) -> list[str]:
 def test_a_dataset_is_fetched_once_to_the_folder_of_the_environment(source, monkeypatch, tmp_path):
     folder = tmp_path / "measured"
     monkeypatch.setenv("KFOPC_DATA", str(folder))
+    assert not has_dataset("duct")
     assert fetch_dataset("duct") == dataset_folder() == folder
+    assert has_dataset("duct")
+    assert not has_dataset("duct", tmp_path / "other")
     assert left_in(folder) == ["Pz1.mat", "Sz.mat"]
     assert (folder / "duct" / "Sz.mat").read_bytes() == (tmp_path / "duct" / "Sz.mat").read_bytes()
     (folder / "duct" / "Pz1.mat").unlink()

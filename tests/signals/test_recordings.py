@@ -481,10 +481,13 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
         read_recording(tmp_path / name, fs=FS)
 
 
-@pytest.mark.parametrize("kind", ["OGG", "AU", "MP3"])
-def test_formats_that_lose_something_or_are_not_checked_are_refused(tmp_path, kind):
-    soundfile.write(tmp_path / "x.wav", signal(1, 4000), FS, format=kind)
-    with pytest.raises(ValueError, match=r"x\.wav is .*, expected WAV, AIFF or FLAC: record it again"):
+@pytest.mark.parametrize(
+    ("kind", "coding"),
+    [("OGG", "VORBIS"), ("AU", "PCM_16"), ("MP3", "MPEG_LAYER_III"), ("WAV", "IMA_ADPCM"), ("WAV", "ULAW")],
+)
+def test_formats_that_lose_something_or_are_not_checked_are_refused(tmp_path, kind, coding):
+    soundfile.write(tmp_path / "x.wav", signal(1, 4000), FS, format=kind, subtype=coding)
+    with pytest.raises(ValueError, match=r"x\.wav is .*, .*, expected WAV, AIFF or FLAC without loss: record it again"):
         read_recording(tmp_path / "x.wav")
 
 
