@@ -476,6 +476,8 @@ def test_numbers_after_which_text_comes_are_refused(tmp_path):
 @pytest.mark.parametrize("name", ["x.wav", "x.flac", "x.mat", "x.npy", "x.npz", "x.sofa", "x.uff"])
 @pytest.mark.parametrize("content", [b"RIFF", b"no such file at all", bytes(range(256)) * 8, b"\n" * 700])
 def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
+    if name in ("x.sofa", "x.uff"):
+        pytest.importorskip("h5py" if name == "x.sofa" else "pyuff")
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=name):
         read_recording(tmp_path / name, fs=FS)
