@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterable
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
+
+_LARGEST_DENOMINATOR = 50_000  # of a ratio of sampling rates
 
 
 def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None = None) -> np.ndarray:
@@ -150,6 +153,17 @@ def as_band(band: Any, fs: float, name: str = "band") -> tuple[float, float]:
     if not 0 <= low < high <= fs / 2:
         raise ValueError(f"{name} must satisfy 0 <= low < high <= fs/2 = {fs / 2:g} Hz, got ({low:g}, {high:g}) Hz")
     return low, high
+
+
+def as_rate_ratio(fs: float, new_fs: float) -> tuple[int, int]:
+    """Return `new_fs / fs` as a ratio (up, down) of whole numbers."""
+    ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_DENOMINATOR)
+    if not ratio or abs(fs * ratio - new_fs) > 1e-12 * new_fs:  # an irrational ratio comes within 2e-10
+        raise ValueError(
+            f"fs and new_fs must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and "
+            f"{new_fs:g} Hz; round the rates to whole Hz"
+        )
+    return ratio.numerator, ratio.denominator
 
 
 def as_sample_count(duration_s: Any, fs: Any, name: str) -> int:

@@ -21,6 +21,7 @@ from .models import path_taps as path_taps
 from .models import perturbed_path as perturbed_path
 from .observation import ObservationFilters as ObservationFilters
 from .observation import identify_observation_filters as identify_observation_filters
+from .reading import read_path as read_path
 from .realization import PathRealization as PathRealization
 from .realization import realize_paths as realize_paths
 from .resampling import resample_path as resample_path

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_positive
+from .._validate import as_positive, as_rate_ratio
 from .models import fir_path, is_system, path_taps, sampling_rate
 
 if TYPE_CHECKING:
     import control
 
-_LARGEST_DENOMINATOR = 50_000
 _FILTER_REACH = 10  # samples of the lower rate to each side: the filter that `scipy.signal.resample_poly` designs
 _LOST_AT_START = 1e-4  # share of the energy, -40 dB
 
@@ -80,13 +78,7 @@ def _resampled(taps: np.ndarray, fs: float, new_fs: float) -> np.ndarray:
     """Return the taps at the new rate; refuse a path that would have to begin before its first sample."""
     from scipy.signal import resample_poly
 
-    ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_DENOMINATOR)
-    up, down = ratio.numerator, ratio.denominator
-    if abs(fs * ratio - new_fs) > 1e-12 * new_fs:  # an irrational ratio comes within 2e-10
-        raise ValueError(
-            f"fs and new_fs must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and "
-            f"{new_fs:g} Hz; round the rates to whole Hz"
-        )
+    up, down = as_rate_ratio(fs, new_fs)
     # Silence on both sides takes what the symmetric filter spreads: whole turns of `down` samples in, `up` samples out.
     spread = _FILTER_REACH * max(up, down)
     turns = math.ceil(spread / (up * down))

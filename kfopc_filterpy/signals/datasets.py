@@ -1,4 +1,4 @@
-"""The public measured duct and room, and recordings of a motor and a compressor.
+"""Public measured data: where they come from, what they are, and fetching them.
 
 These are third-party data without a stated licence, so they are not part of this package. They are read from a folder
 of the user's, or fetched from their public sources, and checked by SHA-256.
@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
-import numpy as np
-
-from .._validate import as_choice, as_positive, as_real_array, as_signal, require_finite
-from .recordings import read_mat_vector
+from .._validate import as_choice, as_positive
 
 _FOLDER_VARIABLE = "KFOPC_DATA"
+_HOST = "https://raw.githubusercontent.com"
+_NO_LICENCE = "none stated"
 
 # The room's files by variable: P{k} to microphone k, S{k}{j} from loudspeaker j to microphone k.
 _ROOM_HASHES = {
@@ -42,277 +42,341 @@ _ROOM_HASHES = {
     "S43": "ee087943f71e14ecebbae62db8db1ed33f74de799ed38ff3b2fd2fefad16aea5",
     "S44": "e9a9abe5d954d98933e13c0b933a3487bb54fcf7e2826a25b2b259a1fa01576c",
 }
-_ROOM = "ShiDongyuan/Meta/dd99aaa351c397090ab7efc03f02a84b669cf302/path"
-# Where each file lies in a data folder, its SHA-256, and its public source at a fixed commit.
-_HASHES = {
-    **{f"room4x4/{name}.mat": digest for name, digest in _ROOM_HASHES.items()},
-    "duct/Pz1.mat": "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
-    "duct/Sz.mat": "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
-    "motor/Motor.mat": "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
-    "compressor/compressor_16kHz.mat": "41498a595d746ce706926c2b33156bc868753a7e29be1ebb6a1eabcf3417227d",
-}
-_DUCT = "Luo-Zhengding/GFANC-Kalman/06badd525411571402e83212e7f00b2345cde62d/Pz%20and%20Sz/Duct_Path"
-_MOTOR = "Ji-Junwei/PriPathEst_MOVFxLMS_ANC/84bcdae3aaba5c7410898dcb20ba14f5d417c0d8/MOVFxLMS_PriEst/Noise_data"
-_COMPRESSOR = "ANC-Research/IC-DMCANC-CPA/ed1d5dbe59c990c1718052e6d3e28513ff12b70c"
-_URLS = {
-    **{f"room4x4/{name}.mat": f"https://raw.githubusercontent.com/{_ROOM}/{name}.mat" for name in _ROOM_HASHES},
-    "duct/Pz1.mat": f"https://raw.githubusercontent.com/{_DUCT}/Pz1.mat",
-    "duct/Sz.mat": f"https://raw.githubusercontent.com/{_DUCT}/Sz.mat",
-    "motor/Motor.mat": f"https://raw.githubusercontent.com/{_MOTOR}/Motor.mat",
-    "compressor/compressor_16kHz.mat": f"https://raw.githubusercontent.com/{_COMPRESSOR}/compressor_16kHz.mat",
-}
-# File and variable of each noise.
-_NOISES = {"motor": ("motor/Motor.mat", "Motor_noise"), "compressor": ("compressor/compressor_16kHz.mat", "yr")}
 
 
 class DataUnavailableError(FileNotFoundError):
     """Measured data cannot be read or fetched, or are not the published ones; the message says what to do."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class MeasuredDuct:
-    """Impulse responses of a measured duct, and a noise to run through it.
-
-    Build one from files of your own, for instance with `read_mat_vector` and `read_wav`.
+@dataclass(frozen=True)
+class DatasetFile:
+    """A file of a dataset.
 
     Attributes
     ----------
-    primary : ndarray, shape (n_taps,)
-        Taps of the primary path, from the reference to the error microphone.
-    secondary : ndarray, shape (n_taps,)
-        Taps of the secondary path, from the loudspeaker to the error microphone.
-    noise : ndarray, shape (n_samples,)
-        Primary noise.
-    fs : float, default 16000
-        Sampling frequency of all three in Hz.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If a signal is empty, not one-dimensional or not finite, or fs is not above 0.
-
-    Examples
-    --------
-    >>> MeasuredDuct(primary=[0.0, 0.0, 1.0], secondary=[0.0, 1.0], noise=np.zeros(4000), fs=8000)
-    <MeasuredDuct: primary path 3 taps, secondary path 2 taps, noise 0.5 s, fs 8000 Hz>
+    name : str
+        Where it lies in a data folder: "duct/Sz.mat".
+    url : str
+        Its public source, at a fixed commit.
+    sha256 : str
+        The hash of the published file.
+    variable : str
+        The variable in it that is read.
     """
 
-    primary: np.ndarray
-    secondary: np.ndarray
-    noise: np.ndarray
-    fs: float = 16000.0
-
-    def __post_init__(self) -> None:
-        for name in ("primary", "secondary", "noise"):
-            object.__setattr__(self, name, as_signal(getattr(self, name), name))
-        object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
-
-    def __repr__(self) -> str:
-        taps = f"primary path {self.primary.size} taps, secondary path {self.secondary.size} taps"
-        return f"<MeasuredDuct: {taps}, noise {self.noise.size / self.fs:.3g} s, fs {self.fs:g} Hz>"
+    name: str
+    url: str
+    sha256: str
+    variable: str
 
 
-def load_measured_duct(
-    folder: str | os.PathLike[str] | None = None,
-    *,
-    noise: str = "motor",
-    allow_download: bool = False,
-    timeout_s: float = 5.0,
-) -> MeasuredDuct:
-    """Load measured duct paths and a recorded noise at 16 kHz.
-
-    The paper does not say which paths and which compressor it used. The compressor recording here was published by its
-    first author, so it is probably the paper's.
-
-    The first of these that is given is used, and no other is tried after it: `folder`; the folder that the environment
-    variable KFOPC_DATA names; the public sources, if `allow_download` is true and pooch is installed. A folder holds
-    duct/Pz1.mat, duct/Sz.mat, and motor/Motor.mat or compressor/compressor_16kHz.mat. From any source, every file must
-    have the published SHA-256; for paths of your own, build a `MeasuredDuct`. Units are arbitrary: the secondary path
-    gains 10 to 30 dB.
-
-    Parameters
-    ----------
-    folder : path, optional
-        Folder with the files.
-    noise : {"motor", "compressor"}, default "motor"
-        Recording that is read; the file of the other one is not needed.
-    allow_download : bool, default False
-        Fetch the files, one try each, into pooch's cache of the operating system; later calls find them there.
-    timeout_s : float, default 5.0
-        How long to wait for the network's next answer, in seconds; the first failure ends the call.
-
-    Returns
-    -------
-    MeasuredDuct
-        primary (1024,), secondary (512,), noise (162001,) of the motor or (279378,) of the compressor, fs = 16000.
-
-    Raises
-    ------
-    DataUnavailableError
-        If a file is missing, differs from the published one or cannot be fetched.
-    ValueError, TypeError
-        If `noise` names no recording, or `timeout_s` is not above 0.
-
-    References
-    ----------
-    Z. Luo et al., "GFANC-Kalman: generative fixed-filter active noise control with CNN-Kalman filtering",
-    IEEE Signal Process. Lett., 2023 (duct). J. Ji et al., MOV-FxLMS with primary-path estimation (motor noise). The
-    repository ANC-Research/IC-DMCANC-CPA of J. Ji et al. on distributed multichannel ANC (compressor noise).
-
-    Examples
-    --------
-    >>> try:
-    ...     duct = load_measured_duct("no/such/folder")
-    ... except DataUnavailableError:
-    ...     print("run the built-in duct instead")
-    run the built-in duct instead
-    """
-    noise_file = _NOISES[as_choice(noise, "noise", _NOISES)]
-    timeout = as_positive(timeout_s, "timeout_s", unit="s")
-    vector = _vector_reader("the measured duct", folder, allow_download, timeout)
-    return MeasuredDuct(
-        primary=vector("duct/Pz1.mat", "Pz1"),
-        secondary=vector("duct/Sz.mat", "S"),
-        noise=vector(*noise_file),
-    )
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class MeasuredRoom:
-    """Impulse responses between several loudspeakers and microphones.
+@dataclass(frozen=True)
+class Dataset:
+    """Public measured data: what they are, and where they come from.
 
     Attributes
     ----------
-    primary : ndarray, shape (K, I, n_taps)
-        Taps of the primary paths, from each of I references to each of K error microphones.
-    secondary : ndarray, shape (K, J, n_taps)
-        Taps of the secondary paths, from each of J loudspeakers to each error microphone.
-    fs : float, default 16000
+    name : str
+        Name for `fetch_dataset`.
+    title : str
+        What the data are.
+    repository : str
+        Public source on GitHub, owner/name.
+    commit : str
+        Commit of it that is used.
+    licence : str
+        Licence as the source states it, or "none stated". Then the data are for the user's own reading; they must not be
+        passed on.
+    fs : float
         Sampling frequency in Hz.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If paths are not finite, not (K, inputs, n_taps) with the same K, or fs is not above 0.
-
-    Examples
-    --------
-    >>> MeasuredRoom(primary=np.ones((2, 1, 8)), secondary=np.ones((2, 3, 4)), fs=8000)
-    <MeasuredRoom: primary paths (2, 1, 8), secondary paths (2, 3, 4), fs 8000 Hz>
+    units : str
+        Units of the samples.
+    files : tuple of DatasetFile
+        The files.
     """
 
-    primary: np.ndarray
-    secondary: np.ndarray
-    fs: float = 16000.0
-
-    def __post_init__(self) -> None:
-        for name in ("primary", "secondary"):
-            paths = as_real_array(getattr(self, name), name)
-            if paths.ndim != 3 or paths.size == 0:
-                raise ValueError(f"{name} must have shape (K microphones, inputs, taps), got {paths.shape}")
-            require_finite(paths, name)
-            object.__setattr__(self, name, paths)
-        if len(self.primary) != len(self.secondary):
-            raise ValueError(
-                f"primary and secondary must have the same K microphones as their first axis, got "
-                f"{len(self.primary)} and {len(self.secondary)}"
-            )
-        object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
-
-    def __repr__(self) -> str:
-        return f"<MeasuredRoom: primary paths {self.primary.shape}, secondary paths {self.secondary.shape}, fs {self.fs:g} Hz>"
+    name: str
+    title: str
+    repository: str
+    commit: str
+    licence: str
+    fs: float
+    units: str
+    files: tuple[DatasetFile, ...]
 
 
-def load_measured_room(
-    folder: str | os.PathLike[str] | None = None, *, allow_download: bool = False, timeout_s: float = 5.0
-) -> MeasuredRoom:
-    """Load measured paths of one noise source and four loudspeakers to four microphones, at 16 kHz.
+def _dataset(
+    name: str, title: str, repository: str, commit: str, units: str, files: list[tuple[str, str, str, str]]
+) -> Dataset:
+    """Return a dataset at 16 kHz without a licence; of each file its name, path at the source, SHA-256, variable."""
+    source = f"{repository}/{commit}"
+    entries = (DatasetFile(name, f"{_HOST}/{source}/{quote(path)}", sha, var) for name, path, sha, var in files)
+    return Dataset(name, title, repository, commit, _NO_LICENCE, 16000.0, units, tuple(entries))
 
-    The source does not state which index of a secondary path's file is the loudspeaker. S{k}{j} is read as the path from
-    loudspeaker j to microphone k. It does not describe the room or the units either.
 
-    Files are found and checked as by `load_measured_duct`. A folder holds room4x4/P1.mat to P4.mat and room4x4/S11.mat to
-    S44.mat.
+_DATASETS = {
+    dataset.name: dataset
+    for dataset in (
+        _dataset(
+            "duct",
+            "impulse responses of a duct: primary path of 1024 taps, secondary path of 512",
+            "Luo-Zhengding/GFANC-Kalman",
+            "06badd525411571402e83212e7f00b2345cde62d",
+            "arbitrary: the secondary path gains 10 to 30 dB",
+            [
+                (
+                    "duct/Pz1.mat",
+                    "Pz and Sz/Duct_Path/Pz1.mat",
+                    "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
+                    "Pz1",
+                ),
+                (
+                    "duct/Sz.mat",
+                    "Pz and Sz/Duct_Path/Sz.mat",
+                    "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
+                    "S",
+                ),
+            ],
+        ),
+        _dataset(
+            "motor",
+            "recorded noise of a motor, 10.1 s",
+            "Ji-Junwei/PriPathEst_MOVFxLMS_ANC",
+            "84bcdae3aaba5c7410898dcb20ba14f5d417c0d8",
+            "arbitrary",
+            [
+                (
+                    "motor/Motor.mat",
+                    "MOVFxLMS_PriEst/Noise_data/Motor.mat",
+                    "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
+                    "Motor_noise",
+                )
+            ],
+        ),
+        _dataset(
+            "compressor",
+            "recorded noise of a compressor, 17.5 s",
+            "ANC-Research/IC-DMCANC-CPA",
+            "ed1d5dbe59c990c1718052e6d3e28513ff12b70c",
+            "arbitrary",
+            [
+                (
+                    "compressor/compressor_16kHz.mat",
+                    "compressor_16kHz.mat",
+                    "41498a595d746ce706926c2b33156bc868753a7e29be1ebb6a1eabcf3417227d",
+                    "yr",
+                )
+            ],
+        ),
+        _dataset(
+            "room",
+            "impulse responses of a noise source and four loudspeakers to four microphones, 256 taps each",
+            "ShiDongyuan/Meta",
+            "dd99aaa351c397090ab7efc03f02a84b669cf302",
+            "not stated",
+            [(f"room4x4/{name}.mat", f"path/{name}.mat", sha, name) for name, sha in _ROOM_HASHES.items()],
+        ),
+    )
+}
 
-    Parameters
-    ----------
-    folder : path, optional
-        Folder with the files, by default the one that the environment variable KFOPC_DATA names.
-    allow_download : bool, default False
-        Fetch the files from their public source if no folder is named, into pooch's cache.
-    timeout_s : float, default 5.0
-        How long to wait for the network's next answer, in seconds.
+
+def list_datasets() -> tuple[Dataset, ...]:
+    """Return the public measured data that can be read or fetched, with their sources.
 
     Returns
     -------
-    MeasuredRoom
-        primary (4, 1, 256), secondary (4, 4, 256), fs = 16000.
+    tuple of Dataset
+        Name, title, source, commit, licence, sampling rate, units and files of each.
+
+    Examples
+    --------
+    >>> for dataset in list_datasets():
+    ...     print(f"{dataset.name:10} {len(dataset.files):2} files at {dataset.fs:g} Hz, licence: {dataset.licence}")
+    duct        2 files at 16000 Hz, licence: none stated
+    motor       1 files at 16000 Hz, licence: none stated
+    compressor  1 files at 16000 Hz, licence: none stated
+    room       20 files at 16000 Hz, licence: none stated
+    """
+    return tuple(_DATASETS.values())
+
+
+def dataset_folder() -> Path:
+    """Return the folder that measured data are read from and fetched to.
+
+    It is the one that the environment variable KFOPC_DATA names, or else pooch's cache of the operating system. It need not
+    exist yet.
+
+    Returns
+    -------
+    pathlib.Path
+        The folder; a dataset's files have their `DatasetFile.name` in it.
 
     Raises
     ------
     DataUnavailableError
-        If a file is missing, differs from the published one or cannot be fetched.
-    ValueError, TypeError
-        If `timeout_s` is not above 0.
-
-    References
-    ----------
-    D. Shi, the repository ShiDongyuan/Meta on GitHub.
+        If KFOPC_DATA is not set and pooch is not installed.
 
     Examples
     --------
-    >>> try:
-    ...     room = load_measured_room("no/such/folder")
-    ... except DataUnavailableError:
-    ...     print("compute a room with room_paths instead")
-    compute a room with room_paths instead
+    >>> import os
+    >>> from unittest import mock
+    >>> with mock.patch.dict(os.environ, KFOPC_DATA="measured"):
+    ...     print(dataset_folder())
+    measured
     """
+    named = os.environ.get(_FOLDER_VARIABLE)
+    return Path(named) if named else Path(_pooch().os_cache("kfopc_filterpy"))
+
+
+def has_dataset(name: str, folder: str | os.PathLike[str] | None = None) -> bool:
+    """Return whether a whole dataset is in the folder, checked by SHA-256, so that it can be read without a network.
+
+    Parameters
+    ----------
+    name : {"duct", "motor", "compressor", "room"}
+        The dataset, see `list_datasets`.
+    folder : path, optional
+        Folder to look in, `dataset_folder` by default.
+
+    Returns
+    -------
+    bool
+        False if a file is missing.
+
+    Raises
+    ------
+    DataUnavailableError
+        If a file is there but is not the published one, or no folder is named and pooch is not installed.
+    ValueError
+        If there is no such dataset.
+
+    Examples
+    --------
+    >>> has_dataset("duct", "no/such/folder")
+    False
+    """
+    place = Path(folder) if folder is not None else dataset_folder()
+    return all(_is_published(place, file) for file in named_dataset(name).files)
+
+
+def fetch_dataset(name: str, folder: str | os.PathLike[str] | None = None, *, timeout_s: float = 5.0) -> Path:
+    """Fetch what is missing of a dataset, and return the folder.
+
+    Files that are there are not fetched again; a whole dataset is found without a network. A file that differs from the
+    published one is never overwritten.
+
+    Parameters
+    ----------
+    name : {"duct", "motor", "compressor", "room"}
+        The dataset, see `list_datasets`.
+    folder : path, optional
+        Folder to fetch it to, `dataset_folder` by default.
+    timeout_s : float, default 5.0
+        How long to wait for the network's next answer, in seconds; each file is tried once, and the first failure ends the
+        call.
+
+    Returns
+    -------
+    pathlib.Path
+        The folder; every file in it was checked by SHA-256.
+
+    Raises
+    ------
+    DataUnavailableError
+        If a file cannot be fetched (no network, not found, cut off, no room), or a file that is there or was fetched is not
+        the published one, or pooch is needed and not installed. Nothing is left of a file that was not fetched whole.
+    ValueError, TypeError
+        If there is no such dataset, or `timeout_s` is not above 0.
+
+    Examples
+    --------
+    >>> fetch_dataset("fan")
+    Traceback (most recent call last):
+    ValueError: name must be one of 'duct', 'motor', 'compressor', 'room', got 'fan'
+    """
+    dataset = named_dataset(name)
     timeout = as_positive(timeout_s, "timeout_s", unit="s")
-    vector = _vector_reader("the measured room", folder, allow_download, timeout)
-    each = range(1, 5)
-    return MeasuredRoom(
-        primary=np.array([[vector(f"room4x4/P{k}.mat", f"P{k}")] for k in each]),
-        secondary=np.array([[vector(f"room4x4/S{k}{j}.mat", f"S{k}{j}") for j in each] for k in each]),
+    place = Path(folder) if folder is not None else dataset_folder()
+    for file in dataset.files:
+        if not _is_published(place, file):
+            _fetch(place, file, timeout)
+    return place
+
+
+def named_dataset(name: str) -> Dataset:
+    """Return a dataset by its name."""
+    return _DATASETS[as_choice(name, "name", _DATASETS)]
+
+
+def find_or_fetch(name: str, folder: str | os.PathLike[str] | None, *, allow_download: bool, timeout_s: float) -> Path:
+    """Return the folder that has a dataset: the one named, else the one of the environment, else pooch's cache.
+
+    Only to the cache is anything fetched, if that is allowed.
+    """
+    dataset = named_dataset(name)
+    named = folder if folder is not None else os.environ.get(_FOLDER_VARIABLE) or None
+    if named is None:
+        if allow_download:
+            return fetch_dataset(name, timeout_s=timeout_s)
+        return _cached(dataset)
+    for file in dataset.files:
+        if not _is_published(Path(named), file):
+            raise DataUnavailableError(
+                f"{Path(named) / file.name} is missing: put {file.url} there with signals.fetch_dataset({name!r}, folder), or "
+                f"name another folder (argument folder, or the environment variable {_FOLDER_VARIABLE})"
+            )
+    return Path(named)
+
+
+def _cached(dataset: Dataset) -> Path:
+    try:
+        if has_dataset(dataset.name):
+            return dataset_folder()
+        reason = ""
+    except DataUnavailableError as error:  # pooch is not installed, or a file of the cache is damaged
+        reason = f" ({error})"
+    raise DataUnavailableError(
+        f"no folder with the measured {dataset.name} is named, and none is in the cache{reason}: pass folder, set "
+        f"{_FOLDER_VARIABLE}, or pass allow_download=True to fetch it from its public sources"
     )
 
 
-def _vector_reader(
-    what: str, folder: str | os.PathLike[str] | None, allow_download: bool, timeout_s: float
-) -> Callable[[str, str], np.ndarray]:
-    """Return a function that reads a published file's variable from the folder chosen, or else from its source."""
-    chosen = folder if folder is not None else os.environ.get(_FOLDER_VARIABLE) or None
-    if chosen is None and not allow_download:
-        raise DataUnavailableError(
-            f"no folder with {what} is named: pass folder, set {_FOLDER_VARIABLE}, or pass "
-            "allow_download=True to fetch it from its public sources"
-        )
-
-    def vector(name: str, variable: str) -> np.ndarray:
-        path = _fetched_file(name, timeout_s) if chosen is None else _checked_file(Path(chosen), name)
-        return read_mat_vector(path, variable)
-
-    return vector
-
-
-def _checked_file(folder: Path, name: str) -> Path:
-    """Return the path of a published file in `folder`, its content verified."""
-    path = folder / name
+def _is_published(folder: Path, file: DatasetFile) -> bool:
+    """Return whether a file is in `folder`; raise DataUnavailableError if it is there but not the published one."""
+    path = folder / file.name
     if not path.is_file():
-        raise DataUnavailableError(
-            f"{path} is missing: put {_URLS[name]} there, or name another folder (argument folder, or the "
-            f"environment variable {_FOLDER_VARIABLE})"
-        )
+        return False
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if digest != _HASHES[name]:
+    if digest != file.sha256:
         raise DataUnavailableError(
-            f"{path} is not the published file, its SHA-256 is {digest}, expected {_HASHES[name]}: "
-            f"fetch it again from {_URLS[name]}, or build a MeasuredDuct or MeasuredRoom from files of your own"
+            f"{path} is not the published file, its SHA-256 is {digest}, expected {file.sha256}: delete it and fetch it "
+            f"again from {file.url}, or build a MeasuredDuct or MeasuredRoom from files of your own"
         )
-    return path
+    return True
 
 
-def _fetched_file(name: str, timeout_s: float) -> Path:
-    """Return the path of a published file in pooch's cache, fetched on first use, its content verified."""
+def _fetch(folder: Path, file: DatasetFile, timeout_s: float) -> None:
+    """Fetch a published file to `folder`; one that is not whole, or not the published one, is not kept."""
+    pooch = _pooch()
+    path = folder / file.name
+    try:
+        pooch.retrieve(
+            file.url,
+            f"sha256:{file.sha256}",
+            fname=path.name,
+            path=path.parent,
+            downloader=pooch.HTTPDownloader(timeout=timeout_s),
+        )
+    # No network, an answer such as 404, a cut transfer and a folder that cannot be written are OSErrors, a wrong hash is a
+    # ValueError.
+    except (OSError, ValueError) as error:
+        raise DataUnavailableError(
+            f"{file.url} could not be fetched ({error}): set {_FOLDER_VARIABLE} to a folder with the file as {file.name}, or "
+            "try again with a network"
+        ) from error
+
+
+def _pooch() -> Any:
     try:
         import pooch
     except ImportError as error:
@@ -321,12 +385,4 @@ def _fetched_file(name: str, timeout_s: float) -> Path:
             f"{_FOLDER_VARIABLE} to a folder with the files"
         ) from error
     pooch.get_logger().setLevel("WARNING")  # its announcements would run into a progress bar
-    cache = pooch.create(pooch.os_cache("kfopc_filterpy"), base_url="", registry=_HASHES, urls=_URLS)
-    try:
-        return Path(cache.fetch(name, downloader=pooch.HTTPDownloader(timeout=timeout_s)))
-    # No network and a cache that cannot be written are OSErrors, a wrong hash is a ValueError.
-    except (OSError, ValueError) as error:
-        raise DataUnavailableError(
-            f"{_URLS[name]} could not be fetched ({error}): set {_FOLDER_VARIABLE} to a folder with the file as "
-            f"{name}, or try again with a network"
-        ) from error
+    return pooch

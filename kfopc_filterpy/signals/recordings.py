@@ -1,132 +1,373 @@
-"""Recordings as files: vectors in MATLAB files, signals in audio files."""
+"""Recordings as files: read from the formats that people have, with rate and unit, and written as WAV."""
 
 from __future__ import annotations
 
+import math
 import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._validate import as_channels, as_count, as_positive, as_real_array, as_signal
+from .._validate import as_channels, as_count, as_number, as_positive, as_rate_ratio, as_real_array, require_finite
+from .arrays import read_npy, read_npz
+from .audio import read_audio
+from .content import Content, channels_first, reading, require_file, require_room
+from .hdf5 import read_sofa
+from .matlab import read_mat
+from .text import read_text
+from .uff import read_uff
 
-# A size that a WAV file's header states if its writer could not know it, because it wrote to a pipe.
-_SIZE_UNKNOWN = 0xFFFFFFFF
+_REFERENCE_PRESSURE = 20e-6  # Pa, of sound pressure levels
+_LEAST_TONE_S = 0.5  # of a calibrator
+_LEAST_TONE_SHARE = 0.9  # of the power of a calibrator's recording
+_LARGEST_DRIFT_DB = 0.5
+
+# What a reader is called in messages, and the reader of a path and a variable, which None stands for if it has none.
+_Reader = Callable[[Any, str | None], Content]
+_NAMED = {"a MAT file": read_mat, "a .npz file": read_npz}
+_UNNAMED = {
+    "an audio file": read_audio,
+    "a .npy file": read_npy,
+    "text": read_text,
+    "a UFF file": read_uff,
+    "a SOFA file": read_sofa,
+}
+_SUFFIXES = {
+    **dict.fromkeys((".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc"), "an audio file"),
+    **dict.fromkeys((".txt", ".csv", ".tsv", ".dat", ".asc"), "text"),
+    **dict.fromkeys((".uff", ".unv", ".uf", ".58"), "a UFF file"),
+    ".mat": "a MAT file",
+    ".npy": "a .npy file",
+    ".npz": "a .npz file",
+    ".sofa": "a SOFA file",
+}
+# A file whose suffix says nothing is known by how it begins.
+_BEGINNINGS = {
+    b"\x93NUMPY": "a .npy file",
+    b"PK\x03\x04": "a .npz file",
+    b"MATLAB": "a MAT file",
+    b"\x89HDF": "a SOFA file",
+    **dict.fromkeys((b"RIFF", b"RIFX", b"RF64", b"BW64", b"FORM", b"fLaC"), "an audio file"),
+}
 
 
-def read_mat_vector(path: str | os.PathLike[str], variable: str) -> np.ndarray:
-    """Read one real vector from a MATLAB file (version 4 to 7.2).
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording:
+    """Samples that were read from a file, with their rate and unit: of a recording, or the taps of measured paths.
 
-    Parameters
+    Attributes
     ----------
-    path : path
-        The MAT file.
-    variable : str
-        Name of the variable; its shape is (n, 1), (1, n) or (n,).
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        The values as float64.
+    samples : ndarray, shape (n_samples,) or (n_channels, n_samples)
+        The samples, or the taps of a path. Paths from a file that has a matrix of them are (K microphones,
+        J loudspeakers, n_taps).
+    fs : float
+        Sampling frequency in Hz.
+    unit : str, default "1"
+        Unit of the samples: "Pa", "V", "Pa/V"; "1" is full scale of an audio file, or not known.
+    name : str, default ""
+        Where they come from, for messages: the file's name.
+    file_fs : float, optional
+        Sampling frequency in Hz that the file states. None if it states none: then the caller gave it.
 
     Raises
     ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file cannot be read, does not hold the variable (the message lists those it holds), or the variable is
-        empty, complex, not numeric, not a vector, or holds NaN or Inf.
+    ValueError, TypeError
+        If the samples are empty, not finite or have more channels than samples, or a rate is not above 0.
 
     Examples
     --------
-    >>> import tempfile, scipy.io
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     scipy.io.savemat(folder + "/path.mat", {"S": [[0.0], [1.0], [0.5]]})
-    ...     read_mat_vector(folder + "/path.mat", "S").tolist()
-    [0.0, 1.0, 0.5]
+    >>> Recording(np.zeros((2, 4000)), 8000, unit="Pa", name="fan.wav", file_fs=44100)
+    <Recording fan.wav: 0.5 s, 2 x 4000 samples at 8000 Hz (44100 Hz in the file), in Pa>
     """
-    import scipy.io
 
-    _require_file(path)
-    try:
-        content = scipy.io.loadmat(path)
-    except NotImplementedError as error:
-        raise ValueError(f"{path} is a MAT file of version 7.3; save it with MATLAB's -v7 option") from error
-    # A damaged file can make loadmat raise nearly anything, zlib.error and IndexError among others.
-    except Exception as error:
-        raise ValueError(f"{path} cannot be read as a MAT file: {error}") from error
-    if variable not in content:
-        there = ", ".join(sorted(name for name in content if not name.startswith("__"))) or "none"
-        raise ValueError(f"variable {variable!r} is not in {path}; it holds: {there}")
-    value = np.asarray(content[variable])
-    name = f"variable {variable!r} of {path}"
-    if value.dtype.kind not in "fiub":
-        raise ValueError(f"{name} must hold real numbers, got {value.dtype}")
-    if value.size == 0 or value.size != max(value.shape):
-        raise ValueError(f"{name} must be a vector with at least one value, got shape {value.shape}")
-    return as_signal(value.ravel(), name)
+    samples: np.ndarray
+    fs: float
+    unit: str = "1"
+    name: str = ""
+    file_fs: float | None = None
+
+    def __post_init__(self) -> None:
+        name = f"the signal of {self.name}" if self.name else "samples"
+        samples = as_real_array(self.samples, name)
+        if samples.ndim == 3 and samples.size:
+            require_finite(samples, name)
+        else:
+            samples = as_channels(samples, name)
+        object.__setattr__(self, "samples", samples)
+        object.__setattr__(self, "fs", as_positive(self.fs, "fs", unit="Hz"))
+        if self.file_fs is not None:
+            object.__setattr__(self, "file_fs", as_positive(self.file_fs, "file_fs", unit="Hz"))
+
+    def one_channel(self) -> np.ndarray:
+        """Return the samples of the only channel, (n_samples,).
+
+        Raises
+        ------
+        ValueError
+            If there are several channels. Read the file with `channel`.
+
+        Examples
+        --------
+        >>> Recording([[1.0, 2.0, 3.0]], 8000).one_channel().tolist()
+        [1.0, 2.0, 3.0]
+        """
+        if self.samples.size != self.samples.shape[-1]:
+            count = math.prod(self.samples.shape[:-1])
+            raise ValueError(
+                f"{self.name or 'the recording'} has {count} channels where one is needed: read it with channel=0 to "
+                f"channel={count - 1}"
+            )
+        return self.samples.reshape(-1)
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.samples.shape))
+        other = f" ({self.file_fs:g} Hz in the file)" if self.file_fs not in (None, self.fs) else ""
+        given = " (not stated in the file)" if self.file_fs is None and self.name else ""
+        unit = f", in {self.unit}" if self.unit != "1" else ""
+        name = f" {self.name}" if self.name else ""
+        length = f"{self.samples.shape[-1] / self.fs:.3g} s, {shape} samples at {self.fs:g} Hz"
+        return f"<Recording{name}: {length}{other}{given}{unit}>"
 
 
-def read_wav(
-    path: str | os.PathLike[str], fs: float | None = None, *, channel: int | None = None
-) -> tuple[np.ndarray, float]:
-    """Read an audio file: WAV, or any other format that libsndfile reads, such as FLAC or AIFF.
+def read_recording(
+    path: str | os.PathLike[str],
+    *,
+    fs: float | None = None,
+    channel: int | None = None,
+    variable: str | None = None,
+    unit: str | None = None,
+    unit_per_full_scale: float | None = None,
+    calibrator: str | os.PathLike[str] | Recording | None = None,
+    level_db: float = 94.0,
+    file_fs: float | None = None,
+) -> Recording:
+    """Read a recording: WAV, RF64, FLAC, AIFF, MATLAB, .npy, .npz, text, CSV or UFF.
 
-    Whole-number samples are scaled so that full scale is 1.
+    The suffix of the file tells its format, or else how the file begins. Whole-number samples of audio files are scaled
+    so that full scale is 1. In formats that hold arrays, the longer axis is time. A first column of text that rises evenly
+    is time in seconds (or the number of the sample, if it rises by 1) and is left out. The page *File formats* has all of it.
+
+    Nothing is unpickled. Files that are compressed may become at most 64 MiB or 100 times their size, whichever is more.
 
     Parameters
     ----------
     path : path
-        The audio file.
+        The file.
     fs : float, optional
-        Sampling frequency in Hz that the file must have. By default any is taken.
+        Sampling frequency wanted in Hz: a recording with another is resampled by `scipy.signal.resample_poly`. By default
+        it stays as it is. A file that states no rate is taken to be sampled at `fs`, unless `file_fs` says otherwise.
     channel : int, optional
         Channel to read, from 0. By default all are read.
+    variable : str, optional
+        Variable of a .mat or .npz file. By default the only one with several values.
+    unit : str, optional
+        Unit of the samples, after scaling. By default what the file states, or "1".
+    unit_per_full_scale : float, optional
+        What the number 1 in the file stands for, in `unit`: 2.5 for a WAV file whose full scale is 2.5 Pa, or 20 for
+        numbers in volts of a microphone with 50 mV/Pa.
+    calibrator : path or Recording, optional
+        Recording of a sound calibrator with the same gain: `calibration_factor` gives the scale, and the unit is "Pa".
+        If it has several channels, `channel` is used.
+    level_db : float, default 94.0
+        Sound pressure level of the calibrator in dB re 20 uPa.
+    file_fs : float, optional
+        Sampling frequency in Hz of a file that states none.
 
     Returns
     -------
-    signal : ndarray, shape (n_samples,) or (n_channels, n_samples)
-        The samples as float64. A file with several channels gives (n_channels, n_samples) unless one is chosen.
-    fs : float
-        Sampling frequency of the file in Hz.
+    Recording
+        Samples as float64, (n_samples,) or (n_channels, n_samples), their rate, unit and name.
 
     Raises
     ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If the file is not an audio file, is cut short, is empty or holds NaN or Inf, has another sampling frequency
-        than `fs`, or does not have the channel.
+    FileNotFoundError, OSError
+        If there is no such file, or it may not be read.
+    ModuleNotFoundError
+        If the format needs a library of the extra `formats`; the message names it.
+    ValueError, TypeError
+        If the file is empty, cut short, damaged, claims more than it has, or holds NaN or Inf; if it holds several variables
+        and none is chosen, or no such variable or channel; if no sampling rate is known, or `file_fs` is another than
+        the file's; if the rates are in no ratio of whole numbers; if a scale comes without its unit.
+
+    See Also
+    --------
+    kfopc_filterpy.paths.read_path : for impulse responses, which resampling must treat differently.
 
     Examples
     --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_wav(folder + "/noise.wav", [[0.0, 0.5, -0.25], [1.0, 0.0, 0.0]], 16000)
-    ...     signal, fs = read_wav(folder + "/noise.wav", 16000)
-    >>> signal.tolist(), fs
-    ([[0.0, 0.5, -0.25], [1.0, 0.0, 0.0]], 16000.0)
+    ...     recording = read_recording(folder + "/noise.wav", unit="Pa", unit_per_full_scale=2.0)
+    >>> recording
+    <Recording noise.wav: 0.000188 s, 2 x 3 samples at 16000 Hz, in Pa>
+    >>> recording.samples.tolist()
+    [[0.0, 1.0, -0.5], [2.0, 0.0, 0.0]]
     """
-    import soundfile
-
-    _require_file(path)
-    _require_whole(path)
-    try:
-        frames, file_fs = soundfile.read(path, dtype="float64", always_2d=True)
-    except soundfile.SoundFileError as error:
-        raise ValueError(f"{path} cannot be read as an audio file: {error}") from error
-    if fs is not None and file_fs != as_positive(fs, "fs", unit="Hz"):
+    content, name = read_content(path, channel=channel, variable=variable), Path(path).name
+    if content.samples.ndim > 2:
         raise ValueError(
-            f"{path} is sampled at {file_fs} Hz, expected fs = {fs:g} Hz; read it without fs and "
-            "resample it: a recording with scipy.signal.resample_poly, an impulse response with paths.resample_path"
+            f"{path} must hold signals, (n_channels, n_samples), got shape {content.samples.shape}; read impulse responses "
+            "with paths.read_path"
         )
-    name, channels = f"the signal of {path}", frames.T
+    rate, wanted = rates_of(path, content, fs, file_fs)
+    if calibrator is not None:
+        if unit_per_full_scale is not None or unit not in (None, "Pa"):
+            raise ValueError("calibrator gives scale and unit (Pa): leave out unit and unit_per_full_scale")
+        unit, unit_per_full_scale = "Pa", calibration_factor(calibrator, level_db, channel=channel)
+    samples, unit = scaled(content, unit, unit_per_full_scale)
+    if wanted != rate:
+        samples = _resampled(path, samples, rate, wanted)
+    return Recording(samples, wanted, unit, name, content.fs)
+
+
+def calibration_factor(
+    calibrator: str | os.PathLike[str] | Recording, level_db: float = 94.0, *, channel: int | None = None
+) -> float:
+    """Return the pascals that the number 1 of a recording stands for, from a recording of a sound calibrator.
+
+    The rms of the tone becomes ``20e-6 * 10**(level_db / 20)`` Pa: 1.002 Pa at 94 dB. Hum and noise beside the tone do not
+    count.
+
+    Parameters
+    ----------
+    calibrator : path or Recording
+        The calibrator's tone, at least 0.5 s of it and nothing else, recorded with the gain of the recordings to be scaled.
+    level_db : float, default 94.0
+        Its sound pressure level in dB re 20 uPa; IEC 60942 prefers 94 dB and 114 dB.
+    channel : int, optional
+        Channel of a recording with several.
+
+    Returns
+    -------
+    float
+        Pascals per unit, the `unit_per_full_scale` of `read_recording`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If the recording has several channels and none is chosen, is shorter than 0.5 s or silent, has a unit already, if
+        less than 90 % of its power is one tone, or its level drifts by more than 0.5 dB.
+
+    Examples
+    --------
+    >>> tone = 0.1 * np.sin(2 * np.pi * 1000 * np.arange(16000) / 16000)
+    >>> round(calibration_factor(Recording(tone, 16000)), 2)  # 1.002 Pa is an rms of 0.0707
+    14.18
+    """
+    level = as_number(level_db, "level_db", unit="dB")
+    recording = calibrator if isinstance(calibrator, Recording) else read_recording(calibrator)
+    if recording.unit != "1":
+        raise ValueError(f"calibrator must not be scaled yet, got {recording.unit}: read it without unit")
+    if channel is not None and recording.samples.ndim == 2:
+        recording = replace(
+            recording, samples=recording.samples[as_channel(channel, recording.samples, recording.name)]
+        )
+    signal = recording.one_channel()
+    signal = signal - signal.mean()
+    what = f"calibrator {recording.name}".strip()
+    if signal.size < _LEAST_TONE_S * recording.fs:
+        raise ValueError(f"{what} must last {_LEAST_TONE_S} s or more, got {signal.size / recording.fs:.3g} s")
+    quarters = [np.mean(part**2) for part in np.array_split(signal, 4)]
+    if min(quarters) == 0:
+        raise ValueError(f"{what} is silent: record the calibrator's tone")
+    drift = 10 * np.log10(max(quarters) / min(quarters))
+    if drift > _LARGEST_DRIFT_DB:
+        raise ValueError(f"{what} must have a steady level, but it drifts by {drift:.1f} dB: cut out the steady part")
+    share = _tone_share(signal)
+    if share < _LEAST_TONE_SHARE:
+        raise ValueError(
+            f"{what} must be one tone, but only {100 * share:.0f} % of its power is: record the calibrator alone, unclipped"
+        )
+    return _REFERENCE_PRESSURE * 10 ** (level / 20) / math.sqrt(share * np.mean(signal**2))
+
+
+def _tone_share(signal: np.ndarray) -> float:
+    """Return the share of the power within 3 % of the strongest frequency."""
+    power = np.abs(np.fft.rfft(signal * np.hanning(signal.size))) ** 2
+    peak = int(np.argmax(power))
+    reach = max(3, round(0.03 * peak))
+    return float(np.sum(power[max(0, peak - reach) : peak + reach + 1]) / np.sum(power))
+
+
+def read_content(path: str | os.PathLike[str], *, channel: int | None = None, variable: str | None = None) -> Content:
+    """Return what a file holds as finite float64, with time as the last axis, or the channel chosen."""
+    require_file(path)
+    kind = _SUFFIXES.get(Path(path).suffix.lower()) or _kind_of(path)
+    if variable is not None and kind not in _NAMED:
+        raise ValueError(f"{path} is {kind}, which has no named variables: leave out variable")
+    with reading(path, kind):
+        content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
+    if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
+        raise ValueError(f"{path} states a sampling rate of {content.fs:g} Hz, expected one above 0")
+    samples = channels_first(content.samples)
     if channel is not None:
-        index = as_count(channel, "channel", minimum=0)
-        if index >= len(channels):
-            raise ValueError(f"channel must be below the {len(channels)} channel(s) of {path}, got {index}")
-        return as_signal(channels[index], name), float(file_fs)
-    return as_channels(channels[0] if len(channels) == 1 else channels, name), float(file_fs)
+        samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
+    require_finite(samples, f"the signal of {path}")
+    return content._replace(samples=np.ascontiguousarray(samples, dtype=np.float64))
+
+
+def as_channel(channel: int, samples: np.ndarray, name: object) -> int:
+    """Return `channel` if samples (n_channels, n_samples) have it."""
+    if samples.ndim > 2:
+        raise ValueError(f"{name} holds a matrix of paths, {samples.shape}, and no channels: leave out channel")
+    index = as_count(channel, "channel", minimum=0)
+    if index >= len(samples):
+        raise ValueError(f"channel must be below the {len(samples)} channel(s) of {name}, got {index}")
+    return index
+
+
+def _kind_of(path: str | os.PathLike[str]) -> str:
+    with open(path, "rb") as file:
+        head = file.read(600)
+    for beginning, kind in _BEGINNINGS.items():
+        if head.startswith(beginning):
+            return "a MAT file" if head.startswith(b"MATLAB") else kind
+    if head[512:516] == b"\x89HDF":
+        return "a MAT file"
+    lines = head.split(b"\n", 2)
+    if lines[0].rstrip() == b"    -1" and len(lines) > 1 and lines[1].startswith(b"    58"):
+        return "a UFF file"
+    return "text"
+
+
+def rates_of(
+    path: str | os.PathLike[str], content: Content, fs: float | None, file_fs: float | None
+) -> tuple[float, float]:
+    """Return the rate of a file, and the rate wanted, in Hz."""
+    wanted = None if fs is None else as_positive(fs, "fs", unit="Hz")
+    given = None if file_fs is None else as_positive(file_fs, "file_fs", unit="Hz")
+    if content.fs is not None and given is not None and given != content.fs:
+        raise ValueError(
+            f"{path} states a sampling rate of {content.fs:g} Hz, but file_fs = {given:g} Hz: leave it out"
+        )
+    rate = content.fs or given or wanted
+    if rate is None:
+        raise ValueError(
+            f"{path} states no sampling rate: pass fs, the rate in Hz at which it was sampled (or file_fs, if it is to be "
+            "resampled to fs)"
+        )
+    return rate, wanted or rate
+
+
+def scaled(content: Content, unit: str | None, unit_per_full_scale: float | None) -> tuple[np.ndarray, str]:
+    """Return the samples in their unit."""
+    if unit_per_full_scale is None:
+        return content.samples, unit or content.unit or "1"
+    if unit is None:
+        raise ValueError('unit_per_full_scale needs the unit of its result: pass unit="Pa" or unit="V", for example')
+    return content.samples * as_positive(unit_per_full_scale, "unit_per_full_scale"), unit
+
+
+def _resampled(path: str | os.PathLike[str], samples: np.ndarray, fs: float, new_fs: float) -> np.ndarray:
+    from scipy.signal import resample_poly
+
+    up, down = as_rate_ratio(fs, new_fs)
+    require_room(path, samples.size * up / down, what=f"resampled from {fs:g} to {new_fs:g} Hz it has")
+    return resample_poly(samples, up, down, axis=-1)
 
 
 def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: float | None = None) -> None:
@@ -157,8 +398,8 @@ def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: flo
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_wav(folder + "/error.wav", [4.0, -2.0, float("nan")], 16000, peak=4.0)
-    ...     signal, fs = read_wav(folder + "/error.wav")
-    >>> signal.round(3).tolist()
+    ...     recording = read_recording(folder + "/error.wav")
+    >>> recording.samples.round(3).tolist()
     [1.0, -0.5, 0.0]
     """
     # Not soundfile, which puts the time of writing into floating-point files: the same signal gives the same bytes.
@@ -178,20 +419,6 @@ def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: flo
             f"signal reaches {largest:g}, beyond peak = {full_scale:g}; raise peak, or limit the signal with np.clip"
         )
     wavfile.write(path, round(rate), np.round(samples.T / full_scale * 32767).astype(np.int16))
-
-
-def _require_file(path: str | os.PathLike[str]) -> None:
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
-
-
-def _require_whole(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError if a WAV file is shorter than its header says: libsndfile would read what is left of it."""
-    with open(path, "rb") as file:
-        riff, size, kind = file.read(4), int.from_bytes(file.read(4), "little"), file.read(4)
-    held = Path(path).stat().st_size - 8
-    if (riff, kind) == (b"RIFF", b"WAVE") and held < size != _SIZE_UNKNOWN:
-        raise ValueError(f"{path} cannot be read as an audio file: it is cut short, at {held} of {size} bytes")
 
 
 def _silent_tail(signal: Any) -> np.ndarray:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from kfopc_filterpy.bench import report
 from kfopc_filterpy.bench.report import FigureItem, Sound, Table, results_table, write_report
-from kfopc_filterpy.signals import read_wav
+from kfopc_filterpy.signals import read_recording
 
 
 class _Links(HTMLParser):
@@ -167,9 +167,9 @@ def test_figures_and_sounds_are_files_too(written):
     assert {path.name for path in (written / "figures").iterdir()} == {
         f"{stem}.{kind}" for stem in ("at-a-glance", "tonal-a-spectra") for kind in ("png", "svg")
     }
-    loud, fs = read_wav(written / "audio" / "tonal-disturbance.wav")
-    soft, _ = read_wav(written / "audio" / "tonal-kf-anc.wav")
-    assert fs == FS
+    disturbance = read_recording(written / "audio" / "tonal-disturbance.wav")
+    loud, soft = disturbance.samples, read_recording(written / "audio" / "tonal-kf-anc.wav").samples
+    assert disturbance.fs == FS
     assert np.max(np.abs(loud)) == pytest.approx(1.0, abs=1e-3)
     np.testing.assert_allclose(soft[:-1], loud[:-1] / 2, atol=1e-4)  # one scale
     assert soft[-1] == 0
@@ -179,11 +179,13 @@ def test_figures_and_sounds_are_files_too(written):
 def test_a_residual_far_louder_than_the_disturbance_does_not_silence_it(tmp_path):
     made = study(sounds=[Sound("disturbance", "Disturbance", D), Sound("fxlms", "Residual", 1e6 * D)])
     page = write_report([made], tmp_path).read_text(encoding="utf-8")
-    assert np.max(np.abs(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])) == pytest.approx(0.25, abs=1e-3)
+    assert np.max(np.abs(read_recording(tmp_path / "audio" / "tonal-disturbance.wav").samples)) == pytest.approx(
+        0.25, abs=1e-3
+    )
     assert "louder than full scale: clipped" in page
     silent = study(sounds=[Sound("disturbance", "Disturbance", 0 * D)], figures=[])
     write_report([silent], tmp_path)
-    assert not np.any(read_wav(tmp_path / "audio" / "tonal-disturbance.wav")[0])
+    assert not np.any(read_recording(tmp_path / "audio" / "tonal-disturbance.wav").samples)
 
 
 def _inlined_sounds(source):
@@ -204,7 +206,7 @@ def test_the_page_plays_excerpts_of_one_moment(tmp_path):
         off, x[2 * fs : 6 * fs] / np.abs(x).max(), atol=1e-4
     )  # the file's scale and the file's bits
     np.testing.assert_allclose(on, -off / 4, atol=1e-4)  # the same moment
-    assert read_wav(tmp_path / "audio" / "tonal-kf.wav")[0].size == n  # the file has all of it
+    assert read_recording(tmp_path / "audio" / "tonal-kf.wav").samples.size == n  # the file has all of it
     assert len(source) < 2 * (4 * fs * 2) * 4 / 3 + 100_000  # at most what 16 bits take; lossless packing takes less
 
 

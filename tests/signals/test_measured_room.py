@@ -5,13 +5,14 @@ import hashlib
 import numpy as np
 import pytest
 import scipy.io
-from helpers.network import serve
+from helpers.network import publish, serving
 
 from kfopc_filterpy.signals import DataUnavailableError, MeasuredRoom, datasets, load_measured_room
 
 EACH = range(1, 5)
 NAMES = [f"P{k}" for k in EACH] + [f"S{k}{j}" for k in EACH for j in EACH]
-SOURCE = "https://raw.githubusercontent.com/ShiDongyuan/Meta/dd99aaa351c397090ab7efc03f02a84b669cf302/path"
+SOURCE = "ShiDongyuan/Meta/dd99aaa351c397090ab7efc03f02a84b669cf302/path"
+HOST = "https://raw.githubusercontent.com"
 
 
 @pytest.fixture
@@ -22,8 +23,7 @@ def own_files(tmp_path, monkeypatch):
     for name in NAMES:
         path = tmp_path / "room4x4" / f"{name}.mat"
         scipy.io.savemat(path, {name: np.array([[float(digit)] for digit in name[1:]])})
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        monkeypatch.setitem(datasets._HASHES, f"room4x4/{name}.mat", digest)
+    publish(tmp_path, monkeypatch)
     return tmp_path
 
 
@@ -51,12 +51,14 @@ def test_first_index_is_the_microphone_and_second_the_loudspeaker(own_files):
 
 
 def test_room_is_found_through_the_environment(own_files, monkeypatch):
-    with pytest.raises(DataUnavailableError, match="no folder with the measured room is named: pass folder"):
+    with pytest.raises(
+        DataUnavailableError, match="no folder with the measured room is named, and none is in the cache: pass folder"
+    ):
         load_measured_room()
     monkeypatch.setenv("KFOPC_DATA", str(own_files))
     assert load_measured_room().secondary.shape == (4, 4, 2)
     (own_files / "room4x4" / "S41.mat").unlink()
-    with pytest.raises(DataUnavailableError, match=rf"S41\.mat is missing: put {SOURCE}/S41\.mat there"):
+    with pytest.raises(DataUnavailableError, match=rf"S41\.mat is missing: put {HOST}/{SOURCE}/S41\.mat there"):
         load_measured_room()
 
 
@@ -68,19 +70,21 @@ def test_changed_file_of_the_room_is_refused(own_files):
 
 
 def test_download_asks_once_for_each_file_of_the_room(own_files, monkeypatch):
-    asked = serve(own_files, monkeypatch)
-    for _ in range(2):
-        assert load_measured_room(allow_download=True, timeout_s=2.5).secondary[3, 1].tolist() == [4, 2]
-    assert sorted(asked) == sorted((f"{SOURCE}/{name}.mat", 2.5) for name in NAMES)
+    with serving(own_files, monkeypatch) as source:
+        for _ in range(2):
+            assert load_measured_room(allow_download=True).secondary[3, 1].tolist() == [4, 2]
+    assert source.asked == [f"/{SOURCE}/{name}.mat" for name in NAMES]
 
 
 def test_pinned_files_of_the_room_are_the_published_ones(shared_data):
     if not (shared_data / "room4x4").is_dir():
         pytest.skip(f"no measured room: {shared_data} has no folder room4x4")
-    for name in NAMES:
-        content = (shared_data / "room4x4" / f"{name}.mat").read_bytes()
-        assert hashlib.sha256(content).hexdigest() == datasets._HASHES[f"room4x4/{name}.mat"]
-        assert datasets._URLS[f"room4x4/{name}.mat"] == f"{SOURCE}/{name}.mat"
+    files = datasets.named_dataset("room").files
+    assert [file.variable for file in files] == NAMES
+    for file in files:
+        assert file.name == f"room4x4/{file.variable}.mat"
+        assert hashlib.sha256((shared_data / file.name).read_bytes()).hexdigest() == file.sha256
+        assert file.url == f"{HOST}/{SOURCE}/{file.variable}.mat"
 
 
 def test_measured_room_of_own_paths_is_checked():

@@ -1,0 +1,79 @@
+"""Arrays of numpy: .npy and .npz. Nothing is unpickled."""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from .content import Content, chosen_variable, require_room
+
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+class _Header(NamedTuple):
+    shape: tuple[int, ...]
+    is_fortran: bool
+    dtype: np.dtype
+
+    @property
+    def n_bytes(self) -> int:
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def read_npy(path: str | os.PathLike[str]) -> Content:
+    """Return the array of a .npy file."""
+    with open(path, "rb") as file:
+        header = _read_header(file)
+        at = file.tell()
+        held = file.seek(0, os.SEEK_END) - at
+        if header.dtype.kind not in "fiub":
+            raise ValueError(f"{path} must hold real numbers, got {header.dtype}")
+        if held != header.n_bytes:
+            raise ValueError(
+                f"{path} is damaged: its header claims {header.n_bytes} bytes of data, shape {header.shape}, but {held} "
+                "are there"
+            )
+        require_room(path, math.prod(header.shape))
+        file.seek(at)
+        array = _read_array(file, header)
+    if array.size == 0:
+        raise ValueError(f"{path} holds no samples, shape {array.shape}: expected at least one")
+    return Content(array)
+
+
+def read_npz(path: str | os.PathLike[str], variable: str | None) -> Content:
+    """Return one array of a .npz file."""
+    with zipfile.ZipFile(path) as archive:
+        headers: dict[str, _Header] = {}
+        for entry in archive.infolist():
+            require_room(path, entry.file_size / 8)  # numpy would read a header of any length
+            with archive.open(entry) as file:
+                headers[entry.filename.removesuffix(".npy")] = _read_header(file)
+
+        def read(name: str) -> np.ndarray:
+            with archive.open(f"{name}.npy") as file:
+                return _read_array(file, _read_header(file))
+
+        shapes = {name: header.shape for name, header in headers.items() if header.dtype.kind in "fiub"}
+        others = {name: str(header.dtype) for name, header in headers.items() if name not in shapes}
+        return chosen_variable(path, shapes, read, variable, others)
+
+
+def _read_header(file: IO[bytes]) -> _Header:
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise ValueError(f"its format has version {version}, expected (1, 0) or (2, 0)")
+    header = _Header(*_HEADERS[version](file))
+    if any(type(n) is not int or n < 0 for n in header.shape):
+        raise ValueError(f"its header claims the shape {header.shape}")
+    return header
+
+
+def _read_array(file: IO[bytes], header: _Header) -> np.ndarray:
+    """Return the array; not by numpy.load, which makes room for what the header claims before it reads."""
+    values = np.frombuffer(file.read(header.n_bytes), header.dtype)  # a cut file leaves too few for the shape
+    return values.reshape(header.shape, order="F" if header.is_fortran else "C")

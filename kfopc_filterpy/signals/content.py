@@ -1,0 +1,140 @@
+"""What every reader of a file hands on, and the limits and choices that all of them share."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+_LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
+_LARGEST_EXPANSION = 100  # bytes of float64 samples for each byte of a larger file
+_RATE_NAMES = ("fs", "f_s", "sr", "samplerate", "sample_rate", "samplingrate", "sampling_rate", "sampling_frequency")
+
+
+class Content(NamedTuple):
+    """Samples (..., n_samples) of a file; its sampling rate in Hz, unit and the time of its first sample if it has them."""
+
+    samples: np.ndarray
+    fs: float | None = None
+    unit: str | None = None
+    start_s: float = 0.0
+
+
+def require_file(path: str | os.PathLike[str]) -> None:
+    """Raise FileNotFoundError if there is no such file, another OSError if it may not be read, ValueError if it is empty."""
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path} does not exist or is not a file; the current folder is {Path.cwd()}")
+    with open(path, "rb") as file:
+        is_empty = not file.read(1)
+    if is_empty:
+        raise ValueError(f"{path} is empty (0 bytes): record or export it again")
+
+
+def room_of(path: str | os.PathLike[str]) -> int:
+    """Return how many bytes the samples of a file may take as float64."""
+    return max(_LEAST_ROOM, _LARGEST_EXPANSION * Path(path).stat().st_size)
+
+
+def require_room(path: str | os.PathLike[str], n_values: float, *, what: str = "it claims") -> None:
+    """Raise ValueError if `n_values` float64 samples are more than a file of this size may become in memory."""
+    if 8 * n_values > room_of(path):
+        raise ValueError(
+            f"{path} has {Path(path).stat().st_size} bytes, but {what} {n_values:.4g} samples: what takes more than "
+            f"{_LEAST_ROOM // 2**20} MiB and {_LARGEST_EXPANSION} times the file is not read. If the file is right, "
+            "store it uncompressed, or in parts"
+        )
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
+    """Turn whatever a library raises for a damaged file into a ValueError that names the file.
+
+    They raise nearly anything: zlib.error, struct.error, IndexError, KeyError, NotImplementedError, MemoryError.
+    """
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise
+    except Exception as error:
+        if isinstance(error, ValueError) and str(path) in str(error):
+            raise
+        raise ValueError(f"{path} cannot be read as {what}: {error or type(error).__name__}") from error
+
+
+def optional_module(name: str, path: str | os.PathLike[str], what: str) -> Any:
+    """Return a module of the extra `formats`, or say how to install it."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ModuleNotFoundError(
+            f"{path} is {what}, which needs {name}: install kfopc-filterpy[formats]", name=name
+        ) from error
+
+
+def channels_first(array: np.ndarray) -> np.ndarray:
+    """Return a table with its longer axis, time, last; (n, 1) and (1, n) become (n,)."""
+    if array.ndim == 2:
+        table = array.T if array.shape[0] > array.shape[1] else array
+        return table[0] if len(table) == 1 else table
+    return array.reshape(1) if array.ndim == 0 else array
+
+
+def rate_of_step(step_s: float, path: str | os.PathLike[str]) -> float:
+    """Return the sampling rate for a sample interval, which a text rounds: a whole number of Hz within 1e-4 of it."""
+    if not (math.isfinite(step_s) and step_s > 0):
+        raise ValueError(f"{path} states a sample interval of {step_s:g} s, expected one above 0")
+    rate = 1 / step_s
+    return float(round(rate)) if abs(rate - round(rate)) <= 1e-4 * rate else rate
+
+
+def chosen_variable(
+    path: str | os.PathLike[str],
+    shapes: Mapping[str, tuple[int, ...]],
+    read: Callable[[str], np.ndarray],
+    variable: str | None,
+    others: Mapping[str, str],
+) -> Content:
+    """Return the variable that is named, or else the only one with several values, and the rate stored beside it.
+
+    `shapes` has the arrays of real numbers, `others` what the rest is.
+    """
+    name = _name_of(path, shapes, variable, others)
+    require_room(path, math.prod(shapes[name]))
+    samples = np.asarray(read(name))
+    what = f"variable {name!r} of {path}"
+    if samples.dtype.kind not in "fiub":
+        raise ValueError(f"{what} must hold real numbers, got {samples.dtype}")
+    if samples.shape != shapes[name]:
+        raise ValueError(f"{what} has shape {samples.shape}, but its header claims {shapes[name]}: the file is damaged")
+    if samples.size == 0:
+        raise ValueError(f"{what} is empty, shape {samples.shape}: expected at least one sample")
+    rates = [key for key, shape in shapes.items() if key.lower() in _RATE_NAMES and math.prod(shape) == 1]
+    return Content(samples, float(np.asarray(read(rates[0])).reshape(())) if len(rates) == 1 else None)
+
+
+def _name_of(
+    path: str | os.PathLike[str],
+    shapes: Mapping[str, tuple[int, ...]],
+    variable: str | None,
+    others: Mapping[str, str],
+) -> str:
+    there = ", ".join([f"{name} {shape}" for name, shape in sorted(shapes.items())]) or "no array of real numbers"
+    if variable is None:
+        names = [name for name, shape in shapes.items() if math.prod(shape) > 1]
+        if len(names) == 1:
+            return names[0]
+        if len(shapes) == 1:
+            return next(iter(shapes))
+        few = "several variables" if names else "no signal"
+        raise ValueError(f"{path} holds {few}: {there}; choose one with variable=")
+    if variable in others:
+        raise ValueError(f"variable {variable!r} of {path} must hold real numbers, got {others[variable]}")
+    if variable not in shapes:
+        raise ValueError(f"variable {variable!r} is not in {path}; it holds: {there}")
+    return variable

@@ -1,0 +1,139 @@
+"""HDF5 files: MATLAB's version 7.3, and SOFA."""
+
+from __future__ import annotations
+
+import math
+import os
+import zlib
+from typing import Any
+
+import numpy as np
+
+from .content import Content, chosen_variable, optional_module, require_room
+
+NUMERIC_CLASSES = (
+    "double",
+    "single",
+    "logical",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+)
+_DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 that neither run foreign code nor expand twice
+
+
+def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
+    """Return one variable of a MATLAB file of version 7.3.
+
+    h5py and not pymatreader: it tells shapes and types before it reads, so that a file cannot claim the memory, and it
+    needs nothing else.
+    """
+    with _h5py(path).File(path, "r") as file:
+        shapes: dict[str, tuple[int, ...]] = {}
+        others: dict[str, str] = {}
+        for name in file:
+            if not name.startswith("#"):  # MATLAB's own
+                kind = _matlab_class(path, file, name)
+                if kind in NUMERIC_CLASSES and file[name].dtype.kind in "fiu":
+                    # HDF5 has the axes in C's order, MATLAB in Fortran's; of an empty variable it keeps the shape.
+                    empty = "MATLAB_empty" in file[name].attrs
+                    shapes[name] = (0,) if empty else file[name].shape[::-1]
+                else:
+                    others[name] = "complex numbers" if kind in NUMERIC_CLASSES else kind
+        return chosen_variable(
+            path,
+            shapes,
+            lambda name: _read(path, file, name).T if shapes[name] != (0,) else np.empty(0),
+            variable,
+            others,
+        )
+
+
+def read_sofa(path: str | os.PathLike[str]) -> Content:
+    """Return the impulse responses of a SOFA file (AES69), (receivers, sources, n_taps), with their delays."""
+    with _h5py(path).File(path, "r") as file:
+        kind = _text(file.attrs.get("DataType"))
+        if _text(file.attrs.get("Conventions")) != "SOFA" or kind not in ("FIR", "FIR-E"):
+            raise ValueError(f"{path} must be a SOFA file with impulse responses (DataType FIR or FIR-E), got {kind!r}")
+        responses = _read(path, file, "Data.IR")
+        rates = np.unique(_read(path, file, "Data.SamplingRate"))
+        delays = _read(path, file, "Data.Delay") if "Data.Delay" in file else np.zeros(1)
+    if responses.ndim != (3 if kind == "FIR" else 4) or rates.size != 1:
+        raise ValueError(
+            f"{path} must have impulse responses (measurements, receivers, taps) at one rate, got shape "
+            f"{responses.shape} at {rates.size} rates"
+        )
+    if kind == "FIR-E":  # (M, R, N, E)
+        if len(responses) != 1:
+            raise ValueError(f"{path} has several emitters in each of {len(responses)} measurements, expected one")
+        responses, delays = np.moveaxis(responses[0], 2, 0), np.moveaxis(np.atleast_1d(delays)[0], -1, 0)
+    taps = _delayed(path, np.swapaxes(responses, 0, 1), np.swapaxes(np.atleast_2d(delays), 0, 1))
+    return Content(taps[0, 0] if taps.shape[:2] == (1, 1) else taps, float(rates[0]))
+
+
+def _delayed(path: str | os.PathLike[str], taps: np.ndarray, delays: np.ndarray) -> np.ndarray:
+    """Return taps (K, J, n_taps) with as many zeros before each as its delay in samples says."""
+    if taps.size == 0:
+        raise ValueError(f"{path} holds no taps: its impulse responses have shape {taps.shape}")
+    try:
+        samples = np.broadcast_to(delays, taps.shape[:2])
+    except ValueError as error:
+        raise ValueError(f"{path} has delays of shape {delays.shape} for paths of {taps.shape[:2]}") from error
+    if not np.all((samples >= 0) & (samples == np.floor(samples)) & np.isfinite(samples)):
+        raise ValueError(f"{path} has delays that are no whole numbers of samples: shift its impulse responses instead")
+    longest = float(np.max(samples))
+    require_room(path, math.prod(taps.shape[:2]) * (taps.shape[2] + longest))
+    if longest == 0:
+        return taps
+    result = np.zeros((*taps.shape[:2], taps.shape[2] + int(longest)))
+    for index in np.ndindex(taps.shape[:2]):
+        begin = int(samples[index])
+        result[index][begin : begin + taps.shape[2]] = taps[index]
+    return result
+
+
+def _h5py(path: str | os.PathLike[str]) -> Any:
+    return optional_module("h5py", path, "an HDF5 file")
+
+
+def _matlab_class(path: str | os.PathLike[str], file: Any, name: str) -> str:
+    h5py = _h5py(path)
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        return "a link to another file"
+    if not isinstance(file[name], h5py.Dataset):
+        return "a struct or cell"
+    return _text(file[name].attrs.get("MATLAB_class"))
+
+
+def _text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _read(path: str | os.PathLike[str], file: Any, name: str) -> np.ndarray:
+    """Return a data set whose samples are in this very file, and no more of them than it may hold."""
+    h5py = _h5py(path)
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Dataset):
+        raise ValueError(f"{path} has no data set {name!r} of its own")
+    data = file[name]
+    if data.is_virtual or data.external:
+        raise ValueError(f"{name!r} of {path} refers to other files: store its samples in the file itself")
+    if data.dtype.kind not in "fiu" or data.shape is None:
+        raise ValueError(f"{name!r} of {path} must hold real numbers, got {data.dtype}")
+    require_room(path, math.prod(data.shape))
+    if data.chunks is not None:
+        _require_honest_chunks(path, data)
+    return data[()]
+
+
+def _require_honest_chunks(path: str | os.PathLike[str], data: Any) -> None:
+    """Raise ValueError if a compressed chunk would become larger than the data set says: HDF5 makes room without limit."""
+    plist = data.id.get_create_plist()
+    filters = [plist.get_filter(index)[0] for index in range(plist.get_nfilters())]
+    if set(filters) - {_DEFLATE, _SHUFFLE, _FLETCHER32} or filters.count(_DEFLATE) > 1:
+        raise ValueError(
+            f"{data.name} of {path} is compressed in a way that is not read: store it with gzip or without"
+        )
+    room = math.prod(data.chunks) * data.dtype.itemsize
+    require_room(path, room / 8)
+    for index in range(data.id.get_num_chunks()) if _DEFLATE in filters else ():
+        _, raw = data.id.read_direct_chunk(data.id.get_chunk_info(index).chunk_offset)
+        if len(zlib.decompressobj().decompress(raw, room + 5)) > room + 4:  # Fletcher's checksum has 4 bytes
+            raise ValueError(f"{data.name} of {path} is damaged: a chunk is larger than its {room} bytes")

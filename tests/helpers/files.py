@@ -1,0 +1,153 @@
+"""A small valid file of every format that is read, written by the field's own libraries."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import soundfile
+
+FS = 16000
+
+
+def signal(n_channels: int = 1, n_samples: int = 300) -> np.ndarray:
+    """Return the signal that the files hold, exact in 16 bits, (n_channels, n_samples), or without the first axis for one."""
+    rng = np.random.default_rng(8)
+    steps = rng.integers(-(2**15), 2**15, (n_channels, n_samples))
+    return np.squeeze(steps / 2**15, axis=0) if n_channels == 1 else steps / 2**15
+
+
+def _audio(path: Path, **settings: str) -> None:
+    soundfile.write(path, signal(2).T, FS, **settings)
+
+
+def _npy(path: Path) -> None:
+    np.save(path, signal(2))
+
+
+def _npz(path: Path) -> None:
+    np.savez_compressed(path, noise=signal(), fs=FS, other=np.array([1.0]))
+
+
+def _mat5(path: Path) -> None:
+    scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS), "text": "a fan"}, do_compression=True)
+
+
+def _mat5_plain(path: Path) -> None:
+    scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS), "text": "a fan"})
+
+
+def _mat4(path: Path) -> None:
+    scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS)}, format="4")
+
+
+def _mat73(path: Path) -> None:
+    """Write what MATLAB's `save -v7.3` writes: HDF5 after 512 bytes of its own, axes swapped, the class as an attribute."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        noise = file.create_dataset("noise", data=signal()[None, :], chunks=(1, 300), compression="gzip")
+        rate, text = file.create_dataset("fs", data=[[float(FS)]]), file.create_dataset("text", data=np.uint16([[97]]))
+        for data, kind in ((noise, "double"), (rate, "double"), (text, "char")):
+            data.attrs["MATLAB_class"] = np.bytes_(kind)
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    with open(path, "r+b") as file:
+        file.write(head)
+
+
+def _text(path: Path) -> None:
+    np.savetxt(path, signal(2).T, header="left right", delimiter=",")
+
+
+def _timed(path: Path) -> None:
+    np.savetxt(
+        path,
+        np.column_stack([np.arange(signal().size) / FS, signal()]),
+        fmt=["%.7f", "%.17g"],
+        delimiter=";",
+        header="t;p",
+    )
+
+
+def rew_text(taps: np.ndarray, *, fs: float = FS, start_s: float = 0.0, changes: tuple[str, str] = ("", "")) -> str:
+    """Return an impulse response as REW 5.40 exports it, `changes` replaced in its header."""
+    header = (
+        "* Impulse Response data saved by REW V5.40 Beta 132\n* IR is not normalised\n* IR window has not been applied\n"
+        "* IR is not the min phase version\n* Source: Scarlett 2i2, 1, volume: no control\n* Measurement: w-L_01 (sw)\n"
+        "* Excitation: 512k Log Swept Sine, 1 sweep at -10.0 dBFS using a loopback as a timing reference\n"
+        "* Response measured over: 20.1 to 7,999.9 Hz\n0.25 // Peak value before normalisation\n"
+        f"{int(np.argmax(np.abs(taps)))} // Peak index\n{taps.size} // Response length\n{1 / fs!r} // Sample interval (seconds)\n"
+        f"{start_s!r} // Start time (seconds)\n120.0 // Data offset (dB)\n* Data start\n"
+    ).replace(*changes)
+    return header + "".join(f"{tap!r}\n" for tap in taps.tolist())
+
+
+def _rew(path: Path) -> None:
+    path.write_text(rew_text(signal()), encoding="utf-8")
+
+
+def write_uff(path: Path, channels: np.ndarray, *, start_s: float = 0.0, binary: int = 0, func_type: int = 1) -> None:
+    """Write each channel as a data set 58, in pascal."""
+    pyuff = pytest.importorskip("pyuff")
+    path.unlink(missing_ok=True)
+    for index, channel in enumerate(np.atleast_2d(channels)):
+        data = pyuff.prepare_58(
+            binary=binary, func_type=func_type, rsp_node=index + 1, rsp_dir=1, ref_dir=1, ref_node=1, data=channel,
+            x=start_s + np.arange(channel.size) / FS, id1="a fan", rsp_ent_name="mic", ref_ent_name="mic",
+            abscissa_spacing=1, abscissa_spec_data_type=17, ordinate_spec_data_type=15, ordinate_axis_units_lab="Pa",
+            orddenom_spec_data_type=0, abscissa_min=start_s, abscissa_inc=1 / FS, num_pts=channel.size,
+            ord_data_type=4,
+        )  # fmt: skip
+        with warnings.catch_warnings():  # it leaves a binary file to the garbage collector
+            warnings.simplefilter("ignore", ResourceWarning)
+            pyuff.UFF(str(path)).write_sets(data, mode="add")
+
+
+def _uff(path: Path) -> None:
+    write_uff(path, signal(2))
+
+
+def _uff_binary(path: Path) -> None:
+    write_uff(path, signal(2), binary=1)
+
+
+def write_sofa(path: Path, responses: np.ndarray, *, delay: object = 0.0) -> None:
+    """Write impulse responses (measurements, receivers, taps), or (measurements, receivers, taps, emitters)."""
+    sofar = pytest.importorskip("sofar")
+    sofa = sofar.Sofa("GeneralFIR" if responses.ndim == 3 else "GeneralFIR-E")
+    sofa.Data_IR, sofa.Data_SamplingRate = responses, float(FS)
+    shape = (1, responses.shape[1], *responses.shape[3:])
+    sofa.Data_Delay = np.full(shape, delay) if np.ndim(delay) == 0 else delay
+    sofa.ReceiverPosition = np.zeros((responses.shape[1], 3))
+    sofa.SourcePosition = np.array([[1.0, 0.0, 0.0]])
+    if responses.ndim == 4:
+        sofa.EmitterPosition = np.zeros((responses.shape[3], 3))
+    sofar.write_sofa(str(path), sofa)
+
+
+def _sofa(path: Path) -> None:
+    write_sofa(path, np.stack([signal(2), signal(2)[::-1]])[:, :, :64])
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "pcm16.wav": lambda path: _audio(path, subtype="PCM_16"),
+    "float.wav": lambda path: _audio(path, subtype="FLOAT"),
+    "long.rf64": lambda path: _audio(path, format="RF64", subtype="PCM_24"),
+    "x.flac": _audio,
+    "x.aiff": _audio,
+    "x.npy": _npy,
+    "x.npz": _npz,
+    "packed.mat": _mat5,
+    "plain.mat": _mat5_plain,
+    "four.mat": _mat4,
+    "new.mat": _mat73,
+    "x.csv": _text,
+    "timed.csv": _timed,
+    "rew.txt": _rew,
+    "x.uff": _uff,
+    "binary.uff": _uff_binary,
+    "x.sofa": _sofa,
+}

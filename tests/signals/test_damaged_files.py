@@ -1,0 +1,259 @@
+"""Damaged files of every format: each is read, or refused with a message; nothing else comes out, and no warning."""
+
+from __future__ import annotations
+
+import gc
+import os
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import soundfile
+from helpers.files import FS, WRITERS, rew_text, signal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy.paths import read_path
+from kfopc_filterpy.signals import Recording, read_recording
+from kfopc_filterpy.signals.content import room_of
+
+# For a longer search: `FUZZ_EXAMPLES=20000 pytest tests/signals/test_damaged_files.py --hypothesis-profile default`.
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "60"))
+LIBRARIES = {".uff": "pyuff", ".sofa": "sofar", "new.mat": "h5py"}
+
+# An edit: what it does, where (share of the file, or byte of its head), and with what.
+_EXTREMES = [
+    bytes(4),
+    b"\xff" * 4,
+    b"\xff\xff\xff\x7f",
+    b"\x00\x00\x00\x80",
+    b"\x01\x00\x00\x00",
+    b"-1e9",
+    b"nan ",
+    b" 9999 ",
+]
+_PLACE = st.one_of(st.integers(0, 260), st.floats(0, 1))
+EDIT = st.one_of(
+    st.tuples(st.just("flip"), _PLACE, st.integers(0, 7)),
+    st.tuples(st.just("put"), _PLACE, st.one_of(st.sampled_from(_EXTREMES), st.binary(min_size=1, max_size=8))),
+    st.tuples(st.just("insert"), _PLACE, st.binary(min_size=1, max_size=8)),
+    st.tuples(st.just("remove"), _PLACE, st.integers(1, 64)),
+    st.tuples(st.just("cut"), _PLACE, st.none()),
+)
+
+
+def damaged(content: bytes, edits: list[tuple[str, float, object]]) -> bytes:
+    for kind, place, what in edits:
+        at = min(place if isinstance(place, int) else int(place * len(content)), max(0, len(content) - 1))
+        head, rest = content[:at], content[at:]
+        if kind == "flip" and rest:
+            rest = bytes([rest[0] ^ (1 << what)]) + rest[1:]
+        elif kind == "put":
+            rest = what + rest[len(what) :]
+        elif kind == "insert":
+            rest = what + rest
+        elif kind == "remove":
+            rest = rest[what:]
+        elif kind == "cut":
+            rest = b""
+        content = head + rest
+    return content
+
+
+@pytest.fixture(scope="module")
+def originals(tmp_path_factory):
+    """The valid content of a file of each format, written when it is first asked for."""
+    folder, contents = tmp_path_factory.mktemp("valid"), {}
+
+    def content(name: str) -> bytes:
+        if name not in contents:
+            WRITERS[name](folder / name)
+            contents[name] = (folder / name).read_bytes()
+        return contents[name]
+
+    return content
+
+
+def outcome(read: Callable[..., Recording], path: Path) -> Recording | Exception:
+    """Return what comes of a file: a recording, or an exception of the kinds that readers may raise."""
+    try:
+        return read(path, file_fs=FS if path.name in ("x.npy", "x.csv") else None)
+    except (ValueError, OSError) as error:
+        return error
+
+
+def check(result: Recording | Exception, path: Path) -> bool:
+    """Check a recording or a message; return whether it is a recording."""
+    if isinstance(result, Exception):
+        assert path.stem in str(result)
+        return False
+    assert result.samples.size > 0
+    assert np.all(np.isfinite(result.samples))
+    assert result.samples.dtype == np.float64
+    assert result.samples.nbytes <= room_of(path)
+    assert 0 < result.fs < np.inf
+    assert repr(result)
+    return True
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damaged_files_are_read_or_refused_with_a_message(name, originals, tmp_path_factory):
+    library = next((library for end, library in LIBRARIES.items() if name.endswith(end)), "numpy")
+    if find_spec(library) is None:
+        pytest.skip(f"needs {library} (the extra `test`)")
+    path = tmp_path_factory.mktemp("damaged") / name
+    outcomes = []
+
+    @settings(max_examples=EXAMPLES, deadline=None)
+    @given(st.lists(EDIT, min_size=1, max_size=4))
+    def search(edits):
+        path.write_bytes(damaged(originals(name), edits))
+        outcomes.extend(check(outcome(read, path), path) for read in (read_recording, read_path))
+
+    search()
+    assert not all(outcomes)  # some damage was found
+
+
+@pytest.mark.parametrize(
+    ("at", "what"),
+    [
+        (b"fs\0\0\x09", b"fs\0\0\x00"),  # numbers of type 0
+        (b"\x06\0\0\0\x08\0\0\0\x06\0", b"\x06\0\0\0\x08\0\0\0\x06\x08"),  # complex, without an imaginary part
+        (b"\x06\0\0\0\x08\0\0\0\x06", b"\x06\0\0\0\x10\0\0\0\x06"),  # flags of another size
+    ],
+)
+def test_what_the_search_found_to_end_the_process_within_scipy_is_refused(at, what, tmp_path):
+    path = tmp_path / "plain.mat"
+    WRITERS["plain.mat"](path)
+    content = path.read_bytes()
+    assert at in content
+    path.write_bytes(content.replace(at, what, 1))
+    with pytest.raises(ValueError, match=r"plain\.mat is damaged: "):
+        read_recording(path)
+
+
+# ---- memory: what comes of a small file is bounded, whatever it claims
+
+
+class Memory:
+    """The most bytes that Python and numpy held within a `with` block, beyond what they held before."""
+
+    def __enter__(self) -> Memory:
+        gc.collect()
+        tracemalloc.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+
+
+def _claims(path: Path, name: str) -> None:
+    """Write a small file of a format that claims, or unpacks to, 160 MB and more."""
+    large = 20_000_000
+    if name == "x.flac":
+        WRITERS["x.flac"](path)
+        content = bytearray(path.read_bytes())
+        content[22:26] = (2**31).to_bytes(4, "big")  # STREAMINFO's number of samples
+        path.write_bytes(content)
+    elif name == "silence.flac":
+        soundfile.write(path, np.zeros(large, dtype=np.int16), FS, subtype="PCM_16")
+    elif name == "packed.mat":
+        scipy.io.savemat(path, {"noise": np.zeros(large)}, do_compression=True)
+    elif name == "x.npz":
+        np.savez_compressed(path, noise=np.zeros(large))
+    elif name == "header.npz":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("noise.npy", b"\x93NUMPY\x02\x00" + (8 * large).to_bytes(4, "little") + bytes(8 * large))
+    elif name == "x.npy":
+        with open(path, "wb") as file:
+            np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
+    elif name in ("new.mat", "x.sofa"):
+        h5py = pytest.importorskip("h5py")
+        WRITERS["new.mat"](path)
+        with h5py.File(path, "a") as file:
+            zeros = file.create_dataset("zeros", (1, 10**11), "f8", chunks=(1, 10**5), compression="gzip")
+            zeros.attrs["MATLAB_class"] = np.bytes_("double")
+            del file["noise"]
+    elif name == "inflated.mat":
+        _inflated(path)
+    elif name == "rew.txt":
+        path.write_text(rew_text(np.ones(3), start_s=1e6))
+
+
+def _inflated(path: Path) -> None:
+    """Write a chunk that says it has 300 numbers and unpacks to 160 MB."""
+    h5py = pytest.importorskip("h5py")
+    WRITERS["new.mat"](path)
+    with h5py.File(path, "r+") as file:
+        del file["noise"]
+        noise = file.create_dataset("noise", (1, 300), "f8", chunks=(1, 300), compression="gzip")
+        noise.attrs["MATLAB_class"] = np.bytes_("double")
+        noise.id.write_direct_chunk((0, 0), zlib.compress(bytes(160_000_000)))
+
+
+CLAIMS = {
+    "x.flac": "claims .* samples: what takes more than 64 MiB and 100 times the file",
+    "silence.flac": "claims 2e\\+07 samples",
+    "packed.mat": "its compressed variables unpack to more than it may hold",
+    "x.npz": "claims 2e\\+07 samples",
+    "header.npz": "claims 2e\\+07 samples",
+    "x.npy": "its header claims 8000000000000 bytes of data",
+    "new.mat": "claims 1e\\+11 samples",
+    "inflated.mat": "is damaged: a chunk is larger than its 2400 bytes",
+    "rew.txt": "with its start time it has 1.6e\\+10 samples",
+}
+
+
+@pytest.mark.parametrize("name", CLAIMS)
+def test_a_file_that_claims_far_more_than_it_has_is_refused_before_it_takes_the_memory(name, tmp_path):
+    _claims(tmp_path / name, name)
+    assert (tmp_path / name).stat().st_size < 2_000_000
+    with Memory() as memory, pytest.raises(ValueError, match=CLAIMS[name]):
+        read_path(tmp_path / name)
+    assert memory.peak < 2.1 * room_of(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["x.flac", "packed.mat"])
+def test_what_is_compressed_as_far_as_it_may_be_takes_no_more_than_three_times_its_room(name, tmp_path):
+    samples = np.zeros((2, 4_000_000), dtype=np.int16)
+    if name == "x.flac":
+        soundfile.write(tmp_path / name, samples.T, FS)
+    else:
+        scipy.io.savemat(tmp_path / name, {"noise": samples.astype(float)}, do_compression=True)
+    with Memory() as memory:
+        assert read_path(tmp_path / name, fs=FS).samples.shape == (2, 4_000_000)
+    assert samples.size * 8 < memory.peak < 3 * room_of(tmp_path / name)
+
+
+MULTIPLE = 32  # docs/formats.md states it, of what is not compressed
+
+
+@pytest.mark.parametrize("name", [name for name in WRITERS if name != "x.sofa"])
+def test_reading_takes_no_more_than_the_stated_multiple_of_the_file(name, tmp_path, monkeypatch):
+    monkeypatch.setattr("helpers.files.signal", lambda n_channels=1: signal(n_channels, 60_000))
+    WRITERS[name](tmp_path / name)
+    settings = {"fs": FS, "file_fs": FS if name in ("x.npy", "x.csv") else None}
+    read_path(tmp_path / name, **settings)  # what is imported is not the file's
+    with Memory() as memory:
+        recording = read_path(tmp_path / name, **settings)
+    assert recording.samples.shape[-1] == 60_000
+    assert memory.peak <= MULTIPLE * (tmp_path / name).stat().st_size
+
+
+def test_the_worst_of_what_is_not_compressed_takes_no_more_than_the_stated_multiple(tmp_path):
+    soundfile.write(tmp_path / "x.wav", signal(2, 60_000).T, FS, subtype="PCM_U8")
+    (tmp_path / "x.txt").write_text("1 " * 60_000)
+    for name, stated in (("x.wav", 16), ("x.txt", 25)):
+        read_path(tmp_path / name, fs=FS)
+        with Memory() as memory:
+            assert read_path(tmp_path / name, fs=FS).samples.shape[-1] >= 60_000
+        size = (tmp_path / name).stat().st_size
+        assert memory.peak == pytest.approx(stated * size, rel=0.15)
+        assert memory.peak <= MULTIPLE * size
