@@ -23,7 +23,7 @@ def borrowed(value):
 
 @overload(borrowed, jit_options=OPTIONS)
 def _borrowed(value):
-    return lambda value: _without_owner(value)
+    return lambda value: _without_owner(value)  # type: ignore[call-arg]
 
 
 @intrinsic
@@ -45,6 +45,7 @@ def _disown(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         array.meminfo, array.parent = array.meminfo.type(None), array.parent.type(None)
         return array._getvalue()
     if isinstance(kind, types.BaseTuple):
-        for i, item in enumerate(kind):
-            value = builder.insert_value(value, _disown(context, builder, item, builder.extract_value(value, i)), i)
+        for i in range(len(kind)):
+            item = _disown(context, builder, kind[i], builder.extract_value(value, i))  # type: ignore[index]
+            value = builder.insert_value(value, item, i)
     return value
