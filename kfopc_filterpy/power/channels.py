@@ -27,8 +27,8 @@ from ..kernels.block_toeplitz import (
 from .budget import DEFAULT_AVERAGING_S, DEFAULT_CREDIT_S, PACE, TARGET_LEAST
 
 SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
-MOST_SWEEPS = 24  # as long as a power is beyond its rated power by more than
-EXCESS = 1.1
+MOST_SWEEPS = 6  # as long as a power exceeds its target by more than
+EXCESS = 1.1  # times; what is left after the last sweep is scaled down
 RIDGE = 1e-6  # of the mean energy: limits the weights in directions without energy
 LARGEST_CHANGE = 10.0  # largest ratio of power to rated power that counts in a sweep
 SMALLEST_WEIGHT = 1e-6  # of the natural weight: a penalty that is not needed must be able to grow again
