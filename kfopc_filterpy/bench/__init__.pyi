@@ -1,3 +1,8 @@
+from .assessment import Assessment as Assessment
+from .assessment import Band as Band
+from .assessment import Ceilings as Ceilings
+from .assessment import Levels as Levels
+from .assessment import assess as assess
 from .items import FigureItem as FigureItem
 from .items import Parameter as Parameter
 from .items import Sound as Sound
