@@ -73,7 +73,7 @@ CAUSES = ("coherence", "causality", "filter", "path", "amplifier", "adaptation")
 ALGORITHMS = ("KF-PB", "KF-OPC", "FxLMS")
 LONGEST = 256
 LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
-TUNED_ON_S = 10.0  # of the record, for FxLMS's step size
+TUNED_ON_S = 5.0  # of the record, for FxLMS's step size
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
 NEARLY_FREE = 1e6  # times the rated power: an amplifier without limits
 CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.5)  # rated powers of the figure, over the one that full control needs
@@ -261,9 +261,14 @@ class Assessment:
 
     def power(self, rated_power: float) -> str:
         """Return a `rated_power` in words: in W if the impedance is known, else in squared units."""
-        if self.ohm is None or self.volts_per_unit is None:
+        if self.watt_per_power is None:
             return f"a rated power of {rated_power:.3g}"
-        return f"{rated_power * self.volts_per_unit**2 / self.ohm:.3g} W into {self.ohm:g} ohm"
+        return f"{rated_power * self.watt_per_power:.3g} W into {self.ohm:g} ohm"
+
+    @property
+    def watt_per_power(self) -> float | None:
+        """Watts of a mean square of 1; None if the impedance is not known."""
+        return None if self.ohm is None or self.volts_per_unit is None else self.volts_per_unit**2 / self.ohm
 
     def __repr__(self) -> str:
         lines = [self.verdict, self.reason, *self.advice]
@@ -436,7 +441,7 @@ def assess(
     False amplifier
     """
     fs = as_positive(fs, "fs", unit="Hz")
-    x, d, s = _signals(noise, primary, secondary, disturbance, fs)
+    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
     want_db = as_nonnegative(want_db, "want_db", unit="dB")
     as_choice(algorithm, "algorithm", ALGORITHMS)
     for name in beside:
@@ -444,7 +449,7 @@ def assess(
     limits = output_limits(rating)
     if pascal_per_unit is not None:
         as_positive(pascal_per_unit, "pascal_per_unit", unit="Pa")
-    start = _switch_on(switch_on_s, fs, x.size)
+    start = switch_on_sample(switch_on_s, fs, x.size)
     delta = path_uncertainty(secondary_path_uncertainty, s)
     notes: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
@@ -458,7 +463,7 @@ def assess(
             n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
             max_taps=LONGEST,
         )
-        bounds = _Bounds(x[start:], d[start:], s, settings.n_taps, fs, delta)
+        bounds = FixedFilters(x[start:], d[start:], s, settings.n_taps, fs, delta)
         limits = _with_excursion(limits, rating, bounds)
         official = bounds.within(limits.rated_power)
         required = bounds.needed(want_db)
@@ -525,7 +530,7 @@ def assess(
     return replace(assessment, advice=tuple(_advice(assessment)))
 
 
-def _signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: float) -> tuple[np.ndarray, ...]:
+def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: float) -> tuple[np.ndarray, ...]:
     """Return reference, disturbance and secondary path, checked, the recordings without their offsets."""
     for value, name in ((noise, "noise"), (disturbance, "disturbance")):
         if value is not None and as_channels(value, name).ndim == 2 and len(value) > 1:
@@ -549,7 +554,7 @@ def _signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: flo
     return x, d, s
 
 
-def _switch_on(switch_on_s: float | None, fs: float, n_samples: int) -> int:
+def switch_on_sample(switch_on_s: float | None, fs: float, n_samples: int) -> int:
     duration = n_samples / fs
     time = min(0.5, 0.1 * duration) if switch_on_s is None else as_nonnegative(switch_on_s, "switch_on_s", unit="s")
     if time >= duration:
@@ -557,7 +562,7 @@ def _switch_on(switch_on_s: float | None, fs: float, n_samples: int) -> int:
     return round(time * fs)
 
 
-class _Bounds:
+class FixedFilters:
     """What fixed filters reach on the steady half of a run."""
 
     def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, delta: np.ndarray) -> None:
@@ -629,7 +634,7 @@ class _Bounds:
         return powers, np.array(reached)
 
 
-def _with_excursion(limits: OutputLimits, rating: Any, bounds: _Bounds) -> OutputLimits:
+def _with_excursion(limits: OutputLimits, rating: Any, bounds: FixedFilters) -> OutputLimits:
     """Return limits with the largest rated power at which the best filter keeps the excursion of every loudspeaker."""
     from scipy.optimize import brentq
 
@@ -701,7 +706,8 @@ class _Plan:
     def controller(self, name: str, limits: OutputLimits, limited: bool) -> Any:
         """Return a fresh controller."""
         limiter = limits.limiter(self.fs) if limited else None
-        n_taps, noises = self.settings.n_taps, self.settings.settings
+        n_taps = self.settings.n_taps
+        noises: dict[str, Any] = {**self.settings.settings}
         if name == "FxLMS":
             return FxLMS(n_taps, self.s, step_size=self.step_size, limiter=limiter)
         if name == "KF-OPC":
@@ -722,21 +728,40 @@ class _Plan:
     def step_size(self) -> float:
         """Step size of FxLMS by the rule of the studies, on the start of the record."""
         excerpt = slice(0, self.start + round(TUNED_ON_S * self.fs))
-        peak = self.limits.amplitude_limit
-        scene = Scene(
-            fs=self.fs,
-            secondary=self.s,
-            references=[self.x[excerpt]],
-            disturbances=[self.d[excerpt]],
-            rated_power=self.limits.rated_power,
-            n_taps=self.settings.n_taps,
-            sensor_noise_std=0.0,
-            switch_on_s=self.start / self.fs,
-            nse_window_s=0.005,
-            amplifier=None if peak is None else HardClipAmplifier(peak),
-            seeds=[0],
+        scene = recorded_scene(
+            self.x[excerpt], self.d[excerpt], self.s, self.fs, self.start, self.limits, self.settings
         )
         return REGISTRY["FxLMS"].value(scene, tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting)
+
+
+def recorded_scene(
+    x: np.ndarray,
+    d: np.ndarray,
+    s: np.ndarray,
+    fs: float,
+    start: int,
+    limits: OutputLimits,
+    settings: SuggestedSettings,
+    unconstrained_power: float = 1.0,
+) -> Scene:
+    """Return a scene of recorded signals as they are, the control switched on at sample `start`."""
+    peak = limits.amplitude_limit
+    return Scene(
+        fs=fs,
+        secondary=s,
+        references=[x],
+        disturbances=[d],
+        rated_power=limits.rated_power,
+        n_taps=settings.n_taps,
+        sensor_noise_std=0.0,
+        switch_on_s=start / fs,
+        nse_window_s=0.005,
+        amplifier=None if peak is None else HardClipAmplifier(peak),
+        measurement_noise=settings.measurement_noise,
+        initial_variance=settings.initial_variance,
+        unconstrained_power=unconstrained_power,
+        seeds=[0],
+    )
 
 
 def _each(rating: Any) -> list[Any]:
@@ -858,7 +883,9 @@ def _advice(verdict: Assessment) -> list[str]:
             "Try a longer memory for a steady noise, a shorter one for a noise that changes, or a longer record: the "
             "controller may not have settled."
         ]
-    advice = [f"About {verdict.power(needed)} would do for {want}, an estimate from the bound, and from what this controller loses to it."]
+    advice = [
+        f"About {verdict.power(needed)} would do for {want}, an estimate from the bound, and from what this controller loses to it."
+    ]
     if not np.isfinite(needed):
         advice = [
             f"A fixed filter would need {verdict.power(verdict.required_rated_power)} for {want}; this controller did "

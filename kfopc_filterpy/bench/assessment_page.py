@@ -87,31 +87,24 @@ def _figures(verdict: Assessment) -> Any:
         "the power it took.",
         figure,
     )
-    for stem, draw, caption, options in (
-        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half.", {}),
-        ("nse", plot_nse, "Error power over that of the disturbance; below 0 dB it is quieter than without control.", {}),
-        (
-            "power",
-            plot_output_power,
-            "Mean power of the control signal over a sliding window, and the rated power.",
-            {"rated_power": verdict.limits.rated_power},
-        ),
-    ):
+    plots: list[tuple[str, Any, str]] = [
+        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half."),
+        ("nse", plot_nse, "Error power over that of the disturbance; below 0 dB it is quieter than without control."),
+        ("power", plot_output_power, "Mean power of the control signal over a sliding window, and the rated power."),
+    ]
+    for stem, draw, caption in plots:
         figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-        draw(dict(verdict.runs), ax=ax, **options)
+        draw(dict(verdict.runs), ax=ax)
         yield FigureItem(stem, caption, figure)
     if verdict.levels is not None:
         figure, ax = plt.subplots(figsize=(9, 3.6), layout="constrained")
         _draw_bands(verdict.levels, ax)
-        yield FigureItem(
-            "third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure
-        )
+        yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
 def _draw_bound(verdict: Assessment, ax: Any) -> None:
     """Draw the bound against the rated power, with what is wanted, the rating and the runs."""
-    in_watt = verdict.ohm is not None and verdict.volts_per_unit is not None
-    scale = verdict.volts_per_unit**2 / verdict.ohm if in_watt else 1.0
+    scale = verdict.watt_per_power or 1.0
     powers, reached = verdict.curve
     ax.semilogx(scale * powers, reached, color="0.2", label="best fixed filter")
     ax.axvline(scale * verdict.limits.rated_power, color="0.2", linestyle="--", label="rated power")
@@ -121,7 +114,9 @@ def _draw_bound(verdict: Assessment, ax: Any) -> None:
         if power and own is not None and np.isfinite(power) and np.isfinite(own):
             style = curve_style(name)
             ax.plot(scale * power, own, style["marker"], color=style["color"], label=name)
-    ax.set_xlabel(f"Power (W into {verdict.ohm:g} ohm)" if in_watt else "Power of the control signal")
+    ax.set_xlabel(
+        "Power of the control signal" if verdict.watt_per_power is None else f"Power (W into {verdict.ohm:g} ohm)"
+    )
     ax.set_ylabel("Noise reduction (dB)")
     ax.grid(True, which="both", alpha=0.25)
     ax.legend(fontsize="small")
@@ -215,15 +210,25 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
     if verdict.volts_per_unit is not None and limits.amplitude_limit is not None:
         peak += f", {limits.amplitude_limit * verdict.volts_per_unit:.3g} V"
     checks = [
-        ("Rating", f"{verdict.power(limits.rated_power)}, decided by the {limits.decided_by}; peak limit {peak}; "
-                   f"windows of {limits.window_s:g} s"),
+        (
+            "Rating",
+            f"{verdict.power(limits.rated_power)}, decided by the {limits.decided_by}; peak limit {peak}; "
+            f"windows of {limits.window_s:g} s",
+        ),
         ("Power for full control", verdict.power(verdict.unlimited_power)),
         (f"Least power for {verdict.want_db:g} dB, best fixed filter", _or_none(verdict, verdict.required_rated_power)),
         ("Estimate for this controller", _or_none(verdict, verdict.expected_rated_power)),
-        ("Causality", "unknown without a primary path" if late is None else
-         f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}"),
-        ("Band of the noise", f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
-                              f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there"),
+        (
+            "Causality",
+            "unknown without a primary path"
+            if late is None
+            else f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}",
+        ),
+        (
+            "Band of the noise",
+            f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
+            f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
+        ),
         ("Secondary path", f"{band.uncertain_share:.1%} of the noise's power lies where it may be wrong by 100 %"),
     ]
     if verdict.levels is not None:

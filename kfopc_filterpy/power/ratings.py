@@ -68,9 +68,7 @@ class OutputLimits:
 
     def limiter(self, fs: float) -> OutputLimiter:
         """Return a limiter that keeps these limits at a sample rate `fs` in Hz, whatever the controller asks for."""
-        return OutputLimiter(
-            self.rated_power, fs=fs, window_s=self.window_s, amplitude_limit=self.amplitude_limit
-        )
+        return OutputLimiter(self.rated_power, fs=fs, window_s=self.window_s, amplitude_limit=self.amplitude_limit)
 
 
 @dataclass(frozen=True)
