@@ -49,7 +49,7 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy._validate import as_channels, as_choice, as_count, as_nonnegative, as_positive, as_signal
 from kfopc_filterpy.bounds import SuggestedSettings, budgeted_rated_power, coherence_bound
-from kfopc_filterpy.bounds.wiener import Correlations, Stretch, constrained_weights, full_stretch
+from kfopc_filterpy.bounds.wiener import Correlations, Stretch, constrained_weights, full_stretch, reduction_db
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
     convergence_time_s,
@@ -75,6 +75,8 @@ LONGEST = 256
 LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
 TUNED_ON_S = 5.0  # of the record, for FxLMS's step size
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
+MANY_TAPS = 192  # from which float32 pays
+LEAST_STATE_NOISE = 3e-7  # over the initial variance, for float32, which rounds that by 6e-8
 NEARLY_FREE = 1e6  # times the rated power: an amplifier without limits
 CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.5)  # rated powers of the figure, over the one that full control needs
 
@@ -627,11 +629,11 @@ class FixedFilters:
     def curve(self, rated_power: float) -> tuple[np.ndarray, np.ndarray]:
         """Return rated powers about the given one and the one that full control needs, and the bound for each."""
         powers = np.unique([*CURVE * self.free.control_power, rated_power, rated_power / 2, rated_power * 2])
-        reached = []
+        own, left = self.correlations, []
         for power in powers:
-            weights, _ = constrained_weights(self.stretch, self.correlations, float(power))
-            reached.append(self.stretch.solution(weights).noise_reduction_db)
-        return powers, np.array(reached)
+            weights, _ = constrained_weights(self.stretch, own, float(power))
+            left.append(self.free.disturbance_power - weights @ (2 * own.cross - own.filtered @ weights))
+        return powers, np.array([reduction_db(one, self.free.disturbance_power) for one in left])
 
 
 def _with_excursion(limits: OutputLimits, rating: Any, bounds: FixedFilters) -> OutputLimits:
@@ -707,7 +709,7 @@ class _Plan:
         """Return a fresh controller."""
         limiter = limits.limiter(self.fs) if limited else None
         n_taps = self.settings.n_taps
-        noises: dict[str, Any] = {**self.settings.settings}
+        noises: dict[str, Any] = {**self.settings.settings, "dtype": self.precision}
         if name == "FxLMS":
             return FxLMS(n_taps, self.s, step_size=self.step_size, limiter=limiter)
         if name == "KF-OPC":
@@ -723,6 +725,13 @@ class _Plan:
             form="direct",
             **noises,
         )
+
+    @property
+    def precision(self) -> type:
+        """float32 for long filters, which halves the time, if the state noise is well above its rounding of P."""
+        settings = self.settings
+        is_safe = settings.state_noise > LEAST_STATE_NOISE * settings.initial_variance
+        return np.float32 if is_safe and settings.n_taps >= MANY_TAPS else np.float64
 
     @cached_property
     def step_size(self) -> float:
