@@ -381,7 +381,7 @@ def _limits(rating: Any) -> OutputLimits:
 
 def _curve(value: Any, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve's frequencies and values; one number holds at all frequencies."""
-    if np.ndim(value) == 0:
+    if not isinstance(value, list | tuple | np.ndarray):
         return np.array([0.0]), np.array([as_positive(value, name, unit=unit)])
     try:
         frequencies, values = (as_real_array(part, name) for part in value)
