@@ -224,6 +224,11 @@ def _scene_options(parser: argparse.ArgumentParser) -> None:
         "--volts-per-unit", type=float, default=1.0, metavar="V", help="volts for a control signal of 1 (default: 1)"
     )
     rating.add_argument("--rated-power", type=float, metavar="P", help="rated power as mean square, in place of watts")
+    rating.add_argument(
+        "--impedance",
+        metavar="CSV",
+        help="the loudspeaker's impedance, whose least value counts: Hz, ohm (default: --ohm)",
+    )
     rating.add_argument("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
     rating.add_argument("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
     rating.add_argument("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
@@ -286,11 +291,11 @@ def _rating(options: argparse.Namespace) -> list[Any]:
     elif options.rated_power is not None:
         ratings.append(options.rated_power)
     if (options.loudspeaker_watt, options.programme_watt, options.x_max_mm) != (None, None, None):
-        if options.ohm is None:
-            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance")
+        if options.ohm is None and options.impedance is None:
+            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance, or --impedance, its curve")
         ratings.append(
             LoudspeakerRating(
-                options.ohm,
+                options.ohm if options.impedance is None else _curve(options.impedance),
                 noise_watt=options.loudspeaker_watt,
                 programme_watt=options.programme_watt,
                 x_max_mm=options.x_max_mm,
@@ -310,9 +315,9 @@ def _curve(path: str) -> Any:
     try:
         columns = np.loadtxt(path, delimiter=",", ndmin=2)
     except ValueError as error:
-        raise ValueError(f"{path} must hold two numbers in a line, Hz and mm/V, with a comma: {error}") from error
+        raise ValueError(f"{path} must hold two numbers in a line with a comma between them: {error}") from error
     if columns.shape[1] != 2:
-        raise ValueError(f"{path} must hold two columns, Hz and mm/V, got {columns.shape[1]}")
+        raise ValueError(f"{path} must hold two columns, Hz and a value, got {columns.shape[1]}")
     return columns[:, 0], columns[:, 1]
 
 

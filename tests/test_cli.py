@@ -179,6 +179,26 @@ def test_a_second_measurement_of_the_path_tells_how_well_it_is_known(command, fo
     assert json.loads(out)["limited_by"] == "path"
 
 
+def test_a_loudspeakers_curves_are_read_from_files(command, folder):
+    (folder / "impedance.csv").write_text("20,7\n80,40\n300,6.4\n")
+    (folder / "displacement.csv").write_text("20,0.5\n4000,0.5\n")
+    rating = ["--watt", "100", "--ohm", "8", "--loudspeaker-watt", "1", "--impedance", "impedance.csv"]
+    options = ["--taps", "32", "--json", "--algorithm", "KF-PB"]
+    code, out, _ = command("verdict", *SCENE, *rating, *options)
+    assert code == 0
+    assert json.loads(out)["rating"]["rated_power"] == pytest.approx(6.4)
+    excursion = ["--x-max-mm", "0.1", "--displacement", "displacement.csv"]
+    code, out, _ = command("verdict", *SCENE, *rating, *excursion, *options)
+    assert code == 1
+    data = json.loads(out)
+    assert data["rating"]["decided_by"] == "loudspeaker's excursion"
+    assert data["rating"]["rated_power"] == pytest.approx((0.1 / 2 / 0.5) ** 2, rel=0.01)  # a response without colour
+    (folder / "words.csv").write_text("Hz,mm\n")
+    code, _, err = command("verdict", *SCENE, *rating, "--x-max-mm", "1", "--displacement", "words.csv")
+    assert code == 2
+    assert "words.csv must hold two numbers in a line" in err
+
+
 # Paths.
 
 

@@ -234,6 +234,8 @@ class Assessment:
         """The verdict as one sentence."""
         answer = "Enough" if self.enough else "Not enough"
         missed = self.noise_reduction_db - self.want_db
+        if not np.isfinite(missed):
+            return f"{answer}: {self.algorithm} diverges with {self.power(self.limits.rated_power)}."
         return (
             f"{answer}: {self.algorithm} reaches {self.noise_reduction_db:.1f} dB with {self.power(self.limits.rated_power)}, "
             f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted."
@@ -362,7 +364,7 @@ def assess(
     disturbance: Any = None,
     want_db: float = 6.0,
     algorithm: str = "KF-PB",
-    beside: Sequence[str] = ("KF-OPC", "FxLMS"),
+    beside: Sequence[str] | None = None,
     n_taps: int | None = None,
     memory_s: float = 0.25,
     secondary_path_uncertainty: Any = HALF_A_SAMPLE,
@@ -394,8 +396,8 @@ def assess(
         Noise reduction wanted in dB.
     algorithm : {"KF-PB", "KF-OPC", "FxLMS"}, default "KF-PB"
         Controller that the verdict is on. It has a limiter, which keeps the rating in every window.
-    beside : sequence of str, default ("KF-OPC", "FxLMS")
-        Algorithms to run beside it, without a limiter, as published.
+    beside : sequence of str, optional
+        Algorithms to run beside it, without a limiter, as published; by default the other two.
     n_taps : int, optional
         Taps of the control filter; by default `suggest_settings` finds them, at most 256.
     memory_s : float, default 0.25
@@ -446,8 +448,7 @@ def assess(
     x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
     want_db = as_nonnegative(want_db, "want_db", unit="dB")
     as_choice(algorithm, "algorithm", ALGORITHMS)
-    for name in beside:
-        as_choice(name, "beside", ALGORITHMS)
+    others = ALGORITHMS if beside is None else [as_choice(name, "beside", ALGORITHMS) for name in beside]
     limits = output_limits(rating)
     if pascal_per_unit is not None:
         as_positive(pascal_per_unit, "pascal_per_unit", unit="Pa")
@@ -473,7 +474,7 @@ def assess(
         notes.append("The reference is so narrow-band that larger weights could do better than the bound.")
 
     plan = _Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar)
-    names = [algorithm, *(name for name in beside if name != algorithm)]
+    names = [algorithm, *(name for name in others if name != algorithm)]
     plan.announce(len(names))
     runs: dict[str, SimulationResult] = {}
     for name in names:
