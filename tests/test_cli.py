@@ -11,11 +11,12 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import soundfile
 
 from kfopc_filterpy import cli
 from kfopc_filterpy.bench.assessment import SCHEMA
 from kfopc_filterpy.paths import resample_path
-from kfopc_filterpy.signals import band_limited_noise, read_wav, write_wav
+from kfopc_filterpy.signals import band_limited_noise, write_wav
 
 FS = 8000
 ROOT = Path(__file__).resolve().parents[1]
@@ -211,7 +212,7 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
     code, out, _ = command("paths", "identify", "sent.wav", "received.wav", "--taps", 24, "-o", tmp_path / "S.wav")
     assert code == 0
     assert "24 taps" in out
-    found, fs = read_wav(tmp_path / "S.wav")
+    found, fs = soundfile.read(tmp_path / "S.wav")
     assert fs == FS
     np.testing.assert_allclose(found, taps, atol=1e-4)
 
@@ -222,7 +223,7 @@ def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
     code, _, _ = command("paths", "convert", "S.wav", output)
     assert code == 0
     if suffix == "wav":
-        taps = read_wav(output)[0]
+        taps = soundfile.read(output)[0]
     elif suffix == "npy":
         taps = np.load(output)
     else:
@@ -234,7 +235,7 @@ def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
 def test_a_path_is_resampled_with_its_gain(command, tmp_path):
     code, _, _ = command("paths", "resample", "S.wav", tmp_path / "S.wav", "--fs", 2 * FS)
     assert code == 0
-    taps, fs = read_wav(tmp_path / "S.wav")
+    taps, fs = soundfile.read(tmp_path / "S.wav")
     assert fs == 2 * FS
     assert taps.sum() == pytest.approx(1.0, abs=0.01)
     assert int(np.argmax(np.abs(taps))) == 24

@@ -10,6 +10,7 @@ import re
 import jsonschema
 import numpy as np
 import pytest
+import soundfile
 
 from kfopc_filterpy import noise_reduction_db
 from kfopc_filterpy.bench import assess
@@ -17,7 +18,7 @@ from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
-from kfopc_filterpy.signals import band_limited_noise, read_wav
+from kfopc_filterpy.signals import band_limited_noise
 
 FS, SECONDS, TAPS = 8000, 3.0, 32
 PLENTY = 100.0  # times what full control takes
@@ -243,8 +244,8 @@ def test_the_page_needs_no_other_file_and_says_the_verdict(written):
 def test_the_sounds_have_one_level(written):
     verdict, page = written
     run = verdict.runs["KF-PB"]
-    before, fs = read_wav(page.parent / "audio" / "verdict-before.wav")
-    after, _ = read_wav(page.parent / "audio" / "verdict-after.wav")
+    before, fs = soundfile.read(page.parent / "audio" / "verdict-before.wav")
+    after, _ = soundfile.read(page.parent / "audio" / "verdict-after.wav")
     assert fs == FS
     ratio = np.sum(run.disturbance**2) / np.sum(run.error**2)
     assert np.sum(before**2) / np.sum(after**2) == pytest.approx(ratio, rel=1e-3)  # 16 bits

@@ -6,9 +6,8 @@ import json
 from pathlib import Path
 
 import numpy as np
+import soundfile
 from helpers.pages import Page
-
-from kfopc_filterpy.signals import read_wav
 
 
 def test_the_commands_say_what_the_page_says(tmp_path, monkeypatch, capsys):
@@ -33,7 +32,7 @@ def test_the_commands_say_what_the_page_says(tmp_path, monkeypatch, capsys):
     assert verdicts["small"]["limited_by"] == "amplifier"
     assert verdicts["large"]["limited_by"] is None
     assert verdicts["large"]["ceilings"]["coherence_db"] > 6
-    before, after = (read_wav(f"large/audio/verdict-{name}.wav")[0] for name in ("before", "after"))
+    before, after = (soundfile.read(f"large/audio/verdict-{name}.wav")[0] for name in ("before", "after"))
     steady = slice(before.size // 2, None)
     reduction = 10 * np.log10(np.sum(before[steady] ** 2) / np.sum(after[steady] ** 2))
     assert abs(reduction - verdicts["large"]["noise_reduction_db"]) < 0.05
