@@ -108,7 +108,7 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1"], "choose with --channel 0 to --channel 1"),
         (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1", "--channel", "2"], "channel must be below the 2"),
         (["verdict", *SCENE[:3], "--secondary", "S16.wav", "--rated-power", "1"], "for example with --fs 16000"),
-        (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
+        (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "empty.wav"),
         (["verdict", "text.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
         (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "algorithm must be one of 'KF-PB'"),
         (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "cannot be written"),

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIALS = ROOT / "docs" / "tutorials"
-_SHELL = "%%sh\n"
+_SHELL = re.compile(r"^!", re.M)  # marks a command of the shell
 _PART = re.compile(
     r"^```\{code-cell\}[^\n]*\n(?P<options>(?:---\n.*?^---\n)?(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$",
     re.M | re.S,
@@ -45,8 +45,8 @@ class Page:
         """Run the cells before the heading `until`, by default all that are left; return the variables."""
         while self._left and not (until and self._left[0]["heading"] == until):
             part = self._left.pop(0)
-            if part["code"] is not None and part["code"].startswith(_SHELL):
-                _run_in_shell(part["code"].removeprefix(_SHELL))
+            if part["code"] is not None and _SHELL.match(part["code"]):
+                _run_in_shell(_SHELL.sub("", part["code"]))
             elif part["code"] is not None:
                 exec(compile(part["code"], f"{self.stem}.md", "exec"), self._variables)
                 plt.close("all")  # as a notebook does
