@@ -37,6 +37,8 @@ from ._validate import (
 
 __all__ = [
     "CoherenceAndGain",
+    "a_weighted_level_db",
+    "a_weighting_db",
     "clipped_fraction",
     "coherence_and_gain",
     "convergence_time_s",
@@ -48,7 +50,10 @@ __all__ = [
     "peak_control_signal",
     "power_spectrum_db",
     "short_time_power",
+    "third_octave_levels_db",
 ]
+
+SOUND_PRESSURE = 2e-5  # Pa, the reference of sound pressure levels
 
 # Half the main lobe of the four-term Blackman-Harris window, in Fourier bins.
 _LOBE_BINS = 4
@@ -565,6 +570,152 @@ def power_spectrum_db(
     kind = as_choice(scaling, "scaling", ("density", "spectrum"))
     frequencies, power = welch(part, fs, nperseg=segment, detrend=False, scaling=kind)
     return frequencies, _ratio_db(power.mean(axis=0), 1.0)
+
+
+def a_weighting_db(frequencies_hz: Any) -> np.ndarray:
+    r"""Return the frequency weighting A in dB, 0 dB at 1 kHz.
+
+    It is the formula of IEC 61672-1 with the poles at 20.6, 107.7, 737.9 and 12194 Hz:
+
+    .. math:: A(f) = 20 \log_{10} \frac{f_4^2 f^4}{(f^2 + f_1^2) \sqrt{(f^2 + f_2^2)(f^2 + f_3^2)} (f^2 + f_4^2)} - A_{1000}
+
+    Parameters
+    ----------
+    frequencies_hz : array_like
+        Frequencies in Hz, zero or above.
+
+    Returns
+    -------
+    ndarray
+        The weighting in dB, of the same shape; -inf at 0 Hz.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If a frequency is negative, or no number.
+
+    References
+    ----------
+    IEC 61672-1, "Electroacoustics - Sound level meters - Part 1: Specifications".
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.metrics import a_weighting_db
+    >>> a_weighting_db([100.0, 1000.0, 10000.0]).round(1) + 0.0
+    array([-19.1,   0. ,  -2.5])
+    """
+    f = as_real_array(frequencies_hz, "frequencies_hz")
+    if np.any(f < 0):
+        raise ValueError(f"frequencies_hz must not be negative, got {f.min():g} Hz")
+    with np.errstate(divide="ignore"):
+        return 20 * np.log10(_a_response(f) / _a_response(np.array(1000.0)))
+
+
+def _a_response(f: np.ndarray) -> np.ndarray:
+    one, two, three, four = 20.598997, 107.65265, 737.86223, 12194.217
+    square = f**2
+    return (
+        four**2
+        * square**2
+        / ((square + one**2) * np.sqrt((square + two**2) * (square + three**2)) * (square + four**2))
+    )
+
+
+def a_weighted_level_db(signal: Any, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5) -> Any:
+    """Return the A-weighted level, in dBA if the signal is a sound pressure in Pa.
+
+    It is the equivalent level of the steady portion. The weighting is applied to the spectrum.
+
+    Parameters
+    ----------
+    signal : array_like, shape (n_samples,) or (n_channels, n_samples)
+        Sound pressure, in Pa for the default reference.
+    fs : float
+        Sampling frequency in Hz.
+    reference : float, default 2e-5
+        Rms value of 0 dB: 20 µPa.
+    steady : float, default 0.5
+        Portion of the run, from its end.
+
+    Returns
+    -------
+    float or ndarray, shape (n_channels,)
+        Level in dB.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.metrics import a_weighted_level_db
+    >>> from kfopc_filterpy.signals import tone
+    >>> round(a_weighted_level_db(tone(100.0, 2.0, fs=16000, amplitude=2**0.5), 16000), 1)  # 1 Pa rms, 94.0 dB
+    74.8
+    """
+    frequencies, powers = _powers_of_bins(signal, fs, steady)
+    weighted = np.sum(powers * 10 ** (a_weighting_db(frequencies) / 10), axis=-1)
+    return _figure(_ratio_db(weighted, as_positive(reference, "reference") ** 2))
+
+
+def third_octave_levels_db(
+    signal: Any, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the levels in third-octave bands from 25 Hz on.
+
+    The bands are those of IEC 61260-1 with base ten: exact centres ``1000 * 10**(k/10)``, edges half a tenth of a decade
+    to each side. The powers of the Fourier bins within the edges are added, so a band is a rectangle, as the narrowest
+    filters of the standard approach it. Bands that do not end below fs/2, or that hold no bin, are left out.
+
+    Parameters
+    ----------
+    signal : array_like, shape (n_samples,) or (n_channels, n_samples)
+        Sound pressure, in Pa for the default reference.
+    fs : float
+        Sampling frequency in Hz.
+    reference : float, default 2e-5
+        Rms value of 0 dB: 20 µPa.
+    steady : float, default 0.5
+        Portion of the run, from its end.
+
+    Returns
+    -------
+    centres_hz : ndarray, shape (n_bands,)
+        Exact centre frequencies in Hz.
+    levels_db : ndarray, shape (n_bands,) or (n_channels, n_bands)
+        Level of each band in dB.
+
+    Raises
+    ------
+    ValueError
+        If the portion is too short for a single band, or an argument is out of range.
+
+    References
+    ----------
+    IEC 61260-1, "Electroacoustics - Octave-band and fractional-octave-band filters - Part 1: Specifications".
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.metrics import third_octave_levels_db
+    >>> from kfopc_filterpy.signals import tone
+    >>> centres, levels = third_octave_levels_db(tone(100.0, 2.0, fs=16000, amplitude=2**0.5), 16000)  # 1 Pa rms
+    >>> print(f"{levels.max():.1f} dB in the band at {centres[levels.argmax()]:.0f} Hz")
+    94.0 dB in the band at 100 Hz
+    """
+    frequencies, powers = _powers_of_bins(signal, fs, steady)
+    exact = 1000.0 * 10.0 ** (np.arange(-16, 14) / 10.0)
+    edges = np.searchsorted(frequencies, np.stack([exact * 10**-0.05, exact * 10**0.05]))
+    kept = (exact * 10**0.05 < frequencies[-1]) & (edges[1] > edges[0])
+    if not np.any(kept):
+        raise ValueError(f"signal must be longer for a third-octave band, got {frequencies.size} Fourier bins")
+    bands = [np.sum(powers[..., first:last], axis=-1) for first, last in edges.T[kept]]
+    return exact[kept], _ratio_db(np.stack(bands, axis=-1), as_positive(reference, "reference") ** 2)
+
+
+def _powers_of_bins(signal: Any, fs: float, steady: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Fourier bins of the steady portion and the power in each, (..., n_bins), by a Hann window."""
+    from scipy.signal import periodogram
+
+    fs = as_positive(fs, "fs", unit="Hz")
+    settled = _steady_part(_as_runs(signal, "signal", False)[0], steady)
+    frequencies, density = periodogram(settled, fs, window="hann", detrend=False)
+    return frequencies, density * fs / settled.shape[-1]
 
 
 def _as_runs(value: Any, name: str, runs: bool) -> np.ndarray:

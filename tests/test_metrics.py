@@ -486,3 +486,53 @@ def test_refusals_say_what_was_wrong(call, error, message):
 
 def test_every_public_name_exists():
     assert all(hasattr(metrics, name) for name in metrics.__all__)
+
+
+# Levels.
+
+# Table of IEC 61672-1: nominal frequency, weighting A in dB, rounded to a tenth.
+A_WEIGHTING = {
+    31.5: -39.4,
+    63: -26.2,
+    125: -16.1,
+    250: -8.6,
+    500: -3.2,
+    1000: 0.0,
+    2000: 1.2,
+    4000: 1.0,
+    8000: -1.1,
+    16000: -6.6,
+}
+
+
+def test_the_weighting_a_is_that_of_the_standards_table():
+    exact = 1000 * 10.0 ** (0.3 * np.arange(-5, 5))  # what the nominal frequencies stand for
+    np.testing.assert_allclose(metrics.a_weighting_db(exact), list(A_WEIGHTING.values()), atol=0.1)
+    assert metrics.a_weighting_db(0.0) == -np.inf
+    with pytest.raises(ValueError, match="frequencies_hz must not be negative"):
+        metrics.a_weighting_db([-1.0])
+
+
+@pytest.mark.parametrize("hz", [100.0, 1000.0, 4000.0])
+def test_a_tone_of_one_pascal_has_94_decibels_in_its_band_and_less_by_the_weighting(hz):
+    fs = 16000
+    t = np.arange(2 * fs) / fs
+    signal = np.sqrt(2) * np.sin(2 * np.pi * hz * t)
+    centres, levels = metrics.third_octave_levels_db(signal, fs)
+    level = 20 * np.log10(1 / 2e-5)
+    assert levels.max() == pytest.approx(level, abs=0.01)
+    assert abs(np.log10(centres[levels.argmax()] / hz)) < 0.05
+    assert metrics.a_weighted_level_db(signal, fs) == pytest.approx(level + metrics.a_weighting_db(hz), abs=0.02)
+
+
+def test_the_bands_of_noise_add_up_and_channels_stay_apart():
+    fs = 16000
+    noise = np.random.default_rng(0).standard_normal(10 * fs) * [[1.0], [10.0]]
+    centres, levels = metrics.third_octave_levels_db(noise, fs, reference=1.0, steady=1.0)
+    assert levels.shape == (2, centres.size)
+    np.testing.assert_allclose(levels[1] - levels[0], 20.0, atol=1e-9)
+    # White noise: a band's power is its width over fs/2; ten seconds leave a third of a decibel in the lowest ones.
+    width = centres * (10**0.05 - 10**-0.05)
+    np.testing.assert_allclose(levels[0][centres > 100], 10 * np.log10(width / (fs / 2))[centres > 100], atol=1.0)
+    with pytest.raises(ValueError, match="must be longer for a third-octave band"):
+        metrics.third_octave_levels_db(np.ones(4), fs)

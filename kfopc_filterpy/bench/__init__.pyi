@@ -1,3 +1,9 @@
+from .assessment import Assessment as Assessment
+from .assessment import Band as Band
+from .assessment import Ceilings as Ceilings
+from .assessment import Levels as Levels
+from .assessment import assess as assess
+from .comparing import compare_recordings as compare_recordings
 from .items import FigureItem as FigureItem
 from .items import Parameter as Parameter
 from .items import Sound as Sound

@@ -43,6 +43,26 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
 
     The `lead` figure stands at the top; without one, the first figure of the studies does.
     """
+    figures = [images(study, folder) for study in studies]
+    first: dict[str, Any] | None = None
+    if lead is not None:
+        first = _image(lead, folder / "figures" / lead.stem)
+    elif shown := next(filter(None, figures), None):
+        first = shown.pop(0)
+    return rendered(
+        TEMPLATE,
+        title=TITLE,
+        paper=PAPER,
+        lead=first,
+        verdict=verdict_sentence(studies),
+        headroom=HEADROOM,
+        excerpt_s=EXCERPT_S,
+        parts=[_part(study, own, folder) for study, own in zip(studies, figures, strict=True)],
+    )
+
+
+def rendered(template: str, **values: Any) -> str:
+    """Return a template of this folder, filled in with values, which are escaped."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     layout = Environment(
@@ -52,21 +72,12 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
         keep_trailing_newline=True,
     )
     layout.filters |= {"math": mathml, "prose": prose}
-    figures = [[_image(item, figure_file(folder, study, item)) for item in study.figures] for study in studies]
-    first: dict[str, Any] | None = None
-    if lead is not None:
-        first = _image(lead, folder / "figures" / lead.stem)
-    elif shown := next(filter(None, figures), None):
-        first = shown.pop(0)
-    return layout.get_template(TEMPLATE).render(
-        title=TITLE,
-        paper=PAPER,
-        lead=first,
-        verdict=verdict_sentence(studies),
-        headroom=HEADROOM,
-        excerpt_s=EXCERPT_S,
-        parts=[_part(study, own, folder) for study, own in zip(studies, figures, strict=True)],
-    )
+    return layout.get_template(template).render(**values)
+
+
+def images(study: StudyReport, folder: Path) -> list[dict[str, Any]]:
+    """Return the figures of a study, whose files lie in `folder`, as they are inlined."""
+    return [_image(item, figure_file(folder, study, item)) for item in study.figures]
 
 
 def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> dict[str, Any]:
@@ -78,7 +89,7 @@ def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> di
         "merit_headings": headings,
         "merit": merit,
         "figures": figures,
-        "players": list(_players(study, folder)),
+        "players": list(players(study, folder)),
         "parameters": list(_parameters(study.parameters, study.algorithms)),
     }
 
@@ -135,8 +146,8 @@ def _image(item: FigureItem, file: Path) -> dict[str, Any]:
     return {"caption": item.caption, "alt": item.alt or item.caption, "source": source, "broad": broad}
 
 
-def _players(study: StudyReport, folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the sounds of each group, which one player switches between."""
+def players(study: StudyReport, folder: Path, first_heard: str = "KF-OPC") -> Iterator[dict[str, Any]]:
+    """Yield the sounds of each group, which one player switches between, at first to the label with these words."""
     scaled = zip(study.sounds, loudness(study), strict=True)
     for number, (group, members) in enumerate(groupby(scaled, key=lambda member: member[0].group)):
         tracks = [
@@ -148,7 +159,7 @@ def _players(study: StudyReport, folder: Path) -> Iterator[dict[str, Any]]:
             }
             for sound, (clipped, peak) in members
         ]
-        shown = next((i for i, track in enumerate(tracks) if "KF-OPC" in track["label"]), min(1, len(tracks) - 1))
+        shown = next((i for i, track in enumerate(tracks) if first_heard in track["label"]), min(1, len(tracks) - 1))
         yield {"id": f"{study.name}-sounds-{number}", "group": group, "tracks": tracks, "shown": shown}
 
 

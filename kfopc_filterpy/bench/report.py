@@ -122,22 +122,27 @@ def write_report(studies: Sequence[StudyReport], folder: str | os.PathLike[str])
         {"studies": {study.name: study.result for study in studies}}, allow_nan=False, ensure_ascii=False, indent=2
     )
     path = prepare_folder(folder)
-    for kind in ("figures", "audio"):
-        prepare_folder(path / kind)
     lead = glance(studies)
     if lead is not None:
         save_figure(lead.figure, path / "figures" / lead.stem)
     for study in studies:
-        for item in study.figures:
-            save_figure(item.figure, figure_file(path, study, item))
-        for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
-            write_wav(sound_file(path, study, sound), clipped, study.fs, peak=peak)
-        for table in study.tables:
-            prepare_folder(path / "tables")
-            _write_csv(table_file(path, study, table), table)
+        write_files(study, path)
     write_whole(path / "results.json", results + "\n")
     write_whole(path / "report.html", page(studies, path, lead))
     return path / "report.html"
+
+
+def write_files(study: StudyReport, path: Path) -> None:
+    """Write the figures, sounds and tables of a study into folders of these names."""
+    for kind in ("figures", "audio"):
+        prepare_folder(path / kind)
+    for item in study.figures:
+        save_figure(item.figure, figure_file(path, study, item))
+    for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
+        write_wav(sound_file(path, study, sound), clipped, study.fs, peak=peak)
+    for table in study.tables:
+        prepare_folder(path / "tables")
+        _write_csv(table_file(path, study, table), table)
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:

@@ -1,4 +1,4 @@
-"""Rated output power: constraint factor, power budget, limiter and amplifier models."""
+"""Rated output power: constraint factor, power budget, limiter, amplifier models and ratings."""
 
 import lazy_loader
 

@@ -1,1 +1,5 @@
 from .budget import PowerBudget as PowerBudget
+from .ratings import AmplifierRating as AmplifierRating
+from .ratings import LoudspeakerRating as LoudspeakerRating
+from .ratings import OutputLimits as OutputLimits
+from .ratings import output_limits as output_limits

@@ -36,7 +36,7 @@ def test_the_figures_say_what_the_page_says():
         assert overshoot(run.control_signal, watt * v.ohm, v.fs, window_s=0.1) <= 1 + 1e-9
         assert limits[watt] * 0.999 < np.abs(run.control_signal).max() <= limits[watt]  # peaks are what is cut
         assert output_power(run.control_signal) < 0.75 * watt * v.ohm
-    with_headroom = {watt: v.try_amplifier(watt, crest=2.0) for watt in (10, 20)}
+    with_headroom = {watt: v.try_amplifier(watt, "noise_watt") for watt in (10, 20)}
     better = {watt: noise_reduction_db(run.error, run.disturbance) for watt, run in with_headroom.items()}
     assert better[10] > 6
     assert better[20] > v.reductions[20] + 1

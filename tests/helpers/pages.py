@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import matplotlib.pyplot as plt
 
-TUTORIALS = Path(__file__).resolve().parents[2] / "docs" / "tutorials"
+ROOT = Path(__file__).resolve().parents[2]
+TUTORIALS = ROOT / "docs" / "tutorials"
+_SHELL = re.compile(r"^!", re.M)  # marks a command of the shell
 _PART = re.compile(
     r"^```\{code-cell\}[^\n]*\n(?P<options>(?:---\n.*?^---\n)?(?::[^\n]*\n)*)(?P<code>.*?)^```$|^## (?P<heading>[^\n]*)$",
     re.M | re.S,
@@ -39,8 +45,22 @@ class Page:
         """Run the cells before the heading `until`, by default all that are left; return the variables."""
         while self._left and not (until and self._left[0]["heading"] == until):
             part = self._left.pop(0)
-            if part["code"] is not None:
+            if part["code"] is not None and _SHELL.match(part["code"]):
+                _run_in_shell(_SHELL.sub("", part["code"]))
+            elif part["code"] is not None:
                 exec(compile(part["code"], f"{self.stem}.md", "exec"), self._variables)
                 plt.close("all")  # as a notebook does
         assert self._left or until is None, f"{self.stem}.md has no heading {until!r} there"
         return SimpleNamespace(**{name: value for name, value in self._variables.items() if not name.startswith("__")})
+
+
+def _run_in_shell(commands: str) -> None:
+    """Run a cell of shell commands and print what they say; `kfopc` is this checkout's."""
+    with tempfile.TemporaryDirectory() as folder:
+        script = Path(folder) / "kfopc"
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m kfopc_filterpy "$@"\n', encoding="utf-8")
+        script.chmod(0o755)
+        environment = os.environ | {"PATH": folder + os.pathsep + os.environ["PATH"], "PYTHONPATH": str(ROOT)}
+        ended = subprocess.run(["sh", "-c", commands], env=environment, capture_output=True, text=True)
+    print(ended.stdout, end="")
+    assert ended.returncode == 0, ended.stderr

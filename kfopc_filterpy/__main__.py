@@ -1,0 +1,8 @@
+"""`python -m kfopc_filterpy` is the command `kfopc`."""
+
+import sys
+
+from .cli import main
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,243 @@
+"""The page of a verdict, with its figures and sounds; its layout is in verdict.html.jinja."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
+
+from .items import EXCERPT_S, HEADROOM, FigureItem, Sound, StudyReport, Table
+from .page import images, players, rendered
+from .report import prepare_folder, write_files, write_whole
+
+if TYPE_CHECKING:
+    from .assessment import Assessment
+
+TEMPLATE = "verdict.html.jinja"
+NEEDED = ("jinja2", "latex2mathml", "matplotlib", "PIL")
+CHAIN = (  # what each ceiling may use, and the cause if it is too low
+    ("coherence_db", "Everything that the reference explains of the disturbance", "coherence"),
+    ("time_db", "A filter of {taps} taps that may look ahead, any power", "filter"),
+    ("filter_db", "A filter of {taps} taps, in time, any power", "causality"),
+    ("path_db", "The same, held back where the secondary path is uncertain", "path"),
+    ("power_db", "The same, within the rated power", "amplifier"),
+)
+
+
+def require_page() -> None:
+    """Raise ModuleNotFoundError, which names the extra, if a library that the page needs is missing."""
+    missing = [name for name in NEEDED if find_spec(name) is None]
+    if missing:
+        raise ModuleNotFoundError(
+            f"the page needs {', '.join(missing)}: install the extra `studies`, "
+            'python -m pip install "kfopc-filterpy[studies]"'
+        )
+
+
+def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Path:
+    """Write the page, the figures, the sounds and verdict.json into a folder; return the path of the page."""
+    require_page()
+    path = prepare_folder(folder)
+    study = StudyReport(
+        "verdict",
+        "Verdict",
+        "",
+        verdict.fs,
+        verdict.limits.rated_power,
+        {},
+        {},
+        figures=list(_figures(verdict)),
+        sounds=_sounds(verdict),
+        tables=list(_tables(verdict)),
+    )
+    write_files(study, path)
+    write_whole(path / "verdict.json", verdict.json + "\n")
+    shown = images(study, path)
+    page = rendered(
+        TEMPLATE,
+        verdict=verdict,
+        lead=shown[0],
+        figures=shown[1:],
+        tables=study.tables,
+        players=list(players(study, path, verdict.algorithm)),
+        checks=_checks(verdict),
+        settings=list(verdict.settings.reasons.items()),
+        values={"n_taps": verdict.settings.n_taps, **verdict.settings.settings},
+        headroom=HEADROOM,
+        excerpt_s=EXCERPT_S,
+    )
+    write_whole(path / "verdict.html", page)
+    return path / "verdict.html"
+
+
+def _figures(verdict: Assessment) -> Any:
+    """Yield the figures: the bound, spectra, noise reduction and power over time, bands."""
+    import matplotlib.pyplot as plt
+
+    figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
+    _draw_bound(verdict, ax)
+    yield FigureItem(
+        "bound",
+        "What a rated power buys: the least error of any fixed filter of this length, with the run of each algorithm at "
+        "the power it took.",
+        figure,
+    )
+    plots: list[tuple[str, Any, str]] = [
+        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half."),
+        ("nse", plot_nse, "Error power over that of the disturbance; below 0 dB it is quieter than without control."),
+        ("power", plot_output_power, "Mean power of the control signal over a sliding window, and the rated power."),
+    ]
+    for stem, draw, caption in plots:
+        figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
+        draw(dict(verdict.runs), ax=ax)
+        yield FigureItem(stem, caption, figure)
+    if verdict.levels is not None:
+        figure, ax = plt.subplots(figsize=(9, 3.6), layout="constrained")
+        _draw_bands(verdict.levels, ax)
+        yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
+
+
+def _draw_bound(verdict: Assessment, ax: Any) -> None:
+    """Draw the bound against the rated power, with what is wanted, the rating and the runs."""
+    scale = verdict.watt_per_power or 1.0
+    powers, reached = verdict.curve
+    ax.semilogx(scale * powers, reached, color="0.2", label="best fixed filter")
+    ax.axvline(scale * verdict.limits.rated_power, color="0.2", linestyle="--", label="rated power")
+    ax.axhline(verdict.want_db, color="0.5", linestyle=":", label="wanted")
+    for name, figures in verdict.figures.items():
+        power, own = figures["output_power"], figures["noise_reduction_db"]
+        if power and own is not None and np.isfinite(power) and np.isfinite(own):
+            style = curve_style(name)
+            ax.plot(scale * power, own, style["marker"], color=style["color"], label=name)
+    ax.set_xlabel(
+        "Power of the control signal" if verdict.watt_per_power is None else f"Power (W into {verdict.ohm:g} ohm)"
+    )
+    ax.set_ylabel("Noise reduction (dB)")
+    ax.grid(True, which="both", alpha=0.25)
+    ax.legend(fontsize="small")
+
+
+def _draw_bands(levels: Any, ax: Any) -> None:
+    """Draw third-octave levels without and with control, from 60 dB below the loudest on."""
+    floor = max(np.max(levels.before_db), np.max(levels.after_db)) - 60
+    places = np.arange(levels.centres_hz.size)
+    for offset, values, label, colour in (
+        (-0.2, levels.before_db, "without control", "0.6"),
+        (0.2, levels.after_db, "with control", curve_style("KF-OPC")["color"]),
+    ):
+        ax.bar(places + offset, np.maximum(values - floor, 0.0), 0.4, bottom=floor, label=label, color=colour)
+    ax.set_xticks(places[::3], [_nominal(f) for f in levels.centres_hz[::3]])
+    ax.set_xlabel("Third-octave band (Hz)")
+    ax.set_ylabel("Level (dB re 20 µPa)")
+    ax.grid(True, axis="y", alpha=0.25)
+    ax.legend(fontsize="small")
+
+
+def _nominal(centre: float) -> str:
+    """Return a third octave's nominal centre frequency: the exact one to the preferred digits."""
+    digits = (1, 1.25, 1.6, 2, 2.5, 3.15, 4, 5, 6.3, 8)[round(10 * np.log10(centre)) % 10]
+    return f"{digits * 10 ** np.floor(np.log10(centre) + 1e-6):g}"
+
+
+def _sounds(verdict: Assessment) -> list[Sound]:
+    """Return the sounds without control and of each algorithm, of the steady half."""
+    run = verdict.runs[verdict.algorithm]
+    settled = 0.5 * run.n_samples / verdict.fs
+    group = "at the error microphone"
+    sounds = [Sound("before", "Without control", run.disturbance, group, settled)]
+    for name, own in verdict.runs.items():
+        stem = "after" if name == verdict.algorithm else name.lower()
+        sounds.append(Sound(stem, name, own.error, group, settled))
+    return sounds
+
+
+def _tables(verdict: Assessment) -> Any:
+    """Yield the tables: what limits, the algorithms, the bands."""
+    taps = verdict.settings.n_taps
+    rows: list[list[str | float]] = []
+    for name, what, cause in CHAIN:
+        value = getattr(verdict.ceilings, name)
+        mark = "limits" if cause == verdict.limited_by else ""
+        rows.append([what.format(taps=taps), "not measured" if value is None else f"{value:.1f} dB", mark])
+    adapting = "limits" if verdict.limited_by == "adaptation" else ""
+    rows.append([f"The run of {verdict.algorithm}", f"{verdict.noise_reduction_db:.1f} dB", adapting])
+    rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
+    yield Table("ceilings", "What limits", ["It may use", "Noise reduction", ""], rows)
+    yield Table(
+        "algorithms",
+        "The controllers",
+        ["Controller", "Noise reduction (dB)", "Power", "Of the rated power", "Worst window", "Highest peak"],
+        [
+            [
+                name if name == verdict.algorithm else f"{name}, as published",
+                _number(own["noise_reduction_db"]),
+                verdict.power(own["output_power"]) if own["output_power"] is not None else "–",
+                _number(own["of_rated_power"]),
+                _number(own["worst_window"]),
+                _number(own["peak_control_signal"]),
+            ]
+            for name, own in verdict.figures.items()
+        ],
+    )
+    if verdict.levels is not None:
+        yield Table(
+            "levels",
+            "Third-octave bands",
+            ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"],
+            [
+                [_nominal(centre), float(before), float(after), float(before - after)]
+                for centre, before, after in zip(
+                    verdict.levels.centres_hz, verdict.levels.before_db, verdict.levels.after_db, strict=True
+                )
+            ],
+        )
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _checks(verdict: Assessment) -> list[tuple[str, str]]:
+    """Return what was checked, and what was found, in words."""
+    band, limits = verdict.band, verdict.limits
+    late = verdict.causality_margin_s
+    peak = "none" if limits.amplitude_limit is None else f"{limits.amplitude_limit:.3g}"
+    if verdict.volts_per_unit is not None and limits.amplitude_limit is not None:
+        peak += f", {limits.amplitude_limit * verdict.volts_per_unit:.3g} V"
+    checks = [
+        (
+            "Rating",
+            f"{verdict.power(limits.rated_power)}, decided by the {limits.decided_by}; peak limit {peak}; "
+            f"windows of {limits.window_s:g} s",
+        ),
+        ("Power for full control", verdict.power(verdict.unlimited_power)),
+        (f"Least power for {verdict.want_db:g} dB, best fixed filter", _or_none(verdict, verdict.required_rated_power)),
+        ("Estimate for this controller", _or_none(verdict, verdict.expected_rated_power)),
+        (
+            "Causality",
+            "unknown without a primary path"
+            if late is None
+            else f"the anti-noise is {abs(1e3 * late):.2g} ms {'early' if late >= 0 else 'late'}",
+        ),
+        (
+            "Band of the noise",
+            f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
+            f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
+        ),
+        ("Secondary path", f"{band.uncertain_share:.1%} of the noise's power lies where it may be wrong by 100 %"),
+    ]
+    if verdict.levels is not None:
+        before, after = verdict.levels.before_dba, verdict.levels.after_dba
+        checks.append(("A-weighted level", f"{before:.1f} dBA without control, {after:.1f} dBA with it"))
+    if verdict.excursion_mm is not None:
+        checks.append(("Largest excursion", f"{verdict.excursion_mm:.2g} mm"))
+    return checks
+
+
+def _or_none(verdict: Assessment, power: float) -> str:
+    return verdict.power(power) if np.isfinite(power) else "none would do"

@@ -1,0 +1,627 @@
+"""The command `kfopc`, which is also `python -m kfopc_filterpy`: verdicts, paths and comparisons from files.
+
+Exit codes: 0 done, and for a verdict "enough"; 1 the verdict "not enough"; 2 wrong input, said in one line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .signals import Recording
+
+ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
+STANDARD_INPUT = "-"
+EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
+WRITTEN = (".wav", ".npy", ".csv", ".txt")
+
+EXAMPLES = {
+    "": """examples:
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
+  kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
+  kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
+  kfopc data list
+each command has its own --help""",
+    "verdict": """examples:
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
+  kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
+  cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
+
+exit code: 0 enough, 1 not enough, 2 wrong input""",
+    "identify": """example:
+  kfopc paths identify sent.wav received.wav --taps 512 -o S.wav""",
+    "inspect": """example:
+  kfopc paths inspect S.wav --primary P.wav""",
+    "convert": """example:
+  kfopc paths convert S.wav S.csv""",
+    "resample": """example:
+  kfopc paths resample S.wav S16.wav --fs 16000""",
+    "plot": """example:
+  kfopc paths plot P.wav S.wav -o paths.png""",
+    "data": """examples:
+  kfopc data list
+  kfopc data fetch duct compressor
+  kfopc data where""",
+    "compare": """example:
+  kfopc compare noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --algorithm KF-PB,KF-OPC,FxLMS -o out""",
+}
+
+
+def _read(path: Any, *, fs: float | None, channel: int | None, variable: str | None, is_path: bool) -> Recording:
+    """Read a recording or an impulse response: the one place that knows how."""
+    from .paths import read_path
+    from .signals import read_recording
+
+    return (read_path if is_path else read_recording)(path, fs=fs, channel=channel, variable=variable)
+
+
+class _Files:
+    """Reader of the files of a command, which must agree on their sample rate."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self.fs: float | None = options.fs
+        self._first = ""
+
+    def recording(self, path: str) -> np.ndarray:
+        """Return the samples of a recording, one channel."""
+        return self._one(path, is_path=False)
+
+    def path(self, path: str) -> np.ndarray:
+        """Return the taps of a path."""
+        return self._one(path, is_path=True)
+
+    def _one(self, path: str, *, is_path: bool) -> np.ndarray:
+        with _file(path) as source:
+            read = _read(
+                source,
+                fs=self.options.fs,
+                channel=self.options.channel,
+                variable=self.options.variable,
+                is_path=is_path,
+            )
+        if read.samples.size != read.samples.shape[-1]:
+            raise ValueError(
+                f"{path} has {len(read.samples)} channels where one is needed: choose with --channel 0 to --channel "
+                f"{len(read.samples) - 1}"
+            )
+        if self.fs is not None and read.fs != self.fs:
+            raise ValueError(
+                f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
+                "example with --fs 16000"
+            )
+        self.fs, self._first = read.fs, self._first or path
+        return read.one_channel()
+
+
+@contextmanager
+def _file(path: str) -> Iterator[str]:
+    """Give the name of a file, for "-" of a copy of the standard input."""
+    if path != STANDARD_INPUT:
+        yield path
+        return
+    content = sys.stdin.buffer.read()
+    if not content:
+        raise ValueError("standard input is empty: pipe a file into the command")
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "standard-input"
+        copy.write_bytes(content)
+        yield str(copy)
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(WRONG_INPUT, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The arguments; by default those of the process.
+
+    Returns
+    -------
+    int
+        0 done or enough, 1 not enough, 2 wrong input.
+    """
+    # A filter of some hundred taps gains nothing from more threads, and they get in each other's way.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        words = " ".join(str(error).split()) or type(error).__name__
+        print(f"{options.prog}: {words}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print(f"{options.prog}: interrupted; nothing of it was written", file=sys.stderr)
+        return 130
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="kfopc",
+        description="Active noise control with a limited amplifier, from recordings.",
+        epilog=EXAMPLES[""],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=_Parser)
+    _verdict_options(_command(commands, "verdict", _verdict, "say whether an amplifier is enough, and what limits"))
+    _compare_options(_command(commands, "compare", _compare, "tune and compare the algorithms on your own data"))
+    about = "identify, inspect, convert, resample and plot impulse responses"
+    paths = commands.add_parser("paths", help=about, description=_sentence(about))
+    _path_commands(paths.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser))
+    data = _command(commands, "data", _data, "list or fetch the public measured data, or say where they are")
+    data.add_argument("action", choices=("list", "fetch", "where"), help="what to do")
+    data.add_argument("name", nargs="*", help="data sets to list or fetch (default: all)")
+    data.add_argument("--folder", metavar="FOLDER", help="in place of KFOPC_DATA or the cache")
+    data.add_argument("--json", action="store_true", help="print JSON")
+    return parser
+
+
+def _command(commands: Any, name: str, run: Callable[[Any], int], about: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name,
+        help=about,
+        description=_sentence(about),
+        epilog=EXAMPLES[name],
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run, prog=parser.prog)
+    return parser
+
+
+def _sentence(about: str) -> str:
+    return about[0].upper() + about[1:] + "."
+
+
+def _reading_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--fs", type=float, metavar="HZ", help="resample everything to this rate")
+    parser.add_argument("--channel", type=int, metavar="N", help="channel of files with several, from 0")
+    parser.add_argument("--variable", metavar="NAME", help="variable of files with several")
+
+
+def _scene_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the noise, the paths and the rating."""
+    parser.add_argument("noise", help="recording of the reference microphone, loudspeaker silent; - is standard input")
+    parser.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
+    parser.add_argument("--disturbance", metavar="FILE", help="recording of the error microphone, made with the noise")
+    parser.add_argument(
+        "--secondary", metavar="FILE", required=True, help="impulse response, control signal to error microphone"
+    )
+    _reading_options(parser)
+    rating = parser.add_argument_group("rating", "of the amplifier: --watt and --ohm, or --rated-power")
+    rating.add_argument("--watt", type=float, metavar="W", help="rated power of the amplifier")
+    rating.add_argument("--ohm", type=float, metavar="R", help="into this resistance")
+    rating.add_argument(
+        "--rating",
+        choices=("sine", "noise"),
+        default="sine",
+        help="what the watts were measured with (default: sine, the safe side)",
+    )
+    rating.add_argument("--peak-volts", type=float, metavar="V", help="voltage at which the amplifier clips")
+    rating.add_argument(
+        "--volts-per-unit", type=float, default=1.0, metavar="V", help="volts for a control signal of 1 (default: 1)"
+    )
+    rating.add_argument("--rated-power", type=float, metavar="P", help="rated power as mean square, in place of watts")
+    rating.add_argument(
+        "--impedance",
+        metavar="CSV",
+        help="the loudspeaker's impedance, whose least value counts: Hz, ohm (default: --ohm)",
+    )
+    rating.add_argument("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
+    rating.add_argument("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
+    rating.add_argument("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
+    rating.add_argument(
+        "--displacement", metavar="CSV", help="its excursion per volt: a column of Hz, a column of mm/V, and commas"
+    )
+
+
+def _verdict_options(parser: argparse.ArgumentParser) -> None:
+    _scene_options(parser)
+    parser.add_argument("--want-db", type=float, default=6.0, metavar="DB", help="noise reduction wanted (default: 6)")
+    parser.add_argument(
+        "--algorithm", default="KF-PB", help="KF-PB (default), KF-OPC or FxLMS, behind a limiter; the others beside it"
+    )
+    parser.add_argument(
+        "--taps", type=int, metavar="N", help="taps of the control filter (default: found, at most 256)"
+    )
+    parser.add_argument(
+        "--memory", type=float, default=0.25, metavar="S", help="memory of the filter (default: 0.25 s)"
+    )
+    parser.add_argument(
+        "--path-error-samples",
+        type=float,
+        metavar="N",
+        help="delay by which the secondary path may be wrong (default: 0.5)",
+    )
+    parser.add_argument(
+        "--path-error-deg", type=float, default=0.0, metavar="DEG", help="phase by which it may be wrong"
+    )
+    parser.add_argument("--path-error-db", type=float, default=0.0, metavar="DB", help="gain by which it may be wrong")
+    parser.add_argument(
+        "--secondary-again",
+        action="append",
+        metavar="FILE",
+        help="another measurement of the secondary path, which tells how far it may be wrong; may be repeated",
+    )
+    parser.add_argument(
+        "--pascal-per-unit", type=float, metavar="PA", help="calibration of the error microphone, for levels in dBA"
+    )
+    parser.add_argument(
+        "--calibrator", metavar="FILE", help="recording of a sound calibrator by the error microphone, in place of that"
+    )
+    parser.add_argument(
+        "--calibrator-db", type=float, default=94.0, metavar="DB", help="its sound pressure level (default: 94)"
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="FOLDER", help="folder for the page, figures, sounds and verdict.json"
+    )
+    parser.add_argument("--json", action="store_true", help="print verdict.json in place of text")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _rating(options: argparse.Namespace) -> list[Any]:
+    """Return the ratings that the options state."""
+    from .power import AmplifierRating, LoudspeakerRating
+
+    ratings: list[Any] = []
+    volts = options.volts_per_unit
+    if options.watt is not None or options.peak_volts is not None:
+        if options.ohm is None:
+            raise ValueError("--watt and --peak-volts need --ohm, the resistance they were measured with")
+        if options.rated_power is not None:
+            raise ValueError("--rated-power stands in place of --watt and --peak-volts: leave out one of them")
+        watts = {f"{options.rating}_watt": options.watt}
+        ratings.append(AmplifierRating(options.ohm, peak_volts=options.peak_volts, volts_per_unit=volts, **watts))
+    elif options.rated_power is not None:
+        ratings.append(options.rated_power)
+    if (options.loudspeaker_watt, options.programme_watt, options.x_max_mm) != (None, None, None):
+        if options.ohm is None and options.impedance is None:
+            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance, or --impedance, its curve")
+        ratings.append(
+            LoudspeakerRating(
+                options.ohm if options.impedance is None else _curve(options.impedance),
+                noise_watt=options.loudspeaker_watt,
+                programme_watt=options.programme_watt,
+                x_max_mm=options.x_max_mm,
+                displacement_mm_per_volt=None if options.displacement is None else _curve(options.displacement),
+                volts_per_unit=volts,
+            )
+        )
+    if not ratings:
+        raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
+    return ratings
+
+
+def _curve(path: str) -> Any:
+    """Return two columns of a CSV file."""
+    import numpy as np
+
+    try:
+        columns = np.loadtxt(path, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path} must hold two numbers in a line with a comma between them: {error}") from error
+    if columns.shape[1] != 2:
+        raise ValueError(f"{path} must hold two columns, Hz and a value, got {columns.shape[1]}")
+    return columns[:, 0], columns[:, 1]
+
+
+def _uncertainty(options: argparse.Namespace, files: _Files, secondary: np.ndarray) -> Any:
+    """Return how far the secondary path may be wrong: by the other measurements, or by the tolerances."""
+    import numpy as np
+
+    from .paths import PathTolerance
+
+    tolerances = (options.path_error_samples, options.path_error_deg, options.path_error_db)
+    if options.secondary_again:
+        if tolerances != (None, 0.0, 0.0):
+            raise ValueError("--secondary-again stands in place of --path-error-...: leave out one of them")
+        others = [files.path(name) for name in options.secondary_again]
+        longest = max(secondary.size, *(other.size for other in others))
+        return np.array([np.pad(path, (0, longest - path.size)) for path in [secondary, *others]])
+    samples = 0.5 if options.path_error_samples is None else options.path_error_samples
+    return PathTolerance(samples, options.path_error_deg, options.path_error_db)
+
+
+def _scene(options: argparse.Namespace, files: _Files) -> tuple[Any, Any, Any, Any]:
+    """Return noise, primary path, secondary path and disturbance."""
+    if options.primary is None and options.disturbance is None:
+        raise ValueError("--primary or --disturbance is needed: what arrives at the error microphone?")
+    return (
+        files.recording(options.noise),
+        None if options.primary is None else files.path(options.primary),
+        files.path(options.secondary),
+        None if options.disturbance is None else files.recording(options.disturbance),
+    )
+
+
+@contextmanager
+def _bar(quiet: bool, unit: str) -> Iterator[Any]:
+    """Give a progress bar on a terminal."""
+    try:
+        from tqdm import tqdm
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"the progress bar needs tqdm: {EXTRA}") from error
+    with tqdm(unit=unit, unit_scale=True, disable=True if quiet else None, dynamic_ncols=True, leave=False) as bar:
+        yield bar
+
+
+def _verdict(options: argparse.Namespace) -> int:
+    if options.output is not None:  # better before the run than after it
+        import matplotlib
+
+        from .bench.assessment_page import require_page
+        from .bench.report import prepare_folder
+
+        matplotlib.use("Agg")
+        require_page()
+        prepare_folder(options.output)
+    from .bench import assess
+
+    files, rating = _Files(options), _rating(options)
+    noise, primary, secondary, disturbance = _scene(options, files)
+    uncertainty = _uncertainty(options, files, secondary)
+    assert files.fs is not None
+    with _bar(options.quiet, "sample") as bar:
+        verdict = assess(
+            noise,
+            primary,
+            secondary,
+            rating=rating,
+            fs=files.fs,
+            disturbance=disturbance,
+            want_db=options.want_db,
+            algorithm=options.algorithm,
+            n_taps=options.taps,
+            memory_s=options.memory,
+            secondary_path_uncertainty=uncertainty,
+            pascal_per_unit=_pascal_per_unit(options),
+            bar=bar,
+        )
+    if options.output is not None:
+        page = verdict.write(options.output)
+    print(verdict.json if options.json else verdict)
+    if options.output is not None and not options.json:
+        print(f"{page} and verdict.json written")
+    return ENOUGH if verdict.enough else NOT_ENOUGH
+
+
+def _pascal_per_unit(options: argparse.Namespace) -> float | None:
+    """Return the calibration of the error microphone, if the options give one."""
+    if options.calibrator is None:
+        return options.pascal_per_unit
+    if options.pascal_per_unit is not None:
+        raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
+    from .signals import calibration_factor
+
+    return calibration_factor(options.calibrator, options.calibrator_db, channel=options.channel)
+
+
+def _compare_options(parser: argparse.ArgumentParser) -> None:
+    _scene_options(parser)
+    parser.add_argument(
+        "--taps", type=int, metavar="N", help="taps of the control filters (default: found, at most 256)"
+    )
+    parser.add_argument("--algorithm", metavar="NAME,...", help="algorithms to compare (default: all)")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=10.0,
+        metavar="S",
+        help="of the record that is used, from its start (default: 10)",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="FOLDER", help="folder for the report, figures, sounds and results.json"
+    )
+    parser.add_argument("--json", action="store_true", help="print the figures of merit as JSON")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+
+
+def _compare(options: argparse.Namespace) -> int:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from .bench import algorithms, compare_recordings, results_table, write_report
+
+    names = list(algorithms()) if options.algorithm is None else options.algorithm.split(",")
+    files, rating = _Files(options), _rating(options)
+    noise, primary, secondary, disturbance = _scene(options, files)
+    with _bar(options.quiet, "run") as bar:
+        report = compare_recordings(
+            noise,
+            primary,
+            secondary,
+            rating=rating,
+            fs=files.fs or 0.0,
+            disturbance=disturbance,
+            names=names,
+            n_taps=options.taps,
+            seconds=options.seconds,
+            bar=bar,
+        )
+    if options.output is not None:
+        page = write_report([report], options.output)
+    print(json.dumps(report.result, indent=2, allow_nan=False) if options.json else results_table([report]).rstrip())
+    if options.output is not None and not options.json:
+        print(f"{page} and results.json written")
+    return ENOUGH
+
+
+def _path_commands(actions: Any) -> None:
+    identify = _command(
+        actions, "identify", _identify, "fit an impulse response to a recorded excitation, noise or sweep"
+    )
+    identify.add_argument("excitation", help="what was sent to the amplifier; - is standard input")
+    identify.add_argument("response", help="what the microphone heard, recorded at the same time")
+    identify.add_argument("--taps", type=int, required=True, metavar="N", help="length of the impulse response")
+    identify.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
+    inspect = _command(actions, "inspect", _inspect, "say what an impulse response does")
+    inspect.add_argument("path", help="the impulse response; - is standard input")
+    inspect.add_argument(
+        "--primary", metavar="FILE", help="impulse response of the primary path, for the causality margin"
+    )
+    convert = _command(actions, "convert", _convert, "write an impulse response in another format")
+    resample = _command(actions, "resample", _convert, "write an impulse response at another sample rate")
+    for parser in (convert, resample):
+        parser.add_argument("path", help="the impulse response; - is standard input")
+        parser.add_argument("output", help=f"file to write: {', '.join(WRITTEN)}")
+    plot = _command(actions, "plot", _plot, "draw impulse responses and frequency responses")
+    plot.add_argument("path", nargs="+", help="impulse responses of one sample rate")
+    plot.add_argument("-o", "--output", metavar="FILE", required=True, help="figure to write: .png, .svg or .pdf")
+    for parser in (identify, inspect, convert, plot):
+        _reading_options(parser)
+    resample.add_argument("--fs", type=float, metavar="HZ", required=True, help="the new rate")
+    resample.set_defaults(channel=None, variable=None)
+    for parser in (identify, inspect):
+        parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _identify(options: argparse.Namespace) -> int:
+    from .paths import estimate_path
+
+    files = _Files(options)
+    sent, heard = files.recording(options.excitation), files.recording(options.response)
+    shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
+    found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs or 0.0)
+    _write_path(options.output, found.taps, files.fs or 0.0)
+    facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
+    text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
+    print(json.dumps(facts) if options.json else text)
+    return ENOUGH
+
+
+def _inspect(options: argparse.Namespace) -> int:
+    from .paths import achieved_band, causality_margin, secondary_path_gain
+
+    files = _Files(options)
+    taps = files.path(options.path)
+    primary = None if options.primary is None else files.path(options.primary)
+    fs = files.fs or 0.0
+    facts: dict[str, Any] = {"n_taps": taps.size, "fs": fs, "duration_s": taps.size / fs}
+    facts["power_gain_db"] = _db(secondary_path_gain(taps, band=(0.0, fs / 2), fs=fs))
+    band = achieved_band(taps, fs=fs)
+    facts |= {"low_hz": band.low_hz, "high_hz": band.high_hz}
+    margin = causality_margin(taps if primary is None else primary, taps, fs=fs)
+    facts["onset_s"] = margin.secondary_onset_s
+    if primary is not None:
+        facts["causality_margin_s"] = margin.margin_s
+    if options.json:
+        from .bench.items import jsonable
+
+        print(json.dumps(jsonable(facts), allow_nan=False))
+        return ENOUGH
+    print(
+        f"{taps.size} taps at {fs:g} Hz, {1e3 * taps.size / fs:.3g} ms; its energy begins at {1e3 * margin.secondary_onset_s:.3g} ms"
+    )
+    print(
+        f"power gain {facts['power_gain_db']:.1f} dB; within 3 dB of its peak from {band.low_hz:.0f} to {band.high_hz:.0f} Hz"
+    )
+    if primary is not None:
+        late = "early enough" if margin.margin_s > 0 else "too late for anything but tones"
+        print(f"causality margin {1e3 * margin.margin_s:+.2f} ms: the anti-noise is {late}")
+    return ENOUGH
+
+
+def _db(power: float) -> float:
+    import math
+
+    return 10 * math.log10(max(power, 1e-30))
+
+
+def _convert(options: argparse.Namespace) -> int:
+    files = _Files(options)
+    taps = files.path(options.path)
+    _write_path(options.output, taps, files.fs or 0.0)
+    print(f"{options.output}: {taps.size} taps at {files.fs:g} Hz")
+    return ENOUGH
+
+
+def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
+    """Write taps in the format of the file's suffix: text has a column of times in s."""
+    import numpy as np
+
+    from .signals import write_wav
+
+    suffix = Path(output).suffix.lower()
+    if suffix == ".wav":
+        write_wav(output, taps, fs)
+    elif suffix == ".npy":
+        np.save(output, taps)
+    elif suffix in (".csv", ".txt"):
+        times = np.arange(taps.size) / fs
+        np.savetxt(output, np.column_stack([times, taps]), delimiter="," if suffix == ".csv" else "\t", fmt="%.17g")
+    else:
+        raise ValueError(f"{output} must end in {', '.join(WRITTEN)}")
+
+
+def _plot(options: argparse.Namespace) -> int:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from .plot import plot_bode, plot_impulse_responses
+
+    files = _Files(options)
+    taps = {Path(name).stem: files.path(name) for name in options.path}
+    figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
+    plot_impulse_responses(taps, fs=files.fs, ax=axes[0])
+    plot_bode(taps, fs=files.fs, ax=axes[1:])
+    figure.savefig(options.output, dpi=160)
+    print(f"{options.output} written")
+    return ENOUGH
+
+
+def _data(options: argparse.Namespace) -> int:
+    from .signals import dataset_folder, fetch_dataset, has_dataset, list_datasets
+
+    known = {one.name: one for one in list_datasets()}
+    for name in options.name:
+        if name not in known:
+            raise ValueError(f"there is no data set {name!r}; there are {', '.join(known)}")
+    folder = str(options.folder or dataset_folder())
+    if options.action == "where":
+        print(json.dumps({"folder": folder}) if options.json else folder)
+        return ENOUGH
+    facts = {}
+    for name, one in known.items():
+        if options.name and name not in options.name:
+            continue
+        if options.action == "fetch":
+            fetch_dataset(name, folder)
+        facts[name] = {
+            "title": one.title,
+            "source": f"https://github.com/{one.repository}/tree/{one.commit}",
+            "licence": one.licence,
+            "fs": one.fs,
+            "units": one.units,
+            "here": has_dataset(name, folder),
+        }
+    if options.json:
+        print(json.dumps(facts, indent=2))
+    else:
+        for name, fact in facts.items():
+            here = f"in {folder}" if fact["here"] else "not here: kfopc data fetch"
+            print(f"{name}: {fact['title']}, {fact['fs']:g} Hz; licence: {fact['licence']}; {here}")
+    return ENOUGH
+
+
+if __name__ == "__main__":
+    sys.exit(main())

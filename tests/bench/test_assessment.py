@@ -1,0 +1,292 @@
+"""The verdict on a rating: each cause from both sides, what it promises, its JSON, its page."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import re
+
+import jsonschema
+import numpy as np
+import pytest
+import soundfile
+
+from kfopc_filterpy import noise_reduction_db
+from kfopc_filterpy.bench import assess
+from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
+from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy.paths import PathTolerance
+from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
+from kfopc_filterpy.signals import band_limited_noise
+
+FS, SECONDS, TAPS = 8000, 3.0, 32
+PLENTY = 100.0  # times what full control takes
+
+
+def arriving(*samples: int, length: int = 128) -> np.ndarray:
+    """A path that hands on what comes in after so many samples, once for each."""
+    return np.eye(length)[list(samples)].sum(axis=0)
+
+
+@functools.cache
+def noise(seed: int = 1, high: float = 1500.0) -> np.ndarray:
+    return band_limited_noise((100, high), SECONDS, fs=FS, rng=seed, power=1.0)
+
+
+def heard(primary: np.ndarray, other_db: float) -> np.ndarray:
+    """A disturbance with another source, so many dB below what the reference explains."""
+    x = noise()
+    return np.convolve(x, primary)[: x.size] + 10 ** (-other_db / 20) * noise(2)
+
+
+@functools.cache
+def verdict_on(case: str, better: bool):
+    """The verdict on a scene with one fault, or without it."""
+    primary, secondary = arriving(20), arriving(6, length=16)
+    options: dict = {"rating": PLENTY, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
+    x = noise()
+    if case == "coherence":
+        options["disturbance"] = heard(primary, 15.0 if better else 2.0)
+    if case == "causality":
+        x = noise(high=3500.0)  # what a filter hardly predicts
+        primary, secondary = arriving(20 if better else 2), arriving(12, length=16)
+    if case == "filter":
+        primary = arriving(20, 100)
+        options |= {"n_taps": 128 if better else TAPS, "want_db": 8.0}
+    if case == "path":
+        options["secondary_path_uncertainty"] = PathTolerance(delay_samples=0.2 if better else 4.0)
+    if case == "amplifier":
+        options["rating"] = 0.6 if better else 0.1
+    if case == "adaptation":
+        options |= {"disturbance": heard(primary, 12.0), "want_db": 10.0, "memory_s": 0.25 if better else 0.005}
+    return assess(x, primary, secondary, fs=FS, **options)
+
+
+@pytest.mark.parametrize("case", CAUSES)
+def test_a_fault_is_found_as_the_cause(case):
+    verdict = verdict_on(case, better=False)
+    assert not verdict.enough
+    assert verdict.limited_by == case
+    assert verdict.noise_reduction_db < verdict.want_db
+    assert {"path": "secondary path"}.get(case, case) in verdict.reason.lower()
+    assert verdict.advice
+    assert repr(verdict).startswith("Not enough: KF-PB reaches")
+
+
+@pytest.mark.parametrize("case", CAUSES)
+def test_without_the_fault_the_same_scene_is_enough(case):
+    verdict = verdict_on(case, better=True)
+    assert verdict.enough
+    assert verdict.limited_by is None
+    assert verdict.reason == ""
+    assert verdict.noise_reduction_db >= verdict.want_db
+    assert repr(verdict).startswith("Enough: KF-PB reaches")
+
+
+@pytest.mark.parametrize("case", CAUSES)
+@pytest.mark.parametrize("better", [False, True])
+def test_no_ceiling_is_above_the_one_before(case, better):
+    """A fit of 32 taps to 1.3 s explains some hundredths of a dB by chance."""
+    c = verdict_on(case, better).ceilings
+    chain = [c.coherence_db, c.time_db, c.filter_db, c.path_db, c.power_db]
+    known = [value for value in chain if value is not None]
+    assert all(later <= earlier + 0.1 for earlier, later in itertools.pairwise(known))
+
+
+def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
+    """Noise within the mean power has peaks beyond a sine's: a fixed filter would do, the run does not, with more it does."""
+    x, primary, secondary = noise(), arriving(20), arriving(6, length=16)
+    options: dict = {"n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None, "want_db": 14.0, "fs": FS}
+    small = assess(x, primary, secondary, rating=AmplifierRating(ohm=1.0, sine_watt=0.75), **options)
+    assert small.ceilings.power_db >= 14.0
+    assert small.limited_by == "amplifier"
+    large = assess(x, primary, secondary, rating=AmplifierRating(ohm=1.0, sine_watt=8.0), **options)
+    assert large.enough
+
+
+def test_a_tone_is_predicted_so_that_a_late_loudspeaker_does_not_limit():
+    t = np.arange(round(SECONDS * FS)) / FS
+    x = np.sin(2 * np.pi * 300 * t) + 0.01 * np.random.default_rng(0).standard_normal(t.size)
+    verdict = assess(
+        x, arriving(2), arriving(12, length=16), rating=PLENTY, fs=FS, n_taps=TAPS, beside=(), want_db=15.0
+    )
+    assert verdict.causality_margin_s < 0
+    assert verdict.enough
+
+
+def test_the_run_keeps_the_rating_and_the_figures_are_those_of_the_run():
+    verdict = verdict_on("amplifier", better=False)
+    run = verdict.runs["KF-PB"]
+    assert overshoot(run.control_signal, 0.1, FS, window_s=0.1) <= 1 + 1e-12
+    assert verdict.noise_reduction_db == noise_reduction_db(run.error, run.disturbance)
+    figures = verdict.figures["KF-PB"]
+    assert figures["worst_window"] <= 1 + 1e-12
+    assert figures["output_power"] == pytest.approx(0.1 * figures["of_rated_power"])
+
+
+def test_the_required_power_is_that_of_the_bound_and_the_estimate_is_not_below():
+    """With a path of gain one, the best filter within a power scales: 6 dB take a quarter of the power, in closed form."""
+    verdict = verdict_on("amplifier", better=False)
+    wanted = 1 - 10 ** (-verdict.want_db / 20)
+    assert verdict.unlimited_power == pytest.approx(1.0, rel=0.03)  # the record's own second half
+    assert verdict.required_rated_power / verdict.unlimited_power == pytest.approx(wanted**2, rel=0.02)
+    assert verdict.expected_rated_power >= verdict.required_rated_power
+    enough = assess(
+        noise(),
+        arriving(20),
+        arriving(6, length=16),
+        rating=1.1 * verdict.expected_rated_power,
+        fs=FS,
+        n_taps=TAPS,
+        beside=(),
+        secondary_path_uncertainty=None,
+    )
+    assert enough.enough
+
+
+def test_the_advice_on_causality_is_a_delay_that_helps():
+    verdict = verdict_on("causality", better=False)
+    more = round(verdict.helpful_delay_s * FS)
+    helped = assess(
+        noise(high=3500.0),
+        arriving(2 + more),
+        arriving(12, length=16),
+        rating=PLENTY,
+        fs=FS,
+        n_taps=TAPS,
+        beside=(),
+        secondary_path_uncertainty=None,
+    )
+    assert helped.ceilings.filter_db >= verdict.want_db
+    assert verdict.causality_margin_s == pytest.approx(-10 / FS)
+
+
+def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
+    x, primary, secondary = noise(), arriving(20), arriving(6, length=16)
+    curve = (np.array([100.0, 300.0, 1500.0]), np.array([2.0, 1.0, 0.05]))
+
+    def on(x_max: float):
+        loudspeaker = LoudspeakerRating(8.0, x_max_mm=x_max, displacement_mm_per_volt=curve)
+        rating = [AmplifierRating(ohm=8.0, sine_watt=0.1), loudspeaker]
+        options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
+        return assess(x, primary, secondary, rating=rating, **options), loudspeaker
+
+    verdict, loudspeaker = on(0.5)
+    assert verdict.limits.decided_by == "loudspeaker's excursion"
+    assert verdict.limits.rated_power < 0.8
+    y = verdict.runs["KF-PB"].control_signal
+    moved = loudspeaker.displacement_mm(y[y.size // 2 :], FS)
+    assert np.sqrt(np.mean(moved**2)) <= 0.5 / 2.0 * 1.02
+    assert verdict.excursion_mm > 0
+    free, _ = on(50.0)
+    assert free.limits.decided_by == "amplifier"
+    assert free.limits.rated_power == pytest.approx(0.8)
+
+
+# What it writes.
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("verdict") / "out"
+    verdict = assess(
+        noise(),
+        arriving(20),
+        arriving(6, length=16),
+        rating=AmplifierRating(ohm=8.0, sine_watt=2.0, volts_per_unit=10.0),
+        fs=FS,
+        n_taps=TAPS,
+        pascal_per_unit=1.0,
+    )
+    return verdict, verdict.write(folder)
+
+
+def strict(text: str):
+    def refuse(constant):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_the_json_is_strict_and_as_its_schema_says(written):
+    verdict, page = written
+    schema = strict(SCHEMA.read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    data = strict((page.parent / "verdict.json").read_text(encoding="utf-8"))
+    jsonschema.validate(data, schema)
+    assert data == verdict.to_dict()
+    assert data["enough"] is verdict.enough
+    assert set(data["algorithms"]) == {"KF-PB", "KF-OPC", "FxLMS"}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data | {"surprise": 1}, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data | {"limited_by": "bad luck"}, schema)
+
+
+@pytest.mark.parametrize("case", CAUSES)
+def test_every_cause_is_as_the_schema_says(case):
+    jsonschema.validate(strict(verdict_on(case, better=False).json), strict(SCHEMA.read_text(encoding="utf-8")))
+
+
+def test_the_page_needs_no_other_file_and_says_the_verdict(written):
+    verdict, page = written
+    text = page.read_text(encoding="utf-8")
+    sources = re.findall(r'src="([^"]{0,40})', text)
+    assert len(sources) >= 9  # five figures, four sounds
+    assert all(source.startswith("data:") for source in sources)
+    assert not re.search(r'(?:href|src)="(?:https?:)?//', text)
+    assert verdict.verdict in text
+    for stem in re.findall(r'href="([^"#]+)"', text):
+        assert (page.parent / stem).is_file()
+
+
+def test_the_sounds_have_one_level(written):
+    verdict, page = written
+    run = verdict.runs["KF-PB"]
+    before, fs = soundfile.read(page.parent / "audio" / "verdict-before.wav")
+    after, _ = soundfile.read(page.parent / "audio" / "verdict-after.wav")
+    assert fs == FS
+    ratio = np.sum(run.disturbance**2) / np.sum(run.error**2)
+    assert np.sum(before**2) / np.sum(after**2) == pytest.approx(ratio, rel=1e-3)  # 16 bits
+
+
+def test_the_levels_are_those_of_the_sounds(written):
+    verdict, _ = written
+    run = verdict.runs["KF-PB"]
+    half = run.disturbance[run.n_samples // 2 :]
+    whole = 10 * np.log10(np.sum(10 ** (verdict.levels.before_db / 10)))
+    assert whole == pytest.approx(10 * np.log10(np.mean(half**2) / 4e-10), abs=0.3)
+    less = verdict.levels.before_dba - verdict.levels.after_dba
+    assert less == pytest.approx(verdict.noise_reduction_db, abs=3.0)  # the noise is where A is flat within 3 dB or so
+
+
+# What it refuses.
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"noise": np.zeros(8000)}, "noise must not be silent"),
+        ({"noise": np.ones(8000)}, "noise must not be silent"),
+        ({"secondary": np.zeros(8)}, "secondary must not be silent"),
+        ({"primary": None}, "primary must be given unless there is a disturbance"),
+        ({"disturbance": np.ones(7)}, "disturbance must have 8000 values, got 7"),
+        ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
+        ({"noise": np.ones((2, 8000))}, "noise must have one channel, got 2"),
+        ({"rating": 0.0}, "rating must be greater than 0"),
+        ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
+        ({"want_db": -1.0}, "want_db must not be negative"),
+        ({"switch_on_s": 2.0}, "switch_on_s must be within the 1 s"),
+        ({"n_taps": 4000}, "must have at least"),
+        ({"pascal_per_unit": 0.0}, "pascal_per_unit must be greater than 0"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_bad_input_is_refused(change, message):
+    good = {"noise": noise()[:8000], "primary": arriving(20), "secondary": arriving(6, length=16), "rating": 1.0}
+    options = good | change
+    with pytest.raises(ValueError, match=re.escape(message)):
+        assess(
+            options.pop("noise"), options.pop("primary"), options.pop("secondary"), fs=FS, **{"n_taps": 16, **options}
+        )

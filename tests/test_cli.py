@@ -1,0 +1,302 @@
+"""The command line: exit codes of real processes, one-line errors, JSON, files."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import soundfile
+
+from kfopc_filterpy import cli
+from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.paths import resample_path
+from kfopc_filterpy.signals import band_limited_noise, write_wav
+
+FS = 8000
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Files of a scene: full control takes a power of 1 of it."""
+    here = tmp_path_factory.mktemp("recordings")
+    x = band_limited_noise((100, 1500), 3.0, fs=FS, rng=1, power=1.0)
+    primary, secondary = np.eye(64)[26], np.eye(64)[12]
+    signals = {"noise": x, "P": primary, "S": secondary, "d": np.convolve(x, primary)[: x.size], "stereo": [x, x]}
+    for name, signal in signals.items():
+        write_wav(here / f"{name}.wav", signal, FS)
+    write_wav(here / "S16.wav", np.asarray(resample_path(secondary, 2 * FS, fs=FS)), 2 * FS)
+    (here / "empty.wav").write_bytes(b"")
+    (here / "text.wav").write_text("these are words")
+    return here
+
+
+@pytest.fixture
+def command(folder, monkeypatch, capsys):
+    """Run the command in the folder; return its exit code, output and errors."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        try:
+            code = cli.main([str(one) for one in arguments])
+        except SystemExit as end:
+            code = int(end.code or 0)
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def process(folder: Path, *arguments: str, standard_input: bytes | None = None) -> subprocess.CompletedProcess:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "kfopc_filterpy", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, input=standard_input)
+
+
+def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_says(folder, tmp_path):
+    out = tmp_path / "out"
+    rating = ["--watt", "10", "--ohm", "8", "--volts-per-unit", "4", "--pascal-per-unit", "1"]
+    ended = process(folder, "verdict", *SCENE, *rating, "--taps", "32", "-o", str(out))
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.startswith(b"Enough: KF-PB reaches")
+    assert sorted(path.name for path in out.iterdir()) == ["audio", "figures", "tables", "verdict.html", "verdict.json"]
+    data = json.loads((out / "verdict.json").read_text(encoding="utf-8"))
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    assert data["enough"] is True
+    assert data["rating"]["rated_power"] == pytest.approx(10 * 8 / 16)
+    assert data["levels"]["before_dba"] > data["levels"]["after_dba"]
+
+
+def test_a_process_ends_with_1_if_it_is_not_and_reads_its_standard_input(folder):
+    scene = ["-", *SCENE[1:], "--rated-power", "0.05", "--taps", "32", "--json", "--quiet"]
+    ended = process(folder, "verdict", *scene, standard_input=(folder / "noise.wav").read_bytes())
+    assert ended.returncode == 1, ended.stderr
+    data = json.loads(ended.stdout)
+    assert data["limited_by"] == "amplifier"
+    assert data["rating"]["ohm"] is None
+
+
+def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
+    ended = process(folder, "verdict", "nose.wav", *SCENE[1:], "--rated-power", "1")
+    assert ended.returncode == 2
+    assert ended.stdout == b""
+    assert ended.stderr.startswith(b"kfopc verdict: nose.wav does not exist")
+    assert ended.stderr.count(b"\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["verdict"], "the following arguments are required: noise, --secondary; see kfopc verdict --help"),
+        (["verdikt"], "invalid choice"),
+        (["verdict", *SCENE], "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6"),
+        (["verdict", *SCENE, "--watt", "20"], "need --ohm"),
+        (["verdict", *SCENE, "--watt", "20", "--ohm", "8", "--rated-power", "1"], "leave out one of them"),
+        (["verdict", *SCENE, "--watt", "twenty", "--ohm", "8"], "invalid float value: 'twenty'"),
+        (["verdict", *SCENE, "--watt", "-20", "--ohm", "8"], "sine_watt must be greater than 0 W"),
+        (
+            ["verdict", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "--primary or --disturbance is needed",
+        ),
+        (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1"], "choose with --channel 0 to --channel 1"),
+        (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1", "--channel", "2"], "channel must be below the 2"),
+        (["verdict", *SCENE[:3], "--secondary", "S16.wav", "--rated-power", "1"], "for example with --fs 16000"),
+        (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "empty.wav"),
+        (["verdict", "text.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
+        (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "algorithm must be one of 'KF-PB'"),
+        (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "cannot be written"),
+        (["verdict", *SCENE, "--loudspeaker-watt", "1"], "a loudspeaker's rating needs --ohm"),
+        (["verdict", *SCENE, "--rated-power", "1", "--ohm", "8", "--x-max-mm", "1"], "must be given together"),
+        (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "names must be one of"),
+        (["paths", "convert", "S.wav", "S.xyz"], "must end in .wav, .npy, .csv, .txt"),
+        (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "n_taps must be at least 1"),
+    ],
+    ids=lambda value: "-".join(value).replace("/", "") if isinstance(value, list) else "",
+)
+def test_an_error_is_one_line_that_says_what_to_do(command, arguments, message):
+    code, out, err = command(*arguments)
+    assert code == 2
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+    assert err.startswith("kfopc")
+
+
+@pytest.mark.parametrize("name", ["jinja2", "PIL"])
+def test_a_missing_library_is_named_with_its_extra_before_anything_runs(command, monkeypatch, name, tmp_path):
+    from kfopc_filterpy.bench import assessment_page
+
+    found = assessment_page.find_spec
+    monkeypatch.setattr(assessment_page, "find_spec", lambda one: None if one == name else found(one))
+    code, _, err = command("verdict", *SCENE, "--rated-power", "1", "-o", tmp_path / "out")
+    assert code == 2
+    assert name in err
+    assert "extra `studies`" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_tqdm_is_named_with_its_extra(command, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    code, _, err = command("verdict", *SCENE, "--rated-power", "1")
+    assert code == 2
+    assert "tqdm" in err
+    assert "extra `studies`" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["verdict"], ["compare"], ["paths"], ["paths", "identify"], ["paths", "inspect"], ["paths", "plot"]],
+)
+def test_help_says_what_it_does_and_shows_an_example(command, arguments):
+    code, out, _ = command(*arguments, "--help")
+    assert code == 0
+    assert "usage: kfopc" in out
+    if arguments != ["paths"]:
+        assert "example" in out
+        assert f"  kfopc {' '.join(arguments)}".rstrip() in out
+
+
+def test_rates_that_differ_are_resampled_each_in_its_way(command):
+    """An impulse response keeps its gain, so that the power needed stays the same: 1 for full control."""
+    scene = [*SCENE[:3], "--secondary", "S16.wav", "--rated-power", "4", "--taps", "32", "--json"]
+    code, out, _ = command("verdict", *scene, "--fs", FS)
+    assert code == 0
+    assert json.loads(out)["unlimited_power"] == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_second_measurement_of_the_path_tells_how_well_it_is_known(command, folder):
+    write_wav(folder / "other.wav", np.eye(64)[15], FS)  # three samples later: 150 % wrong at 700 Hz
+    scene = [*SCENE, "--rated-power", "4", "--taps", "32", "--json"]
+    same, _, _ = command("verdict", *scene, "--secondary-again", "S.wav")
+    code, out, _ = command("verdict", *scene, "--secondary-again", "other.wav")
+    assert (same, code) == (0, 1)
+    assert json.loads(out)["limited_by"] == "path"
+
+
+def test_a_loudspeakers_curves_are_read_from_files(command, folder):
+    (folder / "impedance.csv").write_text("20,7\n80,40\n300,6.4\n")
+    (folder / "displacement.csv").write_text("20,0.5\n4000,0.5\n")
+    rating = ["--watt", "100", "--ohm", "8", "--loudspeaker-watt", "1", "--impedance", "impedance.csv"]
+    options = ["--taps", "32", "--json", "--algorithm", "KF-PB"]
+    code, out, _ = command("verdict", *SCENE, *rating, *options)
+    assert code == 0
+    assert json.loads(out)["rating"]["rated_power"] == pytest.approx(6.4)
+    excursion = ["--x-max-mm", "0.1", "--displacement", "displacement.csv"]
+    code, out, _ = command("verdict", *SCENE, *rating, *excursion, *options)
+    assert code == 1
+    data = json.loads(out)
+    assert data["rating"]["decided_by"] == "loudspeaker's excursion"
+    assert data["rating"]["rated_power"] == pytest.approx((0.1 / 2 / 0.5) ** 2, rel=0.01)  # a response without colour
+    (folder / "words.csv").write_text("Hz,mm\n")
+    code, _, err = command("verdict", *SCENE, *rating, "--x-max-mm", "1", "--displacement", "words.csv")
+    assert code == 2
+    assert "words.csv must hold two numbers in a line" in err
+
+
+# Paths.
+
+
+def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
+    rng = np.random.default_rng(0)
+    sent = rng.standard_normal(2 * FS)
+    taps = rng.standard_normal(24) * 0.8 ** np.arange(24)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "received.wav", np.convolve(sent, taps), FS)  # recorded a little longer
+    code, out, _ = command("paths", "identify", "sent.wav", "received.wav", "--taps", 24, "-o", tmp_path / "S.wav")
+    assert code == 0
+    assert "24 taps" in out
+    found, fs = soundfile.read(tmp_path / "S.wav")
+    assert fs == FS
+    np.testing.assert_allclose(found, taps, atol=1e-4)
+
+
+@pytest.mark.parametrize("suffix", ["wav", "npy", "csv", "txt"])
+def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
+    output = tmp_path / f"S.{suffix}"
+    code, _, _ = command("paths", "convert", "S.wav", output)
+    assert code == 0
+    if suffix == "wav":
+        taps = soundfile.read(output)[0]
+    elif suffix == "npy":
+        taps = np.load(output)
+    else:
+        times, taps = np.loadtxt(output, delimiter="," if suffix == "csv" else "\t").T
+        np.testing.assert_allclose(times, np.arange(64) / FS, rtol=1e-12)
+    np.testing.assert_array_equal(taps, np.eye(64)[12])
+
+
+def test_a_path_is_resampled_with_its_gain(command, tmp_path):
+    code, _, _ = command("paths", "resample", "S.wav", tmp_path / "S.wav", "--fs", 2 * FS)
+    assert code == 0
+    taps, fs = soundfile.read(tmp_path / "S.wav")
+    assert fs == 2 * FS
+    assert taps.sum() == pytest.approx(1.0, abs=0.01)
+    assert int(np.argmax(np.abs(taps))) == 24
+
+
+def test_a_path_is_inspected_and_plotted(command, tmp_path):
+    code, out, _ = command("paths", "inspect", "S.wav", "--primary", "P.wav", "--json")
+    assert code == 0
+    facts = json.loads(out)
+    assert facts["onset_s"] == pytest.approx(12 / FS)
+    assert facts["causality_margin_s"] == pytest.approx(14 / FS)
+    assert facts["power_gain_db"] == pytest.approx(0.0, abs=1e-9)
+    code, out, _ = command("paths", "inspect", "P.wav", "--primary", "S.wav")
+    assert code == 0
+    assert "too late" in out
+    code, _, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "paths.png")
+    assert code == 0
+    assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")
+
+
+# Comparisons.
+
+
+def test_algorithms_are_compared_on_ones_own_files(command, tmp_path):
+    scene = [*SCENE, "--rated-power", "0.3", "--taps", "16", "--seconds", "1.5", "--algorithm", "FxLMS,KF-OPC"]
+    code, out, _ = command("compare", *scene, "-o", tmp_path / "out")
+    assert code == 0
+    assert "FxLMS" in out
+    assert "KF-OPC" in out
+    assert (tmp_path / "out" / "report.html").is_file()
+    results = json.loads((tmp_path / "out" / "results.json").read_text())["studies"]["own-data"]["algorithms"]
+    assert results["FxLMS"]["output_power"] > 0.3  # without a constraint
+    assert results["KF-OPC"]["output_power"] < 0.33
+
+
+# Data.
+
+
+def test_the_measured_data_are_listed_and_an_unknown_name_is_refused(command, tmp_path):
+    code, out, _ = command("data", "list", "--folder", tmp_path, "--json")
+    assert code == 0
+    facts = json.loads(out)
+    assert facts["duct"]["fs"] == 16000
+    assert facts["duct"]["here"] is False
+    assert facts["duct"]["licence"]
+    code, out, _ = command("data", "where", "--folder", tmp_path)
+    assert (code, out.strip()) == (0, str(tmp_path))
+    code, _, err = command("data", "fetch", "fan")
+    assert code == 2
+    assert "there is no data set 'fan'; there are duct" in err
+
+
+def test_a_calibrators_recording_gives_the_levels(command, folder):
+    """94 dB are 1 Pa rms, recorded here as 0.5: the noise of power 1 then has 2 Pa, 100 dB."""
+    t = np.arange(FS) / FS
+    write_wav(folder / "calibrator.wav", 0.5 * np.sqrt(2) * np.sin(2 * np.pi * 1000 * t), FS)
+    options = [*SCENE, "--rated-power", "4", "--taps", "32", "--json", "--calibrator", "calibrator.wav"]
+    code, out, _ = command("verdict", *options)
+    assert code == 0
+    bands = np.array(json.loads(out)["levels"]["before_db"])
+    assert 10 * np.log10(np.sum(10 ** (bands / 10))) == pytest.approx(100.0, abs=0.3)
+    code, _, err = command("verdict", *options, "--pascal-per-unit", "2")
+    assert code == 2
+    assert "leave out one of them" in err
