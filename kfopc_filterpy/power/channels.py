@@ -24,7 +24,7 @@ from ..kernels.block_toeplitz import (
     toeplitz_energy,
     toeplitz_product,
 )
-from .budget import DEFAULT_AVERAGING_S, DEFAULT_CREDIT_S, PACE, TARGET_LEAST
+from .budget import DEFAULT_AVERAGING_S, DEFAULT_CREDIT_S, PACE, REPAYMENT, TARGET_LEAST
 
 SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
 MOST_SWEEPS = 6  # as long as a power exceeds its target by more than
@@ -32,7 +32,6 @@ EXCESS = 1.1  # times; what is left after the last sweep is scaled down
 RIDGE = 1e-6  # of the mean energy: limits the weights in directions without energy
 LARGEST_CHANGE = 10.0  # largest ratio of power to rated power that counts in a sweep
 SMALLEST_WEIGHT = 1e-6  # of the natural weight: a penalty that is not needed must be able to grow again
-REPAYMENT = 1.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account)
 
 
 class ChannelBudget:
@@ -85,7 +84,7 @@ class ChannelBudget:
         """Add what each loudspeaker spent in a time to its account, and set the powers to solve for.
 
         The recent correlation predicts the power only roughly. The account corrects the mean: a target is the rated
-        power times ``exp(-account)``, with the account in seconds of rated power. As for one loudspeaker (see
+        power times ``exp(-3 account)``, with the account in seconds of rated power. As for one loudspeaker (see
         `PowerBudget`), half of the rated power at most repays a debt, more only if the debt exceeds a quarter of the
         averaging time, and debt beyond the averaging time is forgotten.
 
