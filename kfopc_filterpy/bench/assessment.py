@@ -23,6 +23,7 @@ from __future__ import annotations
 import json
 import os
 import textwrap
+import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -43,7 +44,6 @@ from kfopc_filterpy import (
     kf_pb,
     noise_reduction_db,
     output_power,
-    power_constrained_wiener,
     simulate,
     suggest_settings,
 )
@@ -64,7 +64,7 @@ from kfopc_filterpy.power import LoudspeakerRating, OutputLimits, output_limits
 
 from .items import jsonable
 from .registry import REGISTRY
-from .scene import Runs, Scene
+from .scene import Runs, Scene, one_blas_thread
 from .tuning import AllDivergedError, tune
 
 SCHEMA_VERSION = 1
@@ -354,6 +354,7 @@ _REASONS = {
 }
 
 
+@one_blas_thread()
 def assess(
     noise: Any,
     primary: Any,
@@ -410,7 +411,7 @@ def assess(
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     bar : tqdm bar, optional
-        Bar that advances with the samples that are run; its total is set.
+        Bar that advances with the samples that are run; its total is set, and it is described by what is going on.
 
     Returns
     -------
@@ -428,6 +429,9 @@ def assess(
     The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does not,
     it is repeated with a million times the rated power: the amplifier is the cause if that reaches it (its peaks and its
     short windows cost more than its mean power), otherwise the adaptation is.
+
+    The algorithms run side by side, on as many cores as there are. The numerical libraries get one thread meanwhile if
+    threadpoolctl is installed (it is in the extra `studies`): with filters of this size, more of them slow each other down.
 
     If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
     signal keeps it.
@@ -454,7 +458,9 @@ def assess(
         as_positive(pascal_per_unit, "pascal_per_unit", unit="Pa")
     start = switch_on_sample(switch_on_s, fs, x.size)
     delta = path_uncertainty(secondary_path_uncertainty, s)
+    names = [algorithm, *(name for name in others if name != algorithm)]
     notes: list[str] = []
+    _announce(bar, len(names) * (x.size - start), "bounds")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", np.exceptions.RankWarning)
         settings = suggest_settings(
@@ -474,16 +480,15 @@ def assess(
         notes.append("The reference is so narrow-band that larger weights could do better than the bound.")
 
     plan = _Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar)
-    names = [algorithm, *(name for name in others if name != algorithm)]
-    plan.announce(len(names))
+    _announce(bar, 0, ", ".join(names))
     runs: dict[str, SimulationResult] = {}
-    for name in names:
-        try:
-            runs[name] = plan.run(name, limited=name == algorithm)
-        except AllDivergedError as error:
-            if name == algorithm:
-                raise ValueError(f"{error}; use another algorithm") from error
-            notes.append(f"{name} is left out: {error}.")
+    for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
+        if isinstance(outcome, SimulationResult):
+            runs[name] = outcome
+        elif name == algorithm:
+            raise ValueError(f"{outcome}; use another algorithm") from outcome
+        else:
+            notes.append(f"{name} is left out: {outcome}.")
     run = runs[algorithm]
     reached = _reduction(run)
     ceilings = Ceilings(
@@ -513,7 +518,7 @@ def assess(
         algorithm=algorithm,
         limits=limits,
         ceilings=ceilings,
-        bound_db=official.noise_reduction_db,
+        bound_db=official,
         unlimited_power=float(bounds.free.control_power),
         required_rated_power=required,
         expected_rated_power=required * _price(limits.rated_power, bounds.needed(reached)),
@@ -604,19 +609,10 @@ class FixedFilters:
         weights, _ = constrained_weights(self.stretch, self._guarded, rated_power)
         return weights, self.stretch.solution(weights).noise_reduction_db
 
-    def within(self, rated_power: float) -> Any:
-        """Return the bound within the rated power, over the steady half."""
-        on = (self.x.size - self.stretch.d.size) / self.fs
-        return power_constrained_wiener(
-            self.x,
-            self.d,
-            self.s,
-            self.n_taps,
-            rated_power,
-            fs=self.fs,
-            switch_on_s=on,
-            segment_s=self.x.size / self.fs,
-        ).whole
+    def within(self, rated_power: float) -> float:
+        """Return the bound within the rated power, as a noise reduction in dB."""
+        weights, _ = constrained_weights(self.stretch, self.correlations, rated_power)
+        return self.stretch.solution(weights).noise_reduction_db
 
     def needed(self, reduction_db: float) -> float:
         """Return the rated power with which the bound reaches a noise reduction; Inf if none does, 0 below 0 dB."""
@@ -673,26 +669,29 @@ class _Plan:
     settings: SuggestedSettings
     uncertainty: Any
     bar: Any
-    planned: int = field(default=0)
+    lock: Any = field(default_factory=threading.Lock)
 
-    def announce(self, runs: int) -> None:
-        """Add runs to the bar's total."""
-        self.planned += runs
-        if self.bar is not None:
-            self.bar.total = self.planned * (self.x.size - self.start)
-            self.bar.refresh()
+    def outcome(self, name: str, limited: bool) -> SimulationResult | AllDivergedError:
+        """Return an algorithm's run, or why there is none."""
+        try:
+            return self.run(name, limited=limited)
+        except AllDivergedError as error:
+            return error
+
+    def advance(self, samples: int) -> None:
+        """Move the bar, which several threads share."""
+        with self.lock:
+            self.bar.update(samples)
 
     def run(self, name: str, *, limited: bool, freed: float = 1.0) -> SimulationResult:
         """Run an algorithm, behind a limiter or not; `freed` multiplies the rating's power."""
         limits = self.limits
         if freed != 1.0:
-            self.announce(1)
+            _announce(self.bar, self.x.size - self.start, f"{name}, unlimited")
             peak = limits.amplitude_limit
             limits = replace(
                 limits, rated_power=freed * limits.rated_power, amplitude_limit=peak and float(np.sqrt(freed)) * peak
             )
-        if self.bar is not None:
-            self.bar.set_description(name if freed == 1.0 else f"{name}, unlimited")
         peak = limits.amplitude_limit
         return simulate(
             self.controller(name, limits, limited),
@@ -703,7 +702,7 @@ class _Plan:
             amplifier=LinearAmplifier() if peak is None else HardClipAmplifier(peak),
             rated_power=limits.rated_power,
             switch_on_s=self.start / self.fs,
-            progress=None if self.bar is None else self.bar.update,
+            progress=None if self.bar is None else self.advance,
         )
 
     def controller(self, name: str, limits: OutputLimits, limited: bool) -> Any:
@@ -772,6 +771,13 @@ def recorded_scene(
         unconstrained_power=unconstrained_power,
         seeds=[0],
     )
+
+
+def _announce(bar: Any, samples: int, description: str) -> None:
+    """Add samples to a bar's total, and say what begins."""
+    if bar is not None:
+        bar.total = (bar.total or 0) + samples
+        bar.set_description(description)
 
 
 def _each(rating: Any) -> list[Any]:
