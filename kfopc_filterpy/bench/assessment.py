@@ -49,7 +49,15 @@ from kfopc_filterpy import (
 )
 from kfopc_filterpy._validate import as_channels, as_choice, as_count, as_nonnegative, as_positive, as_signal
 from kfopc_filterpy.bounds import SuggestedSettings, budgeted_rated_power, coherence_bound
-from kfopc_filterpy.bounds.wiener import Correlations, Stretch, constrained_weights, full_stretch, reduction_db
+from kfopc_filterpy.bounds.wiener import (
+    Correlations,
+    Stretch,
+    constrained_weights,
+    full_stretch,
+    loss_db,
+    reduction_db,
+    warn_of_loss,
+)
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
     convergence_time_s,
@@ -610,8 +618,12 @@ class FixedFilters:
         return weights, self.stretch.solution(weights).noise_reduction_db
 
     def within(self, rated_power: float) -> float:
-        """Return the bound within the rated power, as a noise reduction in dB."""
-        weights, _ = constrained_weights(self.stretch, self.correlations, rated_power)
+        """Return the bound within the rated power, as a noise reduction in dB; warn if larger weights could do better."""
+        own = self.correlations
+        weights, penalty = constrained_weights(self.stretch, own, rated_power)
+        warn_of_loss(
+            max(loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights))
+        )
         return self.stretch.solution(weights).noise_reduction_db
 
     def needed(self, reduction_db: float) -> float:
