@@ -621,9 +621,7 @@ class FixedFilters:
         """Return the bound within the rated power, as a noise reduction in dB; warn if larger weights could do better."""
         own = self.correlations
         weights, penalty = constrained_weights(self.stretch, own, rated_power)
-        warn_of_loss(
-            max(loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights))
-        )
+        warn_of_loss(max(loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights)))
         return self.stretch.solution(weights).noise_reduction_db
 
     def needed(self, reduction_db: float) -> float:
