@@ -184,8 +184,9 @@ class Assessment:
     required_rated_power : float
         Rated power with which the bound reaches the noise reduction wanted; Inf if it is out of reach.
     expected_rated_power : float
-        An estimate of the rated power that the controller needs: `required_rated_power`, times the rated power over the
-        one with which the bound reaches what the controller reached. Inf if it is out of reach.
+        An estimate of the rated power that the controller needs: `required_rated_power`, times the power of the rating
+        that its run took (by its worst window or its highest peak) over the one with which the bound reaches what the
+        controller reached. Inf if it is out of reach.
     causality_margin_s : float or None
         Time by which the anti-noise is early; None without a primary path.
     helpful_delay_s : float or None
@@ -529,7 +530,7 @@ def assess(
         bound_db=official,
         unlimited_power=float(bounds.free.control_power),
         required_rated_power=required,
-        expected_rated_power=required * _price(limits.rated_power, bounds.needed(reached)),
+        expected_rated_power=required * _price(_taken(run, limits), bounds.needed(reached)),
         causality_margin_s=margin,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, delta, fs),
@@ -800,9 +801,18 @@ def _reduction(run: SimulationResult) -> float:
     return -np.inf if np.isnan(reached) else reached
 
 
-def _price(rated_power: float, of_the_bound: float) -> float:
+def _taken(run: SimulationResult, limits: OutputLimits) -> float:
+    """Return the least rated power, with limits in proportion, that would have left the run as it is."""
+    worst = overshoot(run.control_signal, limits.rated_power, run.fs, window_s=limits.window_s)
+    peak = peak_control_signal(run.control_signal, steady=1.0)
+    of_peak = 0.0 if limits.amplitude_limit is None else (peak / limits.amplitude_limit) ** 2
+    share = max(worst, of_peak)
+    return limits.rated_power * (min(share, 1.0) if np.isfinite(share) else 1.0)
+
+
+def _price(taken: float, of_the_bound: float) -> float:
     """Return how many times the power of the bound the controller takes, at least 1; Inf if it reached nothing."""
-    return max(rated_power / of_the_bound, 1.0) if of_the_bound > 0 else np.inf
+    return max(taken / of_the_bound, 1.0) if of_the_bound > 0 else np.inf
 
 
 def _cause(ceilings: Ceilings, want_db: float) -> str:

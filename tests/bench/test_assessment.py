@@ -145,6 +145,17 @@ def test_the_required_power_is_that_of_the_bound_and_the_estimate_is_not_below()
     assert enough.enough
 
 
+@pytest.mark.parametrize("rating", [PLENTY, AmplifierRating(ohm=1.0, sine_watt=PLENTY)], ids=["power", "amplifier"])
+def test_the_estimate_does_not_grow_with_a_rating_that_the_run_does_not_use(rating):
+    more = 10 * PLENTY if rating is PLENTY else AmplifierRating(ohm=1.0, sine_watt=10 * PLENTY)
+    options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
+    large, larger = (
+        assess(noise(), arriving(20), arriving(6, length=16), rating=one, **options) for one in (rating, more)
+    )
+    assert large.expected_rated_power == pytest.approx(larger.expected_rated_power, rel=0.05)
+    assert large.required_rated_power <= large.expected_rated_power < 10 * large.unlimited_power
+
+
 def test_the_advice_on_causality_is_a_delay_that_helps():
     verdict = verdict_on("causality", better=False)
     more = round(verdict.helpful_delay_s * FS)
