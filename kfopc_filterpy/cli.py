@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -140,8 +139,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 done or enough, 1 not enough, 2 wrong input.
     """
-    # A filter of some hundred taps gains nothing from more threads, and they get in each other's way.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     options = _parser().parse_args(arguments)
     try:
         return options.run(options)
@@ -395,8 +392,9 @@ def _verdict(options: argparse.Namespace) -> int:
             pascal_per_unit=_pascal_per_unit(options),
             bar=bar,
         )
-    if options.output is not None:
-        page = verdict.write(options.output)
+        if options.output is not None:
+            bar.set_description("page")
+            page = verdict.write(options.output)
     print(verdict.json if options.json else verdict)
     if options.output is not None and not options.json:
         print(f"{page} and verdict.json written")

@@ -23,6 +23,7 @@ from __future__ import annotations
 import json
 import os
 import textwrap
+import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -43,13 +44,20 @@ from kfopc_filterpy import (
     kf_pb,
     noise_reduction_db,
     output_power,
-    power_constrained_wiener,
     simulate,
     suggest_settings,
 )
 from kfopc_filterpy._validate import as_channels, as_choice, as_count, as_nonnegative, as_positive, as_signal
 from kfopc_filterpy.bounds import SuggestedSettings, budgeted_rated_power, coherence_bound
-from kfopc_filterpy.bounds.wiener import Correlations, Stretch, constrained_weights, full_stretch, reduction_db
+from kfopc_filterpy.bounds.wiener import (
+    Correlations,
+    Stretch,
+    constrained_weights,
+    full_stretch,
+    loss_db,
+    reduction_db,
+    warn_of_loss,
+)
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
     convergence_time_s,
@@ -64,7 +72,7 @@ from kfopc_filterpy.power import LoudspeakerRating, OutputLimits, output_limits
 
 from .items import jsonable
 from .registry import REGISTRY
-from .scene import Runs, Scene
+from .scene import Runs, Scene, one_blas_thread
 from .tuning import AllDivergedError, tune
 
 SCHEMA_VERSION = 1
@@ -176,8 +184,9 @@ class Assessment:
     required_rated_power : float
         Rated power with which the bound reaches the noise reduction wanted; Inf if it is out of reach.
     expected_rated_power : float
-        An estimate of the rated power that the controller needs: `required_rated_power`, times the rated power over the
-        one with which the bound reaches what the controller reached. Inf if it is out of reach.
+        An estimate of the rated power that the controller needs: `required_rated_power`, times the power of the rating
+        that its run took (by its worst window or its highest peak) over the one with which the bound reaches what the
+        controller reached. Inf if it is out of reach.
     causality_margin_s : float or None
         Time by which the anti-noise is early; None without a primary path.
     helpful_delay_s : float or None
@@ -354,6 +363,7 @@ _REASONS = {
 }
 
 
+@one_blas_thread()
 def assess(
     noise: Any,
     primary: Any,
@@ -410,7 +420,7 @@ def assess(
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     bar : tqdm bar, optional
-        Bar that advances with the samples that are run; its total is set.
+        Bar that advances with the samples that are run; its total is set, and it is described by what is going on.
 
     Returns
     -------
@@ -428,6 +438,9 @@ def assess(
     The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does not,
     it is repeated with a million times the rated power: the amplifier is the cause if that reaches it (its peaks and its
     short windows cost more than its mean power), otherwise the adaptation is.
+
+    The algorithms run side by side, on as many cores as there are. The numerical libraries get one thread meanwhile if
+    threadpoolctl is installed (it is in the extra `studies`): with filters of this size, more of them slow each other down.
 
     If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
     signal keeps it.
@@ -454,7 +467,9 @@ def assess(
         as_positive(pascal_per_unit, "pascal_per_unit", unit="Pa")
     start = switch_on_sample(switch_on_s, fs, x.size)
     delta = path_uncertainty(secondary_path_uncertainty, s)
+    names = [algorithm, *(name for name in others if name != algorithm)]
     notes: list[str] = []
+    _announce(bar, len(names) * (x.size - start), "bounds")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", np.exceptions.RankWarning)
         settings = suggest_settings(
@@ -474,16 +489,15 @@ def assess(
         notes.append("The reference is so narrow-band that larger weights could do better than the bound.")
 
     plan = _Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar)
-    names = [algorithm, *(name for name in others if name != algorithm)]
-    plan.announce(len(names))
+    _announce(bar, 0, ", ".join(names))
     runs: dict[str, SimulationResult] = {}
-    for name in names:
-        try:
-            runs[name] = plan.run(name, limited=name == algorithm)
-        except AllDivergedError as error:
-            if name == algorithm:
-                raise ValueError(f"{error}; use another algorithm") from error
-            notes.append(f"{name} is left out: {error}.")
+    for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
+        if isinstance(outcome, SimulationResult):
+            runs[name] = outcome
+        elif name == algorithm:
+            raise ValueError(f"{outcome}; use another algorithm") from outcome
+        else:
+            notes.append(f"{name} is left out: {outcome}.")
     run = runs[algorithm]
     reached = _reduction(run)
     ceilings = Ceilings(
@@ -513,10 +527,10 @@ def assess(
         algorithm=algorithm,
         limits=limits,
         ceilings=ceilings,
-        bound_db=official.noise_reduction_db,
+        bound_db=official,
         unlimited_power=float(bounds.free.control_power),
         required_rated_power=required,
-        expected_rated_power=required * _price(limits.rated_power, bounds.needed(reached)),
+        expected_rated_power=required * _price(_taken(run, limits), bounds.needed(reached)),
         causality_margin_s=margin,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, delta, fs),
@@ -604,19 +618,12 @@ class FixedFilters:
         weights, _ = constrained_weights(self.stretch, self._guarded, rated_power)
         return weights, self.stretch.solution(weights).noise_reduction_db
 
-    def within(self, rated_power: float) -> Any:
-        """Return the bound within the rated power, over the steady half."""
-        on = (self.x.size - self.stretch.d.size) / self.fs
-        return power_constrained_wiener(
-            self.x,
-            self.d,
-            self.s,
-            self.n_taps,
-            rated_power,
-            fs=self.fs,
-            switch_on_s=on,
-            segment_s=self.x.size / self.fs,
-        ).whole
+    def within(self, rated_power: float) -> float:
+        """Return the bound within the rated power, as a noise reduction in dB; warn if larger weights could do better."""
+        own = self.correlations
+        weights, penalty = constrained_weights(self.stretch, own, rated_power)
+        warn_of_loss(max(loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights)))
+        return self.stretch.solution(weights).noise_reduction_db
 
     def needed(self, reduction_db: float) -> float:
         """Return the rated power with which the bound reaches a noise reduction; Inf if none does, 0 below 0 dB."""
@@ -673,26 +680,29 @@ class _Plan:
     settings: SuggestedSettings
     uncertainty: Any
     bar: Any
-    planned: int = field(default=0)
+    lock: Any = field(default_factory=threading.Lock)
 
-    def announce(self, runs: int) -> None:
-        """Add runs to the bar's total."""
-        self.planned += runs
-        if self.bar is not None:
-            self.bar.total = self.planned * (self.x.size - self.start)
-            self.bar.refresh()
+    def outcome(self, name: str, limited: bool) -> SimulationResult | AllDivergedError:
+        """Return an algorithm's run, or why there is none."""
+        try:
+            return self.run(name, limited=limited)
+        except AllDivergedError as error:
+            return error
+
+    def advance(self, samples: int) -> None:
+        """Move the bar, which several threads share."""
+        with self.lock:
+            self.bar.update(samples)
 
     def run(self, name: str, *, limited: bool, freed: float = 1.0) -> SimulationResult:
         """Run an algorithm, behind a limiter or not; `freed` multiplies the rating's power."""
         limits = self.limits
         if freed != 1.0:
-            self.announce(1)
+            _announce(self.bar, self.x.size - self.start, f"{name}, unlimited")
             peak = limits.amplitude_limit
             limits = replace(
                 limits, rated_power=freed * limits.rated_power, amplitude_limit=peak and float(np.sqrt(freed)) * peak
             )
-        if self.bar is not None:
-            self.bar.set_description(name if freed == 1.0 else f"{name}, unlimited")
         peak = limits.amplitude_limit
         return simulate(
             self.controller(name, limits, limited),
@@ -703,7 +713,7 @@ class _Plan:
             amplifier=LinearAmplifier() if peak is None else HardClipAmplifier(peak),
             rated_power=limits.rated_power,
             switch_on_s=self.start / self.fs,
-            progress=None if self.bar is None else self.bar.update,
+            progress=None if self.bar is None else self.advance,
         )
 
     def controller(self, name: str, limits: OutputLimits, limited: bool) -> Any:
@@ -774,6 +784,13 @@ def recorded_scene(
     )
 
 
+def _announce(bar: Any, samples: int, description: str) -> None:
+    """Add samples to a bar's total, and say what begins."""
+    if bar is not None:
+        bar.total = (bar.total or 0) + samples
+        bar.set_description(description)
+
+
 def _each(rating: Any) -> list[Any]:
     return list(rating) if isinstance(rating, list | tuple) else [rating]
 
@@ -784,9 +801,18 @@ def _reduction(run: SimulationResult) -> float:
     return -np.inf if np.isnan(reached) else reached
 
 
-def _price(rated_power: float, of_the_bound: float) -> float:
+def _taken(run: SimulationResult, limits: OutputLimits) -> float:
+    """Return the least rated power, with limits in proportion, that would have left the run as it is."""
+    worst = overshoot(run.control_signal, limits.rated_power, run.fs, window_s=limits.window_s)
+    peak = peak_control_signal(run.control_signal, steady=1.0)
+    of_peak = 0.0 if limits.amplitude_limit is None else (peak / limits.amplitude_limit) ** 2
+    share = max(worst, of_peak)
+    return limits.rated_power * (min(share, 1.0) if np.isfinite(share) else 1.0)
+
+
+def _price(taken: float, of_the_bound: float) -> float:
     """Return how many times the power of the bound the controller takes, at least 1; Inf if it reached nothing."""
-    return max(rated_power / of_the_bound, 1.0) if of_the_bound > 0 else np.inf
+    return max(taken / of_the_bound, 1.0) if of_the_bound > 0 else np.inf
 
 
 def _cause(ceilings: Ceilings, want_db: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,8 @@ from .page import images, players, rendered
 from .report import prepare_folder, write_files, write_whole
 
 if TYPE_CHECKING:
+    from kfopc_filterpy import SimulationResult
+
     from .assessment import Assessment
 
 TEMPLATE = "verdict.html.jinja"
@@ -87,10 +90,16 @@ def _figures(verdict: Assessment) -> Any:
         "the power it took.",
         figure,
     )
+
+    def draw_power(runs: dict[str, SimulationResult], ax: Any) -> None:
+        scale = verdict.watt_per_power or 1.0
+        plot_output_power({name: _scaled(run, scale) for name, run in runs.items()}, ax=ax)
+        ax.set_ylabel(_power_label(verdict))
+
     plots: list[tuple[str, Any, str]] = [
         ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half."),
         ("nse", plot_nse, "Error power over that of the disturbance; below 0 dB it is quieter than without control."),
-        ("power", plot_output_power, "Mean power of the control signal over a sliding window, and the rated power."),
+        ("power", draw_power, "Mean power of the control signal over a sliding window, and the rated power."),
     ]
     for stem, draw, caption in plots:
         figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
@@ -102,10 +111,17 @@ def _figures(verdict: Assessment) -> Any:
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
+def _scaled(run: SimulationResult, scale: float) -> SimulationResult:
+    """Return a run whose powers of the control signal are multiplied."""
+    rated = None if run.rated_power is None else scale * run.rated_power
+    return replace(run, control_signal=np.sqrt(scale) * run.control_signal, rated_power=rated)
+
+
 def _draw_bound(verdict: Assessment, ax: Any) -> None:
     """Draw the bound against the rated power, with what is wanted, the rating and the runs."""
     scale = verdict.watt_per_power or 1.0
     powers, reached = verdict.curve
+    right = 2 * scale * powers.max()  # a run without a constraint may ask for a million times as much
     ax.semilogx(scale * powers, reached, color="0.2", label="best fixed filter")
     ax.axvline(scale * verdict.limits.rated_power, color="0.2", linestyle="--", label="rated power")
     ax.axhline(verdict.want_db, color="0.5", linestyle=":", label="wanted")
@@ -113,10 +129,10 @@ def _draw_bound(verdict: Assessment, ax: Any) -> None:
         power, own = figures["output_power"], figures["noise_reduction_db"]
         if power and own is not None and np.isfinite(power) and np.isfinite(own):
             style = curve_style(name)
-            ax.plot(scale * power, own, style["marker"], color=style["color"], label=name)
-    ax.set_xlabel(
-        "Power of the control signal" if verdict.watt_per_power is None else f"Power (W into {verdict.ohm:g} ohm)"
-    )
+            label = name if scale * power <= right else f"{name}, beyond: {scale * power:.2g}"
+            ax.plot(min(scale * power, right), own, style["marker"], color=style["color"], label=label, clip_on=False)
+    ax.set_xlim(right=right)
+    ax.set_xlabel(_power_label(verdict))
     ax.set_ylabel("Noise reduction (dB)")
     ax.grid(True, which="both", alpha=0.25)
     ax.legend(fontsize="small")
@@ -158,7 +174,7 @@ def _sounds(verdict: Assessment) -> list[Sound]:
 
 def _tables(verdict: Assessment) -> Any:
     """Yield the tables: what limits, the algorithms, the bands."""
-    taps = verdict.settings.n_taps
+    taps, volts = verdict.settings.n_taps, verdict.volts_per_unit
     rows: list[list[str | float]] = []
     for name, what, cause in CHAIN:
         value = getattr(verdict.ceilings, name)
@@ -167,19 +183,26 @@ def _tables(verdict: Assessment) -> Any:
     adapting = "limits" if verdict.limited_by == "adaptation" else ""
     rows.append([f"The run of {verdict.algorithm}", f"{verdict.noise_reduction_db:.1f} dB", adapting])
     rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
-    yield Table("ceilings", "What limits", ["It may use", "Noise reduction", ""], rows)
+    yield Table("ceilings", "What limits", ["Ceiling", "Noise reduction", ""], rows)
     yield Table(
         "algorithms",
         "The controllers",
-        ["Controller", "Noise reduction (dB)", "Power", "Of the rated power", "Worst window", "Highest peak"],
+        [
+            "Controller",
+            "Noise reduction (dB)",
+            _power_label(verdict),
+            "Over the rated power",
+            "Worst window",
+            "Highest peak" if volts is None else "Highest peak (V)",
+        ],
         [
             [
                 name if name == verdict.algorithm else f"{name}, as published",
                 _number(own["noise_reduction_db"]),
-                verdict.power(own["output_power"]) if own["output_power"] is not None else "–",
+                _number(own["output_power"], verdict.watt_per_power),
                 _number(own["of_rated_power"]),
                 _number(own["worst_window"]),
-                _number(own["peak_control_signal"]),
+                _number(own["peak_control_signal"], volts),
             ]
             for name, own in verdict.figures.items()
         ],
@@ -198,21 +221,27 @@ def _tables(verdict: Assessment) -> Any:
         )
 
 
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else float(value)
+def _number(value: float | None, scale: float | None = None) -> float:
+    """Return a figure of merit, in the unit that a scale gives if there is one; NaN if it is not defined."""
+    return float("nan") if value is None else float(value) * (scale or 1.0)
+
+
+def _power_label(verdict: Assessment) -> str:
+    return "Power (mean square)" if verdict.watt_per_power is None else f"Power (W into {verdict.ohm:g} ohm)"
 
 
 def _checks(verdict: Assessment) -> list[tuple[str, str]]:
     """Return what was checked, and what was found, in words."""
     band, limits = verdict.band, verdict.limits
     late = verdict.causality_margin_s
-    peak = "none" if limits.amplitude_limit is None else f"{limits.amplitude_limit:.3g}"
-    if verdict.volts_per_unit is not None and limits.amplitude_limit is not None:
-        peak += f", {limits.amplitude_limit * verdict.volts_per_unit:.3g} V"
+    peak = "no peak limit"
+    if limits.amplitude_limit is not None:
+        in_volts = verdict.volts_per_unit is not None
+        peak = f"peak limit {_number(limits.amplitude_limit, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"
     checks = [
         (
             "Rating",
-            f"{verdict.power(limits.rated_power)}, decided by the {limits.decided_by}; peak limit {peak}; "
+            f"{verdict.power(limits.rated_power)}, decided by the {limits.decided_by}; {peak}; "
             f"windows of {limits.window_s:g} s",
         ),
         ("Power for full control", verdict.power(verdict.unlimited_power)),

@@ -16,10 +16,11 @@ from kfopc_filterpy.power import output_limits
 from .assessment import LONGEST, recorded_scene, recorded_signals, switch_on_sample
 from .items import FigureItem, Parameter, Sound, StudyReport
 from .registry import REGISTRY, algorithms
-from .scene import Runs, figures_of_merit
+from .scene import Runs, figures_of_merit, one_blas_thread
 from .tuning import RULE, AllDivergedError, run_setting, tune
 
 
+@one_blas_thread()
 def compare_recordings(
     noise: Any,
     primary: Any,

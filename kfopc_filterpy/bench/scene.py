@@ -39,6 +39,21 @@ Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
 
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Give numpy's and scipy's BLAS one thread, if threadpoolctl is there.
+
+    A filter of some hundred taps gains nothing from more, and the threads of several runs get in each other's way.
+    """
+    try:
+        from threadpoolctl import threadpool_limits
+    except ModuleNotFoundError:  # only the speed differs
+        yield
+        return
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
 class Runs:
     """Jobs on all cores, with one progress bar for all of them.
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import soundfile
 
-from kfopc_filterpy import noise_reduction_db
-from kfopc_filterpy.bench import assess
+from kfopc_filterpy import kf_pb, noise_reduction_db
+from kfopc_filterpy.bench import assess, assessment
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import PathTolerance
@@ -145,6 +145,17 @@ def test_the_required_power_is_that_of_the_bound_and_the_estimate_is_not_below()
     assert enough.enough
 
 
+@pytest.mark.parametrize("rating", [PLENTY, AmplifierRating(ohm=1.0, sine_watt=PLENTY)], ids=["power", "amplifier"])
+def test_the_estimate_does_not_grow_with_a_rating_that_the_run_does_not_use(rating):
+    more = 10 * PLENTY if rating is PLENTY else AmplifierRating(ohm=1.0, sine_watt=10 * PLENTY)
+    options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
+    large, larger = (
+        assess(noise(), arriving(20), arriving(6, length=16), rating=one, **options) for one in (rating, more)
+    )
+    assert large.expected_rated_power == pytest.approx(larger.expected_rated_power, rel=0.05)
+    assert large.required_rated_power <= large.expected_rated_power < 10 * large.unlimited_power
+
+
 def test_the_advice_on_causality_is_a_delay_that_helps():
     verdict = verdict_on("causality", better=False)
     more = round(verdict.helpful_delay_s * FS)
@@ -182,6 +193,39 @@ def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
     free, _ = on(50.0)
     assert free.limits.decided_by == "amplifier"
     assert free.limits.rated_power == pytest.approx(0.8)
+
+
+def test_long_filters_run_in_float32_with_the_same_verdict_unless_it_cannot_hold_the_state_noise(monkeypatch):
+    used = []
+
+    def spy(*arguments, **options):
+        used.append(options["dtype"])
+        return kf_pb(*arguments, **options)
+
+    def on(memory_s: float = 0.25):
+        return assess(
+            noise(),
+            None,
+            arriving(6, length=16),
+            disturbance=heard(arriving(20, 100), 10.0),
+            rating=0.3,
+            fs=FS,
+            n_taps=assessment.MANY_TAPS,
+            beside=(),
+            secondary_path_uncertainty=None,
+            memory_s=memory_s,
+        )
+
+    monkeypatch.setattr(assessment, "kf_pb", spy)
+    short, slow = on(), on(memory_s=1000.0)  # the state noise goes with the inverse square of the memory
+    monkeypatch.setattr(assessment._Plan, "precision", np.float64)
+    exact = on()
+    assert used == [np.float32, np.float64, np.float64]
+    assert slow.settings.state_noise < 1e-6 * short.settings.state_noise
+    assert short.noise_reduction_db != exact.noise_reduction_db
+    assert short.noise_reduction_db == pytest.approx(exact.noise_reduction_db, abs=0.01)
+    assert (short.enough, short.limited_by) == (exact.enough, exact.limited_by) == (False, "amplifier")
+    assert short.figures["KF-PB"]["worst_window"] <= 1 + 1e-6
 
 
 # What it writes.
