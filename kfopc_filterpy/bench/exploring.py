@@ -33,6 +33,7 @@ MOST_FS = 16000.0  # files with a higher rate are resampled, so that a run takes
 POWER_WINDOW_S = 0.05
 POWER_EVERY_S = 0.01
 SEGMENT_S = 0.064  # of the spectra
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +173,7 @@ class ExploreResult:
     disturbance_spectrum_db, error_spectrum_db : ndarray, shape (n_bins,)
         Power densities over the steady half of the run, in dB re 1/Hz.
     time_s : ndarray, shape (n_times,)
-        Times of the powers in seconds, every 10 ms.
+        Times of the powers in seconds, every 10 ms from 50 ms on.
     disturbance_power, error_power, asked_power, delivered_power : ndarray, shape (n_times,)
         Mean squares over the last 50 ms of the disturbance, the error, the control signal and the amplifier's output.
     noise_reduction_db : float
@@ -220,7 +221,7 @@ class ExploreResult:
         """What the run shows, in words."""
         name = self.settings.algorithm
         if self.diverged_at_s is not None:
-            return f"{name} diverged {self.diverged_at_s:.2f} s after it was switched on."
+            return f"{name} diverged {self.diverged_at_s:.3f} s after it was switched on."
         change = f"reduces the noise by {self.noise_reduction_db:.1f} dB"
         if self.noise_reduction_db < 0.0:
             change = f"makes the noise {-self.noise_reduction_db:.1f} dB louder"
@@ -379,9 +380,9 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
     with reachable_weights():
         bound = power_constrained_solution(*scene.settled, scene.secondary, N_TAPS, rated)
     frequencies, of_disturbance = power_spectrum_db(run.disturbance, run.fs, segment_s=SEGMENT_S)
-    every = round(POWER_EVERY_S * run.fs)
+    shown = slice(round(POWER_WINDOW_S * run.fs) - 1, None, round(POWER_EVERY_S * run.fs))  # from the first full window
     powers = {
-        name: short_time_power(signal, run.fs, POWER_WINDOW_S)[::every]
+        name: short_time_power(signal, run.fs, POWER_WINDOW_S)[shown]
         for name, signal in (
             ("disturbance_power", run.disturbance),
             ("error_power", run.error),
@@ -401,7 +402,7 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
         frequencies_hz=frequencies,
         disturbance_spectrum_db=of_disturbance,
         error_spectrum_db=power_spectrum_db(run.error, run.fs, segment_s=SEGMENT_S)[1],
-        time_s=run.time_s[::every],
+        time_s=run.time_s[shown],
         **powers,
         noise_reduction_db=noise_reduction_db(run.error, run.disturbance),
         output_power=output_power(run.control_signal),
@@ -437,7 +438,7 @@ def _noise(setup: AcousticSetup, band: tuple[float, float]) -> np.ndarray:
     spectrum = np.fft.rfft(setup.noise)
     frequencies = np.fft.rfftfreq(setup.noise.size, 1 / setup.fs)
     inside = (frequencies >= band[0]) & (frequencies <= band[1])
-    if not np.any(np.abs(spectrum[inside]) > 0.0):
+    if np.linalg.norm(spectrum[inside]) <= ROUNDING * np.linalg.norm(spectrum):
         raise ValueError(f"the recording is silent from {band[0]:g} to {band[1]:g} Hz: choose a wider band")
     return np.fft.irfft(np.where(inside, spectrum, 0.0), setup.noise.size)
 

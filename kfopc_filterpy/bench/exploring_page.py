@@ -69,7 +69,7 @@ def serve_explore(
     Raises
     ------
     ModuleNotFoundError
-        If Bokeh is not installed.
+        If Bokeh or threadpoolctl is not installed.
     OSError
         If the port is in use or not allowed.
     ValueError, TypeError
@@ -90,9 +90,10 @@ def serve_explore(
         from bokeh.application import Application
         from bokeh.application.handlers import FunctionHandler
         from bokeh.server.server import Server
+        from threadpoolctl import threadpool_limits
     except ImportError as error:
         raise ModuleNotFoundError(
-            'the page needs Bokeh: install the extra `explore`, python -m pip install "kfopc-filterpy[explore]"'
+            'the page needs Bokeh and threadpoolctl: install the extra `explore`, python -m pip install "kfopc-filterpy[explore]"'
         ) from error
     choices = list(explore_setups() if setups is None else setups)
     if not choices:
@@ -106,7 +107,9 @@ def serve_explore(
     server.start()
     announce(f"open http://{ADDRESS}:{port}/ in a browser; Ctrl+C ends it")
     try:
-        server.io_loop.start()
+        # Systems of 128 unknowns gain nothing from more threads, which wait for each other if the cores have other work.
+        with threadpool_limits(1):
+            server.io_loop.start()
     except KeyboardInterrupt:
         announce("ended")
     finally:
@@ -190,7 +193,7 @@ class _Page:
             "step_size": is_kalman,
         }
         for name, value in disabled.items():
-            self.controls[name].disabled = value
+            self.controls[name].update(disabled=value, styles={"opacity": "0.4" if value else "1"})
 
     def _settings(self) -> ExploreSettings:
         value = {name: getattr(control, "value", None) for name, control in self.controls.items()}
@@ -263,8 +266,9 @@ class _Page:
 
 def curves(result: ExploreResult) -> dict[str, dict[str, np.ndarray]]:
     """Return the curves of the page's plots: "spectrum", "wave", "power" and "level"."""
-    first = max(result.control_signal.size - round(WAVE_S * result.fs), 0)
-    asked, delivered = result.control_signal[first:], result.amplifier_output[first:]
+    end = result.control_signal.size if result.diverged_at_s is None else round(result.diverged_at_s * result.fs)
+    last = slice(max(end - round(WAVE_S * result.fs), 0), end)
+    asked, delivered = result.control_signal[last], result.amplifier_output[last]
     limit = np.full(asked.size, result.amplitude_limit)
     heard = result.frequencies_hz >= LOWEST_HZ
     powers = {"asked": result.asked_power, "delivered": result.delivered_power}
@@ -276,7 +280,7 @@ def curves(result: ExploreResult) -> dict[str, dict[str, np.ndarray]]:
             "error": result.error_spectrum_db[heard],
         },
         "wave": {
-            "x": 1000 * (first + np.arange(asked.size)) / result.fs,
+            "x": 1000 * np.arange(last.start, end) / result.fs,
             "asked": asked,
             "delivered": delivered,
             "upper": limit,
@@ -331,8 +335,8 @@ def _controls(setups: list[AcousticSetup]) -> dict[str, Any]:
             format="0",
             width=SIDE,
         ),
-        "path_error": slider("path_error", "True path later than the known one (samples)", 0, 4, 0, 0.5),
-        "tolerance": slider("tolerance", "Such an error that KF-PB allows for (samples)", 0, 4, 0.5, 0.25),
+        "path_error": slider("path_error", "True path later than the known path (samples)", 0, 4, 0, 0.5),
+        "tolerance": slider("tolerance", "Such an error KF-PB is prepared for (samples)", 0, 4, 0.5, 0.25),
         "state_noise": slider(
             "state_noise", "State noise r E[x'²]/q", -9, -3, np.log10(default.state_noise), 0.5, format=power_of_ten
         ),
@@ -390,7 +394,7 @@ def _texts() -> dict[str, Any]:
     width = 2 * WIDTH
     return {
         "status": Div(name="status", text="", width=width, styles={"color": "#555555"}),
-        "summary": Div(name="summary", text="", width=width, min_height=40),
+        "summary": Div(name="summary", text="", width=width, min_height=66),
         "sounds": Div(name="sounds", text="", width=width),
     }
 
@@ -404,8 +408,8 @@ def _players(result: ExploreResult) -> str:
     for name, signal in sounds.items():
         source = data_uri(flac(np.clip(signal / full, -1.0, 1.0), result.fs), "audio/flac")
         players.append(
-            f'<figure style="margin:0;display:inline-block;width:48%"><figcaption>{name}</figcaption>'
-            f'<audio controls style="width:95%" src="{source}"></audio></figure>'
+            f'<figure style="margin:0;display:inline-block;width:445px"><figcaption>{name}</figcaption>'
+            f'<audio controls style="width:425px" src="{source}"></audio></figure>'
         )
     cut = " What exceeds four times the peak of the noise is cut off." if full < max(peaks) else ""
     note = '<p style="margin:2px 0;color:#555555">Both have one scale. The control is switched on as they begin.'

@@ -26,7 +26,9 @@ PATIENCE_S = 120.0  # for the first run of an algorithm, which compiles
 FOLLOWS_S = 1.0  # from a move of a slider to the new curves, in the median
 SLOWEST_S = 4.0  # of all moves, on a machine with other work
 
-SERVER = "from kfopc_filterpy.bench import serve_explore; serve_explore(port=0, announce=lambda s: print(s, flush=True))"
+SERVER = (
+    "from kfopc_filterpy.bench import serve_explore; serve_explore(port=0, announce=lambda s: print(s, flush=True))"
+)
 WATCH = """
 const page = Bokeh.documents[0], plots = ["spectrum", "wave", "power", "level"]
 window.copies = () => Object.fromEntries(plots.map(name => {
@@ -73,9 +75,8 @@ NAMES = sorted({name for name, *_ in MOVES})
 @pytest.fixture(scope="module")
 def address() -> Iterator[str]:
     """The address of the page, served by another process on a free port."""
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
     command = [sys.executable, "-c", SERVER]
-    with subprocess.Popen(command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
         assert server.stdout is not None
         line = server.stdout.readline()
         assert line.startswith("open http://127.0.0.1:"), line
@@ -187,11 +188,15 @@ def test_the_page_shows_the_run_of_its_sliders_and_plays_it(address, browser):
     for plot, data in expected.items():
         for key, curve in data.items():
             got = np.array(shown[plot][key], dtype=float)
-            np.testing.assert_allclose(got, np.where(np.isfinite(curve), curve, np.nan), rtol=1e-9, err_msg=f"{plot} {key}")
+            np.testing.assert_allclose(
+                got, np.where(np.isfinite(curve), curve, np.nan), rtol=1e-9, err_msg=f"{plot} {key}"
+            )
     sounds = browser.execute_script(FIND, "sounds", "audio")
     assert len(sounds) == 2
     for sound in sounds:
-        length = wait_until(lambda one=sound: browser.execute_script("return arguments[0].duration || 0", one), "it loaded")
+        length = wait_until(
+            lambda one=sound: browser.execute_script("return arguments[0].duration || 0", one), "it loaded"
+        )
         assert length == pytest.approx(3.0, abs=1e-3)
 
 
@@ -253,7 +258,11 @@ def test_a_port_in_use_is_named():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [({"port": -1}, "port must be at least 0"), ({"port": 65536}, "at most 65535"), ({"setups": []}, "setups must not be empty")],
+    [
+        ({"port": -1}, "port must be at least 0"),
+        ({"port": 65536}, "at most 65535"),
+        ({"setups": []}, "setups must not be empty"),
+    ],
     ids=["negative", "too large", "no setups"],
 )
 def test_wrong_arguments_are_refused_before_anything_is_served(arguments, message):
