@@ -196,7 +196,7 @@ class _Page:
             self.controls[name].update(disabled=value, styles={"opacity": "0.4" if value else "1"})
 
     def _settings(self) -> ExploreSettings:
-        value = {name: getattr(control, "value", None) for name, control in self.controls.items()}
+        value: dict[str, Any] = {name: getattr(control, "value", None) for name, control in self.controls.items()}
         is_relative = self.controls["rating_kind"].active == RELATIVE
         return ExploreSettings(
             algorithm=value["algorithm"],

@@ -118,12 +118,18 @@ def test_nothing_is_outside_the_band_of_the_noise():
 
 
 def test_kf_pb_that_is_prepared_for_the_path_error_does_better_with_it_and_worse_without():
-    def reduction(error: float, tolerance: float) -> float:
-        settings = ExploreSettings(path_error_samples=error, path_tolerance_samples=tolerance)
-        return explore(BAND_PASS, settings).noise_reduction_db
+    def run(error: float, tolerance: float) -> tuple[float, float]:
+        result = explore(BAND_PASS, ExploreSettings(path_error_samples=error, path_tolerance_samples=tolerance))
+        near = (result.frequencies_hz > 1700) & (result.frequencies_hz < 1950)
+        louder = np.mean(result.error_spectrum_db[near] - result.disturbance_spectrum_db[near])
+        return result.noise_reduction_db, float(louder)
 
-    assert reduction(4.0, 2.0) > reduction(4.0, 0.5) + 1.0
-    assert reduction(0.0, 2.0) < reduction(0.0, 0.5) - 1.0
+    unprepared, louder = run(4.0, 0.5)
+    prepared, as_loud = run(4.0, 2.0)
+    assert prepared > unprepared + 1.0
+    assert louder > 2.0
+    assert as_loud < 0.5
+    assert run(0.0, 2.0)[0] < run(0.0, 0.5)[0] - 1.0
 
 
 def test_a_rating_beyond_what_the_noise_takes_leaves_nothing_clipped_and_all_of_the_reduction():

@@ -35,7 +35,7 @@ window.copies = () => Object.fromEntries(plots.map(name => {
   const data = page.get_model_by_name(name + " curves").data, keys = Object.keys(data)
   return [name, Object.fromEntries(keys.map(key => [key, Array.from(data[key], v => isFinite(v) ? v : null)]))]
 }))
-window.times = {moved: 0, followed: 0}
+window.times = {name: "", moved: 0, followed: 0}
 for (const name of plots) {
   const source = page.get_model_by_name(name + " curves")
   source.connect(source.properties.data.change, () => { times.followed = performance.now() })
@@ -43,7 +43,7 @@ for (const name of plots) {
 for (const name of arguments[0]) {
   const control = page.get_model_by_name(name)
   const value = control.properties.value ?? control.properties.active
-  control.connect(value.change, () => { times.moved = performance.now() })
+  control.connect(value.change, () => { if (times.name === name) times.moved = performance.now() })
 }
 """
 FIND = """
@@ -135,7 +135,7 @@ def move(browser: Any, name: str, selector: str, sent: str | None) -> float:
     """Use a control as a reader does; return the time in seconds from its new value to the new curves."""
     from selenium.webdriver.common.keys import Keys
 
-    browser.execute_script("times.moved = times.followed = 0")
+    browser.execute_script("window.times = {name: arguments[0], moved: 0, followed: 0}", name)
     (element,) = browser.execute_script(FIND, name, selector)
     if sent is None:
         element.click()
@@ -188,9 +188,9 @@ def test_the_page_shows_the_run_of_its_sliders_and_plays_it(address, browser):
     for plot, data in expected.items():
         for key, curve in data.items():
             got = np.array(shown[plot][key], dtype=float)
-            np.testing.assert_allclose(
-                got, np.where(np.isfinite(curve), curve, np.nan), rtol=1e-9, err_msg=f"{plot} {key}"
-            )
+            wanted = np.where(np.isfinite(curve), curve, np.nan)
+            # The number of BLAS threads rounds differently: q, and with it the run.
+            np.testing.assert_allclose(got, wanted, rtol=1e-6, atol=1e-6, err_msg=f"{plot} {key}")
     sounds = browser.execute_script(FIND, "sounds", "audio")
     assert len(sounds) == 2
     for sound in sounds:
