@@ -29,6 +29,7 @@ EXAMPLES = {
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
   kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
   kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
+  kfopc explore
   kfopc data list
 each command has its own --help""",
     "verdict": """examples:
@@ -48,6 +49,9 @@ exit code: 0 enough, 1 not enough, 2 wrong input""",
   kfopc paths resample S.wav S16.wav --fs 16000""",
     "plot": """example:
   kfopc paths plot P.wav S.wav -o paths.png""",
+    "explore": """examples:
+  kfopc explore
+  kfopc explore noise.wav --primary P.wav --secondary S.wav""",
     "data": """examples:
   kfopc data list
   kfopc data fetch duct compressor
@@ -164,6 +168,12 @@ def _parser() -> argparse.ArgumentParser:
     about = "identify, inspect, convert, resample and plot impulse responses"
     paths = commands.add_parser("paths", help=about, description=_sentence(about))
     _path_commands(paths.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser))
+    explore = _command(commands, "explore", _explore, "open a page with sliders for rating, noise, paths and algorithm")
+    explore.add_argument("noise", nargs="?", help="your own recording of the reference microphone; needs both paths")
+    explore.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
+    explore.add_argument("--secondary", metavar="FILE", help="impulse response, control signal to error microphone")
+    explore.add_argument("--fs", type=float, metavar="HZ", help="resample everything to this rate")
+    explore.add_argument("--port", type=int, default=5006, metavar="N", help="port; 0 is any free one (default: 5006)")
     data = _command(commands, "data", _data, "list or fetch the public measured data, or say where they are")
     data.add_argument("action", choices=("list", "fetch", "where"), help="what to do")
     data.add_argument("name", nargs="*", help="data sets to list or fetch (default: all)")
@@ -584,6 +594,18 @@ def _plot(options: argparse.Namespace) -> int:
     plot_bode(taps, fs=files.fs, ax=axes[1:])
     figure.savefig(options.output, dpi=160)
     print(f"{options.output} written")
+    return ENOUGH
+
+
+def _explore(options: argparse.Namespace) -> int:
+    from .bench import explore_setups, read_setup, serve_explore
+
+    setups = list(explore_setups())
+    if options.primary and options.secondary:
+        setups.insert(0, read_setup(options.noise, options.primary, options.secondary, fs=options.fs))
+    elif options.noise or options.primary or options.secondary:
+        raise ValueError("your own files need both --primary and --secondary; without files, the page has built-in paths")
+    serve_explore(setups, port=options.port)
     return ENOUGH
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import toeplitz
 
-from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, noise_reduction_db, output_power
+from kfopc_filterpy import SimulationResult, bandpass_path, noise_reduction_db, output_power
 from kfopc_filterpy.bench import (
     FigureItem,
     Parameter,
@@ -23,8 +23,8 @@ from kfopc_filterpy.bench import (
     make_scene,
     run_settings,
     tune,
+    with_clipping,
 )
-from kfopc_filterpy.bounds import measurement_noise_from_run, power_constrained_solution
 from kfopc_filterpy.metrics import coherence_and_gain, peak_control_signal
 from kfopc_filterpy.plot import (
     plot_disturbance_and_anti_noise,
@@ -156,22 +156,6 @@ def _scene(n_taps: int) -> Scene:
         power_multiple=POWER_MULTIPLE,
         n_taps=n_taps,
     )
-
-
-def with_clipping(scene: Scene) -> Scene:
-    """Return the scene with an amplifier that clips, and the q of eq. 7 with it.
-
-    The measurement is then d + s * (y - clip(y)), so e_o of eq. 1b contains what is clipped off. It is estimated from the
-    best control signal of rated power, as a batch fit's residual: a control filter can take over the part of it that is
-    proportional to y.
-    """
-    amplifier = HardClipAmplifier(scene.amplitude_limit)
-    x, d = scene.settled
-    bound = power_constrained_solution(x, d, scene.secondary, scene.n_taps, scene.rated_power)
-    y = np.convolve(x, bound.weights)[: x.size]
-    lost = np.convolve(y - amplifier(y), scene.secondary)[: x.size]
-    q = scene.measurement_noise + measurement_noise_from_run(x, lost, scene.secondary, scene.n_taps)
-    return dataclasses.replace(scene, amplifier=amplifier, measurement_noise=q)
 
 
 # ---- Runs

@@ -4,6 +4,13 @@ from .assessment import Ceilings as Ceilings
 from .assessment import Levels as Levels
 from .assessment import assess as assess
 from .comparing import compare_recordings as compare_recordings
+from .exploring import AcousticSetup as AcousticSetup
+from .exploring import ExploreResult as ExploreResult
+from .exploring import ExploreSettings as ExploreSettings
+from .exploring import explore as explore
+from .exploring import explore_setups as explore_setups
+from .exploring import read_setup as read_setup
+from .exploring_page import serve_explore as serve_explore
 from .items import FigureItem as FigureItem
 from .items import Parameter as Parameter
 from .items import Sound as Sound
@@ -21,6 +28,7 @@ from .scene import Runs as Runs
 from .scene import Scene as Scene
 from .scene import figures_of_merit as figures_of_merit
 from .scene import make_scene as make_scene
+from .scene import with_clipping as with_clipping
 from .summary import verdict_sentence as verdict_sentence
 from .tuning import AllDivergedError as AllDivergedError
 from .tuning import Trial as Trial

@@ -142,7 +142,7 @@ def _image(item: FigureItem, file: Path) -> dict[str, Any]:
         small = io.BytesIO()
         image.convert("RGB").quantize(_COLOURS).save(small, "PNG", optimize=True)
         broad = image.width > 2 * image.height
-    source = _data_uri(small.getvalue(), "image/png")
+    source = data_uri(small.getvalue(), "image/png")
     return {"caption": item.caption, "alt": item.alt or item.caption, "source": source, "broad": broad}
 
 
@@ -154,7 +154,7 @@ def players(study: StudyReport, folder: Path, first_heard: str = "KF-OPC") -> It
             {
                 "label": sound.label,
                 "caveat": _caveat(sound, clipped),
-                "source": _data_uri(_flac(sound.excerpt(clipped / peak, study.fs), study.fs), "audio/flac"),
+                "source": data_uri(flac(sound.excerpt(clipped / peak, study.fs), study.fs), "audio/flac"),
                 "file": sound_file(folder, study, sound).relative_to(folder).as_posix(),
             }
             for sound, (clipped, peak) in members
@@ -163,7 +163,7 @@ def players(study: StudyReport, folder: Path, first_heard: str = "KF-OPC") -> It
         yield {"id": f"{study.name}-sounds-{number}", "group": group, "tracks": tracks, "shown": shown}
 
 
-def _flac(signal: np.ndarray, fs: float) -> bytes:
+def flac(signal: np.ndarray, fs: float) -> bytes:
     """Return a signal of full scale 1 as FLAC of 16 bits, lossless and half as large as WAV; NaN is silence."""
     import soundfile
 
@@ -182,5 +182,5 @@ def _caveat(sound: Sound, clipped: np.ndarray) -> str:
     return "; ".join(remarks)
 
 
-def _data_uri(data: bytes, kind: str) -> str:
+def data_uri(data: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

@@ -7,13 +7,14 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import (
+    HardClipAmplifier,
     KalmanController,
     SimulationResult,
     clipped_fraction,
@@ -24,7 +25,12 @@ from kfopc_filterpy import (
     simulate_scenarios,
 )
 from kfopc_filterpy._validate import as_channels, as_positive, as_signal, per_loudspeaker
-from kfopc_filterpy.bounds import WienerSolution, measurement_noise_from_run, wiener_solution
+from kfopc_filterpy.bounds import (
+    WienerSolution,
+    measurement_noise_from_run,
+    power_constrained_solution,
+    wiener_solution,
+)
 from kfopc_filterpy.bounds.channels import channel_record
 from kfopc_filterpy.loop.channels import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
@@ -328,6 +334,44 @@ def make_scene(
     )
 
 
+def with_clipping(scene: Scene) -> Scene:
+    """Return a scene of one channel with an amplifier that clips, and the q of eq. 7 with it.
+
+    The amplifier clips at the peak of a sine of rated power. The measurement is then d + s * (y - clip(y)), so e_o of
+    eq. 1b contains what is clipped off. It is estimated from the best control signal of rated power, as a batch fit's
+    residual: a control filter can take over the part of it that is proportional to y.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene with a linear amplifier.
+
+    Returns
+    -------
+    Scene
+        The same scene with the amplifier and its q.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import make_scene, with_clipping
+    >>> x = np.random.default_rng(0).standard_normal(8000)
+    >>> scene = make_scene({0: x}, [0, 0, 1.0], [0, 1.0], fs=8000, rated_power=0.5, power_multiple=4.0, n_taps=8)
+    >>> clipped = with_clipping(scene)
+    >>> clipped.amplifier.limit, bool(clipped.measurement_noise > 100 * scene.measurement_noise)
+    (1.0, True)
+    """
+    amplifier = HardClipAmplifier(scene.amplitude_limit)
+    x, d = scene.settled
+    with reachable_weights():
+        bound = power_constrained_solution(x, d, scene.secondary, scene.n_taps, scene.rated_power)
+    y = np.convolve(x, bound.weights)[: x.size]
+    lost = np.convolve(y - amplifier(y), scene.secondary)[: x.size]
+    q = scene.measurement_noise
+    if np.any(lost):  # else the rating is ample
+        q += _unexplained(x, lost, scene.secondary, scene.n_taps, scene.fs)
+    return replace(scene, amplifier=amplifier, measurement_noise=q)
+
+
 def _as_rating(rated_power: Any, s: np.ndarray) -> Any:
     """Return a rated power, or one for each loudspeaker if several are given."""
     if s.ndim == 1 or np.ndim(rated_power) == 0:
@@ -358,7 +402,7 @@ def _heard(x: np.ndarray, primary: Any, s: np.ndarray, fs: float) -> np.ndarray:
 def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
     """Return the unconstrained Wiener solution whose weights a controller can reach."""
     if s.ndim == 1:
-        with _reachable_weights():
+        with reachable_weights():
             return wiener_solution(x, d, s, n_taps)
     record = channel_record(x, d, s, n_taps, fs).part(n_taps + s.shape[2] - 2, x.shape[1])
     return record.solution(record.correlations().weights(ridge=CHANNEL_RIDGE * record.filtered_power))
@@ -367,13 +411,13 @@ def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: flo
 def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> float:
     """Return q, the power that no control filter explains (eq. 7), per microphone."""
     if s.ndim == 1:
-        with _reachable_weights():
+        with reachable_weights():
             return measurement_noise_from_run(x, d, s, n_taps)
     return float(_reachable(x, d, s, n_taps, fs).error_power)
 
 
 @contextmanager
-def _reachable_weights() -> Iterator[None]:
+def reachable_weights() -> Iterator[None]:
     """Silence the warning that very large weights in directions without energy would do better.
 
     Level and q should belong to weights that a controller with the scene's P0 reaches, and none reaches such weights.

@@ -1,0 +1,416 @@
+"""The page of `explore`: sliders, figures that follow, and sounds, served to browsers on this machine by Bokeh."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy._validate import as_count
+from kfopc_filterpy.plot.style import decibels
+
+from .exploring import ALGORITHMS, AcousticSetup, ExploreResult, ExploreSettings, explore, explore_setups
+from .page import data_uri, flac
+from .registry import REGISTRY
+
+ADDRESS = "127.0.0.1"
+PORT = 5006
+LOWEST_HZ = 50.0
+WAVE_S = 0.03  # of the control signal that is drawn
+BELOW_PEAK_DB = 70.0  # that a spectrum shows
+QUIETEST_DB = -60.0  # re rated power that is drawn
+HEADROOM = 4.0  # a sound may have this many times the disturbance's peak; beyond it is cut off
+WIDTH, HEIGHT, SIDE = 470, 285, 290
+BLUE, GREEN, ORANGE, GREY = "#0072B2", "#009E73", "#D55E00", "#777777"
+RELATIVE, ABSOLUTE = 0, 1
+CURVES = {  # of each plot: the curve's key, its legend, colour and dash
+    "spectrum": [("disturbance", "without control", GREY, "solid"), ("error", "with control", BLUE, "solid")],
+    "wave": [
+        ("asked", "control signal", BLUE, "solid"),
+        ("delivered", "after the amplifier", GREEN, "dashed"),
+        ("upper", "peak of a sine at rated power", ORANGE, "dotdash"),
+        ("lower", "peak of a sine at rated power", ORANGE, "dotdash"),
+    ],
+    "power": [
+        ("asked", "control signal", BLUE, "solid"),
+        ("delivered", "after the amplifier", GREEN, "dashed"),
+        ("rating", "rated power", ORANGE, "dotdash"),
+    ],
+    "level": [("disturbance", "without control", GREY, "solid"), ("error", "with control", BLUE, "solid")],
+}
+
+
+def serve_explore(
+    setups: Sequence[AcousticSetup] | None = None,
+    *,
+    port: int = PORT,
+    announce: Callable[[str], Any] = print,
+) -> None:
+    """Serve the page to browsers on this machine until it is interrupted with Ctrl+C.
+
+    The server listens on 127.0.0.1 only, and the page loads nothing from elsewhere. It needs the extra `explore`.
+
+    Parameters
+    ----------
+    setups : sequence of AcousticSetup, optional
+        Setups to choose from, see `read_setup`; by default those of `explore_setups`.
+    port : int, default 5006
+        Port; 0 for a free one.
+    announce : callable, default print
+        Called with a line that names the page's address when the server is ready.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Bokeh or threadpoolctl is not installed.
+    OSError
+        If the port is in use or not allowed.
+    ValueError, TypeError
+        No setups, or a port that is no number from 0 to 65535.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.bench import serve_explore
+    >>> serve_explore(port=70000)
+    Traceback (most recent call last):
+    ...
+    ValueError: port must be at most 65535, got 70000
+    """
+    port = as_count(port, "port", minimum=0)
+    if port > 65535:
+        raise ValueError(f"port must be at most 65535, got {port}")
+    try:
+        from bokeh.application import Application
+        from bokeh.application.handlers import FunctionHandler
+        from bokeh.server.server import Server
+        from threadpoolctl import threadpool_limits
+    except ImportError as error:
+        raise ModuleNotFoundError(
+            'the page needs Bokeh and threadpoolctl: install the extra `explore`, python -m pip install "kfopc-filterpy[explore]"'
+        ) from error
+    choices = list(explore_setups() if setups is None else setups)
+    if not choices:
+        raise ValueError("setups must not be empty: leave it out for those that need no files")
+    port = _free_port(port)
+    pool = ThreadPoolExecutor(max_workers=1)  # the server goes on answering while a run computes
+    application = Application(FunctionHandler(lambda document: _Page(document, choices, pool).open()))
+    # The page's own address is the only origin that may open its socket.
+    origins = [f"{ADDRESS}:{port}", f"localhost:{port}"]
+    server = Server({"/": application}, address=ADDRESS, port=port, allow_websocket_origin=origins)
+    server.start()
+    announce(f"open http://{ADDRESS}:{port}/ in a browser; Ctrl+C ends it")
+    try:
+        # Systems of 128 unknowns gain nothing from more threads, which wait for each other if the cores have other work.
+        with threadpool_limits(1):
+            server.io_loop.start()
+    except KeyboardInterrupt:
+        announce("ended")
+    finally:
+        server.stop()
+        pool.shutdown(cancel_futures=True)
+
+
+def _free_port(port: int) -> int:
+    """Return a port that is free: `port`, or any if it is 0."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((ADDRESS, port))
+        except OSError as error:
+            reason = "is in use" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
+            raise OSError(f"port {port} of {ADDRESS} {reason}: choose another, or 0 for a free one") from error
+        return probe.getsockname()[1]
+
+
+class _Page:
+    """One browser tab: its controls, its figures, and the run that is under way."""
+
+    def __init__(self, document: Any, setups: list[AcousticSetup], pool: ThreadPoolExecutor) -> None:
+        self.document, self.setups, self.pool = document, setups, pool
+        self.setup = setups[0]
+        self.controls = _controls(setups)
+        self.sources, self.plots = _figures()
+        self.texts = _texts()
+        self._is_running = self._is_filling = self._is_asked = self._is_new_setup = False
+
+    def open(self) -> None:
+        """Lay the page out, connect the controls, and start the first run."""
+        from bokeh.layouts import column, gridplot, row
+
+        left = column(*self.controls.values(), width=SIDE)
+        rows = [[self.plots["spectrum"], self.plots["wave"]], [self.plots["level"], self.plots["power"]]]
+        right = column(self.texts["summary"], gridplot(rows, toolbar_options={"logo": None}), self.texts["sounds"])
+        self.document.add_root(row(left, column(self.texts["status"], right, margin=(0, 0, 0, 20))))
+        self.document.title = "kfopc explore"
+        for name, control in self.controls.items():
+            changing = {"rating_kind": "active", "clips": "active"}.get(name, "value")
+            control.on_change(changing, partial(self._changed, name))
+        self._take_setup()
+        self._run()
+
+    def _changed(self, name: str, attribute: str, old: Any, new: Any) -> None:
+        """Run again, now or after the run that is under way: a slider that is dragged sends more values than can be run."""
+        if self._is_filling:
+            return
+        if name == "setup":
+            self.setup = self.setups[int(new)]
+            self._take_setup()
+        self._enable()
+        if self._is_running:
+            self._is_asked = True
+        else:
+            self._run()
+
+    def _take_setup(self) -> None:
+        """Set what depends on the setup: the level, and the range of the band."""
+        self._is_filling, self._is_new_setup = True, True
+        highest = self.setup.fs / 2
+        band, level = self.controls["band"], self.controls["level"]
+        band.end = highest
+        band.value = (200.0, min(2000.0, highest)) if self.setup.noise is None else (LOWEST_HZ, highest)
+        middle = round(self.setup.level_db)
+        level.update(start=middle - 30, end=middle + 30, value=middle)
+        self.controls["rating_kind"].active = RELATIVE
+        self._is_filling = False
+        self._enable()
+
+    def _enable(self) -> None:
+        """Let only the controls be moved that the run depends on."""
+        algorithm, kind = self.controls["algorithm"].value, self.controls["rating_kind"].active
+        is_kalman = REGISTRY[algorithm].symbol == "r"
+        disabled = {
+            "relative_rating": kind != RELATIVE,
+            "absolute_rating": kind != ABSOLUTE,
+            "tolerance": algorithm != "KF-PB",
+            "state_noise": not is_kalman,
+            "step_size": is_kalman,
+        }
+        for name, value in disabled.items():
+            self.controls[name].update(disabled=value, styles={"opacity": "0.4" if value else "1"})
+
+    def _settings(self) -> ExploreSettings:
+        value: dict[str, Any] = {name: getattr(control, "value", None) for name, control in self.controls.items()}
+        is_relative = self.controls["rating_kind"].active == RELATIVE
+        return ExploreSettings(
+            algorithm=value["algorithm"],
+            rating_db=value["relative_rating" if is_relative else "absolute_rating"],
+            rating_is_relative=is_relative,
+            level_db=value["level"],
+            band=tuple(value["band"]),
+            path_error_samples=value["path_error"],
+            path_tolerance_samples=value["tolerance"],
+            state_noise=10.0 ** value["state_noise"],
+            step_size=2.0 ** value["step_size"],
+            clips=bool(self.controls["clips"].active),
+        )
+
+    def _run(self) -> None:
+        self._is_running, self._is_asked = True, False
+        self.texts["status"].text = "Computing … (compiling an algorithm, once, takes up to half a minute)"
+        start = time.perf_counter()
+        future = self.pool.submit(explore, self.setup, self._settings())
+        future.add_done_callback(lambda done: self.document.add_next_tick_callback(partial(self._show, done, start)))
+
+    def _show(self, done: Future[ExploreResult], start: float) -> None:
+        """Show a run that has ended, all at once; then start the one that was asked for meanwhile."""
+        self._is_running = False
+        self.document.hold("combine")
+        try:
+            self._fill(done.result())
+            self.texts["status"].text = f"Computed in {time.perf_counter() - start:.2f} s."
+        except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+            self.texts["status"].text = f"<b>Not computed:</b> {escape(' '.join(str(error).split()))}"
+        finally:
+            self.document.unhold()
+        if self._is_asked:
+            self._run()
+
+    def _fill(self, result: ExploreResult) -> None:
+        for name, data in curves(result).items():
+            self.sources[name].data = data
+        self._fill_ratings(result)
+        top = np.nanmax(result.disturbance_spectrum_db)
+        errors = result.error_spectrum_db[np.isfinite(result.error_spectrum_db)]
+        top = max(top, errors.max(initial=top))
+        self.plots["spectrum"].y_range.update(start=float(top - BELOW_PEAK_DB), end=float(top + 5))
+        self.plots["spectrum"].x_range.end = result.fs / 2
+        asked = self.sources["wave"].data["asked"]
+        most = float(np.max(np.abs(asked), initial=0.0, where=np.isfinite(asked)))
+        height = 1.15 * min(max(most, result.amplitude_limit), 4 * result.amplitude_limit)
+        self.plots["wave"].y_range.update(start=-height, end=height)
+        self.texts["summary"].text = f'<p style="margin:0;font-size:15px">{escape(result.summary)}</p>'
+        self.texts["sounds"].text = _players(result)
+
+    def _fill_ratings(self, result: ExploreResult) -> None:
+        """Let the slider of the other kind of rating show what the rating is in its terms."""
+        kind = self.controls["rating_kind"].active
+        absolute, relative = self.controls["absolute_rating"], self.controls["relative_rating"]
+        rated, full = (float(decibels(power)) for power in (result.rated_power, result.full_power))
+        self._is_filling = True
+        if self._is_new_setup:
+            absolute.update(start=round(full) - 40, end=round(full) + 20)
+            self._is_new_setup = False
+        if kind == RELATIVE:
+            absolute.value = float(np.clip(round(rated, 1), absolute.start, absolute.end))
+        else:
+            relative.value = float(np.clip(round(rated - full, 1), relative.start, relative.end))
+        self._is_filling = False
+
+
+def curves(result: ExploreResult) -> dict[str, dict[str, np.ndarray]]:
+    """Return the curves of the page's plots: "spectrum", "wave", "power" and "level"."""
+    end = result.control_signal.size if result.diverged_at_s is None else round(result.diverged_at_s * result.fs)
+    last = slice(max(end - round(WAVE_S * result.fs), 0), end)
+    asked, delivered = result.control_signal[last], result.amplifier_output[last]
+    limit = np.full(asked.size, result.amplitude_limit)
+    heard = result.frequencies_hz >= LOWEST_HZ
+    powers = {"asked": result.asked_power, "delivered": result.delivered_power}
+    over = {name: decibels(power / result.rated_power) for name, power in powers.items()}
+    return {
+        "spectrum": {
+            "x": result.frequencies_hz[heard],
+            "disturbance": result.disturbance_spectrum_db[heard],
+            "error": result.error_spectrum_db[heard],
+        },
+        "wave": {
+            "x": 1000 * np.arange(last.start, end) / result.fs,
+            "asked": asked,
+            "delivered": delivered,
+            "upper": limit,
+            "lower": -limit,
+        },
+        "power": {
+            "x": result.time_s,
+            **{name: np.where(level > QUIETEST_DB, level, np.nan) for name, level in over.items()},
+            "rating": np.zeros(result.time_s.size),
+        },
+        "level": {
+            "x": result.time_s,
+            "disturbance": decibels(result.disturbance_power),
+            "error": decibels(result.error_power),
+        },
+    }
+
+
+def _controls(setups: list[AcousticSetup]) -> dict[str, Any]:
+    """Return the controls, from the top of the page to its bottom."""
+    from bokeh.models import CheckboxGroup, CustomJSTickFormatter, RadioButtonGroup, RangeSlider, Select, Slider
+
+    power_of_ten = CustomJSTickFormatter(code="return Math.pow(10, tick).toExponential(1)")
+    power_of_two = CustomJSTickFormatter(code="return Math.pow(2, tick).toPrecision(2)")
+
+    def slider(name: str, title: str, start: float, end: float, value: float, step: float, **more: Any) -> Any:
+        return Slider(name=name, title=title, start=start, end=end, value=value, step=step, width=SIDE, **more)
+
+    names = [(str(i), setup.name) for i, setup in enumerate(setups)]
+    default = ExploreSettings()
+    return {
+        "setup": Select(name="setup", title="Paths and noise", options=names, value="0", width=SIDE),
+        "algorithm": Select(
+            name="algorithm", title="Algorithm", options=list(ALGORITHMS), value=default.algorithm, width=SIDE
+        ),
+        "rating_kind": RadioButtonGroup(
+            name="rating_kind", labels=["rating follows the noise", "rating is fixed"], active=RELATIVE, width=SIDE
+        ),
+        "relative_rating": slider(
+            "relative_rating", "Rated power over that of full control (dB)", -30, 10, default.rating_db, 0.5
+        ),
+        "absolute_rating": slider("absolute_rating", "Rated power (dB re 1)", -40, 20, 0, 0.5),
+        "clips": CheckboxGroup(name="clips", labels=["amplifier clips at its rating"], active=[0], width=SIDE),
+        "level": slider("level", "Noise at the error microphone (dB re 1)", -30, 30, 0, 1),
+        "band": RangeSlider(
+            name="band",
+            title="Band of the noise (Hz)",
+            start=LOWEST_HZ,
+            end=8000,
+            value=default.band,
+            step=50,
+            format="0",
+            width=SIDE,
+        ),
+        "path_error": slider("path_error", "True path later than the known path (samples)", 0, 4, 0, 0.5),
+        "tolerance": slider("tolerance", "Such an error KF-PB is prepared for (samples)", 0, 4, 0.5, 0.25),
+        "state_noise": slider(
+            "state_noise", "State noise r E[x'²]/q", -9, -3, np.log10(default.state_noise), 0.5, format=power_of_ten
+        ),
+        "step_size": slider(
+            "step_size", "Step size µ L E[x'²]", -14, 0, np.log2(default.step_size), 1, format=power_of_two
+        ),
+    }
+
+
+def _figures() -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the sources of the plots, and the plots."""
+    from bokeh.models import ColumnDataSource, FixedTicker, Range1d
+    from bokeh.plotting import figure
+
+    titles = {
+        "spectrum": ("Spectrum at the error microphone", "Frequency (Hz)", "Power density (dB re 1/Hz)"),
+        "wave": ("Control signal, the last 30 ms", "Time (ms)", "Amplitude"),
+        "level": ("Level at the error microphone", "Time (s)", "Power (dB re 1)"),
+        "power": ("Output power against the rating", "Time (s)", "Power (dB re rated power)"),
+    }
+    sources, plots = {}, {}
+    for name, (title, x_label, y_label) in titles.items():
+        own = CURVES[name]
+        source = ColumnDataSource({key: [] for key in ("x", *(curve for curve, *_ in own))}, name=f"{name} curves")
+        options: dict[str, Any] = {"x_axis_type": "log"} if name == "spectrum" else {}
+        plot = figure(
+            name=f"{name} plot",
+            title=title,
+            x_axis_label=x_label,
+            y_axis_label=y_label,
+            width=WIDTH,
+            height=HEIGHT,
+            tools="pan,box_zoom,wheel_zoom,reset,save",
+            active_scroll=None,
+            **options,
+        )
+        for curve, legend, colour, dash in own:
+            plot.line("x", curve, source=source, legend_label=legend, color=colour, line_dash=dash, line_width=1.5)
+        legend = plot.legend[0]
+        legend.update(orientation="horizontal", border_line_color=None, padding=0, margin=0, label_text_font_size="9pt")
+        legend.update(spacing=12, glyph_width=20)
+        plot.add_layout(legend, "above")  # it would cover curves inside
+        sources[name], plots[name] = source, plot
+    plots["spectrum"].x_range = Range1d(LOWEST_HZ, 8000)
+    plots["spectrum"].xaxis.ticker = FixedTicker(ticks=[50, 100, 200, 500, 1000, 2000, 5000])
+    for name in ("spectrum", "wave"):
+        plots[name].y_range = Range1d(-1, 1)
+    plots["level"].x_range = plots["power"].x_range
+    return sources, plots
+
+
+def _texts() -> dict[str, Any]:
+    from bokeh.models import Div
+
+    width = 2 * WIDTH
+    return {
+        "status": Div(name="status", text="", width=width, styles={"color": "#555555"}),
+        "summary": Div(name="summary", text="", width=width, min_height=66),
+        "sounds": Div(name="sounds", text="", width=width),
+    }
+
+
+def _players(result: ExploreResult) -> str:
+    """Return the players of the noise without and with control, which have one scale."""
+    sounds = {"Without control": result.disturbance, "With control": np.nan_to_num(result.error)}
+    peaks = [float(np.max(np.abs(signal))) for signal in sounds.values()]
+    full = min(max(peaks), HEADROOM * peaks[0])
+    players = []
+    for name, signal in sounds.items():
+        source = data_uri(flac(np.clip(signal / full, -1.0, 1.0), result.fs), "audio/flac")
+        players.append(
+            f'<figure style="margin:0;display:inline-block;width:445px"><figcaption>{name}</figcaption>'
+            f'<audio controls style="width:425px" src="{source}"></audio></figure>'
+        )
+    cut = " What exceeds four times the peak of the noise is cut off." if full < max(peaks) else ""
+    note = '<p style="margin:2px 0;color:#555555">Both have one scale. The control is switched on as they begin.'
+    return "".join(players) + note + cut + "</p>"

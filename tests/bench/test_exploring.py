@@ -1,0 +1,250 @@
+"""One run per move of a slider: its numbers against the studies' own, and the files it reads."""
+
+from __future__ import annotations
+
+import re
+import time
+
+import numpy as np
+import pytest
+import soundfile
+from threadpoolctl import threadpool_limits
+
+from kfopc_filterpy import kf_pb, output_power, simulate
+from kfopc_filterpy.bench import AcousticSetup, ExploreSettings, explore, explore_setups, read_setup
+from kfopc_filterpy.bench.exploring import ALGORITHMS, N_TAPS
+from kfopc_filterpy.paths import PathTolerance
+from kfopc_filterpy.signals import band_limited_noise
+
+BAND_PASS = explore_setups()[0]
+
+
+@pytest.fixture(autouse=True)
+def one_blas_thread():
+    """Solve with one thread, as the page does."""
+    with threadpool_limits(1):
+        yield
+
+
+def test_a_linear_amplifier_at_a_quarter_of_the_power_gives_6_db_on_a_flat_path():
+    # In the band, path and noise are flat: within a quarter of the power, half of the amplitude is cancelled.
+    result = explore(BAND_PASS, ExploreSettings(rating_db=-6.0206, clips=False))
+    assert result.rated_power == pytest.approx(0.25 * result.full_power, rel=1e-5)
+    assert result.bound_db == pytest.approx(6.02, abs=0.05)
+    assert result.noise_reduction_db == pytest.approx(6.02, abs=0.2)
+    assert output_power(result.control_signal) == pytest.approx(result.rated_power, rel=0.02)
+    np.testing.assert_array_equal(result.control_signal, result.amplifier_output)
+
+
+def test_the_run_is_the_one_that_simulate_gives():
+    settings = ExploreSettings(rating_db=-9.0, rating_is_relative=False, level_db=3.0, clips=False, state_noise=1e-6)
+    result = explore(BAND_PASS, settings)
+    x = band_limited_noise((200.0, 2000.0), 3.5, fs=16000, rng=0)
+    d = np.convolve(x, BAND_PASS.primary)[: x.size]
+    gain = np.sqrt(10**0.3 / np.mean(d[8000:] ** 2))
+    x, d = gain * x, gain * d
+    filtered = np.convolve(x, BAND_PASS.secondary)[: x.size]
+    np.testing.assert_allclose(result.disturbance, d[8000:], rtol=1e-9, atol=1e-12)
+    # q for itself: a batch fit to the disturbance with sensor noise 60 dB below, which is nearly all that is left.
+    q = 1e-6 * np.mean(d[8000:] ** 2)
+    controller = kf_pb(
+        N_TAPS,
+        BAND_PASS.secondary,
+        rated_power=10**-0.9,
+        state_noise=1e-6 * q / np.mean(filtered**2),
+        measurement_noise=q,
+        initial_variance=result.full_power / (N_TAPS * np.mean(x**2)),
+        secondary_path_uncertainty=PathTolerance(delay_samples=0.5),
+        fs=16000.0,
+    )
+    own = simulate(controller, x, disturbance=d, secondary_path=BAND_PASS.secondary, fs=16000.0, switch_on_s=0.5)
+    left = np.mean((own.error[24000:] - result.error[24000:]) ** 2) / np.mean(own.error[24000:] ** 2)
+    assert 10 * np.log10(left) < -30.0  # of the sensor noise, and of q's difference
+
+
+def test_spectra_and_powers_are_those_of_the_signals():
+    result = explore(BAND_PASS)
+    spacing = result.frequencies_hz[1]
+    steady = slice(result.error.size // 2, None)
+    for spectrum, signal in (
+        (result.disturbance_spectrum_db, result.disturbance),
+        (result.error_spectrum_db, result.error),
+    ):
+        # Parseval; Welch's windows do not weigh all samples alike.
+        assert np.sum(10 ** (spectrum / 10)) * spacing == pytest.approx(np.mean(signal[steady] ** 2), rel=0.05)
+    assert 10 * np.log10(np.mean(result.disturbance**2)) == pytest.approx(0.0, abs=1e-9)
+    assert result.time_s[0] == pytest.approx(0.05, abs=1e-3)
+    for power, signal in ((result.asked_power, result.control_signal), (result.error_power, result.error)):
+        assert power[0] == pytest.approx(np.mean(signal[:800] ** 2))
+        assert power[10] == pytest.approx(np.mean(signal[1600:2400] ** 2))
+
+
+def test_the_amplifier_clips_at_the_peak_of_a_sine_of_rated_power():
+    result = explore(BAND_PASS)
+    assert result.amplitude_limit == pytest.approx(np.sqrt(2 * result.rated_power))
+    np.testing.assert_array_equal(
+        result.amplifier_output, np.clip(result.control_signal, -result.amplitude_limit, result.amplitude_limit)
+    )
+    # A Gaussian signal of rated power is beyond sqrt(2) standard deviations for 15.7 % of the time.
+    assert result.clipped_fraction == pytest.approx(0.157, abs=0.01)
+
+
+def test_kf_pb_and_kf_opc_keep_the_rating_and_the_plain_algorithms_do_not():
+    share = {}
+    for name in ALGORITHMS:
+        result = explore(BAND_PASS, ExploreSettings(algorithm=name, rating_db=-6.0))
+        share[name] = result.output_power / result.rated_power
+        is_beyond = "far beyond the rated power" in result.summary
+        assert is_beyond == (share[name] > 2.0)
+    assert max(share[name] for name in ("KF-PB", "KF-OPC", "MOV-FxLMS")) < 1.05
+    assert min(share[name] for name in ("KF-ANC", "FxLMS")) > 3.9
+
+
+def test_a_relative_rating_scales_with_the_noise_and_a_fixed_one_does_not():
+    quiet, loud = (explore(BAND_PASS, ExploreSettings(level_db=level)) for level in (0.0, 12.0))
+    assert loud.rated_power == pytest.approx(10**1.2 * quiet.rated_power)
+    assert loud.noise_reduction_db == pytest.approx(quiet.noise_reduction_db, abs=1e-6)
+    fixed = ExploreSettings(level_db=12.0, rating_is_relative=False, rating_db=float(10 * np.log10(quiet.rated_power)))
+    result = explore(BAND_PASS, fixed)
+    assert result.rated_power == pytest.approx(quiet.rated_power)
+    assert result.noise_reduction_db < quiet.noise_reduction_db - 2.0
+
+
+def test_nothing_is_outside_the_band_of_the_noise():
+    result = explore(BAND_PASS, ExploreSettings(band=(500.0, 1000.0)))
+    inside = (result.frequencies_hz >= 500) & (result.frequencies_hz <= 1000)
+    outside = (result.frequencies_hz < 450) | (result.frequencies_hz > 1050)
+    assert result.disturbance_spectrum_db[inside].min() > result.disturbance_spectrum_db[outside].max() + 40.0
+
+
+def test_kf_pb_that_is_prepared_for_the_path_error_does_better_with_it_and_worse_without():
+    def run(error: float, tolerance: float) -> tuple[float, float]:
+        result = explore(BAND_PASS, ExploreSettings(path_error_samples=error, path_tolerance_samples=tolerance))
+        near = (result.frequencies_hz > 1700) & (result.frequencies_hz < 1950)
+        louder = np.mean(result.error_spectrum_db[near] - result.disturbance_spectrum_db[near])
+        return result.noise_reduction_db, float(louder)
+
+    unprepared, louder = run(4.0, 0.5)
+    prepared, as_loud = run(4.0, 2.0)
+    assert prepared > unprepared + 1.0
+    assert louder > 2.0
+    assert as_loud < 0.5
+    assert run(0.0, 2.0)[0] < run(0.0, 0.5)[0] - 1.0
+
+
+def test_a_rating_beyond_what_the_noise_takes_leaves_nothing_clipped_and_all_of_the_reduction():
+    result = explore(BAND_PASS, ExploreSettings(rating_db=20.0))
+    assert result.clipped_fraction == 0.0
+    assert result.noise_reduction_db > 40.0
+    assert result.bound_db == pytest.approx(result.free_db)
+
+
+def test_a_diverged_run_says_when():
+    result = explore(BAND_PASS, ExploreSettings("KF-ANC", path_error_samples=4.0, clips=False))
+    assert result.diverged_at_s is not None
+    assert re.fullmatch(r"KF-ANC diverged \d\.\d{3} s after it was switched on\.", result.summary)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_run_takes_less_than_a_second(algorithm):
+    explore(BAND_PASS, ExploreSettings(algorithm=algorithm))  # compiles
+    taken = []
+    for level in (1.0, 2.0, 3.0):
+        start = time.perf_counter()
+        explore(BAND_PASS, ExploreSettings(algorithm=algorithm, level_db=level))
+        taken.append(time.perf_counter() - start)
+    assert min(taken) < 1.0  # on a core that other work shares
+
+
+def test_the_measured_duct_is_there_with_its_two_recordings(shared_data, monkeypatch):
+    monkeypatch.setenv("KFOPC_DATA", str(shared_data))
+    setups = {setup.name: setup for setup in explore_setups()}
+    assert list(setups)[1:] == ["Measured duct", "Measured duct, motor", "Measured duct, compressor"]
+    motor = setups["Measured duct, motor"]
+    result = explore(motor, ExploreSettings(level_db=motor.level_db, band=(50.0, 8000.0)))
+    # The recording in its own units: only what lies below 50 Hz is missing.
+    own = np.convolve(motor.noise, motor.primary)[: motor.noise.size][8000:]
+    assert np.corrcoef(own, result.disturbance)[0, 1] > 0.95
+    assert result.noise_reduction_db > 1.0
+
+
+def test_without_data_only_the_models_are_offered(monkeypatch, tmp_path):
+    monkeypatch.setenv("KFOPC_DATA", str(tmp_path))
+    assert [setup.name for setup in explore_setups()] == ["Band-pass paths"]
+
+
+# Files
+
+
+@pytest.fixture
+def files(tmp_path):
+    """Write a noise and two paths at 48 kHz; return their names."""
+    noise = band_limited_noise((100.0, 3000.0), 2.0, fs=48000, rng=1)
+    signals = {"noise": 0.1 * noise, "P": np.eye(1, 400, 144)[0], "S": 0.5 * np.eye(1, 200, 48)[0]}
+    for name, signal in signals.items():
+        soundfile.write(tmp_path / f"{name}.wav", signal, 48000, subtype="FLOAT")
+    return [tmp_path / f"{name}.wav" for name in signals]
+
+
+def test_files_are_read_at_16_khz_in_their_own_units(files):
+    setup = read_setup(*files)
+    assert setup.fs == 16000.0
+    assert setup.noise.size == 32000
+    # The primary path only delays: the disturbance is the noise, 0.01 in mean square.
+    assert setup.level_db == pytest.approx(-20.0, abs=0.2)
+    assert np.argmax(setup.secondary) == 16
+    result = explore(setup, ExploreSettings(level_db=setup.level_db, band=(50.0, 8000.0), rating_db=10.0))
+    # The secondary path halves: full control takes four times the disturbance's power.
+    assert result.full_power == pytest.approx(4 * 10 ** (setup.level_db / 10), rel=0.05)
+    assert result.noise_reduction_db > 20.0
+
+
+def test_paths_without_a_recording_get_gaussian_noise(files):
+    assert read_setup(None, *files[1:]).noise is None
+
+
+def test_files_that_do_not_fit_are_refused(files, tmp_path):
+    soundfile.write(tmp_path / "P8.wav", [0.0, 1.0], 8000)
+    with pytest.raises(
+        ValueError, match=r"one sample rate, got .*noise.wav 48000 Hz, .*P8.wav 8000 Hz.*: pass fs=8000"
+    ):
+        read_setup(files[0], tmp_path / "P8.wav", files[2])
+    with pytest.raises(FileNotFoundError, match=r"gone\.wav"):
+        read_setup(tmp_path / "gone.wav", *files[1:])
+    (tmp_path / "no.wav").write_text("this is no sound")
+    with pytest.raises(ValueError, match=r"no\.wav"):
+        read_setup(tmp_path / "no.wav", *files[1:])
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [(np.ones(7999), "must last 1 s at least, got 1 s"), (np.zeros(8000), "silent"), ([np.nan] * 8000, "noise")],
+    ids=["short", "silent", "NaN"],
+)
+def test_recordings_that_cannot_be_used_are_refused(noise, message):
+    with pytest.raises(ValueError, match=message):
+        AcousticSetup("mine", [0, 1.0], [1.0], 8000, noise)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"algorithm": "KF"}, "algorithm must be"),
+        ({"rating_db": np.inf}, "rating_db"),
+        ({"path_error_samples": -1.0}, "path_error_samples"),
+        ({"state_noise": 0.0}, "state_noise"),
+    ],
+    ids=["algorithm", "rating", "path error", "state noise"],
+)
+def test_settings_out_of_range_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        ExploreSettings(**settings)
+
+
+def test_a_band_that_the_recording_or_the_sample_rate_lacks_is_refused():
+    hum = AcousticSetup("hum", [0, 0, 1.0], [0, 1.0], 8000, np.sin(2 * np.pi * 100 * np.arange(8000) / 8000))
+    with pytest.raises(ValueError, match="band"):
+        explore(hum, ExploreSettings(band=(200.0, 5000.0)))
+    zeros_above = AcousticSetup("mean", [0, 0, 1.0], [0, 1.0], 8000, np.ones(8000))
+    with pytest.raises(ValueError, match="silent from 200 to 2000 Hz: choose a wider band"):
+        explore(zeros_above)

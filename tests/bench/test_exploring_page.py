@@ -1,0 +1,279 @@
+"""The page with sliders: in a real browser, whose sliders are moved, and as a server that is started wrongly."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bokeh", reason="needs bokeh (the extra `explore`)")
+
+from kfopc_filterpy.bench import AcousticSetup, ExploreSettings, explore, explore_setups, serve_explore
+from kfopc_filterpy.bench.exploring_page import CURVES, curves
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 120.0  # for the first run of an algorithm, which compiles
+FOLLOWS_S = 1.0  # from a move of a slider to the new curves, in the median
+SLOWEST_S = 4.0  # of all moves, on a machine with other work
+
+SERVER = (
+    "from kfopc_filterpy.bench import serve_explore; serve_explore(port=0, announce=lambda s: print(s, flush=True))"
+)
+WATCH = """
+const page = Bokeh.documents[0], plots = ["spectrum", "wave", "power", "level"]
+window.copies = () => Object.fromEntries(plots.map(name => {
+  const data = page.get_model_by_name(name + " curves").data, keys = Object.keys(data)
+  return [name, Object.fromEntries(keys.map(key => [key, Array.from(data[key], v => isFinite(v) ? v : null)]))]
+}))
+window.times = {name: "", moved: 0, followed: 0}
+for (const name of plots) {
+  const source = page.get_model_by_name(name + " curves")
+  source.connect(source.properties.data.change, () => { times.followed = performance.now() })
+}
+for (const name of arguments[0]) {
+  const control = page.get_model_by_name(name)
+  const value = control.properties.value ?? control.properties.active
+  control.connect(value.change, () => { if (times.name === name) times.moved = performance.now() })
+}
+"""
+FIND = """
+const model = Bokeh.documents[0].get_model_by_name(arguments[0])
+return Bokeh.index.find_one(model).shadow_el.querySelectorAll(arguments[1])
+"""
+# The sliders and buttons that the test moves: name, the element in it, what it is sent, and the curves that change.
+ALL = ("spectrum", "wave", "power", "level")
+MOVES = [
+    ("relative_rating", ".noUi-handle", "LEFT", ALL),
+    ("level", ".noUi-handle", "RIGHT", ("spectrum", "wave", "level")),
+    ("band", ".noUi-handle-upper", "LEFT", ALL),
+    ("band", ".noUi-handle-lower", "RIGHT", ALL),
+    ("path_error", ".noUi-handle", "RIGHT", ALL),
+    ("tolerance", ".noUi-handle", "RIGHT", ALL),
+    ("state_noise", ".noUi-handle", "RIGHT", ALL),
+    ("rating_kind", ".bk-btn:nth-child(2)", None, ()),
+    ("absolute_rating", ".noUi-handle", "RIGHT", ALL),
+    ("clips", "input", None, ALL),
+    ("algorithm", "select", "KF-OPC", ALL),
+    ("algorithm", "select", "KF-ANC", ALL),
+    ("algorithm", "select", "MOV-FxLMS", ALL),
+    ("algorithm", "select", "FxLMS", ALL),
+    ("step_size", ".noUi-handle", "LEFT", ALL),
+]
+NAMES = sorted({name for name, *_ in MOVES})
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """The address of the page, served by another process on a free port."""
+    command = [sys.executable, "-c", SERVER]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        line = server.stdout.readline()
+        assert line.startswith("open http://127.0.0.1:"), line
+        yield line.split()[1]
+        server.terminate()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A headless Chromium with a profile of its own."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium (the extra `test`)")
+    binary = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    driver = shutil.which("chromedriver")
+    if binary is None or driver is None:
+        pytest.skip("needs Chromium and its driver: apt-get install chromium chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = binary
+    profile = tmp_path_factory.mktemp("profile")
+    for argument in (
+        "--headless",
+        "--no-sandbox",
+        "--disable-background-networking",
+        "--disable-dev-shm-usage",
+        "--window-size=1300,1000",
+        f"--user-data-dir={profile}",
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    chromium = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    chromium.set_script_timeout(PATIENCE_S)
+    yield chromium
+    chromium.quit()
+
+
+def wait_until(condition: Any, what: str) -> Any:
+    """Return what `condition` gives as soon as it is true."""
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.02)
+    raise AssertionError(f"waited {PATIENCE_S:g} s in vain until {what}")
+
+
+def status(browser: Any) -> str:
+    return browser.execute_script('return Bokeh.documents[0]?.get_model_by_name("status")?.text ?? ""')
+
+
+def rest(browser: Any) -> None:
+    """Wait until no run is under way."""
+    wait_until(lambda: status(browser).startswith("Computed in"), f"a run ended: {status(browser)}")
+
+
+def move(browser: Any, name: str, selector: str, sent: str | None) -> float:
+    """Use a control as a reader does; return the time in seconds from its new value to the new curves."""
+    from selenium.webdriver.common.keys import Keys
+
+    browser.execute_script("window.times = {name: arguments[0], moved: 0, followed: 0}", name)
+    (element,) = browser.execute_script(FIND, name, selector)
+    if sent is None:
+        element.click()
+    else:
+        element.send_keys({"LEFT": Keys.ARROW_LEFT, "RIGHT": Keys.ARROW_RIGHT}.get(sent, sent))
+    wait_until(
+        lambda: browser.execute_script("return times.moved > 0 && times.followed > times.moved"), f"{name} was followed"
+    )
+    rest(browser)
+    return browser.execute_script("return times.followed - times.moved") / 1000
+
+
+def test_every_slider_changes_the_curves_within_a_second(address, browser, tmp_path):
+    browser.get(address)
+    wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")
+    rest(browser)
+    browser.execute_script(WATCH, NAMES)
+    folder = Path(os.environ.get("EXPLORE_SCREENSHOTS", tmp_path))
+    browser.save_screenshot(str(folder / "start.png"))
+    seconds = {}
+    for i, (name, selector, sent, changing) in enumerate(MOVES):
+        before = browser.execute_script("return copies()")
+        taken = move(browser, name, selector, sent)
+        after = browser.execute_script("return copies()")
+        for plot in changing:
+            assert after[plot] != before[plot], f"{plot} did not change with {name}"
+        if name != "algorithm":  # whose first run compiles
+            seconds[f"{name} {i}"] = taken
+        browser.save_screenshot(str(folder / f"{i:02d}-{name}.png"))
+    told = ", ".join(f"{name} {taken:.2f} s" for name, taken in seconds.items())
+    print(told)
+    assert statistics.median(seconds.values()) < FOLLOWS_S, told
+    assert max(seconds.values()) < SLOWEST_S, told
+
+    # Everything came from this machine, and nothing failed.
+    loaded = browser.execute_script("return performance.getEntriesByType('resource').map(entry => entry.name)")
+    assert loaded
+    assert all(url.startswith((address, "data:")) for url in loaded), loaded
+    severe = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert not [message for message in severe if "favicon" not in message]
+
+
+def test_the_page_shows_the_run_of_its_sliders_and_plays_it(address, browser):
+    browser.get(address)
+    wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")
+    rest(browser)
+    browser.execute_script(WATCH, NAMES)
+    shown = browser.execute_script("return copies()")
+    expected = curves(explore(explore_setups()[0], ExploreSettings()))
+    for plot, data in expected.items():
+        for key, curve in data.items():
+            got = np.array(shown[plot][key], dtype=float)
+            wanted = np.where(np.isfinite(curve), curve, np.nan)
+            # The number of BLAS threads rounds differently: q, and with it the run.
+            np.testing.assert_allclose(got, wanted, rtol=1e-6, atol=1e-6, err_msg=f"{plot} {key}")
+    sounds = browser.execute_script(FIND, "sounds", "audio")
+    assert len(sounds) == 2
+    for sound in sounds:
+        length = wait_until(
+            lambda one=sound: browser.execute_script("return arguments[0].duration || 0", one), "it loaded"
+        )
+        assert length == pytest.approx(3.0, abs=1e-3)
+
+
+def test_a_fixed_rating_stays_while_the_noise_gets_louder(address, browser):
+    browser.get(address)
+    wait_until(lambda: browser.execute_script("return window.Bokeh?.documents.length > 0"), "the page was open")
+    rest(browser)
+    browser.execute_script(WATCH, NAMES)
+    value = "return Bokeh.documents[0].get_model_by_name(arguments[0])"
+    start = browser.execute_script(f"{value}.value", "absolute_rating")
+    move(browser, "rating_kind", ".bk-btn:nth-child(2)", None)
+    assert browser.execute_script(f"{value}.disabled", "relative_rating")
+    assert not browser.execute_script(f"{value}.disabled", "absolute_rating")
+    relative = browser.execute_script(f"{value}.value", "relative_rating")
+    move(browser, "level", ".noUi-handle", "RIGHT")
+    assert browser.execute_script(f"{value}.value", "absolute_rating") == start
+    assert browser.execute_script(f"{value}.value", "relative_rating") == pytest.approx(relative - 1.0, abs=0.11)
+
+
+def test_what_cannot_be_computed_is_said_in_the_page():
+    from bokeh.document import Document
+
+    from kfopc_filterpy.bench.exploring_page import _Page
+
+    class Now:
+        """A pool that runs what it is given at once."""
+
+        def submit(self, job, *arguments):
+            from concurrent.futures import Future
+
+            done = Future()
+            try:
+                done.set_result(job(*arguments))
+            except ValueError as error:
+                done.set_exception(error)
+            return done
+
+    t = np.arange(16000) / 8000
+    silent_above = np.round(np.sin(2 * np.pi * 100 * t), 3) * (t > 0)
+    setup = AcousticSetup("hum", [0, 0, 0, 1.0], [0, 1.0], 8000, silent_above)
+    page = _Page(Document(), [setup], Now())
+    page._is_running = True
+    failed = Now().submit(explore, setup, ExploreSettings(band=(3999.9, 4000.1)))
+    page._show(failed, 0.0)
+    assert page.texts["status"].text.startswith("<b>Not computed:</b> band")
+    page._show(Now().submit(explore, setup, ExploreSettings(band=(50.0, 4000.0))), 0.0)
+    assert page.texts["status"].text.startswith("Computed in")
+    assert {name: set(data) for name, data in CURVES.items()}.keys() == page.sources.keys()
+
+
+def test_a_port_in_use_is_named():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(OSError, match=f"port {port} of 127.0.0.1 is in use: choose another, or 0"):
+            serve_explore(port=port)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"port": -1}, "port must be at least 0"),
+        ({"port": 65536}, "at most 65535"),
+        ({"setups": []}, "setups must not be empty"),
+    ],
+    ids=["negative", "too large", "no setups"],
+)
+def test_wrong_arguments_are_refused_before_anything_is_served(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        serve_explore(**arguments)
+
+
+def test_the_server_listens_on_this_machine_only(address):
+    port = int(address.rstrip("/").rpartition(":")[2])
+    lines = Path("/proc/net/tcp")
+    if not lines.is_file():
+        pytest.skip("needs /proc/net/tcp")
+    listening = [line.split()[1] for line in lines.read_text().splitlines()[1:] if line.split()[3] == "0A"]
+    assert [where.split(":")[0] for where in listening if int(where.split(":")[1], 16) == port] == ["0100007F"]
