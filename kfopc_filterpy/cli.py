@@ -604,7 +604,9 @@ def _explore(options: argparse.Namespace) -> int:
     if options.primary and options.secondary:
         setups.insert(0, read_setup(options.noise, options.primary, options.secondary, fs=options.fs))
     elif options.noise or options.primary or options.secondary:
-        raise ValueError("your own files need both --primary and --secondary; without files, the page has built-in paths")
+        raise ValueError(
+            "your own files need both --primary and --secondary; without files, the page has built-in paths"
+        )
     serve_explore(setups, port=options.port)
     return ENOUGH
 
