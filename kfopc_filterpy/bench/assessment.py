@@ -453,7 +453,7 @@ def assess(
     >>> from kfopc_filterpy.signals import band_limited_noise
     >>> noise = band_limited_noise((100, 1000), 4.0, fs=8000, rng=1)
     >>> primary, secondary = np.eye(64)[40], np.eye(16)[8]
-    >>> verdict = assess(noise, primary, secondary, rating=AmplifierRating(ohm=8, sine_watt=0.05), fs=8000, n_taps=64)
+    >>> verdict = assess(noise, primary, secondary, rating=AmplifierRating(ohm=8, sine_watt=0.02), fs=8000, n_taps=64)
     >>> print(verdict.enough, verdict.limited_by)
     False amplifier
     """

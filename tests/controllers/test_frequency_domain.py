@@ -83,10 +83,9 @@ def test_two_thousand_taps_reach_the_bound() -> None:
     rated = wanted * [0.25, 0.5]
     bound = -10 * np.log10(np.sum((1 - np.sqrt(rated / wanted)) ** 2 * wanted) / wanted.sum())
     controller = kf_pb(n_taps, secondary, rated_power=rated, form="frequency domain", secondary_path_uncertainty=None)
-    result = simulate(controller, white(48000, 1), primary_path=primary, secondary_path=secondary)
-    late = slice(24000, None)
-    # The first blocks, with a correlation of a few samples, spend too much, and a part of it is repaid here.
-    assert abs(noise_reduction_db(result.error[:, late], result.disturbance[:, late]) - bound) < 0.2
+    result = simulate(controller, white(64000, 1), primary_path=primary, secondary_path=secondary)
+    late = slice(24000, None)  # 2.5 s: in half a second, the reduction of white noise scatters by 0.2 dB
+    assert abs(noise_reduction_db(result.error[:, late], result.disturbance[:, late], steady=1.0) - bound) < 0.1
     np.testing.assert_allclose(output_power(result.control_signal[:, late]) / rated, 1.0, atol=0.03)
 
 
