@@ -71,19 +71,19 @@ def leak_channel_guarded(guard, weights, j, mu):
     if guard is not None:
         taps = weights.shape[2]
         for k in range(guard.output.size if j == 0 else 0):
-            guard.output[k] = guarded_output(guard, weights, k)
+            guard.output[k] = heard_output(guard.filtered, weights, k)
         for i in range(weights.shape[1]):
             for k in range(guard.output.size):
                 add_scaled(weights[j, i], -mu * guard.output[k], newest(guard.filtered[k, j, i], taps), 0, taps)
 
 
 @part()
-def guarded_output(guard, weights, k):
-    """Return sum_ji w_ji'x''_kji for microphone k."""
+def heard_output(filtered, weights, k):
+    """Return the sum of w_ji' x'_kji for microphone k, with the delay lines of x', (K, J, I, size)."""
     total = 0.0
     for j in range(weights.shape[0]):
         for i in range(weights.shape[1]):
-            total += dot(weights[j, i], newest(guard.filtered[k, j, i], weights.shape[2]))
+            total += dot(weights[j, i], newest(filtered[k, j, i], weights.shape[2]))
     return total
 
 

@@ -16,7 +16,7 @@ from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint
 from .base import constraint_for
 from .channels import ChannelLines
-from .lms import Limiters, LMSController, change_filter, penalty_of_constraint
+from .lms import Limiters, LMSController, change_filter, heard_output, penalty_of_constraint
 from .step import Lines, adapt, advance_powers, loudspeakers
 
 
@@ -101,11 +101,7 @@ def modified_error(lines, weights, disturbance):
 def modified_channel_errors(lines, weights, disturbance):
     """Return it for each microphone, (K,)."""
     for k in range(disturbance.size):
-        total = 0.0
-        for j in range(weights.shape[0]):
-            for i in range(weights.shape[1]):
-                total += dot(weights[j, i], newest(lines.filtered[k, j, i], weights.shape[2]))
-        lines.modified_error[k] = disturbance[k] - total
+        lines.modified_error[k] = disturbance[k] - heard_output(lines.filtered, weights, k)
     return lines.modified_error
 
 
