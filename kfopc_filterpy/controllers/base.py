@@ -222,11 +222,10 @@ class FilteredReferenceController:
         model = compiled_model(amplifier)
         if model is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
+        to_filter_again = filtered_taps + secondary.size + GUARD_TAPS - 2  # with another path, and then with a guard
         return Lines(
             secondary_estimate=secondary.copy(),  # a new estimate is written into it
-            reference=delay_line(
-                max(reference_taps, filtered_taps + secondary.size + GUARD_TAPS - 2)
-            ),  # to filter again
+            reference=delay_line(max(reference_taps, to_filter_again)),
             filtered=delay_line(filtered_taps),
             output=delay_line(secondary.size),
             amplifier=model,
@@ -314,7 +313,7 @@ class FilteredReferenceController:
         uncertainty = path_uncertainty(value, lines.secondary_estimate)
         exact = not np.any(uncertainty)
         guard = None if exact else self._new_guard(guard_filter(uncertainty))
-        self._uncertainty, self._stated_uncertainty = None if exact else uncertainty, value
+        self._uncertainty, self._stated_uncertainty = None if exact else uncertainty, deepcopy(value)
         self._state = self._state._replace(lines=lines._replace(guard=guard))
         if not self.multichannel:
             self._filter_again()
