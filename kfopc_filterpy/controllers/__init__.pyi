@@ -10,6 +10,7 @@ from .mov import penalty_factor as penalty_factor
 from .path_tracker import PathChange as PathChange
 from .path_tracker import PathTracker as PathTracker
 from .power_budget import PowerBudgetController as PowerBudgetController
+from .processing import RefusedUpdate as RefusedUpdate
 from .shared_gain import SharedGainKalman as SharedGainKalman
 from .virtual import KalmanObserver as KalmanObserver
 from .virtual import VirtualMicrophones as VirtualMicrophones

@@ -18,7 +18,16 @@ from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .channels import ChannelGuard, channel_lines, channel_sample, new_channel_guard
-from .step import GuardLine, Lines, adapt_once, emit_once, estimate_once, listen
+from .processing import (
+    BlockProcessing,
+    RefusedUpdate,
+    Rows,
+    adapt_flags,
+    block_signal,
+    require_one_length,
+    require_room,
+)
+from .step import GuardLine, Lines, adapt_once, emit_once, estimate_once, listen, process_samples
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
@@ -92,7 +101,7 @@ def listening(controller: Any) -> Any:
     return controller
 
 
-class WrappedController:
+class WrappedController(BlockProcessing):
     """Base class of a controller that wraps another one and passes on its attributes."""
 
     def __init__(self, controller: Controller) -> None:
@@ -118,7 +127,7 @@ class WrappedController:
         return {}
 
 
-class FilteredReferenceController:
+class FilteredReferenceController(BlockProcessing):
     """Delay lines, powers and filtered reference that the built-in controllers share.
 
     A subclass sets `_state`, which begins with `_common()`, and registers the step for its type (see `step`).
@@ -165,6 +174,7 @@ class FilteredReferenceController:
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
     _holding: Held | None = None
+    _rows: Rows | None = None
 
     def __init__(
         self,
@@ -465,7 +475,7 @@ class FilteredReferenceController:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for a copy, which holds a state of its own."""
-        return {name: value for name, value in vars(self).items() if name != "_holding"}
+        return {name: value for name, value in vars(self).items() if name not in ("_holding", "_rows")}
 
     def _held(self) -> Held:
         """Return the state, held for compiled code."""
@@ -483,6 +493,64 @@ class FilteredReferenceController:
             raise ValueError(self._reason(error))
         if self.multichannel:
             self.after_compiled(self._state)  # a solution may be due
+
+    def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
+        state = self.compiled_state()
+        if state is None:
+            return super().process(references, errors, adapt=adapt, out=out)
+        x = self._block_signal(references, "references", self.n_references)
+        e = self._block_signal(errors, "errors", self.n_microphones)
+        require_one_length(x, e)
+        flags = adapt_flags(adapt, x.shape[-1])
+        shape = (self.n_loudspeakers, x.shape[-1]) if self.multichannel else x.shape
+        y = np.empty(shape) if out is None else out
+        require_room(y, shape)
+        rows = self._rows_of(x, e) if self.multichannel else (x, e, y)
+        done = self._process_rows(*rows, flags)
+        if self.multichannel:
+            y[:] = rows[2].T
+        else:
+            self._y = float(y[min(done, y.size - 1)])
+        if done < x.shape[-1]:
+            self._raise_refusal(e[..., done], done)
+        return y
+
+    def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
+        """Return a block of samples, (n_samples,) or (n_channels, n_samples)."""
+        signal = block_signal(value, name)
+        wanted = "(n_samples,)" if not self.multichannel else f"({n_channels}, n_samples)"
+        if signal.ndim != 1 + self.multichannel or (self.multichannel and len(signal) != n_channels):
+            raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
+        return np.ascontiguousarray(signal)
+
+    def _rows_of(self, x: np.ndarray, e: np.ndarray) -> list[np.ndarray]:
+        """Return references, errors and room for the control signals, with a sample in each row."""
+        if self._rows is None:
+            self._rows = Rows(self.n_references, self.n_microphones, self.n_loudspeakers)
+        rows = self._rows.of(x.shape[-1])
+        rows[0][:], rows[1][:] = x.T, e.T
+        return rows
+
+    def _process_rows(self, x: np.ndarray, e: np.ndarray, y: np.ndarray, flags: np.ndarray) -> int:
+        """Process samples, and return how many; fewer than all if the controller could not adapt to the next one."""
+        done = 0
+        while done < len(x):
+            end = min(done + (self.samples_to_block() or len(x)), len(x))
+            held = self._held()
+            done = process_samples.with_held(held, x, e, flags, y, done, end)
+            self.after_compiled(held.state)
+            if done < end:
+                break
+        return done
+
+    def _raise_refusal(self, error: Any, sample: int) -> None:
+        """Raise `RefusedUpdate` with the reason that `update` gives."""
+        try:
+            self.update(error)
+        except ValueError as reason:
+            raise RefusedUpdate(str(reason), sample) from reason
+        raise RefusedUpdate(NO_SOLUTION, sample)
 
     def _reason(self, error: Any) -> str:
         """Return why an update was refused."""

@@ -23,6 +23,7 @@ from .step import (
     advance_powers,
     emit_outputs,
     emit_silence,
+    emitted,
     filter_output,
     loudspeakers,
     output,
@@ -138,9 +139,15 @@ def new_channel_guard(taps: np.ndarray, shape: tuple[int, int, int], n_taps: int
 
 @emit_outputs.register(ChannelLines)
 def emit_channel_outputs(lines, state):
-    """Return y(n), (J,)."""
+    """Set y(n), (J,)."""
     for j in range(lines.output.shape[0]):
         emit_channel(lines, j, output(state, j))
+    return 0.0
+
+
+@emitted.register(ChannelLines)
+def emitted_channels(lines, y):
+    """Return y(n), (J,)."""
     return lines.control_signal
 
 

@@ -15,10 +15,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba.extending import overload
 
 from ..kernels.borrowing import borrowed
-from ..kernels.compiling import by_type, compiled, compiled_for_states, inlined, part
+from ..kernels.compiling import OPTIONS, by_type, compiled, compiled_for_states, inlined, part
 from ..kernels.delay_lines import latest, newest, push
+from ..kernels.holding import kind_of_held
 from ..kernels.vectors import dot
 from ..power.amplifiers import amplify
 from ..power.constraint import advance_constraint, squares_are_finite
@@ -66,6 +68,11 @@ def adapt(state, error, control_signal):
 
 
 @by_type
+def skip(state):
+    """Advance what must advance with every sample, if there is anything, without adapting to it."""
+
+
+@by_type
 def follow(state, error):
     """Update the powers with a sample heard while the loudspeaker is silent. Return False if that fails."""
     finite, _, _ = advance_powers(state.lines, state.constraint, error)
@@ -110,8 +117,14 @@ def take_reference(lines, x):
 
 @by_type
 def emit_outputs(lines, state):
-    """Return y(n), after any limiter, and add it to its delay line."""
+    """Return y(n), after any limiter, and add it to its delay line; with several channels, only `emitted` has it."""
     return emit_limited(lines, output(state, 0))
+
+
+@by_type
+def emitted(lines, y):
+    """Return the control signal after `emit` has returned y; with several channels (J,)."""
+    return y
 
 
 @by_type
@@ -173,19 +186,42 @@ def disturbance_estimate(lines, error):
     return error + dot(s, newest(lines.output, s.size))
 
 
-# Entry points from Python.
+# Entry points from Python. The loops call `emit_step` and `adapt_step`, which are the same compiled functions: an
+# algorithm is compiled once, and a loop over its samples is small.
 
 
 @compiled_for_states()
 def emit_once(held, x):
-    """Call `emit` from Python, with a `Held` state."""
-    return emit(held.state, x)
+    """Call `emit` with a `Held` state."""
+    return emit(borrowed(held.state), x)
 
 
 @compiled_for_states()
 def adapt_once(held, error, control_signal):
-    """Call `adapt` from Python, with a `Held` state."""
+    """Call `adapt` with a `Held` state."""
+    return adapt(borrowed(held.state), error, control_signal)
+
+
+def emit_step(held, x):
+    """Call `emit_once` in a compiled loop."""
+    return emit(held.state, x)
+
+
+def adapt_step(held, error, control_signal):
+    """Call `adapt_once` in a compiled loop."""
     return adapt(held.state, error, control_signal)
+
+
+@overload(emit_step, jit_options=OPTIONS)
+def _emit_step(held, x):
+    step = emit_once.for_states(kind_of_held(held))
+    return lambda held, x: step(held, x)
+
+
+@overload(adapt_step, jit_options=OPTIONS)
+def _adapt_step(held, error, control_signal):
+    step = adapt_once.for_states(kind_of_held(held))
+    return lambda held, error, control_signal: step(held, error, control_signal)
 
 
 @compiled()
@@ -207,3 +243,21 @@ def listen(state, references, errors):
         if not follow(state, errors[n]):
             return n
     return references.shape[0]
+
+
+@compiled_for_states(nogil=True)
+def process_samples(held, references, errors, adapting, outputs, begin, end):
+    """Process the samples from `begin` to `end` of a block, and set their control signals.
+
+    Return the number of samples processed, or the sample to which the controller could not adapt. The first axis is
+    time; with several channels, each row is a sample.
+    """
+    state = borrowed(held.state)
+    for n in range(begin, end):
+        y = emitted(state.lines, emit_step(held, references[n]))
+        outputs[n] = y
+        if not adapting[n]:
+            skip(state)
+        elif not adapt_step(held, errors[n], y):
+            return n
+    return end

@@ -65,8 +65,12 @@ class StateEntry:
         self.passing = part(**options)(function)
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
+    def for_states(self, kind: type) -> Any:
+        """Return the compiled function for a type of state; compiled callers call it, so that it is compiled once."""
+        return self.kept if is_ours(kind) else self.passing
+
     def __call__(self, state: Any, *arguments: Any) -> Any:
-        return (self.kept if is_ours(type(state)) else self.passing)(state, *arguments)
+        return self.for_states(type(state))(state, *arguments)
 
     def with_held(self, held: Any, *arguments: Any) -> Any:
         """Call it with a `Held` state, of which it reads the field `state`."""

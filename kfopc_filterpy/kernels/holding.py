@@ -29,8 +29,15 @@ structref.define_attributes(_HeldType)
 
 
 @compiled_for_states()
-def _hold(state):
+def hold(state):
+    """Return the held form of a state."""
     return _Held(state)
+
+
+def kind_of_held(held: Any) -> type:
+    """Return the type of the state in a held form, from numba's type of that."""
+    kind: type = held.field_dict["state"].instance_class
+    return kind
 
 
 class Held:
@@ -43,4 +50,4 @@ class Held:
     def __init__(self, state: Any) -> None:
         self.state = state
         self.ours = is_ours(type(state))
-        self.passed = self if CONFIG.DISABLE_JIT else _hold(state)
+        self.passed = self if CONFIG.DISABLE_JIT else hold(state)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..controllers.step import adapt, control_filter, emit, power_weight
+from ..controllers.step import adapt_step, control_filter, emit_step, power_weight
 from ..kernels.borrowing import borrowed
 from ..kernels.compiling import compiled, compiled_for_states, inlined
 from ..kernels.delay_lines import newest, push
@@ -83,22 +83,22 @@ def note_weights(rows, weights, every, n):
 
 
 @compiled_for_states(nogil=True)
-def run(state, plant, signals, weights, limit, every, first):
-    """Run a controller's `state` over a stretch, whose first sample is sample `first` of the run.
+def run(held, plant, signals, weights, limit, every, first):
+    """Run a controller, whose state is `Held`, over a stretch, whose first sample is sample `first` of the run.
 
     Return the status and the number of samples done. The control filter is stored in `weights`, (rows, L), at every
     `every`-th sample.
     """
-    state, plant, signals = borrowed(state), borrowed(plant), borrowed(signals)
+    state, plant, signals = borrowed(held.state), borrowed(plant), borrowed(signals)
     for k in range(signals.reference.size):
-        y = emit(state, measured_reference(plant, signals.reference[k]))
+        y = emit_step(held, measured_reference(plant, signals.reference[k]))
         if not abs(y) <= limit:
             return DIVERGED, k
         y_amplified = amplify(plant.amplifier, y)
         a = anti_noise(plant, y_amplified)
         e = signals.disturbance[k] - a + signals.sensor_noise[k]
         signals.error[k], signals.control_signal[k] = e, y
-        if not adapt(state, e, y):
+        if not adapt_step(held, e, y):
             return REFUSED, k
         signals.amplifier_output[k], signals.anti_noise[k] = y_amplified, a
         used = state.constraint.numbers[0]

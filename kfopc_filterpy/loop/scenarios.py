@@ -25,6 +25,7 @@ from ..kernels.covariance import (
     project_covariance,
 )
 from ..kernels.delay_lines import TAPS, delay_line, newest, refill
+from ..kernels.holding import hold
 from ..kernels.stacking import member, stacked, unstack
 from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
@@ -37,6 +38,7 @@ from .simulation import POWERS, RECORDED
 
 BLOCK = 512  # samples whose gains are stored at a time
 VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
+hold_kept = hold.kept  # for compiled callers
 SAFE = 1e290  # a smaller correction cannot overflow finite weights
 
 
@@ -93,7 +95,7 @@ def run_scenarios(states, plants, signals, limits, status, done, begin, end):
             states.gains.taken[0] = 0
             state, plant = member(states, i), member(plants, i)
             block = part_of(member(signals, i), begin, end)
-            status[i], taken = run_kept(state, plant, block, no_weights, limits[i], 1, 0)
+            status[i], taken = run_kept(hold_kept(state), plant, block, no_weights, limits[i], 1, 0)
             done[i] += taken
 
 

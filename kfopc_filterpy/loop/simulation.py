@@ -11,6 +11,7 @@ import numpy as np
 from .._validate import as_count, as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
 from ..kernels.delay_lines import delay_line
+from ..kernels.holding import Held
 from ..paths.models import path_taps
 from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
@@ -218,7 +219,7 @@ def _run_compiled(
 ) -> tuple[int, int]:
     """Run a stretch by `run.run`."""
     try:
-        status, done = run(state, plant, stretch, weights, limit, every, first)
+        status, done = run.with_held(Held(state), plant, stretch, weights, limit, every, first)
     finally:  # even if interrupted, the controller must have the state of its last sample
         controller.after_compiled(state)
     if progress:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.comparing import assert_same_run, numbers_of
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, run
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, noises, run
 
 import kfopc_filterpy
 from kfopc_filterpy import (
@@ -97,6 +98,27 @@ def test_compiled_run_is_the_steps_bit_for_bit(name: str, variant: str) -> None:
     assert np.any(np.abs(np.diff(result.weights, axis=0)) > 0)
     assert_same_run(run(fast, n=50), run(slow, n=50, compiled=False))  # and they go on alike
     assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
+
+
+@pytest.mark.parametrize("name", [name for name in MAKERS if not name.startswith("fast")])
+def test_blocks_are_the_steps_bit_for_bit(name: str) -> None:
+    """However a recording is cut into blocks, and whichever samples are not adapted to."""
+    blocks, steps = made(name, "plain"), made(name, "plain")
+    x, d, _ = noises(300)
+    adapt = np.random.default_rng(1).random(300) < 0.9
+    expected = np.empty(300)
+    for n in range(300):
+        expected[n] = steps.control_signal(x[n])
+        if adapt[n]:
+            steps.update(d[n])
+    cuts = [0, 1, 2, 18, 82, 83, 300]
+    got = [blocks.process(x[a:b], d[a:b], adapt=adapt[a:b]) for a, b in itertools.pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(got), expected)
+    np.testing.assert_array_equal(blocks.weights, steps.weights)
+    for mine, theirs in zip(numbers_of(blocks.constraint.state), numbers_of(steps.constraint.state), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    blocks.update(d[-1]), steps.update(d[-1])  # they go on alike, sample by sample
+    np.testing.assert_array_equal(blocks.weights, steps.weights)
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -1,0 +1,156 @@
+"""Blocks of samples: what a real-time process hands to a controller, and what it gets back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_real_array, require_finite
+
+
+class RefusedUpdate(ValueError):
+    """Raised by `process` if the controller could not adapt to a sample of a block.
+
+    The control signals up to that sample are in `out`, if it was given, and the controller has processed everything up
+    to it but did not adapt to it. Go on with the rest of the block, ``references[..., sample + 1:]``.
+
+    Attributes
+    ----------
+    sample : int
+        Index of the sample in the block.
+    """
+
+    def __init__(self, reason: str, sample: int) -> None:
+        super().__init__(reason)
+        self.sample = sample
+        self.add_note(f"in sample {sample} of the block")
+
+
+class BlockProcessing:
+    """Gives a controller `process`, by its two methods per sample."""
+
+    def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the control signals of a block of samples, and adapt to its errors.
+
+        This is `control_signal` and `update` for each sample in turn, so the results do not depend on how a recording is
+        cut into blocks. The errors of a block must have been measured before its control signals are known. In a
+        real-time process this holds if the estimated secondary path includes the delay of the blocks: the path then
+        begins with at least as many zeros as a block has samples.
+
+        Parameters
+        ----------
+        references : array_like, shape (n_samples,) or (I, n_samples)
+            Reference x.
+        errors : array_like, shape (n_samples,) or (K, n_samples)
+            Error e.
+        adapt : bool or array_like, shape (n_samples,), default True
+            Whether to adapt to a sample. Without, the control signal is computed with the present control filter.
+        out : ndarray of float64, shape (n_samples,) or (J, n_samples), optional
+            Array for the control signals, C-contiguous. With it, nothing is allocated for them.
+
+        Returns
+        -------
+        ndarray, shape (n_samples,) or (J, n_samples)
+            Control signals y; `out` if it was given.
+
+        Raises
+        ------
+        ValueError
+            Signals of other shapes, without a sample, or with NaN or Inf: nothing was changed.
+        RefusedUpdate
+            An update that `update` refuses, for example because a square overflows.
+
+        Notes
+        -----
+        The built-in controllers process a block in compiled code, which releases the interpreter lock. Wrappers, and
+        subclasses with methods of their own, are called sample by sample.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import FxLMS
+        >>> path = np.zeros(65)
+        >>> path[64] = 1.0  # blocks of 64 samples: a sample is heard 64 samples later
+        >>> controller = FxLMS(16, path, step_size=1e-3)
+        >>> block = np.ones(64)
+        >>> controller.process(block, 0.5 * block).shape
+        (64,)
+        """
+        return process_steps(self, references, errors, adapt=adapt, out=out)
+
+
+def process_steps(controller: Any, references: Any, errors: Any, *, adapt: Any, out: np.ndarray | None) -> np.ndarray:
+    """Do what `BlockProcessing.process` says for any controller, by its two methods per sample."""
+    x, e = block_signal(references, "references"), block_signal(errors, "errors")
+    require_one_length(x, e)
+    flags = adapt_flags(adapt, x.shape[-1])
+    y: Any = out
+    for n in range(x.shape[-1]):
+        sample = controller.control_signal(x[..., n])
+        if n == 0:
+            shape = (*np.shape(sample), x.shape[-1])
+            y = np.empty(shape) if out is None else out
+            require_room(y, shape)
+        y[..., n] = sample
+        if flags[n]:
+            try:
+                controller.update(e[..., n])
+            except ValueError as error:
+                raise RefusedUpdate(str(error), n) from error
+    return y
+
+
+def block_signal(value: Any, name: str) -> np.ndarray:
+    """Return a block of finite samples, (n_samples,) or (n_channels, n_samples), with at least one sample."""
+    signal = as_real_array(value, name)
+    if signal.ndim not in (1, 2) or signal.size == 0:
+        raise ValueError(
+            f"{name} must be (n_samples,) or (n_channels, n_samples) with at least 1 sample, got shape {signal.shape}"
+        )
+    # The sum of the squares says at once whether all are finite, without an array for the answers, unless it overflows.
+    if not (signal.flags.c_contiguous and np.isfinite(np.vdot(signal, signal))):
+        require_finite(signal, name)
+    return signal
+
+
+def require_one_length(references: np.ndarray, errors: np.ndarray) -> None:
+    """Raise ValueError if a block's signals differ in length."""
+    if references.shape[-1] != errors.shape[-1]:
+        raise ValueError(
+            "references and errors of a block must have the same number of samples, "
+            f"got {references.shape[-1]} and {errors.shape[-1]}"
+        )
+
+
+def adapt_flags(adapt: Any, n_samples: int) -> np.ndarray:
+    """Return for each sample whether to adapt to it, (n_samples,) of bool."""
+    flags = np.asarray(adapt)
+    if flags.dtype != bool or flags.shape not in ((), (n_samples,)):
+        raise ValueError(
+            f"adapt must be True, False or an array of bool with one for each of the {n_samples} samples, got "
+            f"{flags.dtype} of shape {flags.shape}"
+        )
+    return np.ascontiguousarray(np.broadcast_to(flags, n_samples))
+
+
+def require_room(out: Any, shape: tuple[int, ...]) -> None:
+    """Raise ValueError if control signals of a shape do not fit into `out`."""
+    fits = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == shape and out.flags.c_contiguous
+    if not fits or not out.flags.writeable:
+        got = f"{out.dtype} of shape {out.shape}" if isinstance(out, np.ndarray) else repr(out)
+        raise ValueError(f"out must be a writable, C-contiguous array of float64 of shape {shape}, got {got}")
+
+
+class Rows:
+    """Arrays in which a block of several channels has a sample in each row; kept from block to block."""
+
+    def __init__(self, *channels: int) -> None:
+        self._channels = channels
+        self._arrays = [np.empty((0, n)) for n in channels]
+
+    def of(self, n_samples: int) -> list[np.ndarray]:
+        """Return an array (n_samples, channels) for each number of channels."""
+        if len(self._arrays[0]) < n_samples:
+            self._arrays = [np.empty((n_samples, n)) for n in self._channels]
+        return [array[:n_samples] for array in self._arrays]

@@ -1,0 +1,489 @@
+"""A supervisor for a controller in a real-time process: whatever comes in, what goes out is finite and within limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_choice, as_positive, as_real_array, as_sample_count, per_loudspeaker
+from ..controllers.base import Controller
+from ..controllers.processing import RefusedUpdate, process_steps
+from ..power.constraint import DEFAULT_FS
+from .faults import GOOD, KINDS, REPEATED, Inspector, is_repeated
+from .health import Health
+
+ACTIONS = ("mute", "reset", "freeze")
+LONGEST_PAUSE = 64  # of the first pause
+OVER_POWER = 4.0  # times the rated power over a window: no algorithm here exceeds its rating so much, except in its first blocks
+OFTEN_LIMITED = 0.1  # of a window's samples at the limit
+SURPRISE = 1e4  # squared innovation over its predicted variance, relative to what is usual: 40 dB
+SETTLING_WINDOWS = 4  # before the usual surprise is known
+USUAL_WINDOWS = 40.0  # over which it is averaged
+
+
+class Supervisor:
+    """Runs a controller block by block, and keeps faults of microphones, drivers and the adaptation from the loudspeakers.
+
+    Three things hold, whatever the inputs are. The control signal is finite and within `amplitude_limit`. A bad sample is
+    never adapted to: weights, covariance and running powers stay as they are. Every event is counted in `health`.
+
+    A bad sample of a reference also spoils the filtered reference for as long as the control filter and the secondary
+    path remember it. The controller therefore adapts again after ``recovery_samples``, L + n_path samples after the last
+    bad reference. After a bad error, it adapts to the next sample.
+
+    Parameters
+    ----------
+    controller : Controller
+        Any controller that can be copied. A fresh copy of its present state replaces it after a divergence.
+    fs : float, default 16000
+        Sample rate in Hz.
+    amplitude_limit : float or array_like, shape (J,)
+        Largest magnitude of the control signal, of all loudspeakers or of each. This is a last resort, which the
+        controller does not know of: give the controller itself a limiter of a smaller `amplitude_limit`.
+    full_scale : float, optional
+        Magnitude at which the converters of the microphones clip; by default they do not.
+    stuck_s : float, default 0.01
+        Time of equal samples after which a microphone is stuck, in seconds. Digital silence is stuck too.
+    fade_s : float, default 0.05
+        Time in seconds over which the control fades in and out.
+    mute_after_s : float, default 10
+        Time in seconds without a usable sample after which the control fades out; it fades in again after `fade_s` of
+        usable samples.
+    on_divergence : {"mute", "reset", "freeze"}, default "mute"
+        What to do about a divergence: fade out, start anew with a fresh copy after a pause, and double the pause for the
+        next time; start anew at once; or go back to the state of the last good window and do not adapt during the pause.
+    pause_s : float, default 2
+        First pause in seconds.
+    window_s : float, default 0.25
+        Time over which the divergence monitor averages, in seconds.
+    largest_gain : float, default 1e6
+        Largest sum of the magnitudes of a control filter's weights.
+
+    Attributes
+    ----------
+    controller : Controller
+        Controller that is running now.
+    health : Health
+        What was noticed.
+    muted : bool
+        Whether the loudspeakers are silent now.
+    recovery_samples : int
+        Samples after a bad reference before the controller adapts again; 0 if it does not say how much it remembers.
+
+    Raises
+    ------
+    TypeError, ValueError
+        An object that is not a controller; a limit, time or choice that is out of range.
+
+    Notes
+    -----
+    The divergence monitor looks at each window for
+
+    - weights that are not finite, or larger than `largest_gain`;
+    - a control signal of more than four times the controller's rated power, or one at its limit for a tenth of the time;
+    - squared innovations, relative to their predicted variance, 40 dB above what has been usual, for the controllers
+      around a Kalman filter (of the last sample of each block).
+
+    It cannot see that the noise becomes louder in the room: put the controller into a `MonitoredController` for that, for
+    example for a microphone or a loudspeaker whose sign was flipped.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import FxLMS
+    >>> from kfopc_filterpy.realtime import Supervisor
+    >>> path = np.zeros(33)
+    >>> path[32] = 1.0  # the delay of a block is part of the secondary path
+    >>> supervisor = Supervisor(FxLMS(8, path, step_size=0.01), amplitude_limit=0.5)
+    >>> reference = np.sin(np.arange(32.0))
+    >>> error = reference.copy()
+    >>> error[[3, 4]] = np.nan, np.inf
+    >>> y = supervisor.process(reference, error)
+    >>> supervisor.health
+    <Health: 1 not finite>
+    """
+
+    def __init__(
+        self,
+        controller: Controller,
+        *,
+        fs: float = DEFAULT_FS,
+        amplitude_limit: Any,
+        full_scale: float | None = None,
+        stuck_s: float = 0.01,
+        fade_s: float = 0.05,
+        mute_after_s: float = 10.0,
+        on_divergence: str = "mute",
+        pause_s: float = 2.0,
+        window_s: float = 0.25,
+        largest_gain: float = 1e6,
+    ) -> None:
+        if isinstance(controller, type) or not isinstance(controller, Controller):
+            raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+        self.controller: Any = controller
+        self.fs = as_positive(fs, "fs", unit="Hz")
+        if hasattr(controller, "require_sample_rate"):
+            controller.require_sample_rate(self.fs)
+        self.multichannel = bool(getattr(controller, "multichannel", False))
+        counts = ("n_references", "n_microphones", "n_loudspeakers")
+        self.n_references, self.n_microphones, self.n_loudspeakers = (
+            int(getattr(controller, count, 1)) if self.multichannel else 1 for count in counts
+        )
+        self.amplitude_limit = per_loudspeaker(amplitude_limit, self.n_loudspeakers, "amplitude_limit")
+        self.on_divergence = as_choice(on_divergence, "on_divergence", ACTIONS)
+        self.largest_gain = as_positive(largest_gain, "largest_gain")
+        self.recovery_samples = _remembered(controller)
+        self._inspectors = [
+            Inspector(
+                n,
+                most_equal=as_sample_count(stuck_s, fs, "stuck_s"),
+                rate=1.0 / (0.1 * self.fs),
+                full_scale=np.inf if full_scale is None else as_positive(full_scale, "full_scale"),
+            )
+            for n in (self.n_references, self.n_microphones)
+        ]
+        self.health = Health()
+        self._fresh = deepcopy(controller)
+        self._good = self._fresh if on_divergence == "freeze" else None  # state of the last good window
+        self._fade = as_sample_count(fade_s, fs, "fade_s")
+        self._mute_after = as_sample_count(mute_after_s, fs, "mute_after_s")
+        self._window = as_sample_count(window_s, fs, "window_s")
+        self._pause = self._first_pause = as_sample_count(pause_s, fs, "pause_s")
+        self._samples = 0  # processed since the start
+        self._gain, self._target = 1.0, 1.0  # of the control signal, and where it fades to
+        self._waiting = 0  # samples left of a pause
+        self._replacement_due = False  # a fresh controller takes over when the loudspeakers are silent
+        self._frozen = 0  # samples left without adaptation
+        self._since_bad_reference = self.recovery_samples
+        self._unusable = 0  # samples since the last usable one
+        self._paused_for_input = False
+        self._last_y = np.zeros(self.n_loudspeakers)
+        self._last_blocks: tuple[Any, Any] = (None, None)
+        self._usual, self._windows = np.nan, 0
+        self._begin_window()
+
+    @property
+    def muted(self) -> bool:
+        """Whether the loudspeakers are silent now."""
+        return self._gain == 0.0 and self._target == 0.0
+
+    def __repr__(self) -> str:
+        state = "muted" if self.muted else "frozen" if self._frozen else "running"
+        return f"<Supervisor of {getattr(self.controller, 'name', type(self.controller).__name__)}: {state}, {self.health!r}>"
+
+    def fade_in(self) -> None:
+        """Let the control fade in over `fade_s`."""
+        self._target = 1.0
+
+    def fade_out(self) -> None:
+        """Let the control fade out over `fade_s`; the controller listens while it is silent."""
+        self._target = 0.0
+
+    def start_silent(self) -> None:
+        """Begin with silent loudspeakers; `fade_in` starts the control."""
+        self._gain = self._target = 0.0
+
+    def process(self, references: Any, errors: Any, *, lost: int = 0) -> np.ndarray:
+        """Return the control signals of a block.
+
+        Parameters
+        ----------
+        references : array_like, shape (n_samples,) or (I, n_samples), or None
+            References x; None, and any value that is None, NaN or infinite, is a missing sample.
+        errors : array_like, shape (n_samples,) or (K, n_samples), or None
+            Errors e, of as many samples; None as for the references, but not for both.
+        lost : int, default 0
+            Number of samples that the interface lost before this block.
+
+        Returns
+        -------
+        ndarray, shape (n_samples,) or (J, n_samples)
+            Control signals y.
+
+        Raises
+        ------
+        TypeError, ValueError
+            Signals of other shapes, or that are not numbers: nothing was changed.
+        """
+        x, e = self._read(references, errors)
+        usable = self._usable(x, e, lost)
+        y = self._control(x, e, usable)
+        self._limit(y)
+        self._samples += y.shape[1]
+        self._watch(y)
+        return y if self.multichannel else y[0]
+
+    # ---- What comes in
+
+    def _read(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return copies of references (I, n) and errors (K, n); what is missing is NaN."""
+        if references is None and errors is None:
+            raise ValueError("references or errors must be given: without both, the length of the block is not known")
+        given = [
+            None if value is None else _channels(value, n, name)
+            for value, n, name in (
+                (references, self.n_references, "references"),
+                (errors, self.n_microphones, "errors"),
+            )
+        ]
+        lengths = {block.shape[1] for block in given if block is not None}
+        if len(lengths) != 1 or 0 in lengths:
+            raise ValueError(f"references and errors must have the same number of samples, at least 1, got {lengths}")
+        (n,) = lengths
+        x, e = (
+            np.full((channels, n), np.nan) if block is None else block
+            for block, channels in zip(given, (self.n_references, self.n_microphones), strict=True)
+        )
+        return x, e
+
+    def _usable(self, x: np.ndarray, e: np.ndarray, lost: int) -> np.ndarray:
+        """Return which samples can be adapted to, (n,); bad ones are replaced in place and noted."""
+        n = x.shape[1]
+        repeated = is_repeated(x, self._last_blocks[0]) and is_repeated(e, self._last_blocks[1])
+        self._last_blocks = (x.copy(), e.copy())
+        kinds = [inspector(block) for inspector, block in zip(self._inspectors, (x, e), strict=True)]
+        if repeated:
+            for kind in kinds:
+                kind[kind == GOOD] = REPEATED
+        for name, kind in zip(("reference", "error"), kinds, strict=True):
+            self._note_kinds(name, kind)
+        if lost:
+            self._note("lost", n_samples=lost)
+            self._since_bad_reference = 0
+        bad_x, bad_e = (np.any(kind != GOOD, axis=0) for kind in kinds)
+        index = np.arange(n)
+        last_bad = np.maximum.accumulate(np.where(bad_x, index, -1))
+        since = np.where(last_bad < 0, self._since_bad_reference + index, index - last_bad - 1)
+        usable = ~bad_x & ~bad_e & (since >= self.recovery_samples)
+        self._since_bad_reference = int(since[-1]) + 1
+        self._count_unusable(usable)
+        return usable
+
+    def _note_kinds(self, name: str, kinds: np.ndarray) -> None:
+        """Record the bad samples of a block."""
+        for channel in np.flatnonzero(np.any(kinds != GOOD, axis=1)):
+            for kind in range(1, len(KINDS)):
+                where = np.flatnonzero(kinds[channel] == kind)
+                if where.size:
+                    begin, end = (self._samples + where[[0, -1]]) / self.fs
+                    self.health.note(
+                        KINDS[kind],
+                        f"{name} {channel}",
+                        time_s=float(begin),
+                        n_samples=where.size,
+                        until_s=float(end + 1 / self.fs),
+                    )
+
+    def _count_unusable(self, usable: np.ndarray) -> None:
+        """Fade out if nothing was usable for long, and in again afterwards."""
+        good = np.flatnonzero(usable)
+        self._unusable = usable.size - 1 - int(good[-1]) if good.size else self._unusable + usable.size
+        if self._unusable > self._mute_after and not self._paused_for_input and self._target == 1.0:
+            self._note("silent: no usable input")
+            self._paused_for_input = True
+            self.fade_out()
+        elif self._paused_for_input and self._unusable == 0:
+            self._note("running again")
+            self._paused_for_input = False
+            if self._waiting == 0:
+                self.fade_in()
+
+    # ---- The control signal
+
+    def _control(self, x: np.ndarray, e: np.ndarray, usable: np.ndarray) -> np.ndarray:
+        """Return the control signals of a block, (J, n), faded."""
+        n = x.shape[1]
+        gains = self._gains(n)
+        if not np.any(gains):
+            self._listen(x, e, usable)
+            y = np.zeros((self.n_loudspeakers, n))
+        else:
+            frozen = min(self._frozen, n)
+            self._frozen -= frozen
+            usable[:frozen] = False
+            y = self._adapted(x, e, usable & (gains == 1.0)) * gains
+            if gains[-1] < 1.0:  # the controller does not know that its output is faded: it must forget that
+                self._since_bad_reference = 0
+        return self._finite(y)
+
+    def _gains(self, n: int) -> np.ndarray:
+        """Return the gains of a block, which approach the target at a constant rate."""
+        if self._gain == self._target:
+            return np.full(n, self._gain)
+        step = (1.0 if self._target > self._gain else -1.0) / self._fade
+        gains = np.clip(self._gain + step * np.arange(1, n + 1), 0.0, 1.0)
+        self._gain = float(gains[-1])
+        return gains
+
+    def _listen(self, x: np.ndarray, e: np.ndarray, usable: np.ndarray) -> None:
+        """Let the controller follow the noise with silent loudspeakers, and count the pause."""
+        if self._replacement_due:
+            self.controller, self._replacement_due = deepcopy(self._fresh), False
+        if np.all(usable) and hasattr(self.controller, "listen"):
+            try:
+                self.controller.listen(*(self._shaped(block) for block in (x, e)))
+            except ValueError:
+                self._note("refused", n_samples=x.shape[1])
+        if self._waiting > 0:
+            self._waiting = max(self._waiting - x.shape[1], 0)
+            if self._waiting == 0 and not self._paused_for_input:
+                self._note("running again")
+                self.fade_in()
+
+    def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
+        """Return the controller's outputs, (J, n); a sample that it refuses is counted, and the rest goes on."""
+        y, begin, n = np.zeros((self.n_loudspeakers, x.shape[1])), 0, x.shape[1]
+        process: Callable[..., Any] = getattr(self.controller, "process", None) or partial(process_steps, self.controller)
+        with np.errstate(over="ignore", invalid="ignore"):
+            while begin < n:
+                rest = slice(begin, n)
+                room = np.zeros((self.n_loudspeakers, n - begin))
+                try:
+                    process(
+                        self._shaped(x[:, rest]), self._shaped(e[:, rest]), adapt=adapt[rest], out=self._shaped(room)
+                    )
+                    done = n - begin
+                except RefusedUpdate as refused:
+                    done = refused.sample + 1
+                    self._note("refused", after=begin + refused.sample)
+                y[:, begin : begin + done] = room[:, :done]
+                begin += done
+        return y
+
+    def _finite(self, y: np.ndarray) -> np.ndarray:
+        """Return the control signals; from a value that is not finite on, the last finite one fades out."""
+        finite = np.isfinite(y).all(axis=0)
+        if not finite.all():
+            first = int(finite.argmin())
+            held = y[:, first - 1] if first else self._last_y
+            n = y.shape[1] - first
+            y[:, first:] = held[:, np.newaxis] * np.clip(1.0 - np.arange(1, n + 1) / min(n, self._fade), 0.0, 1.0)
+            self._stop("diverged: not finite", at_once=True)
+        self._last_y = y[:, -1].copy()
+        return y
+
+    def _limit(self, y: np.ndarray) -> None:
+        """Clip the control signals to their limits."""
+        for j, limit in enumerate(self.amplitude_limit):
+            over = np.abs(y[j]) > limit
+            count = int(np.count_nonzero(over))
+            if count:
+                np.clip(y[j], -limit, limit, out=y[j])
+                self._limited[j] += count
+                self._note("limited", f"loudspeaker {j}", n_samples=count)
+
+    # ---- The divergence monitor
+
+    def _begin_window(self) -> None:
+        self._counted, self._energy = 0, np.zeros(self.n_loudspeakers)
+        self._limited = np.zeros(self.n_loudspeakers)
+        self._surprises: list[float] = []
+
+    def _watch(self, y: np.ndarray) -> None:
+        """Add a block to the window; at its end, act if the adaptation has diverged."""
+        if self.muted:
+            return
+        self._counted += y.shape[1]
+        self._energy += np.sum(y * y, axis=1)
+        surprise = _surprise(self.controller)
+        if np.isfinite(surprise):
+            self._surprises.append(surprise)
+        if self._counted >= self._window:
+            what = self._divergence()
+            if what:
+                self._stop(f"diverged: {what}")
+            elif self._good is not None:
+                self._good = deepcopy(self.controller)
+            self._begin_window()
+
+    def _divergence(self) -> str:
+        """Return what shows a divergence in this window; empty if nothing does."""
+        weights = getattr(self.controller, "control_filter", getattr(self.controller, "weights", np.zeros(1)))
+        gains = np.abs(np.atleast_1d(weights)).sum(axis=-1)
+        if not np.all(gains <= self.largest_gain):
+            return "weights"
+        rated = getattr(self.controller, "rated_power", None)
+        over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
+        if over or np.any(self._limited > OFTEN_LIMITED * self._counted):
+            return "power"
+        return "innovation" if self._is_surprised() else ""
+
+    def _is_surprised(self) -> bool:
+        """Return whether the innovations are far larger than usual."""
+        if not self._surprises:
+            return False
+        mean = float(np.mean(self._surprises))
+        self._windows += 1
+        if self._windows <= SETTLING_WINDOWS or not np.isfinite(self._usual):
+            self._usual = mean
+            return False
+        if mean > SURPRISE * self._usual:
+            self._windows = 0
+            return True
+        self._usual += (mean - self._usual) / USUAL_WINDOWS
+        return False
+
+    def _stop(self, why: str, at_once: bool = False) -> None:
+        """Act on a divergence."""
+        self._note(why)
+        action = self.on_divergence
+        if action == "freeze":
+            self.controller = deepcopy(self._good)
+            self._frozen = self._pause
+            self._note("frozen")
+        else:
+            if action == "mute":
+                self._note("muted")
+                self._waiting = self._pause
+                self._target = 0.0
+                if at_once:
+                    self._gain = 0.0
+            else:
+                self._note("reset")
+            if at_once or action == "reset":
+                self.controller = deepcopy(self._fresh)
+            else:  # it goes on until it is silent
+                self._replacement_due = True
+        self._pause = min(2 * self._pause, LONGEST_PAUSE * self._first_pause)
+        self._since_bad_reference = 0
+        self._begin_window()
+
+    def _note(self, what: str, channel: str = "", *, after: int = 0, n_samples: int = 1) -> None:
+        begin = (self._samples + after) / self.fs
+        self.health.note(what, channel, time_s=begin, n_samples=n_samples, until_s=begin + n_samples / self.fs)
+
+    def _shaped(self, block: np.ndarray) -> np.ndarray:
+        """Return a block as the controller takes it."""
+        return np.ascontiguousarray(block) if self.multichannel else block[0]
+
+
+def _channels(value: Any, n_channels: int, name: str) -> np.ndarray:
+    """Return a copy of a block as (n_channels, n_samples); None becomes NaN."""
+    if isinstance(value, np.ndarray) and value.dtype == object or isinstance(value, list | tuple):
+        value = np.array(value, dtype=np.float64)
+    block = np.array(as_real_array(value, name))
+    block = block[np.newaxis] if block.ndim == 1 and n_channels == 1 else block
+    if block.ndim != 2 or len(block) != n_channels:
+        wanted = "(n_samples,)" if n_channels == 1 else f"({n_channels}, n_samples)"
+        raise ValueError(f"{name} must be {wanted} for this controller, got shape {block.shape}")
+    return np.ascontiguousarray(block)
+
+
+def _remembered(controller: Any) -> int:
+    """Return the number of samples for which a reference has an effect on what a controller learns."""
+    path = getattr(controller, "secondary_path", None)
+    return int(getattr(controller, "n_taps", 0)) + (0 if path is None else int(np.shape(path)[-1]))
+
+
+def _surprise(controller: Any) -> float:
+    """Return the squared innovation over its predicted variance of a Kalman filter's last update; NaN without one."""
+    estimator = getattr(controller, "estimator", None)
+    innovation, variance = (getattr(estimator, name, None) for name in ("y", "S"))
+    if innovation is None or variance is None or np.size(innovation) != 1 or np.size(variance) != 1:
+        return np.nan
+    y, S = float(np.ravel(innovation)[0]), float(np.ravel(variance)[0])
+    return y * y / S if S > 0.0 else np.nan

@@ -1,0 +1,227 @@
+"""`process`: blocks of samples, for any controller, as a real-time process hands them over."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import threading
+import time
+import tracemalloc
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.channels import random_paths
+from helpers.simulation import X
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy import (
+    FxLMS,
+    KalmanController,
+    LimitedController,
+    OutputLimiter,
+    OutputPowerConstraint,
+    kf_anc,
+    kf_opc,
+    kf_pb,
+    simulate,
+)
+from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, RefusedUpdate, VirtualMicrophones
+
+FS = 4000.0
+DELAY = 40  # samples of the longest block
+PATH = np.concatenate((np.zeros(DELAY), [0.9, -0.4, 0.2]))
+PATHS = np.concatenate((np.zeros((2, 2, DELAY)), random_paths(2, 2, 6, seed=1)), axis=2)
+PRIMARY = np.concatenate((np.zeros(DELAY + 4), [1.0, 0.5, -0.3]))
+KALMAN: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 1e-2, "initial_variance": 0.1}
+
+ONE: dict[str, Any] = {
+    "KF-OPC": lambda: kf_opc(12, PATH, constraint=OutputPowerConstraint(0.3, fs=FS), **KALMAN),
+    "KF-PB with a limiter": lambda: kf_pb(
+        12, PATH, rated_power=0.3, fs=FS, limiter=OutputLimiter(0.3, fs=FS, window_s=0.01), **KALMAN
+    ),
+    "FxLMS": lambda: FxLMS(12, PATH, step_size=1e-3),
+    "monitored": lambda: MonitoredController(FxLMS(12, PATH, step_size=1e-3), fs=FS, window_s=0.02),
+    "neutralized": lambda: FeedbackNeutralizer(FxLMS(12, PATH, step_size=1e-3), [0.0, 0.1]),
+}
+SEVERAL: dict[str, Any] = {
+    "shared gain": lambda: kf_pb(8, PATHS, rated_power=[0.2, 0.3], fs=FS, n_references=2),
+    "frequency domain": lambda: kf_pb(8, PATHS, rated_power=0.2, fs=FS, n_references=2, form="frequency domain"),
+    "direct": lambda: kf_anc(8, PATHS, n_references=2, **KALMAN),
+    "FxLMS of several channels": lambda: FxLMS(8, PATHS, step_size=1e-3, n_references=2),
+}
+
+
+def closed_loop(controller: Any, cuts: list[int], x: np.ndarray, d: np.ndarray, path: np.ndarray) -> np.ndarray:
+    """Process block by block while the plant answers each block before the next one; return the control signals."""
+    several = x.ndim == 2
+    n_loudspeakers = path.shape[1] if several else 1
+    y = np.zeros((n_loudspeakers, x.shape[-1]) if several else x.shape[-1])
+    for begin, end in itertools.pairwise(cuts):
+        if several:
+            a = [sum(np.convolve(y[j], s[j])[begin:end] for j in range(n_loudspeakers)) for s in path]
+        else:
+            a = np.convolve(y, path)[begin:end]
+        y[..., begin:end] = controller.process(x[..., begin:end], d[..., begin:end] - np.array(a))
+    return y
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+@pytest.mark.parametrize("name", [*ONE, *SEVERAL])
+def test_blocks_of_any_length_are_the_simulation_with_the_same_delay(name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 400
+    cuts = [0]
+    while cuts[-1] < n:
+        cuts.append(min(cuts[-1] + int(rng.integers(1, DELAY + 1)), n))
+    if name in ONE:
+        make, path, x = ONE[name], PATH, rng.standard_normal(n)
+        d = np.convolve(x, PRIMARY)[:n]
+    else:
+        make, path, x = SEVERAL[name], PATHS, rng.standard_normal((2, n))
+        d = np.array([np.convolve(x[0], PRIMARY)[:n], np.convolve(x[1], PRIMARY)[:n]])
+    expected = simulate(make(), x, disturbance=d, secondary_path=path, fs=FS).control_signal
+    got = closed_loop(make(), cuts, x, d, path)
+    # The plant here sums in another order; over 400 samples rounding grew to less than 1e-11.
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-9 * max(np.max(np.abs(expected)), 1e-3))
+
+
+def test_without_adaptation_the_control_filter_stays() -> None:
+    controller = ONE["KF-OPC"]()
+    controller.process(X[:100], 0.5 * X[:100])
+    before = controller.weights
+    y = controller.process(X[100:150], X[100:150], adapt=False)
+    np.testing.assert_array_equal(controller.weights, before)
+    assert np.any(y != 0.0)
+
+
+def test_a_subclass_with_its_own_step_is_called_for_each_sample() -> None:
+    class Halved(FxLMS):
+        def control_signal(self, reference: Any) -> Any:
+            return 0.5 * super().control_signal(reference)
+
+    steps = Halved(12, PATH, step_size=1e-3)
+    plain = FxLMS(12, PATH, step_size=1e-3)
+    X_, E = X[:200], 0.5 * X[:200]
+    got, whole = steps.process(X_, E), plain.process(X_, E)
+    np.testing.assert_array_equal(got[:1], 0.5 * whole[:1])
+    assert not np.array_equal(got, whole)
+    assert np.any(got != 0.0)
+
+
+def test_a_filter_of_filterpy_and_wrappers_process_blocks() -> None:
+    from filterpy.kalman import KalmanFilter
+
+    class Own:
+        def control_signal(self, reference: float) -> float:
+            return 2.0 * reference
+
+        def update(self, error: float) -> None:
+            self.error = error
+
+    blocks, steps = (KalmanController(KalmanFilter(4, 1), [0.0, 1.0]) for _ in range(2))
+    y = blocks.process(X[:50], X[50:100])
+    for n in range(50):
+        assert y[n] == steps.control_signal(X[n])
+        steps.update(X[50 + n])
+    limited = LimitedController(Own(), OutputLimiter(1e3, amplitude_limit=1.0))
+    assert np.max(np.abs(limited.process(np.ones(8), np.zeros(8)))) == 1.0
+    paths = np.zeros((2, 1, 5))
+    paths[:, 0, 1] = 1.0
+    virtual = VirtualMicrophones(FxLMS(4, paths[:1], step_size=0.1), paths, np.ones((1, 1, 1)), virtual=[0], physical=[1])
+    assert virtual.process(np.ones((1, 6)), np.ones((2, 6))).shape == (1, 6)
+
+
+@pytest.mark.parametrize("name", ["KF-OPC", "FxLMS of several channels"])
+def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
+    controller = (ONE | SEVERAL)[name]()
+    shape = (2, 10) if name in SEVERAL else (10,)
+    good = np.ones(shape)
+    controller.process(good, good)
+    untouched = deepcopy(controller)
+    with_nan = good.copy()
+    with_nan[..., 7] = np.nan
+    bad: list[tuple[Any, Any, dict[str, Any], str]] = [
+        (with_nan, good, {}, "references must be finite, but holds NaN or Inf"),
+        (good, -np.inf * good, {}, "errors must be finite"),
+        (good, good[..., :9], {}, "the same number of samples, got 10 and 9"),
+        (good[..., :0], good[..., :0], {}, "with at least 1 sample"),
+        (good[np.newaxis, np.newaxis], good, {}, r"references must be \(n_samples,\)"),
+        (good[..., np.newaxis] if good.ndim == 1 else good[0], good, {}, "for this controller, got shape"),
+        (good, good, {"adapt": 1}, "adapt must be True, False or an array of bool"),
+        (good, good, {"adapt": np.ones(9, bool)}, "one for each of the 10 samples"),
+        (good, good, {"out": np.empty(3)}, r"out must be a writable, C-contiguous array of float64 of shape \("),
+        (good, good, {"out": [0.0] * 10}, "out must be"),
+    ]
+    for x, e, options, message in bad:
+        with pytest.raises(ValueError, match=message):
+            controller.process(x, e, **options)
+    with pytest.raises(TypeError, match="references must be a sequence of real numbers"):
+        controller.process("noise", good)
+    np.testing.assert_array_equal(controller.process(good, good), untouched.process(good, good))
+
+
+@pytest.mark.parametrize("name", ["KF-OPC", "FxLMS", "FxLMS of several channels", "monitored"])
+def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> None:
+    controller = (ONE | SEVERAL)[name]()
+    steps = deepcopy(controller)
+    n = 200
+    x = np.random.default_rng(0).standard_normal((2, n) if name in SEVERAL else n)
+    e = 0.3 * x
+    e[..., 120] = 1e200  # finite, but its square is not
+    y = np.zeros_like(x)
+    with pytest.raises(RefusedUpdate, match="overflow|finite square") as caught:
+        controller.process(x, e, out=y)
+    assert caught.value.sample == 120
+    y[..., 121:] = controller.process(x[..., 121:], e[..., 121:])
+    adapt = np.arange(n) != 120
+    np.testing.assert_array_equal(y, steps.process(x, e, adapt=adapt))
+
+
+def test_a_silent_reference_without_measurement_noise_names_its_sample() -> None:
+    controller = kf_anc(4, [1.0], state_noise=1e-6, measurement_noise=0.0)
+    with pytest.raises(RefusedUpdate, match="tells nothing") as caught:
+        controller.process([1.0, 1.0, 0.0, 0.0, 0.0, 0.0], np.ones(6))
+    assert caught.value.sample == 5
+
+
+@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB with a limiter", "FxLMS", "FxLMS of several channels", "direct"])
+def test_memory_is_not_allocated_after_the_first_block(name: str) -> None:
+    """Beside small objects, such as the estimator's new x, nothing is allocated, and nothing stays."""
+    controller = (ONE | SEVERAL)[name]()
+    n = 1000
+    x = np.random.default_rng(0).standard_normal((2, n) if name in SEVERAL else n)
+    y = np.empty_like(x)
+    for _ in range(3):
+        controller.process(x, x, out=y)
+    gc.collect()
+    tracemalloc.start()
+    try:
+        for _ in range(40):  # Python keeps some small objects for the next calls
+            controller.process(x, x, out=y)
+        before, _ = tracemalloc.get_traced_memory()
+        tracemalloc.reset_peak()
+        for _ in range(20):
+            controller.process(x, x, out=y)
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 1000
+    assert peak - before < 4000  # half of one of the block's signals
+
+
+def test_the_interpreter_lock_is_released() -> None:
+    """While a thread processes a block of more than a second, this one counts."""
+    controller = kf_anc(256, PATH, state_noise=1e-9, measurement_noise=1.0)
+    controller.process(X[:10], X[:10])
+    x = np.random.default_rng(0).standard_normal(100_000)
+    thread = threading.Thread(target=controller.process, args=(x, x))
+    thread.start()
+    ticks = 0
+    while thread.is_alive():
+        time.sleep(0.005)
+        ticks += 1
+    assert ticks > 20  # with the lock held, only the last one or two
