@@ -200,7 +200,7 @@ def test_memory_is_not_allocated_after_the_first_block(name: str) -> None:
     gc.collect()
     tracemalloc.start()
     try:
-        for _ in range(40):  # Python keeps some small objects for the next calls
+        for _ in range(200):  # Python keeps some small objects for the next calls
             controller.process(x, x, out=y)
         before, _ = tracemalloc.get_traced_memory()
         tracemalloc.reset_peak()
