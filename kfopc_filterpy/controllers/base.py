@@ -506,8 +506,8 @@ class FilteredReferenceController(BlockProcessing):
         shape = (self.n_loudspeakers, x.shape[-1]) if self.multichannel else x.shape
         y = np.empty(shape) if out is None else out
         require_room(y, shape)
-        rows = self._rows_of(x, e) if self.multichannel else (x, e, y)
-        done = self._process_rows(*rows, flags)
+        rows = self._rows_of(x, e) if self.multichannel else [x, e, y]
+        done = self._process_rows(rows[0], rows[1], rows[2], flags)
         if self.multichannel:
             y[:] = rows[2].T
         else:
@@ -522,7 +522,7 @@ class FilteredReferenceController(BlockProcessing):
         wanted = "(n_samples,)" if not self.multichannel else f"({n_channels}, n_samples)"
         if signal.ndim != 1 + self.multichannel or (self.multichannel and len(signal) != n_channels):
             raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
-        return np.ascontiguousarray(signal)
+        return np.require(signal, requirements=("C", "W"))  # one type of array, which is compiled once
 
     def _rows_of(self, x: np.ndarray, e: np.ndarray) -> list[np.ndarray]:
         """Return references, errors and room for the control signals, with a sample in each row."""

@@ -68,7 +68,9 @@ class Health:
         self.counts: Counter[str] = Counter()
         self._latest: dict[tuple[str, str], Fault] = {}
 
-    def note(self, what: str, channel: str = "", *, time_s: float, n_samples: int = 1, until_s: float | None = None) -> None:
+    def note(
+        self, what: str, channel: str = "", *, time_s: float, n_samples: int = 1, until_s: float | None = None
+    ) -> None:
         """Record an event, or that the last one of its kind goes on."""
         until_s = time_s if until_s is None else until_s
         self.samples[what] += n_samples

@@ -18,7 +18,9 @@ from .health import Health
 
 ACTIONS = ("mute", "reset", "freeze")
 LONGEST_PAUSE = 64  # of the first pause
-OVER_POWER = 4.0  # times the rated power over a window: no algorithm here exceeds its rating so much, except in its first blocks
+OVER_POWER = (
+    4.0  # times the rated power over a window: no algorithm here exceeds its rating so much, except in its first blocks
+)
 OFTEN_LIMITED = 0.1  # of a window's samples at the limit
 SURPRISE = 1e4  # squared innovation over its predicted variance, relative to what is usual: 40 dB
 SETTLING_WINDOWS = 4  # before the usual surprise is known
@@ -337,7 +339,9 @@ class Supervisor:
     def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
         """Return the controller's outputs, (J, n); a sample that it refuses is counted, and the rest goes on."""
         y, begin, n = np.zeros((self.n_loudspeakers, x.shape[1])), 0, x.shape[1]
-        process: Callable[..., Any] = getattr(self.controller, "process", None) or partial(process_steps, self.controller)
+        process: Callable[..., Any] = getattr(self.controller, "process", None) or partial(
+            process_steps, self.controller
+        )
         with np.errstate(over="ignore", invalid="ignore"):
             while begin < n:
                 rest = slice(begin, n)
@@ -463,7 +467,7 @@ class Supervisor:
 
 def _channels(value: Any, n_channels: int, name: str) -> np.ndarray:
     """Return a copy of a block as (n_channels, n_samples); None becomes NaN."""
-    if isinstance(value, np.ndarray) and value.dtype == object or isinstance(value, list | tuple):
+    if (isinstance(value, np.ndarray) and value.dtype == object) or isinstance(value, list | tuple):
         value = np.array(value, dtype=np.float64)
     block = np.array(as_real_array(value, name))
     block = block[np.newaxis] if block.ndim == 1 and n_channels == 1 else block

@@ -210,7 +210,7 @@ def test_memory_is_not_allocated_after_the_first_block(name: str) -> None:
     finally:
         tracemalloc.stop()
     assert after - before < 1000
-    assert peak - before < 4000  # half of one of the block's signals
+    assert peak - before < 8000  # less than one of the signals of the block
 
 
 def test_the_interpreter_lock_is_released() -> None:

@@ -1,0 +1,13 @@
+from .health import Fault as Fault
+from .health import Health as Health
+from .interfaces import Block as Block
+from .interfaces import Interface as Interface
+from .interfaces import SimulatedInterface as SimulatedInterface
+from .running import FaultError as FaultError
+from .running import Levels as Levels
+from .running import NotCausalError as NotCausalError
+from .running import RunReport as RunReport
+from .running import measure_round_trip as measure_round_trip
+from .running import run as run
+from .sound_device import SoundDevice as SoundDevice
+from .supervisor import Supervisor as Supervisor

@@ -1,0 +1,244 @@
+"""Interfaces: where blocks of microphone signals come from, and where the control signals go."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from scipy.signal import lfilter
+
+from .._validate import as_channels, as_choice, as_count, as_generator, as_nonnegative, as_positive
+from ..controllers.channels import amplifier_functions
+from ..paths.channels import is_path_matrix, path_matrix, primary_paths, secondary_paths
+from ..paths.models import path_taps
+
+
+class Block(NamedTuple):
+    """Signals of the microphones over one block."""
+
+    references: np.ndarray  # (I, n_samples)
+    errors: np.ndarray  # (K, n_samples)
+    lost: int = 0  # samples that were lost before this block
+
+
+@runtime_checkable
+class Interface(Protocol):
+    """What `run` needs: sample rate and counts, and four methods. Signals have a channel axis, also for one channel.
+
+    `full_scale`, the magnitude at which the converters of the microphones clip, is used if it is there.
+    """
+
+    fs: float
+    block: int
+    n_references: int
+    n_microphones: int
+    n_loudspeakers: int
+
+    def start(self) -> None:
+        """Open the streams."""
+
+    def read(self) -> Block | None:
+        """Return the next block, as soon as it has been heard; None at the end."""
+
+    def write(self, control_signals: np.ndarray) -> None:
+        """Play the control signals of the block that was read last, (J, n_samples)."""
+
+    def stop(self) -> None:
+        """Close the streams."""
+
+
+class SimulatedInterface:
+    """A plant model that behaves like a sound card: blocks, and a delay between writing and playing.
+
+    Parameters
+    ----------
+    reference : array_like, shape (n_samples,) or (I, n_samples)
+        Reference x, the noise.
+    secondary_path : array_like or control.TransferFunction
+        True secondary path s, or paths (K, J, n_taps), without the delay of the interface.
+    primary_path : array_like or control.TransferFunction, optional
+        Path from the reference to the error microphone, or paths (K, I, n_taps).
+    disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
+        Disturbance d, in place of `primary_path`.
+    fs : float, default 16000
+        Sample rate in Hz.
+    block : int, default 64
+        Samples of a block.
+    latency : int, optional
+        Samples from a sample's reading to the playing of its control signal, at least a block; by default two blocks.
+    amplifier : callable, optional
+        Amplifier model or function of a sample, or a sequence with one for each loudspeaker; by default linear.
+    feedback_path : array_like or control.TransferFunction, optional
+        Acoustic feedback from the amplifier to the reference microphone, or paths (I, J, n_taps).
+    sensor_noise_std : float, default 0
+        Standard deviation of white noise at each error microphone.
+    rng : int or numpy.random.Generator, optional
+        Seed of the sensor noise; required if there is any.
+    clock : {"free", "real"}, default "free"
+        Whether a block is there at once, or as in reality after its duration. With a real clock, blocks that are not
+        fetched in time are lost.
+
+    Attributes
+    ----------
+    total_secondary_path : ndarray, shape (latency + n_taps,) or (K, J, latency + n_taps)
+        Secondary path as a controller sees it, the delay of the interface included.
+    disturbance : ndarray, shape (K, n_samples)
+        Disturbance at the error microphones.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Signals or paths that do not fit each other; a latency below a block; both or neither of `primary_path` and
+        `disturbance`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy.realtime import SimulatedInterface
+    >>> noise = np.random.default_rng(0).standard_normal(1000)
+    >>> plant = SimulatedInterface(noise, [0.0, 0.8], primary_path=[0.0, 0.0, 0.5], block=50)
+    >>> plant.start()
+    >>> first = plant.read()
+    >>> first.references.shape, first.errors.shape
+    ((1, 50), (1, 50))
+    >>> plant.total_secondary_path.shape  # 100 zeros, then the path
+    (102,)
+    """
+
+    def __init__(
+        self,
+        reference: Any,
+        secondary_path: Any,
+        *,
+        primary_path: Any = None,
+        disturbance: Any = None,
+        fs: float = 16000.0,
+        block: int = 64,
+        latency: int | None = None,
+        amplifier: Callable[..., Any] | Sequence[Callable[..., Any]] | None = None,
+        feedback_path: Any = None,
+        sensor_noise_std: float = 0.0,
+        rng: Any = None,
+        clock: str = "free",
+    ) -> None:
+        self.fs = as_positive(fs, "fs", unit="Hz")
+        self.block = as_count(block, "block")
+        self.latency = 2 * self.block if latency is None else as_count(latency, "latency")
+        if self.latency < self.block:
+            raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
+        self.clock = as_choice(clock, "clock", ("free", "real"))
+        self._noise_std = as_nonnegative(sensor_noise_std, "sensor_noise_std")
+        self._rng = as_generator(rng) if self._noise_std > 0 else None
+        self._x = np.atleast_2d(as_channels(reference, "reference"))
+        several = is_path_matrix(secondary_path)
+        secondary = _matrix(secondary_path, several, self.fs, "secondary_path", secondary_paths)
+        self.n_microphones, self.n_loudspeakers, _ = secondary.shape
+        self.n_references = len(self._x)
+        zeros = np.zeros((*secondary.shape[:2], self.latency))
+        total = np.concatenate((zeros, secondary), axis=2)
+        self.total_secondary_path = total if several else total[0, 0]
+        self.disturbance = self._disturbances(primary_path, disturbance)
+        self._amplifiers = amplifier_functions(amplifier, self.n_loudspeakers)
+        self._secondary = _Paths(secondary)
+        feedback = None
+        if feedback_path is not None:
+            feedback = _matrix(feedback_path, several or self.n_references > 1, self.fs, "feedback_path", path_matrix)
+            if feedback.shape[:2] != (self.n_references, self.n_loudspeakers):
+                raise ValueError(
+                    f"feedback_path must lead from the {self.n_loudspeakers} loudspeakers to the {self.n_references} "
+                    f"references, got paths {feedback.shape}"
+                )
+        self._feedback = None if feedback is None else _Paths(feedback)
+        self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
+        self._done, self._began = 0, 0.0
+
+    def _disturbances(self, primary_path: Any, disturbance: Any) -> np.ndarray:
+        if (primary_path is None) == (disturbance is None):
+            raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+        if disturbance is not None:
+            d = np.atleast_2d(as_channels(disturbance, "disturbance"))
+            if d.shape != (self.n_microphones, self._x.shape[1]):
+                raise ValueError(f"disturbance must be {(self.n_microphones, self._x.shape[1])}, got {d.shape}")
+            return d
+        primary = _matrix(primary_path, is_path_matrix(primary_path), self.fs, "primary_path", primary_paths)
+        if primary.shape[:2] != (self.n_microphones, self.n_references):
+            raise ValueError(
+                f"primary_path must lead from the {self.n_references} references to the {self.n_microphones} "
+                f"microphones, got paths {primary.shape}"
+            )
+        return _Paths(primary)(self._x)
+
+    @property
+    def n_samples(self) -> int:
+        """Samples of the noise."""
+        return self._x.shape[1]
+
+    def start(self) -> None:
+        """Start the clock."""
+        self._began = time.perf_counter() - self._done / self.fs
+
+    def read(self) -> Block | None:
+        """Return the next block; None if less than a block of the noise is left."""
+        lost = 0
+        if self.clock == "real":
+            wait = self._began + (self._done + self.block) / self.fs - time.perf_counter()
+            if wait > 0:
+                time.sleep(wait)
+            while -wait > self.block / self.fs and self._advance() is not None:
+                lost += self.block
+                wait += self.block / self.fs
+        heard = self._advance()
+        return None if heard is None else Block(*heard, lost)
+
+    def _advance(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return references and errors of the next block."""
+        now = slice(self._done, self._done + self.block)
+        if now.stop > self.n_samples:
+            return None
+        y = self._queue[:, : self.block]
+        if self._amplifiers is not None:
+            y = np.array([amplifier(signal) for amplifier, signal in zip(self._amplifiers, y, strict=True)])
+        e = self.disturbance[:, now] - self._secondary(y)
+        if self._rng is not None:
+            e += self._noise_std * self._rng.standard_normal(e.shape)
+        x = self._x[:, now] + (0.0 if self._feedback is None else self._feedback(y))
+        self._queue = np.concatenate((self._queue[:, self.block :], np.zeros((len(y), self.block))), axis=1)
+        self._done = now.stop
+        return x, e
+
+    def write(self, control_signals: np.ndarray) -> None:
+        """Play the control signals of the block that was read last, `latency` samples after it."""
+        # The block that was read last has been taken from the queue already, so its place is one block earlier.
+        end = self.latency
+        self._queue[:, end - self.block : end] = control_signals
+
+    def stop(self) -> None:
+        """Stop; `start` goes on from here."""
+
+
+class _Paths:
+    """Paths (outputs, inputs, taps), through which signals pass block by block."""
+
+    def __init__(self, taps: np.ndarray) -> None:
+        self._taps = taps
+        self._states = np.zeros((*taps.shape[:2], taps.shape[2] - 1))
+
+    def __call__(self, signals: np.ndarray) -> np.ndarray:
+        """Return the outputs, (outputs, n), of the next block, (inputs, n)."""
+        outputs = np.zeros((len(self._taps), signals.shape[1]))
+        for k, row in enumerate(self._taps):
+            for j, taps in enumerate(row):
+                y, self._states[k, j] = lfilter(taps, [1.0], signals[j], zi=self._states[k, j])
+                outputs[k] += y
+        return outputs
+
+
+def _matrix(path: Any, several: bool, fs: float, name: str, read: Callable[..., Any]) -> np.ndarray:
+    """Return paths (outputs, inputs, taps) of a matrix, or of one path."""
+    if several:
+        options = {"name": name} if read is path_matrix else {}
+        taps: np.ndarray = read(path, fs=fs, **options)[0]
+        return taps
+    return path_taps(path, fs=fs, name=name)[np.newaxis, np.newaxis]

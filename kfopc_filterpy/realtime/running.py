@@ -1,0 +1,610 @@
+"""A run in real time: identify the plant, check it, fade in, control, fade out, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_generator, as_nonnegative, as_positive
+from ..bounds.power_constrained import power_constrained_wiener
+from ..controllers.base import Controller, listed
+from ..paths.identification import PathEstimate, estimate_path
+from .health import Health
+from .interfaces import Interface
+from .supervisor import Supervisor
+
+LOUDEST = 1e12  # times the power of the reference: a rated power that limits nothing
+WORTH_DB = 1.0  # less noise reduction than this, by any filter, is no control
+WARM_UP = 1024  # samples, so that a controller that works between blocks has done so
+FATAL = 3  # divergences after which a run stops
+DELAY_SHARE = 0.05  # of the largest tap, at which a path has arrived
+
+
+class NotCausalError(ValueError):
+    """Raised by `run` if the anti-noise comes too late to reduce the noise."""
+
+
+class FaultError(RuntimeError):
+    """Raised by `run` if the plant cannot be identified: nothing is heard, or nothing comes out."""
+
+
+@dataclass
+class Levels:
+    """Levels since the last report, handed to `on_report`.
+
+    Attributes
+    ----------
+    time_s : float
+        Seconds since the control was switched on.
+    reduction_db : ndarray, shape (K,)
+        Error power before the control over the error power now, in dB, at each error microphone.
+    reference_level_db, error_level_db : ndarray, shape (I,), (K,)
+        Power of each microphone in dB relative to 1.
+    powers : ndarray, shape (J,)
+        Output power of each loudspeaker.
+    rated_power : ndarray, shape (J,), or None
+        Rated powers of the controller.
+    load : float
+        Largest share of a block's duration that its processing has taken.
+    overruns : int
+        Blocks so far whose processing took longer than the block.
+    lost : int
+        Samples lost so far.
+    health : Health
+        Health record.
+    """
+
+    time_s: float
+    reduction_db: np.ndarray
+    reference_level_db: np.ndarray
+    error_level_db: np.ndarray
+    powers: np.ndarray
+    rated_power: np.ndarray | None
+    load: float
+    overruns: int
+    lost: int
+    health: Health
+
+
+@dataclass
+class RunReport:
+    """What a run has done.
+
+    Attributes
+    ----------
+    seconds : float
+        Time under control.
+    stopped_by : str
+        "end" of the time or of the noise, "user", or the fault that ended it.
+    reduction_db : ndarray, shape (K,)
+        Noise reduction over the second half of the run, against the silence before it.
+    powers : ndarray, shape (J,)
+        Output power of each loudspeaker over that half.
+    rated_power : ndarray, shape (J,), or None
+        Rated powers of the controller.
+    round_trip_samples : int or None
+        Samples from a control signal to its arrival at the nearest error microphone, buffers included; None if the
+        path was not identified.
+    secondary_path : PathEstimate or None
+        Identified secondary path.
+    possible_db : float
+        Noise reduction that the best filter of `n_taps` taps reaches in the silence before the control; NaN if that was
+        not checked.
+    overruns, blocks, lost : int
+        Blocks whose processing took longer than the block, all blocks, samples lost.
+    load : float
+        Largest share of a block's duration that its processing has taken.
+    health : Health
+        Health record.
+    controller : Controller
+        Controller at the end, which can be saved.
+    """
+
+    seconds: float
+    stopped_by: str
+    reduction_db: np.ndarray
+    powers: np.ndarray
+    rated_power: np.ndarray | None
+    round_trip_samples: int | None
+    secondary_path: PathEstimate | None
+    possible_db: float
+    overruns: int
+    blocks: int
+    lost: int
+    load: float
+    health: Health
+    controller: Any = field(repr=False)
+
+    def __repr__(self) -> str:
+        rated = "" if self.rated_power is None else f" (rated {listed(self.rated_power, 'g')})"
+        return (
+            f"<RunReport: {self.seconds:.4g} s, stopped by {self.stopped_by}, noise reduction "
+            f"{listed(self.reduction_db, '.1f')} dB, output power {listed(self.powers, '.3g')}{rated}, "
+            f"{self.overruns} overruns in {self.blocks} blocks, {self.health!r}>"
+        )
+
+
+@dataclass
+class _Heard:
+    """Signals of a stretch without control: references (I, n), errors (K, n), and what was played, (J, n)."""
+
+    x: np.ndarray
+    e: np.ndarray
+    y: np.ndarray
+
+
+class _Session:
+    """An interface in use: it counts what is lost and how long blocks take."""
+
+    def __init__(self, interface: Interface) -> None:
+        self.interface = interface
+        self.block_s = interface.block / interface.fs
+        self.blocks = self.overruns = self.lost = 0
+        self.load = self.load_since_report = 0.0
+
+    def play(self, signal: np.ndarray) -> _Heard:
+        """Play a signal (J, n), and return what was heard meanwhile."""
+        heard: list[Any] = []
+        size = self.interface.block
+        blocks = -(-signal.shape[1] // size)
+        padded = np.pad(signal, ((0, 0), (0, blocks * size - signal.shape[1])))
+        for b in range(blocks):
+            block = self.interface.read()
+            if block is None:
+                break
+            heard.append(block)
+            self.interface.write(padded[:, b * size : (b + 1) * size])
+        if not heard:
+            raise FaultError("the interface ended before anything was heard")
+        x, e = (np.concatenate([block[i] for block in heard], axis=1) for i in (0, 1))
+        return _Heard(x, e, padded[:, : x.shape[1]])
+
+    def step(self, supervisor: Supervisor) -> tuple[Any, np.ndarray] | None:
+        """Process a block; return it with its control signals, None at the end."""
+        block = self.interface.read()
+        if block is None:
+            return None
+        began = time.perf_counter()
+        x, e = (signals if supervisor.multichannel else signals[0] for signals in (block.references, block.errors))
+        y = np.atleast_2d(supervisor.process(x, e, lost=block.lost))
+        self.interface.write(y)
+        share = (time.perf_counter() - began) / self.block_s
+        self.blocks += 1
+        self.overruns += share > 1.0
+        self.lost += block.lost
+        self.load = max(self.load, share)
+        self.load_since_report = max(self.load_since_report, share)
+        return block, y
+
+
+def measure_round_trip(
+    interface: Interface, *, level: float, seconds: float = 1.0, longest: int = 4096, rng: Any = 0
+) -> int:
+    """Return the number of samples from a control signal to its first arrival at an error microphone.
+
+    White noise is played, from each loudspeaker in turn, and each microphone's signal correlated with it.
+
+    Parameters
+    ----------
+    interface : Interface
+        Interface, not yet started.
+    level : float
+        Standard deviation of the noise, above zero.
+    seconds : float, default 1
+        Time for each loudspeaker.
+    longest : int, default 4096
+        Longest round trip looked for, in samples.
+    rng : int or numpy.random.Generator, default 0
+        Seed of the noise.
+
+    Returns
+    -------
+    int
+        Round trip, which includes the buffers of the interface.
+
+    Raises
+    ------
+    FaultError
+        No loudspeaker is heard: the correlation has no clear peak.
+    TypeError, ValueError
+        A level or time that is not positive.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy.realtime import SimulatedInterface, measure_round_trip
+    >>> plant = SimulatedInterface(np.zeros(20000), [0.0, 0.0, 0.8], disturbance=np.zeros(20000), block=32)
+    >>> measure_round_trip(plant, level=0.1)  # two blocks of 32 samples, and two samples of the path
+    66
+    """
+    level, longest = as_positive(level, "level"), as_count(longest, "longest")
+    n = round(as_positive(seconds, "seconds", unit="s") * interface.fs) + longest
+    noise = level * as_generator(rng).standard_normal(n)
+    interface.start()
+    try:
+        session = _Session(interface)
+        arrivals = []
+        for j in range(interface.n_loudspeakers):
+            signal = np.zeros((interface.n_loudspeakers, n))
+            signal[j] = noise
+            heard = session.play(signal)
+            arrivals += [_arrival(heard.y[j], e, longest) for e in heard.e]
+    finally:
+        interface.stop()
+    clear = [arrival for arrival in arrivals if arrival is not None]
+    if not clear:
+        raise FaultError(
+            "no loudspeaker is heard by any error microphone: check the cables and the channels, or raise the level"
+        )
+    return min(clear)
+
+
+def _arrival(sent: np.ndarray, heard: np.ndarray, longest: int) -> int | None:
+    """Return the first lag at which a sent noise is clearly heard, up to `longest`; None if it is not."""
+    from scipy.signal import correlate
+
+    n = sent.size - longest
+    if n < longest or not np.any(sent):
+        return None
+    correlation = np.abs(correlate(heard, sent[:n], mode="valid"))[: longest + 1]
+    chance = np.linalg.norm(sent[:n]) * np.sqrt(np.mean(heard**2))  # standard deviation if it is not heard
+    if not np.max(correlation) > 6.0 * chance:
+        return None
+    return int(np.argmax(correlation > max(DELAY_SHARE * np.max(correlation), 5.0 * chance)))
+
+
+def run(
+    controller: Controller | Callable[[PathEstimate], Controller],
+    interface: Interface,
+    *,
+    amplitude_limit: Any,
+    seconds: float | None = None,
+    listen_s: float = 2.0,
+    identify_s: float = 5.0,
+    excitation: float | None = None,
+    n_path: int | None = None,
+    check_causality: bool = True,
+    on_report: Callable[[Levels], Any] | None = None,
+    report_every_s: float = 0.25,
+    should_stop: Callable[[], bool] | None = None,
+    rng: Any = 0,
+    **supervision: Any,
+) -> RunReport:
+    """Control noise in real time, from the identification of the plant to the fade-out at the end.
+
+    In order: listen to the noise with silent loudspeakers; play noise and identify the secondary paths, with the buffers
+    of the interface; check that a control filter can reduce the noise in time; fade in; control; fade out. A `Supervisor`
+    stands between the controller and the interface. The run stops by itself after three divergences.
+
+    Parameters
+    ----------
+    controller : Controller or callable
+        A function that makes the controller from the identified secondary path, a `PathEstimate` with `taps` (n_path,) or
+        (K, J, n_path) and their `uncertainty`. Or a controller made for a known path, which must include the delay of
+        the interface: nothing is identified then.
+    interface : Interface
+        `SoundDevice`, `SimulatedInterface` or your own.
+    amplitude_limit : float or array_like, shape (J,)
+        Largest magnitude of the control signal, see `Supervisor`.
+    seconds : float, optional
+        Time under control; by default until the noise ends or `should_stop` says so.
+    listen_s : float, default 2
+        Time of silence before, against which the noise reduction is measured.
+    identify_s : float, default 5
+        Time for which noise is played to identify the secondary paths, from each loudspeaker in turn.
+    excitation : float, optional
+        Standard deviation of that noise; by default a tenth of the smallest `amplitude_limit`.
+    n_path : int, optional
+        Taps of the identified paths; by default the round trip plus 16 ms.
+    check_causality : bool, default True
+        Whether to refuse a plant in which no causal filter can reduce the noise that was heard.
+    on_report : callable, optional
+        Called with `Levels` every `report_every_s` seconds.
+    report_every_s : float, default 0.25
+        Time between two reports in seconds.
+    should_stop : callable, optional
+        Called once for each block; the run ends when it returns True. Ctrl-C ends it too.
+    rng : int or numpy.random.Generator, default 0
+        Seed of the noise.
+    **supervision
+        Settings of the `Supervisor`, for example ``on_divergence="freeze"``.
+
+    Returns
+    -------
+    RunReport
+        What was measured, and the controller.
+
+    Raises
+    ------
+    NotCausalError
+        The anti-noise comes too late.
+    FaultError
+        No loudspeaker is heard, or the interface ends too early.
+    TypeError, ValueError
+        A setting that is out of range, or numbers of channels that do not fit.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import kf_pb
+    >>> from kfopc_filterpy.realtime import SimulatedInterface, run
+    >>> noise = np.random.default_rng(0).standard_normal(100_000)
+    >>> primary = np.zeros(120)
+    >>> primary[[80, 90]] = 1.0, 0.4
+    >>> plant = SimulatedInterface(noise, [0.0, 0.9, 0.3], primary_path=primary, block=32)
+    >>> def make(path):
+    ...     return kf_pb(
+    ...         32,
+    ...         path.taps,
+    ...         rated_power=2.0,
+    ...         secondary_path_uncertainty=path.uncertainty,
+    ...         state_noise=1e-9,
+    ...         measurement_noise=1e-3,
+    ...     )
+    >>> report = run(make, plant, amplitude_limit=10.0, seconds=2.0, identify_s=2.0)
+    >>> report.stopped_by, report.round_trip_samples, bool(report.reduction_db[0] > 10.0)
+    ('end', 65, True)
+    """
+    listen_n = max(round(as_nonnegative(listen_s, "listen_s", unit="s") * interface.fs), interface.block)
+    level = 0.1 * float(np.min(amplitude_limit)) if excitation is None else as_positive(excitation, "excitation")
+    session = _Session(interface)
+    path, round_trip = None, None
+    with _open(interface):
+        silence = session.play(np.zeros((interface.n_loudspeakers, listen_n)))
+        if not isinstance(controller, Controller):
+            path, round_trip = _identified(session, level, identify_s, n_path, as_generator(rng))
+    made = controller if isinstance(controller, Controller) else controller(path)  # type: ignore[arg-type]
+
+    def supervised(controller: Any) -> Supervisor:
+        settings: dict[str, Any] = {"full_scale": getattr(interface, "full_scale", None)} | supervision
+        return Supervisor(controller, fs=interface.fs, amplitude_limit=amplitude_limit, **settings)
+
+    supervisor = supervised(made)
+    _require_fit(supervisor, interface)
+    possible_db = _possible_db(silence, made, interface.fs) if check_causality else np.nan
+    _warm_up(supervised(deepcopy(made)), interface.block)
+    supervisor.start_silent()
+    supervisor.fade_in()
+    watch = _Watch(session, supervisor, silence, report_every_s, on_report)
+    with _open(interface):
+        stopped_by = _control(session, supervisor, watch, seconds, should_stop)
+    return watch.report(stopped_by, round_trip, path, possible_db)
+
+
+@contextmanager
+def _open(interface: Interface) -> Iterator[None]:
+    """Open the streams for a while; what takes long is done in between, so that no block is lost."""
+    interface.start()
+    try:
+        yield
+    finally:
+        interface.stop()
+
+
+def _warm_up(supervisor: Supervisor, block: int) -> None:
+    """Process blocks with a copy of the controller, so that everything is compiled before the first real one."""
+    x, e = 1e-3 * np.random.default_rng(0).standard_normal(
+        (2, supervisor.n_references + supervisor.n_microphones, block)
+    )
+    x, e = x[: supervisor.n_references], e[: supervisor.n_microphones]
+    for _ in range(2 * max(WARM_UP // block, 1)):
+        supervisor.process(*((x, e) if supervisor.multichannel else (x[0], e[0])))
+    supervisor.start_silent()
+    supervisor.process(*((x, e) if supervisor.multichannel else (x[0], e[0])))
+
+
+def _control(
+    session: _Session,
+    supervisor: Supervisor,
+    watch: _Watch,
+    seconds: float | None,
+    should_stop: Callable[[], bool] | None,
+) -> str:
+    """Control until the end; return what ended it. Whatever that is, the loudspeakers fade out."""
+    last = np.inf if seconds is None else as_positive(seconds, "seconds", unit="s") * supervisor.fs
+    done, stopped_by = 0, ""
+    try:
+        while not stopped_by:
+            stepped = session.step(supervisor)
+            if stepped is None:
+                return "end"
+            watch.add(*stepped)
+            done += session.interface.block
+            divergences = sum(n for what, n in supervisor.health.counts.items() if what.startswith("diverged"))
+            if done >= last:
+                stopped_by = "end"
+            elif should_stop is not None and should_stop():
+                stopped_by = "user"
+            elif divergences >= FATAL:
+                stopped_by = f"fault: {FATAL} divergences"
+    except KeyboardInterrupt:
+        stopped_by = "user"
+    supervisor.fade_out()
+    while not supervisor.muted and session.step(supervisor) is not None:
+        pass
+    return stopped_by
+
+
+class _Watch:
+    """Levels of a run, for its reports."""
+
+    def __init__(
+        self,
+        session: _Session,
+        supervisor: Supervisor,
+        silence: _Heard,
+        every_s: float,
+        on_report: Callable[[Levels], Any] | None,
+    ) -> None:
+        self._session, self._supervisor, self._on_report = session, supervisor, on_report
+        self._every = max(round(as_positive(every_s, "report_every_s", unit="s") * supervisor.fs), 1)
+        self._counts = (supervisor.n_references, supervisor.n_microphones, supervisor.n_loudspeakers)
+        self._before = np.mean(silence.e**2, axis=1)
+        self._parts: list[tuple[Any, ...]] = []  # of each second: samples, energies of e and of y
+        self._samples = 0
+        self._new_sums()
+        self._second = self._no_energy()
+
+    def _no_energy(self) -> list[Any]:
+        _, n_microphones, n_loudspeakers = self._counts
+        return [0, np.zeros(n_microphones), np.zeros(n_loudspeakers)]
+
+    def _new_sums(self) -> None:
+        self._n = 0
+        self._x, self._e, self._y = (np.zeros(n) for n in self._counts)
+        self._session.load_since_report = 0.0
+
+    def add(self, block: Any, y: np.ndarray) -> None:
+        """Add a block, and report if it is time."""
+        n = y.shape[1]
+        with np.errstate(invalid="ignore"):
+            energies = [np.nansum(np.square(signals), axis=1) for signals in (block.references, block.errors, y)]
+        self._n, self._samples = self._n + n, self._samples + n
+        self._x, self._e, self._y = (
+            total + energy for total, energy in zip((self._x, self._e, self._y), energies, strict=True)
+        )
+        self._second[0] += n
+        self._second[1] = self._second[1] + energies[1]
+        self._second[2] = self._second[2] + energies[2]
+        if self._second[0] >= self._supervisor.fs:
+            self._parts.append(tuple(self._second))
+            self._second = self._no_energy()
+        if self._n >= self._every:
+            if self._on_report is not None:
+                self._on_report(self._levels())
+            self._new_sums()
+
+    def _levels(self) -> Levels:
+        e, x, y = self._e / self._n, self._x / self._n, self._y / self._n
+        return Levels(
+            time_s=self._samples / self._supervisor.fs,
+            reduction_db=_db(self._before, e),
+            reference_level_db=_db(x, np.ones_like(x)),
+            error_level_db=_db(e, np.ones_like(e)),
+            powers=y,
+            rated_power=self._rated(),
+            load=self._session.load_since_report,
+            overruns=self._session.overruns,
+            lost=self._session.lost,
+            health=self._supervisor.health,
+        )
+
+    def _rated(self) -> np.ndarray | None:
+        rated = getattr(self._supervisor.controller, "rated_power", None)
+        return None if rated is None else np.atleast_1d(rated)
+
+    def report(
+        self, stopped_by: str, round_trip: int | None, path: PathEstimate | None, possible_db: float
+    ) -> RunReport:
+        """Return the report of the whole run; its figures are those of the second half."""
+        if self._second[0]:
+            self._parts.append(tuple(self._second))
+        half = self._parts[len(self._parts) // 2 :]
+        n = max(sum(part[0] for part in half), 1)
+        e, y = (np.sum([part[i] for part in half] or [self._no_energy()[i]], axis=0) / n for i in (1, 2))
+        return RunReport(
+            seconds=self._samples / self._supervisor.fs,
+            stopped_by=stopped_by,
+            reduction_db=_db(self._before, e),
+            powers=y,
+            rated_power=self._rated(),
+            round_trip_samples=round_trip,
+            secondary_path=path,
+            possible_db=possible_db,
+            overruns=self._session.overruns,
+            blocks=self._session.blocks,
+            lost=self._session.lost,
+            load=self._session.load,
+            health=self._supervisor.health,
+            controller=self._supervisor.controller,
+        )
+
+
+def _db(above: np.ndarray, below: np.ndarray) -> np.ndarray:
+    """Return a ratio of powers in dB; infinite or NaN where one is zero."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        decibels: np.ndarray = 10.0 * np.log10(above / below)
+    return decibels
+
+
+def _identified(
+    session: _Session, level: float, identify_s: float, n_path: int | None, rng: np.random.Generator
+) -> tuple[PathEstimate, int]:
+    """Return the secondary path, with the buffers of the interface, and the round trip in samples."""
+    interface = session.interface
+    n = round(as_positive(identify_s, "identify_s", unit="s") * interface.fs)
+    recordings = []
+    for j in range(interface.n_loudspeakers):
+        signal = np.zeros((interface.n_loudspeakers, n))
+        signal[j] = level * rng.standard_normal(n)
+        recordings.append(session.play(signal))
+        session.play(np.zeros((interface.n_loudspeakers, round(0.1 * interface.fs))))  # let it die away
+    longest = n // 4
+    arrivals = [_arrival(r.y[j], e, longest) for j, r in enumerate(recordings) for e in r.e]
+    clear = [arrival for arrival in arrivals if arrival is not None]
+    if not clear:
+        raise FaultError(
+            "no loudspeaker is heard by any error microphone: check the cables and the channels, or raise excitation"
+        )
+    taps = min(clear) + round(0.016 * interface.fs) if n_path is None else as_count(n_path, "n_path")
+    length = min(r.y.shape[1] for r in recordings)
+    if interface.n_loudspeakers == interface.n_microphones == 1:
+        return estimate_path(recordings[0].y[0], -recordings[0].e[0], taps, interface.fs), min(clear)
+    sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
+    heard = np.array([-r.e[:, :length] for r in recordings])  # e = d - s * y
+    return estimate_path(sent, heard, taps, interface.fs), min(clear)
+
+
+def _require_fit(supervisor: Supervisor, interface: Interface) -> None:
+    for name in ("n_references", "n_microphones", "n_loudspeakers"):
+        own, theirs = getattr(supervisor, name), getattr(interface, name)
+        if own != theirs:
+            raise ValueError(f"the controller has {name} = {own}, but the interface has {theirs}")
+
+
+def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
+    """Return the noise reduction of the best filter; raise `NotCausalError` if there is none, and a faster plant has."""
+    path, n_taps = getattr(controller, "secondary_path", None), getattr(controller, "n_taps", None)
+    if path is None or n_taps is None or not np.any(silence.e) or not np.any(silence.x):
+        return np.nan
+    if silence.x.shape[1] < 4 * (n_taps + np.shape(path)[-1]):
+        return np.nan
+    possible = _best_db(silence, path, n_taps, fs)
+    if possible >= WORTH_DB:
+        return possible
+    delay = _first_arrival(path)
+    sooner = _best_db(silence, path[..., delay:], n_taps + delay, fs)
+    if sooner < possible + WORTH_DB:
+        return possible
+    raise NotCausalError(
+        f"the anti-noise comes too late: it takes {delay} samples ({1e3 * delay / fs:.1f} ms) to reach the error "
+        f"microphone, and no filter of {n_taps} taps reduces the noise by more than {possible:.1f} dB (without this delay "
+        f"{sooner:.1f} dB). Use shorter blocks, or move the reference microphone towards the noise: each millisecond "
+        "takes 34 cm. check_causality=False runs it nevertheless"
+    )
+
+
+def _first_arrival(path: Any) -> int:
+    """Return the number of samples before the first path of an array has arrived."""
+    taps = np.abs(np.reshape(path, (-1, np.shape(path)[-1])))
+    return int(np.argmax(np.any(taps > DELAY_SHARE * np.max(taps), axis=0)))
+
+
+def _best_db(silence: _Heard, path: Any, n_taps: int, fs: float) -> float:
+    """Return the noise reduction of the best filter of some taps, whatever its power."""
+    import warnings
+
+    single = np.ndim(path) == 1
+    x, d = (signal[0] if single else signal for signal in (silence.x, silence.e))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", np.exceptions.RankWarning)  # a lower bound does here
+        solution = power_constrained_wiener(
+            x, d, path, n_taps, LOUDEST * float(np.mean(silence.x**2)), fs=fs, segment_s=d.shape[-1] / fs
+        )
+    return float(np.max(solution.unconstrained.noise_reduction_db))

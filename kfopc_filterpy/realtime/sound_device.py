@@ -1,0 +1,142 @@
+"""A sound card as an interface, through PortAudio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_count, as_positive
+from .interfaces import Block
+
+
+class SoundDevice:
+    """A sound card: microphones at some of its inputs, loudspeakers at some of its outputs.
+
+    It needs the extra ``realtime`` (sounddevice, and the PortAudio library, which its wheels bring on Windows and macOS).
+    It has been tested with its stream replaced, not on hardware.
+
+    Parameters
+    ----------
+    reference_channels, error_channels : sequence of int
+        Inputs of the reference and the error microphones, the first input is 0.
+    output_channels : sequence of int, default (0,)
+        Outputs of the loudspeakers. The other outputs up to the largest of them stay silent.
+    fs : float, default 16000
+        Sample rate in Hz.
+    block : int, default 64
+        Samples of a block.
+    device : int, str or pair of them, optional
+        Device, or input and output device, as sounddevice names them (``python -m sounddevice`` lists them); by default
+        the system's.
+    latency : float or {"low", "high"}, default "low"
+        What sounddevice is asked for. `measure_round_trip` measures what came of it.
+    ahead : int, default 2
+        Blocks of silence that are written first, so that the output never runs dry.
+
+    Attributes
+    ----------
+    full_scale : float
+        1, the largest value of a sample.
+    dry : int
+        Blocks that came too late for the output.
+
+    Raises
+    ------
+    ImportError
+        sounddevice or the PortAudio library is missing.
+    ValueError
+        No channels, a negative one, or one that is both a reference and an error.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.realtime import SoundDevice, run
+    >>> card = SoundDevice([0], [1], fs=16000, block=32)  # doctest: +SKIP
+    >>> run(lambda path: kf_pb(256, path.taps, rated_power=0.01), card, amplitude_limit=0.5, seconds=60)  # doctest: +SKIP
+    """
+
+    full_scale = 1.0
+
+    def __init__(
+        self,
+        reference_channels: Sequence[int],
+        error_channels: Sequence[int],
+        output_channels: Sequence[int] = (0,),
+        *,
+        fs: float = 16000.0,
+        block: int = 64,
+        device: Any = None,
+        latency: float | str = "low",
+        ahead: int = 2,
+    ) -> None:
+        self._references = _indices(reference_channels, "reference_channels")
+        self._errors = _indices(error_channels, "error_channels")
+        self._outputs = _indices(output_channels, "output_channels")
+        if set(self._references) & set(self._errors):
+            raise ValueError("reference_channels and error_channels must be different inputs")
+        self.fs = as_positive(fs, "fs", unit="Hz")
+        self.block = as_count(block, "block")
+        self.device, self.latency = device, latency
+        self.ahead = as_count(ahead, "ahead")
+        self.n_references, self.n_microphones = len(self._references), len(self._errors)
+        self.n_loudspeakers = len(self._outputs)
+        self.dry = 0
+        self._stream: Any = None
+
+    def start(self) -> None:
+        """Open the stream, and write the silence that goes ahead."""
+        sounddevice = _sounddevice()
+        self._stream = sounddevice.Stream(
+            samplerate=self.fs,
+            blocksize=self.block,
+            device=self.device,
+            channels=(max(self._references + self._errors) + 1, max(self._outputs) + 1),
+            dtype="float32",
+            latency=self.latency,
+        )
+        self._stream.start()
+        for _ in range(self.ahead):
+            self.write(np.zeros((self.n_loudspeakers, self.block)))
+
+    def read(self) -> Block | None:
+        """Return the next block; a block is counted as lost if the driver reports that the input overflowed."""
+        heard, overflowed = self._stream.read(self.block)
+        signals = np.asarray(heard, dtype=np.float64).T
+        return Block(signals[self._references], signals[self._errors], self.block if overflowed else 0)
+
+    def write(self, control_signals: np.ndarray) -> None:
+        """Play the control signals of a block, (J, n_samples)."""
+        frames = np.zeros((control_signals.shape[1], max(self._outputs) + 1), dtype=np.float32)
+        frames[:, self._outputs] = control_signals.T
+        self.dry += bool(self._stream.write(frames))
+
+    def stop(self) -> None:
+        """Close the stream."""
+        if self._stream is not None:
+            self._stream.stop()
+            self._stream.close()
+            self._stream = None
+
+
+def _indices(channels: Sequence[int], name: str) -> list[int]:
+    """Return different channel numbers from 0."""
+    numbers = list(channels)
+    wanted = all(isinstance(n, int | np.integer) and n >= 0 for n in numbers)
+    if not numbers or not wanted or len(set(numbers)) != len(numbers):
+        raise ValueError(f"{name} must be one or more different channel numbers from 0, got {channels!r}")
+    return [int(n) for n in numbers]
+
+
+def _sounddevice() -> Any:
+    """Return the module sounddevice."""
+    try:
+        import sounddevice
+    except ImportError as error:
+        raise ImportError("SoundDevice needs sounddevice: pip install 'kfopc-filterpy[realtime]'") from error
+    except OSError as error:
+        raise ImportError(
+            f"sounddevice did not find the PortAudio library ({error}): install it, for example with "
+            "'apt install libportaudio2'"
+        ) from error
+    return sounddevice
