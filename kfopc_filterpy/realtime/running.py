@@ -554,11 +554,29 @@ def _identified(
         )
     taps = min(clear) + round(0.016 * interface.fs) if n_path is None else as_count(n_path, "n_path")
     length = min(r.y.shape[1] for r in recordings)
+    fs = interface.fs
+    left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
     if interface.n_loudspeakers == interface.n_microphones == 1:
-        return estimate_path(recordings[0].y[0], -recordings[0].e[0], taps, interface.fs), min(clear)
+        return estimate_path(recordings[0].y[0], left[0][0], taps, fs), min(clear)
+    length = min(e.shape[1] for e in left)
     sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
-    heard = np.array([-r.e[:, :length] for r in recordings])  # e = d - s * y
-    return estimate_path(sent, heard, taps, interface.fs), min(clear)
+    return estimate_path(sent, np.array([e[:, :length] for e in left]), taps, fs), min(clear)
+
+
+def _without_noise(y: np.ndarray, x: np.ndarray, e: np.ndarray, n_taps: int, fs: float) -> np.ndarray:
+    """Return the errors without the noise that the references explain while a loudspeaker plays y.
+
+    The noise goes on during an identification. Primary paths are fitted together with the secondary paths, so that
+    feedback from the loudspeaker to the references does no harm.
+    """
+    x = x[np.any(x[:, n_taps - 1 :], axis=1)]
+    if not len(x):
+        return e
+    primary = estimate_path(np.concatenate((y, x)), e, n_taps, fs).taps[:, 1:]
+    explained = [
+        sum(np.convolve(signal, path)[: e.shape[1]] for signal, path in zip(x, paths, strict=True)) for paths in primary
+    ]
+    return e - np.array(explained)
 
 
 def _require_fit(supervisor: Supervisor, interface: Interface) -> None:

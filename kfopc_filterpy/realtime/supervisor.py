@@ -21,6 +21,7 @@ LONGEST_PAUSE = 64  # of the first pause
 OVER_POWER = (
     4.0  # times the rated power over a window: no algorithm here exceeds its rating so much, except in its first blocks
 )
+PATIENCE = 3  # windows in a row that must be too loud: after a jump of the noise, the power needs some time
 OFTEN_LIMITED = 0.1  # of a window's samples at the limit
 SURPRISE = 1e4  # squared innovation over its predicted variance, relative to what is usual: 40 dB
 SETTLING_WINDOWS = 4  # before the usual surprise is known
@@ -86,7 +87,8 @@ class Supervisor:
     The divergence monitor looks at each window for
 
     - weights that are not finite, or larger than `largest_gain`;
-    - a control signal of more than four times the controller's rated power, or one at its limit for a tenth of the time;
+    - in three windows in a row, a control signal of more than four times the controller's rated power, or one at its
+      limit for a tenth of the time;
     - squared innovations, relative to their predicted variance, 40 dB above what has been usual, for the controllers
       around a Kalman filter (of the last sample of each block).
 
@@ -165,7 +167,7 @@ class Supervisor:
         self._paused_for_input = False
         self._last_y = np.zeros(self.n_loudspeakers)
         self._last_blocks: tuple[Any, Any] = (None, None)
-        self._usual, self._windows = np.nan, 0
+        self._usual, self._windows, self._loud_windows = np.nan, 0, 0
         self._begin_window()
 
     @property
@@ -412,7 +414,10 @@ class Supervisor:
             return "weights"
         rated = getattr(self.controller, "rated_power", None)
         over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
-        if over or np.any(self._limited > OFTEN_LIMITED * self._counted):
+        loud = over or np.any(self._limited > OFTEN_LIMITED * self._counted)
+        self._loud_windows = self._loud_windows + 1 if loud else 0
+        if self._loud_windows == PATIENCE:
+            self._loud_windows = 0
             return "power"
         return "innovation" if self._is_surprised() else ""
 

@@ -131,7 +131,9 @@ def test_a_filter_of_filterpy_and_wrappers_process_blocks() -> None:
     assert np.max(np.abs(limited.process(np.ones(8), np.zeros(8)))) == 1.0
     paths = np.zeros((2, 1, 5))
     paths[:, 0, 1] = 1.0
-    virtual = VirtualMicrophones(FxLMS(4, paths[:1], step_size=0.1), paths, np.ones((1, 1, 1)), virtual=[0], physical=[1])
+    virtual = VirtualMicrophones(
+        FxLMS(4, paths[:1], step_size=0.1), paths, np.ones((1, 1, 1)), virtual=[0], physical=[1]
+    )
     assert virtual.process(np.ones((1, 6)), np.ones((2, 6))).shape == (1, 6)
 
 

@@ -1,0 +1,115 @@
+"""Bad samples are found, whatever the blocks, and replaced."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy.realtime import Health
+from kfopc_filterpy.realtime.faults import CLIPPED, GOOD, NOT_FINITE, OFFSET, STUCK, Inspector, is_repeated
+
+FS = 8000.0
+
+
+def inspector(**changed: Any) -> Inspector:
+    return Inspector(1, **{"most_equal": 20, "rate": 1.0 / 800, "full_scale": 1.0} | changed)
+
+
+def noise(n: int = 8000) -> np.ndarray:
+    return np.clip(0.2 * np.random.default_rng(0).standard_normal((1, n)), -0.9, 0.9)
+
+
+def test_sound_is_good_and_stays() -> None:
+    rng = np.random.default_rng(0)
+    t = np.arange(8000) / FS
+    sounds = {
+        "white": noise(),
+        "faint": 1e-4 * rng.standard_normal((1, 8000)),
+        "20 Hz": 0.8 * np.sin(2 * np.pi * 20 * t + 1.0)[np.newaxis],
+        "16 bits": np.round(3.0 * rng.standard_normal((1, 8000))) / 32768,  # many equal neighbours
+        "impulses": np.where(rng.random((1, 8000)) < 0.01, 0.8, 1e-3 * rng.standard_normal((1, 8000))),
+    }
+    for name, sound in sounds.items():
+        heard = sound.copy()
+        kinds = inspector()(heard)
+        assert not np.any(kinds), (name, np.unique(kinds))
+        np.testing.assert_array_equal(heard, sound)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+def test_values_that_are_no_sound_become_zero(value: float) -> None:
+    heard = noise()
+    heard[0, 100:130] = value
+    kinds = inspector()(heard)
+    assert np.flatnonzero(kinds[0]).tolist() == list(range(100, 130))
+    assert set(kinds[0, 100:130]) == {NOT_FINITE}
+    assert not np.any(heard[0, 100:130])
+
+
+def test_a_stuck_channel_is_found_after_some_samples_and_is_silent() -> None:
+    for stuck in (0.0, 0.37):
+        heard = noise()
+        heard[0, 1000:3000] = stuck
+        kinds = inspector()(heard)
+        assert set(kinds[0, 1000:1020]) == {GOOD}
+        assert set(kinds[0, 1020:3000]) == {STUCK}
+        assert not np.any(heard[0, 1020:3000])
+        assert not np.any(kinds[0, 3000:])
+
+
+def test_clipped_samples_are_kept_but_noted() -> None:
+    heard = np.clip(6.0 * noise(), -1.0, 1.0)
+    sound = heard.copy()
+    kinds = inspector()(heard)
+    np.testing.assert_array_equal(kinds == CLIPPED, np.abs(sound) == 1.0)
+    np.testing.assert_array_equal(heard, sound)
+    assert not np.any(inspector(full_scale=np.inf)(np.clip(6.0 * noise(), -1.0, 1.0)))  # not known
+
+
+def test_an_offset_is_found_and_subtracted() -> None:
+    heard = 0.1 * noise()
+    heard[0, 2000:] += 0.5
+    kinds = inspector()(heard)
+    assert not np.any(kinds[0, :2000])
+    assert set(kinds[0, 2800:]) == {OFFSET}  # within the averaging time
+    assert abs(np.mean(heard[0, 7000:])) < 0.005
+    small = 1e-4 * noise()
+    small[0] += 0.005  # of a converter in silence
+    assert not np.any(inspector()(small))
+
+
+def test_nothing_depends_on_the_blocks() -> None:
+    heard = noise()
+    heard[0, 100:110] = np.nan
+    heard[0, 500:900] = 0.3
+    heard[0, 2000:] += 0.7
+    whole, parts = heard.copy(), heard.copy()
+    kinds = inspector()(whole)
+    by_parts = inspector()
+    cuts = [0, 1, 50, 105, 513, 514, 2001, 8000]
+    got = [by_parts(parts[:, a:b]) for a, b in itertools.pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(got, axis=1), kinds)
+    np.testing.assert_array_equal(parts, whole)
+
+
+def test_a_repeated_block() -> None:
+    block = noise(64)
+    assert is_repeated(block.copy(), block)
+    assert not is_repeated(block, None)
+    assert not is_repeated(block[:, :32], block)
+    assert not is_repeated(np.nextafter(block, 1.0), block)
+    assert not is_repeated(np.zeros((1, 64)), np.zeros((1, 64)))  # silence tells nothing
+
+
+def test_the_record_stays_small_and_counts_go_on() -> None:
+    health = Health()
+    for n in range(5000):
+        health.note("clipped", "error 0", time_s=float(n), n_samples=2, until_s=n + 0.01)
+    assert len(health.events) == 1000
+    assert (health.counts["clipped"], health.samples["clipped"]) == (5000, 10000)
+    health.note("clipped", "error 1", time_s=4999.005, until_s=4999.1)
+    assert health.counts["clipped"] == 5001  # another channel
+    assert repr(health) == "<Health: 5001 clipped>"

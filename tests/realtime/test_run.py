@@ -1,0 +1,244 @@
+"""A run in real time, on a simulated plant and on a sound card that is replaced."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
+from kfopc_filterpy.realtime import (
+    FaultError,
+    Interface,
+    Levels,
+    NotCausalError,
+    SimulatedInterface,
+    SoundDevice,
+    measure_round_trip,
+    run,
+)
+
+FS = 8000.0
+S = np.array([0.0, 0.8, -0.3])
+PRIMARY = np.zeros(90)
+PRIMARY[[70, 75, 82]] = 1.0, 0.5, -0.3
+X = np.random.default_rng(5).standard_normal(round(8 * FS))
+
+
+def plant(**changed: Any) -> SimulatedInterface:
+    return SimulatedInterface(X, S, **{"primary_path": PRIMARY, "fs": FS, "block": 32, "latency": 64} | changed)
+
+
+def started(interface: Interface, step_size: float = 2e-3, **changed: Any) -> Any:
+    settings = {"amplitude_limit": 8.0, "listen_s": 0.5, "identify_s": 1.5, "fade_s": 0.02}
+    return run(lambda path: FxLMS(24, path.taps, step_size=step_size), interface, **settings | changed)
+
+
+def test_the_simulated_plant_is_that_of_simulate() -> None:
+    """With clipping and feedback: the same controller, block by block and in one simulation with the delay in the path."""
+    clip, feedback = HardClipAmplifier(0.8), np.array([0.0, 0.05, -0.02])
+    options: dict[str, Any] = {"sensor_noise_std": 0.1, "rng": 3}
+    interface = plant(amplifier=clip, feedback_path=feedback, **options)
+    controller = FxLMS(24, interface.total_secondary_path, step_size=1e-3)
+    errors, outputs = [], []
+    while (block := interface.read()) is not None:
+        errors.append(block.errors[0])
+        outputs.append(controller.process(block.references[0], block.errors[0]))
+        interface.write(outputs[-1][np.newaxis])
+    expected = simulate(
+        FxLMS(24, interface.total_secondary_path, step_size=1e-3),
+        X,
+        primary_path=PRIMARY,
+        secondary_path=interface.total_secondary_path,
+        amplifier=clip,
+        feedback_path=np.concatenate((np.zeros(64), feedback)),
+        fs=FS,
+        **options,
+    )
+    # The sums are in another order; the loop contracts, so rounding stays small.
+    np.testing.assert_allclose(np.concatenate(outputs), expected.control_signal, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(np.concatenate(errors), expected.error, rtol=0, atol=1e-10)
+
+
+def test_a_real_clock_waits_for_the_blocks_and_loses_those_not_fetched() -> None:
+    interface = plant(block=400, latency=400, clock="real")  # 50 ms
+    began = time.perf_counter()
+    interface.start()
+    for _ in range(4):
+        block = interface.read()
+        assert block is not None
+    assert time.perf_counter() - began >= 0.2
+    time.sleep(0.27)
+    late = interface.read()
+    assert late is not None
+    assert late.lost >= 1600
+
+
+def test_a_run_identifies_fades_in_reduces_and_fades_out() -> None:
+    reports: list[Levels] = []
+    interface = plant()
+    report = started(interface, seconds=3.0, on_report=reports.append, report_every_s=0.5)
+    assert report.stopped_by == "end"
+    assert report.round_trip_samples == 65
+    assert report.secondary_path is not None
+    # The disturbance is twice as loud as the noise that is played, but the reference explains it.
+    np.testing.assert_allclose(report.secondary_path.taps[64:67], S, atol=1e-3)
+    assert report.possible_db > 15.0
+    assert report.reduction_db[0] > 10.0
+    assert [round(r.time_s, 1) for r in reports] == [0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    assert reports[-1].reduction_db[0] > reports[0].reduction_db[0] + 3.0
+    assert reports[-1].powers.shape == (1,)
+    assert report.seconds == pytest.approx(3.0, abs=0.01)
+    np.testing.assert_allclose(report.powers, np.sum(lfilter([1.0], [0.8, -0.3], PRIMARY) ** 2), rtol=0.1)
+    assert not report.health.counts
+    assert "stopped by end, noise reduction" in repr(report)
+    assert not np.any(interface._queue[:, -32:])  # silence at the end
+    assert report.controller.weights.shape == (24,)
+
+
+def test_several_loudspeakers_and_microphones() -> None:
+    paths = np.zeros((2, 2, 4))
+    paths[:, :, 1] = [[0.9, 0.2], [0.1, 0.8]]
+    primary = np.stack((PRIMARY, np.roll(0.7 * PRIMARY, 3)))[:, np.newaxis]
+    interface = SimulatedInterface(X, paths, primary_path=primary, fs=FS, block=32, latency=64)
+    report = run(
+        lambda path: FxLMS(32, path.taps, step_size=1e-3),
+        interface,
+        amplitude_limit=[8.0, 8.0],
+        seconds=2.0,
+        listen_s=0.5,
+        identify_s=1.5,
+    )
+    assert report.secondary_path is not None
+    np.testing.assert_allclose(report.secondary_path.taps[:, :, 65], paths[:, :, 1], atol=1e-3)
+    assert np.all(report.reduction_db > 6.0)
+
+
+def test_a_plant_that_is_not_causal_is_refused_with_the_way_out() -> None:
+    with pytest.raises(NotCausalError, match=r"it takes 193 samples .* Use shorter blocks, or move the reference"):
+        started(plant(block=64, latency=192))
+    tone = np.sin(2 * np.pi * 200 * np.arange(X.size) / FS)  # can be predicted: not refused
+    report = started(
+        SimulatedInterface(tone, S, primary_path=PRIMARY, fs=FS, block=64, latency=192), seconds=1.0, n_path=200
+    )
+    assert report.possible_db > 10.0
+    report = started(plant(block=64, latency=192), seconds=0.5, check_causality=False)
+    assert np.isnan(report.possible_db)
+
+
+def test_a_loudspeaker_that_is_not_heard_is_a_fault() -> None:
+    with pytest.raises(FaultError, match="no loudspeaker is heard by any error microphone"):
+        started(SimulatedInterface(X, [0.0, 0.0], primary_path=PRIMARY, fs=FS, block=32, latency=64))
+    with pytest.raises(FaultError, match="ended before anything was heard"):
+        started(SimulatedInterface(X[:4000], S, primary_path=PRIMARY, fs=FS, block=32, latency=64))
+    with pytest.raises(FaultError, match="no loudspeaker is heard"):
+        measure_round_trip(SimulatedInterface(X, [0.0, 0.0], disturbance=X, fs=FS), level=0.1, longest=256)
+
+
+@pytest.mark.parametrize("delay", [64, 100, 333])
+def test_the_round_trip_is_measured_under_noise(delay: int) -> None:
+    interface = SimulatedInterface(X, [0.0, 0.9, 0.2], disturbance=0.3 * X[::-1], fs=FS, block=64, latency=delay)
+    assert measure_round_trip(interface, level=0.3, longest=1000) == delay + 1
+
+
+def test_a_run_stops_on_a_fault_when_told_to_and_on_ctrl_c() -> None:
+    wrong = FxLMS(24, np.concatenate((np.zeros(64), -S)), step_size=5e-3)
+    settings: dict[str, Any] = {"amplitude_limit": 3.0, "listen_s": 0.5, "pause_s": 0.1, "check_causality": False}
+    report = run(wrong, plant(), **settings)
+    assert report.stopped_by == "fault: 3 divergences"
+    assert report.secondary_path is None
+    blocks: list[int] = []
+
+    def enough() -> bool:
+        blocks.append(1)
+        return len(blocks) == 50
+
+    right = FxLMS(24, plant().total_secondary_path, step_size=1e-3)
+    assert run(right, plant(), should_stop=enough, **settings).stopped_by == "user"
+    assert len(blocks) == 50
+
+    def interrupted(levels: Levels) -> None:
+        raise KeyboardInterrupt
+
+    assert run(right, plant(), on_report=interrupted, **settings).stopped_by == "user"
+
+
+def test_channels_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="n_microphones = 2, but the interface has 1"):
+        run(FxLMS(8, np.ones((2, 1, 70)), step_size=1e-3), plant(), amplitude_limit=1.0, listen_s=0.1)
+    with pytest.raises(ValueError, match="latency must be at least a block"):
+        plant(latency=31)
+    with pytest.raises(ValueError, match="either primary_path= or disturbance="):
+        plant(disturbance=X)
+    with pytest.raises(ValueError, match="feedback_path must lead"):
+        SimulatedInterface(X, np.ones((1, 1, 2)), disturbance=X[np.newaxis], feedback_path=np.zeros((2, 1, 4)))
+
+
+class Card:
+    """Stands for sounddevice.Stream: a simulated plant behind the channels of a card."""
+
+    def __init__(self, interface: SimulatedInterface) -> None:
+        self.interface = interface
+        self.asked: dict[str, Any] = {}
+        self.states: list[str] = []
+        self.reads = 0
+        self.ahead: list[Any] = []
+
+    def __call__(self, **asked: Any) -> Card:
+        self.asked = asked
+        return self
+
+    def start(self) -> None:
+        self.states.append("start")
+
+    def read(self, n: int) -> tuple[Any, bool]:
+        block = self.interface.read()
+        assert block is not None
+        self.reads += 1
+        frames = np.zeros((n, 4), np.float32)
+        frames[:, 2], frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
+        return frames, self.reads == 100
+
+    def write(self, frames: Any) -> bool:
+        assert frames.dtype == np.float32
+        assert frames.shape[1] == 2
+        assert not np.any(frames[:, 0])
+        self.interface.write(10.0 * frames[:, 1:].T.astype(float))
+        return self.reads == 120
+
+    def stop(self) -> None:
+        self.states.append("stop")
+
+    def close(self) -> None:
+        self.states.append("close")
+
+
+def test_a_sound_card_is_driven_through_its_stream(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = Card(plant())
+    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
+    device = SoundDevice([2], [3], [1], fs=FS, block=32, device="duplex")
+    assert isinstance(device, Interface)
+    report = started(device, step_size=0.2, amplitude_limit=0.8, seconds=2.0)
+    assert card.asked["channels"] == (4, 2)
+    assert (card.asked["samplerate"], card.asked["blocksize"], card.asked["device"]) == (FS, 32, "duplex")
+    assert card.states == ["start", "stop", "close"] * 2
+    assert report.reduction_db[0] > 6.0
+    assert device.dry == 1
+    assert report.round_trip_samples == 65
+
+
+def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    device = SoundDevice([0], [1])
+    monkeypatch.setitem(sys.modules, "sounddevice", None)
+    with pytest.raises(ImportError, match=r"kfopc-filterpy\[realtime\]"):
+        device.start()
+    for channels, message in ((([], [1]), "reference_channels must be"), (([0], [0]), "must be different inputs")):
+        with pytest.raises(ValueError, match=message):
+            SoundDevice(*channels)
+    with pytest.raises(ValueError, match="output_channels must be"):
+        SoundDevice([0], [1], [-1])

@@ -1,0 +1,361 @@
+"""The supervisor's promises: finite, within limits, nothing learned from bad samples, recovery, a health record."""
+
+from __future__ import annotations
+
+import itertools
+from copy import deepcopy
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.channels import random_paths
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kfopc_filterpy import FxLMS, OutputPowerConstraint, kf_opc
+from kfopc_filterpy.controllers import MonitoredController
+from kfopc_filterpy.realtime import SimulatedInterface, Supervisor
+
+FS = 8000.0
+BLOCK, LATENCY = 32, 64
+S = np.array([0.0, 0.8, -0.3])
+PATH = np.concatenate((np.zeros(LATENCY), S))
+PRIMARY = np.zeros(90)
+PRIMARY[[70, 75, 82]] = 1.0, 0.5, -0.3
+PATHS = np.concatenate((np.zeros((2, 2, LATENCY)), random_paths(2, 2, 5, seed=2)), axis=2)
+LIMIT = 4.0
+
+MAKERS: dict[str, Any] = {
+    "FxLMS": lambda: FxLMS(24, PATH, step_size=1e-3),
+    "KF-OPC": lambda: kf_opc(
+        24,
+        PATH,
+        constraint=OutputPowerConstraint(0.5, fs=FS),
+        state_noise=1e-7,
+        measurement_noise=1e-2,
+        initial_variance=1e-2,
+    ),
+    "FxLMS of several channels": lambda: FxLMS(16, PATHS, step_size=3e-4),
+    "monitored": lambda: MonitoredController(FxLMS(24, PATH, step_size=1e-3), fs=FS, window_s=0.1),
+}
+
+
+def supervised(controller: Any, **changed: Any) -> Supervisor:
+    return Supervisor(
+        controller, **{"fs": FS, "amplitude_limit": LIMIT, "full_scale": 50.0, "mute_after_s": 2.0} | changed
+    )
+
+
+def plant(several: bool = False, seconds: float = 3.0, **changed: Any) -> SimulatedInterface:
+    x = np.random.default_rng(5).standard_normal(round(seconds * FS))
+    primary = np.stack((PRIMARY, 0.7 * PRIMARY))[:, np.newaxis] if several else PRIMARY
+    secondary = PATHS[..., LATENCY:] if several else S
+    return SimulatedInterface(x, secondary, primary_path=primary, fs=FS, block=BLOCK, latency=LATENCY, **changed)
+
+
+def loop(supervisor: Supervisor, interface: SimulatedInterface, spoil: Any = None) -> tuple[np.ndarray, np.ndarray]:
+    """Run to the end; `spoil(references, errors, first_sample)` changes what is heard. Return y and the true errors."""
+    ys, es = [], []
+    first = 0
+    while (block := interface.read()) is not None:
+        x, e = block.references.copy(), block.errors.copy()
+        es.append(block.errors)
+        given = (x, e) if spoil is None else spoil(x, e, first)
+        if not supervisor.multichannel:
+            given = tuple(None if signal is None else signal[0] for signal in given)
+        y = np.atleast_2d(supervisor.process(*given))
+        interface.write(y)
+        ys.append(y)
+        first += BLOCK
+    return np.concatenate(ys, axis=1), np.concatenate(es, axis=1)
+
+
+def db(e: np.ndarray, d: np.ndarray) -> float:
+    return float(10 * np.log10(np.sum(d**2) / np.sum(e**2)))
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_without_faults_it_changes_nothing(name: str) -> None:
+    several = name.endswith("channels")
+    supervisor, bare = supervised(MAKERS[name](), amplitude_limit=100.0), MAKERS[name]()
+    y, _ = loop(supervisor, plant(several, 1.0))
+    again = plant(several, 1.0)
+    direct = []
+    while (block := again.read()) is not None:
+        x, e = (signal if several else signal[0] for signal in block[:2])
+        direct.append(np.atleast_2d(bare.process(x, e)))
+        again.write(direct[-1])
+    np.testing.assert_array_equal(y, np.concatenate(direct, axis=1))
+    assert not supervisor.health.counts
+
+
+BAD: dict[str, Any] = {
+    "NaN": lambda v: np.full_like(v, np.nan),
+    "Inf": lambda v: np.full_like(v, -np.inf),
+    "huge": lambda v: np.full_like(v, 1e250),
+    "stuck": lambda v: np.full_like(v, 0.123),
+    "unplugged": np.zeros_like,
+    "offset": lambda v: v + 20.0,
+    "clipped": lambda v: np.sign(v) * 50.0,
+    "sign": lambda v: -v,
+    "40 dB up": lambda v: 100.0 * v,
+    "40 dB down": lambda v: 0.01 * v,
+}
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    fault=st.sampled_from(sorted(BAD)),
+    where=st.sampled_from(["reference", "error", "both"]),
+    begin=st.integers(1, 16000),
+    log_length=st.floats(0.0, 5.0),
+    action=st.sampled_from(["mute", "reset", "freeze"]),
+)
+@pytest.mark.parametrize("name", MAKERS)
+def test_whatever_comes_in_what_goes_out_is_finite_and_within_the_limit(
+    name: str, fault: str, where: str, begin: int, log_length: float, action: str
+) -> None:
+    end = begin + round(10.0**log_length)
+
+    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
+        a, b = max(begin - first, 0), min(end - first, BLOCK)
+        if a < b:
+            if where != "error":
+                x[-1, a:b] = BAD[fault](x[-1, a:b])
+            if where != "reference":
+                e[-1, a:b] = BAD[fault](e[-1, a:b])
+        return x, e
+
+    supervisor = supervised(MAKERS[name](), on_divergence=action, pause_s=0.3)
+    y, _ = loop(supervisor, plant(name.endswith("channels"), 3.0), spoil)
+    assert np.all(np.isfinite(y))
+    assert np.max(np.abs(y)) <= LIMIT
+    if fault in ("NaN", "Inf", "huge"):
+        heard = min(end, 24000) - begin
+        assert supervisor.health.samples["not finite"] == heard * (2 if where == "both" else 1)
+    if fault == "clipped":
+        assert supervisor.health.counts["clipped"] >= 1
+
+
+@pytest.mark.parametrize("name", ["FxLMS", "KF-OPC", "FxLMS of several channels"])
+@pytest.mark.parametrize("where", ["reference", "error"])
+def test_nothing_is_learned_from_bad_samples(name: str, where: str) -> None:
+    """Weights, running powers and covariance stay until the recovery, and then go on."""
+    supervisor = supervised(MAKERS[name]())
+    several = name.endswith("channels")
+    loop(supervisor, plant(several, 1.0))
+    controller: Any = supervisor.controller
+    before = deepcopy(controller)
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((controller.n_references if several else 1, 400))
+    e = rng.standard_normal((2 if several else 1, 400))
+    bad_x, bad_e = x.copy(), e.copy()
+    (bad_x if where == "reference" else bad_e)[-1, :100] = np.nan
+    recovery = supervisor.recovery_samples if where == "reference" else 0
+    assert supervisor.recovery_samples == (16 + 69 if several else 24 + 67)
+
+    def process(begin: int, end: int) -> None:
+        part = slice(begin, end)
+        supervisor.process(*((bad_x[:, part], bad_e[:, part]) if several else (bad_x[0, part], bad_e[0, part])))
+
+    process(0, 100)
+    process(100, 100 + recovery) if recovery else None
+    np.testing.assert_array_equal(controller.weights, before.weights)
+    np.testing.assert_array_equal(controller.disturbance_power, before.disturbance_power)
+    if name == "KF-OPC":
+        np.testing.assert_array_equal(controller.estimator.P, before.estimator.P)
+    process(100 + recovery, 101 + recovery)
+    assert not np.array_equal(controller.weights, before.weights)
+
+
+@pytest.mark.parametrize("missing", ["references", "errors"])
+def test_missing_blocks_and_values_are_bad_samples(missing: str) -> None:
+    supervisor = supervised(MAKERS["FxLMS"]())
+    good = np.random.default_rng(0).standard_normal(32)
+    blocks = {"references": good, "errors": good} | {missing: None}
+    assert supervisor.process(**blocks).shape == (32,)
+    assert supervisor.health.samples["not finite"] == 32
+    with_none = [*good[:-1].tolist(), None]
+    supervisor.process(with_none, good)
+    assert supervisor.health.samples["not finite"] == 33
+
+
+def test_blocks_that_do_not_fit_are_refused_and_nothing_changes() -> None:
+    supervisor = supervised(MAKERS["FxLMS"]())
+    good = np.ones(32)
+    with pytest.raises(ValueError, match="references or errors must be given"):
+        supervisor.process(None, None)
+    with pytest.raises(ValueError, match="the same number of samples"):
+        supervisor.process(good, good[:5])
+    with pytest.raises(ValueError, match=r"errors must be \(n_samples,\)"):
+        supervisor.process(good, np.ones((2, 32)))
+    with pytest.raises(ValueError, match="at least 1"):
+        supervisor.process([], [])
+    with pytest.raises((TypeError, ValueError), match=r"references|float"):
+        supervisor.process("noise", good)
+    assert not supervisor.health.counts
+
+
+def test_lost_and_repeated_blocks() -> None:
+    supervisor = supervised(MAKERS["FxLMS"]())
+    rng = np.random.default_rng(0)
+    block = rng.standard_normal((2, 32))
+    for _ in range(10):
+        supervisor.process(*rng.standard_normal((2, 32)))
+    supervisor.process(*block)
+    weights = supervisor.controller.weights
+    supervisor.process(*block)
+    assert supervisor.health.samples["repeated"] == 64
+    np.testing.assert_array_equal(supervisor.controller.weights, weights)
+    supervisor.process(*rng.standard_normal((2, 32)), lost=320)
+    assert supervisor.health.samples["lost"] == 320
+    np.testing.assert_array_equal(supervisor.controller.weights, weights)
+
+
+@pytest.mark.parametrize("name", ["FxLMS", "KF-OPC", "FxLMS of several channels"])
+@pytest.mark.parametrize("length", [1, 100, 8000])
+def test_the_noise_reduction_recovers_within_half_a_second(name: str, length: int) -> None:
+    """After NaN in reference and error; the filter is not lost, so it need not learn anew."""
+    several = name.endswith("channels")
+
+    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
+        n = first + np.arange(BLOCK)
+        bad = (n >= 24000) & (n < 24000 + length)
+        x[:, bad] = e[:, bad] = np.nan
+        return x, e
+
+    free, faulty = plant(several, 5.0), plant(several, 5.0)
+    _, expected = loop(supervised(MAKERS[name]()), free)
+    _, got = loop(supervised(MAKERS[name]()), faulty, spoil)
+    after = slice(24000 + length + 4000, 24000 + length + 8000)
+    d = free.disturbance[:, : got.shape[1]]
+    assert db(got[:, after], d[:, after]) > db(expected[:, after], d[:, after]) - 1.0
+
+
+def diverging(**changed: Any) -> Supervisor:
+    return supervised(FxLMS(24, -PATH, step_size=3e-3), **changed)  # wrong sign: it must diverge
+
+
+@pytest.mark.parametrize("action", ["mute", "reset", "freeze"])
+def test_a_divergence_is_noticed_and_acted_on(action: str) -> None:
+    supervisor = diverging(on_divergence=action, pause_s=0.5)
+    y, _ = loop(supervisor, plant(seconds=4.0))
+    counts = supervisor.health.counts
+    assert counts["diverged: power"] >= 1
+    done = {"mute": "muted", "reset": "reset", "freeze": "frozen"}[action]
+    assert counts[done] == counts["diverged: power"]
+    assert np.max(np.abs(y)) <= LIMIT
+    if action == "mute":
+        assert counts["running again"] >= 1
+        assert np.mean(y == 0.0) > 0.3
+        muted = [event.time_s for event in supervisor.health.events if event.what == "muted"]
+        assert np.all(np.diff(muted) > 0.5)
+        assert np.diff(muted)[-1] > np.diff(muted)[0]  # the pauses grow
+
+
+def test_a_healthy_controller_is_left_alone_when_the_noise_jumps_by_20_db() -> None:
+    x = np.random.default_rng(5).standard_normal(24000)
+    x[12000:] *= 10.0
+    noise = SimulatedInterface(x, S, primary_path=PRIMARY, fs=FS, block=BLOCK, latency=LATENCY)
+    supervisor = supervised(MAKERS["KF-OPC"](), amplitude_limit=1e3, full_scale=1e3)
+    loop(supervisor, noise)
+    assert not supervisor.health.counts
+
+
+def test_surprising_innovations_are_a_divergence() -> None:
+    """The error suddenly is 60 dB up, and the reference is not."""
+
+    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
+        return x, (1e3 * e if first >= 20000 else e)
+
+    supervisor = supervised(MAKERS["KF-OPC"](), amplitude_limit=1e9, full_scale=None)
+    supervisor.controller.estimator.rated_power = None  # KF-ANC: no power can be exceeded
+    loop(supervisor, plant(seconds=4.0), spoil)
+    assert supervisor.health.counts["diverged: innovation"] >= 1
+
+
+def test_a_control_signal_that_is_not_finite_ends_in_silence() -> None:
+    class Broken:
+        n = 0
+
+        def control_signal(self, reference: float) -> float:
+            self.n += 1
+            return 1.0 if self.n % 200 else np.nan
+
+        def update(self, error: float) -> None:
+            pass
+
+    supervisor = Supervisor(Broken(), fs=FS, amplitude_limit=2.0, pause_s=0.1)
+    y = np.concatenate([supervisor.process(*np.random.default_rng(k).standard_normal((2, 64))) for k in range(40)])
+    assert np.all(np.isfinite(y))
+    assert supervisor.health.counts["diverged: not finite"] >= 1
+    assert np.max(np.abs(np.diff(y[:200]))) < 1.0 / 50  # it fades, it does not click
+    assert not np.any(y[256:800])
+
+
+def test_long_faults_fade_out_and_in_again() -> None:
+    def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
+        return x, (np.full_like(e, np.nan) if 8000 <= first < 20000 else e)
+
+    supervisor = supervised(MAKERS["FxLMS"](), mute_after_s=0.5)
+    y, _ = loop(supervisor, plant(seconds=4.0), spoil)
+    counts = supervisor.health.counts
+    assert counts["silent: no usable input"] == counts["running again"] == 1
+    assert not np.any(y[0, 13000:19900])
+    assert np.any(y[0, 12000] != 0.0)
+    assert np.all(np.abs(y[0, 21000:]) <= LIMIT)
+    assert np.std(y[0, 21000:]) > 0.1
+
+
+def test_fades_are_smooth() -> None:
+    class Constant:
+        def control_signal(self, reference: float) -> float:
+            return 1.0
+
+        def update(self, error: float) -> None:
+            pass
+
+    supervisor = Supervisor(Constant(), fs=FS, amplitude_limit=2.0, fade_s=0.05)
+    supervisor.start_silent()
+    rng = np.random.default_rng(0)
+    silent = supervisor.process(*rng.standard_normal((2, 100)))
+    supervisor.fade_in()
+    up = np.concatenate([supervisor.process(*rng.standard_normal((2, 100))) for _ in range(6)])
+    supervisor.fade_out()
+    down = np.concatenate([supervisor.process(*rng.standard_normal((2, 100))) for _ in range(6)])
+    y = np.concatenate((silent, up, down))
+    assert not np.any(silent)
+    assert np.max(np.abs(np.diff(y))) <= 1.0 / 400 + 1e-12
+    assert up[-1] == 1.0
+    assert down[-1] == 0.0
+    assert supervisor.muted
+
+
+def test_settings_that_are_out_of_range_are_refused() -> None:
+    controller = MAKERS["FxLMS"]()
+    bad: list[tuple[dict[str, Any], str]] = [
+        ({"amplitude_limit": 0.0}, "amplitude_limit must be greater than 0"),
+        ({"on_divergence": "panic"}, "on_divergence must be"),
+        ({"fs": -1.0}, "fs must be greater than 0"),
+        ({"stuck_s": 0.0}, "stuck_s must be greater than 0"),
+        ({"full_scale": -1.0}, "full_scale must be greater than 0"),
+    ]
+    for changed, message in bad:
+        with pytest.raises(ValueError, match=message):
+            supervised(controller, **changed)
+    with pytest.raises(TypeError, match="controller must have control_signal"):
+        supervised(object())
+    with pytest.raises(ValueError, match="fs is 8000 Hz but"):
+        supervised(kf_opc(8, PATH, rated_power=1.0, state_noise=1e-6, measurement_noise=1e-2))
+
+
+def test_its_results_depend_on_the_blocks_only_through_the_windows() -> None:
+    """Without a divergence, any cut of the signals gives the same control signals."""
+    x, e = np.random.default_rng(3).standard_normal((2, 2000))
+    x[500:520] = np.nan
+    e[900] = np.inf
+    whole, parts = supervised(MAKERS["FxLMS"]()), supervised(MAKERS["FxLMS"]())
+    expected = whole.process(x, e)
+    cuts = [0, 1, 40, 510, 515, 600, 901, 1500, 2000]
+    got = [parts.process(x[a:b], e[a:b]) for a, b in itertools.pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(got), expected)
