@@ -20,6 +20,9 @@ from . import (
     power as power,
 )
 from . import (
+    realtime as realtime,
+)
+from . import (
     signals as signals,
 )
 from .bounds.power_constrained import power_constrained_wiener as power_constrained_wiener

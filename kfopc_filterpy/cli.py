@@ -29,6 +29,7 @@ EXAMPLES = {
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
   kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
   kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
+  kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
   kfopc explore
   kfopc data list
 each command has its own --help""",
@@ -168,6 +169,7 @@ def _parser() -> argparse.ArgumentParser:
     about = "identify, inspect, convert, resample and plot impulse responses"
     paths = commands.add_parser("paths", help=about, description=_sentence(about))
     _path_commands(paths.add_subparsers(dest="action", required=True, metavar="ACTION", parser_class=_Parser))
+    _run_options(_command(commands, "run", _run, "control noise in real time, with a sound card or a simulated plant"))
     explore = _command(commands, "explore", _explore, "open a page with sliders for rating, noise, paths and algorithm")
     explore.add_argument("noise", nargs="?", help="your own recording of the reference microphone; needs both paths")
     explore.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
@@ -187,7 +189,7 @@ def _command(commands: Any, name: str, run: Callable[[Any], int], about: str) ->
         name,
         help=about,
         description=_sentence(about),
-        epilog=EXAMPLES[name],
+        epilog=EXAMPLES.get(name),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run, prog=parser.prog)
@@ -609,6 +611,20 @@ def _explore(options: argparse.Namespace) -> int:
         )
     serve_explore(setups, port=options.port)
     return ENOUGH
+
+
+def _run_options(parser: argparse.ArgumentParser) -> None:
+    from .realtime.command import EXAMPLES as run_examples
+    from .realtime.command import add_options
+
+    parser.epilog = run_examples
+    add_options(parser)
+
+
+def _run(options: argparse.Namespace) -> int:
+    from .realtime.command import run_command
+
+    return run_command(options)
 
 
 def _data(options: argparse.Namespace) -> int:

@@ -219,12 +219,22 @@ class KalmanController(FilteredReferenceController):
         error = as_number(error, "error")
         state = self._steppable_state()
         if state is None:
-            self._update_through_estimator(error)
+            self._update_or_restore(error)
         elif adapt_once.with_held(self._held(), error, self._y):
             self.estimator.after_compiled(state.weights.copy())
         else:
-            self._update_through_estimator(error)  # raises, with the reason
+            self._update_or_restore(error)  # raises, with the reason
             raise ValueError(NO_SOLUTION)
+
+    def _update_or_restore(self, error: float) -> None:
+        """Call the estimator; if it refuses the update, undo its `predict`."""
+        estimator = self.estimator
+        x, P = np.array(estimator.x), np.array(estimator.P)
+        try:
+            self._update_through_estimator(error)
+        except Exception:
+            estimator.x, estimator.P = x, P
+            raise
 
     def _update_through_estimator(self, error: float) -> None:
         """Call the estimator's `predict` and `update`."""

@@ -4,6 +4,7 @@ from .interfaces import Block as Block
 from .interfaces import Interface as Interface
 from .interfaces import SimulatedInterface as SimulatedInterface
 from .running import FaultError as FaultError
+from .running import IdentifiedPlant as IdentifiedPlant
 from .running import Levels as Levels
 from .running import NotCausalError as NotCausalError
 from .running import RunReport as RunReport

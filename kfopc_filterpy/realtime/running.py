@@ -13,6 +13,7 @@ import numpy as np
 
 from .._validate import as_count, as_generator, as_nonnegative, as_positive
 from ..bounds.power_constrained import power_constrained_wiener
+from ..bounds.settings import SuggestedSettings, suggest_settings
 from ..controllers.base import Controller, listed
 from ..paths.identification import PathEstimate, estimate_path
 from .health import Health
@@ -128,6 +129,43 @@ class RunReport:
             f"{listed(self.reduction_db, '.1f')} dB, output power {listed(self.powers, '.3g')}{rated}, "
             f"{self.overruns} overruns in {self.blocks} blocks, {self.health!r}>"
         )
+
+
+@dataclass(frozen=True)
+class IdentifiedPlant:
+    """What `run` knows of a plant before it makes the controller.
+
+    Attributes
+    ----------
+    path : PathEstimate
+        Secondary path, with the buffers of the interface.
+    round_trip_samples : int
+        Samples from a control signal to its first arrival at an error microphone.
+    references, errors : ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
+        Microphones during the silence before; with one channel, without a channel axis.
+    fs : float
+        Sample rate in Hz.
+    """
+
+    path: PathEstimate
+    round_trip_samples: int
+    references: np.ndarray = field(repr=False)
+    errors: np.ndarray = field(repr=False)
+    fs: float
+
+    @property
+    def taps(self) -> np.ndarray:
+        """Taps of the secondary path, (n_path,) or (K, J, n_path)."""
+        return self.path.taps
+
+    @property
+    def uncertainty(self) -> np.ndarray:
+        """Largest relative error of the path, (257,) from 0 to fs/2, for `secondary_path_uncertainty`."""
+        return np.asarray(self.path.uncertainty)
+
+    def suggested(self, n_taps: int | None = None) -> SuggestedSettings:
+        """Return `suggest_settings` for the noise heard in the silence; for one channel."""
+        return suggest_settings(self.references, self.errors, self.taps, fs=self.fs, n_taps=n_taps)
 
 
 @dataclass
@@ -260,7 +298,7 @@ def _arrival(sent: np.ndarray, heard: np.ndarray, longest: int) -> int | None:
 
 
 def run(
-    controller: Controller | Callable[[PathEstimate], Controller],
+    controller: Controller | Callable[[IdentifiedPlant], Controller],
     interface: Interface,
     *,
     amplitude_limit: Any,
@@ -285,9 +323,9 @@ def run(
     Parameters
     ----------
     controller : Controller or callable
-        A function that makes the controller from the identified secondary path, a `PathEstimate` with `taps` (n_path,) or
-        (K, J, n_path) and their `uncertainty`. Or a controller made for a known path, which must include the delay of
-        the interface: nothing is identified then.
+        A function that makes the controller from an `IdentifiedPlant`, which has the `taps` of the secondary path and
+        their `uncertainty`. Or a controller made for a known path, which must include the delay of the interface:
+        nothing is identified then.
     interface : Interface
         `SoundDevice`, `SimulatedInterface` or your own.
     amplitude_limit : float or array_like, shape (J,)
@@ -338,14 +376,10 @@ def run(
     >>> primary = np.zeros(120)
     >>> primary[[80, 90]] = 1.0, 0.4
     >>> plant = SimulatedInterface(noise, [0.0, 0.9, 0.3], primary_path=primary, block=32)
-    >>> def make(path):
+    >>> def make(plant):
+    ...     settings = plant.suggested(n_taps=32).settings
     ...     return kf_pb(
-    ...         32,
-    ...         path.taps,
-    ...         rated_power=2.0,
-    ...         secondary_path_uncertainty=path.uncertainty,
-    ...         state_noise=1e-9,
-    ...         measurement_noise=1e-3,
+    ...         32, plant.taps, rated_power=2.0, secondary_path_uncertainty=plant.uncertainty, **settings
     ...     )
     >>> report = run(make, plant, amplitude_limit=10.0, seconds=2.0, identify_s=2.0)
     >>> report.stopped_by, report.round_trip_samples, bool(report.reduction_db[0] > 10.0)
@@ -354,12 +388,12 @@ def run(
     listen_n = max(round(as_nonnegative(listen_s, "listen_s", unit="s") * interface.fs), interface.block)
     level = 0.1 * float(np.min(amplitude_limit)) if excitation is None else as_positive(excitation, "excitation")
     session = _Session(interface)
-    path, round_trip = None, None
+    identified = None
     with _open(interface):
         silence = session.play(np.zeros((interface.n_loudspeakers, listen_n)))
         if not isinstance(controller, Controller):
-            path, round_trip = _identified(session, level, identify_s, n_path, as_generator(rng))
-    made = controller if isinstance(controller, Controller) else controller(path)  # type: ignore[arg-type]
+            identified = _identified(session, silence, level, identify_s, n_path, as_generator(rng))
+    made = controller if isinstance(controller, Controller) else controller(identified)  # type: ignore[arg-type]
 
     def supervised(controller: Any) -> Supervisor:
         settings: dict[str, Any] = {"full_scale": getattr(interface, "full_scale", None)} | supervision
@@ -374,7 +408,7 @@ def run(
     watch = _Watch(session, supervisor, silence, report_every_s, on_report)
     with _open(interface):
         stopped_by = _control(session, supervisor, watch, seconds, should_stop)
-    return watch.report(stopped_by, round_trip, path, possible_db)
+    return watch.report(stopped_by, identified, possible_db)
 
 
 @contextmanager
@@ -499,9 +533,7 @@ class _Watch:
         rated = getattr(self._supervisor.controller, "rated_power", None)
         return None if rated is None else np.atleast_1d(rated)
 
-    def report(
-        self, stopped_by: str, round_trip: int | None, path: PathEstimate | None, possible_db: float
-    ) -> RunReport:
+    def report(self, stopped_by: str, identified: IdentifiedPlant | None, possible_db: float) -> RunReport:
         """Return the report of the whole run; its figures are those of the second half."""
         if self._second[0]:
             self._parts.append(tuple(self._second))
@@ -514,8 +546,8 @@ class _Watch:
             reduction_db=_db(self._before, e),
             powers=y,
             rated_power=self._rated(),
-            round_trip_samples=round_trip,
-            secondary_path=path,
+            round_trip_samples=None if identified is None else identified.round_trip_samples,
+            secondary_path=None if identified is None else identified.path,
             possible_db=possible_db,
             overruns=self._session.overruns,
             blocks=self._session.blocks,
@@ -534,9 +566,14 @@ def _db(above: np.ndarray, below: np.ndarray) -> np.ndarray:
 
 
 def _identified(
-    session: _Session, level: float, identify_s: float, n_path: int | None, rng: np.random.Generator
-) -> tuple[PathEstimate, int]:
-    """Return the secondary path, with the buffers of the interface, and the round trip in samples."""
+    session: _Session,
+    silence: _Heard,
+    level: float,
+    identify_s: float,
+    n_path: int | None,
+    rng: np.random.Generator,
+) -> IdentifiedPlant:
+    """Play noise from each loudspeaker in turn, and return what this tells about the plant."""
     interface = session.interface
     n = round(as_positive(identify_s, "identify_s", unit="s") * interface.fs)
     recordings = []
@@ -556,11 +593,13 @@ def _identified(
     length = min(r.y.shape[1] for r in recordings)
     fs = interface.fs
     left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
-    if interface.n_loudspeakers == interface.n_microphones == 1:
-        return estimate_path(recordings[0].y[0], left[0][0], taps, fs), min(clear)
+    if interface.n_loudspeakers == interface.n_microphones == interface.n_references == 1:
+        path = estimate_path(recordings[0].y[0], left[0][0], taps, fs)
+        return IdentifiedPlant(path, min(clear), silence.x[0], silence.e[0], fs)
     length = min(e.shape[1] for e in left)
     sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
-    return estimate_path(sent, np.array([e[:, :length] for e in left]), taps, fs), min(clear)
+    path = estimate_path(sent, np.array([e[:, :length] for e in left]), taps, fs)
+    return IdentifiedPlant(path, min(clear), silence.x, silence.e, fs)
 
 
 def _without_noise(y: np.ndarray, x: np.ndarray, e: np.ndarray, n_taps: int, fs: float) -> np.ndarray:

@@ -175,7 +175,7 @@ def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> 
     e = 0.3 * x
     e[..., 120] = 1e200  # finite, but its square is not
     y = np.zeros_like(x)
-    with pytest.raises(RefusedUpdate, match="overflow|finite square") as caught:
+    with pytest.raises(RefusedUpdate, match=r"overflow|finite square") as caught:
         controller.process(x, e, out=y)
     assert caught.value.sample == 120
     y[..., 121:] = controller.process(x[..., 121:], e[..., 121:])
@@ -188,6 +188,20 @@ def test_a_silent_reference_without_measurement_noise_names_its_sample() -> None
     with pytest.raises(RefusedUpdate, match="tells nothing") as caught:
         controller.process([1.0, 1.0, 0.0, 0.0, 0.0, 0.0], np.ones(6))
     assert caught.value.sample == 5
+
+
+def test_a_refused_update_leaves_the_covariance() -> None:
+    """`predict` comes before the refusal, and is undone."""
+    from filterpy.kalman import KalmanFilter
+
+    own = KalmanController(KalmanFilter(2, 1), [1.0])
+    own.estimator.R *= 0.0
+    for controller in (own, kf_anc(2, [1.0], state_noise=0.5, measurement_noise=0.0)):
+        before = np.array(controller.estimator.P)
+        controller.control_signal(0.0)
+        with pytest.raises((ValueError, np.linalg.LinAlgError)):
+            controller.update(1.0)
+        np.testing.assert_array_equal(controller.estimator.P, before)
 
 
 @pytest.mark.parametrize("name", ["KF-OPC", "KF-PB with a limiter", "FxLMS", "FxLMS of several channels", "direct"])
