@@ -85,8 +85,8 @@ class CExport:
 def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any = "float64") -> CExport:
     """Write a controller as a C99 source file and its header, to continue from its present state.
 
-    The files need no library but the C standard's `math.h`. They allocate nothing: a struct of fixed size holds the
-    state, so several controllers, each exported under its own name, link into one program. The calls are
+    The files need nothing but `memcpy` and the C standard's `math.h`. They allocate nothing: a struct of fixed size holds
+    the state. Several controllers, each exported under its own name, link into one program. The calls are
 
     - ``void anc_init(anc_state *state)``: set the state to the controller's as it was when exported;
     - ``double anc_control_signal(anc_state *state, double reference)``: return y(n);

@@ -1,6 +1,6 @@
 void anc_init(anc_state *state)
 {
-    *state = initial;
+    memcpy(state, &initial, sizeof *state);
 }
 
 double anc_control_signal(anc_state *state, double reference)

@@ -15,7 +15,8 @@
  * refuses that sample. It also refuses a bad error. A refused update changes nothing. If the weights have grown so much
  * that w'x overflows, the output is 0.
  *
- * Compile as C99 or later, without -ffast-math: it would remove the checks for NaN. No heap, no library but math.h.
+ * Compile as C99 or later, without -ffast-math, which would remove the checks for NaN. There is no heap; of the library
+ * only memcpy and functions of math.h are called.
  */
 #ifndef ANC_H
 #define ANC_H

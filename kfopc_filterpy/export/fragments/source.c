@@ -2,6 +2,7 @@
 #include "$header"
 
 #include <math.h>
+#include <string.h>
 
 #ifdef __FAST_MATH__
 #error "-ffast-math removes the checks for NaN and Inf: compile this file without it"
