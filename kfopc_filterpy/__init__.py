@@ -1,7 +1,7 @@
 """Kalman filter with output power constraint (KF-OPC) for active noise control, an extension of filterpy.
 
 What everyone uses is here; the rest is in the namespaces `filters`, `power`, `controllers`, `paths`, `signals`, `bounds`,
-`metrics` and `plot`. Each name stands once, in the `__init__.pyi` beside this file or in a namespace's, and is loaded
+`metrics`, `export` and `plot`. Each name stands once, in the `__init__.pyi` beside this file or in a namespace's, and is loaded
 when it is first used.
 """
 

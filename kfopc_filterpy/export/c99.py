@@ -18,14 +18,10 @@ from typing import Any
 import numpy as np
 
 from ..filters.random_walk import as_precision
-from .parts import Part, Value, Values, parts_of
+from .parts import Part, Values, parts_of
 
 FRAGMENTS = Path(__file__).parent / "fragments"
 WIDTH = 120
-KEYWORDS = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long register "
-    "restrict return short signed sizeof static struct switch typedef union unsigned void volatile while".split()
-)
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,7 +57,7 @@ class CExport:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     exported = export_c(controller, Path(folder) / "anc.c", dtype="float32")
     >>> exported
-    <CExport anc.c: FxLMS, 16 taps, float32, state of 332 bytes, 73 operations per sample>
+    <CExport anc.c: FxLMS, 16 taps, float32, state of 332 bytes, 72 operations per sample>
     """
 
     path: Path
@@ -156,7 +152,7 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
 
 
 def _checked_name(name: Any) -> str:
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or name in KEYWORDS:
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier that begins with a letter, such as name='anc', got {name!r}")
     return name
 
@@ -263,7 +259,9 @@ def _declared(values: Values, indent: str = "    ") -> str:
 
 def _header(export: CExport, description: str, parts: list[Part], dialect: _Dialect) -> str:
     state = _state(parts)
-    sizes = [f"#define ANC_{name} {one.value} /* {one.comment} */\n" for part in parts for name, one in part.sizes.items()]
+    sizes = [
+        f"#define ANC_{name} {one.value} /* {one.comment} */\n" for part in parts for name, one in part.sizes.items()
+    ]
     structs = [
         f"/* {one.comment[0].upper()}{one.comment[1:]}. */\ntypedef struct {{\n{_declared(one.value)}}} anc_{name};\n\n"
         for name, one in state.items()

@@ -196,7 +196,7 @@ def _limiter(limiter: LimiterState, dtype: np.dtype) -> Part:
         "average": Value(max(number("average"), floor), "running mean of the input energies"),
         "loud": Value(max(number("loud"), floor), "slowly falling maximum of it"),
         "known": Value(number("known"), "largest recent energy of a window"),
-        "held": Value(np.maximum(limiter.held, floor), "largest recent input energy in a span of each horizon", "ANC_HORIZONS"),
+        "held": Value(np.maximum(limiter.held, floor), "largest recent input energy in such a span", "ANC_HORIZONS"),
         "laps_out": Value(limiter.laps_out, "output energies of this lap and the last", "ANC_WINDOW + 1"),
         "laps_in": Value(limiter.laps_in, "input energies", "ANC_WINDOW + 1"),
         "squares": Value(limiter.squares[:window], "output energies of this lap's samples", "ANC_WINDOW"),
@@ -236,9 +236,10 @@ def _mov(state: MOVState, dtype: np.dtype) -> Part:
 
 def _constrained(state: DiagonalState | KalmanState) -> tuple[Values, set[str]]:
     """Return the settings and flags of a Kalman filter's measurement alpha d^."""
-    if math.isnan(state.constraint.numbers["supplied_factor"][0]):
+    fixed = float(state.constraint.numbers["supplied_factor"][0])
+    if math.isnan(fixed):
         return {}, {"OUTPUT", "POWERS"}
-    return {"constraint_factor": Value(float(state.constraint.numbers["supplied_factor"][0]), "alpha, fixed")}, {"OUTPUT"}
+    return {"constraint_factor": Value(fixed, "alpha, fixed")}, {"OUTPUT"}
 
 
 def _diagonal(state: DiagonalState, dtype: np.dtype) -> Part:

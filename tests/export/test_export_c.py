@@ -134,7 +134,8 @@ TOLERANCES = {  # (largest, root of mean square) difference of y over the root o
 
 def assert_same(name, n, dtype, folder):
     trained, result, weights = trained_and_run(name, n)
-    out = Program(trained, folder, dtype).run(result.reference, result.disturbance, S)
+    program = Program(trained, folder, dtype)
+    out = program.run(result.reference, result.disturbance, S)
     largest, mean, of_weights = TOLERANCES[dtype, trained.limiter is not None]
     scale = np.sqrt(np.mean(result.control_signal**2))
     difference = np.abs(out.y - result.control_signal) / scale
@@ -143,7 +144,7 @@ def assert_same(name, n, dtype, folder):
     assert np.sqrt(np.mean(difference**2)) <= mean
     np.testing.assert_allclose(out.weights, weights, rtol=0, atol=of_weights * np.abs(weights).max())
     assert not out.status.any()
-    return out
+    assert out.n_bytes == program.exported.n_bytes  # sizeof of the compiled state, and what the export states
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -256,25 +257,24 @@ def test_an_export_changes_nothing_in_the_controller(name, tmp_path):
 # Bad input.
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200], ids=["NaN", "Inf", "-Inf", "1e200"])
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(("dtype", "large"), [("float64", 1e200), ("float32", 1e30)])
 @pytest.mark.parametrize("name", LONG)
-def test_a_bad_error_is_refused_and_a_bad_reference_counts_as_zero(name, dtype, bad, tmp_path):
+def test_a_bad_error_is_refused_and_a_bad_reference_counts_as_zero(name, dtype, large, tmp_path):
     """Python's controller, which is told nothing of the bad errors and zero for the bad references, goes on alike."""
-    bad = np.inf if dtype == "float32" and np.isfinite(bad) else bad
     controller = LONG[name]()
     x, e = (one.copy() for one in noises(900))
-    e[[300, 301, 650]] = bad
-    x[[400, 401, 650, 700]] = bad
+    e[[300, 301, 450, 550, 650]] = [np.nan, np.inf, -np.inf, large, np.nan]
+    x[[400, 401, 500, 600, 650]] = [np.nan, np.inf, -np.inf, large, np.nan]
     out = Program(controller, tmp_path, dtype).run(x, e)
     expected, refused = np.empty(x.size), np.zeros(x.size, int)
     for n in range(x.size):
-        finite = np.isfinite(x[n]) and abs(x[n]) < 1e150
-        expected[n] = controller.control_signal(x[n] if finite else 0.0)
-        if finite and np.isfinite(e[n]) and abs(e[n]) < 1e150:
-            controller.update(e[n])
-        else:
+        bad_reference, bad_error = not abs(x[n]) < large, not abs(e[n]) < large
+        expected[n] = controller.control_signal(0.0 if bad_reference else x[n])
+        if bad_reference or bad_error:
             refused[n] = BAD_INPUT
+        else:
+            controller.update(e[n])
+    assert np.count_nonzero(refused) == 9
     np.testing.assert_array_equal(out.status, refused)
     np.testing.assert_allclose(out.y, expected, rtol=0, atol=1e-9 if dtype == "float64" else 2e-2)
 
@@ -321,8 +321,11 @@ def test_a_control_signal_that_overflows_is_silent_and_its_update_is_refused(dty
     np.testing.assert_allclose(out.y, [1e-3, 0.0, 0.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*LONG, "KF-OPC, twice the precision", "MOV-MFxLMS limited"])
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [(name, "float64") for name in [*LONG, "KF-OPC, twice the precision", "MOV-MFxLMS limited"]]
+    + [("KF-OPC limited", "float32")],
+)
 def test_sanitizers_find_nothing(name, dtype, tmp_path):
     options = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     probe = tmp_path / "probe.c"
@@ -338,13 +341,6 @@ def test_sanitizers_find_nothing(name, dtype, tmp_path):
 
 
 # What it costs.
-
-
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("name", [*LONG, *SHORT])
-def test_the_stated_size_is_that_of_the_compiled_state(name, dtype, tmp_path):
-    program = Program((LONG | SHORT)[name](), tmp_path, dtype)
-    assert program.run(np.zeros(1), np.zeros(1)).n_bytes == program.exported.n_bytes
 
 
 @pytest.mark.parametrize("name", [*LONG, *SHORT])
@@ -522,7 +518,6 @@ BAD_ARGUMENTS = {
     "stem": ({"path": "my anc.c"}, "C identifier"),
     "name": ({"name": "2nd"}, "C identifier"),
     "underscore": ({"name": "_anc"}, "C identifier"),
-    "keyword": ({"name": "double"}, "C identifier"),
     "empty name": ({"name": ""}, "C identifier"),
     "dtype": ({"dtype": "float16"}, "float64 or numpy.float32"),
 }
