@@ -16,7 +16,7 @@ from ..controllers.fxlms import FxLMSState
 from ..controllers.kalman import KalmanState
 from ..controllers.mov import MOVState
 from ..controllers.step import Lines
-from ..kernels.covariance import CANCELLATION, Covariance, covariance_matrix
+from ..kernels.covariance import CANCELLATION, covariance_matrix
 from ..kernels.delay_lines import newest
 from ..power.amplifiers import LINEAR
 from ..power.constraint import DISTURBANCE, FILTERED_REFERENCE, REFERENCE, ConstraintState
@@ -73,18 +73,17 @@ def _exportable_state(controller: Any) -> Any:
     if controller.multichannel:
         raise ValueError(f"{name} has several channels and cannot be exported: {EXPORTED}")
     state = deepcopy(controller).compiled_state()
-    if type(state) not in ALGORITHMS or not isinstance(state.lines, Lines):
+    if type(state) not in ALGORITHMS:
         raise TypeError(f"{name} ({type(controller).__name__}) cannot be exported: {EXPORTED}")
-    numbers, powers = state.constraint.numbers, state.constraint.window.shape[1]
+    factor_is_fixed = not math.isnan(state.constraint.numbers["supplied_factor"][0])
     obstacles = {
         "an amplifier model": state.lines.amplifier["kind"][0] != LINEAR,
         "a secondary_path_uncertainty": state.lines.guard is not None,
-        "power estimates over a sliding window": powers > 0,
+        "power estimates over a sliding window": state.constraint.window.shape[1] > 0,
         "a fading memory": isinstance(state, KalmanState) and state.numbers["alpha_sq"][0] != 1.0,
-        "another filter's gains": isinstance(state, KalmanState) and not isinstance(state.gains, Covariance),
-        "a penalty with a fixed constraint factor": isinstance(state, MOVState)
+        "a penalty from a fixed constraint factor": isinstance(state, MOVState)
         and math.isnan(state.penalty)
-        and not math.isnan(numbers["supplied_factor"][0]),
+        and factor_is_fixed,
     }
     found = [what for what, there in obstacles.items() if there]
     if found:

@@ -279,6 +279,15 @@ def test_a_bad_error_is_refused_and_a_bad_reference_counts_as_zero(name, dtype, 
     np.testing.assert_allclose(out.y, expected, rtol=0, atol=1e-9 if dtype == "float64" else 2e-2)
 
 
+@pytest.mark.parametrize(("dtype", "large"), [("float64", 1.2e154), ("float32", 1.2e19)])
+def test_a_reference_that_overflows_in_the_path_is_refused_as_long_as_the_path_hears_it(dtype, large, tmp_path):
+    x, e = (one.copy() for one in noises(400))
+    x[100] = large  # its square is finite, that of 3 times as much is not
+    out = Program(FxLMS(4, [3.0, 3.0], step_size=1e-4), tmp_path, dtype).run(x, e)
+    np.testing.assert_array_equal(np.flatnonzero(out.status), [100, 101])
+    assert np.abs(out.y[110:]).max() < 10.0
+
+
 def test_an_update_without_a_solution_is_refused_and_changes_nothing(tmp_path):
     """With q = 0, a silent reference tells nothing."""
     controller = kf_anc(4, [1.0, 0.5], state_noise=1e-6, measurement_noise=0.0)
@@ -297,6 +306,60 @@ def test_an_update_without_a_solution_is_refused_and_changes_nothing(tmp_path):
     silent = np.arange(100 + 1 + 3, 120)  # x' has left the filter: one more tap of the path, then those of the filter
     np.testing.assert_array_equal(np.flatnonzero(out.status), silent)
     np.testing.assert_allclose(out.y, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("make", [kf_anc, DiagonalKalman], ids=["Kalman", "diagonal"])
+def test_an_innovation_variance_that_overflows_is_refused(make, tmp_path):
+    controller = make(2, [1.0], state_noise=0.0, measurement_noise=1.0, initial_variance=1e10)
+    x, e = (one[:200].copy() for one in noises(300))
+    x[100] = (
+        1e150  # its square is finite, but not 10^10 times as much once the noise has corrected the weights a little
+    )
+    x[:100], e[:101] = 0.0, 0.0
+    out = Program(controller, tmp_path).run(x, e)
+    np.testing.assert_array_equal(np.flatnonzero(out.status == NO_SOLUTION), [100, 101])
+    assert set(out.status) == {ADAPTED, NO_SOLUTION}
+    expected = [controller.control_signal(x[n]) for n in range(102)]
+    expected = np.append(expected, sample_by_sample(controller, x[102:], e[102:]))
+    np.testing.assert_allclose(out.y, expected, rtol=0, atol=1e-8 * np.abs(expected).max())
+
+
+def test_weights_that_would_overflow_are_refused(tmp_path):
+    """The gain is about 1/h without measurement noise, so a tiny h and a large error overflow."""
+    controller = kf_anc(1, [1.0], state_noise=0.0, measurement_noise=0.0)
+    out = Program(controller, tmp_path).run(np.array([7e-155]), np.array([1.3e154]))
+    np.testing.assert_array_equal(out.status, [NO_SOLUTION])
+    np.testing.assert_array_equal(out.weights, [0.0])
+
+
+def test_a_variance_too_large_for_twice_the_precision_is_updated_as_in_python(tmp_path):
+    controller = kf_anc(1, [1.0], state_noise=1e91, measurement_noise=1.0, initial_variance=1e105)  # r beyond rounding
+    x, e = noises(300)
+    out = Program(controller, tmp_path).run(x, e)
+    np.testing.assert_allclose(out.y, sample_by_sample(controller, x, e), rtol=1e-9)
+    assert not out.status.any()
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_in_silence_the_last_gain_stays(dtype, tmp_path):
+    """After 15 000 samples with a memory of 16, the running powers are zero, and their ratio has no digits long before."""
+    controller = kf_opc(4, S_HAT, constraint=constraint(memory_s=0.001), state_noise=1e-6, measurement_noise=0.1)
+    x, e = (one.copy() for one in noises(20_000))
+    x[1000:16_000] = 0.0
+    out = Program(controller, tmp_path, dtype).run(x, e)
+    tolerance = 1e-9 if dtype == "float64" else 1e-2
+    np.testing.assert_allclose(out.y, sample_by_sample(controller, x, e), rtol=0, atol=tolerance)
+    assert not out.status.any()
+
+
+def test_a_diagonal_filter_without_measurement_noise_learns_nothing_from_silence(tmp_path):
+    controller = DiagonalKalman(4, [1.0, 0.5], state_noise=1e-6, measurement_noise=0.0)
+    x, e = (one.copy() for one in noises(400))
+    x[100:200] = 0.0
+    out = Program(controller, tmp_path).run(x, e)
+    expected = sample_by_sample(controller, x, e)
+    np.testing.assert_allclose(out.y, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+    assert not out.status.any()
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

@@ -44,7 +44,7 @@ static void add_product(double *sum, double *rest, double a, double b)
 }
 
 /* Apply eq. 8 and 4 in twice the precision, where S is so large beside q that the difference cancels most digits of P;
- * this happens in the first samples after a large initial variance. Return 0, with P and g unchanged, if that overflows. */
+ * this happens in the first samples after a large initial variance. Return 0, with P unchanged, if that overflows. */
 static int downdate_carefully(anc_state *state, const double *h)
 {
     double *g = state->gain_direction, *g_low = state->gain_direction_low;
@@ -78,10 +78,8 @@ static int downdate_carefully(anc_state *state, const double *h)
         k_low[i] = (((g[i] - product) - rest) + g_low[i] - k[i] * S_low) / S;
         size += fabs(g[i]) + fabs(g_low[i]) + fabs(k[i]) + fabs(k_low[i]);
     }
-    if (!(S > 0.0 && size < largest_size)) {
-        project(state, h);
+    if (!(S > 0.0 && size < largest_size))
         return 0;
-    }
     row = state->covariance;
     for (int32_t i = 0; i < ANC_TAPS; i++) {
         for (int32_t j = 0; j <= i; j++) {
