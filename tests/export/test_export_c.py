@@ -193,6 +193,26 @@ def test_a_large_initial_variance_cancels_no_digits_that_matter(dtype, ratio, to
     assert not out.status.any()
 
 
+def test_a_variance_too_large_for_float32_is_reported_in_c_as_in_python(tmp_path):
+    def make(**options):
+        return kf_opc(
+            L,
+            S_HAT,
+            rated_power=RATED,
+            state_noise=0.0,
+            measurement_noise=1e-3,
+            initial_variance=1e6,
+            **options,
+        )
+
+    x, d = noises(30_000)
+    with pytest.raises(ValueError, match="P is not positive definite"):
+        simulate(make(dtype=np.float32), x, disturbance=d, secondary_path=S)
+    out = Program(make(), tmp_path, "float32").run(x, d, S)
+    assert np.count_nonzero(out.status == NO_SOLUTION) > 10_000
+    assert np.isfinite(out.y).all()
+
+
 # The state that it starts from.
 
 
