@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from helpers.c99 import FOLDER, STRICT, Program, c_compiler, compiler, operations, succeeds
+from helpers.c99 import STRICT, Program, c_compiler, compiler, operations, succeeds
 from scipy import signal
 
 from kfopc_filterpy import (
@@ -517,10 +517,6 @@ def test_a_name_cannot_end_the_comment_that_it_stands_in(tmp_path):
     controller = kf_anc(2, [1.0], **NOISES)
     controller.name = "mine */ int broken;"
     Program(controller, tmp_path)
-
-
-def test_the_stream_program_is_the_one_that_the_page_names():
-    assert (FOLDER / "stream.c").is_file()
 
 
 # What is refused.
