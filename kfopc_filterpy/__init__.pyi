@@ -5,6 +5,9 @@ from . import (
     controllers as controllers,
 )
 from . import (
+    export as export,
+)
+from . import (
     filters as filters,
 )
 from . import (

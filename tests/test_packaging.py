@@ -61,7 +61,19 @@ def test_import_leaves_heavy_modules_for_later_and_warns_of_nothing(statement):
     assert run.stdout.split() == [], f"{statement} loads {run.stdout.strip()}"
 
 
-NAMESPACES = ("", ".filters", ".power", ".controllers", ".paths", ".signals", ".bounds", ".metrics", ".plot", ".bench")
+NAMESPACES = (
+    "",
+    ".filters",
+    ".power",
+    ".controllers",
+    ".paths",
+    ".signals",
+    ".bounds",
+    ".metrics",
+    ".export",
+    ".plot",
+    ".bench",
+)
 
 
 @pytest.mark.parametrize("namespace", NAMESPACES)
