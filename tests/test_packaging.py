@@ -71,6 +71,7 @@ NAMESPACES = (
     ".bounds",
     ".metrics",
     ".export",
+    ".realtime",
     ".plot",
     ".bench",
 )

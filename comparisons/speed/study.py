@@ -33,6 +33,7 @@ WORST_TAPS = (128, 256, 512)
 WORST_SAMPLES = 1_000_000
 FIRST_USE_TIMES = 3  # the shortest counts
 CHANNEL_BLOCKS = 100
+BLOCK_SAMPLES = 640_000  # 40 s at 16 kHz; 40,000 of the shortest blocks
 # Above these taps a variant would take minutes or gigabytes, and the trend is clear.
 LARGEST = {"pykalman": 512, f"closed loop, each of {variants.SCENARIOS} KF-OPC": 512}
 NEEDS = {
@@ -180,6 +181,39 @@ def channel_table(rows: list[dict[str, Any]], taps: int = 512) -> str:
     )
 
 
+def block_times(samples: int = BLOCK_SAMPLES) -> list[dict[str, Any]]:
+    """Return the usual, the 99.99 % and the longest time of `process` for a block, for each controller and length."""
+    rows = []
+    for name in variants.BLOCK_CONTROLLERS:
+        for block in variants.BLOCKS:
+            run = variants.process_block(name, block)
+            times = np.array([seconds(run) for _ in range(max(samples // block, 1))])
+            usual, rare = np.percentile(times, (50, 99.99))
+            rows.append(
+                {
+                    "controller": name,
+                    "block": block,
+                    "median_us": 1e6 * float(usual),
+                    "percentile_99_99_us": 1e6 * float(rare),
+                    "worst_us": 1e6 * float(times.max()),
+                    "shares": [[float(t) * fs / block for t in (usual, rare, times.max())] for fs in REAL_TIME_FS],
+                }
+            )
+    return rows
+
+
+def block_table(rows: list[dict[str, Any]]) -> str:
+    """Return the times of blocks for the terminal."""
+    rates = "".join(f"{f'at {fs / 1e3:g} kHz':>24}" for fs in REAL_TIME_FS)
+    title = f"{'process, a block at a time':28}{'block':>6}{'median µs':>11}{'99.99 %':>10}{'worst':>10}{rates}"
+    lines = [f"{'median, 99.99 %, worst over the duration of a block':>{len(title)}}", title]
+    for row in rows:
+        shares = "".join(f"{' '.join(f'{share:.2f}' for share in three):>24}" for three in row["shares"])
+        times = f"{row['median_us']:11.1f}{row['percentile_99_99_us']:10.1f}{row['worst_us']:10.1f}"
+        lines.append(f"{row['controller']:28}{row['block']:6}{times}{shares}")
+    return "\n".join(lines)
+
+
 def first_use_s(name: str) -> float:
     """Return the seconds that a first use takes longer than the second, with nothing compiled yet."""
     with tempfile.TemporaryDirectory() as cache:
@@ -289,7 +323,7 @@ def main(folder: Path, quiet: bool = False) -> int:
     with (
         threadpool_limits(1),
         tqdm(
-            total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 1 + len(variants.FIRST_USES), disable=quiet, unit="round"
+            total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 2 + len(variants.FIRST_USES), disable=quiet, unit="round"
         ) as bar,
     ):
         for taps in TAPS:
@@ -305,6 +339,9 @@ def main(folder: Path, quiet: bool = False) -> int:
         bar.set_description("speed, several channels")
         channels = channel_times()
         bar.update()
+        bar.set_description("speed, blocks")
+        blocks = block_times()
+        bar.update()
         first_use = {}
         for name in variants.FIRST_USES:
             bar.set_description(f"speed, first use, {name}")
@@ -315,6 +352,7 @@ def main(folder: Path, quiet: bool = False) -> int:
         "rows": rows,
         "worst_sample": worst,
         "channels": channels,
+        "blocks": blocks,
         "first_use_s": first_use,
     }
     (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
@@ -323,6 +361,8 @@ def main(folder: Path, quiet: bool = False) -> int:
         table(result),
         "",
         channel_table(channels),
+        "",
+        block_table(blocks),
         "",
         *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)),
         sep="\n",

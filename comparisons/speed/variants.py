@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import KFOPC, MOVFxLMS, kf_anc, kf_opc, kf_pb, simulate, simulate_scenarios
+from kfopc_filterpy import KFOPC, FxLMS, MOVFxLMS, kf_anc, kf_opc, kf_pb, simulate, simulate_scenarios
 
 Work = tuple[Callable[[], Any], int]
 R, Q, P0 = 1e-8, 1.0, 1e-3
@@ -109,6 +109,39 @@ def channel_blocks(
     for _ in range(20):  # past the start, whose first updates are computed carefully
         run()
     return run, controller.block
+
+
+# ---- Blocks as a real-time process hands them over: controllers, and samples of a block.
+
+BLOCK_CONTROLLERS: dict[str, Callable[[], Any]] = {
+    "FxLMS, 256 taps": lambda: FxLMS(256, PATH, step_size=1e-5),
+    "KF-OPC, 256 taps": lambda: CONTROLLERS["KF-OPC"](256),
+    "KF-PB, 256 taps": lambda: CONTROLLERS["KF-PB"](256),
+    "KF-PB, 4 x 4, 128 taps": lambda: kf_pb(
+        128, np.random.default_rng(3).standard_normal((4, 4, 64)) * np.exp(-np.arange(64) / 10), rated_power=1e-3
+    ),
+}
+BLOCKS = (16, 64, 256)
+
+
+def process_block(name: str, block: int) -> Callable[[], Any]:
+    """Return a function that processes the next block of a controller, past its start."""
+    controller = BLOCK_CONTROLLERS[name]()
+    shape = (controller.n_microphones, 4096) if controller.multichannel else 4096
+    rng = np.random.default_rng(5)
+    x, e = rng.standard_normal((1, 4096) if controller.multichannel else 4096), rng.standard_normal(shape)
+    y = np.empty((controller.n_loudspeakers, block)) if controller.multichannel else np.empty(block)
+    position = 0
+
+    def run() -> None:
+        nonlocal position
+        part = slice(position, position + block)
+        controller.process(x[..., part], e[..., part], out=y)
+        position = (position + block) % 4096
+
+    for _ in range(max(8192 // block, 1)):
+        run()
+    return run
 
 
 def _noise(samples: int) -> tuple[np.ndarray, np.ndarray]:

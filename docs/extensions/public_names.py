@@ -10,7 +10,20 @@ from typing import Any
 import kfopc_filterpy
 
 NOT_OURS = "KalmanFilter,tuple,Protocol,Exception"  # bases whose members are described elsewhere
-NAMESPACES = ("", "filters", "power", "controllers", "paths", "signals", "bounds", "metrics", "export", "plot", "bench")
+NAMESPACES = (
+    "",
+    "filters",
+    "power",
+    "controllers",
+    "paths",
+    "signals",
+    "bounds",
+    "metrics",
+    "export",
+    "realtime",
+    "plot",
+    "bench",
+)
 
 
 def names_of(namespace: str) -> list[str]:

@@ -71,7 +71,17 @@ class Health:
     def note(
         self, what: str, channel: str = "", *, time_s: float, n_samples: int = 1, until_s: float | None = None
     ) -> None:
-        """Record an event, or that the last one of its kind goes on."""
+        """Record an event, or that the last one of its kind goes on.
+
+        Parameters
+        ----------
+        what, channel : str
+            What happened, and where; see `Fault`.
+        time_s, until_s : float
+            Time of its first sample and after its last one, in seconds.
+        n_samples : int, default 1
+            Number of samples concerned.
+        """
         until_s = time_s if until_s is None else until_s
         self.samples[what] += n_samples
         latest = self._latest.get((what, channel))

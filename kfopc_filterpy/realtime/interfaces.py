@@ -25,9 +25,28 @@ class Block(NamedTuple):
 
 @runtime_checkable
 class Interface(Protocol):
-    """What `run` needs: sample rate and counts, and four methods. Signals have a channel axis, also for one channel.
+    """Describe what `run` needs: sample rate and counts, and four methods.
 
-    `full_scale`, the magnitude at which the converters of the microphones clip, is used if it is there.
+    Signals have a channel axis, also for one channel. `full_scale`, the magnitude at which the converters of the
+    microphones clip, is used if it is there.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy.realtime import Block, Interface
+    >>> class Silence:
+    ...     fs, block = 8000.0, 16
+    ...     n_references = n_microphones = n_loudspeakers = 1
+    ...     def start(self):
+    ...         pass
+    ...     def read(self):
+    ...         return Block(np.zeros((1, 16)), np.zeros((1, 16)))
+    ...     def write(self, control_signals):
+    ...         pass
+    ...     def stop(self):
+    ...         pass
+    >>> isinstance(Silence(), Interface)
+    True
     """
 
     fs: float
@@ -43,7 +62,7 @@ class Interface(Protocol):
         """Return the next block, as soon as it has been heard; None at the end."""
 
     def write(self, control_signals: np.ndarray) -> None:
-        """Play the control signals of the block that was read last, (J, n_samples)."""
+        """Play `control_signals`, (J, n_samples), those of the block that was read last."""
 
     def stop(self) -> None:
         """Close the streams."""
@@ -209,7 +228,7 @@ class SimulatedInterface:
         return x, e
 
     def write(self, control_signals: np.ndarray) -> None:
-        """Play the control signals of the block that was read last, `latency` samples after it."""
+        """Play `control_signals`, (J, n_samples), those of the block that was read last, `latency` samples after it."""
         # The block that was read last has been taken from the queue already, so its place is one block earlier.
         end = self.latency
         self._queue[:, end - self.block : end] = control_signals

@@ -164,7 +164,7 @@ class IdentifiedPlant:
         return np.asarray(self.path.uncertainty)
 
     def suggested(self, n_taps: int | None = None) -> SuggestedSettings:
-        """Return `suggest_settings` for the noise heard in the silence; for one channel."""
+        """Return `suggest_settings` for the noise heard in the silence, for `n_taps` taps or a length found; one channel."""
         return suggest_settings(self.references, self.errors, self.taps, fs=self.fs, n_taps=n_taps)
 
 

@@ -106,7 +106,7 @@ class SoundDevice:
         return Block(signals[self._references], signals[self._errors], self.block if overflowed else 0)
 
     def write(self, control_signals: np.ndarray) -> None:
-        """Play the control signals of a block, (J, n_samples)."""
+        """Play `control_signals`, (J, n_samples), those of a block."""
         frames = np.zeros((control_signals.shape[1], max(self._outputs) + 1), dtype=np.float32)
         frames[:, self._outputs] = control_signals.T
         self.dry += bool(self._stream.write(frames))

@@ -14,6 +14,7 @@ from comparisons.speed import variants as speed_variants
 from kfopc_filterpy import MOVFxLMS, kf_opc, simulate, simulate_scenarios
 from kfopc_filterpy.power.constraint import OutputPowerConstraint, preview_constraint
 
+BLOCK_TIMES = speed.block_times
 FORMS = ("shared gain", "frequency domain")
 
 
@@ -29,6 +30,9 @@ def small(monkeypatch):
     }.items():
         monkeypatch.setattr(speed, name, value)
     monkeypatch.setattr(speed_variants, "CHANNELS", [(form, 1, 2, 3, 16, 32) for form in FORMS])
+    fxlms = speed_variants.BLOCK_CONTROLLERS["FxLMS, 256 taps"]
+    monkeypatch.setattr(speed_variants, "BLOCK_CONTROLLERS", {"FxLMS, 256 taps": fxlms})
+    monkeypatch.setattr(speed, "block_times", lambda: BLOCK_TIMES(6400))
     monkeypatch.setattr(speed, "first_use_s", lambda name: 1.0)
     monkeypatch.setattr(speed, "find_spec", lambda name: None)  # the same wherever it runs
     monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
@@ -64,7 +68,14 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
         assert channels["form"] == form
         assert (channels["references"], channels["loudspeakers"], channels["microphones"]) == (1, 2, 3)
         assert channels["us_per_sample"] > 0
+    for block, length in zip(result["blocks"], (16, 64, 256), strict=True):
+        assert (block["controller"], block["block"]) == ("FxLMS, 256 taps", length)
+        assert 0.0 < block["median_us"] <= block["percentile_99_99_us"] <= block["worst_us"]
+        assert block["shares"][0] == pytest.approx(
+            [block[key] * 16e3 / 1e6 / length for key in ("median_us", "percentile_99_99_us", "worst_us")]
+        )
     printed = capsys.readouterr().out
+    assert "FxLMS, 256 taps                 16" in printed
     for form in FORMS:
         assert f"{form:16}     1 x  2 x  3,   16,   32" in printed
     assert "times as fast as filterpy" in printed

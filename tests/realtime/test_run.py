@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 from scipy.signal import lfilter
 
 from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
+from kfopc_filterpy.cli import main
 from kfopc_filterpy.realtime import (
     FaultError,
     Interface,
@@ -22,6 +25,7 @@ from kfopc_filterpy.realtime import (
     measure_round_trip,
     run,
 )
+from kfopc_filterpy.signals import write_wav
 
 FS = 8000.0
 S = np.array([0.0, 0.8, -0.3])
@@ -242,3 +246,28 @@ def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeyp
             SoundDevice(*channels)
     with pytest.raises(ValueError, match="output_channels must be"):
         SoundDevice([0], [1], [-1])
+
+
+def test_the_command_shows_levels_and_returns_what_ended_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_wav(tmp_path / "noise.wav", 0.1 * X, int(FS))
+    write_wav(tmp_path / "P.wav", PRIMARY, int(FS))
+    write_wav(tmp_path / "S.wav", S, int(FS))
+    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
+    options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "1"]
+    assert main(["run", *given, *options, "--seconds", "5.2"]) == 0
+    printed = capsys.readouterr()
+    assert "stopped by end" in printed.out
+    assert "round trip 65 samples, 8.1 ms" in printed.out
+    assert "% of the rated power" in printed.out
+    assert "health: nothing noticed" in printed.out
+    assert re.search(r"5\.0 s +reduction +[1-9]\d\.\d dB +power [\d.e-]+ \(\d+ %\) +load", printed.err)
+    for wrong, message in (
+        ([given[0], *options], "--secondary is needed"),
+        (options, "a recording with --primary and --secondary is needed"),
+        ([*given[:3], *options], "--secondary is needed"),
+        ([*given, *options, "--latency", "3"], "latency must be at least a block"),
+    ):
+        assert main(["run", *wrong]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert len(error.splitlines()) == 1
