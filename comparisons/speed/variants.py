@@ -14,6 +14,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from kfopc_filterpy import KFOPC, FxLMS, MOVFxLMS, kf_anc, kf_opc, kf_pb, simulate, simulate_scenarios
+from kfopc_filterpy.realtime import Supervisor
 
 Work = tuple[Callable[[], Any], int]
 R, Q, P0 = 1e-8, 1.0, 1e-3
@@ -115,6 +116,7 @@ def channel_blocks(
 
 BLOCK_CONTROLLERS: dict[str, Callable[[], Any]] = {
     "FxLMS, 256 taps": lambda: FxLMS(256, PATH, step_size=1e-5),
+    "FxLMS, supervised": lambda: Supervisor(FxLMS(256, PATH, step_size=1e-5), amplitude_limit=10.0),
     "KF-OPC, 256 taps": lambda: CONTROLLERS["KF-OPC"](256),
     "KF-PB, 256 taps": lambda: CONTROLLERS["KF-PB"](256),
     "KF-PB, 4 x 4, 128 taps": lambda: kf_pb(
@@ -131,12 +133,13 @@ def process_block(name: str, block: int) -> Callable[[], Any]:
     rng = np.random.default_rng(5)
     x, e = rng.standard_normal((1, 4096) if controller.multichannel else 4096), rng.standard_normal(shape)
     y = np.empty((controller.n_loudspeakers, block)) if controller.multichannel else np.empty(block)
+    room = {} if isinstance(controller, Supervisor) else {"out": y}
     position = 0
 
     def run() -> None:
         nonlocal position
         part = slice(position, position + block)
-        controller.process(x[..., part], e[..., part], out=y)
+        controller.process(x[..., part], e[..., part], **room)
         position = (position + block) % 4096
 
     for _ in range(max(8192 // block, 1)):
