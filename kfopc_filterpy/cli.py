@@ -14,9 +14,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
 
+from ._validate import as_count
+
+if TYPE_CHECKING:
     from .signals import Recording
 
 ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
@@ -37,6 +39,15 @@ each command has its own --help""",
   kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
   cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
+  kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
+
+several channels: those of the noise are the references, those of the disturbance the microphones. Each --secondary is one
+loudspeaker and each --primary one reference; the channels of these files are the microphones. With files of one channel,
+say how many microphones there are, and give the files source after source, for each source its microphones in order:
+  kfopc verdict noise.wav --microphones 2 --primary P11.wav --primary P21.wav \\
+    --secondary S11.wav --secondary S21.wav --secondary S12.wav --secondary S22.wav --rated-power 1.6
+where S21 is loudspeaker 1 at microphone 2. An array (microphones, loudspeakers, taps) in a .npy, .mat or .sofa file holds
+all. Options of the rating are given once for all loudspeakers, or once for each, in their order.
 
 exit code: 0 enough, 1 not enough, 2 wrong input""",
     "identify": """example:
@@ -85,7 +96,39 @@ class _Files:
         """Return the taps of a path."""
         return self._one(path, is_path=True)
 
+    def channels(self, path: str) -> np.ndarray:
+        """Return all channels of a recording, (n_channels, n_samples)."""
+        return np.atleast_2d(self._read(path, is_path=False).samples)
+
+    def matrix(self, paths: Sequence[str], option: str, n_microphones: int | None = None) -> np.ndarray:
+        """Return the taps of paths, (microphones, sources, taps); see the examples of `verdict` for their order."""
+        each = [self._read(path, is_path=True).samples for path in paths]
+        if any(one.ndim == 3 for one in each):
+            if len(each) > 1:
+                raise ValueError(f"{option} holds a matrix of paths: leave out the other files")
+            return each[0]
+        rows = [row for one in each for row in np.atleast_2d(one)]
+        count = len(np.atleast_2d(each[0])) if n_microphones is None else as_count(n_microphones, "--microphones")
+        if len(rows) % count:
+            raise ValueError(
+                f"{option} must give a path to each of the {count} microphone(s) from every source, got {len(rows)} in all: "
+                "choose one channel with --channel, or see the order of several with --help"
+            )
+        longest = max(row.size for row in rows)
+        padded = np.array([np.pad(row, (0, longest - row.size)) for row in rows])
+        return padded.reshape(-1, count, longest).swapaxes(0, 1)
+
     def _one(self, path: str, *, is_path: bool) -> np.ndarray:
+        read = self._read(path, is_path=is_path)
+        if read.samples.size != read.samples.shape[-1]:
+            raise ValueError(
+                f"{path} has {len(read.samples)} channels where one is needed: choose with --channel 0 to --channel "
+                f"{len(read.samples) - 1}"
+            )
+        return read.one_channel()
+
+    def _read(self, path: str, *, is_path: bool) -> Recording:
+        """Read a file, whose rate must be that of the files before it."""
         with _file(path) as source:
             read = _read(
                 source,
@@ -94,18 +137,13 @@ class _Files:
                 variable=self.options.variable,
                 is_path=is_path,
             )
-        if read.samples.size != read.samples.shape[-1]:
-            raise ValueError(
-                f"{path} has {len(read.samples)} channels where one is needed: choose with --channel 0 to --channel "
-                f"{len(read.samples) - 1}"
-            )
         if self.fs is not None and read.fs != self.fs:
             raise ValueError(
                 f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
                 "example with --fs 16000"
             )
         self.fs, self._first = read.fs, self._first or path
-        return read.one_channel()
+        return read
 
 
 @contextmanager
@@ -207,35 +245,52 @@ def _reading_options(parser: argparse.ArgumentParser) -> None:
 def _scene_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the noise, the paths and the rating."""
     parser.add_argument("noise", help="recording of the reference microphone, loudspeaker silent; - is standard input")
-    parser.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
+    parser.add_argument(
+        "--primary", action="append", metavar="FILE", help="impulse response, reference to error microphone"
+    )
     parser.add_argument("--disturbance", metavar="FILE", help="recording of the error microphone, made with the noise")
     parser.add_argument(
-        "--secondary", metavar="FILE", required=True, help="impulse response, control signal to error microphone"
+        "--secondary",
+        action="append",
+        metavar="FILE",
+        required=True,
+        help="impulse response, control signal to error microphone; repeated for several loudspeakers",
+    )
+    parser.add_argument(
+        "--microphones",
+        type=int,
+        metavar="K",
+        help="number of error microphones (default: the channels of the first --secondary)",
     )
     _reading_options(parser)
-    rating = parser.add_argument_group("rating", "of the amplifier: --watt and --ohm, or --rated-power")
-    rating.add_argument("--watt", type=float, metavar="W", help="rated power of the amplifier")
-    rating.add_argument("--ohm", type=float, metavar="R", help="into this resistance")
+    rating = parser.add_argument_group(
+        "rating",
+        "of the amplifier: --watt and --ohm, or --rated-power; numbers and curves once for all loudspeakers, or once for each",
+    )
+
+    def add(option: str, **more: Any) -> None:
+        rating.add_argument(option, action="append", **more)
+
+    add("--watt", type=float, metavar="W", help="rated power of the amplifier")
+    add("--ohm", type=float, metavar="R", help="into this resistance")
     rating.add_argument(
         "--rating",
         choices=("sine", "noise"),
         default="sine",
         help="what the watts were measured with (default: sine, the safe side)",
     )
-    rating.add_argument("--peak-volts", type=float, metavar="V", help="voltage at which the amplifier clips")
-    rating.add_argument(
-        "--volts-per-unit", type=float, default=1.0, metavar="V", help="volts for a control signal of 1 (default: 1)"
-    )
-    rating.add_argument("--rated-power", type=float, metavar="P", help="rated power as mean square, in place of watts")
-    rating.add_argument(
+    add("--peak-volts", type=float, metavar="V", help="voltage at which the amplifier clips")
+    add("--volts-per-unit", type=float, metavar="V", help="volts for a control signal of 1 (default: 1)")
+    add("--rated-power", type=float, metavar="P", help="rated power as mean square, in place of watts")
+    add(
         "--impedance",
         metavar="CSV",
         help="the loudspeaker's impedance, whose least value counts: Hz, ohm (default: --ohm)",
     )
-    rating.add_argument("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
-    rating.add_argument("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
-    rating.add_argument("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
-    rating.add_argument(
+    add("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
+    add("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
+    add("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
+    add(
         "--displacement", metavar="CSV", help="its excursion per volt: a column of Hz, a column of mm/V, and commas"
     )
 
@@ -250,7 +305,7 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
         "--taps", type=int, metavar="N", help="taps of the control filter (default: found, at most 256)"
     )
     parser.add_argument(
-        "--memory", type=float, default=0.25, metavar="S", help="memory of the filter (default: 0.25 s)"
+        "--memory", type=float, metavar="S", help="memory of the filter (default: 0.25 s, several channels 1 s)"
     )
     parser.add_argument(
         "--path-error-samples",
@@ -269,10 +324,17 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
         help="another measurement of the secondary path, which tells how far it may be wrong; may be repeated",
     )
     parser.add_argument(
-        "--pascal-per-unit", type=float, metavar="PA", help="calibration of the error microphone, for levels in dBA"
+        "--pascal-per-unit",
+        action="append",
+        type=float,
+        metavar="PA",
+        help="calibration of the error microphone, for levels in dBA; once for all microphones, or once for each",
     )
     parser.add_argument(
-        "--calibrator", metavar="FILE", help="recording of a sound calibrator by the error microphone, in place of that"
+        "--calibrator",
+        action="append",
+        metavar="FILE",
+        help="recording of a sound calibrator by the error microphone, in place of that",
     )
     parser.add_argument(
         "--calibrator-db", type=float, default=94.0, metavar="DB", help="its sound pressure level (default: 94)"
@@ -284,12 +346,45 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
+OF_THE_RATING = (
+    "watt",
+    "ohm",
+    "peak_volts",
+    "volts_per_unit",
+    "rated_power",
+    "impedance",
+    "loudspeaker_watt",
+    "programme_watt",
+    "x_max_mm",
+    "displacement",
+)
+
+
+def _ratings(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
+    """Return the ratings that the options state: of one loudspeaker, or a list for each of several."""
+    for name in OF_THE_RATING:
+        given = getattr(options, name)
+        if given is not None and len(given) not in (1, n_loudspeakers):
+            raise ValueError(
+                f"--{name.replace('_', '-')} must be given once, or once for each of the {n_loudspeakers} loudspeaker(s), "
+                f"got {len(given)}"
+            )
+    each = []
+    for j in range(n_loudspeakers):
+        own = argparse.Namespace(rating=options.rating)
+        for name in OF_THE_RATING:
+            given = getattr(options, name)
+            setattr(own, name, None if given is None else given[j if len(given) > 1 else 0])
+        each.append(_rating(own))
+    return each[0] if n_loudspeakers == 1 else each
+
+
 def _rating(options: argparse.Namespace) -> list[Any]:
-    """Return the ratings that the options state."""
+    """Return the ratings of one loudspeaker."""
     from .power import AmplifierRating, LoudspeakerRating
 
     ratings: list[Any] = []
-    volts = options.volts_per_unit
+    volts = 1.0 if options.volts_per_unit is None else options.volts_per_unit
     if options.watt is not None or options.peak_volts is not None:
         if options.ohm is None:
             raise ValueError("--watt and --peak-volts need --ohm, the resistance they were measured with")
@@ -319,8 +414,6 @@ def _rating(options: argparse.Namespace) -> list[Any]:
 
 def _curve(path: str) -> Any:
     """Return two columns of a CSV file."""
-    import numpy as np
-
     try:
         columns = np.loadtxt(path, delimiter=",", ndmin=2)
     except ValueError as error:
@@ -332,17 +425,21 @@ def _curve(path: str) -> Any:
 
 def _uncertainty(options: argparse.Namespace, files: _Files, secondary: np.ndarray) -> Any:
     """Return how far the secondary path may be wrong: by the other measurements, or by the tolerances."""
-    import numpy as np
-
     from .paths import PathTolerance
 
     tolerances = (options.path_error_samples, options.path_error_deg, options.path_error_db)
     if options.secondary_again:
         if tolerances != (None, 0.0, 0.0):
             raise ValueError("--secondary-again stands in place of --path-error-...: leave out one of them")
-        others = [files.path(name) for name in options.secondary_again]
-        longest = max(secondary.size, *(other.size for other in others))
-        return np.array([np.pad(path, (0, longest - path.size)) for path in [secondary, *others]])
+        K, J, _ = secondary.shape
+        others = files.matrix(options.secondary_again, "--secondary-again", K)  # (K, M J, taps)
+        if others.shape[0] != K or others.shape[1] % J:
+            raise ValueError(
+                f"--secondary-again must give paths from {J} loudspeakers to {K} microphones, once or several times"
+            )
+        longest = max(secondary.shape[2], others.shape[2])
+        every = [np.pad(one, ((0, 0), (0, 0), (0, longest - one.shape[2]))) for one in (secondary, others)]
+        return np.concatenate(every, axis=1).reshape(K, -1, J, longest).swapaxes(0, 1)
     samples = 0.5 if options.path_error_samples is None else options.path_error_samples
     return PathTolerance(samples, options.path_error_deg, options.path_error_db)
 
@@ -351,12 +448,19 @@ def _scene(options: argparse.Namespace, files: _Files) -> tuple[Any, Any, Any, A
     """Return noise, primary path, secondary path and disturbance."""
     if options.primary is None and options.disturbance is None:
         raise ValueError("--primary or --disturbance is needed: what arrives at the error microphone?")
-    return (
-        files.recording(options.noise),
-        None if options.primary is None else files.path(options.primary),
-        files.path(options.secondary),
-        None if options.disturbance is None else files.recording(options.disturbance),
-    )
+    noise = files.channels(options.noise)
+    primary = None
+    if options.primary is not None:
+        primary = files.matrix(options.primary, "--primary", options.microphones)
+    secondary = files.matrix(options.secondary, "--secondary", options.microphones)
+    if primary is not None and primary.shape[:2] != (len(secondary), len(noise)):
+        raise ValueError(
+            f"--primary must give a path from each of the {len(noise)} channel(s) of {options.noise} to each of the "
+            f"{len(secondary)} microphone(s), got {primary.shape[1]} to {primary.shape[0]}: choose with --channel 0 to "
+            f"--channel {max(len(noise), 2) - 1}, or see the order of several with --help"
+        )
+    disturbance = None if options.disturbance is None else files.channels(options.disturbance)
+    return noise, primary, secondary, disturbance
 
 
 @contextmanager
@@ -382,8 +486,9 @@ def _verdict(options: argparse.Namespace) -> int:
         prepare_folder(options.output)
     from .bench import assess
 
-    files, rating = _Files(options), _rating(options)
+    files = _Files(options)
     noise, primary, secondary, disturbance = _scene(options, files)
+    rating = _ratings(options, secondary.shape[1])
     uncertainty = _uncertainty(options, files, secondary)
     assert files.fs is not None
     with _bar(options.quiet, "sample") as bar:
@@ -411,15 +516,20 @@ def _verdict(options: argparse.Namespace) -> int:
     return ENOUGH if verdict.enough else NOT_ENOUGH
 
 
-def _pascal_per_unit(options: argparse.Namespace) -> float | None:
-    """Return the calibration of the error microphone, if the options give one."""
+def _pascal_per_unit(options: argparse.Namespace) -> Any:
+    """Return the calibration of the error microphones, if the options give one."""
     if options.calibrator is None:
-        return options.pascal_per_unit
+        return _one_or_all(options.pascal_per_unit)
     if options.pascal_per_unit is not None:
         raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
     from .signals import calibration_factor
 
-    return calibration_factor(options.calibrator, options.calibrator_db, channel=options.channel)
+    level = options.calibrator_db
+    return _one_or_all([calibration_factor(one, level, channel=options.channel) for one in options.calibrator])
+
+
+def _one_or_all(values: list[float] | None) -> Any:
+    return values[0] if values is not None and len(values) == 1 else values
 
 
 def _compare_options(parser: argparse.ArgumentParser) -> None:
@@ -449,8 +559,9 @@ def _compare(options: argparse.Namespace) -> int:
     from .bench import algorithms, compare_recordings, results_table, write_report
 
     names = list(algorithms()) if options.algorithm is None else options.algorithm.split(",")
-    files, rating = _Files(options), _rating(options)
+    files = _Files(options)
     noise, primary, secondary, disturbance = _scene(options, files)
+    rating = _ratings(options, secondary.shape[1])
     with _bar(options.quiet, "run") as bar:
         report = compare_recordings(
             noise,
@@ -563,8 +674,6 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
     """Write taps in the format of the file's suffix: text has a column of times in s."""
-    import numpy as np
-
     from .signals import write_wav
 
     suffix = Path(output).suffix.lower()
