@@ -290,9 +290,7 @@ def _scene_options(parser: argparse.ArgumentParser) -> None:
     add("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
     add("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
     add("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
-    add(
-        "--displacement", metavar="CSV", help="its excursion per volt: a column of Hz, a column of mm/V, and commas"
-    )
+    add("--displacement", metavar="CSV", help="its excursion per volt: a column of Hz, a column of mm/V, and commas")
 
 
 def _verdict_options(parser: argparse.ArgumentParser) -> None:

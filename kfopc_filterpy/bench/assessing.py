@@ -271,7 +271,9 @@ def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any,
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", length=x.shape[1])
         if len(d) != K:
-            raise ValueError(f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}")
+            raise ValueError(
+                f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
+            )
     elif primary is None:
         raise ValueError("primary must be given unless there is a disturbance: what arrives at the error microphone?")
     else:

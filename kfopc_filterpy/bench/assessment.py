@@ -239,7 +239,9 @@ class Assessment:
         """Return a `rated_power` in words: in W if the impedance is known, else in squared units."""
         if self.watt_per_power is None:
             return f"a rated power of {_each(rated_power, '.3g')}"
-        return f"{_each(rated_power * self.watt_per_power, '.3g', ' W')} into {_each(self.ohm, 'g', all_the_same='')} ohm"
+        return (
+            f"{_each(rated_power * self.watt_per_power, '.3g', ' W')} into {_each(self.ohm, 'g', all_the_same='')} ohm"
+        )
 
     @property
     def watt_per_power(self) -> Any:

@@ -107,17 +107,19 @@ def _figures(verdict: Assessment) -> Any:
         yield FigureItem(stem, caption, figure)
     scale = 1.0 if verdict.watt_per_power is None else verdict.watt_per_power
     powers = {name: _scaled(run, scale) for name, run in runs.items()}
-    figure, axes = _axes_of_each(n_loudspeakers(verdict), (6.4, 4), "loudspeaker")
-    for j, ax in axes:
+    figure, axes = _rows_of_axes(n_loudspeakers(verdict), (6.4, 4))
+    for j, ax in enumerate(axes):
         rated = np.ravel(scale * verdict.limits.rated_power)[j]
         plot_output_power(powers, channel=j, rated_power=rated, ax=ax)
         ax.set_ylabel(_power_label(verdict))
+    _number_rows(axes, "Loudspeaker")
     yield FigureItem("power", "Mean power of the control signal over a sliding window, and the rated power.", figure)
     if verdict.levels is not None:
         levels = verdict.levels
-        figure, axes = _axes_of_each(n_microphones(verdict), (9, 3.6), "microphone")
-        for k, ax in axes:
+        figure, axes = _rows_of_axes(n_microphones(verdict), (9, 3.6))
+        for k, ax in enumerate(axes):
             _draw_bands(levels.centres_hz, np.atleast_2d(levels.before_db)[k], np.atleast_2d(levels.after_db)[k], ax)
+        _number_rows(axes, "Microphone")
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
@@ -129,17 +131,20 @@ def n_microphones(verdict: Assessment) -> int:
     return 1 if verdict.channels is None else verdict.channels[2]
 
 
-def _axes_of_each(count: int, size: tuple[float, float], what: str) -> tuple[Any, list[tuple[int, Any]]]:
-    """Return a figure with axes below each other, and the axes, with a title if there are several."""
+def _rows_of_axes(count: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a figure with axes below each other, and the axes."""
     import matplotlib.pyplot as plt
 
-    width, height = size
-    rows = height if count == 1 else 0.8 * height * count
-    figure, axes = plt.subplots(count, squeeze=False, figsize=(width, rows), layout="constrained")
-    if count > 1:
-        for number, ax in enumerate(axes[:, 0], 1):
-            ax.set_title(f"{what} {number}", loc="right", fontsize="medium")
-    return figure, list(enumerate(axes[:, 0]))
+    height = size[1] * (1.0 if count == 1 else 0.8 * count)
+    figure, axes = plt.subplots(count, squeeze=False, figsize=(size[0], height), layout="constrained")
+    return figure, axes[:, 0]
+
+
+def _number_rows(axes: Any, what: str) -> None:
+    """Begin the labels of several axes with what they show, and its number."""
+    if len(axes) > 1:
+        for number, ax in enumerate(axes, 1):
+            ax.set_ylabel(f"{what} {number}\n{ax.get_ylabel()}")
 
 
 def _scaled(run: SimulationResult, scale: Any) -> SimulationResult:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -202,7 +203,9 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
 
     fs = as_positive(fs, "fs", unit="Hz")
     segment = as_count(segment, "segment", minimum=8)
-    x, d = (np.atleast_2d(as_channels(one, name)) for one, name in ((reference, "reference"), (disturbance, "disturbance")))
+    x, d = (
+        np.atleast_2d(as_channels(one, name)) for one, name in ((reference, "reference"), (disturbance, "disturbance"))
+    )
     for each, name in ((x, "reference"), (d, "disturbance")):
         for channel in each:
             as_signal(channel, name, min_length=8 * segment, length=x.shape[1])
@@ -216,7 +219,9 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
     else:
         spectra = np.moveaxis(csd(x[:, np.newaxis], x, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, I)
         cross = np.moveaxis(between, -1, 0)
-        coherent = np.einsum("fik,fik->f", cross.conj(), np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross).real
+        coherent = np.einsum(
+            "fik,fik->f", cross.conj(), np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
+        ).real
     floor = 1e-30
     remaining = np.clip(1 - coherent / np.maximum(of_d, np.finfo(float).tiny), floor, 1)
     overall = max(float(np.sum(remaining * of_d) / np.sum(of_d)), floor)
@@ -240,6 +245,31 @@ class Correlations:
         matrix = self.filtered + penalty * self.reference
         matrix.flat[:: self.cross.size + 1] += ridge
         return matrix
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """The weights without a penalty."""
+        return self.weights()
+
+    @cached_property
+    def balance(self) -> float:
+        """Energy of x' over that of x; 0 if one of them is silent."""
+        energies = float(np.trace(self.filtered)), float(np.trace(self.reference))
+        return energies[0] / energies[1] if min(energies) > 0 else 0.0
+
+    @cached_property
+    def basis(self) -> tuple[np.ndarray, np.ndarray]:
+        """A basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), and the shares.
+
+        Both matrices may be singular. Directions that the path does not pass, which would cost power for nothing, are left
+        out.
+        """
+        values, vectors = np.linalg.eigh(self.filtered + self.balance * self.reference)
+        kept = values > RANK_TOLERANCE * values[-1]
+        whitened = vectors[:, kept] / np.sqrt(values[kept])
+        share, turn = np.linalg.eigh(whitened.T @ self.filtered @ whitened)
+        heard = share > RANK_TOLERANCE
+        return whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
 
     def antinoise(self, weights: np.ndarray) -> float:
         """Return the reduction of the error power by the weights: 2 w'r - w' R_x' w."""
@@ -390,31 +420,24 @@ def warn_of_loss(loss: float, what: str = "the solution is not the least-squares
 
 def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
     """Return the weights of the least error within the power, and their λ."""
-    energies = float(np.trace(correlations.filtered)), float(np.trace(correlations.reference))
     weights, penalty = np.zeros(stretch.n_taps), 0.0
-    if min(energies) > 0:
-        weights, penalty = _least_penalty(correlations, energies[0] / energies[1], rated_power)
+    if correlations.balance > 0:
+        weights, penalty = _least_penalty(correlations, rated_power)
     if penalty == 0:
         # Without a penalty, `wiener_solution` takes the filter of least norm. In directions that the path does not pass
         # that filter may waste power, and so exceed the rated power.
-        free = correlations.weights()
+        free = correlations.free
         if mean_square(stretch.control_signal(free)) <= rated_power:
             weights = free
     return weights, penalty
 
 
-def _least_penalty(correlations: Correlations, balance: float, rated_power: float) -> tuple[np.ndarray, float]:
+def _least_penalty(correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
     """Return the weights that solve (R_x' + λ R_x) w = r with the smallest λ >= 0 that keeps within the power, and it.
 
-    In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), each λ costs a sum over the taps
-    instead of the solution of a system. Both matrices may be singular.
+    In the basis of the correlations, each λ costs a sum over the taps instead of the solution of a system.
     """
-    values, vectors = np.linalg.eigh(correlations.filtered + balance * correlations.reference)
-    kept = values > RANK_TOLERANCE * values[-1]
-    whitened = vectors[:, kept] / np.sqrt(values[kept])
-    share, turn = np.linalg.eigh(whitened.T @ correlations.filtered @ whitened)
-    heard = share > RANK_TOLERANCE  # the path does not pass the others, which would cost power for nothing
-    basis, share = whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
+    balance, (basis, share) = correlations.balance, correlations.basis
     cross = basis.T @ correlations.cross
 
     # Newton's method on 1/sqrt(power), which rises with λ and is concave and nearly straight: from λ = 0 the steps

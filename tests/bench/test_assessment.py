@@ -317,7 +317,10 @@ def test_the_levels_are_those_of_the_sounds(written):
         ({"primary": None}, "primary must be given unless there is a disturbance"),
         ({"disturbance": np.ones(7)}, "disturbance must have 8000 values, got 7"),
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
-        ({"noise": noise()[:16000].reshape(2, 8000)}, "primary must be (K microphones, I references, taps) = (1, 2, taps)"),
+        (
+            {"noise": noise()[:16000].reshape(2, 8000)},
+            "primary must be (K microphones, I references, taps) = (1, 2, taps)",
+        ),
         ({"rating": 0.0}, "rating must be greater than 0"),
         ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
         ({"want_db": -1.0}, "want_db must not be negative"),
