@@ -52,7 +52,7 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
         "Verdict",
         "",
         verdict.fs,
-        verdict.limits.rated_power,
+        float(np.max(verdict.limits.rated_power)),  # which this page does not show
         {},
         {},
         figures=list(_figures(verdict)),
@@ -336,7 +336,7 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
 
 def _peak_limits(verdict: Assessment) -> str:
     """Return the peak limits in words."""
-    limits = verdict.limits.amplitude_limit
+    limits: Any = verdict.limits.amplitude_limit
     if verdict.channels is None:
         in_volts = verdict.volts_per_unit is not None
         return f"peak limit {_number(limits, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"

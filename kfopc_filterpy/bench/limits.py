@@ -204,7 +204,9 @@ def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> A
 
     None if a loudspeaker has no such rating, or a curve instead of a number.
     """
-    found = [next((getattr(one, name) for one in own if hasattr(one, "volts_per_unit")), None) for own in ratings]
+    found: list[Any] = [
+        next((getattr(one, name) for one in own if hasattr(one, "volts_per_unit")), None) for own in ratings
+    ]
     if not several:
         return found[0]
     return np.array(found, dtype=float) if all(np.ndim(one) == 0 and one is not None for one in found) else None
