@@ -330,7 +330,7 @@ WAYS = {
         ["S11.wav", "S21.wav", "S12.wav", "S22.wav"],
         ["--microphones", 2],
     ],
-    "one array": [["P1.wav"], ["S.npy"], []],
+    "one array": [["P1.wav"], ["S.npy"], ["--fs", FS]],  # it states no rate
 }
 
 
