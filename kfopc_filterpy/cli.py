@@ -8,19 +8,16 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
-if TYPE_CHECKING:
-    import numpy as np
+import numpy as np
 
-    from .signals import Recording
+from .cli_inputs import Files, pascal_per_unit_of, ratings_of, scene_of, uncertainty_of
 
 ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
-STANDARD_INPUT = "-"
 EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
 
@@ -38,6 +35,15 @@ each command has its own --help""",
   kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
   kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
   cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
+  kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
+
+several channels: those of the noise are the references, those of the disturbance the microphones. Each --secondary is one
+loudspeaker and each --primary one reference; the channels of these files are the microphones. With files of one channel,
+say how many microphones there are, and give the files source after source, for each source its microphones in order:
+  kfopc verdict noise.wav --microphones 2 --primary P11.wav --primary P21.wav \\
+    --secondary S11.wav --secondary S21.wav --secondary S12.wav --secondary S22.wav --rated-power 1.6
+where S21 is loudspeaker 1 at microphone 2. An array (microphones, loudspeakers, taps) in a .npy, .mat or .sofa file holds
+all. Options of the rating are given once for all loudspeakers, or once for each, in their order.
 
 exit code: 0 enough, 1 not enough, 2 wrong input""",
     "identify": """example:
@@ -60,68 +66,6 @@ exit code: 0 enough, 1 not enough, 2 wrong input""",
     "compare": """example:
   kfopc compare noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --algorithm KF-PB,KF-OPC,FxLMS -o out""",
 }
-
-
-def _read(path: Any, *, fs: float | None, channel: int | None, variable: str | None, is_path: bool) -> Recording:
-    """Read a recording or an impulse response: the one place that knows how."""
-    from .paths import read_path
-    from .signals import read_recording
-
-    return (read_path if is_path else read_recording)(path, fs=fs, channel=channel, variable=variable)
-
-
-class _Files:
-    """Reader of the files of a command, which must agree on their sample rate."""
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self.options = options
-        self.fs: float | None = options.fs
-        self._first = ""
-
-    def recording(self, path: str) -> np.ndarray:
-        """Return the samples of a recording, one channel."""
-        return self._one(path, is_path=False)
-
-    def path(self, path: str) -> np.ndarray:
-        """Return the taps of a path."""
-        return self._one(path, is_path=True)
-
-    def _one(self, path: str, *, is_path: bool) -> np.ndarray:
-        with _file(path) as source:
-            read = _read(
-                source,
-                fs=self.options.fs,
-                channel=self.options.channel,
-                variable=self.options.variable,
-                is_path=is_path,
-            )
-        if read.samples.size != read.samples.shape[-1]:
-            raise ValueError(
-                f"{path} has {len(read.samples)} channels where one is needed: choose with --channel 0 to --channel "
-                f"{len(read.samples) - 1}"
-            )
-        if self.fs is not None and read.fs != self.fs:
-            raise ValueError(
-                f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
-                "example with --fs 16000"
-            )
-        self.fs, self._first = read.fs, self._first or path
-        return read.one_channel()
-
-
-@contextmanager
-def _file(path: str) -> Iterator[str]:
-    """Give the name of a file, for "-" of a copy of the standard input."""
-    if path != STANDARD_INPUT:
-        yield path
-        return
-    content = sys.stdin.buffer.read()
-    if not content:
-        raise ValueError("standard input is empty: pipe a file into the command")
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder) / "standard-input"
-        copy.write_bytes(content)
-        yield str(copy)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -209,37 +153,52 @@ def _reading_options(parser: argparse.ArgumentParser) -> None:
 def _scene_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the noise, the paths and the rating."""
     parser.add_argument("noise", help="recording of the reference microphone, loudspeaker silent; - is standard input")
-    parser.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
+    parser.add_argument(
+        "--primary", action="append", metavar="FILE", help="impulse response, reference to error microphone"
+    )
     parser.add_argument("--disturbance", metavar="FILE", help="recording of the error microphone, made with the noise")
     parser.add_argument(
-        "--secondary", metavar="FILE", required=True, help="impulse response, control signal to error microphone"
+        "--secondary",
+        action="append",
+        metavar="FILE",
+        required=True,
+        help="impulse response, control signal to error microphone; repeated for several loudspeakers",
+    )
+    parser.add_argument(
+        "--microphones",
+        type=int,
+        metavar="K",
+        help="number of error microphones (default: the channels of the first --secondary)",
     )
     _reading_options(parser)
-    rating = parser.add_argument_group("rating", "of the amplifier: --watt and --ohm, or --rated-power")
-    rating.add_argument("--watt", type=float, metavar="W", help="rated power of the amplifier")
-    rating.add_argument("--ohm", type=float, metavar="R", help="into this resistance")
+    rating = parser.add_argument_group(
+        "rating",
+        "of the amplifier: --watt and --ohm, or --rated-power; numbers and curves once for all loudspeakers, or once for each",
+    )
+
+    def add(option: str, **more: Any) -> None:
+        rating.add_argument(option, action="append", **more)
+
+    add("--watt", type=float, metavar="W", help="rated power of the amplifier")
+    add("--ohm", type=float, metavar="R", help="into this resistance")
     rating.add_argument(
         "--rating",
         choices=("sine", "noise"),
         default="sine",
         help="what the watts were measured with (default: sine, the safe side)",
     )
-    rating.add_argument("--peak-volts", type=float, metavar="V", help="voltage at which the amplifier clips")
-    rating.add_argument(
-        "--volts-per-unit", type=float, default=1.0, metavar="V", help="volts for a control signal of 1 (default: 1)"
-    )
-    rating.add_argument("--rated-power", type=float, metavar="P", help="rated power as mean square, in place of watts")
-    rating.add_argument(
+    add("--peak-volts", type=float, metavar="V", help="voltage at which the amplifier clips")
+    add("--volts-per-unit", type=float, metavar="V", help="volts for a control signal of 1 (default: 1)")
+    add("--rated-power", type=float, metavar="P", help="rated power as mean square, in place of watts")
+    add(
         "--impedance",
         metavar="CSV",
         help="the loudspeaker's impedance, whose least value counts: Hz, ohm (default: --ohm)",
     )
-    rating.add_argument("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
-    rating.add_argument("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
-    rating.add_argument("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
-    rating.add_argument(
-        "--displacement", metavar="CSV", help="its excursion per volt: a column of Hz, a column of mm/V, and commas"
-    )
+    add("--loudspeaker-watt", type=float, metavar="W", help="rated noise power of the loudspeaker")
+    add("--programme-watt", type=float, metavar="W", help="its programme power, in place of that")
+    add("--x-max-mm", type=float, metavar="MM", help="its largest excursion, one way")
+    add("--displacement", metavar="CSV", help="its excursion per volt: a column of Hz, a column of mm/V, and commas")
 
 
 def _verdict_options(parser: argparse.ArgumentParser) -> None:
@@ -252,7 +211,7 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
         "--taps", type=int, metavar="N", help="taps of the control filter (default: found, at most 256)"
     )
     parser.add_argument(
-        "--memory", type=float, default=0.25, metavar="S", help="memory of the filter (default: 0.25 s)"
+        "--memory", type=float, metavar="S", help="memory of the filter (default: 0.25 s, several channels 1 s)"
     )
     parser.add_argument(
         "--path-error-samples",
@@ -271,10 +230,17 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
         help="another measurement of the secondary path, which tells how far it may be wrong; may be repeated",
     )
     parser.add_argument(
-        "--pascal-per-unit", type=float, metavar="PA", help="calibration of the error microphone, for levels in dBA"
+        "--pascal-per-unit",
+        action="append",
+        type=float,
+        metavar="PA",
+        help="calibration of the error microphone, for levels in dBA; once for all microphones, or once for each",
     )
     parser.add_argument(
-        "--calibrator", metavar="FILE", help="recording of a sound calibrator by the error microphone, in place of that"
+        "--calibrator",
+        action="append",
+        metavar="FILE",
+        help="recording of a sound calibrator by the error microphone, in place of that",
     )
     parser.add_argument(
         "--calibrator-db", type=float, default=94.0, metavar="DB", help="its sound pressure level (default: 94)"
@@ -284,81 +250,6 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--json", action="store_true", help="print verdict.json in place of text")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-
-
-def _rating(options: argparse.Namespace) -> list[Any]:
-    """Return the ratings that the options state."""
-    from .power import AmplifierRating, LoudspeakerRating
-
-    ratings: list[Any] = []
-    volts = options.volts_per_unit
-    if options.watt is not None or options.peak_volts is not None:
-        if options.ohm is None:
-            raise ValueError("--watt and --peak-volts need --ohm, the resistance they were measured with")
-        if options.rated_power is not None:
-            raise ValueError("--rated-power stands in place of --watt and --peak-volts: leave out one of them")
-        watts = {f"{options.rating}_watt": options.watt}
-        ratings.append(AmplifierRating(options.ohm, peak_volts=options.peak_volts, volts_per_unit=volts, **watts))
-    elif options.rated_power is not None:
-        ratings.append(options.rated_power)
-    if (options.loudspeaker_watt, options.programme_watt, options.x_max_mm) != (None, None, None):
-        if options.ohm is None and options.impedance is None:
-            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance, or --impedance, its curve")
-        ratings.append(
-            LoudspeakerRating(
-                options.ohm if options.impedance is None else _curve(options.impedance),
-                noise_watt=options.loudspeaker_watt,
-                programme_watt=options.programme_watt,
-                x_max_mm=options.x_max_mm,
-                displacement_mm_per_volt=None if options.displacement is None else _curve(options.displacement),
-                volts_per_unit=volts,
-            )
-        )
-    if not ratings:
-        raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
-    return ratings
-
-
-def _curve(path: str) -> Any:
-    """Return two columns of a CSV file."""
-    import numpy as np
-
-    try:
-        columns = np.loadtxt(path, delimiter=",", ndmin=2)
-    except ValueError as error:
-        raise ValueError(f"{path} must hold two numbers in a line with a comma between them: {error}") from error
-    if columns.shape[1] != 2:
-        raise ValueError(f"{path} must hold two columns, Hz and a value, got {columns.shape[1]}")
-    return columns[:, 0], columns[:, 1]
-
-
-def _uncertainty(options: argparse.Namespace, files: _Files, secondary: np.ndarray) -> Any:
-    """Return how far the secondary path may be wrong: by the other measurements, or by the tolerances."""
-    import numpy as np
-
-    from .paths import PathTolerance
-
-    tolerances = (options.path_error_samples, options.path_error_deg, options.path_error_db)
-    if options.secondary_again:
-        if tolerances != (None, 0.0, 0.0):
-            raise ValueError("--secondary-again stands in place of --path-error-...: leave out one of them")
-        others = [files.path(name) for name in options.secondary_again]
-        longest = max(secondary.size, *(other.size for other in others))
-        return np.array([np.pad(path, (0, longest - path.size)) for path in [secondary, *others]])
-    samples = 0.5 if options.path_error_samples is None else options.path_error_samples
-    return PathTolerance(samples, options.path_error_deg, options.path_error_db)
-
-
-def _scene(options: argparse.Namespace, files: _Files) -> tuple[Any, Any, Any, Any]:
-    """Return noise, primary path, secondary path and disturbance."""
-    if options.primary is None and options.disturbance is None:
-        raise ValueError("--primary or --disturbance is needed: what arrives at the error microphone?")
-    return (
-        files.recording(options.noise),
-        None if options.primary is None else files.path(options.primary),
-        files.path(options.secondary),
-        None if options.disturbance is None else files.recording(options.disturbance),
-    )
 
 
 @contextmanager
@@ -384,9 +275,10 @@ def _verdict(options: argparse.Namespace) -> int:
         prepare_folder(options.output)
     from .bench import assess
 
-    files, rating = _Files(options), _rating(options)
-    noise, primary, secondary, disturbance = _scene(options, files)
-    uncertainty = _uncertainty(options, files, secondary)
+    files = Files(options)
+    noise, primary, secondary, disturbance = scene_of(options, files)
+    rating = ratings_of(options, secondary.shape[1])
+    uncertainty = uncertainty_of(options, files, secondary)
     assert files.fs is not None
     with _bar(options.quiet, "sample") as bar:
         verdict = assess(
@@ -401,7 +293,7 @@ def _verdict(options: argparse.Namespace) -> int:
             n_taps=options.taps,
             memory_s=options.memory,
             secondary_path_uncertainty=uncertainty,
-            pascal_per_unit=_pascal_per_unit(options),
+            pascal_per_unit=pascal_per_unit_of(options),
             bar=bar,
         )
         if options.output is not None:
@@ -411,17 +303,6 @@ def _verdict(options: argparse.Namespace) -> int:
     if options.output is not None and not options.json:
         print(f"{page} and verdict.json written")
     return ENOUGH if verdict.enough else NOT_ENOUGH
-
-
-def _pascal_per_unit(options: argparse.Namespace) -> float | None:
-    """Return the calibration of the error microphone, if the options give one."""
-    if options.calibrator is None:
-        return options.pascal_per_unit
-    if options.pascal_per_unit is not None:
-        raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
-    from .signals import calibration_factor
-
-    return calibration_factor(options.calibrator, options.calibrator_db, channel=options.channel)
 
 
 def _compare_options(parser: argparse.ArgumentParser) -> None:
@@ -451,8 +332,9 @@ def _compare(options: argparse.Namespace) -> int:
     from .bench import algorithms, compare_recordings, results_table, write_report
 
     names = list(algorithms()) if options.algorithm is None else options.algorithm.split(",")
-    files, rating = _Files(options), _rating(options)
-    noise, primary, secondary, disturbance = _scene(options, files)
+    files = Files(options)
+    noise, primary, secondary, disturbance = scene_of(options, files)
+    rating = ratings_of(options, secondary.shape[1])
     with _bar(options.quiet, "run") as bar:
         report = compare_recordings(
             noise,
@@ -506,7 +388,7 @@ def _path_commands(actions: Any) -> None:
 def _identify(options: argparse.Namespace) -> int:
     from .paths import estimate_path
 
-    files = _Files(options)
+    files = Files(options)
     sent, heard = files.recording(options.excitation), files.recording(options.response)
     shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs or 0.0)
@@ -520,7 +402,7 @@ def _identify(options: argparse.Namespace) -> int:
 def _inspect(options: argparse.Namespace) -> int:
     from .paths import achieved_band, causality_margin, secondary_path_gain
 
-    files = _Files(options)
+    files = Files(options)
     taps = files.path(options.path)
     primary = None if options.primary is None else files.path(options.primary)
     fs = files.fs or 0.0
@@ -556,7 +438,7 @@ def _db(power: float) -> float:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    files = _Files(options)
+    files = Files(options)
     taps = files.path(options.path)
     _write_path(options.output, taps, files.fs or 0.0)
     print(f"{options.output}: {taps.size} taps at {files.fs:g} Hz")
@@ -565,8 +447,6 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
     """Write taps in the format of the file's suffix: text has a column of times in s."""
-    import numpy as np
-
     from .signals import write_wav
 
     suffix = Path(output).suffix.lower()
@@ -589,7 +469,7 @@ def _plot(options: argparse.Namespace) -> int:
 
     from .plot import plot_bode, plot_impulse_responses
 
-    files = _Files(options)
+    files = Files(options)
     taps = {Path(name).stem: files.path(name) for name in options.path}
     figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
     plot_impulse_responses(taps, fs=files.fs, ax=axes[0])

@@ -14,6 +14,7 @@ import pytest
 import soundfile
 
 from kfopc_filterpy import cli
+from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
 from kfopc_filterpy.paths import resample_path
 from kfopc_filterpy.signals import band_limited_noise, write_wav
@@ -300,3 +301,106 @@ def test_a_calibrators_recording_gives_the_levels(command, folder):
     code, _, err = command("verdict", *options, "--pascal-per-unit", "2")
     assert code == 2
     assert "leave out one of them" in err
+
+
+# ---- Several loudspeakers and microphones
+
+
+@pytest.fixture
+def several(folder):
+    """Two loudspeakers and two microphones: recordings of both microphones, and their paths, each way to give them."""
+    x = band_limited_noise((100, 1500), 3.0, fs=FS, rng=1, power=1.0)
+    primary, secondary = np.eye(64)[[26, 28]], np.zeros((2, 2, 64))  # (K, J, taps)
+    secondary[[0, 0, 1, 1], [0, 1, 0, 1], [12, 15, 16, 12]] = [1.0, 0.2, 0.3, 0.8]
+    write_wav(folder / "errors.wav", [np.convolve(x, p)[: x.size] for p in primary], FS)
+    np.save(folder / "S.npy", secondary)
+    write_wav(folder / "P1.wav", primary, FS)
+    for j in (0, 1):
+        write_wav(folder / f"S{j + 1}.wav", secondary[:, j], FS)
+        write_wav(folder / f"P{j + 1}1.wav", primary[j], FS)
+        for k in (0, 1):
+            write_wav(folder / f"S{k + 1}{j + 1}.wav", secondary[k, j], FS)
+    return x, primary[:, np.newaxis], secondary
+
+
+WAYS = {
+    "a file for each loudspeaker": [["P1.wav"], ["S1.wav", "S2.wav"], []],
+    "a file for each path": [
+        ["P11.wav", "P21.wav"],
+        ["S11.wav", "S21.wav", "S12.wav", "S22.wav"],
+        ["--microphones", 2],
+    ],
+    "one array": [["P1.wav"], ["S.npy"], ["--fs", FS]],  # it states no rate
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_several_channels_are_read_in_the_order_that_the_help_states(command, several, way):
+    primary, secondary, options = WAYS[way]
+    files = [part for name in primary for part in ("--primary", name)]
+    files += [part for name in secondary for part in ("--secondary", name)]
+    rating = ["--rated-power", 4, "--rated-power", 0.05]
+    code, out, err = command("verdict", "noise.wav", *files, *options, *rating, "--taps", 32, "--json", "--quiet")
+    x, p, s = several
+    verdict = assess(x.astype(np.float32), p, s.astype(np.float32), rating=[4.0, 0.05], fs=FS, n_taps=32)
+    data = json.loads(out)
+    assert code == (0 if verdict.enough else 1), err
+    assert data["channels"] == {"references": 1, "loudspeakers": 2, "microphones": 2}
+    assert data["rating"]["rated_power"] == [4.0, 0.05]
+    assert data["bound_db"] == pytest.approx(verdict.bound_db, abs=1e-3)
+    assert data["noise_reduction_db"] == pytest.approx(verdict.noise_reduction_db, abs=0.05)
+    assert data["unlimited_power"] == pytest.approx(verdict.unlimited_power.tolist(), rel=1e-3)
+
+
+def test_the_exit_code_is_that_of_all_amplifiers_together(command, several):
+    files = ["noise.wav", "--disturbance", "errors.wav", "--secondary", "S1.wav", "--secondary", "S2.wav"]
+    options = ["--ohm", 8, "--taps", 32, "--quiet", "--algorithm", "KF-PB"]
+    code, out, _ = command("verdict", *files, "--watt", 1, *options)
+    assert code == 0
+    assert out.startswith("Enough: KF-PB reaches")
+    code, out, _ = command("verdict", *files, "--watt", 1, "--watt", 0.0001, *options)
+    assert code == 1
+    assert "1, 0.0001 W into 8 ohm" in out
+    assert "The amplifier limits" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--primary", "P1.wav", "--secondary", "S1.wav", "--watt", "1", "--watt", "2", "--ohm", "8"],
+            "--watt must be given once",
+        ),
+        (
+            ["--primary", "P11.wav", "--secondary", "S1.wav", "--rated-power", "1"],
+            "--primary must give a path from each",
+        ),
+        (
+            ["--primary", "P1.wav", "--secondary", "S1.wav", "--secondary", "S12.wav", "--rated-power", "1"],
+            "got 3 in all",
+        ),
+        (
+            ["--disturbance", "d.wav", "--secondary", "S1.wav", "--rated-power", "1"],
+            "disturbance must have a channel for each",
+        ),
+        (
+            ["--primary", "P1.wav", "--secondary", "S.npy", "--secondary", "S1.wav", "--rated-power", "1"],
+            "leave out the other",
+        ),
+        (
+            ["--primary", "P1.wav", "--secondary", "S1.wav", "--microphones", "0", "--rated-power", "1"],
+            "must be at least 1",
+        ),
+    ],
+    ids=["ratings", "references", "uneven", "microphones", "matrix", "none"],
+)
+def test_channels_that_do_not_fit_are_refused(command, several, arguments, message):
+    code, _, err = command("verdict", "noise.wav", *arguments, "--fs", FS, "--quiet")
+    assert code == 2
+    assert message in err
+
+
+def test_a_comparison_of_several_channels_is_refused(command, several):
+    code, _, err = command("compare", "noise.wav", "--primary", "P1.wav", "--secondary", "S1.wav", "--rated-power", 1)
+    assert code == 2
+    assert "must have one channel for a comparison" in err

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 
 from .items import EXCERPT_S, HEADROOM, FigureItem, Sound, StudyReport, Table
@@ -51,7 +52,7 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
         "Verdict",
         "",
         verdict.fs,
-        verdict.limits.rated_power,
+        float(np.max(verdict.limits.rated_power)),  # which this page does not show
         {},
         {},
         figures=list(_figures(verdict)),
@@ -84,70 +85,109 @@ def _figures(verdict: Assessment) -> Any:
 
     figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
     _draw_bound(verdict, ax)
+    each = "the run of each algorithm at the power it took"
+    if verdict.channels is not None:
+        each += ", relative to its rating, of the loudspeaker that took most"
     yield FigureItem(
-        "bound",
-        "What a rated power buys: the least error of any fixed filter of this length, with the run of each algorithm at "
-        "the power it took.",
-        figure,
+        "bound", f"What a rated power buys: the least error of any fixed filter of this length, with {each}.", figure
     )
-
-    def draw_power(runs: dict[str, SimulationResult], ax: Any) -> None:
-        scale = verdict.watt_per_power or 1.0
-        plot_output_power({name: _scaled(run, scale) for name, run in runs.items()}, ax=ax)
-        ax.set_ylabel(_power_label(verdict))
-
+    runs = dict(verdict.runs)
+    together = "" if verdict.channels is None else " All microphones together."
     plots: list[tuple[str, Any, str]] = [
-        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half."),
-        ("nse", plot_nse, "Error power over that of the disturbance; below 0 dB it is quieter than without control."),
-        ("power", draw_power, "Mean power of the control signal over a sliding window, and the rated power."),
+        ("spectra", plot_error_spectra, f"Spectra without control and of the errors, over the steady half.{together}"),
+        (
+            "nse",
+            plot_nse,
+            f"Error power over that of the disturbance; below 0 dB it is quieter than without control.{together}",
+        ),
     ]
     for stem, draw, caption in plots:
         figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-        draw(dict(verdict.runs), ax=ax)
+        draw(runs, ax=ax)
         yield FigureItem(stem, caption, figure)
+    scale = 1.0 if verdict.watt_per_power is None else verdict.watt_per_power
+    powers = {name: _scaled(run, scale) for name, run in runs.items()}
+    figure, axes = _rows_of_axes(n_loudspeakers(verdict), (6.4, 4))
+    for j, ax in enumerate(axes):
+        rated = np.ravel(scale * verdict.limits.rated_power)[j]
+        plot_output_power(powers, channel=j, rated_power=rated, ax=ax)
+        ax.set_ylabel(_power_label(verdict))
+    _number_rows(axes, "Loudspeaker")
+    yield FigureItem("power", "Mean power of the control signal over a sliding window, and the rated power.", figure)
     if verdict.levels is not None:
-        figure, ax = plt.subplots(figsize=(9, 3.6), layout="constrained")
-        _draw_bands(verdict.levels, ax)
+        levels = verdict.levels
+        figure, axes = _rows_of_axes(n_microphones(verdict), (9, 3.6))
+        for k, ax in enumerate(axes):
+            _draw_bands(levels.centres_hz, np.atleast_2d(levels.before_db)[k], np.atleast_2d(levels.after_db)[k], ax)
+        _number_rows(axes, "Microphone")
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
-def _scaled(run: SimulationResult, scale: float) -> SimulationResult:
-    """Return a run whose powers of the control signal are multiplied."""
+def n_loudspeakers(verdict: Assessment) -> int:
+    return 1 if verdict.channels is None else verdict.channels[1]
+
+
+def n_microphones(verdict: Assessment) -> int:
+    return 1 if verdict.channels is None else verdict.channels[2]
+
+
+def _rows_of_axes(count: int, size: tuple[float, float]) -> tuple[Any, Any]:
+    """Return a figure with axes below each other, and the axes."""
+    import matplotlib.pyplot as plt
+
+    height = size[1] * (1.0 if count == 1 else 0.8 * count)
+    figure, axes = plt.subplots(count, squeeze=False, figsize=(size[0], height), layout="constrained")
+    return figure, axes[:, 0]
+
+
+def _number_rows(axes: Any, what: str) -> None:
+    """Begin the labels of several axes with what they show, and its number."""
+    if len(axes) > 1:
+        for number, ax in enumerate(axes, 1):
+            ax.set_ylabel(f"{what} {number}\n{ax.get_ylabel()}")
+
+
+def _scaled(run: SimulationResult, scale: Any) -> SimulationResult:
+    """Return a run whose powers of the control signals are multiplied, by one number or by one for each."""
     rated = None if run.rated_power is None else scale * run.rated_power
-    return replace(run, control_signal=np.sqrt(scale) * run.control_signal, rated_power=rated)
+    factor = np.sqrt(scale) if np.ndim(scale) == 0 else np.sqrt(scale)[:, np.newaxis]
+    return replace(run, control_signal=factor * run.control_signal, rated_power=rated)
 
 
 def _draw_bound(verdict: Assessment, ax: Any) -> None:
     """Draw the bound against the rated power, with what is wanted, the rating and the runs."""
-    scale = verdict.watt_per_power or 1.0
+    several = verdict.channels is not None  # then the powers are multiples of all ratings
+    scale = 1.0 if several else verdict.watt_per_power or 1.0
     powers, reached = verdict.curve
     right = 2 * scale * powers.max()  # a run without a constraint may ask for a million times as much
     ax.semilogx(scale * powers, reached, color="0.2", label="best fixed filter")
-    ax.axvline(scale * verdict.limits.rated_power, color="0.2", linestyle="--", label="rated power")
+    rated = 1.0 if several else scale * verdict.limits.rated_power
+    ax.axvline(rated, color="0.2", linestyle="--", label="rated power")
     ax.axhline(verdict.want_db, color="0.5", linestyle=":", label="wanted")
     for name, figures in verdict.figures.items():
-        power, own = figures["output_power"], figures["noise_reduction_db"]
+        own = figures["noise_reduction_db"]
+        power = np.max(figures["of_rated_power"]) if several else figures["output_power"]
         if power and own is not None and np.isfinite(power) and np.isfinite(own):
             style = curve_style(name)
             label = name if scale * power <= right else f"{name}, beyond: {scale * power:.2g}"
             ax.plot(min(scale * power, right), own, style["marker"], color=style["color"], label=label, clip_on=False)
     ax.set_xlim(right=right)
-    ax.set_xlabel(_power_label(verdict))
+    ax.set_xlabel("Power over the rated power" if several else _power_label(verdict))
     ax.set_ylabel("Noise reduction (dB)")
     ax.grid(True, which="both", alpha=0.25)
     ax.legend(fontsize="small")
 
 
-def _draw_bands(levels: Any, ax: Any) -> None:
+def _draw_bands(centres_hz: np.ndarray, before_db: np.ndarray, after_db: np.ndarray, ax: Any) -> None:
     """Draw third-octave levels without and with control, from 60 dB below the loudest on."""
-    floor = max(np.max(levels.before_db), np.max(levels.after_db)) - 60
-    places = np.arange(levels.centres_hz.size)
+    floor = max(np.max(before_db), np.max(after_db)) - 60
+    places = np.arange(centres_hz.size)
     for offset, values, label, colour in (
-        (-0.2, levels.before_db, "without control", "0.6"),
-        (0.2, levels.after_db, "with control", curve_style("KF-OPC")["color"]),
+        (-0.2, before_db, "without control", "0.6"),
+        (0.2, after_db, "with control", curve_style("KF-OPC")["color"]),
     ):
         ax.bar(places + offset, np.maximum(values - floor, 0.0), 0.4, bottom=floor, label=label, color=colour)
-    ax.set_xticks(places[::3], [_nominal(f) for f in levels.centres_hz[::3]])
+    ax.set_xticks(places[::3], [_nominal(f) for f in centres_hz[::3]])
     ax.set_xlabel("Third-octave band (Hz)")
     ax.set_ylabel("Level (dB re 20 µPa)")
     ax.grid(True, axis="y", alpha=0.25)
@@ -161,14 +201,18 @@ def _nominal(centre: float) -> str:
 
 
 def _sounds(verdict: Assessment) -> list[Sound]:
-    """Return the sounds without control and of each algorithm, of the steady half."""
+    """Return the sounds without control and of each algorithm, of the steady half, at each microphone."""
     run = verdict.runs[verdict.algorithm]
     settled = 0.5 * run.n_samples / verdict.fs
-    group = "at the error microphone"
-    sounds = [Sound("before", "Without control", run.disturbance, group, settled)]
-    for name, own in verdict.runs.items():
-        stem = "after" if name == verdict.algorithm else name.lower()
-        sounds.append(Sound(stem, name, own.error, group, settled))
+    sounds = []
+    for k, disturbance in enumerate(np.atleast_2d(run.disturbance)):
+        several = verdict.channels is not None
+        group = f"at microphone {k + 1}" if several else "at the error microphone"
+        end = f"-{k + 1}" if several else ""
+        sounds.append(Sound(f"before{end}", "Without control", disturbance, group, settled))
+        for name, own in verdict.runs.items():
+            stem = "after" if name == verdict.algorithm else name.lower()
+            sounds.append(Sound(f"{stem}{end}", name, np.atleast_2d(own.error)[k], group, settled))
     return sounds
 
 
@@ -207,27 +251,49 @@ def _tables(verdict: Assessment) -> Any:
             for name, own in verdict.figures.items()
         ],
     )
-    if verdict.levels is not None:
+    if verdict.channels is not None:
         yield Table(
-            "levels",
-            "Third-octave bands",
-            ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"],
+            "microphones",
+            "Noise reduction at each microphone (dB)",
+            ["Controller", *(f"Microphone {k + 1}" for k in range(n_microphones(verdict)))],
             [
-                [_nominal(centre), float(before), float(after), float(before - after)]
-                for centre, before, after in zip(
-                    verdict.levels.centres_hz, verdict.levels.before_db, verdict.levels.after_db, strict=True
-                )
+                [name, *(_number(one) for one in own["noise_reduction_by_microphone_db"])]
+                for name, own in verdict.figures.items()
             ],
         )
+    if verdict.levels is not None:
+        yield Table("levels", "Third-octave bands", *_level_rows(verdict))
 
 
-def _number(value: float | None, scale: float | None = None) -> float:
-    """Return a figure of merit, in the unit that a scale gives if there is one; NaN if it is not defined."""
-    return float("nan") if value is None else float(value) * (scale or 1.0)
+def _level_rows(verdict: Assessment) -> tuple[list[str], list[list[str | float]]]:
+    """Return the headings and rows of the third-octave bands, of all microphones."""
+    levels = verdict.levels
+    assert levels is not None
+    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
+    rows: list[list[str | float]] = []
+    pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
+    for k, (before_db, after_db) in enumerate(pairs, 1):
+        first: list[str | float] = [] if verdict.channels is None else [str(k)]
+        for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True):
+            rows.append([*first, _nominal(centre), float(before), float(after), float(before - after)])
+    return headings if verdict.channels is None else ["Microphone", *headings], rows
+
+
+def _number(value: Any, scale: Any = None) -> Any:
+    """Return a figure of merit, in the unit that a scale gives if there is one; NaN if it is not defined.
+
+    Of several loudspeakers the figures become one text.
+    """
+    if value is None:
+        return float("nan")
+    own = np.asarray(value, dtype=float) * (1.0 if scale is None else scale)
+    return float(own) if own.ndim == 0 else listed(own, ".4g")
 
 
 def _power_label(verdict: Assessment) -> str:
-    return "Power (mean square)" if verdict.watt_per_power is None else f"Power (W into {verdict.ohm:g} ohm)"
+    if verdict.watt_per_power is None:
+        return "Power (mean square)"
+    return f"Power (W into {listed(np.unique(verdict.ohm), 'g')} ohm)"
 
 
 def _checks(verdict: Assessment) -> list[tuple[str, str]]:
@@ -236,12 +302,11 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
     late = verdict.causality_margin_s
     peak = "no peak limit"
     if limits.amplitude_limit is not None:
-        in_volts = verdict.volts_per_unit is not None
-        peak = f"peak limit {_number(limits.amplitude_limit, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"
+        peak = _peak_limits(verdict)
     checks = [
         (
             "Rating",
-            f"{verdict.power(limits.rated_power)}, decided by the {limits.decided_by}; {peak}; "
+            f"{verdict.power(limits.rated_power)}, decided by the {_listed_once(limits.decided_by)}; {peak}; "
             f"windows of {limits.window_s:g} s",
         ),
         ("Power for full control", verdict.power(verdict.unlimited_power)),
@@ -262,11 +327,25 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
     ]
     if verdict.levels is not None:
         before, after = verdict.levels.before_dba, verdict.levels.after_dba
-        checks.append(("A-weighted level", f"{before:.1f} dBA without control, {after:.1f} dBA with it"))
+        text = f"{listed(before, '.1f')} dBA without control, {listed(after, '.1f')} dBA with it"
+        checks.append(("A-weighted level", text))
     if verdict.excursion_mm is not None:
         checks.append(("Largest excursion", f"{verdict.excursion_mm:.2g} mm"))
     return checks
 
 
-def _or_none(verdict: Assessment, power: float) -> str:
-    return verdict.power(power) if np.isfinite(power) else "none would do"
+def _peak_limits(verdict: Assessment) -> str:
+    """Return the peak limits in words."""
+    limits: Any = verdict.limits.amplitude_limit
+    if verdict.channels is None:
+        in_volts = verdict.volts_per_unit is not None
+        return f"peak limit {_number(limits, verdict.volts_per_unit):.3g}{' V' if in_volts else ''}"
+    return f"peak limits {', '.join('none' if one is None else f'{one:.3g}' for one in limits)}"
+
+
+def _listed_once(texts: Any) -> str:
+    return texts if isinstance(texts, str) else ", ".join(dict.fromkeys(texts))
+
+
+def _or_none(verdict: Assessment, power: Any) -> str:
+    return verdict.power(power) if np.all(np.isfinite(power)) else "none would do"

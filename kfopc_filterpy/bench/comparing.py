@@ -13,7 +13,8 @@ from kfopc_filterpy._validate import as_choice, as_count, as_positive
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.power import output_limits
 
-from .assessment import LONGEST, recorded_scene, recorded_signals, switch_on_sample
+from .assessed_runs import recorded_scene
+from .assessing import LONGEST, recorded_signals, switch_on_sample
 from .items import FigureItem, Parameter, Sound, StudyReport
 from .registry import REGISTRY, algorithms
 from .scene import Runs, figures_of_merit, one_blas_thread
@@ -80,6 +81,11 @@ def compare_recordings(
     for name in names:
         as_choice(name, "names", algorithms())
     x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
+    if s.ndim > 1:
+        raise ValueError(
+            "noise, primary, secondary and disturbance must have one channel for a comparison: choose one. `assess` runs "
+            "KF-PB, KF-OPC and FxLMS with several"
+        )
     if seconds is not None:
         kept = slice(0, round(as_positive(seconds, "seconds", unit="s") * fs))
         x, d = x[kept], d[kept]

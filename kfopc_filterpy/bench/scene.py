@@ -31,7 +31,7 @@ from kfopc_filterpy.bounds import (
     power_constrained_solution,
     wiener_solution,
 )
-from kfopc_filterpy.bounds.channels import channel_record
+from kfopc_filterpy.bounds.channels import full_channel_stretch
 from kfopc_filterpy.loop.channels import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
@@ -404,7 +404,7 @@ def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: flo
     if s.ndim == 1:
         with reachable_weights():
             return wiener_solution(x, d, s, n_taps)
-    record = channel_record(x, d, s, n_taps, fs).part(n_taps + s.shape[2] - 2, x.shape[1])
+    record = full_channel_stretch(x, d, s, n_taps, fs)
     return record.solution(record.correlations().weights(ridge=CHANNEL_RIDGE * record.filtered_power))
 
 

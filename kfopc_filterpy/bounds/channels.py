@@ -16,7 +16,7 @@ from scipy.signal import correlate, fftconvolve
 
 from .._validate import as_channels, as_count
 from ..paths.channels import secondary_paths
-from .wiener import WienerSolution, mean_square, reduction_db
+from .wiener import WienerSolution, mean_square, reduction_db, require_sound
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight
 TOLERANCE = 1e-5  # relative, for a rated power that limits
@@ -46,15 +46,20 @@ class ChannelStretch:
 
     def correlations(self) -> ChannelCorrelations:
         """Return the correlations of the stretch."""
-        n_samples, n_taps = self.d.shape[1], self.n_taps
-        size = self.filtered.shape[1] * self.filtered.shape[2] * n_taps
-        filtered, cross = np.zeros((size, size)), np.zeros(size)
-        for x, d in zip(self.filtered.reshape(len(self.d), -1, self.x.shape[1]), self.d, strict=True):
-            filtered += block_correlation(x, n_taps)
-            cross += np.array([correlate(row, d, "valid")[::-1] for row in x]).ravel() / n_samples
-        return ChannelCorrelations(
-            np.asarray(filtered), block_correlation(self.x, n_taps), np.asarray(cross), self.shape
-        )
+        of_x = block_correlation(self.x, self.n_taps)
+        return ChannelCorrelations(self.correlation(self.filtered), of_x, self.cross(), self.shape)
+
+    def correlation(self, filtered: np.ndarray) -> np.ndarray:
+        """Return the correlation matrix of signals that take the place of x', summed over microphones."""
+        return np.asarray(sum(block_correlation(each, self.n_taps) for each in _rows(filtered)))
+
+    def cross(self) -> np.ndarray:
+        """Return r, the cross-correlation of d and x', summed over microphones."""
+        each = [
+            [correlate(row, d, "valid")[::-1] for row in rows]
+            for rows, d in zip(_rows(self.filtered), self.d, strict=True)
+        ]
+        return np.sum(each, axis=0).ravel() / self.d.shape[1]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -83,6 +88,11 @@ class ChannelStretch:
             error_power=error_power,
             noise_reduction_db=reduction_db(error_power, disturbance_power),
         )
+
+
+def _rows(filtered: np.ndarray) -> np.ndarray:
+    """Return filtered references (K, J, I, n) as (K, J I, n)."""
+    return filtered.reshape(len(filtered), -1, filtered.shape[-1])
 
 
 def _sum_of_convolutions(signals: np.ndarray, filters: np.ndarray) -> np.ndarray:
@@ -213,3 +223,18 @@ def channel_record(reference: Any, disturbance: Any, secondary_path: Any, n_taps
     filtered = fftconvolve(x[np.newaxis, np.newaxis], secondary[:, :, np.newaxis], axes=-1)[..., : x.shape[1]]
     past = [(0, 0), (n_taps - 1, 0)]
     return ChannelStretch(np.pad(x, past), np.pad(filtered, [(0, 0), (0, 0), *past]), d, n_taps)
+
+
+def full_channel_stretch(
+    reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, fs: float
+) -> ChannelStretch:
+    """Check the signals and return the samples at which all delay lines are full."""
+    secondary, _ = secondary_paths(secondary_path, fs=fs)
+    record = channel_record(reference, disturbance, secondary, n_taps, fs)
+    start, stop = n_taps + secondary.shape[2] - 2, record.d.shape[1]
+    if stop < start + n_taps:
+        raise ValueError(
+            f"reference must have at least {start + n_taps} samples for {n_taps} control "
+            f"and {secondary.shape[2]} path taps, got {stop}; use a longer signal or fewer taps"
+        )
+    return require_sound(record.part(start, stop))

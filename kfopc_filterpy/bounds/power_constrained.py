@@ -433,6 +433,13 @@ def _losses_db(
     ]
 
 
+def weights_within(stretch: Stretch | ChannelStretch, correlations: Any, rated_power: Any) -> tuple[np.ndarray, Any]:
+    """Return the weights of the least error within the power of each loudspeaker, and their λ."""
+    if isinstance(stretch, ChannelStretch):
+        return correlations.constrained_weights(rated_power)
+    return constrained_weights(stretch, correlations, rated_power)
+
+
 def _solve(
     stretch: Stretch | ChannelStretch, rated_power: Any, ridge: float, start_s: float, end_s: float
 ) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
@@ -445,10 +452,7 @@ def _solve(
 
     times: dict[str, Any] = {"start_s": start_s, "end_s": end_s, "stretch": stretch}
     correlations: Any = stretch.correlations()
-    if isinstance(stretch, ChannelStretch):
-        constrained = control_filter(*correlations.constrained_weights(rated_power))
-    else:
-        constrained = control_filter(*constrained_weights(stretch, correlations, rated_power))
+    constrained = control_filter(*weights_within(stretch, correlations, rated_power))
     free = control_filter(correlations.weights(ridge=ridge))
     if np.all(free.control_power <= rated_power):
         return constrained, free, free

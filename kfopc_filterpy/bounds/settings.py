@@ -1,7 +1,8 @@
-"""Settings of a single-channel Kalman controller from a recording made while the loudspeaker is silent."""
+"""Settings of a Kalman controller from a recording made while the loudspeakers are silent."""
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_positive, as_signal
+from .._validate import as_channels, as_count, as_positive
+from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.least_squares import RANK_TOLERANCE
 from ..paths.models import path_taps
 from ..power.constraint import DEFAULT_FS
-from .wiener import ERROR_THAT_MATTERS, Correlations, Stretch, full_stretch, mean_square, reduction_db
+from .channels import ChannelStretch, full_channel_stretch
+from .wiener import ERROR_THAT_MATTERS, Stretch, full_stretch, mean_square, reduction_db
 
 # A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the
 # constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one costs.
@@ -85,17 +88,17 @@ def suggest_settings(
 ) -> SuggestedSettings:
     r"""Return the length L and the settings q, r and P0 that suit a noise, with the reason for each.
 
-    The signals are those of a silent run: the noise runs, the loudspeaker does not. A few seconds are enough if they
-    contain what the noise usually does. The settings are for one reference, one loudspeaker and one microphone.
+    The signals are those of a silent run: the noise runs, the loudspeakers do not. A few seconds are enough if they
+    contain what the noise usually does.
 
     Parameters
     ----------
-    reference : array_like, shape (n_samples,)
+    reference : array_like, shape (n_samples,) or (I, n_samples)
         Reference x of the silent run.
-    disturbance : array_like, shape (n_samples,)
+    disturbance : array_like, shape (n_samples,) or (K, n_samples)
         Signal of the error microphone, the disturbance d. Leave out its start-up transient.
-    secondary_path : array_like, shape (n_path,), or control.TransferFunction
-        Estimated secondary path.
+    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
+        Estimated secondary path, or those from J loudspeakers to K microphones.
     fs : float, default 16000
         Sample rate of the signals in Hz.
     memory_s : float, default 0.25
@@ -114,8 +117,8 @@ def suggest_settings(
     Raises
     ------
     TypeError, ValueError
-        If the signals differ in length, are too short, silent or not finite; if the secondary path has several channels
-        or another sample rate; if a setting is out of range.
+        If the signals differ in length, are too short, silent or not finite; if their channels do not fit the secondary
+        path, or that has another sample rate; if a setting is out of range.
 
     See Also
     --------
@@ -141,6 +144,12 @@ def suggest_settings(
     - :math:`P_0 = E[d^2] / (L\, E[x'^2])`: with independent weights of this variance and a white filtered reference, the
       anti-noise is as strong as the disturbance.
 
+    With several channels, J and :math:`E[d^2]` are means over the K microphones and :math:`E[x'^2]` is the mean over
+    loudspeakers and references of the sum over microphones, whose measurements inform the same weights. The fractions of
+    L are multiplied by J I / K, the weights per tap and microphone. :math:`P_0` then is
+    :math:`K E[d^2] / (J I L\, E[x'^2])`. These q, r and :math:`P_0` are for the direct form; `SharedGainKalman` takes
+    only the length.
+
     Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`. q contains neither
     what a clipping amplifier cuts off nor the errors of the path estimate, which a silent run does not show.
 
@@ -162,20 +171,18 @@ def suggest_settings(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     memory = as_positive(memory_s, "memory_s", unit="s") * fs
-    s = path_taps(secondary_path, fs=fs, name="secondary_path")
-    longest = _longest(as_signal(reference, "reference").size, s.size, n_taps, max_taps)
-    stretch = full_stretch(reference, disturbance, s, longest)
-    correlations, d_power, filtered_power = stretch.correlations(), mean_square(stretch.d), stretch.filtered_power
-    errors, quietest = _error_powers(stretch, correlations, 0.0), ERROR_THAT_MATTERS * d_power
+    fit = _Fits(reference, disturbance, secondary_path, fs, n_taps, max_taps)
+    longest, d_power, filtered_power = fit.stretch.n_taps, mean_square(fit.stretch.d), fit.filtered_power
+    errors, quietest = fit.error_powers(0.0), ERROR_THAT_MATTERS * d_power
     if n_taps is None:
-        learned = max(float(errors[-1]), quietest) * longest * filtered_power / (memory * d_power)  # q / (M P0)
-        reached = np.maximum(_error_powers(stretch, correlations, learned), quietest)
-        taps = _shortest(reached * (1 + np.arange(1, longest + 1) / memory))
+        learned = max(float(errors[-1]), quietest) * longest * fit.per_tap * filtered_power  # q / (M P0), and below
+        reached = np.maximum(fit.error_powers(learned / (memory * d_power * fit.n_microphones)), quietest)
+        taps = _shortest(reached * (1 + fit.crowding * np.arange(1, longest + 1) / memory))
     else:
         taps = longest
     q = max(float(errors[taps - 1]), quietest)
-    lengthened = memory * np.sqrt(_burstiness(stretch.filtered, fs, memory))
-    initial_variance = d_power / (taps * filtered_power)
+    lengthened = memory * np.sqrt(_burstiness(fit.stretch.filtered, fs, memory))
+    initial_variance = d_power / (taps * fit.crowding * filtered_power)
     return SuggestedSettings(
         n_taps=taps,
         measurement_noise=q,
@@ -184,44 +191,80 @@ def suggest_settings(
         fs=fs,
         reasons={
             "n_taps": _why_length(errors, taps, d_power, n_taps, max_taps),
-            "measurement_noise": _why_noise(errors[taps - 1], taps, d_power, stretch.d.size / fs),
-            "state_noise": _why_memory(memory / fs, lengthened / fs, taps / lengthened),
+            "measurement_noise": _why_noise(errors[taps - 1], taps, d_power, fit.stretch.d.shape[-1] / fs),
+            "state_noise": _why_memory(memory / fs, lengthened / fs, fit.crowding * taps / lengthened),
             "initial_variance": (
-                f"E[d^2] / (L E[x'^2]) with E[d^2] = {d_power:.3g} and E[x'^2] = {filtered_power:.3g}: independent "
+                f"{fit.variance_rule} with E[d^2] = {d_power:.3g} and E[x'^2] = {filtered_power:.3g}: independent "
                 "weights of this variance would make an anti-noise as strong as the disturbance"
             ),
         },
     )
 
 
-def _longest(n_samples: int, n_path: int, n_taps: int | None, max_taps: int) -> int:
+class _Fits:
+    """Fixed filters of 1, 2, ... taps, fitted to one record."""
+
+    def __init__(
+        self, reference: Any, disturbance: Any, secondary_path: Any, fs: float, n_taps: int | None, max_taps: int
+    ) -> None:
+        x = as_channels(reference, "reference")
+        self.stretch: Stretch | ChannelStretch
+        if is_path_matrix(secondary_path) or x.ndim == 2 or np.ndim(disturbance) == 2:
+            s, _ = secondary_paths(secondary_path, fs=fs)
+            self.n_microphones, self.per_tap = len(s), s.shape[1] * len(np.atleast_2d(x))
+            longest = _longest(x.shape[-1], s.shape[2], n_taps, max_taps, self.crowding)
+            self.stretch = full_channel_stretch(x, disturbance, s, longest, fs)
+            self.variance_rule = "K E[d^2] / (J I L E[x'^2])"
+        else:
+            s = path_taps(secondary_path, fs=fs, name="secondary_path")
+            self.n_microphones = self.per_tap = 1
+            self.stretch = full_stretch(x, disturbance, s, _longest(x.size, s.size, n_taps, max_taps, 1.0))
+            self.variance_rule = "E[d^2] / (L E[x'^2])"
+        self.filtered_power = self.stretch.filtered_power / self.per_tap
+        correlations: Any = self.stretch.correlations()
+        size, shape = correlations.cross.size, (self.per_tap, self.stretch.n_taps)
+        # Taps of one delay side by side: then the matrix of a shorter filter is the first part of that of a longer one.
+        self._filtered = correlations.filtered.reshape(*shape, *shape).transpose(1, 0, 3, 2).reshape(size, size)
+        self._cross = correlations.cross.reshape(shape).T.ravel()
+
+    @property
+    def crowding(self) -> float:
+        """Weights per tap and microphone: 1 for one channel."""
+        return self.per_tap / self.n_microphones
+
+    def error_powers(self, ridge: float) -> np.ndarray:
+        """Return the error power of the best filter of 1, 2, ... taps, per microphone, corrected for what fits by chance.
+
+        With a ridge, the error power includes ridge |w|^2. All lengths are fitted to the same samples, so each
+        correlation matrix is the first part of the largest, and its Cholesky factor too: one triangular system solves
+        all lengths.
+        """
+        from scipy.linalg import cholesky, solve_triangular
+
+        n_taps, n_samples = self.stretch.n_taps, self.stretch.d.shape[-1]
+        matrix = self._filtered.copy()
+        least = RANK_TOLERANCE * n_taps * self.stretch.filtered_power  # the trace bounds the largest eigenvalue
+        matrix.flat[:: len(matrix) + 1] += max(ridge, least)
+        factor = cholesky(matrix, lower=True, overwrite_a=True)
+        parts = solve_triangular(factor, self._cross, lower=True) ** 2
+        explained = np.cumsum(parts)[self.per_tap - 1 :: self.per_tap] / self.n_microphones
+        left = np.maximum(mean_square(self.stretch.d) - explained, 0.0)
+        return left * n_samples / (n_samples - self.crowding * np.arange(1, n_taps + 1))
+
+
+def _longest(n_samples: int, n_path: int, n_taps: int | None, max_taps: int, crowding: float) -> int:
     """Return the longest control filter to fit: the given one, or the longest that the record supports."""
     max_taps = as_count(max_taps, "max_taps")
-    supported = (n_samples - n_path + 2) // (SAMPLES_PER_TAP + 1)  # for each tap 10 samples with full delay lines
+    per_tap = math.ceil(SAMPLES_PER_TAP * max(crowding, 1.0)) + 1  # samples with full delay lines for each weight
+    supported = (n_samples - n_path + 2) // per_tap
     wanted = 1 if n_taps is None else as_count(n_taps, "n_taps")
     if supported < wanted:
-        needed = n_path - 2 + (SAMPLES_PER_TAP + 1) * wanted
+        needed = n_path - 2 + per_tap * wanted
         raise ValueError(
             f"reference must have at least {needed} samples for {wanted} control and {n_path} path taps, got {n_samples}; "
             "record a longer silent run"
         )
     return min(max_taps, supported) if n_taps is None else wanted
-
-
-def _error_powers(stretch: Stretch, correlations: Correlations, ridge: float) -> np.ndarray:
-    """Return the error power of the best fixed filter of 1, 2, ... `n_taps` taps, corrected for what they fit by chance.
-
-    With a ridge, the error power includes ridge |w|^2. All lengths are fitted to the same samples, so each correlation
-    matrix is the first part of the largest, and its Cholesky factor too: one triangular system solves all lengths.
-    """
-    from scipy.linalg import cholesky, solve_triangular
-
-    n_taps, n_samples = stretch.n_taps, stretch.d.size
-    least = RANK_TOLERANCE * n_taps * stretch.filtered_power  # the trace bounds the largest eigenvalue
-    factor = cholesky(correlations.matrix(0.0, max(ridge, least)), lower=True)
-    explained = np.cumsum(solve_triangular(factor, correlations.cross, lower=True) ** 2)
-    left = np.maximum(mean_square(stretch.d) - explained, 0.0)
-    return left * n_samples / (n_samples - np.arange(1, n_taps + 1))
 
 
 def _shortest(costs: np.ndarray) -> int:
@@ -233,11 +276,12 @@ def _shortest(costs: np.ndarray) -> int:
 def _burstiness(filtered: np.ndarray, fs: float, memory: float) -> float:
     """Return the mean square of the power over 10 ms, divided by that of the power over the memory; at least 1."""
     block = max(round(BURST_S * fs), 1)
-    blocks = max(min(round(memory / block), filtered.size // block), 1)  # in a memory
-    whole = filtered[: filtered.size // (blocks * block) * blocks * block]
+    blocks = max(min(round(memory / block), filtered.shape[-1] // block), 1)  # in a memory
+    squares = np.sum(filtered.reshape(-1, filtered.shape[-1]) ** 2, axis=0)
+    whole = squares[: squares.size // (blocks * block) * blocks * block]
     if not np.any(whole):
         return 1.0
-    powers = np.mean(whole.reshape(-1, blocks, block) ** 2, axis=2)
+    powers = np.mean(whole.reshape(-1, blocks, block), axis=2)
     return float(np.mean(powers**2) / np.mean(powers.mean(axis=1) ** 2))
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_nonnegative, as_positive, as_signal
+from .._validate import as_channels, as_count, as_nonnegative, as_positive, as_signal
 from ..paths.least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
 from ..paths.models import path_taps
 
@@ -160,10 +161,15 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
     No control filter can cancel the part of the disturbance that the reference does not contain, such as a second
     source. Spectra are averaged by Welch's method; with few segments the coherence comes out too high.
 
+    With several references it is the multiple coherence: what all references together explain. With several microphones
+    powers are summed over them.
+
     Parameters
     ----------
-    reference, disturbance : array_like, shape (n_samples,)
-        Reference signal and disturbance.
+    reference : array_like, shape (n_samples,) or (I, n_samples)
+        Reference signal.
+    disturbance : array_like, shape (n_samples,) or (K, n_samples)
+        Disturbance.
     fs : float
         Sampling rate in Hz.
     segment : int, default 1024
@@ -182,6 +188,8 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
     References
     ----------
     .. [1] S. M. Kuo and D. R. Morgan, "Active noise control: a tutorial review", Proc. IEEE 87(6), 1999.
+    .. [2] J. S. Bendat and A. G. Piersol, "Random data: analysis and measurement procedures", Wiley, ch. 7 (multiple
+       coherence).
 
     Examples
     --------
@@ -195,13 +203,25 @@ def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int
 
     fs = as_positive(fs, "fs", unit="Hz")
     segment = as_count(segment, "segment", minimum=8)
-    x = as_signal(reference, "reference", min_length=8 * segment)
-    d = as_signal(disturbance, "disturbance", length=x.size)
+    x, d = (
+        np.atleast_2d(as_channels(one, name)) for one, name in ((reference, "reference"), (disturbance, "disturbance"))
+    )
+    for each, name in ((x, "reference"), (d, "disturbance")):
+        for channel in each:
+            as_signal(channel, name, min_length=8 * segment, length=x.shape[1])
     frequencies, of_x = welch(x, fs, nperseg=segment)
-    of_d = welch(d, fs, nperseg=segment)[1]
+    of_d = welch(d, fs, nperseg=segment)[1].sum(axis=0)
     if not np.any(of_x) or not np.any(of_d):
         raise ValueError("reference and disturbance must not be silent: their coherence is undefined")
-    coherent = np.abs(csd(x, d, fs, nperseg=segment)[1]) ** 2 / np.maximum(of_x, np.finfo(float).tiny)
+    between = csd(x[:, np.newaxis], d, fs, nperseg=segment)[1]  # (I, K, n_frequencies)
+    if len(x) == 1:
+        coherent = np.sum(np.abs(between[0]) ** 2, axis=0) / np.maximum(of_x[0], np.finfo(float).tiny)
+    else:
+        spectra = np.moveaxis(csd(x[:, np.newaxis], x, fs, nperseg=segment)[1], -1, 0)  # (n_frequencies, I, I)
+        cross = np.moveaxis(between, -1, 0)
+        coherent = np.einsum(
+            "fik,fik->f", cross.conj(), np.linalg.pinv(spectra, rcond=1e-10, hermitian=True) @ cross
+        ).real
     floor = 1e-30
     remaining = np.clip(1 - coherent / np.maximum(of_d, np.finfo(float).tiny), floor, 1)
     overall = max(float(np.sum(remaining * of_d) / np.sum(of_d)), floor)
@@ -226,6 +246,35 @@ class Correlations:
         matrix.flat[:: self.cross.size + 1] += ridge
         return matrix
 
+    @cached_property
+    def free(self) -> np.ndarray:
+        """The weights without a penalty."""
+        return self.weights()
+
+    @cached_property
+    def balance(self) -> float:
+        """Energy of x' over that of x; 0 if one of them is silent."""
+        energies = float(np.trace(self.filtered)), float(np.trace(self.reference))
+        return energies[0] / energies[1] if min(energies) > 0 else 0.0
+
+    @cached_property
+    def basis(self) -> tuple[np.ndarray, np.ndarray]:
+        """A basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), and the shares.
+
+        Both matrices may be singular. Directions that the path does not pass, which would cost power for nothing, are left
+        out.
+        """
+        values, vectors = np.linalg.eigh(self.filtered + self.balance * self.reference)
+        kept = values > RANK_TOLERANCE * values[-1]
+        whitened = vectors[:, kept] / np.sqrt(values[kept])
+        share, turn = np.linalg.eigh(whitened.T @ self.filtered @ whitened)
+        heard = share > RANK_TOLERANCE
+        return whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
+
+    def antinoise(self, weights: np.ndarray) -> float:
+        """Return the reduction of the error power by the weights: 2 w'r - w' R_x' w."""
+        return float(weights @ (2.0 * self.cross - self.filtered @ weights))
+
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
@@ -248,12 +297,17 @@ class Stretch:
 
     def correlations(self) -> Correlations:
         """Return the correlations of the stretch."""
-        start = self.n_taps - 1
         return Correlations(
-            correlation_matrix(self.filtered, self.n_taps, start),
-            correlation_matrix(self.x, self.n_taps, start),
-            cross_correlation(self.d, self.filtered),
+            self.correlation(self.filtered), correlation_matrix(self.x, self.n_taps, self.n_taps - 1), self.cross()
         )
+
+    def correlation(self, filtered: np.ndarray) -> np.ndarray:
+        """Return the correlation matrix of a signal that takes the place of x'."""
+        return correlation_matrix(filtered, self.n_taps, self.n_taps - 1)
+
+    def cross(self) -> np.ndarray:
+        """Return r, the cross-correlation of d and x'."""
+        return cross_correlation(self.d, self.filtered)
 
     def control_signal(self, weights: np.ndarray) -> np.ndarray:
         """Return the control signal y = w*x."""
@@ -366,31 +420,24 @@ def warn_of_loss(loss: float, what: str = "the solution is not the least-squares
 
 def constrained_weights(stretch: Stretch, correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
     """Return the weights of the least error within the power, and their λ."""
-    energies = float(np.trace(correlations.filtered)), float(np.trace(correlations.reference))
     weights, penalty = np.zeros(stretch.n_taps), 0.0
-    if min(energies) > 0:
-        weights, penalty = _least_penalty(correlations, energies[0] / energies[1], rated_power)
+    if correlations.balance > 0:
+        weights, penalty = _least_penalty(correlations, rated_power)
     if penalty == 0:
         # Without a penalty, `wiener_solution` takes the filter of least norm. In directions that the path does not pass
         # that filter may waste power, and so exceed the rated power.
-        free = correlations.weights()
+        free = correlations.free
         if mean_square(stretch.control_signal(free)) <= rated_power:
             weights = free
     return weights, penalty
 
 
-def _least_penalty(correlations: Correlations, balance: float, rated_power: float) -> tuple[np.ndarray, float]:
+def _least_penalty(correlations: Correlations, rated_power: float) -> tuple[np.ndarray, float]:
     """Return the weights that solve (R_x' + λ R_x) w = r with the smallest λ >= 0 that keeps within the power, and it.
 
-    In a basis V with V.T R_x' V = diag(share) and balance V.T R_x V = diag(1 - share), each λ costs a sum over the taps
-    instead of the solution of a system. Both matrices may be singular.
+    In the basis of the correlations, each λ costs a sum over the taps instead of the solution of a system.
     """
-    values, vectors = np.linalg.eigh(correlations.filtered + balance * correlations.reference)
-    kept = values > RANK_TOLERANCE * values[-1]
-    whitened = vectors[:, kept] / np.sqrt(values[kept])
-    share, turn = np.linalg.eigh(whitened.T @ correlations.filtered @ whitened)
-    heard = share > RANK_TOLERANCE  # the path does not pass the others, which would cost power for nothing
-    basis, share = whitened @ turn[:, heard], np.minimum(share[heard], 1.0)
+    balance, (basis, share) = correlations.balance, correlations.basis
     cross = basis.T @ correlations.cross
 
     # Newton's method on 1/sqrt(power), which rises with λ and is concave and nearly straight: from λ = 0 the steps

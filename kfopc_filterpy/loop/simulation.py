@@ -40,7 +40,7 @@ def simulate(
     disturbance: Any = None,
     fs: float = DEFAULT_FS,
     amplifier: Amplifier | None = None,
-    rated_power: float | None = None,
+    rated_power: Any = None,
     sensor_noise_std: float = 0.0,
     rng: Any = None,
     switch_on_s: float = 0.0,

@@ -13,7 +13,7 @@ import pytest
 import soundfile
 
 from kfopc_filterpy import kf_pb, noise_reduction_db
-from kfopc_filterpy.bench import assess, assessment
+from kfopc_filterpy.bench import assess, assessed_runs
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import PathTolerance
@@ -210,15 +210,15 @@ def test_long_filters_run_in_float32_with_the_same_verdict_unless_it_cannot_hold
             disturbance=heard(arriving(20, 100), 10.0),
             rating=0.3,
             fs=FS,
-            n_taps=assessment.MANY_TAPS,
+            n_taps=assessed_runs.MANY_TAPS,
             beside=(),
             secondary_path_uncertainty=None,
             memory_s=memory_s,
         )
 
-    monkeypatch.setattr(assessment, "kf_pb", spy)
+    monkeypatch.setattr(assessed_runs, "kf_pb", spy)
     short, slow = on(), on(memory_s=1000.0)  # the state noise goes with the inverse square of the memory
-    monkeypatch.setattr(assessment._Plan, "precision", np.float64)
+    monkeypatch.setattr(assessed_runs.Plan, "precision", np.float64)
     exact = on()
     assert used == [np.float32, np.float64, np.float64]
     assert slow.settings.state_noise < 1e-6 * short.settings.state_noise
@@ -317,7 +317,10 @@ def test_the_levels_are_those_of_the_sounds(written):
         ({"primary": None}, "primary must be given unless there is a disturbance"),
         ({"disturbance": np.ones(7)}, "disturbance must have 8000 values, got 7"),
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
-        ({"noise": np.ones((2, 8000))}, "noise must have one channel, got 2"),
+        (
+            {"noise": noise()[:16000].reshape(2, 8000)},
+            "primary must be (K microphones, I references, taps) = (1, 2, taps)",
+        ),
         ({"rating": 0.0}, "rating must be greater than 0"),
         ({"algorithm": "KF"}, "algorithm must be one of 'KF-PB', 'KF-OPC', 'FxLMS'"),
         ({"want_db": -1.0}, "want_db must not be negative"),

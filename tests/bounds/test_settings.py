@@ -34,6 +34,7 @@ def silent_run(delay=20, n=32000, q=0.01, seed=0):
 
 
 X, D = silent_run()
+PATHS = np.random.default_rng(5).standard_normal((2, 2, 6))  # secondary paths
 
 
 # ---- Each value
@@ -56,7 +57,7 @@ def test_the_error_powers_of_all_lengths_are_those_of_separate_least_squares_fit
     x = scipy.signal.lfilter([1.0], [1.0, -pole], X[:4000])
     d = np.convolve(x, 0.9 ** np.arange(30))[:4000] + D[:4000]
     stretch = full_stretch(x, d, S, 40)
-    errors = settings._error_powers(stretch, stretch.correlations(), ridge)
+    errors = settings._Fits(x, d, S, 16000.0, 40, 40).error_powers(ridge)
     rows = np.lib.stride_tricks.sliding_window_view(stretch.filtered, 40)[:, ::-1]
     right = np.concatenate([stretch.d, np.zeros(40)])
     for n in (1, 2, 7, 24, 40):
@@ -65,6 +66,34 @@ def test_the_error_powers_of_all_lengths_are_those_of_separate_least_squares_fit
         residual = right - left @ np.linalg.lstsq(left, right)[0]
         # without a ridge there is one of 1e-11, which float64 correlations need: it costs less than 1e-6
         assert errors[n - 1] == pytest.approx(residual @ residual / (len(rows) - n), rel=1e-6)
+
+
+def test_of_several_channels_the_error_powers_are_those_of_separate_least_squares_fits_too():
+    x, paths = X[:6000].reshape(2, 3000), PATHS
+    d = np.stack([np.convolve(x[0], 0.9 ** np.arange(30))[:3000], np.convolve(x[1], 0.5 ** np.arange(30))[:3000]])
+    d = d + D[:6000].reshape(2, 3000)
+    fit = settings._Fits(x, d, paths, 16000.0, 10, 10)
+    errors, stretch = fit.error_powers(0.0), fit.stretch
+    windows = np.lib.stride_tricks.sliding_window_view(stretch.filtered, 10, axis=-1)[..., ::-1]  # (K, J, I, n, taps)
+    for n in (1, 4, 10):
+        rows = np.concatenate([np.moveaxis(one[..., :n], 2, 0).reshape(one.shape[2], -1) for one in windows])
+        right = stretch.d.ravel()
+        residual = right - rows @ np.linalg.lstsq(rows, right)[0]
+        weights = rows.shape[1] / 2  # for each microphone
+        assert errors[n - 1] == pytest.approx(residual @ residual / 2 / (len(rows) / 2 - weights), rel=1e-6)
+
+
+def test_two_loudspeakers_that_do_not_meet_get_the_settings_of_one():
+    x, d = silent_run(12)
+    alone = suggest_settings(x, d, S)
+    apart = np.zeros((2, 2, len(S)))
+    apart[[0, 1], [0, 1]] = S
+    both = suggest_settings(x, np.stack([d, d]), apart)
+    assert both.n_taps == alone.n_taps
+    assert both.measurement_noise == pytest.approx(alone.measurement_noise, rel=1e-6)
+    # Each of the two filters learns from one microphone: the mean E[x'^2] is that of one, and so are r and P0.
+    assert both.state_noise == pytest.approx(alone.state_noise, rel=1e-3)
+    assert both.initial_variance == pytest.approx(alone.initial_variance, rel=1e-3)
 
 
 def long_tail():
@@ -207,8 +236,7 @@ def test_the_noise_in_bursts_is_called_so():
         ({"reference": np.zeros(X.size)}, ValueError, "must not be silent"),
         ({"disturbance": np.zeros(X.size)}, ValueError, "disturbance must not be silent"),
         ({"disturbance": np.where(X > 2, np.nan, D)}, ValueError, "disturbance must be finite"),
-        ({"reference": np.stack([X, X])}, ValueError, "reference must be one-dimensional"),
-        ({"secondary_path": np.zeros((2, 2, 4))}, ValueError, "secondary_path must be one-dimensional"),
+        ({"secondary_path": np.zeros((2, 2, 4))}, ValueError, r"\(K microphones, n_samples\) = \(2, 32000\)"),
         ({"secondary_path": bandpass_path(32, fs=12000.0)}, ValueError, "sampled at 12000 Hz but fs is 16000 Hz"),
         ({"fs": 0.0}, ValueError, "fs must be greater than 0"),
         ({"memory_s": -1.0}, ValueError, "memory_s must be greater than 0"),

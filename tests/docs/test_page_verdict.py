@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,10 @@ def test_the_commands_say_what_the_page_says(tmp_path, monkeypatch, capsys):
     assert "exit code 0" in large
 
     page.run()
+    several = capsys.readouterr().out
+    assert "KF-PB reaches" in several
+    assert "20, 10 W into 8 ohm" in several
+    assert re.search(r"exit code [01]\n", several)
     verdicts = {name: json.loads(Path(name, "verdict.json").read_text("utf-8")) for name in ("small", "large")}
     assert verdicts["small"]["limited_by"] == "amplifier"
     assert verdicts["large"]["limited_by"] is None

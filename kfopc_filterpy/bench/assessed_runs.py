@@ -1,0 +1,147 @@
+"""How the controllers of an assessment are made, tuned and run, for one channel or several."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from kfopc_filterpy import FxLMS, OutputPowerConstraint, SimulationResult, kf_opc, kf_pb, simulate
+from kfopc_filterpy.bounds import SuggestedSettings
+
+from .limits import ChannelLimits, Limits, amplifiers, each_of, scaled
+from .registry import REGISTRY
+from .scene import Runs, Scene
+from .tuning import AllDivergedError, tune
+
+ALGORITHMS = ("KF-PB", "KF-OPC", "FxLMS")
+TUNED_ON_S = 5.0  # of the record, for FxLMS's step size
+MANY_TAPS = 192  # from which float32 pays
+LEAST_STATE_NOISE = 3e-7  # over the initial variance, for float32, which rounds that by 6e-8
+
+
+@dataclass
+class Plan:
+    """How the controllers of an assessment are made and run."""
+
+    x: np.ndarray
+    d: np.ndarray
+    s: np.ndarray
+    fs: float
+    start: int
+    limits: Limits
+    settings: SuggestedSettings
+    memory_s: float
+    uncertainty: Any
+    bar: Any
+    lock: Any = field(default_factory=threading.Lock)
+
+    def outcome(self, name: str, limited: bool) -> SimulationResult | AllDivergedError:
+        """Return an algorithm's run, or why there is none."""
+        try:
+            return self.run(name, limited=limited)
+        except AllDivergedError as error:
+            return error
+
+    def advance(self, samples: int) -> None:
+        """Move the bar, which several threads share."""
+        with self.lock:
+            self.bar.update(samples)
+
+    def run(self, name: str, *, limited: bool, freed: float = 1.0) -> SimulationResult:
+        """Run an algorithm, behind a limiter or not; `freed` multiplies the rating's power."""
+        limits = self.limits
+        if freed != 1.0:
+            announce(self.bar, self.x.shape[-1] - self.start, f"{name}, unlimited")
+            limits = scaled(limits, freed)
+        return simulate(
+            self.controller(name, limits, limited),
+            self.x,
+            disturbance=self.d,
+            secondary_path=self.s,
+            fs=self.fs,
+            amplifier=amplifiers(limits),
+            rated_power=limits.rated_power,
+            switch_on_s=self.start / self.fs,
+            progress=None if self.bar is None else self.advance,
+        )
+
+    def controller(self, name: str, limits: Limits, limited: bool) -> Any:
+        """Return a fresh controller."""
+        limiter = limits.limiter(self.fs) if limited else None
+        n_taps = self.settings.n_taps
+        several = isinstance(limits, ChannelLimits)
+        outside: dict[str, Any] = {"limiter": limiter}
+        if several:
+            outside["n_references"] = len(self.x)
+        noises: dict[str, Any] = {**self.settings.settings, "dtype": self.precision}
+        if name == "FxLMS":
+            return FxLMS(n_taps, self.s, step_size=self.step_size, **outside)
+        if name == "KF-OPC":
+            each = [OutputPowerConstraint(one.rated_power, fs=self.fs) for one in each_of(limits)]
+            return kf_opc(n_taps, self.s, constraint=each if several else each[0], **outside, **noises)
+        own = {"form": "shared gain", "path_memory_s": self.memory_s} if several else {"form": "direct", **noises}
+        return kf_pb(
+            n_taps,
+            self.s,
+            rated_power=limits.rated_power,
+            fs=self.fs,
+            secondary_path_uncertainty=self.uncertainty,
+            **outside,
+            **own,
+        )
+
+    @property
+    def precision(self) -> type:
+        """float32 for long filters, which halves the time, if the state noise is well above its rounding of P."""
+        settings = self.settings
+        is_safe = settings.state_noise > LEAST_STATE_NOISE * settings.initial_variance
+        return np.float32 if is_safe and settings.n_taps >= MANY_TAPS else np.float64
+
+    @cached_property
+    def step_size(self) -> float:
+        """Step size of FxLMS by the rule of the studies, on the start of the record."""
+        excerpt = slice(0, self.start + round(TUNED_ON_S * self.fs))
+        scene = recorded_scene(
+            self.x[..., excerpt], self.d[..., excerpt], self.s, self.fs, self.start, self.limits, self.settings
+        )
+        return REGISTRY["FxLMS"].value(scene, tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting)
+
+
+def recorded_scene(
+    x: np.ndarray,
+    d: np.ndarray,
+    s: np.ndarray,
+    fs: float,
+    start: int,
+    limits: Limits,
+    settings: SuggestedSettings,
+    unconstrained_power: float = 1.0,
+) -> Scene:
+    """Return a scene of recorded signals as they are, the control switched on at sample `start`."""
+    return Scene(
+        fs=fs,
+        secondary=s,
+        references=[x],
+        disturbances=[d],
+        rated_power=limits.rated_power,
+        n_taps=settings.n_taps,
+        sensor_noise_std=0.0,
+        switch_on_s=start / fs,
+        nse_window_s=0.005,
+        amplifier=amplifiers(limits),
+        measurement_noise=settings.measurement_noise,
+        initial_variance=settings.initial_variance,
+        unconstrained_power=unconstrained_power,
+        seeds=[0],
+    )
+
+
+def announce(bar: Any, samples: int, description: str) -> None:
+    """Add samples to a bar's total, and say what begins."""
+    if bar is not None:
+        bar.total = (bar.total or 0) + samples
+        bar.set_description(description)

@@ -1,0 +1,392 @@
+"""Assess an amplifier from recordings: check them, find the bounds, run the controllers, name the cause."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import welch
+
+from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power, suggest_settings
+from kfopc_filterpy._validate import (
+    as_channels,
+    as_choice,
+    as_count,
+    as_nonnegative,
+    as_positive,
+    as_signal,
+    per_channel,
+)
+from kfopc_filterpy.bounds import coherence_bound
+from kfopc_filterpy.loop.channels import channel_disturbances
+from kfopc_filterpy.metrics import (
+    a_weighted_level_db,
+    convergence_time_s,
+    overshoot,
+    peak_control_signal,
+    third_octave_levels_db,
+)
+from kfopc_filterpy.paths import causality_margin, frequency_response, path_uncertainty
+from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
+from kfopc_filterpy.paths.uncertainty import HALF_A_SAMPLE
+
+from .assessed_runs import ALGORITHMS, Plan, announce
+from .assessment import Assessment, Band, Ceilings, Levels, advice_on
+from .fixed_filters import FixedFilters
+from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
+from .scene import Runs, one_blas_thread
+
+LONGEST = 256
+MOST_WEIGHTS = 1024  # of all control filters together, unless a length is given: the bounds solve for all at once
+MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
+MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
+WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
+NEARLY_FREE = 1e6  # times the rated power: an amplifier without limits
+
+
+@one_blas_thread()
+def assess(
+    noise: Any,
+    primary: Any,
+    secondary: Any,
+    *,
+    rating: Any,
+    fs: float,
+    disturbance: Any = None,
+    want_db: float = 6.0,
+    algorithm: str = "KF-PB",
+    beside: Sequence[str] | None = None,
+    n_taps: int | None = None,
+    memory_s: float | None = None,
+    secondary_path_uncertainty: Any = HALF_A_SAMPLE,
+    pascal_per_unit: Any = None,
+    switch_on_s: float | None = None,
+    bar: Any = None,
+) -> Assessment:
+    """Return the verdict on an amplifier: whether it buys a noise reduction, what limits, and what to change.
+
+    With I references, J loudspeakers and K error microphones, noise reductions are those of all microphones together:
+    energies are summed over the microphones before the ratio is taken. Each loudspeaker has its own rated power, and the
+    amplifiers are enough if all of them together are. The offsets of the recordings are subtracted, because no
+    loudspeaker plays them.
+
+    Parameters
+    ----------
+    noise : array_like, shape (n_samples,) or (I, n_samples)
+        Recording of the reference microphones, with silent loudspeakers.
+    primary : array_like, shape (n_path,) or (K, I, n_path), or control.TransferFunction, optional
+        Impulse response from each reference to each error microphone. None if there is a `disturbance`.
+    secondary : array_like, shape (n_path,) or (K, J, n_path), or control.TransferFunction
+        Impulse response from each control signal to each error microphone.
+    rating : float, AmplifierRating, LoudspeakerRating, or a sequence of them
+        What the amplifier and the loudspeaker bear; a number is a rated power in squared units of the control signal. With
+        several loudspeakers one rating for all, or a sequence with an entry for each: a rating, or a sequence of ratings
+        that hold together.
+    fs : float
+        Sample rate in Hz of all of them.
+    disturbance : array_like, shape (n_samples,) or (K, n_samples), optional
+        Recording of the error microphones, made together with `noise`. It contains what the reference does not explain,
+        so that the coherence can be checked. By default it is computed by the primary path.
+    want_db : float, default 6
+        Noise reduction wanted in dB.
+    algorithm : {"KF-PB", "KF-OPC", "FxLMS"}, default "KF-PB"
+        Controller that the verdict is on. It has a limiter, which keeps the rating in every window. With several channels
+        KF-PB is the form with a shared gain.
+    beside : sequence of str, optional
+        Algorithms to run beside it, without a limiter, as published; by default the other two, but KF-OPC only if all
+        control filters together have at most 256 taps, because its cost grows with the square of them.
+    n_taps : int, optional
+        Taps of a control filter; by default `suggest_settings` finds them, at most 256, and at most 1024 in all filters
+        together.
+    memory_s : float, optional
+        Memory of the Kalman filters in s; by default 0.25 s, and 1 s with several channels, where KF-PB estimates the
+        primary paths.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        How far the true secondary path may differ from `secondary`, see `paths.path_uncertainty`; by default half a
+        sample of delay. None: it is exact.
+    pascal_per_unit : float or array_like, shape (K,), optional
+        Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound levels
+        are computed.
+    switch_on_s : float, optional
+        Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
+    bar : tqdm bar, optional
+        Bar that advances with the samples that are run; its total is set, and it is described by what is going on.
+
+    Returns
+    -------
+    Assessment
+        The verdict; its ``print`` tells it, `to_dict` gives it as JSON, `write` as a page with figures and sounds.
+
+    Raises
+    ------
+    TypeError, ValueError
+        Signals that are not finite, silent, too short for the filter, or of different lengths; paths whose channels do not
+        fit the signals; neither a primary path nor a disturbance; a rating that does not limit the mean power, or ratings
+        for another number of loudspeakers; an unknown algorithm.
+
+    Notes
+    -----
+    The cause is the first ceiling that does not reach `want_db`; see `Ceilings`. If all of them do and the run does not,
+    it is repeated with a million times the rated power: the amplifier is the cause if that reaches it (its peaks and its
+    short windows cost more than its mean power), otherwise the adaptation is.
+
+    The algorithms run side by side, on as many cores as there are. The numerical libraries get one thread meanwhile if
+    threadpoolctl is installed (it is in the extra `studies`): with filters of this size, more of them slow each other down.
+
+    If a loudspeaker's rating has an excursion, the rated power is the largest at which the best fixed filter's control
+    signal keeps it.
+
+    With several loudspeakers the required rated powers are in the proportions of the ratings. The coherence is the multiple
+    coherence of all references. The causality margin is that of each microphone's earliest loudspeaker, at the worst
+    microphone.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy.bench import assess
+    >>> from kfopc_filterpy.power import AmplifierRating
+    >>> from kfopc_filterpy.signals import band_limited_noise
+    >>> noise = band_limited_noise((100, 1000), 4.0, fs=8000, rng=1)
+    >>> primary, secondary = np.eye(64)[40], np.eye(16)[8]
+    >>> verdict = assess(noise, primary, secondary, rating=AmplifierRating(ohm=8, sine_watt=0.02), fs=8000, n_taps=64)
+    >>> print(verdict.enough, verdict.limited_by)
+    False amplifier
+    """
+    fs = as_positive(fs, "fs", unit="Hz")
+    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
+    several = s.ndim == 3
+    K, J, n_references = (*s.shape[:2], len(x)) if several else (1, 1, 1)
+    want_db = as_nonnegative(want_db, "want_db", unit="dB")
+    as_choice(algorithm, "algorithm", ALGORITHMS)
+    others = ALGORITHMS if beside is None else [as_choice(name, "beside", ALGORITHMS) for name in beside]
+    ratings = ratings_of_each(rating, J)
+    limits = limits_of(ratings, several)
+    if pascal_per_unit is not None:
+        pascal_per_unit = _pascals(pascal_per_unit, K)
+    if memory_s is None:
+        memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
+    start = switch_on_sample(switch_on_s, fs, x.shape[-1])
+    delta = path_uncertainty(secondary_path_uncertainty, s)
+    notes: list[str] = []
+    announce(bar, 0, "bounds")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", np.exceptions.RankWarning)
+        settings = suggest_settings(
+            x[..., start:],
+            d[..., start:],
+            s,
+            fs=fs,
+            memory_s=memory_s,
+            n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
+            max_taps=min(LONGEST, max(MOST_WEIGHTS // (J * n_references), 1)),
+        )
+        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, delta)
+        limits = with_excursion(limits, ratings, bounds)
+        official = bounds.within(limits.rated_power)
+        required = bounds.needed(want_db, limits.rated_power)
+    if any(issubclass(warning.category, np.exceptions.RankWarning) for warning in caught):
+        notes.append("The reference is so narrow-band that larger weights could do better than the bound.")
+    weights = J * n_references * settings.n_taps
+    if several and beside is None and weights > MOST_DIRECT_WEIGHTS and algorithm != "KF-OPC":
+        others = [name for name in others if name != "KF-OPC"]
+        notes.append(
+            f"KF-OPC is left out, because {weights} weights take it long: choose it as the algorithm, or at most "
+            f"{MOST_DIRECT_WEIGHTS // (J * n_references)} taps."
+        )
+    names = [algorithm, *(name for name in others if name != algorithm)]
+
+    plan = Plan(x, d, s, fs, start, limits, settings, memory_s, secondary_path_uncertainty, bar)
+    announce(bar, len(names) * (x.shape[-1] - start), ", ".join(names))
+    runs: dict[str, SimulationResult] = {}
+    for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
+        if isinstance(outcome, SimulationResult):
+            runs[name] = outcome
+        elif name == algorithm:
+            raise ValueError(f"{outcome}; use another algorithm") from outcome
+        else:
+            notes.append(f"{name} is left out: {outcome}.")
+    run = runs[algorithm]
+    reached = _reduction(run)
+    ceilings = Ceilings(
+        coherence_db=None if disturbance is None else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
+        time_db=bounds.time_db,
+        filter_db=bounds.filter_db,
+        path_db=bounds.path_db,
+        power_db=bounds.guarded(limits.rated_power)[1],
+    )
+    cause = None if reached >= want_db else _cause(ceilings, want_db)
+    if cause == "adaptation" and _reduction(plan.run(algorithm, limited=True, freed=NEARLY_FREE)) >= want_db:
+        cause = "amplifier"
+    if disturbance is None:
+        notes.append(
+            "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
+            "together and give the disturbance."
+        )
+    bound_share = np.max(bounds.needed(reached, limits.rated_power) / limits.rated_power)
+    assessment = Assessment(
+        enough=cause is None,
+        want_db=want_db,
+        noise_reduction_db=reached,
+        limited_by=cause,
+        advice=(),
+        notes=tuple(notes),
+        algorithm=algorithm,
+        limits=limits,
+        ceilings=ceilings,
+        bound_db=official,
+        unlimited_power=bounds.free.control_power,
+        required_rated_power=required,
+        expected_rated_power=required * _price(share_taken(run, limits), bound_share),
+        causality_margin_s=None if primary is None else _margin_s(primary, s, fs),
+        helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
+        band=_band(bounds.d, s, delta, fs),
+        levels=None if pascal_per_unit is None else _levels(run, pascal_per_unit),
+        excursion_mm=excursion_mm(ratings, run),
+        settings=settings,
+        figures={name: _figures(one, limits, fs) for name, one in runs.items()},
+        runs=runs,
+        curve=bounds.curve(limits.rated_power),
+        volts_per_unit=scale_of(ratings, "volts_per_unit", several),
+        ohm=scale_of(ratings, "ohm", several),
+        fs=fs,
+        channels=(n_references, J, K) if several else None,
+    )
+    return replace(assessment, advice=tuple(advice_on(assessment)))
+
+
+def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: float) -> tuple[np.ndarray, ...]:
+    """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
+
+    One channel of everything comes without channel axes.
+    """
+    x = _recording(noise, "noise")
+    s, _ = secondary_paths(secondary, fs=fs, name="secondary")
+    K, J, _ = s.shape
+    for k in np.flatnonzero(~np.any(s, axis=(1, 2))):
+        which = "secondary" if K == 1 else f"secondary[{k}]"
+        raise ValueError(f"{which} must not be silent: every value is 0; leave out a microphone that is not reached")
+    if disturbance is not None:
+        d = _recording(disturbance, "disturbance", length=x.shape[1])
+        if len(d) != K:
+            raise ValueError(
+                f"disturbance must have a channel for each of the {K} microphones of secondary, got {len(d)}"
+            )
+    elif primary is None:
+        raise ValueError("primary must be given unless there is a disturbance: what arrives at the error microphone?")
+    else:
+        p, _ = primary_paths(primary, fs=fs, name="primary")
+        if p.shape[:2] != (K, len(x)):
+            raise ValueError(
+                f"primary must be (K microphones, I references, taps) = ({K}, {len(x)}, taps), as secondary has {K} "
+                f"microphone(s) and noise {len(x)} channel(s), got {p.shape}; leave out the channels that do not fit"
+            )
+        d = channel_disturbances(x, p, None, fs, K)
+    if not np.any(d):
+        raise ValueError("disturbance must not be silent: every value is 0")
+    return (x[0], d[0], s[0, 0]) if (K, J, len(x)) == (1, 1, 1) else (x, d, s)
+
+
+def _recording(value: Any, name: str, length: int | None = None) -> np.ndarray:
+    """Return the channels of a recording without their offsets, (channels, n_samples)."""
+    channels = np.atleast_2d(as_channels(value, name))
+    for number, channel in enumerate(channels):
+        which = name if len(channels) == 1 else f"{name}[{number}]"
+        as_signal(channel, which, length=length)
+        if np.all(channel == channel[0]):
+            raise ValueError(f"{which} must not be silent: every value is the same")
+    return channels - channels.mean(axis=1, keepdims=True)
+
+
+def _pascals(value: Any, n_microphones: int) -> Any:
+    """Return pascals per unit, of all microphones or as a column of them."""
+    if np.ndim(value) == 0:
+        return as_positive(value, "pascal_per_unit", unit="Pa")
+    return per_channel(value, n_microphones, "microphones", "pascal_per_unit")[:, np.newaxis]
+
+
+def _margin_s(primary: Any, s: np.ndarray, fs: float) -> float:
+    p, _ = primary_paths(primary, fs=fs, name="primary")
+    return causality_margin(p if s.ndim == 3 else p[0, 0], s, fs=fs).margin_s
+
+
+def switch_on_sample(switch_on_s: float | None, fs: float, n_samples: int) -> int:
+    duration = n_samples / fs
+    time = min(0.5, 0.1 * duration) if switch_on_s is None else as_nonnegative(switch_on_s, "switch_on_s", unit="s")
+    if time >= duration:
+        raise ValueError(f"switch_on_s must be within the {duration:g} s of the noise, got {time:g} s")
+    return round(time * fs)
+
+
+def _reduction(run: SimulationResult) -> float:
+    """Return the noise reduction of a run in dB; -Inf if it diverged."""
+    reached = noise_reduction_db(run.error, run.disturbance)
+    return -np.inf if np.isnan(reached) else reached
+
+
+def _price(taken: float, of_the_bound: float) -> float:
+    """Return how many times the power of the bound the controller takes, at least 1; Inf if it reached nothing."""
+    return max(float(taken / of_the_bound), 1.0) if of_the_bound > 0 else np.inf
+
+
+def _cause(ceilings: Ceilings, want_db: float) -> str:
+    """Return the cause by the first ceiling that does not reach what is wanted."""
+    if ceilings.coherence_db is not None and ceilings.coherence_db < want_db:
+        return "coherence"
+    if ceilings.filter_db < want_db:
+        return "causality" if ceilings.time_db >= want_db else "filter"
+    if ceilings.path_db < want_db:
+        return "path"
+    return "amplifier" if ceilings.power_db < want_db else "adaptation"
+
+
+def _coherence_db(x: np.ndarray, d: np.ndarray, fs: float) -> float:
+    """Return the noise reduction that the coherence allows; segments as long as sixteen of them allow."""
+    segment = int(2 ** np.clip(np.floor(np.log2(max(x.shape[-1] / 16, 8))), 3, 14))
+    return coherence_bound(x, d, fs, segment=segment).overall_db
+
+
+def _band(d: np.ndarray, s: np.ndarray, delta: np.ndarray, fs: float) -> Band:
+    """Return where the disturbance is, and which share of it the loudspeakers together hardly reach."""
+    frequencies, powers = welch(np.atleast_2d(d), fs, nperseg=min(4096, d.shape[-1]))
+    share = powers.sum(axis=0) / powers.sum()
+    below = np.cumsum(share)
+    low, high = (float(np.interp(edge, below, frequencies)) for edge in (0.05, 0.95))
+    paths = s.reshape(-1, s.shape[-1])
+    gain = np.sum([np.abs(frequency_response(one, frequencies, fs=fs)) ** 2 for one in paths], axis=0)
+    inside = (frequencies >= low) & (frequencies <= high)
+    mean = float(np.mean(gain[inside])) if np.any(inside) else float(gain.max())
+    wrong = np.interp(frequencies, np.linspace(0.0, fs / 2, delta.size), delta) >= 1.0
+    return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()), float(share[wrong].sum()))
+
+
+def _levels(run: SimulationResult, pascal: Any) -> Levels:
+    before, after = pascal * run.disturbance, pascal * run.error
+    centres, bands = third_octave_levels_db(before, run.fs)
+    return Levels(
+        a_weighted_level_db(before, run.fs),
+        a_weighted_level_db(after, run.fs),
+        centres,
+        bands,
+        third_octave_levels_db(after, run.fs)[1],
+    )
+
+
+def _figures(run: SimulationResult, limits: Limits, fs: float) -> dict[str, Any]:
+    """Return the figures of merit of a run; with several channels also of each microphone."""
+    power = output_power(run.control_signal)
+    figures = {
+        "noise_reduction_db": noise_reduction_db(run.error, run.disturbance),
+        "output_power": power,
+        "of_rated_power": power / limits.rated_power,
+        "worst_window": overshoot(run.control_signal, limits.rated_power, fs, window_s=limits.window_s),
+        "peak_control_signal": peak_control_signal(run.control_signal, steady=1.0),
+        "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=0.1),
+        "diverged_at_s": run.diverged_at_s,
+    }
+    if run.error.ndim == 1:
+        return figures
+    pairs = zip(run.error, run.disturbance, strict=True)
+    return figures | {"noise_reduction_by_microphone_db": [noise_reduction_db(e, d) for e, d in pairs]}

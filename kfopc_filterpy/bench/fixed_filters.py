@@ -1,0 +1,125 @@
+"""What fixed filters reach on the steady half of a record, for one channel or several."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from kfopc_filterpy.bounds import budgeted_rated_power
+from kfopc_filterpy.bounds.channels import ChannelStretch, full_channel_stretch
+from kfopc_filterpy.bounds.power_constrained import weights_within
+from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
+from kfopc_filterpy.paths import guard_filter
+
+LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
+CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.5)  # rated powers of the figure, over the one that full control needs
+CHANNEL_CURVE = CURVE[::2]  # a solution for several loudspeakers takes longer
+
+
+class FixedFilters:
+    """What fixed filters reach on the steady half of a run.
+
+    Parameters
+    ----------
+    x, d : ndarray, shape (n_samples,), or (I, n_samples) and (K, n_samples)
+        Reference and disturbance.
+    s : ndarray, shape (n_path,) or (K, J, n_path)
+        Secondary path.
+    n_taps : int
+        Taps of a filter.
+    fs : float
+        Sample rate in Hz.
+    delta : ndarray
+        Uncertainty of the path, see `path_uncertainty`.
+    """
+
+    stretch: Stretch | ChannelStretch
+
+    def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, delta: np.ndarray) -> None:
+        past = s.shape[-1] + n_taps - 2  # samples that fill the delay lines
+        first = max(x.shape[-1] // 2 - past, 0)
+        self.x, self.d, self.s, self.n_taps, self.fs = x[..., first:], d[..., first:], s, n_taps, fs
+        self.several = s.ndim == 3
+        if self.several:
+            self.stretch = full_channel_stretch(self.x, self.d, s, n_taps, fs)
+        else:
+            self.stretch = full_stretch(self.x, self.d, s, n_taps)
+        self.correlations: Any = self.stretch.correlations()
+        self.free = self.stretch.solution(self.correlations.weights())
+        self.filter_db = self.free.noise_reduction_db
+        self._guarded = self._held_back(guard_filter(delta)) if np.any(delta) else self.correlations
+        self.path_db = self.stretch.solution(self._guarded.weights()).noise_reduction_db
+        ahead = sorted({round(share * n_taps) for share in LOOK_AHEAD} - {0})
+        self.ahead = {samples: self._ahead_db(samples) for samples in ahead}
+        self.time_db = max([self.filter_db, *self.ahead.values()])
+
+    def _held_back(self, guard: np.ndarray) -> Any:
+        """Return the correlations with the penalty of the guard, E[(v * W * x')^2]."""
+        penalty = self.stretch.correlation(lfilter(guard, 1.0, self.stretch.filtered))
+        return replace(self.correlations, filtered=self.correlations.filtered + penalty)
+
+    def _ahead_db(self, samples: int) -> float:
+        """Return the noise reduction of a filter that knows the reference so many samples ahead."""
+        own = self.stretch
+        later: Any = type(own)(
+            own.x[..., samples:], own.filtered[..., samples:], own.d[..., : own.d.shape[-1] - samples], self.n_taps
+        )
+        return later.solution(replace(self.correlations, cross=later.cross()).weights()).noise_reduction_db
+
+    def helpful_delay_s(self, want_db: float) -> float | None:
+        """Return the shortest time ahead tried that is enough."""
+        return next((samples / self.fs for samples, reached in self.ahead.items() if reached >= want_db), None)
+
+    def guarded(self, rated_power: Any) -> tuple[np.ndarray, float]:
+        """Return the filter within the rated power that is held back by the guard, and its noise reduction in dB."""
+        weights, _ = weights_within(self.stretch, self._guarded, rated_power)
+        return weights, self.stretch.solution(weights).noise_reduction_db
+
+    def within(self, rated_power: Any) -> float:
+        """Return the bound within the rated power, as a noise reduction in dB; warn if larger weights could do better.
+
+        Of several channels that is not known.
+        """
+        own = self.correlations
+        weights, penalty = weights_within(self.stretch, own, rated_power)
+        if isinstance(self.stretch, Stretch):
+            losses = loss_db(self.stretch, own, weights, penalty), loss_db(self.stretch, own, self.free.weights)
+            warn_of_loss(max(losses))
+        return self.stretch.solution(weights).noise_reduction_db
+
+    def needed(self, noise_reduction_db: float, rated_power: Any) -> Any:
+        """Return the rated power with which the bound reaches a noise reduction; Inf if none does, 0 below 0 dB.
+
+        Of several loudspeakers, the powers are in proportion to `rated_power`, (J,).
+        """
+        if noise_reduction_db <= 0:
+            return np.zeros(np.shape(rated_power))[()]
+        found = budgeted_rated_power(
+            noise_reduction_db,
+            self.x,
+            self.d,
+            self.s,
+            self.n_taps,
+            fs=self.fs,
+            proportions=rated_power if self.several else None,
+            beyond="inf",
+        ).rated_power
+        return found if self.several else float(found)
+
+    def curve(self, rated_power: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return rated powers about the given one and the one that full control needs, and the bound for each.
+
+        With several loudspeakers, they are multiples of all ratings.
+        """
+        own, given = self.correlations, 1.0 if self.several else rated_power
+        full = np.max(self.free.control_power / rated_power) if self.several else self.free.control_power
+        steps = CHANNEL_CURVE if self.several else CURVE
+        powers = np.unique([*steps * full, given, given / 2, given * 2])
+        unit = rated_power if self.several else 1.0
+        removed = np.array([own.antinoise(weights_within(self.stretch, own, one * unit)[0]) for one in powers])
+        microphones = len(np.atleast_2d(self.d))
+        left = self.free.disturbance_power - removed / microphones
+        return powers, np.array([reduction_db(one, self.free.disturbance_power) for one in left])

@@ -1,0 +1,212 @@
+"""What the ratings of one or several loudspeakers allow their control signals, as arrays over the loudspeakers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SimulationResult
+from kfopc_filterpy.metrics import overshoot, peak_control_signal
+from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
+
+if TYPE_CHECKING:
+    from .fixed_filters import FixedFilters
+
+EXCURSION = "loudspeaker's excursion"
+SWEEPS = 3  # over the loudspeakers: what one gives up, others may take over
+
+Rating = Any  # a number, an AmplifierRating, a LoudspeakerRating or OutputLimits
+
+
+@dataclass(frozen=True)
+class ChannelLimits:
+    """What ratings allow the control signals of several loudspeakers; the shortest window counts for all.
+
+    Attributes
+    ----------
+    each : tuple of OutputLimits
+        Limits of each loudspeaker.
+    """
+
+    each: tuple[OutputLimits, ...]
+
+    @property
+    def rated_power(self) -> np.ndarray:
+        """Rated power of each loudspeaker, (J,)."""
+        return np.array([one.rated_power for one in self.each])
+
+    @property
+    def amplitude_limit(self) -> tuple[float | None, ...]:
+        """Largest magnitude of each control signal; None if there is no limit."""
+        return tuple(one.amplitude_limit for one in self.each)
+
+    @property
+    def window_s(self) -> float:
+        """Time in seconds over which the mean squares count."""
+        return min(one.window_s for one in self.each)
+
+    @property
+    def decided_by(self) -> tuple[str, ...]:
+        """Which rating each rated power comes from."""
+        return tuple(one.decided_by for one in self.each)
+
+    def limiter(self, fs: float) -> tuple[Any, ...]:
+        """Return a limiter for each loudspeaker at a sample rate `fs` in Hz."""
+        return tuple(one.limiter(fs) for one in self.each)
+
+
+Limits = OutputLimits | ChannelLimits
+
+
+def ratings_of_each(rating: Any, n_loudspeakers: int) -> list[list[Rating]]:
+    """Return the ratings of each loudspeaker, which hold together.
+
+    One rating counts for all loudspeakers. A sequence has an entry for each of several loudspeakers: a rating, or a
+    sequence of ratings. For one loudspeaker, its ratings may also stand in the sequence themselves.
+
+    Raises
+    ------
+    ValueError
+        A sequence of another length, or one that mixes ratings of amplifiers and of loudspeakers: which of them holds
+        for which loudspeaker is not clear.
+    """
+    if not _is_sequence(rating):
+        return [[rating]] * n_loudspeakers
+    entries = list(rating)
+    if n_loudspeakers == 1 and not any(_is_sequence(one) for one in entries):
+        return [entries]
+    kinds = {kind for one in entries for kind in (AmplifierRating, LoudspeakerRating) if isinstance(one, kind)}
+    if len(entries) != n_loudspeakers or len(kinds) > 1:
+        raise ValueError(
+            f"rating must be one for all of the {n_loudspeakers} loudspeakers, or a sequence with an entry for each, got "
+            f"{len(entries)} ratings{' of amplifiers and of loudspeakers' if len(kinds) > 1 else ''}; an amplifier and a "
+            f"loudspeaker that belong together are one entry: [[amplifier, loudspeaker]] * {n_loudspeakers}"
+        )
+    return [list(one) if _is_sequence(one) else [one] for one in entries]
+
+
+def _is_sequence(value: Any) -> bool:
+    return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
+
+
+def limits_of(ratings: Sequence[Sequence[Rating]], several: bool) -> Limits:
+    """Return what ratings allow: `OutputLimits` with one channel, `ChannelLimits` with several."""
+    each = tuple(output_limits(list(one)) for one in ratings)
+    return ChannelLimits(_with_one_window(each)) if several else each[0]
+
+
+def _with_one_window(each: Sequence[OutputLimits]) -> tuple[OutputLimits, ...]:
+    window = min(one.window_s for one in each)
+    return tuple(replace(one, window_s=window) for one in each)
+
+
+def each_of(limits: Limits) -> tuple[OutputLimits, ...]:
+    """Return the limits of each loudspeaker."""
+    return limits.each if isinstance(limits, ChannelLimits) else (limits,)
+
+
+def _like(limits: Limits, each: Sequence[OutputLimits]) -> Limits:
+    return ChannelLimits(tuple(each)) if isinstance(limits, ChannelLimits) else each[0]
+
+
+def scaled(limits: Limits, share: float) -> Limits:
+    """Return limits with `share` times the rated powers, and peaks in proportion."""
+    return _like(
+        limits,
+        [
+            replace(
+                one,
+                rated_power=share * one.rated_power,
+                amplitude_limit=one.amplitude_limit and float(np.sqrt(share)) * one.amplitude_limit,
+            )
+            for one in each_of(limits)
+        ],
+    )
+
+
+def amplifiers(limits: Limits) -> Any:
+    """Return the amplifier that clips at the limit, or a list with one for each loudspeaker."""
+    each = [
+        LinearAmplifier() if one.amplitude_limit is None else HardClipAmplifier(one.amplitude_limit)
+        for one in each_of(limits)
+    ]
+    return each if isinstance(limits, ChannelLimits) else each[0]
+
+
+def share_taken(run: SimulationResult, limits: Limits) -> float:
+    """Return the least share of the limits, at most 1, that would have left a run as it is."""
+    worst = overshoot(run.control_signal, limits.rated_power, run.fs, window_s=limits.window_s)
+    peaks = np.atleast_1d(peak_control_signal(run.control_signal, steady=1.0))
+    of_peaks = [
+        0.0 if one.amplitude_limit is None else (peak / one.amplitude_limit) ** 2
+        for peak, one in zip(peaks, each_of(limits), strict=True)
+    ]
+    share = max(*np.atleast_1d(worst), *of_peaks)
+    return float(min(share, 1.0)) if np.isfinite(share) else 1.0
+
+
+def with_excursion(limits: Limits, ratings: Sequence[Sequence[Rating]], bounds: FixedFilters) -> Limits:
+    """Return limits with the largest rated powers at which the best filters keep the excursion of every loudspeaker."""
+    moving = [
+        (j, one)
+        for j, own in enumerate(ratings)
+        for one in own
+        if isinstance(one, LoudspeakerRating) and one.x_max_mm is not None
+    ]
+    for _ in range(1 if len(ratings) == 1 else SWEEPS):
+        before = limits
+        for j, one in moving:
+            limits = _keeping(limits, j, one, bounds)
+        if limits is before:
+            break
+    return limits
+
+
+def _keeping(limits: Limits, j: int, rating: LoudspeakerRating, bounds: FixedFilters) -> Limits:
+    """Return limits with which the best filter keeps the excursion of loudspeaker j, the others' as they are."""
+    from scipy.optimize import brentq
+
+    each = each_of(limits)
+
+    def excess(log_power: float) -> float:
+        tried = [*each[:j], replace(each[j], rated_power=float(np.exp(log_power))), *each[j + 1 :]]
+        weights = bounds.guarded(_like(limits, tried).rated_power)[0]
+        y = np.atleast_2d(bounds.stretch.control_signal(weights))[j]
+        return float(np.log(np.mean(y**2) / rating.excursion_rated_power(y, bounds.fs)))
+
+    high = np.log(each[j].rated_power)
+    if excess(high) <= 1e-3 * (each[j].decided_by == EXCURSION):
+        return limits
+    low = high - 1.0
+    while excess(low) > 0:
+        low -= 2.0
+    kept = replace(each[j], rated_power=float(np.exp(brentq(excess, low, high, xtol=1e-4))), decided_by=EXCURSION)
+    return _like(limits, [*each[:j], kept, *each[j + 1 :]])
+
+
+def excursion_mm(ratings: Sequence[Sequence[Rating]], run: SimulationResult) -> float | None:
+    """Return the largest excursion of a run, of any loudspeaker whose rating knows it."""
+    played = np.atleast_2d(np.nan_to_num(run.amplifier_output))
+    moved = [
+        float(np.abs(one.displacement_mm(played[j], run.fs)).max())
+        for j, own in enumerate(ratings)
+        for one in own
+        if isinstance(one, LoudspeakerRating) and one.x_max_mm is not None
+    ]
+    return max(moved, default=None)
+
+
+def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> Any:
+    """Return `volts_per_unit` or `ohm` of the first rating that has volts; of several loudspeakers as (J,).
+
+    None if a loudspeaker has no such rating, or a curve instead of a number.
+    """
+    found: list[Any] = [
+        next((getattr(one, name) for one in own if hasattr(one, "volts_per_unit")), None) for own in ratings
+    ]
+    if not several:
+        return found[0]
+    return np.array(found, dtype=float) if all(np.ndim(one) == 0 and one is not None for one in found) else None
