@@ -2,10 +2,10 @@
 
 A file has four parts::
 
-    kfopc checkpoint 1\n                            the format
-    {"package": ..., "nodes": [...], ...}\n          one line of JSON: versions, and the object as a list of nodes
+    kfopc checkpoint 1 4711\n                the format, and the number of bytes of the JSON
+    {"package": ..., "nodes": [...], ...}\n  versions, and the object as a list of nodes
     zeros up to a multiple of 64 bytes, memory of the arrays
-    64 hexadecimal digits                           SHA-256 of everything before them
+    64 hexadecimal digits                    SHA-256 of everything before them
 
 What an object is, its ``__getstate__`` says, as for a copy. A node is an object, a container or an array; whatever is
 shared in memory is one node. An array is stored by the place of its elements in the file, with its strides. Arrays that
@@ -19,6 +19,7 @@ claim more memory than it has.
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
 import json
 import math
@@ -216,13 +217,15 @@ class _Writer:
 
     def _object(self, value: Any, where: str) -> dict[str, Any]:
         kind = type(value)
-        plain = kind.__reduce_ex__ is object.__reduce_ex__ and kind.__reduce__ is object.__reduce__
-        if not hasattr(value, "__dict__") or not plain or hasattr(kind, "__setstate__") or isinstance(value, type):
+        try:
+            make, arguments, state, *items = value.__reduce_ex__(2)
+        except (TypeError, ValueError):  # of numbers or strings, or with a part that is not Python's
+            make = None
+        if make is not copyreg.__newobj__ or arguments != (kind,) or any(items) or hasattr(kind, "__setstate__"):  # type: ignore[attr-defined]
             raise TypeError(
                 f"{where} cannot be saved: it is a {kind.__name__}, and a file holds numbers, strings, containers, "
                 "numpy arrays and generators, functions with a name, and objects with attributes"
             )
-        state = value.__getstate__()
         attributes, slots = state if isinstance(state, tuple) else (state, None)
         return {
             "kind": "object",
@@ -274,7 +277,7 @@ def _encoded(value: Any) -> Iterator[bytes]:
             f"{type(value).__name__} cannot be saved: its values outside arrays take {len(line)} bytes, and at most "
             f"{MOST_HEADER} can be loaded again; store long lists of numbers as numpy arrays"
         )
-    start = MAGIC + f"{FORMAT}\n".encode() + line + b"\n"
+    start = MAGIC + f"{FORMAT} {len(line)}\n".encode() + line + b"\n"
     return chain([start + bytes(-len(start) % LINE)], _contents(places))
 
 
@@ -421,18 +424,18 @@ def _read(path: Path) -> np.ndarray:
 
 def _opened(path: Path, memory: np.ndarray) -> tuple[dict[str, Any], np.ndarray]:
     """Return the header of a file and the data behind it, if this version reads them."""
-    text = memory[: MOST_HEADER + 2 * LINE].tobytes()
-    line = text.partition(b"\n")[0]
-    if line != MAGIC + f"{FORMAT}".encode():
+    line = memory[:LINE].tobytes().partition(b"\n")[0]
+    number, _, size = line[len(MAGIC) :].partition(b" ")
+    if number != str(FORMAT).encode():
         raise CheckpointError(
-            f"{path} has the format {line[len(MAGIC) : 60].decode(errors='replace')}, and {PACKAGE} "
-            f"{_package_version()} reads format {FORMAT}: install the version of the package that wrote it"
+            f"{path} has the format {number.decode(errors='replace')}, and {PACKAGE} {_package_version()} reads format "
+            f"{FORMAT}: install the version of the package that wrote it"
         )
-    end = text.find(b"\n", len(line) + 1)
-    if end < 0:
-        raise CheckpointError(f"{path} claims a header of more than {MOST_HEADER} bytes, which `save` does not write")
     try:
-        header = json.loads(text[len(line) + 1 : end])
+        begin, end = len(line) + 1, len(line) + 1 + int(size)
+        if not 0 <= int(size) <= min(MOST_HEADER, memory.size - DIGEST - begin):
+            raise ValueError(f"a header of {int(size)} bytes")
+        header = json.loads(memory[begin:end].tobytes())
         written = header["package"]
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise _not_ours(path, error) from error
@@ -441,8 +444,7 @@ def _opened(path: Path, memory: np.ndarray) -> tuple[dict[str, Any], np.ndarray]
             f"{path} was written by {PACKAGE} {written}, and this is {_package_version()}, which may continue in "
             f"another way: install {PACKAGE} {written}, or begin anew"
         )
-    begin = end + 1 + -(end + 1) % LINE
-    return header, memory[begin:-DIGEST]
+    return header, memory[end + 1 + -(end + 1) % LINE : -DIGEST]
 
 
 def _not_ours(path: Path, error: Exception) -> CheckpointError:
