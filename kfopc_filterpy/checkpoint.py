@@ -267,7 +267,7 @@ def _encoded(value: Any) -> Iterator[bytes]:
         "package": _package_version(),
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "libraries": {name: version(name) for name in ("numpy", "scipy", "numba", "filterpy")},
+        "libraries": _libraries(),
         "root": root,
         "nodes": writer.nodes,
     }
@@ -601,6 +601,12 @@ def _modules() -> frozenset[str]:
     """Return the names of the modules in `FOLDERS`."""
     here = Path(__file__).parent
     return frozenset(f"{PACKAGE}.{f}.{m.name}" for f in FOLDERS for m in pkgutil.iter_modules([str(here / f)]))
+
+
+@cache  # looking them up takes longer than all else but the disk
+def _libraries() -> dict[str, str]:
+    """Return the versions of what computes."""
+    return {name: version(name) for name in ("numpy", "scipy", "numba", "filterpy")}
 
 
 def _package_version() -> str:
