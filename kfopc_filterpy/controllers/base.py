@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
+from ..checkpoint import Checkpointed
 from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
 from ..kernels.holding import Held
 from ..paths.channels import is_path_matrix, secondary_paths
@@ -101,7 +102,7 @@ def listening(controller: Any) -> Any:
     return controller
 
 
-class WrappedController(BlockProcessing):
+class WrappedController(BlockProcessing, Checkpointed):
     """Base class of a controller that wraps another one and passes on its attributes."""
 
     def __init__(self, controller: Controller) -> None:
@@ -127,7 +128,7 @@ class WrappedController(BlockProcessing):
         return {}
 
 
-class FilteredReferenceController(BlockProcessing):
+class FilteredReferenceController(BlockProcessing, Checkpointed):
     """Delay lines, powers and filtered reference that the built-in controllers share.
 
     A subclass sets `_state`, which begins with `_common()`, and registers the step for its type (see `step`).
@@ -474,7 +475,7 @@ class FilteredReferenceController(BlockProcessing):
         return self._y
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for a copy, which holds a state of its own."""
+        """Return the attributes for a copy or a file, which holds a state of its own."""
         return {name: value for name, value in vars(self).items() if name not in ("_holding", "_rows")}
 
     def _held(self) -> Held:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +34,32 @@ class HealthEvent:
     time_s: float
     what: str
     change_db: float = np.nan
+
+
+class Recent:
+    """The newest samples of one channel or several, up to a number of them."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._count = most, 0
+        self._samples = np.empty(0)  # a ring, (most, channels)
+
+    def add(self, sample: Any) -> None:
+        """Add a sample, a number or (channels,)."""
+        if self._count == 0:
+            self._samples = np.empty((self._most, *np.shape(sample)))
+        self._samples[self._count % self._most] = sample
+        self._count += 1
+
+    @property
+    def samples(self) -> np.ndarray:
+        """The samples in order of time, (n,) or (channels, n)."""
+        if self._count < self._most:
+            return self._samples[: self._count].T
+        return np.roll(self._samples, -self._count, axis=0).T
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._count = 0
 
 
 class MonitoredController(WrappedController):
@@ -115,9 +139,8 @@ class MonitoredController(WrappedController):
         self._silent_ratio = np.nan  # power of the error over that of the reference, without control
         self._suspicious_ratio = np.nan  # the same with control, while a test is under way
         self._muted_for = self._window  # samples left of a silence
-        self._after_silence: Callable[[float], None] = self._learn
-        self._references: deque[Any] = deque(maxlen=self._window)
-        self._errors: deque[Any] = deque(maxlen=self._window)
+        self._after_silence = "learn"  # or "judge" or "retry": which decision follows the silence
+        self._references, self._errors = Recent(self._window), Recent(self._window)
         self._begin_window()
 
     @property
@@ -145,8 +168,8 @@ class MonitoredController(WrappedController):
     def update(self, error: Any) -> None:
         """Pass the `error` e(n) on to the controller, and compare powers at the end of a window."""
         if self.muted:
-            self._references.append(self._newest)
-            self._errors.append(error)
+            self._references.add(self._newest)
+            self._errors.add(error)
         else:
             self.controller.update(error)
         self._samples += 1
@@ -178,7 +201,7 @@ class MonitoredController(WrappedController):
         allowed = self._silent_ratio * 10.0 ** (self.margin_db / 10.0)
         if np.isfinite(ratio) and not ratio <= allowed < np.inf:
             self._suspicious_ratio = ratio
-            self._muted_for, self._after_silence = self._window, self._judge
+            self._muted_for, self._after_silence = self._window, "judge"
 
     def _judge(self, ratio: float) -> None:
         """Stop the control if the noise is quieter without it."""
@@ -198,7 +221,7 @@ class MonitoredController(WrappedController):
     def _stop(self) -> None:
         """Start a pause, after which a fresh controller begins."""
         self.controller = deepcopy(self._fresh)
-        self._muted_for, self._after_silence = self._pause, self._retry
+        self._muted_for, self._after_silence = self._pause, "retry"
         self._pause = min(2 * self._pause, round(LONGEST_PAUSE * self._first_pause))
         self._references.clear()
         self._errors.clear()
@@ -212,12 +235,12 @@ class MonitoredController(WrappedController):
 
     def _end_silence(self) -> None:
         """Let the controller follow what was heard in silence, and decide."""
-        self._follow(np.array(self._references).T, np.array(self._errors).T)
+        self._follow(self._references.samples, self._errors.samples)
         self._references.clear()
         self._errors.clear()
         ratio = _ratio(self._error_energy, self._reference_energy)
         self._begin_window()
-        self._after_silence(ratio)
+        {"learn": self._learn, "judge": self._judge, "retry": self._retry}[self._after_silence](ratio)
 
     def _follow(self, references: np.ndarray, errors: np.ndarray) -> None:
         listen = getattr(self.controller, "listen", None)

@@ -34,6 +34,8 @@ class RandomWalkCovariance:
     are full arrays if that is no longer possible.
     """
 
+    _held: Held | None = None
+
     def __init__(self, P: np.ndarray, dtype: Any = np.float64) -> None:
         self.arrays: Covariance = new_covariance(0.5 * (P + P.T), dtype)
         self.prior: Moment | np.ndarray = TRIANGLE
@@ -42,7 +44,6 @@ class RandomWalkCovariance:
         self._shown: list[tuple[np.ndarray, np.ndarray]] = []
         self._largest = float(np.finfo(dtype).max)
         self._others_read = False  # other filters share the arrays
-        self._held: Held | None = None
 
     def share(self, arrays: Covariance) -> None:
         """Continue from arrays that other filters share; a filter copies them before its first step."""
@@ -83,10 +84,14 @@ class RandomWalkCovariance:
                 return P
         return None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for a copy or a file, which holds arrays of its own."""
+        return {name: value for name, value in vars(self).items() if name != "_held"}
+
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
         other = memo[id(self)] = object.__new__(type(self))
-        other.__dict__.update(deepcopy({k: v for k, v in vars(self).items() if k not in ("arrays", "_held")}, memo))
-        other.arrays, other._held = copy_covariance(self.arrays), None
+        other.__dict__.update(deepcopy(self.__getstate__() | {"arrays": None}, memo))
+        other.arrays = copy_covariance(self.arrays)
         return other
 
     def replaced(self, P: np.ndarray) -> RandomWalkCovariance:

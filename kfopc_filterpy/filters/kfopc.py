@@ -6,14 +6,16 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from copy import deepcopy
 from math import sqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
+from ..checkpoint import Checkpointed
 from .guards import (
     SILENT_REFERENCE,
+    State,
     all_or_nothing,
     checked_measurement,
     require_matrix,
@@ -59,7 +61,7 @@ def _as_matrix(value: Any, name: str) -> Any:
     return as_real_array(value, name) if isinstance(value, list | tuple) else value
 
 
-class KFOPC(KalmanFilter):
+class KFOPC(KalmanFilter, Checkpointed):
     r"""Kalman filter with output power constraint, a drop-in `filterpy.kalman.KalmanFilter`.
 
     The measurement is scaled by the constraint factor before it corrects the state (eq. 9),
@@ -148,6 +150,8 @@ class KFOPC(KalmanFilter):
 
     if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
         __slots__ = ("_batch_references", "_constraint", "_default_H", "_lifted", "_unconstrained_factor")
+
+    _written_into: ClassVar[tuple[str, ...]] = ("_constraint",)  # in slots
 
     x: Any  # assigned by filterpy, like the others
     y: Any
@@ -484,7 +488,7 @@ class KFOPC(KalmanFilter):
         for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
             if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
                 raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
-        before = self.__getstate__()
+        before = self._snapshot()
         self._batch_references = references
         try:
             result = super().batch_filter(_with_none_for_masked(zs), Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
@@ -523,10 +527,21 @@ class KFOPC(KalmanFilter):
             self._mahalanobis = sqrt(np.dot(np.dot(self.y.T, self.SI), self.y).item())
         return self._mahalanobis
 
-    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the state for a copy; the powers are updated in place, so even a shallow copy needs its own."""
+    def __getstate__(self) -> State:
+        """Return the state for a deep copy or a file, without what is made anew when it is needed."""
         attributes, private = state_of(self)
-        return attributes, private | {"_constraint": deepcopy(self._constraint), "_batch_references": None}
+        return attributes, private | {"_batch_references": None}
+
+    def __copy__(self) -> Self:
+        """Return a copy that shares no array that a step writes into."""
+        other = object.__new__(type(self))
+        restore(other, self._snapshot())
+        return other
+
+    def _snapshot(self) -> State:
+        """Return the state with copies of what a step writes into."""
+        attributes, private = self.__getstate__()
+        return attributes, private | {name: deepcopy(private[name]) for name in self._written_into}
 
     def __repr__(self) -> str:
         if self.dim_x > MOST_STATES_SHOWN:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -62,6 +61,8 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     >>> kf.control_filter.round(1)
     array([0.9, 0.3])
     """
+
+    _written_into = (*RandomWalkKFOPC._written_into, "_budget")
 
     if not TYPE_CHECKING:
         __slots__ = ("_budget",)
@@ -225,8 +226,3 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
 
     def _require_constraint(self, name: str) -> OutputPowerConstraint:
         raise ValueError(f"{name} is not used by a power budget, which uses the correlations of the signals")
-
-    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the state for a copy, with a budget of its own."""
-        attributes, private = super().__getstate__()
-        return attributes, private | {"_budget": deepcopy(self._budget)}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from copy import deepcopy
 from math import isfinite, log, pi
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from ..kernels.covariance import Covariance, project_covariance, update_weights
 from ..kernels.records import new_record
 from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
 from .covariance import RandomWalkCovariance, require_covariance
-from .guards import SILENT_REFERENCE, checked_measurement, require_observation
+from .guards import SILENT_REFERENCE, State, checked_measurement, require_observation
 from .kfopc import KFOPC
 
 # Outcomes of `correct`.
@@ -124,6 +123,7 @@ class RandomWalkKFOPC(KFOPC):
     array([[16.]])
     """
 
+    _written_into = (*KFOPC._written_into, "_covariance", "_numbers")
     _log_likelihood: Any
 
     if not TYPE_CHECKING:  # Out of `Saver`'s records, filterpy's own private attributes included.
@@ -169,11 +169,10 @@ class RandomWalkKFOPC(KFOPC):
         variance = as_nonnegative(initial_variance, "initial_variance")
         self._covariance = RandomWalkCovariance(variance * np.eye(n_taps), precision)
 
-    def __getstate__(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the state for a copy, with its own arrays and no views (copied views would be writeable)."""
+    def __getstate__(self) -> State:
+        """Return the state for a deep copy or a file, without views (copied views would be writeable)."""
         attributes, private = super().__getstate__()
-        own = {"_views": {}, "_covariance": deepcopy(self._covariance), "_numbers": deepcopy(self._numbers)}
-        return attributes, private | own
+        return attributes, private | {"_views": {}}
 
     def _noises(self) -> list[str]:
         state_noise = "full Q" if self.state_noise is None else f"state noise {self.state_noise:g}"

@@ -5,82 +5,15 @@ from __future__ import annotations
 import inspect
 import itertools
 import pickle
-from typing import Any
 
 import numpy as np
 import pytest
 from helpers.comparing import assert_same_run, numbers_of
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, noises, run
+from helpers.controllers import KALMAN, MAKERS, VARIANTS, made
+from helpers.loop import AMPLIFIERS, FEEDBACK, N_TAPS, S_HAT, noises, run
 
 import kfopc_filterpy
-from kfopc_filterpy import (
-    ClippingFxLMS,
-    DiagonalKalman,
-    FastArrayKalman,
-    FxLMS,
-    FxNLMS,
-    LeakyFxLMS,
-    MOVFxLMS,
-    OptimalLeakyFxLMS,
-    OutputLimiter,
-    OutputPowerConstraint,
-    RescalingFxLMS,
-    TwoGradientFxLMS,
-    fx_rls,
-    kf_anc,
-    kf_opc,
-    kf_opc_repaired,
-    kf_pb,
-)
-
-KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
-
-
-def constraint(**settings: Any) -> OutputPowerConstraint:
-    return OutputPowerConstraint(0.3, **{"fs": FS, "memory_s": MEMORY_S} | settings)
-
-
-MAKERS: dict[str, Any] = {
-    "KF-ANC": lambda **o: kf_anc(N_TAPS, S_HAT, **KALMAN, **o),
-    "KF-ANC, float32": lambda **o: kf_anc(N_TAPS, S_HAT, dtype=np.float32, **KALMAN, **o),
-    "KF-OPC": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
-    "KF-OPC repaired": lambda **o: kf_opc_repaired(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "KF-PB": lambda **o: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, memory_s=0.05, **KALMAN, **o),
-    "fxRLS": lambda **o: fx_rls(N_TAPS, S_HAT, forgetting=0.999, **o),
-    "diagonal KF": lambda **o: DiagonalKalman(N_TAPS, S_HAT, **KALMAN, **o),
-    "diagonal KF-OPC": lambda **o: DiagonalKalman(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "fast-array KF": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, **o),
-    "fast-array KF-OPC": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, constraint=constraint(), **o),
-    "FxLMS": lambda **o: FxLMS(N_TAPS, S_HAT, step_size=MU, **o),
-    "FxNLMS": lambda **o: FxNLMS(N_TAPS, S_HAT, step_size=0.1, **o),
-    "leaky": lambda **o: LeakyFxLMS(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),
-    "optimal leaky": lambda **o: OptimalLeakyFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
-    "MOV": lambda **o: MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
-    "MOV, modified": lambda **o: MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), modified=True, **o),
-    "two-gradient": lambda **o: TwoGradientFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-    "re-scaling": lambda **o: RescalingFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-    "clipping": lambda **o: ClippingFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
-}
-KNOWS_AN_AMPLIFIER = [
-    name
-    for name in MAKERS
-    if not name.startswith(("FxLMS", "FxNLMS", "leaky", "two-gradient", "re-scaling", "clipping"))
-]
-VARIANTS = [(name, "plain") for name in MAKERS]
-# The limiter acts on what they emit, alike for all; these adapt to it in different ways. Each is compiled anew for it.
-LIMITED = ("KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "FxLMS", "MOV", "two-gradient", "re-scaling", "clipping")
-VARIANTS += [(name, "limiter") for name in LIMITED]
-VARIANTS += [(name, "known amplifier") for name in KNOWS_AN_AMPLIFIER]
-
-
-def made(name: str, variant: str) -> Any:
-    options: dict[str, Any] = {}
-    if variant == "limiter":
-        options["limiter"] = OutputLimiter(0.05, fs=FS, window_s=0.01)
-    if variant == "known amplifier":
-        options["amplifier"] = AMPLIFIERS["soft"][0]
-    return MAKERS[name](**options)
+from kfopc_filterpy import OutputLimiter, kf_opc
 
 
 @pytest.mark.parametrize(("name", "variant"), VARIANTS)

@@ -1,0 +1,254 @@
+"""Checkpoints of every controller: saved at any sample, it continues to the bit."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pkgutil
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.checkpoints import N, Room, assert_same_contents
+from helpers.comparing import assert_same_run
+from helpers.controllers import ALL, OWN, SEVERAL, OwnController, made, own_amplifier
+from helpers.loop import S_HAT, run
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import kfopc_filterpy
+from kfopc_filterpy import FxLMS, controllers, kf_anc, simulate
+from kfopc_filterpy.bench import algorithms, make_controller, make_scene
+from kfopc_filterpy.checkpoint import Checkpointed
+from kfopc_filterpy.controllers import MonitoredController, PathTracker, VirtualMicrophones
+from kfopc_filterpy.controllers.base import FilteredReferenceController, WrappedController
+from kfopc_filterpy.controllers.blocks import BlockController
+from kfopc_filterpy.controllers.lms import LMSController
+from kfopc_filterpy.controllers.primary_paths import PrimaryPathController
+
+BASES = {FilteredReferenceController, WrappedController, BlockController, LMSController, PrimaryPathController}
+
+
+def again(controller: Any, folder: Path) -> Any:
+    """Save a controller and load it."""
+    path = folder / "run.kfopc"
+    controller.save(path)
+    return type(controller).load(path, trusted=OWN)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_controller_that_is_saved_at_any_sample_continues_to_the_bit(
+    name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("saved")
+
+    @given(samples=st.integers(0, N - 30), halfway=st.booleans())
+    @example(samples=0, halfway=False)
+    @settings(max_examples=5)
+    def check(samples: int, halfway: bool) -> None:
+        controller = ALL[name]()
+        room = Room(controller)
+        room.run(controller, samples)
+        if halfway:  # the control signal was emitted, the error is still to come
+            room.play(controller)
+        loaded, twin = again(controller, folder), room.copy()
+        assert type(loaded) is type(controller)
+        assert_same_contents(loaded, controller)
+        if halfway:
+            room.hear(controller)
+            twin.hear(loaded)
+        rest = N - room.n
+        np.testing.assert_array_equal(twin.run(loaded, rest), room.run(controller, rest))
+        assert_same_contents(loaded, controller)
+
+    check()
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if not name.endswith("many")])
+def test_it_continues_at_compiled_speed_too(name: str, tmp_path: Path) -> None:
+    if ALL[name]().__class__ is VirtualMicrophones:
+        pytest.skip("takes several channels")
+    controller = ALL[name]()
+    run(controller, n=100, on=20)
+    loaded = again(controller, tmp_path)
+    assert_same_run(run(loaded, n=200), run(controller, n=200))
+    assert_same_contents(loaded, controller)
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_so_do_several_channels(name: str, tmp_path: Path) -> None:
+    controller = SEVERAL[name]()
+    room = Room(controller)
+    plant = {"secondary_path": np.moveaxis(room.path, 0, 2), "fs": 8000.0}
+    simulate(controller, room.x[:100].T, disturbance=room.d[:100].T, switch_on_s=0.005, **plant)
+    loaded = again(controller, tmp_path)
+    runs = [simulate(one, room.x[100:].T, disturbance=room.d[100:].T, **plant) for one in (loaded, controller)]
+    assert_same_run(*runs)
+    assert_same_contents(loaded, controller)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_every_algorithm_of_the_registry_continues_to_the_bit(several: bool, tmp_path: Path) -> None:
+    x = np.random.default_rng(1).standard_normal((1, 2000) if several else 2000)
+    primary, secondary = np.array([0.0, 0.0, 1.0, 0.5]), np.array([0.0, 0.8, -0.3])
+    if several:
+        primary, secondary = primary[None, None], secondary * np.array([[1.0, 0.3], [0.2, 1.0]])[..., None]
+        primary = np.repeat(primary, 2, axis=0)
+    rated = np.array([0.5, 0.5]) if several else 1.0
+    settings = {"fs": 16000.0, "rated_power": rated, "power_multiple": 2.0, "n_taps": 8, "switch_on_s": 0.02}
+    scene = make_scene({1: x}, primary, secondary, **settings)
+    found = algorithms(several_channels=several)
+    assert len(found) > 5
+    for name, algorithm in found.items():
+        controller = make_controller(scene, name, algorithm.grid[0])
+        scene.run(controller)
+        loaded = again(controller, tmp_path)
+        assert_same_run(scene.run(loaded), scene.run(controller))
+        assert_same_contents(loaded, controller)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_deep_copy_continues_too(name: str) -> None:
+    controller = ALL[name]()
+    room = Room(controller)
+    room.run(controller, 150)
+    twin, other = copy.deepcopy(controller), room.copy()
+    np.testing.assert_array_equal(other.run(twin, 200), room.run(controller, 200))
+    for reading in ("control_filter", "power_weight", "constraint_factor", "rated_power"):
+        np.testing.assert_array_equal(getattr(twin, reading, 0), getattr(controller, reading, 0))
+
+
+def test_the_rated_power_of_a_copy_of_kf_pb_can_be_assigned() -> None:
+    """Its budget was copied twice: what was assigned and read was not what ran."""
+    controller = made("KF-PB", "plain")
+    room = Room(controller)
+    room.run(controller, 200)
+    twin, other = copy.deepcopy(controller), room.copy()
+    for one in (controller, twin):
+        one.estimator.rated_power = 1e-4
+    np.testing.assert_array_equal(other.run(twin, 200), room.run(controller, 200))
+    np.testing.assert_array_equal(twin.control_filter, controller.control_filter)
+
+
+def test_a_path_tracker_that_has_changed_its_path_continues_to_the_bit(tmp_path: Path) -> None:
+    def fresh() -> PathTracker:
+        return PathTracker(FxLMS(8, [0.0, 1.0, 0.0], step_size=0.005), rng=1, fs=2000.0)
+
+    x, noise = np.random.default_rng(0).standard_normal((2, 16000))
+    plant = {"secondary_path": [0.0, 0.0, -0.8], "fs": 2000.0}
+    tracker, d = fresh(), np.roll(x, 5) + 0.1 * noise
+    simulate(tracker, x[:9000], disturbance=d[:9000], **plant)
+    assert tracker.changes  # it is no beginner
+    loaded = again(tracker, tmp_path)
+    assert loaded.changes == tracker.changes
+    runs = [simulate(one, x[9000:], disturbance=d[9000:], **plant) for one in (loaded, tracker)]
+    assert_same_run(*runs)
+    assert_same_contents(loaded, tracker)
+
+
+def test_a_monitor_is_saved_in_every_state(tmp_path: Path) -> None:
+    """It fails, pauses, tries again and fails: at each sample, what was loaded continues alike."""
+    controller = ALL["MonitoredController, wrong path"]()
+    room, seen = Room(controller), set()
+    for _ in range(N // 10):
+        loaded, twin = again(controller, tmp_path), room.copy()
+        seen.add((controller.muted, controller._after_silence))
+        np.testing.assert_array_equal(twin.run(loaded, 10), room.run(controller, 10))
+        assert repr(loaded.health) == repr(controller.health)  # a NaN does not equal itself
+    assert seen >= {(True, "learn"), (True, "judge"), (True, "retry"), (False, "learn"), (False, "retry")}
+
+
+def test_a_monitor_does_not_keep_the_arrays_that_it_is_given() -> None:
+    """A process may write each sample into the same array."""
+    fresh, reused = (ALL["MonitoredController, many"]() for _ in range(2))
+    room, buffer = Room(fresh), np.empty(3)
+    for x, d in zip(room.x, room.d, strict=True):
+        fresh.control_signal(x)
+        fresh.update(d)
+        buffer[:] = d
+        reused.control_signal(x)
+        reused.update(buffer)
+        buffer[:] = np.nan
+    np.testing.assert_array_equal(fresh.weights, reused.weights)
+
+
+# Classes.
+
+
+def concrete() -> set[type]:
+    """Every class of the package that can be saved and is no mere base."""
+    for folder in ("filters", "controllers"):
+        package = import_module(f"kfopc_filterpy.{folder}")
+        for module in pkgutil.iter_modules(package.__path__):
+            import_module(f"kfopc_filterpy.{folder}.{module.name}")
+    found, left = set(), [Checkpointed]
+    while left:
+        derived = [kind for kind in left.pop().__subclasses__() if kind.__module__.startswith("kfopc_filterpy.")]
+        found |= set(derived)
+        left += derived
+    return found - BASES
+
+
+def test_every_controller_of_the_package_is_saved_by_these_tests() -> None:
+    wanted = {kind for kind in concrete() if kind.__module__.startswith("kfopc_filterpy.controllers")}
+    assert {type(make()) for make in ALL.values()} >= wanted
+
+
+def test_every_function_and_class_of_several_channels_is_among_them() -> None:
+    for name in (*kfopc_filterpy.__all__, *controllers.__all__):
+        offered = getattr(kfopc_filterpy, name, None) or getattr(controllers, name)
+        if callable(offered) and "n_references" in inspect.signature(offered).parameters:
+            kinds = {type(make()).__name__ for make in SEVERAL.values()}
+            assert name in kinds or any(key.split(",")[0] == name for key in SEVERAL), name
+
+
+def test_a_base_class_loads_what_is_derived_from_it(tmp_path: Path) -> None:
+    controller = made("KF-PB", "plain")
+    controller.save(tmp_path / "run.kfopc")
+    assert isinstance(kfopc_filterpy.KalmanController.load(tmp_path / "run.kfopc"), type(controller))
+
+
+class Mine(FxLMS):
+    """A user's subclass, which counts."""
+
+    def __init__(self) -> None:
+        super().__init__(4, S_HAT, step_size=0.01)
+        self.heard = 0
+
+    def update(self, error: float) -> None:
+        self.heard += 1
+        super().update(error)
+
+
+def test_a_users_subclass_is_loaded_by_its_own_load_or_if_it_is_trusted(tmp_path: Path) -> None:
+    controller, path = Mine(), tmp_path / "run.kfopc"
+    Room(controller).run(controller, 20)
+    controller.save(path)
+    loaded = Mine.load(path)
+    assert (type(loaded), loaded.heard) == (Mine, 20)
+    assert type(FxLMS.load(path, trusted=[Mine])) is Mine
+    with pytest.raises(ValueError, match=r"names test_resume.Mine, which is none .*trusted=\[Mine\]"):
+        FxLMS.load(path)
+    FxLMS(4, S_HAT, step_size=0.01).save(path)
+    with pytest.raises(TypeError, match=r"has a FxLMS, which is no Mine: call FxLMS\.load"):
+        Mine.load(path)
+
+
+def test_a_users_controller_in_a_wrapper_has_to_be_trusted(tmp_path: Path) -> None:
+    MonitoredController(OwnController()).save(tmp_path / "run.kfopc")
+    with pytest.raises(ValueError, match=r"names helpers.controllers.OwnController, which is none of"):
+        MonitoredController.load(tmp_path / "run.kfopc")
+
+
+def test_an_amplifier_without_a_name_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "run.kfopc"
+    path.write_bytes(b"before")
+    anonymous = PathTracker(FxLMS(4, S_HAT, step_size=0.01), rng=1, amplifier=lambda y: y)
+    with pytest.raises(TypeError, match=r"PathTracker\._amplifier cannot be saved: .*<lambda>"):
+        anonymous.save(path)
+    assert path.read_bytes() == b"before"
+    named = PathTracker(kf_anc(4, S_HAT, state_noise=0.0, measurement_noise=1.0), rng=1, amplifier=own_amplifier)
+    named.save(path)
+    assert PathTracker.load(path, trusted=[own_amplifier])._amplifier is own_amplifier

@@ -1,0 +1,251 @@
+"""Every controller of the package, made with the options that change what it keeps, for tests that hold for all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from helpers.channels import random_paths
+from helpers.loop import AMPLIFIERS, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R
+from kfopc_filterpy import (
+    KFOPC,
+    ClippingFxLMS,
+    DiagonalKalman,
+    FastArrayKalman,
+    FxLMS,
+    FxNLMS,
+    HardClipAmplifier,
+    KalmanController,
+    LeakyFxLMS,
+    LimitedController,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    OutputPowerConstraint,
+    RescalingFxLMS,
+    TwoGradientFxLMS,
+    fx_rls,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
+    kf_pb,
+)
+from kfopc_filterpy.controllers import (
+    FeedbackNeutralizer,
+    KalmanObserver,
+    MonitoredController,
+    PathTracker,
+    VirtualMicrophones,
+)
+from kfopc_filterpy.filters import PowerBudgetKalmanFilter
+from kfopc_filterpy.paths import PathTolerance
+
+KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+
+
+def constraint(**settings: Any) -> OutputPowerConstraint:
+    return OutputPowerConstraint(0.3, **{"fs": FS, "memory_s": MEMORY_S} | settings)
+
+
+MAKERS: dict[str, Any] = {
+    "KF-ANC": lambda **o: kf_anc(N_TAPS, S_HAT, **KALMAN, **o),
+    "KF-ANC, float32": lambda **o: kf_anc(N_TAPS, S_HAT, dtype=np.float32, **KALMAN, **o),
+    "KF-OPC": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
+    "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
+    "KF-OPC repaired": lambda **o: kf_opc_repaired(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
+    "KF-PB": lambda **o: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, memory_s=0.05, **KALMAN, **o),
+    "fxRLS": lambda **o: fx_rls(N_TAPS, S_HAT, forgetting=0.999, **o),
+    "diagonal KF": lambda **o: DiagonalKalman(N_TAPS, S_HAT, **KALMAN, **o),
+    "diagonal KF-OPC": lambda **o: DiagonalKalman(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
+    "fast-array KF": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, **o),
+    "fast-array KF-OPC": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, constraint=constraint(), **o),
+    "FxLMS": lambda **o: FxLMS(N_TAPS, S_HAT, step_size=MU, **o),
+    "FxNLMS": lambda **o: FxNLMS(N_TAPS, S_HAT, step_size=0.1, **o),
+    "leaky": lambda **o: LeakyFxLMS(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),
+    "optimal leaky": lambda **o: OptimalLeakyFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
+    "MOV": lambda **o: MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), **o),
+    "MOV, modified": lambda **o: MOVFxLMS(N_TAPS, S_HAT, step_size=MU, constraint=constraint(), modified=True, **o),
+    "two-gradient": lambda **o: TwoGradientFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+    "re-scaling": lambda **o: RescalingFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+    "clipping": lambda **o: ClippingFxLMS(N_TAPS, S_HAT, step_size=MU, amplitude_limit=0.5, **o),
+}
+KNOWS_AN_AMPLIFIER = [
+    name
+    for name in MAKERS
+    if not name.startswith(("FxLMS", "FxNLMS", "leaky", "two-gradient", "re-scaling", "clipping"))
+]
+VARIANTS = [(name, "plain") for name in MAKERS]
+# The limiter acts on what they emit, alike for all; these adapt to it in different ways. Each is compiled anew for it.
+LIMITED = ("KF-ANC", "KF-OPC", "KF-OPC repaired", "KF-PB", "FxLMS", "MOV", "two-gradient", "re-scaling", "clipping")
+VARIANTS += [(name, "limiter") for name in LIMITED]
+VARIANTS += [(name, "known amplifier") for name in KNOWS_AN_AMPLIFIER]
+
+
+def made(name: str, variant: str) -> Any:
+    """Return a controller of one channel."""
+    options: dict[str, Any] = {}
+    if variant == "limiter":
+        options["limiter"] = OutputLimiter(0.05, fs=FS, window_s=0.01)
+    if variant == "known amplifier":
+        options["amplifier"] = AMPLIFIERS["soft"][0]
+    return MAKERS[name](**options)
+
+
+# Several channels. A name begins with that of the public function or class.
+
+K, J, I, L = 3, 2, 2, 5  # microphones, loudspeakers, references, taps  # noqa: E741
+PATHS = random_paths(K, J, 4, seed=1)
+MANY: dict[str, Any] = {"n_references": I}
+
+
+def constraints() -> list[OutputPowerConstraint]:
+    return [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY_S) for power in (0.02, 0.05)]
+
+
+def limiters() -> list[OutputLimiter]:
+    return [OutputLimiter(power, fs=FS, window_s=0.01) for power in (0.01, 0.02)]
+
+
+SEVERAL: dict[str, Any] = {
+    "kf_anc": lambda: kf_anc(L, PATHS, **KALMAN, **MANY),
+    "kf_anc, float32": lambda: kf_anc(L, PATHS, dtype=np.float32, **KALMAN, **MANY),
+    "kf_opc": lambda: kf_opc(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
+    "kf_pb, direct": lambda: kf_pb(L, PATHS, rated_power=[0.02, 0.05], form="direct", fs=FS, **KALMAN, **MANY),
+    "kf_pb": lambda: kf_pb(L, PATHS, rated_power=[0.02, 0.05], fs=FS, **MANY),
+    "kf_pb, frequency domain": lambda: kf_pb(
+        L, PATHS, rated_power=0.05, form="frequency domain", fs=FS, block=16, limiter=limiters(), **MANY
+    ),
+    "FxLMS": lambda: FxLMS(L, PATHS, step_size=MU, limiter=limiters(), **MANY),
+    "FxNLMS": lambda: FxNLMS(L, PATHS, step_size=0.1, **MANY),
+    "LeakyFxLMS": lambda: LeakyFxLMS(L, PATHS, step_size=MU, leak=[0.3, 0.1], **MANY),
+    "OptimalLeakyFxLMS": lambda: OptimalLeakyFxLMS(L, PATHS, step_size=MU, constraint=constraints(), **MANY),
+    "MOVFxLMS": lambda: MOVFxLMS(L, PATHS, step_size=MU, constraint=constraints(), modified=True, **MANY),
+    "TwoGradientFxLMS": lambda: TwoGradientFxLMS(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
+    "RescalingFxLMS": lambda: RescalingFxLMS(L, PATHS, step_size=MU, amplitude_limit=[0.1, 0.5], **MANY),
+    "ClippingFxLMS": lambda: ClippingFxLMS(L, PATHS, step_size=MU, amplitude_limit=0.5, **MANY),
+}
+
+# Controllers around something: around another controller, or a filter of somebody else.
+
+
+class OwnFilter(KalmanFilter):
+    """A user's filter."""
+
+    def update(self, z: Any, R: Any = None, H: Any = None) -> None:
+        super().update(0.9 * z, R, H)
+
+
+class OwnController:
+    """A user's controller: FxLMS with a path that only delays, in the arrays that a user would take."""
+
+    def __init__(self) -> None:
+        self.weights, self.x = np.zeros(6), [0.0] * 8
+        self.count, self.emissions = 0, []
+
+    def control_signal(self, reference: float) -> float:
+        self.x = [reference, *self.x[:-1]]
+        return float(self.weights @ self.x[:6])
+
+    def emitted(self, control_signal: float) -> None:
+        self.emissions = [*self.emissions[-4:], control_signal]
+
+    def update(self, error: float) -> None:
+        self.count += 1
+        self.weights = self.weights + 0.01 * error * np.array(self.x[1:7])
+
+    def listen(self, references: Any, errors: Any) -> None:
+        self.x = [*references[:-9:-1], *self.x][:8]
+
+
+def own_amplifier(sample: float) -> float:
+    """Return the output of a user's amplifier."""
+    return min(max(sample, -0.8), 0.8)
+
+
+def _filterpys(kind: type = KalmanFilter, **settings: Any) -> Any:
+    kf = kind(N_TAPS, 1)
+    kf.P, kf.Q, kf.R = P0 * np.eye(N_TAPS), R * np.eye(N_TAPS), Q * np.eye(1)
+    for name, value in settings.items():
+        setattr(kf, name, value)
+    return kf
+
+
+def _full(**settings: Any) -> Any:
+    kf = KFOPC(N_TAPS, **settings)
+    kf.P, kf.Q, kf.R = P0 * np.eye(N_TAPS), R * np.eye(N_TAPS), Q * np.eye(1)
+    return kf
+
+
+def _faded(kf: Any) -> Any:
+    kf.alpha = 1.001
+    return kf
+
+
+def _guarded(controller: Any) -> Any:
+    controller.secondary_path_uncertainty = PathTolerance(delay_samples=0.5, gain_db=1.0)
+    return controller
+
+
+def _observer() -> KalmanObserver:
+    import control
+
+    A = np.diag([0.5, 0.3, -0.2])
+    model = control.StateSpace(A, np.ones((3, 1)), np.eye(3), np.ones((3, 1)), 1 / FS)
+    return KalmanObserver(model, n_physical=2, sensor_noise_std=0.1)
+
+
+def _monitored(controller: Any, **settings: Any) -> MonitoredController:
+    return MonitoredController(controller, **{"fs": FS, "window_s": 0.005, "pause_s": 0.01} | settings)
+
+
+def _tracked(controller: Any, **settings: Any) -> PathTracker:
+    return PathTracker(controller, **{"rng": 7, "fs": FS, "memory_s": 0.2, "check_s": 0.02, "p_value": 0.3} | settings)
+
+
+AROUND: dict[str, Any] = {
+    "filterpy's filter": lambda: KalmanController(_filterpys(), S_HAT),
+    "filterpy's filter, pinv": lambda: KalmanController(_filterpys(inv=np.linalg.pinv, alpha=1.001), S_HAT),
+    "a user's filter": lambda: KalmanController(_filterpys(OwnFilter), S_HAT),
+    "KFOPC": lambda: KalmanController(_full(constraint=constraint()), S_HAT),
+    "fading memory": lambda: KalmanController(_faded(KFOPC.random_walk(N_TAPS, **KALMAN)), S_HAT, name="faded"),
+    "KF-PB, limiter": lambda: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, limiter=OutputLimiter(0.2, fs=FS), **KALMAN),
+    "guarded KF-OPC": lambda: _guarded(kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN)),
+    "guarded FxLMS": lambda: _guarded(FxLMS(N_TAPS, S_HAT, step_size=MU)),
+    "guarded FxLMS, many": lambda: _guarded(FxLMS(L, PATHS, step_size=MU, **MANY)),
+    "guarded KF-ANC, many": lambda: _guarded(kf_anc(L, PATHS, **KALMAN, **MANY)),
+    "LimitedController": lambda: LimitedController(OwnController(), OutputLimiter(0.02, fs=FS, window_s=0.01)),
+    "MonitoredController": lambda: _monitored(MAKERS["KF-PB"]()),
+    "MonitoredController, wrong path": lambda: _monitored(kf_anc(N_TAPS, -S_HAT, **KALMAN)),
+    "MonitoredController, many": lambda: _monitored(SEVERAL["kf_pb"]()),
+    "MonitoredController, a user's": lambda: _monitored(OwnController()),
+    "PathTracker": lambda: _tracked(FxLMS(N_TAPS, -S_HAT, step_size=MU)),
+    "PathTracker, KF-OPC": lambda: _tracked(MAKERS["KF-OPC"](), rng=np.random.Generator(np.random.MT19937(3))),
+    "PathTracker, amplifier": lambda: _tracked(MAKERS["KF-PB"](), amplifier=HardClipAmplifier(0.7)),
+    "PathTracker, a user's amplifier": lambda: _tracked(MAKERS["KF-ANC"](), amplifier=own_amplifier),
+    "FeedbackNeutralizer": lambda: FeedbackNeutralizer(_tracked(MAKERS["FxLMS"]()), [0.0, 0.1, 0.05]),
+    "FeedbackNeutralizer, many": lambda: FeedbackNeutralizer(
+        SEVERAL["kf_anc"](), random_paths(I, J, 3, seed=4), amplifier=HardClipAmplifier(0.7)
+    ),
+    "VirtualMicrophones": lambda: VirtualMicrophones(
+        FxLMS(L, PATHS[2:], step_size=MU, **MANY), PATHS, random_paths(1, 2, 3, seed=5), physical=[0, 1]
+    ),
+    "VirtualMicrophones, KalmanObserver": lambda: VirtualMicrophones(
+        kf_anc(L, PATHS[2:], **KALMAN, **MANY), PATHS, _observer(), physical=[0, 1]
+    ),
+}
+OWN = (OwnFilter, OwnController, own_amplifier)  # what loading them needs beyond the package
+
+ALL: dict[str, Any] = {f"{name} {variant}": lambda n=name, v=variant: made(n, v) for name, variant in VARIANTS}
+ALL |= {f"{name} many": make for name, make in SEVERAL.items()} | AROUND
+
+FILTERS: dict[str, Any] = {
+    "KFOPC": lambda: _full(rated_power=0.3),
+    "KFOPC, plain": lambda: _full(),
+    "KFOPC, loudspeakers": lambda: _full(constraint=constraints()),
+    "random walk": lambda: KFOPC.random_walk(N_TAPS, **KALMAN),
+    "random walk, KF-OPC": lambda: KFOPC.random_walk(N_TAPS, constraint=constraint(), **KALMAN),
+    "random walk, float32": lambda: KFOPC.random_walk(N_TAPS, dtype=np.float32, **KALMAN),
+    "power budget": lambda: PowerBudgetKalmanFilter(N_TAPS, rated_power=0.3, fs=FS, memory_s=0.05, **KALMAN),
+}
