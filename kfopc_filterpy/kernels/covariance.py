@@ -23,6 +23,8 @@ from .vectors import FAST, copy_into, dot
 # Above this ratio of S to the measurement noise, the downdate cancels so many digits of P that it is computed in twice
 # the precision. This happens in the first samples after a large initial variance.
 CANCELLATION = 1e3
+# State noise of float32, relative to the largest variance: its rounding, which otherwise makes P indefinite.
+SINGLE_FLOOR = 2.0 * float(np.finfo(np.float32).eps)
 LINE = 64  # bytes in a cache line
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
@@ -35,7 +37,8 @@ class Covariance(NamedTuple):
     product: np.ndarray  # (n,), P x' of the current pass
     owed: (
         np.ndarray
-    )  # record: scale, diagonal, inverse_S (0 if no downdate is pending); last_inverse_S of the last update
+    )  # record: scale, diagonal, inverse_S (0 if no downdate is pending); last_inverse_S of the last update;
+    # largest: variance at the start
 
 
 def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
@@ -56,7 +59,7 @@ def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     triangle = aligned_zeros(n, n, dtype=dtype)
     triangle[:, :n] = P
     gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(2))
-    owed = new_record(scale=1.0, diagonal=0.0, inverse_S=0.0, last_inverse_S=0.0)
+    owed = new_record(scale=1.0, diagonal=0.0, inverse_S=0.0, last_inverse_S=0.0, largest=float(np.max(np.diagonal(P))))
     return Covariance(triangle, gain_direction, product, owed)
 
 
@@ -133,7 +136,34 @@ def project_covariance(cov, row):
     scale, diagonal, weight = number(owed.scale), number(owed.diagonal), number(owed.scale * owed.inverse_S)
     owed.scale, owed.diagonal, owed.inverse_S = 1.0, 0.0, 0.0
     h = np.asarray(row, cov.triangle.dtype)
-    return project_triangle(cov.triangle, cov.gain_direction, h, cov.product, scale, diagonal, weight)
+    if cov.triangle.itemsize < 8:
+        diagonal = max(diagonal, number(SINGLE_FLOOR * min(largest_variance(cov.triangle, h.size), owed.largest)))
+    variance = project_triangle(cov.triangle, cov.gain_direction, h, cov.product, scale, diagonal, weight)
+    return variance if not variance < 0.0 else lift(cov.triangle, h, cov.product, variance)
+
+
+@part()
+def largest_variance(T, n):
+    """Return the largest element on the diagonal."""
+    largest = T[0, 0]
+    for i in range(1, n):
+        largest = max(largest, T[i, i])
+    return largest
+
+
+@part()
+def lift(T, h, Ph, variance):
+    """Raise the diagonal of a T whose h'T h is negative, so that it is positive, and Ph with it; return h'T h.
+
+    Rounding does that if P is large along some directions and the reference shows others: what P should be there is below
+    the last digit of its elements. Left alone, each sample would shrink 1/P there as if the negative variance were known,
+    until S turns negative. The diagonal grows by twice what is missing and the last digit of the largest variance.
+    """
+    amount = T.dtype.type(-2.0 * variance / dot(h, h) + np.finfo(T.dtype).eps * largest_variance(T, h.size))
+    for i in range(h.size):
+        T[i, i] += amount
+        Ph[i] += amount * h[i]
+    return dot(h, Ph)
 
 
 @inlined
@@ -290,5 +320,5 @@ def _fill(P, T, g, scale, diagonal, weight):
 
 def covariance_matrix(cov: Covariance) -> np.ndarray:
     """Return P as a new full symmetric array (n, n)."""
-    scale, diagonal, inverse_S, _ = cov.owed.item()
+    scale, diagonal, inverse_S, *_ = cov.owed.item()
     return full_covariance(cov.triangle, cov.gain_direction, scale, diagonal, -scale * inverse_S)
