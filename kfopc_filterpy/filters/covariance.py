@@ -131,7 +131,7 @@ class RandomWalkCovariance:
 
     def updated(self) -> None:
         """Record an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""
-        scale, diagonal, inverse_S, last_inverse_S, _ = self.arrays.owed.item()
+        scale, diagonal, inverse_S, last_inverse_S, *_ = self.arrays.owed.item()
         if isinstance(self.prior, tuple):
             self.prior = 1.0, 0.0, last_inverse_S - inverse_S
         self.posterior = scale, diagonal, -scale * inverse_S

@@ -23,8 +23,9 @@ from .vectors import FAST, copy_into, dot
 # Above this ratio of S to the measurement noise, the downdate cancels so many digits of P that it is computed in twice
 # the precision. This happens in the first samples after a large initial variance.
 CANCELLATION = 1e3
-# State noise of float32, relative to the largest variance: its rounding, which otherwise makes P indefinite.
-SINGLE_FLOOR = 2.0 * float(np.finfo(np.float32).eps)
+# In roundings of the largest variance: an h'P h below the first is nothing but rounding (of a unit h), and from then on,
+# in float32 always, the second is the least state noise. See `blurred`.
+BLUR, FLOOR = 16.0, 2.0
 LINE = 64  # bytes in a cache line
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
@@ -38,7 +39,7 @@ class Covariance(NamedTuple):
     owed: (
         np.ndarray
     )  # record: scale, diagonal, inverse_S (0 if no downdate is pending); last_inverse_S of the last update;
-    # largest: variance at the start
+    # largest: variance at the start; bound of the largest variance now; floored: 1.0 if `FLOOR` applies
 
 
 def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
@@ -59,7 +60,9 @@ def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     triangle = aligned_zeros(n, n, dtype=dtype)
     triangle[:, :n] = P
     gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(2))
-    owed = new_record(scale=1.0, diagonal=0.0, inverse_S=0.0, last_inverse_S=0.0, largest=float(np.max(np.diagonal(P))))
+    owed = new_record(scale=1.0, diagonal=0.0, inverse_S=0.0, last_inverse_S=0.0, largest=0.0, bound=0.0, floored=0.0)
+    owed["floored"] = np.dtype(dtype) == np.float32  # from the start: its roundings spoil P within some thousand samples
+    owed["largest"] = owed["bound"] = np.max(np.diagonal(P))
     return Covariance(triangle, gain_direction, product, owed)
 
 
@@ -133,13 +136,32 @@ def project_covariance(cov, row):
     The value of P does not change.
     """
     owed, number = cov.owed[0], cov.triangle.dtype.type  # a float64 factor would make float32 arithmetic float64
+    T, largest_rounding = cov.triangle, float(np.finfo(cov.triangle.dtype).eps)
+    if owed.floored != 0.0:
+        least = FLOOR * largest_rounding * min(largest_variance(T, cov.product.size), owed.largest)
+        owed.diagonal = max(owed.diagonal, least)
+    owed.bound = owed.scale * owed.bound + owed.diagonal
     scale, diagonal, weight = number(owed.scale), number(owed.diagonal), number(owed.scale * owed.inverse_S)
     owed.scale, owed.diagonal, owed.inverse_S = 1.0, 0.0, 0.0
     h = np.asarray(row, cov.triangle.dtype)
-    if cov.triangle.itemsize < 8:
-        diagonal = max(diagonal, number(SINGLE_FLOOR * min(largest_variance(cov.triangle, h.size), owed.largest)))
-    variance = project_triangle(cov.triangle, cov.gain_direction, h, cov.product, scale, diagonal, weight)
-    return variance if not variance < 0.0 else lift(cov.triangle, h, cov.product, variance)
+    variance = project_triangle(T, cov.gain_direction, h, cov.product, scale, diagonal, weight)
+    blur = BLUR * largest_rounding * dot(h, h)
+    return blurred(T, owed, h, cov.product, variance, blur) if variance < blur * owed.bound else variance
+
+
+@part()
+def blurred(T, owed, h, Ph, variance, blur):
+    """Return an h'P h that seems to be lost in the rounding of P, raised if it is negative; see to it that P recovers.
+
+    If P is large along some directions and the reference shows others only, what P should be there falls below the last
+    digit of its elements, and rounding may make it negative. Left alone, each sample would shrink 1/P there as if that
+    were true, until S turns negative. So from then on, P gets as much state noise as its largest element is rounded by.
+    A P whose h'P h is above its rounding never gets any.
+    """
+    owed.bound = largest_variance(T, h.size)
+    if variance < blur * owed.bound:
+        owed.floored = 1.0
+    return lift(T, h, Ph, variance) if variance < 0.0 else variance
 
 
 @part()
@@ -153,12 +175,7 @@ def largest_variance(T, n):
 
 @part()
 def lift(T, h, Ph, variance):
-    """Raise the diagonal of a T whose h'T h is negative, so that it is positive, and Ph with it; return h'T h.
-
-    Rounding does that if P is large along some directions and the reference shows others: what P should be there is below
-    the last digit of its elements. Left alone, each sample would shrink 1/P there as if the negative variance were known,
-    until S turns negative. The diagonal grows by twice what is missing and the last digit of the largest variance.
-    """
+    """Raise the diagonal of a T whose h'T h is negative, so that it is positive, and Ph with it; return h'T h."""
     amount = T.dtype.type(-2.0 * variance / dot(h, h) + np.finfo(T.dtype).eps * largest_variance(T, h.size))
     for i in range(h.size):
         T[i, i] += amount
