@@ -58,6 +58,7 @@ SEED = 1
 LEAST_EIGENVALUE = {"float64": -1e-12, "float32": -1e-6}
 LARGEST_GROWTH_MB = 16.0  # of the process, from the second check to the last: 1.8 bytes a sample in 10^7
 LOUDER_DB = 1.0
+INTERRUPTED = 130  # what shells give a command that Ctrl-C ended
 POWER_TOLERANCE = 1e-9  # of a limiter's window, relative
 
 Take = Callable[[int], np.ndarray]
@@ -447,16 +448,21 @@ def main(arguments: Sequence[str]) -> int:
     from tqdm import tqdm
 
     options.output.mkdir(parents=True, exist_ok=True)
+    written = options.output / "soak.json"
     began, outcomes = time.process_time(), []
-    planned = sum(round(samples * case.share) * len(case.signals) for case in cases)
+    runs = [(case, signal) for case in cases for signal in case.signals]
+    planned = sum(round(samples * case.share) for case, _ in runs)
     with tqdm(total=planned, unit="sample", unit_scale=True, disable=options.quiet, dynamic_ncols=True) as bar:
-        for case in cases:
-            for signal in case.signals:
+        try:
+            for case, signal in runs:
                 bar.set_description(f"{case.name}, {signal}")
                 outcomes.append(soak(case, signal, round(samples * case.share), bar.update))
-    written = options.output / "soak.json"
-    written.write_text(json.dumps([asdict(one) for one in outcomes], indent=1) + "\n")
+                written.write_text(json.dumps([asdict(one) for one in outcomes], indent=1) + "\n")
+        except KeyboardInterrupt:
+            print(f"interrupted after {len(outcomes)} of {len(runs)} runs")
+    if not outcomes:
+        return INTERRUPTED
     print(table(outcomes), "", *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(outcomes)), sep="\n")
     violated = sum(bool(one.violations) for one in outcomes)
     print(f"\n{violated} of {len(outcomes)} runs violated a promise; {time.process_time() - began:.0f} s of CPU; {written}")
-    return 1 if violated else 0
+    return 1 if violated else 0 if len(outcomes) == len(runs) else INTERRUPTED

@@ -295,7 +295,7 @@ def kalman_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
     source of gains with a registered body.
     """
     owed = gains.owed[0]
-    scale, diagonal, inverse_S = owed.scale, owed.diagonal, owed.inverse_S
+    scale, diagonal, inverse_S, bound = owed.scale, owed.diagonal, owed.inverse_S, owed.bound
     predict_covariance(gains, alpha_sq, state_noise)
     S = project_covariance(gains, h) + noise
     y = np.nan
@@ -303,6 +303,7 @@ def kalman_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
         y = update_weights(gains, w, h, scaled_measurement, S, noise)
     if not np.isfinite(y):
         take_back(gains, scale, diagonal, inverse_S, alpha_sq, state_noise)
+        owed.bound = bound
     return y, S
 
 
