@@ -188,12 +188,13 @@ class FastArrayKalman(FilteredReferenceController):
     `update` then raises ValueError, and the weights stay as they were. A narrow band with an `initial_variance` far
     above `measurement_noise` can spoil the array without forgetting, too.
 
-    With `memory` = N the filter forgets and still runs for ever, at twice the cost. Two filters without forgetting take
-    turns: every N samples one of them is restarted from the weights in use, with P = `initial_variance`. The weights are
-    a mixture of both that is as accurate as least squares over the last N samples, or as `fx_rls` with
-    lambda = 1 - 2/N. No sample counts for longer than 2 N samples, except through the weights that a restarted filter
-    trusts as if it had taken its first L - 1 samples with them. An array that rounding spoils before its time is
-    restarted at once with a hundredth of its P; later ones get twice as much each, up to `initial_variance`.
+    With `memory` = N the filter forgets and still runs for ever, at less than twice the cost. Two filters without
+    forgetting take turns: every N samples one of them is restarted from the weights in use, with
+    P = `initial_variance`. The weights are a mixture of both that is as accurate as least squares over the last N
+    samples, or as `fx_rls` with lambda = 1 - 2/N. A sample counts for 2 N samples. After that it is known only through
+    the weights that a restarted filter begins with, which it trusts as if they had explained its first L - 1 samples.
+    An array that rounding spoils before its time is restarted with a hundredth of its P, and each later one with twice
+    the last, up to `initial_variance`.
 
     Parameters
     ----------
@@ -206,8 +207,8 @@ class FastArrayKalman(FilteredReferenceController):
     forgetting : float, default 1
         Forgetting factor lambda, above 0 and at most 1.
     memory : int, optional
-        Memory N in samples, at least 2 L; some tens of L or more reduce the noise better. Not with `forgetting` below 1.
-        By default the filter remembers everything, but for `forgetting`.
+        Memory N in samples, at least 2 L. The excess error is L/N of the measurement noise. Not with `forgetting` below
+        1. By default only `forgetting` limits the memory.
     rated_power : float, optional
         Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default there is no
         constraint.
