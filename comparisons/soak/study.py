@@ -169,11 +169,15 @@ def several_channels() -> np.ndarray:
 
 def all_cases() -> list[Case]:
     """Return every case."""
-    rated = {"rated_power": RATED_POWER}
-    steps = {"step_size": 1e-3}
-    limit = {"amplitude_limit": 1.0}
-    array = {"measurement_noise": Q}
-    filters = (("KF-ANC", kf_anc, {}), ("KF-OPC", kf_opc, rated), ("KF-PB", kf_pb, rated))
+    rated: dict[str, Any] = {"rated_power": RATED_POWER}
+    steps: dict[str, Any] = {"step_size": 1e-3}
+    limit: dict[str, Any] = {"amplitude_limit": 1.0}
+    array: dict[str, Any] = {"measurement_noise": Q}
+    filters: tuple[tuple[str, Any, dict[str, Any]], ...] = (
+        ("KF-ANC", kf_anc, {}),
+        ("KF-OPC", kf_opc, rated),
+        ("KF-PB", kf_pb, rated),
+    )
     precisions = (("float64", 1e4), ("float64", 1e12), ("float32", 1e4))
     lms = {
         "FxLMS": (FxLMS, {}),
@@ -185,7 +189,7 @@ def all_cases() -> list[Case]:
         "re-scaling FxLMS": (RescalingFxLMS, limit),
         "clipping FxLMS": (ClippingFxLMS, limit),
     }
-    zero = {"state_noise": 0.0, "measurement_noise": Q, "initial_variance": 1e12 * Q}
+    zero: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": Q, "initial_variance": 1e12 * Q}
     paths = several_channels()
     return [
         *(
@@ -213,7 +217,10 @@ def all_cases() -> list[Case]:
         ),
         *(
             Case(name, partial(make, TAPS, SECONDARY, **steps, **settings), quiet=make is not ClippingFxLMS)
-            for name, (make, settings) in lms.items()  # clipping lets the weights grow, and is loud when the noise changes
+            for name, (
+                make,
+                settings,
+            ) in lms.items()  # clipping lets the weights grow, and is loud when the noise changes
         ),
     ]
 
@@ -404,7 +411,10 @@ def table(outcomes: Sequence[Outcome]) -> str:
         )
     widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
     return "\n".join(
-        "  ".join(text.ljust(width) if k < 2 else text.rjust(width) for k, (text, width) in enumerate(zip(row, widths)))
+        "  ".join(
+            text.ljust(width) if k < 2 else text.rjust(width)
+            for k, (text, width) in enumerate(zip(row, widths, strict=True))
+        )
         for row in rows
     )
 
@@ -419,7 +429,11 @@ def remarks(outcomes: Sequence[Outcome]) -> list[str]:
         f"{len(outcomes)} runs of {longest:,} samples (several channels: a tenth), {CHECKS} checks in each, "
         f"{TAPS} taps, no state noise, q = {Q:g}. dB: noise reduction in the last interval; least/largest: eigenvalues of "
         "P, the worst of all checks; MB: growth of the process; us: time of a sample, the least of the noises.",
-        *([f"A finite memory of {MEMORY} takes {finite / growing:.1f} times as long as one fast array."] if growing > 0.0 < finite else []),
+        *(
+            [f"A finite memory of {MEMORY} takes {finite / growing:.1f} times as long as one fast array."]
+            if growing > 0.0 < finite
+            else []
+        ),
         *(
             f"{one.name}, P0/q = {one.ratio:.0e}, {one.signal}: largest stray of the arrays {one.stray:.1e}, "
             f"{one.arrays_lost} arrays lost and restarted."
@@ -448,7 +462,9 @@ def main(arguments: Sequence[str]) -> int:
         parser.error(f"--samples must be {100 * CHECKS} at least, got {options.samples:g}")
     cases = [case for case in all_cases() if options.only is None or fnmatch(case.name, options.only)]
     if not cases:
-        parser.error(f"no controller fits {options.only}; there are {', '.join(dict.fromkeys(c.name for c in all_cases()))}")
+        parser.error(
+            f"no controller fits {options.only}; there are {', '.join(dict.fromkeys(c.name for c in all_cases()))}"
+        )
 
     from tqdm import tqdm
 
@@ -467,7 +483,11 @@ def main(arguments: Sequence[str]) -> int:
             print(f"interrupted after {len(outcomes)} of {len(runs)} runs")
     if not outcomes:
         return INTERRUPTED
-    print(table(outcomes), "", *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(outcomes)), sep="\n")
+    print(
+        table(outcomes), "", *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(outcomes)), sep="\n"
+    )
     violated = sum(bool(one.violations) for one in outcomes)
-    print(f"\n{violated} of {len(outcomes)} runs violated a promise; {time.process_time() - began:.0f} s of CPU; {written}")
+    print(
+        f"\n{violated} of {len(outcomes)} runs violated a promise; {time.process_time() - began:.0f} s of CPU; {written}"
+    )
     return 1 if violated else 0 if len(outcomes) == len(runs) else INTERRUPTED

@@ -290,7 +290,9 @@ class FastArrayKalman(FilteredReferenceController):
         super().__init__(
             n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter, filtered_taps=n_taps + 1
         )
-        self.name = ("" if memory is None else "finite-memory ") + ("fast-array KF" if own is None else "fast-array KF-OPC")
+        self.name = ("" if memory is None else "finite-memory ") + (
+            "fast-array KF" if own is None else "fast-array KF-OPC"
+        )
         initial = variance / (q * forgetting)
         self._state: FastArrayState | FiniteMemoryState
         if memory is None:

@@ -36,10 +36,7 @@ class Covariance(NamedTuple):
     triangle: np.ndarray  # (n or more, n or more), lower triangle T valid; rows begin at cache lines
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the current pass
-    owed: (
-        np.ndarray
-    )  # record: scale, diagonal, inverse_S (0 if no downdate is pending); last_inverse_S of the last update;
-    # largest: variance at the start; bound of the largest variance now; floored: 1.0 if `FLOOR` applies
+    owed: np.ndarray  # record, see `new_covariance`
 
 
 def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
@@ -60,9 +57,16 @@ def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     triangle = aligned_zeros(n, n, dtype=dtype)
     triangle[:, :n] = P
     gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(2))
-    owed = new_record(scale=1.0, diagonal=0.0, inverse_S=0.0, last_inverse_S=0.0, largest=0.0, bound=0.0, floored=0.0)
-    owed["floored"] = np.dtype(dtype) == np.float32  # from the start: its roundings spoil P within some thousand samples
-    owed["largest"] = owed["bound"] = np.max(np.diagonal(P))
+    largest = float(np.max(np.diagonal(P)))
+    owed = new_record(
+        scale=1.0,
+        diagonal=0.0,
+        inverse_S=0.0,  # 0 if no downdate is pending
+        last_inverse_S=0.0,  # of the last update
+        largest=largest,  # variance at the start
+        bound=largest,  # the largest variance now is no larger
+        floored=float(np.dtype(dtype) == np.float32),  # 1 if `FLOOR` applies; without it float32 soon spoils P
+    )
     return Covariance(triangle, gain_direction, product, owed)
 
 
@@ -133,19 +137,19 @@ def project_triangle(T, g, h, Ph, scale, diagonal, weight):
 def project_covariance(cov, row):
     """Apply the pending changes to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
 
-    The value of P does not change.
+    The value of P does not change, unless it is lost in rounding (see `blurred`).
     """
     owed, number = cov.owed[0], cov.triangle.dtype.type  # a float64 factor would make float32 arithmetic float64
-    T, largest_rounding = cov.triangle, float(np.finfo(cov.triangle.dtype).eps)
+    T, eps = cov.triangle, float(np.finfo(cov.triangle.dtype).eps)
     if owed.floored != 0.0:
-        least = FLOOR * largest_rounding * min(largest_variance(T, cov.product.size), owed.largest)
+        least = FLOOR * eps * min(largest_variance(T, cov.product.size), owed.largest)
         owed.diagonal = max(owed.diagonal, least)
     owed.bound = owed.scale * owed.bound + owed.diagonal
     scale, diagonal, weight = number(owed.scale), number(owed.diagonal), number(owed.scale * owed.inverse_S)
     owed.scale, owed.diagonal, owed.inverse_S = 1.0, 0.0, 0.0
     h = np.asarray(row, cov.triangle.dtype)
     variance = project_triangle(T, cov.gain_direction, h, cov.product, scale, diagonal, weight)
-    blur = BLUR * largest_rounding * dot(h, h)
+    blur = BLUR * eps * dot(h, h)
     return blurred(T, owed, h, cov.product, variance, blur) if variance < blur * owed.bound else variance
 
 
