@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from comparisons.__main__ import main
 from comparisons.soak import study
 from kfopc_filterpy import FxLMS, OutputLimiter, kf_anc, simulate
 
+ROOT = Path(__file__).resolve().parents[2]
 SHORT = 20_000
 
 
@@ -206,3 +208,15 @@ def test_bad_arguments_are_refused(
         main(arguments)
     assert message in " ".join(capsys.readouterr().err.split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_documentation_shows_the_cases_of_today() -> None:
+    """docs/soak.txt is a whole run of the command, without a violation."""
+    printed = (ROOT / "docs" / "soak.txt").read_text(encoding="utf-8")
+    rows = [line.split("  ")[0] for line in printed.split("\n\n")[0].splitlines()[1:]]
+    cases = study.all_cases()
+    assert rows == [case.name for case in cases]
+    runs = sum(len(case.signals) for case in cases)
+    assert f"{runs} runs of {study.SAMPLES:,} samples" in printed
+    assert f"0 of {runs} runs violated a promise" in printed
+    assert "{literalinclude} soak.txt" in (ROOT / "docs" / "soak.md").read_text(encoding="utf-8")
