@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter against others; sweep, which runs a grid; or soak, which runs every controller for "
+        "speed, which times the filter against others; sweep, which runs a grid; or soak, which runs controllers for "
         "very long; the last two have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")

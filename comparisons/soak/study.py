@@ -1,8 +1,8 @@
-"""`python -m comparisons soak`: every controller over 10^7 samples, watched all the way.
+"""`python -m comparisons soak`: controllers over 10^7 samples, watched all the way.
 
-At equal intervals it checks that the covariance is finite, symmetric and positive semidefinite, that weights and signals
-are finite, that the noise is not louder than without control, that a limiter holds its rated power, and that the
-process does not grow. What fails is dated by the last sample of its interval.
+At equal intervals it checks that the covariance is finite, symmetric and positive semidefinite, that weights and
+signals are finite, that the noise is not louder than without control, that a limiter holds its rated power, and that
+the process does not grow. What fails is dated by the last sample of its interval.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def several_channels() -> np.ndarray:
 
 
 def all_cases() -> list[Case]:
-    """Return every case."""
+    """Return every case, in the order of the table."""
     rated: dict[str, Any] = {"rated_power": RATED_POWER}
     steps: dict[str, Any] = {"step_size": 1e-3}
     limit: dict[str, Any] = {"amplitude_limit": 1.0}
@@ -309,8 +309,8 @@ def reduction_db(result: Any) -> float:
 def intervals(signal: str, samples: int, secondary: np.ndarray) -> Iterator[Callable[[Any], Any]]:
     """Return a function for each interval that runs a controller over it.
 
-    `simulate` begins with silent paths. The anti-noise of the last control signals that is still under way is taken off the
-    disturbance instead, so that the intervals are one run.
+    `simulate` begins with silent paths. The anti-noise of the last control signals that is still under way is taken off
+    the disturbance instead, so that the intervals are one run.
     """
     rng = np.random.default_rng(SEED)
     take, channels = SOURCES[signal](rng), secondary.shape[:-2]
@@ -450,7 +450,7 @@ def remarks(outcomes: Sequence[Outcome]) -> list[str]:
 def main(arguments: Sequence[str]) -> int:
     """Soak the controllers that the command line names; return 1 if anything was violated."""
     parser = argparse.ArgumentParser(
-        prog="python -m comparisons soak", description="Run every controller for very long, and watch it."
+        prog="python -m comparisons soak", description="Run the controllers for very long, and watch them."
     )
     parser.add_argument("--samples", type=float, default=SAMPLES, help="of a run (default: 1e7)")
     parser.add_argument("--only", metavar="NAME", help="controllers whose name fits, such as 'KF-*' (default: all)")
