@@ -15,7 +15,7 @@ from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_tabl
 from .studies import amplifier, broadband, constraint, duct, mismatch, multichannel, power_budget, tonal, tracking
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
-SPEED, SWEEP = "speed", "sweep"
+SPEED, SWEEP, SOAK = "speed", "sweep", "soak"
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -40,6 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from .sweep import command as sweep_command
 
         return sweep_command.main(arguments[1:])
+    if arguments[:1] == [SOAK]:
+        from .soak import study as soak_study
+
+        return soak_study.main(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
@@ -48,15 +52,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter against others; or sweep, which runs a grid and has options of its own "
-        "(sweep --help)",
+        "speed, which times the filter against others; sweep, which runs a grid; or soak, which runs controllers for "
+        "very long; the last two have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED, SWEEP)
-    if SWEEP in options.studies:
-        parser.error(f"{SWEEP} runs alone, and is named first: its options follow it")
+    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK)
+    for name in (SWEEP, SOAK):
+        if name in options.studies:
+            parser.error(f"{name} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]
     if unknown:
         parser.error(f"no study called {', '.join(unknown)}; there are {', '.join(known)}")

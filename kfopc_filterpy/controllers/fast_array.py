@@ -1,28 +1,4 @@
-r"""The Kalman filter without state noise, or with forgetting, in O(L) per sample.
-
-It uses the shift of the row by one sample at a time. Let P be in units of the measurement noise, u(n) = x'(n)^T the
-row, lambda the forgetting factor and :math:`\gamma^{-1}(n) = 1 + \lambda^{-1} u(n) P(n-1) u(n)^T`. Successive rows
-share all but one sample, so
-
-.. math:: \lambda^{-1} \left( \begin{bmatrix} P(n) & 0 \\ 0 & 0 \end{bmatrix} -
-   \begin{bmatrix} 0 & 0 \\ 0 & P(n-1) \end{bmatrix} \right) = \bar L(n)\, \mathrm{diag}(1, -1)\, \bar L(n)^T
-
-keeps its rank of two, which it has at the start if P(-1) = eta diag(lambda^2, ..., lambda^{L+1}). One orthogonal and
-one hyperbolic rotation, which zero the second and third entry of the first row below, then update gain, gamma and L
-together:
-
-.. math:: \begin{bmatrix} \gamma^{-1/2}(n) & \bar u(n+1) \bar L(n) \\
-   \begin{bmatrix} 0 \\ g(n) \gamma^{-1/2}(n) \end{bmatrix} & \bar L(n) \end{bmatrix} \Theta =
-   \begin{bmatrix} \gamma^{-1/2}(n+1) & 0 \\
-   \begin{bmatrix} g(n+1) \gamma^{-1/2}(n+1) \\ 0 \end{bmatrix} & \lambda^{1/2} \bar L(n+1) \end{bmatrix}
-
-with :math:`\bar u(n+1)` the L + 1 newest samples. With forgetting, rounding errors grow by the factor 1/lambda per
-sample, since the errors of P are not forgotten.
-
-References: R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise
-control", Int. J. Adapt. Control Signal Process. 19, 2005; A. H. Sayed, Fundamentals of Adaptive Filtering, Wiley 2003,
-ch. 14 (fast array RLS), from which these equations follow.
-"""
+"""The Kalman filter in O(L) per sample, by the fast array of `kernels.fast_array`: growing or finite memory."""
 
 from __future__ import annotations
 
@@ -30,31 +6,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._validate import as_positive
+from .._validate import as_count, as_positive
 from ..kernels.compiling import inlined, part
 from ..kernels.delay_lines import latest, newest
+from ..kernels.fast_array import FastArray, array_holds, correct_by_rotations, new_fast_array, restart_array, stray
 from ..kernels.records import new_record
-from ..kernels.vectors import FAST
 from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint, advance_constraint, squares_are_finite
 from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController, constraint_or_none
 from .step import Lines, adapt, disturbance_estimate, follow
 
-
-class FastArray(NamedTuple):
-    """The array that the rotations update."""
-
-    gain: np.ndarray  # (L + 1,) g gamma^(-1/2), and 0
-    first: np.ndarray  # (L + 1,) first column of L
-    second: np.ndarray  # (L + 1,) second column
-    numbers: (
-        np.ndarray
-    )  # record: root = gamma^(-1/2), ahead and behind = u_bar times the two columns, forgetting = lambda
+# Of the finite memory, whose arrays can be restarted:
+LARGEST_STRAY = 1e-4  # beyond it an array is lost
+LESS, MORE = 0.01, 2.0  # factors of P at the next start, after an array was lost and after one lasted
+LEAST_MEMORY = 2  # in filter lengths
 
 
 class FastArrayState(NamedTuple):
-    """State of `FastArrayKalman`."""
+    """State of `FastArrayKalman` without a finite memory."""
 
     lines: Lines
     weights: np.ndarray
@@ -62,12 +32,39 @@ class FastArrayState(NamedTuple):
     array: FastArray
 
 
-def new_fast_array(n_taps: int, initial: float, forgetting: float) -> FastArray:
-    """Return the array before the first sample, for P = initial diag(lambda^2, ..., lambda^(L+1)) and zeros so far."""
-    gain, first, second = (np.zeros(n_taps + 1) for _ in range(3))
-    first[0] = np.sqrt(initial * forgetting)
-    second[-1] = first[0] * forgetting ** (n_taps / 2)
-    return FastArray(gain, first, second, new_record(root=1.0, ahead=0.0, behind=0.0, forgetting=forgetting))
+class GrowingFilter(NamedTuple):
+    """One of the two filters of a finite memory, which remembers all since its start."""
+
+    array: FastArray
+    weights: np.ndarray
+
+
+class FiniteMemoryState(NamedTuple):
+    """State of `FastArrayKalman` with a finite memory."""
+
+    lines: Lines
+    weights: np.ndarray  # the two filters' weights, mixed
+    constraint: ConstraintState
+    one: GrowingFilter
+    other: GrowingFilter
+    numbers: np.ndarray  # record, see `new_pair`
+
+
+def new_pair(n_taps: int, initial: float, memory: int) -> tuple[GrowingFilter, GrowingFilter, np.ndarray]:
+    """Return two growing-memory filters, the first at its start, and the record of their turns."""
+    one, other = (
+        GrowingFilter(new_fast_array(n_taps, initial, largest_stray=LARGEST_STRAY), np.zeros(n_taps)) for _ in range(2)
+    )
+    turns = new_record(
+        memory=memory,  # N
+        elder_is_other=0,
+        paired=0,  # whether the younger filter runs
+        elder_lost=0,  # whether the elder stands still until the younger has taken over
+        initial=initial,  # P at the next start
+        largest_initial=initial,
+        lost=0,  # arrays lost to rounding so far
+    )
+    return one, other, turns
 
 
 @adapt.register(FastArrayState)
@@ -80,6 +77,18 @@ def adapt_fast_array(state, error, control_signal):
 def follow_fast_array(state, error):
     """Adapt while listening: the gains must follow the filtered reference from the first sample on."""
     return rotate(state, error)
+
+
+@adapt.register(FiniteMemoryState)
+def adapt_finite_memory(state, error, control_signal):
+    """Apply eq. 2-9 to both filters, and mix them."""
+    return rotate_both(state, error)
+
+
+@follow.register(FiniteMemoryState)
+def follow_finite_memory(state, error):
+    """Adapt while listening, like the single array."""
+    return rotate_both(state, error)
 
 
 @inlined
@@ -96,43 +105,73 @@ def rotate(state, error):
     return True
 
 
-@part(fastmath=FAST)
-def array_holds(array, row):
-    """Return whether the step for `row`, the L + 1 newest samples, has a solution: rounding can corrupt the array.
+@inlined
+def rotate_both(state, error):
+    """Apply eq. 2-9 to both filters, and mix them; return False, with nothing changed, if a square overflows."""
+    row = newest(state.lines.filtered, state.weights.size + 1)
+    d, x = disturbance_estimate(state.lines, error), latest(state.lines.reference)
+    if not squares_are_finite(d, row[0], x):
+        return False
+    scaled = advance_constraint(state.constraint, d, row[0], x) * d
+    if state.numbers[0].elder_is_other == 0:
+        correct_pair(state.one, state.other, state.numbers, state.weights, row, scaled)
+    else:
+        correct_pair(state.other, state.one, state.numbers, state.weights, row, scaled)
+    return True
 
-    Also set the products of `row` and the two columns, which `correct_by_rotations` uses.
+
+@part()
+def correct_pair(elder, younger, numbers, mixed, row, d):
+    """Correct the two filters, mix them, and let them take turns.
+
+    The younger filter starts when the elder one has heard N samples, and takes over after N more, when the elder one is
+    restarted. Its share of the mixed weights grows in proportion to what it has heard, a/N. If the reference's statistics
+    are steady, the variance of the mixed weights is then that of least squares over N samples, at every sample: with
+    shares s = a/N and 1 - s of filters that average over a and a + N samples, it is in proportion to
+    a (s/a + (1 - s)/(a + N))^2 + N ((1 - s)/(a + N))^2 = 1/N.
     """
-    ahead = behind = 0.0
-    for i in range(row.size):
-        ahead += row[i] * array.first[i]
-        behind += row[i] * array.second[i]
-    numbers = array.numbers[0]
-    numbers.ahead, numbers.behind = ahead, behind
-    root = numbers.root
-    return behind * behind < root * root + ahead * ahead < np.inf
+    turns = numbers[0]
+    if turns.elder_lost == 0 and not corrected(elder, row, d):
+        turns.lost += 1
+        if turns.paired != 0:
+            turns.elder_lost = 1
+        else:
+            turns.initial *= LESS
+            restart_array(elder.array, turns.initial)
+    if turns.paired != 0 and not corrected(younger, row, d):
+        turns.lost += 1
+        turns.initial *= LESS
+        restart(younger, elder.weights, turns.initial)
+    share = 0.0
+    if turns.paired != 0:
+        share = younger.array.numbers[0].heard / turns.memory
+    for i in range(mixed.size):
+        mixed[i] = elder.weights[i] + share * (younger.weights[i] - elder.weights[i])
+    if share >= 1.0:
+        turns.elder_is_other = 1 - turns.elder_is_other
+        turns.elder_lost = 0
+        turns.initial = min(MORE * turns.initial, turns.largest_initial)
+        restart(elder, mixed, turns.initial)
+    elif turns.paired == 0 and elder.array.numbers[0].heard >= turns.memory:
+        turns.paired = 1
+        restart(younger, mixed, turns.initial)
 
 
-@part(fastmath=FAST)
-def correct_by_rotations(array, w, row, d):
-    """Apply the two rotations, then w += g (d - w' x'); call `array_holds` with the same `row` first."""
-    gain, first, second, numbers = array.gain, array.first, array.second, array.numbers[0]
-    root = np.sqrt(numbers.root**2 + numbers.ahead**2)
-    c, s, t = numbers.root / root, numbers.ahead / root, numbers.behind / root
-    h = 1.0 / np.sqrt(1.0 - t * t)
-    grow = 1.0 / np.sqrt(numbers.forgetting)
-    for i in range(gain.size - 1, -1, -1):
-        shifted = gain[i - 1] if i > 0 else 0.0
-        rotated = c * shifted + s * first[i]
-        first[i] = (c * first[i] - s * shifted) * grow
-        gain[i] = h * (rotated - t * second[i])
-        second[i] = h * (second[i] - t * rotated) * grow
-    numbers.root = root / h
-    residual = d
-    for i in range(w.size):
-        residual -= w[i] * row[i]
-    step = residual / numbers.root
-    for i in range(w.size):
-        w[i] += gain[i] * step
+@part()
+def corrected(own, row, d):
+    """Correct a filter; return False, with its weights as they were, if rounding has corrupted its array."""
+    if not array_holds(own.array, row):
+        return False
+    correct_by_rotations(own.array, own.weights, row, d)
+    return True
+
+
+@part()
+def restart(own, weights, initial):
+    """Begin a filter again at `weights`."""
+    restart_array(own.array, initial)
+    for i in range(weights.size):
+        own.weights[i] = weights[i]
 
 
 class FastArrayKalman(FilteredReferenceController):
@@ -146,7 +185,16 @@ class FastArrayKalman(FilteredReferenceController):
     Rounding: without forgetting, the weights agree with those of the O(L^2) filter to about 1e-10 over a million
     samples, on white, coloured and band-limited noise. With forgetting, errors grow by 1/lambda per sample until the
     array is lost, after 10 to 20 memories of 1/(1 - lambda) samples: some ten seconds for lambda = 0.9999 at 16 kHz.
-    `update` then raises ValueError, and the weights stay as they were.
+    `update` then raises ValueError, and the weights stay as they were. A narrow band with an `initial_variance` far
+    above `measurement_noise` can spoil the array without forgetting, too.
+
+    With `memory` = N the filter forgets and still runs for ever, at less than twice the cost. Two filters without
+    forgetting take turns: every N samples one of them is restarted from the weights in use, with
+    P = `initial_variance`. The weights are a mixture of both that is as accurate as least squares over the last N
+    samples, or as `fx_rls` with lambda = 1 - 2/N. A sample counts for 2 N samples. After that it is known only through
+    the weights that a restarted filter begins with, which it trusts as if they had explained its first L - 1 samples.
+    An array that rounding spoils before its time is restarted with a hundredth of its P, and each later one with twice
+    the last, up to `initial_variance`.
 
     Parameters
     ----------
@@ -158,6 +206,9 @@ class FastArrayKalman(FilteredReferenceController):
         q and P(0|0) as for `kf_anc`, both above zero.
     forgetting : float, default 1
         Forgetting factor lambda, above 0 and at most 1.
+    memory : int, optional
+        Memory N in samples, at least 2 L. The excess error is L/N of the measurement noise. Not with `forgetting` below
+        1. By default only `forgetting` limits the memory.
     rated_power : float, optional
         Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default there is no
         constraint.
@@ -171,8 +222,9 @@ class FastArrayKalman(FilteredReferenceController):
     Raises
     ------
     ValueError
-        A variance or forgetting factor out of range, a rated power that is not positive and finite, both a rated power
-        and a constraint, fewer than one tap, a path that is not FIR. In a run: an array that rounding has corrupted.
+        A variance, forgetting factor or memory out of range, a memory beside a forgetting factor, a rated power that is
+        not positive and finite, both a rated power and a constraint, fewer than one tap, a path that is not FIR. In a
+        run without `memory`: an array that rounding has corrupted.
     TypeError
         An amplifier that is not one of the package's models.
 
@@ -184,7 +236,12 @@ class FastArrayKalman(FilteredReferenceController):
     References
     ----------
     R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control",
-    Int. J. Adapt. Control Signal Process. 19, 2005. The docstring of this module has the derivation.
+    Int. J. Adapt. Control Signal Process. 19, 2005. The docstring of the module `kernels.fast_array` has the derivation.
+
+    S. van Ophem, A. P. Berkhoff, "A numerically stable, finite memory, fast array recursive least squares filter for
+    broadband active noise control", Int. J. Adapt. Control Signal Process. 30, 2016: two growing memories, mixed so that
+    the information used is always the same, and restarted in turn. Of this paper we had only the abstract; the mixture,
+    the restart and what is done about a lost array are derived here (`correct_pair`, `restart_array`).
 
     Examples
     --------
@@ -199,8 +256,8 @@ class FastArrayKalman(FilteredReferenceController):
 
     name = "fast-array KF"
     _refusal = (
-        "the fast array is lost to rounding: nothing was changed, and this filter cannot go on. Use a forgetting factor "
-        "closer to 1, or kf_anc, whose O(L^2) form does not lose its covariance"
+        "the fast array is lost to rounding: nothing was changed, and this filter cannot go on. Use memory= instead of "
+        "a forgetting factor, or kf_anc, whose O(L^2) form does not lose its covariance"
     )
 
     def __init__(
@@ -211,6 +268,7 @@ class FastArrayKalman(FilteredReferenceController):
         measurement_noise: float,
         initial_variance: float = 1.0,
         forgetting: float = 1.0,
+        memory: int | None = None,
         rated_power: float | None = None,
         constraint: OutputPowerConstraint | None = None,
         amplifier: Amplifier | None = None,
@@ -221,19 +279,51 @@ class FastArrayKalman(FilteredReferenceController):
         forgetting = as_positive(forgetting, "forgetting")
         if forgetting > 1.0:
             raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+        if memory is not None:
+            memory = as_count(memory, "memory")
+            least = LEAST_MEMORY * as_count(n_taps, "n_taps")
+            if memory < least:
+                raise ValueError(f"memory must be {LEAST_MEMORY} n_taps = {least} samples at least, got {memory}")
+            if forgetting < 1.0:
+                raise ValueError(f"give either memory or a forgetting factor below 1, got {memory} and {forgetting:g}")
         own = constraint_or_none(rated_power, constraint)
         super().__init__(
             n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter, filtered_taps=n_taps + 1
         )
-        if own is not None:
-            self.name = "fast-array KF-OPC"
-        array = new_fast_array(self.n_taps, variance / (q * forgetting), forgetting)
-        self._state = FastArrayState(*self._common(), array)
+        self.name = ("" if memory is None else "finite-memory ") + (
+            "fast-array KF" if own is None else "fast-array KF-OPC"
+        )
+        initial = variance / (q * forgetting)
+        self._state: FastArrayState | FiniteMemoryState
+        if memory is None:
+            self._state = FastArrayState(*self._common(), new_fast_array(self.n_taps, initial, forgetting))
+        else:
+            self._state = FiniteMemoryState(*self._common(), *new_pair(self.n_taps, initial, memory))
 
     @property
     def forgetting(self) -> float:
         """Forgetting factor lambda."""
-        return float(self._state.array.numbers["forgetting"][0])
+        return float(self._arrays[0].numbers["forgetting"][0])
+
+    @property
+    def memory(self) -> int | None:
+        """Memory N in samples; None without a finite memory."""
+        return int(self._state.numbers["memory"][0]) if isinstance(self._state, FiniteMemoryState) else None
+
+    @property
+    def stray(self) -> float:
+        """Relative size of what rounding adds to the array, 0 in exact arithmetic; with a finite memory, the larger."""
+        return max(stray(array) for array in self._arrays)
+
+    @property
+    def arrays_lost(self) -> int:
+        """Number of arrays that a finite memory has restarted before their time, because rounding had spoilt them."""
+        return int(self._state.numbers["lost"][0]) if isinstance(self._state, FiniteMemoryState) else 0
+
+    @property
+    def _arrays(self) -> tuple[FastArray, ...]:
+        state = self._state
+        return (state.one.array, state.other.array) if isinstance(state, FiniteMemoryState) else (state.array,)
 
     def _filter_again(self) -> None:
         """Keep the filtered reference: the array needs each row to be the last one, shifted by a sample."""

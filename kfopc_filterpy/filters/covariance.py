@@ -58,7 +58,7 @@ class RandomWalkCovariance:
     @property
     def now(self) -> Moment:
         """P at present."""
-        scale, diagonal, inverse_S, _ = self.arrays.owed.item()
+        scale, diagonal, inverse_S, *_ = self.arrays.owed.item()
         return scale, diagonal, -scale * inverse_S
 
     def full(self, moment: Moment | np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ class RandomWalkCovariance:
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Record eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, as pending for the next pass over the triangle."""
         owed = self.own().owed
-        scale, diagonal, inverse_S, _ = owed.item()
+        scale, diagonal, inverse_S, *_ = owed.item()
         if not alpha_sq * max(scale, diagonal) + state_noise < self._largest:
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
         self._shown = []
@@ -136,7 +136,7 @@ class RandomWalkCovariance:
 
     def updated(self) -> None:
         """Record an update: P is P_post, and P_prior, if it was the triangle, is P + g g'/S."""
-        scale, diagonal, inverse_S, last_inverse_S = self.arrays.owed.item()
+        scale, diagonal, inverse_S, last_inverse_S, *_ = self.arrays.owed.item()
         if isinstance(self.prior, tuple):
             self.prior = 1.0, 0.0, last_inverse_S - inverse_S
         self.posterior = scale, diagonal, -scale * inverse_S

@@ -214,8 +214,8 @@ class KFOPC(KalmanFilter, Checkpointed):
             Given instead of `rated_power`, as for `KFOPC`.
         dtype : {numpy.float64, numpy.float32}, default numpy.float64
             Precision in which P is stored and updated; the weights stay float64. float32 halves the memory and, at many
-            taps, the time. It needs a state noise well above 6e-8 of the largest variance in P. With less, rounding
-            makes P indefinite within some thousand samples of a band-limited reference, and `update` then raises.
+            taps, the time. Rounding limits what it can know: a state noise below 2.4e-7 of the largest variance in P
+            counts as that, so that P stays positive semidefinite.
 
         Returns
         -------

@@ -23,6 +23,9 @@ from .vectors import FAST, copy_into, dot
 # Above this ratio of S to the measurement noise, the downdate cancels so many digits of P that it is computed in twice
 # the precision. This happens in the first samples after a large initial variance.
 CANCELLATION = 1e3
+# In roundings of the largest variance: an h'P h below the first is nothing but rounding (of a unit h), and from then on,
+# in float32 always, the second is the least state noise. See `blurred`.
+BLUR, FLOOR = 16.0, 2.0
 LINE = 64  # bytes in a cache line
 SPLIT = 134217729.0  # 2**27 + 1 cuts a float64 into two halves whose products are exact
 
@@ -33,9 +36,7 @@ class Covariance(NamedTuple):
     triangle: np.ndarray  # (n or more, n or more), lower triangle T valid; rows begin at cache lines
     gain_direction: np.ndarray  # (n,), g = P x' of the last update
     product: np.ndarray  # (n,), P x' of the current pass
-    owed: (
-        np.ndarray
-    )  # record: scale, diagonal, inverse_S (0 if no downdate is pending); last_inverse_S of the last update
+    owed: np.ndarray  # record, see `new_covariance`
 
 
 def aligned_zeros(*shape: int, dtype: Any = np.float64) -> np.ndarray:
@@ -56,7 +57,16 @@ def new_covariance(P: np.ndarray, dtype: Any = np.float64) -> Covariance:
     triangle = aligned_zeros(n, n, dtype=dtype)
     triangle[:, :n] = P
     gain_direction, product = (aligned_zeros(n, dtype=dtype)[:n] for _ in range(2))
-    owed = new_record(scale=1.0, diagonal=0.0, inverse_S=0.0, last_inverse_S=0.0)
+    largest = float(np.max(np.diagonal(P)))
+    owed = new_record(
+        scale=1.0,
+        diagonal=0.0,
+        inverse_S=0.0,  # 0 if no downdate is pending
+        last_inverse_S=0.0,  # of the last update
+        largest=largest,  # variance at the start
+        bound=largest,  # the largest variance now is no larger
+        floored=float(np.dtype(dtype) == np.float32),  # 1 if `FLOOR` applies; without it float32 soon spoils P
+    )
     return Covariance(triangle, gain_direction, product, owed)
 
 
@@ -127,13 +137,54 @@ def project_triangle(T, g, h, Ph, scale, diagonal, weight):
 def project_covariance(cov, row):
     """Apply the pending changes to the triangle and set ``cov.product = P h`` in the same pass; return h'P h.
 
-    The value of P does not change.
+    The value of P does not change, unless it is lost in rounding (see `blurred`).
     """
     owed, number = cov.owed[0], cov.triangle.dtype.type  # a float64 factor would make float32 arithmetic float64
+    T, eps = cov.triangle, float(np.finfo(cov.triangle.dtype).eps)
+    if owed.floored != 0.0:
+        least = FLOOR * eps * min(largest_variance(T, cov.product.size), owed.largest)
+        owed.diagonal = max(owed.diagonal, least)
+    owed.bound = owed.scale * owed.bound + owed.diagonal
     scale, diagonal, weight = number(owed.scale), number(owed.diagonal), number(owed.scale * owed.inverse_S)
     owed.scale, owed.diagonal, owed.inverse_S = 1.0, 0.0, 0.0
     h = np.asarray(row, cov.triangle.dtype)
-    return project_triangle(cov.triangle, cov.gain_direction, h, cov.product, scale, diagonal, weight)
+    variance = project_triangle(T, cov.gain_direction, h, cov.product, scale, diagonal, weight)
+    blur = BLUR * eps * dot(h, h)
+    return blurred(T, owed, h, cov.product, variance, blur) if variance < blur * owed.bound else variance
+
+
+@part()
+def blurred(T, owed, h, Ph, variance, blur):
+    """Return an h'P h that seems to be lost in the rounding of P, raised if it is negative; see to it that P recovers.
+
+    If P is large along some directions and the reference shows others only, what P should be there falls below the last
+    digit of its elements, and rounding may make it negative. Left alone, each sample would shrink 1/P there as if that
+    were true, until S turns negative. So from then on, P gets as much state noise as its largest element is rounded by.
+    A P whose h'P h is above its rounding never gets any.
+    """
+    owed.bound = largest_variance(T, h.size)
+    if variance < blur * owed.bound:
+        owed.floored = 1.0
+    return lift(T, h, Ph, variance) if variance < 0.0 else variance
+
+
+@part()
+def largest_variance(T, n):
+    """Return the largest element on the diagonal."""
+    largest = T[0, 0]
+    for i in range(1, n):
+        largest = max(largest, T[i, i])
+    return largest
+
+
+@part()
+def lift(T, h, Ph, variance):
+    """Raise the diagonal of a T whose h'T h is negative, so that it is positive, and Ph with it; return h'T h."""
+    amount = T.dtype.type(-2.0 * variance / dot(h, h) + np.finfo(T.dtype).eps * largest_variance(T, h.size))
+    for i in range(h.size):
+        T[i, i] += amount
+        Ph[i] += amount * h[i]
+    return dot(h, Ph)
 
 
 @inlined
@@ -248,7 +299,7 @@ def kalman_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
     source of gains with a registered body.
     """
     owed = gains.owed[0]
-    scale, diagonal, inverse_S = owed.scale, owed.diagonal, owed.inverse_S
+    scale, diagonal, inverse_S, bound = owed.scale, owed.diagonal, owed.inverse_S, owed.bound
     predict_covariance(gains, alpha_sq, state_noise)
     S = project_covariance(gains, h) + noise
     y = np.nan
@@ -256,6 +307,7 @@ def kalman_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
         y = update_weights(gains, w, h, scaled_measurement, S, noise)
     if not np.isfinite(y):
         take_back(gains, scale, diagonal, inverse_S, alpha_sq, state_noise)
+        owed.bound = bound
     return y, S
 
 
@@ -290,5 +342,5 @@ def _fill(P, T, g, scale, diagonal, weight):
 
 def covariance_matrix(cov: Covariance) -> np.ndarray:
     """Return P as a new full symmetric array (n, n)."""
-    scale, diagonal, inverse_S, _ = cov.owed.item()
+    scale, diagonal, inverse_S, *_ = cov.owed.item()
     return full_covariance(cov.triangle, cov.gain_direction, scale, diagonal, -scale * inverse_S)

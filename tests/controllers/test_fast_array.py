@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.signal import butter, sosfilt
 
 from kfopc_filterpy import FastArrayKalman, OutputPowerConstraint, fx_rls, kf_anc, kf_opc, simulate
 from kfopc_filterpy.signals import band_limited_noise
@@ -182,6 +183,175 @@ def test_a_copy_goes_on_alone() -> None:
     twin = pickle.loads(pickle.dumps(controller))
     one, other = (simulate(c, x, disturbance=d, secondary_path=[0.9]) for c in (controller, twin))
     np.testing.assert_array_equal(one.error, other.error)
+
+
+# ---- Finite memory
+
+
+class Growing:
+    """A growing memory by its definition: prior weights with information M, and sums over the samples since."""
+
+    def __init__(self, prior: np.ndarray, initial: float, incomplete: int) -> None:
+        self.prior, self.M, self.b = prior.copy(), np.eye(prior.size) / initial, np.zeros(prior.size)
+        self.incomplete, self.heard = incomplete, 0
+
+    def hear(self, row: np.ndarray, d: float) -> None:
+        row = row * (np.arange(row.size) <= self.heard)  # what was before its start counts as zero
+        known = self.heard < self.incomplete
+        self.heard += 1
+        self.M += np.outer(row, row)
+        self.b += row * (row @ self.prior if known else d) - np.outer(row, row) @ self.prior
+
+    @property
+    def weights(self) -> np.ndarray:
+        return self.prior + np.linalg.solve(self.M, self.b)
+
+
+def two_memories(xf: np.ndarray, d: np.ndarray, memory: int, initial: float) -> np.ndarray:
+    """Weights after each sample, (n, L), by batch least squares in information form."""
+    rows, weights = [], np.zeros(L)
+    elder, younger = Growing(weights, initial, 0), None
+    padded = np.r_[np.zeros(L - 1), xf]
+    for n in range(d.size):
+        row = padded[n : n + L][::-1]
+        elder.hear(row, d[n])
+        weights = elder.weights
+        if younger is not None:
+            younger.hear(row, d[n])
+            weights = weights + younger.heard / memory * (younger.weights - weights)
+            if younger.heard == memory:
+                elder, younger = younger, None
+        if younger is None and elder.heard == memory:
+            younger = Growing(weights, initial, L - 1)
+        rows.append(weights)
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("memory", [2 * L, 50])
+def test_a_finite_memory_is_two_growing_ones_in_turn(memory: int, compiled: bool) -> None:
+    x, d = signals(500)
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.02, initial_variance=0.7, memory=memory)
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH, record_weights_every=1, compiled=compiled)
+    expected = two_memories(np.convolve(x, PATH)[: x.size], d, memory, 0.7 / 0.02)
+    assert result.weights is not None
+    np.testing.assert_allclose(result.weights, expected, rtol=0, atol=1e-9)
+    assert (controller.name, controller.memory, controller.arrays_lost) == ("finite-memory fast-array KF", memory, 0)
+    assert 0.0 < controller.stray < 1e-10
+
+
+def test_a_finite_memory_runs_for_ever() -> None:
+    """5000 memories: the weights still are those of the two growing memories that began last."""
+    x, d = signals(200_000)
+    memory = 40
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.02, memory=memory)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    last = 60 * memory  # from an own start, which by then no longer counts
+    expected = two_memories(np.convolve(x, PATH)[: x.size][-last:], d[-last:], memory, 1.0 / 0.02)[-1]
+    np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-6)
+    assert controller.arrays_lost == 0
+
+
+def test_a_finite_memory_is_as_accurate_as_its_samples_allow() -> None:
+    """The excess error of least squares over N samples of white noise is q L/N, at every point of the cycle."""
+    memory, n = 300, 300_000
+    x, other = np.random.default_rng(7).standard_normal((2, n))
+    optimal = np.zeros(L)
+    optimal[2:4] = 1.2, 0.5
+    d = np.convolve(x, optimal)[:n] + 0.1 * other
+    controller = FastArrayKalman(L, [1.0], measurement_noise=0.01, initial_variance=10.0, memory=memory)
+    result = simulate(controller, x, disturbance=d, secondary_path=[1.0], record_weights_every=10)
+    assert result.weights is not None
+    excess = np.sum((result.weights[60:] - optimal) ** 2, axis=1)
+    assert np.mean(excess) == pytest.approx(0.01 * L / memory, rel=0.1)
+    cycle = excess[: excess.size // 30 * 30].reshape(-1, 30).mean(axis=0)
+    np.testing.assert_allclose(cycle, 0.01 * L / memory, rtol=0.2)
+
+
+def test_a_finite_memory_forgets() -> None:
+    """The weights of another primary path are gone two to three memories later; a growing memory keeps them."""
+    x, d = signals(6000)
+    d[3000:] = -d[3000:]
+    errors = {}
+    for memory in (None, 300):
+        controller = FastArrayKalman(L, PATH, measurement_noise=0.01, memory=memory)
+        errors[memory] = simulate(controller, x, disturbance=d, secondary_path=PATH).error
+    assert np.mean(errors[300][3900:4500] ** 2) < 1.1 * np.mean(errors[300][2400:3000] ** 2)
+    assert np.mean(errors[None][3900:4500] ** 2) > 0.5
+
+
+def narrow_band(n: int) -> tuple[np.ndarray, np.ndarray]:
+    sos = butter(4, (290.0, 310.0), "bandpass", fs=16000.0, output="sos")
+    x = sosfilt(sos, np.random.default_rng(0).standard_normal(n))
+    x /= np.std(x)
+    return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[: x.size] + 0.01 * np.random.default_rng(3).standard_normal(x.size)
+
+
+def test_a_narrow_band_spoils_a_growing_memory_and_it_says_so() -> None:
+    """Without a look at its stray, the array would go on with gains that are wrong."""
+    x, d = narrow_band(40_000)
+    controller = FastArrayKalman(32, PATH, measurement_noise=1e-4, initial_variance=1.0)
+    with pytest.raises(ValueError, match="lost to rounding"):
+        simulate(controller, x, disturbance=d, secondary_path=PATH)
+    assert controller.stray > 0.1 or controller._state.array.numbers["root"][0] < 1.1
+
+
+@pytest.mark.parametrize(("memory", "spoilt"), [(100, False), (3200, True)])
+def test_a_finite_memory_survives_a_narrow_band(memory: int, spoilt: bool) -> None:
+    """The same noise: an array is restarted before it is spoilt, or when it is, then with less variance."""
+    x, d = narrow_band(100_000)
+    controller = FastArrayKalman(32, PATH, measurement_noise=1e-4, initial_variance=1.0, memory=memory)
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH)
+    assert (controller.arrays_lost > 0) == spoilt
+    assert np.isfinite(controller.weights).all()
+    assert np.mean(result.error[-50_000:] ** 2) < 3.0 * 1e-4  # of 2.9 without control; the sensor noise is 1e-4
+
+
+def test_silence_leaves_a_finite_memory_its_weights() -> None:
+    """A restart begins at the weights in use: a silent reference tells nothing, so they stay."""
+    x, d = signals(1000)
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, memory=100)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    simulate(controller, np.zeros(50), disturbance=np.zeros(50), secondary_path=PATH)
+    before = controller.weights
+    simulate(controller, np.zeros(5000), disturbance=0.1 * np.ones(5000), secondary_path=PATH)
+    np.testing.assert_allclose(controller.weights, before, rtol=0, atol=1e-12)
+
+
+def test_a_finite_memory_keeps_a_rated_power() -> None:
+    x, d = signals(20_000)
+    controller = FastArrayKalman(
+        L, [1.0], measurement_noise=0.01, memory=400, constraint=OutputPowerConstraint(0.3, memory_s=0.1)
+    )
+    result = simulate(controller, x, disturbance=d, secondary_path=[1.0])
+    assert controller.name == "finite-memory fast-array KF-OPC"
+    assert np.mean(result.control_signal[10_000:] ** 2) == pytest.approx(0.3, rel=0.1)
+
+
+def test_a_finite_memory_refuses_what_overflows_and_nothing_changed() -> None:
+    x, d = signals()
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, memory=50)
+    simulate(controller, x, disturbance=d, secondary_path=PATH)
+    controller.control_signal(0.3)
+    twin = pickle.loads(pickle.dumps(controller))
+    with pytest.raises(ValueError, match="must have finite squares"):
+        controller.update(1e200)
+    for made in (controller, twin):
+        made.update(0.1)
+    np.testing.assert_array_equal(controller.weights, twin.weights)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"memory": 2 * L - 1}, "memory must be 2 n_taps = 12 samples at least, got 11"),
+        ({"memory": 100, "forgetting": 0.99}, "give either memory or a forgetting factor below 1"),
+        ({"memory": 0}, "memory"),
+    ],
+)
+def test_a_bad_memory_is_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FastArrayKalman(L, PATH, measurement_noise=1.0, **settings)
 
 
 @pytest.mark.parametrize("name", ["measurement_noise", "initial_variance", "forgetting"])

@@ -717,11 +717,34 @@ def stepped(dtype, state_noise, samples=6000):
     return kf
 
 
-def test_float32_without_state_noise_loses_definiteness_and_says_so():
-    """Noise of 200-2000 Hz leaves directions that only rounding moves: P is indefinite within some thousand samples."""
-    with pytest.raises(ValueError, match="P is not positive definite"):
-        stepped(np.float32, 0.0)
-    assert np.linalg.eigvalsh(stepped(np.float64, 0.0).P).min() > 0
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_without_state_noise_p_stays_semidefinite(dtype):
+    """Noise of 200-2000 Hz leaves directions that only rounding moves."""
+    kf = stepped(dtype, 0.0)
+    assert np.linalg.eigvalsh(kf.P).min() > 0
+    assert abs(kf.y[0, 0]) < 0.02  # of a measurement of power 4
+
+
+@pytest.mark.parametrize(("dtype", "least"), [(np.float64, -1e-12), (np.float32, -1e-6)])
+@pytest.mark.parametrize("band", [(250.0, 350.0), (200.0, 2000.0)])
+def test_p_stays_semidefinite_at_a_large_initial_variance(dtype, least, band):
+    """P(0|0)/q = 1e12, no state noise: the variances along the noise are below the last digit of the others.
+
+    The innovations must stay near the measurement noise, of variance q: within 3 dB in float64, 10 dB in float32.
+    """
+    q, taps, n = 1e-4, 32, 12000
+    x = band_limited_noise(band, n / 16000.0, fs=16000.0, rng=0)
+    d = 2.0 * np.roll(x, 5) + np.sqrt(q) * np.random.default_rng(1).standard_normal(n)
+    kf = KFOPC.random_walk(taps, state_noise=0.0, measurement_noise=q, initial_variance=1e12 * q, dtype=dtype)
+    innovations = []
+    for k in range(taps, n):
+        kf.predict()
+        kf.update(d[k], H=x[k - taps + 1 : k + 1][::-1])
+        innovations.append(kf.y[0, 0])
+        if k % 400 == 0:
+            values = np.linalg.eigvalsh(kf.P)
+            assert values[0] >= least * values[-1], k
+    assert np.mean(np.square(innovations[-2000:])) < (2.0 if dtype == np.float64 else 10.0) * q
 
 
 def test_float32_with_state_noise_stays_definite_and_near_float64():
@@ -761,10 +784,12 @@ def test_float32_that_would_overflow_is_refused_with_nothing_changed():
     np.testing.assert_array_equal(kf.P, 2 * np.eye(4))
 
 
-def test_float32_below_its_rounding_of_state_noise_is_as_good_as_none():
-    """r = 1e-9 beside a variance of 1: float32 leaves it out, as docs/speed.md says."""
-    kf = KFOPC.random_walk(4, state_noise=1e-9, measurement_noise=1.0, dtype=np.float32)
-    for _ in range(100):
-        kf.predict()
-        kf.update(0.0, H=[0.0, 0.0, 0.0, 1e-6])
-    assert kf.P[0, 0] == 1.0
+@pytest.mark.parametrize(("state_noise", "used"), [(0.0, 2 * 2.0**-23), (1e-9, 2 * 2.0**-23), (1e-5, 1e-5)])
+def test_the_state_noise_of_float32_is_twice_its_rounding_at_least(state_noise, used):
+    """As docs/speed.md says: beside a variance of 1, whose last digit is 2^-23. float64 takes what it is given."""
+    for dtype, expected in ((np.float32, used), (np.float64, state_noise)):
+        kf = KFOPC.random_walk(4, state_noise=state_noise, measurement_noise=1.0, dtype=dtype)
+        for _ in range(100):
+            kf.predict()
+            kf.update(0.0, H=[0.0, 0.0, 0.0, 1e-6])
+        assert kf.P[0, 0] == pytest.approx(1.0 + 100 * expected, rel=0, abs=5e-6)

@@ -61,6 +61,7 @@ MAKERS: dict[str, Any] = {
     "diagonal KF-OPC": lambda **o: DiagonalKalman(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
     "fast-array KF": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, **o),
     "fast-array KF-OPC": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, constraint=constraint(), **o),
+    "finite-memory fast array": lambda **o: FastArrayKalman(N_TAPS, S_HAT, measurement_noise=Q, memory=2 * N_TAPS, **o),
     "FxLMS": lambda **o: FxLMS(N_TAPS, S_HAT, step_size=MU, **o),
     "FxNLMS": lambda **o: FxNLMS(N_TAPS, S_HAT, step_size=0.1, **o),
     "leaky": lambda **o: LeakyFxLMS(N_TAPS, S_HAT, step_size=MU, leak=0.3, **o),

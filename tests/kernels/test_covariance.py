@@ -26,7 +26,8 @@ from kfopc_filterpy.loop.scenarios import SharedGains, advance_gains
 def some_covariance(n: int, owed: tuple[float, float, float]) -> tuple[Covariance, np.ndarray]:
     """A covariance that owes (scale, diagonal, inverse S), and P written out."""
     rng = np.random.default_rng(n)
-    A, g = rng.standard_normal((n, n)), rng.standard_normal(n)
+    A, direction = rng.standard_normal((n, n)), rng.standard_normal(n)
+    g = A @ direction / (2.0 * np.linalg.norm(direction))  # so that P is positive semidefinite up to inverse_S = 4
     cov, (scale, diagonal, inverse_S) = new_covariance(A @ A.T), owed
     cov.gain_direction[:] = g
     for name, value in zip(("scale", "diagonal", "inverse_S"), owed, strict=True):
@@ -189,6 +190,61 @@ def test_a_step_without_a_solution_changes_nothing(n: int, cause: str, owed: Any
     np.testing.assert_array_equal(w, 0.25)
     assert cov.owed.item() == kept
     assert_close(covariance_matrix(cov), P, 1e-13)
+
+
+# ---- A P whose small variances are lost in the rounding of its large ones
+
+
+def split_covariance(small: float, dtype: Any = np.float64) -> tuple[Covariance, np.ndarray, np.ndarray]:
+    """A covariance with variance 1 along all directions but one, where it is `small`; P written out, and that direction."""
+    direction = np.array([0.6, 0.0, -0.8])
+    P = np.eye(3) - (1.0 - small) * np.outer(direction, direction)
+    return new_covariance(P, dtype), P, direction
+
+
+def test_a_negative_variance_is_raised_above_zero() -> None:
+    """By twice what is missing, and the last digit of the largest variance."""
+    cov, P, h = split_covariance(-1e-13)
+    variance = projected(cov, 2.0 * h)
+    eps = np.finfo(np.float64).eps
+    assert variance == pytest.approx(4.0 * (1e-13 + eps), rel=0.05)
+    after = covariance_matrix(cov)
+    np.testing.assert_allclose(after - P, (2e-13 + eps) * np.eye(3), rtol=0, atol=2e-15)
+    np.testing.assert_allclose(cov.product, after @ (2.0 * h), rtol=0, atol=2e-15)
+    assert np.linalg.eigvalsh(after)[0] > 0.0
+
+
+@pytest.mark.parametrize(("small", "floored"), [(1e-16, True), (1e-13, False)])
+def test_state_noise_is_added_only_from_when_a_variance_is_lost_in_rounding(small: float, floored: bool) -> None:
+    """16 roundings of the largest variance are 3.6e-15. The state noise is two of them, and begins with the next sample."""
+    cov, P, h = split_covariance(small)
+    projected(cov, h)
+    np.testing.assert_allclose(covariance_matrix(cov), P, rtol=0, atol=4e-16)
+    for _ in range(50):
+        projected(cov, h)
+    expected = P + 50 * 2 * np.finfo(np.float64).eps * np.eye(3) if floored else P
+    np.testing.assert_allclose(covariance_matrix(cov), expected, rtol=0, atol=2e-15)
+
+
+def test_a_small_p_beside_a_large_row_is_not_taken_for_rounding() -> None:
+    """What counts is h'P h over h'h and the largest variance now, not the one at the start."""
+    cov = new_covariance(np.eye(2))
+    w = np.zeros(2)
+    for h in (np.array([1e3, 0.0]), np.array([0.0, 1e3])) * 4:
+        stepped(cov, w, h, 1.0, 0.0, 1e-12, 1.0)
+    assert np.all(np.diagonal(covariance_matrix(cov)) < 1e-17)
+    projected(cov, np.array([1.0, 1.0]))
+    assert cov.owed["floored"][0] == 0.0
+    assert cov.owed["bound"][0] < 1e-17
+
+
+def test_the_state_noise_against_rounding_does_not_compound() -> None:
+    """It is at most what the largest variance at the start asks for: P grows in a line, and not without bound."""
+    cov, _, h = split_covariance(1e-16, np.float32)
+    for _ in range(3000):
+        stepped(cov, np.zeros(3), h, 0.0, 0.0, 1.0, 1.0)
+    eps = np.finfo(np.float32).eps
+    assert covariance_matrix(cov)[1, 1] == pytest.approx(1.0 + 3000 * 2 * eps, rel=1e-4)
 
 
 def test_the_gains_of_a_line_stop_where_a_sample_has_no_solution() -> None:

@@ -1,0 +1,1 @@
+"""The soak: controllers that run for very long."""

@@ -1,0 +1,222 @@
+"""The soak in short, and what it must notice."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons.__main__ import main
+from comparisons.soak import study
+from kfopc_filterpy import FxLMS, OutputLimiter, kf_anc, simulate
+
+ROOT = Path(__file__).resolve().parents[2]
+SHORT = 20_000
+
+
+@pytest.mark.parametrize("case", study.all_cases(), ids=lambda case: f"{case.name}-{case.precision}-{case.ratio}")
+def test_every_controller_holds_for_a_while(case: study.Case) -> None:
+    """The alternating noise shows all the others in turn; a case that has not got it runs on white noise."""
+    signal = "alternating" if "alternating" in case.signals else "white"
+    samples = round((4 * study.TURN + SHORT if signal == "alternating" else SHORT) * max(case.share, 0.25))
+    outcome = study.soak(case, signal, samples)
+    assert outcome.violations == []
+    assert outcome.samples == samples
+
+
+@pytest.mark.parametrize("precision", ["float64", "float32"])
+def test_a_band_of_noise_leaves_p_semidefinite(precision: str) -> None:
+    """P(0|0)/q = 1e12 over 200 000 samples; without what `kernels.covariance.blurred` does, S is negative by 9000."""
+    case = study.kalman_case("KF-ANC", kf_anc, precision, 1e12)
+    outcome = study.soak(case, "narrow band", 200_000)
+    assert outcome.violations == []
+    assert outcome.least_eigenvalue >= study.LEAST_EIGENVALUE[precision]
+    assert outcome.noise_reduction_db > (43.0 if precision == "float64" else 25.0)
+
+
+class Breaking(FxLMS):
+    """FxLMS to whose properties something happens at a sample."""
+
+    def __init__(self, at: int, what: str) -> None:
+        super().__init__(4, study.SECONDARY, step_size=1e-3)
+        self.at, self.what, self.done = at, what, 0
+
+    def control_signal(self, reference: float) -> float:
+        self.done += 1
+        return super().control_signal(reference)
+
+    @property
+    def broken(self) -> bool:
+        return self.done >= self.at
+
+    @property
+    def covariance(self) -> np.ndarray:
+        P = np.eye(4)
+        if self.broken:
+            P[0, 1] = {"asymmetric": 1e-9, "indefinite": 1.1, "not finite": np.nan}.get(self.what, 0.0)
+            P[1, 0] = P[0, 1] if self.what != "asymmetric" else 0.0
+        return P
+
+    @property
+    def weights(self) -> np.ndarray:
+        return np.full(4, np.nan) if self.broken and self.what == "weights" else super().weights
+
+    def update(self, error: float) -> None:
+        if self.broken and self.what == "refused":
+            raise ValueError("the update has no solution: because")
+        super().update(error)
+        if self.broken and self.what == "loud":
+            self._state.weights[:] = 10.0
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ("asymmetric", "P is not symmetric"),
+        ("indefinite", "the smallest eigenvalue of P is -0.048 of the largest"),
+        ("not finite", "P is not finite"),
+        ("weights", "the weights are not finite"),
+        ("loud", "the noise is louder than without control"),
+        ("refused", "refused in sample"),
+    ],
+)
+def test_what_goes_wrong_is_noticed_and_dated(what: str, message: str) -> None:
+    """At sample 450 of 1000, with a check every 50: the one at 450, and for a refusal the last good one."""
+    outcome = study.soak(study.Case("breaking", lambda: Breaking(450, what)), "white", 1000)
+    (sample, fault), *_ = outcome.violations
+    assert sample == {"refused": 400, "loud": 500}.get(what, 450)
+    assert fault.startswith(message)
+
+
+def test_a_process_that_grows_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    grown = iter(100.0 + 3.0 * np.arange(study.CHECKS))
+    monkeypatch.setattr(study, "process_mb", lambda: next(grown))
+    outcome = study.soak(study.Case("FxLMS", lambda: Breaking(10**9, "")), "white", 2000)
+    assert outcome.violations == [(800, "the process has grown by 18 MB")]  # from the second check to the eighth
+
+
+def test_the_memory_of_the_process_is_what_it_holds() -> None:
+    before = study.process_mb()
+    held = np.ones(8_000_000)  # 64 MB
+    assert 55.0 < study.process_mb() - before < 75.0
+    del held
+
+
+def test_a_limiter_that_does_not_hold_is_noticed() -> None:
+    """The limiter's own power against a rating that is a tenth lower than the one it keeps."""
+    x = np.sqrt(2.0) * np.sin(0.1 * np.arange(4000))
+    limiter = OutputLimiter(0.5, fs=study.FS)
+    controller = kf_anc(4, [1.0], state_noise=0.0, measurement_noise=1e-4, limiter=limiter)
+    result = simulate(controller, x, disturbance=2.0 * x, secondary_path=[1.0])
+    case = study.Case("limited", lambda: controller)
+    assert study.signal_faults(case, controller, result, "tone", starting=False) == []
+    result = replace(result, control_signal=np.sqrt(1.1) * result.control_signal)
+    (fault,) = study.signal_faults(case, controller, result, "tone", starting=False)
+    assert fault.startswith("a window has 1.1")
+
+
+def test_the_intervals_are_one_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Anti-noise that is under way between two intervals is not lost. A tone, without the noise drawn for each interval."""
+    monkeypatch.setattr(study, "SENSOR_NOISE", 0.0)
+    errors = {}
+    for checks in (1, 20):
+        monkeypatch.setattr(study, "CHECKS", checks)
+        controller = FxLMS(8, study.SECONDARY, step_size=1e-3)
+        errors[checks] = np.concatenate(
+            [run(controller).error for run in study.intervals("tone", 4000, study.SECONDARY)]
+        )
+    np.testing.assert_allclose(errors[20], errors[1], rtol=0, atol=1e-9)
+
+
+def test_what_rings_on_is_the_rest_of_the_convolution() -> None:
+    rng = np.random.default_rng(0)
+    paths, y = rng.standard_normal((3, 2, 4)), rng.standard_normal((2, 50))
+    rest = [sum(np.convolve(paths[k, j], y[j])[50:] for j in range(2)) for k in range(3)]
+    np.testing.assert_allclose(study.ringing(paths, y), rest, atol=1e-12)
+    np.testing.assert_allclose(study.ringing(paths[0, 0], y[0]), np.convolve(paths[0, 0], y[0])[50:], atol=1e-12)
+
+
+@pytest.mark.parametrize("signal", ["white", "narrow band", "tone"])
+def test_the_noises_have_power_one_and_go_on(signal: str) -> None:
+    whole = study.SOURCES[signal](np.random.default_rng(3))(160_000)
+    take = study.SOURCES[signal](np.random.default_rng(3))
+    parts = np.concatenate([take(size) for size in (1, 15_999, 144_000)])
+    np.testing.assert_allclose(parts, whole, atol=1e-9)
+    assert np.mean(whole**2) == pytest.approx(1.0, rel=0.1)
+
+
+def test_the_alternating_noise_takes_turns() -> None:
+    take = study.alternating_source(np.random.default_rng(3))
+    signal = np.concatenate([take(size) for size in (10_000, 30_000, 24_000)]).reshape(4, study.TURN)
+    assert list(np.any(signal != 0.0, axis=1)) == [True, False, True, True]
+
+
+def test_the_command_prints_and_writes(tmp_path: Any, capsys: pytest.CaptureFixture) -> None:
+    arguments = ["soak", "--quiet", "--samples", "4e3", "--only", "FxLMS", "--output", str(tmp_path / "new")]
+    assert main(arguments) == 0
+    written = json.loads((tmp_path / "new" / "soak.json").read_text())
+    assert [one["signal"] for one in written] == list(study.SOURCES)
+    assert all(one["samples"] == 4000 and one["violations"] == [] for one in written)
+    printed = capsys.readouterr().out
+    assert "0 of 5 runs violated a promise" in printed
+    row = next(line for line in printed.splitlines() if line.startswith("FxLMS"))
+    assert f"{written[0]['noise_reduction_db']:.1f}" in row
+
+
+def test_a_violation_fails_the_command(
+    tmp_path: Any, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = study.Case("breaking", lambda: Breaking(1050, "indefinite"), signals=("white", "tone"))
+    monkeypatch.setattr(study, "all_cases", lambda: [case])
+    assert main(["soak", "--quiet", "--samples", "2000", "--output", str(tmp_path)]) == 1
+    printed = capsys.readouterr().out
+    assert "VIOLATION: breaking, float64, white, by sample 1,100: the smallest eigenvalue" in printed
+    assert "2 of 2 runs violated a promise" in printed
+
+
+def test_an_interrupted_soak_keeps_what_it_has(
+    tmp_path: Any, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted() -> Any:
+        raise KeyboardInterrupt
+
+    good = study.Case("FxLMS", lambda: FxLMS(4, study.SECONDARY, step_size=1e-3), signals=("white",))
+    monkeypatch.setattr(study, "all_cases", lambda: [good, study.Case("interrupted", interrupted)])
+    assert main(["soak", "--quiet", "--samples", "2000", "--output", str(tmp_path)]) == study.INTERRUPTED
+    assert "interrupted after 1 of 6 runs" in capsys.readouterr().out
+    assert len(json.loads((tmp_path / "soak.json").read_text())) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["soak", "--samples", "100"], "--samples must be 2000 at least, got 100"),
+        (["soak", "--samples", "nan"], "--samples must be 2000 at least, got nan"),
+        (["soak", "--only", "nothing"], "no controller fits nothing; there are KF-ANC"),
+        (["tonal", "soak"], "soak runs alone, and is named first"),
+    ],
+)
+def test_bad_arguments_are_refused(
+    arguments: list[str], message: str, tmp_path: Any, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_documentation_shows_the_cases_of_today() -> None:
+    """docs/soak.txt is a whole run of the command, without a violation."""
+    printed = (ROOT / "docs" / "soak.txt").read_text(encoding="utf-8")
+    rows = [line.split("  ")[0] for line in printed.split("\n\n")[0].splitlines()[1:]]
+    cases = study.all_cases()
+    assert rows == [case.name for case in cases]
+    runs = sum(len(case.signals) for case in cases)
+    assert f"{runs} runs of {study.SAMPLES:,} samples" in printed
+    assert f"0 of {runs} runs violated a promise" in printed
+    assert "{literalinclude} soak.txt" in (ROOT / "docs" / "soak.md").read_text(encoding="utf-8")
