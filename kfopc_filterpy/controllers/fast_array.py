@@ -9,13 +9,21 @@ import numpy as np
 from .._validate import as_count, as_positive
 from ..kernels.compiling import inlined, part
 from ..kernels.delay_lines import latest, newest
-from ..kernels.fast_array import FastArray, array_holds, correct_by_rotations, new_fast_array, restart_array, stray
+from ..kernels.fast_array import (
+    FastArray,
+    array_holds,
+    correct_by_rotations,
+    new_fast_array,
+    restart_array,
+    rotate_array,
+    stray,
+)
 from ..kernels.records import new_record
 from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint, advance_constraint, squares_are_finite
 from ..power.limiter import OutputLimiter
 from .base import FilteredReferenceController, constraint_or_none
-from .step import Lines, adapt, disturbance_estimate, follow
+from .step import Lines, adapt, disturbance_estimate, follow, skip
 
 # Of the finite memory, whose arrays can be restarted:
 LARGEST_STRAY = 1e-4  # beyond it an array is lost
@@ -89,6 +97,27 @@ def adapt_finite_memory(state, error, control_signal):
 def follow_finite_memory(state, error):
     """Adapt while listening, like the single array."""
     return rotate_both(state, error)
+
+
+@skip.register(FastArrayState)
+def skip_fast_array(state):
+    """Advance the array, which must follow each sample of the filtered reference, as if the weights had been right."""
+    advance_if_held(state.array, newest(state.lines.filtered, state.weights.size + 1))
+
+
+@skip.register(FiniteMemoryState)
+def skip_finite_memory(state):
+    """Advance both arrays."""
+    row = newest(state.lines.filtered, state.weights.size + 1)
+    advance_if_held(state.one.array, row)
+    advance_if_held(state.other.array, row)
+
+
+@part()
+def advance_if_held(array, row):
+    """Advance an array without correcting weights; one that rounding has corrupted is left for the next update."""
+    if array_holds(array, row):
+        rotate_array(array)
 
 
 @inlined

@@ -101,8 +101,8 @@ def array_holds(array, row):
 
 
 @part(fastmath=FAST)
-def correct_by_rotations(array, w, row, d):
-    """Apply the two rotations, then w += g (d - w' x'); call `array_holds` with the same `row` first."""
+def rotate_array(array):
+    """Apply the two rotations; call `array_holds` with the row first."""
     gain, first, second, numbers = array.gain, array.first, array.second, array.numbers[0]
     root = np.sqrt(numbers.root**2 + numbers.ahead**2)
     c, s, t = numbers.root / root, numbers.ahead / root, numbers.behind / root
@@ -118,6 +118,13 @@ def correct_by_rotations(array, w, row, d):
         energy += gain[i] * gain[i]
     numbers.root, numbers.energy = root / h, energy
     numbers.heard += 1
+
+
+@part(fastmath=FAST)
+def correct_by_rotations(array, w, row, d):
+    """Apply the two rotations, then w += g (d - w' x'); call `array_holds` with the same `row` first."""
+    rotate_array(array)
+    gain, numbers = array.gain, array.numbers[0]
     if numbers.heard <= numbers.trusted:
         return
     residual = d
