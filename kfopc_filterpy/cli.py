@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         return options.run(options)
-    except (ValueError, TypeError, OSError, ImportError) as error:
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
         words = " ".join(str(error).split()) or type(error).__name__
         print(f"{options.prog}: {words}", file=sys.stderr)
         return WRONG_INPUT

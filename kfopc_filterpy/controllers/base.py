@@ -562,7 +562,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         with np.errstate(over="ignore"):
             return self._refusal if np.isfinite(values**2).all() else OVERFLOW
 
-    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
 
         Parameters
@@ -571,6 +571,8 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             Reference.
         errors : ndarray, shape (n_samples,) or (K, n_samples)
             Signals of the error microphones while the loudspeakers are silent.
+        adapt : bool or ndarray of shape (n_samples,), default True
+            Whether to follow a sample; the others only enter the delay lines.
         """
         if self.multichannel:
             x, e = self._channel_signals(references, errors)
@@ -578,7 +580,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             x = as_signal(references, "references")
             e = as_signal(errors, "errors", length=x.size)
             self._require_finite_squares(x, e)
-        taken = self._listen(x, e)
+        taken = self._listen(x, e, adapt_flags(adapt, len(x)))
         if taken < len(x):
             refused = ValueError(OVERFLOW if self.multichannel else self._refusal)
             refused.add_note(f"in sample {taken} of those listened to")
@@ -586,9 +588,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         if self.multichannel:
             self.after_compiled(self._state)  # a solution may be due
 
-    def _listen(self, references: np.ndarray, errors: np.ndarray) -> int:
+    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         """Follow signals whose first axis is time; return the number of samples before a refusal."""
-        return listen(self._state, references, errors)
+        return listen(self._state, references, errors, adapting)
 
     def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return references and errors with a sample in each row."""

@@ -118,12 +118,12 @@ class BlockController(FilteredReferenceController):
         """Learn from a block and set the control filters; `references`, (I, n), end with those of the block."""
         raise NotImplementedError
 
-    def _listen(self, references: np.ndarray, errors: np.ndarray) -> int:
+    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         """Follow block by block."""
         taken = 0
         while taken < len(references):
             block = slice(taken, taken + self.samples_to_block())
-            done = super()._listen(references[block], errors[block])
+            done = super()._listen(references[block], errors[block], adapting[block])
             self.after_compiled(self._state)
             taken += done
             if done < len(references[block]):

@@ -173,7 +173,7 @@ def correct_pair(elder, younger, numbers, mixed, row, d):
         restart(younger, elder.weights, turns.initial)
     share = 0.0
     if turns.paired != 0:
-        share = younger.array.numbers[0].heard / turns.memory
+        share = min(younger.array.numbers[0].heard / turns.memory, 1.0)  # skipped samples are heard without turns
     for i in range(mixed.size):
         mixed[i] = elder.weights[i] + share * (younger.weights[i] - elder.weights[i])
     if share >= 1.0:

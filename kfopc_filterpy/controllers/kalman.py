@@ -219,22 +219,12 @@ class KalmanController(FilteredReferenceController):
         error = as_number(error, "error")
         state = self._steppable_state()
         if state is None:
-            self._update_or_restore(error)
+            self._update_through_estimator(error)
         elif adapt_once.with_held(self._held(), error, self._y):
             self.estimator.after_compiled(state.weights.copy())
         else:
-            self._update_or_restore(error)  # raises, with the reason
+            self._update_through_estimator(error)  # raises, with the reason
             raise ValueError(NO_SOLUTION)
-
-    def _update_or_restore(self, error: float) -> None:
-        """Call the estimator; if it refuses the update, undo its `predict`."""
-        estimator = self.estimator
-        x, P = np.array(estimator.x), np.array(estimator.P)
-        try:
-            self._update_through_estimator(error)
-        except Exception:
-            estimator.x, estimator.P = x, P
-            raise
 
     def _update_through_estimator(self, error: float) -> None:
         """Call the estimator's `predict` and `update`."""
@@ -295,10 +285,10 @@ class KalmanController(FilteredReferenceController):
         elif arrays is not None:  # it diverged before its first update
             self.estimator.go_on_from(arrays)
 
-    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
+    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
         """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
         self._state_with_estimator()
-        super().listen(references, errors)
+        super().listen(references, errors, adapt=adapt)
 
 
 def kf_anc(

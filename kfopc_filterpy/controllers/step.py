@@ -231,7 +231,7 @@ def estimate_once(lines, error):
 
 
 @compiled_for_states(nogil=True)
-def listen(state, references, errors):
+def listen(state, references, errors, adapting):
     """Follow signals while the loudspeakers are silent; return the number of samples processed before a refusal.
 
     The first axis is time; with several channels, each row is a sample.
@@ -240,7 +240,9 @@ def listen(state, references, errors):
     for n in range(references.shape[0]):
         take_reference(state.lines, references[n])
         emit_silence(state.lines)
-        if not follow(state, errors[n]):
+        if not adapting[n]:
+            skip(state)
+        elif not follow(state, errors[n]):
             return n
     return references.shape[0]
 

@@ -8,6 +8,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from .._validate import as_positive
 from ..controllers.power_budget import kf_pb
 from ..paths.reading import read_path
 from ..power.limiter import OutputLimiter
@@ -49,15 +50,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--taps", type=int, default=256, metavar="N", help="taps of the control filter (default: 256)")
     parser.add_argument(
-        "--seconds", type=float, metavar="S", help="time under control (default: until the end, or Ctrl-C)"
+        "--seconds", type=float, metavar="S", help="seconds of control (default: until the recording ends, or Ctrl-C)"
     )
     parser.add_argument("--listen", type=float, default=2.0, metavar="S", help="silence before (default: 2)")
     parser.add_argument("--identify", type=float, default=5.0, metavar="S", help="noise that is played (default: 5)")
-    parser.add_argument("--quiet", action="store_true", help="only the result")
+    parser.add_argument("--quiet", action="store_true", help="print only the result")
 
 
 def run_command(options: argparse.Namespace) -> int:
     """Run with the options of `add_options`; return 0, or 1 if a fault ended the run."""
+    as_positive(options.rated_power, "--rated-power")
     interface = _interface(options)
     limit = 4.0 * options.rated_power**0.5 if options.amplitude_limit is None else options.amplitude_limit
     show = None if options.quiet else _Screen(sys.stderr)
@@ -77,6 +79,11 @@ def run_command(options: argparse.Namespace) -> int:
 
 
 def _interface(options: argparse.Namespace) -> Interface:
+    card = (options.device, options.references, options.errors)
+    if options.noise is not None and any(option is not None for option in card):
+        raise ValueError(
+            "give either a recording or a sound card: --device, --references and --errors do not go with a recording"
+        )
     if options.noise is None:
         if options.references is None or options.errors is None:
             raise ValueError(
@@ -88,7 +95,7 @@ def _interface(options: argparse.Namespace) -> Interface:
             options.references,
             options.errors,
             options.outputs,
-            fs=options.fs or 16000.0,
+            fs=16000.0 if options.fs is None else options.fs,
             block=options.block,
             device=device,
         )
@@ -143,12 +150,14 @@ class _Screen:
 
     def __init__(self, stream: TextIO) -> None:
         self._stream, self._is_terminal = stream, stream.isatty()
+        self._calls = 0
 
     def __call__(self, levels: Levels) -> None:
         line = describe(levels)
+        self._calls += 1
         if self._is_terminal:
             self._stream.write(f"\r\x1b[K{line}")
-        elif round(levels.time_s / 0.25) % 20 == 0:  # in a file, a line every five seconds
+        elif self._calls % 20 == 0:  # in a file, a line every five seconds
             self._stream.write(f"{line}\n")
         self._stream.flush()
 

@@ -71,7 +71,7 @@ class Health:
     def note(
         self, what: str, channel: str = "", *, time_s: float, n_samples: int = 1, until_s: float | None = None
     ) -> None:
-        """Record an event, or that the last one of its kind goes on.
+        """Record an event, or extend the last one of its kind.
 
         Parameters
         ----------

@@ -172,10 +172,11 @@ class SimulatedInterface:
         self._feedback = None if feedback is None else _Paths(feedback)
         self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
         self._done, self._began = 0, 0.0
+        self.blocks_can_repeat = False  # simulated noise may be exactly periodic
 
     def _disturbances(self, primary_path: Any, disturbance: Any) -> np.ndarray:
         if (primary_path is None) == (disturbance is None):
-            raise ValueError("give either primary_path= or disturbance=, not both and not neither")
+            raise ValueError("give exactly one of primary_path= and disturbance=")
         if disturbance is not None:
             d = np.atleast_2d(as_channels(disturbance, "disturbance"))
             if d.shape != (self.n_microphones, self._x.shape[1]):

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
+from inspect import signature
 from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_generator, as_nonnegative, as_positive
+from .._validate import as_count, as_generator, as_nonnegative, as_positive, per_loudspeaker
 from ..bounds.power_constrained import power_constrained_wiener
 from ..bounds.settings import SuggestedSettings, suggest_settings
 from ..controllers.base import Controller, listed
 from ..paths.identification import PathEstimate, estimate_path
+from .faults import LARGEST
 from .health import Health
 from .interfaces import Interface
 from .supervisor import Supervisor
@@ -23,7 +25,8 @@ from .supervisor import Supervisor
 LOUDEST = 1e12  # times the power of the reference: a rated power that limits nothing
 WORTH_DB = 1.0  # less noise reduction than this, by any filter, is no control
 WARM_UP = 1024  # samples, so that a controller that works between blocks has done so
-FATAL = 3  # divergences after which a run stops
+FATAL, FATAL_S = 3, 600.0  # so many divergences within this time end a run
+MOST_PARTS = 2048  # whose energies are kept; then neighbours are joined
 DELAY_SHARE = 0.05  # of the largest tap, at which a path has arrived
 
 
@@ -187,7 +190,7 @@ class _Session:
         self.load = self.load_since_report = 0.0
 
     def play(self, signal: np.ndarray) -> _Heard:
-        """Play a signal (J, n), and return what was heard meanwhile."""
+        """Play a signal (J, n), and return what was heard meanwhile; a value that is not finite becomes 0."""
         heard: list[Any] = []
         size = self.interface.block
         blocks = -(-signal.shape[1] // size)
@@ -200,7 +203,8 @@ class _Session:
             self.interface.write(padded[:, b * size : (b + 1) * size])
         if not heard:
             raise FaultError("the interface ended before anything was heard")
-        x, e = (np.concatenate([block[i] for block in heard], axis=1) for i in (0, 1))
+        self.lost += sum(block.lost for block in heard)
+        x, e = (_finite(np.concatenate([block[i] for block in heard], axis=1)) for i in (0, 1))
         return _Heard(x, e, padded[:, : x.shape[1]])
 
     def step(self, supervisor: Supervisor) -> tuple[Any, np.ndarray] | None:
@@ -219,6 +223,11 @@ class _Session:
         self.load = max(self.load, share)
         self.load_since_report = max(self.load_since_report, share)
         return block, y
+
+
+def _finite(signals: np.ndarray) -> np.ndarray:
+    """Return signals with 0 for each value that is no sound."""
+    return np.where(np.abs(signals) <= LARGEST, signals, 0.0)
 
 
 def measure_round_trip(
@@ -263,6 +272,8 @@ def measure_round_trip(
     """
     level, longest = as_positive(level, "level"), as_count(longest, "longest")
     n = round(as_positive(seconds, "seconds", unit="s") * interface.fs) + longest
+    if n < 2 * longest:
+        raise ValueError(f"seconds must be at least longest / fs, {longest / interface.fs:.3g} s, got {seconds:g} s")
     noise = level * as_generator(rng).standard_normal(n)
     interface.start()
     try:
@@ -318,7 +329,7 @@ def run(
 
     In order: listen to the noise with silent loudspeakers; play noise and identify the secondary paths, with the buffers
     of the interface; check that a control filter can reduce the noise in time; fade in; control; fade out. A `Supervisor`
-    stands between the controller and the interface. The run stops by itself after three divergences.
+    stands between the controller and the interface. The run stops by itself after three divergences within ten minutes.
 
     Parameters
     ----------
@@ -386,17 +397,28 @@ def run(
     ('end', 65, True)
     """
     listen_n = max(round(as_nonnegative(listen_s, "listen_s", unit="s") * interface.fs), interface.block)
-    level = 0.1 * float(np.min(amplitude_limit)) if excitation is None else as_positive(excitation, "excitation")
+    limits = per_loudspeaker(amplitude_limit, interface.n_loudspeakers, "amplitude_limit")
+    level = 0.1 * float(np.min(limits)) if excitation is None else as_positive(excitation, "excitation")
+    identify_s = as_positive(identify_s, "identify_s", unit="s")
+    as_positive(report_every_s, "report_every_s", unit="s")
+    if seconds is not None:
+        as_positive(seconds, "seconds", unit="s")
+    unknown = set(supervision) - set(signature(Supervisor).parameters)
+    if unknown:
+        raise TypeError(f"run has no setting {', '.join(sorted(unknown))}, and Supervisor has none either")
     session = _Session(interface)
     identified = None
     with _open(interface):
         silence = session.play(np.zeros((interface.n_loudspeakers, listen_n)))
         if not isinstance(controller, Controller):
-            identified = _identified(session, silence, level, identify_s, n_path, as_generator(rng))
+            identified = _identified(session, silence, level, limits, identify_s, n_path, as_generator(rng))
     made = controller if isinstance(controller, Controller) else controller(identified)  # type: ignore[arg-type]
 
     def supervised(controller: Any) -> Supervisor:
-        settings: dict[str, Any] = {"full_scale": getattr(interface, "full_scale", None)} | supervision
+        known = {"full_scale": None, "blocks_can_repeat": True}
+        settings: dict[str, Any] = {
+            name: getattr(interface, name, value) for name, value in known.items()
+        } | supervision
         return Supervisor(controller, fs=interface.fs, amplitude_limit=amplitude_limit, **settings)
 
     supervisor = supervised(made)
@@ -414,8 +436,8 @@ def run(
 @contextmanager
 def _open(interface: Interface) -> Iterator[None]:
     """Open the streams for a while; what takes long is done in between, so that no block is lost."""
-    interface.start()
     try:
+        interface.start()
         yield
     finally:
         interface.stop()
@@ -442,7 +464,7 @@ def _control(
 ) -> str:
     """Control until the end; return what ended it. Whatever that is, the loudspeakers fade out."""
     last = np.inf if seconds is None else as_positive(seconds, "seconds", unit="s") * supervisor.fs
-    done, stopped_by = 0, ""
+    done, stopped_by, divergences = 0, "", supervisor.divergence_times_s
     try:
         while not stopped_by:
             stepped = session.step(supervisor)
@@ -450,19 +472,27 @@ def _control(
                 return "end"
             watch.add(*stepped)
             done += session.interface.block
-            divergences = sum(n for what, n in supervisor.health.counts.items() if what.startswith("diverged"))
             if done >= last:
                 stopped_by = "end"
             elif should_stop is not None and should_stop():
                 stopped_by = "user"
-            elif divergences >= FATAL:
+            elif len(divergences) == FATAL and divergences[-1] - divergences[0] < FATAL_S:
                 stopped_by = f"fault: {FATAL} divergences"
     except KeyboardInterrupt:
         stopped_by = "user"
+    except Exception:
+        with suppress(Exception):  # the first one counts
+            _fade_out(session, supervisor)
+        raise
+    _fade_out(session, supervisor)
+    return stopped_by
+
+
+def _fade_out(session: _Session, supervisor: Supervisor) -> None:
+    """Step until the loudspeakers are silent."""
     supervisor.fade_out()
     while not supervisor.muted and session.step(supervisor) is not None:
         pass
-    return stopped_by
 
 
 class _Watch:
@@ -480,10 +510,11 @@ class _Watch:
         self._every = max(round(as_positive(every_s, "report_every_s", unit="s") * supervisor.fs), 1)
         self._counts = (supervisor.n_references, supervisor.n_microphones, supervisor.n_loudspeakers)
         self._before = np.mean(silence.e**2, axis=1)
-        self._parts: list[tuple[Any, ...]] = []  # of each second: samples, energies of e and of y
+        self._parts: list[tuple[Any, ...]] = []  # samples, energies of e and of y
+        self._part = supervisor.fs  # samples of a part
         self._samples = 0
         self._new_sums()
-        self._second = self._no_energy()
+        self._second = self._no_energy()  # of the present part
 
     def _no_energy(self) -> list[Any]:
         _, n_microphones, n_loudspeakers = self._counts
@@ -497,18 +528,23 @@ class _Watch:
     def add(self, block: Any, y: np.ndarray) -> None:
         """Add a block, and report if it is time."""
         n = y.shape[1]
-        with np.errstate(invalid="ignore"):
-            energies = [np.nansum(np.square(signals), axis=1) for signals in (block.references, block.errors, y)]
-        self._n, self._samples = self._n + n, self._samples + n
+        energies = [np.sum(np.square(_finite(signals)), axis=1) for signals in (block.references, block.errors, y)]
+        self._n, self._samples = self._n + n, self._samples + n + block.lost
         self._x, self._e, self._y = (
             total + energy for total, energy in zip((self._x, self._e, self._y), energies, strict=True)
         )
         self._second[0] += n
         self._second[1] = self._second[1] + energies[1]
         self._second[2] = self._second[2] + energies[2]
-        if self._second[0] >= self._supervisor.fs:
+        if self._second[0] >= self._part:
             self._parts.append(tuple(self._second))
             self._second = self._no_energy()
+            if len(self._parts) == MOST_PARTS:
+                self._part *= 2
+                self._parts = [
+                    tuple(a + b for a, b in zip(one, other, strict=True))
+                    for one, other in zip(self._parts[::2], self._parts[1::2], strict=True)
+                ]
         if self._n >= self._every:
             if self._on_report is not None:
                 self._on_report(self._levels())
@@ -569,19 +605,24 @@ def _identified(
     session: _Session,
     silence: _Heard,
     level: float,
+    limits: np.ndarray,
     identify_s: float,
     n_path: int | None,
     rng: np.random.Generator,
 ) -> IdentifiedPlant:
     """Play noise from each loudspeaker in turn, and return what this tells about the plant."""
     interface = session.interface
-    n = round(as_positive(identify_s, "identify_s", unit="s") * interface.fs)
-    recordings = []
+    n, recordings, lost = round(identify_s * interface.fs), [], session.lost
     for j in range(interface.n_loudspeakers):
         signal = np.zeros((interface.n_loudspeakers, n))
-        signal[j] = level * rng.standard_normal(n)
+        signal[j] = np.clip(level * rng.standard_normal(n), -limits[j], limits[j])
         recordings.append(session.play(signal))
         session.play(np.zeros((interface.n_loudspeakers, round(0.1 * interface.fs))))  # let it die away
+    if session.lost > lost:
+        raise FaultError(
+            f"{session.lost - lost} samples were lost while the path was identified, so that it would be wrong: use "
+            "longer blocks, or run again"
+        )
     longest = n // 4
     arrivals = [_arrival(r.y[j], e, longest) for j, r in enumerate(recordings) for e in r.e]
     clear = [arrival for arrival in arrivals if arrival is not None]
@@ -590,6 +631,8 @@ def _identified(
             "no loudspeaker is heard by any error microphone: check the cables and the channels, or raise excitation"
         )
     taps = min(clear) + round(0.016 * interface.fs) if n_path is None else as_count(n_path, "n_path")
+    if taps <= min(clear):
+        raise ValueError(f"n_path must exceed the round trip, {min(clear)} samples, got {n_path}")
     length = min(r.y.shape[1] for r in recordings)
     fs = interface.fs
     left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
@@ -626,7 +669,7 @@ def _require_fit(supervisor: Supervisor, interface: Interface) -> None:
 
 
 def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
-    """Return the noise reduction of the best filter; raise `NotCausalError` if there is none, and a faster plant has."""
+    """Return the noise reduction of the best filter; raise `NotCausalError` if only a faster plant would allow any."""
     path, n_taps = getattr(controller, "secondary_path", None), getattr(controller, "n_taps", None)
     if path is None or n_taps is None or not np.any(silence.e) or not np.any(silence.x):
         return np.nan
@@ -643,7 +686,7 @@ def _possible_db(silence: _Heard, controller: Any, fs: float) -> float:
         f"the anti-noise comes too late: it takes {delay} samples ({1e3 * delay / fs:.1f} ms) to reach the error "
         f"microphone, and no filter of {n_taps} taps reduces the noise by more than {possible:.1f} dB (without this delay "
         f"{sooner:.1f} dB). Use shorter blocks, or move the reference microphone towards the noise: each millisecond "
-        "takes 34 cm. check_causality=False runs it nevertheless"
+        "corresponds to 34 cm. To run anyway, set check_causality=False"
     )
 
 

@@ -1,7 +1,8 @@
-"""A supervisor for a controller in a real-time process: whatever comes in, what goes out is finite and within limits."""
+"""Supervise a controller in a real-time process: its output stays finite and within limits."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from copy import deepcopy
 from functools import partial
@@ -10,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_choice, as_positive, as_real_array, as_sample_count, per_loudspeaker
-from ..controllers.base import Controller
+from ..controllers.base import Controller, FilteredReferenceController
 from ..controllers.processing import RefusedUpdate, process_steps
+from ..paths.uncertainty import GUARD_TAPS
 from ..power.constraint import DEFAULT_FS
 from .faults import GOOD, KINDS, REPEATED, Inspector, is_repeated
 from .health import Health
@@ -24,19 +26,23 @@ OVER_POWER = (
 PATIENCE = 3  # windows in a row that must be too loud: after a jump of the noise, the power needs some time
 OFTEN_LIMITED = 0.1  # of a window's samples at the limit
 SURPRISE = 1e4  # squared innovation over its predicted variance, relative to what is usual: 40 dB
+GROWN = 1.5  # times the last normal gain: a filter that is louder with the same gain hears louder noise
+OFTEN_REFUSED = 0.1  # of a window's samples
+MOST_REFUSALS = 3  # in a block; then the rest of it is not adapted to
+FORGOTTEN_S = 600.0  # without a divergence, after which the pauses are short again
 SETTLING_WINDOWS = 4  # before the usual surprise is known
 USUAL_WINDOWS = 40.0  # over which it is averaged
 
 
 class Supervisor:
-    """Runs a controller block by block, and keeps faults of microphones, drivers and the adaptation from the loudspeakers.
+    """Run a controller block by block, and keep faults from the loudspeakers.
 
     Three things hold, whatever the inputs are. The control signal is finite and within `amplitude_limit`. A bad sample is
     never adapted to: weights, covariance and running powers stay as they are. Every event is counted in `health`.
 
     A bad sample of a reference also spoils the filtered reference for as long as the control filter and the secondary
-    path remember it. The controller therefore adapts again after ``recovery_samples``, L + n_path samples after the last
-    bad reference. After a bad error, it adapts to the next sample.
+    path remember it. The controller therefore adapts again `recovery_samples` after the last bad reference. After a bad
+    error, it adapts to the next sample.
 
     Parameters
     ----------
@@ -45,26 +51,29 @@ class Supervisor:
     fs : float, default 16000
         Sample rate in Hz.
     amplitude_limit : float or array_like, shape (J,)
-        Largest magnitude of the control signal, of all loudspeakers or of each. This is a last resort, which the
-        controller does not know of: give the controller itself a limiter of a smaller `amplitude_limit`.
+        Largest magnitude of the control signal, of all loudspeakers or of each. The controller does not know about this
+        last resort: give it a limiter with a smaller `amplitude_limit`.
     full_scale : float, optional
-        Magnitude at which the converters of the microphones clip; by default they do not.
+        Magnitude at which the converters of the microphones clip; by default, clipping is not detected.
     stuck_s : float, default 0.01
         Time of equal samples after which a microphone is stuck, in seconds. Digital silence is stuck too.
     fade_s : float, default 0.05
         Time in seconds over which the control fades in and out.
     mute_after_s : float, default 10
-        Time in seconds without a usable sample after which the control fades out; it fades in again after `fade_s` of
-        usable samples.
+        Time in seconds without a usable sample after which the control fades out; with the next usable one it fades in.
     on_divergence : {"mute", "reset", "freeze"}, default "mute"
-        What to do about a divergence: fade out, start anew with a fresh copy after a pause, and double the pause for the
-        next time; start anew at once; or go back to the state of the last good window and do not adapt during the pause.
+        What to do about a divergence: fade out and restart with a fresh copy after a pause; restart at once; or restore
+        the state of the last good window and do not adapt during the pause. Each pause is twice the last one, until
+        there was none for ten minutes.
     pause_s : float, default 2
         First pause in seconds.
     window_s : float, default 0.25
         Time over which the divergence monitor averages, in seconds.
     largest_gain : float, default 1e6
         Largest sum of the magnitudes of a control filter's weights.
+    blocks_can_repeat : bool, default True
+        Whether a block that equals the last one in all channels is a fault of the driver. Switch it off for simulated
+        noise whose period divides the block.
 
     Attributes
     ----------
@@ -75,7 +84,10 @@ class Supervisor:
     muted : bool
         Whether the loudspeakers are silent now.
     recovery_samples : int
-        Samples after a bad reference before the controller adapts again; 0 if it does not say how much it remembers.
+        Samples after a bad reference before the controller adapts again: the taps of its filter and its secondary path,
+        and a guard filter; 0 if the controller does not state its memory.
+    divergence_times_s : deque of float
+        Times of the latest divergences, at most three.
 
     Raises
     ------
@@ -88,9 +100,10 @@ class Supervisor:
 
     - weights that are not finite, or larger than `largest_gain`;
     - in three windows in a row, a control signal of more than four times the controller's rated power, or one at its
-      limit for a tenth of the time;
-    - squared innovations, relative to their predicted variance, 40 dB above what has been usual, for the controllers
-      around a Kalman filter (of the last sample of each block).
+      limit for a tenth of the time, from a control filter whose gain has grown;
+    - updates that the controller refuses for a tenth of the samples;
+    - squared innovations 40 dB above what is usual or predicted, if the reference has not risen as much, for the
+      controllers around a Kalman filter (of the last sample of each block).
 
     It cannot see that the noise becomes louder in the room: put the controller into a `MonitoredController` for that, for
     example for a microphone or a loudspeaker whose sign was flipped.
@@ -125,6 +138,7 @@ class Supervisor:
         pause_s: float = 2.0,
         window_s: float = 0.25,
         largest_gain: float = 1e6,
+        blocks_can_repeat: bool = True,
     ) -> None:
         if isinstance(controller, type) or not isinstance(controller, Controller):
             raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
@@ -157,18 +171,28 @@ class Supervisor:
         self._mute_after = as_sample_count(mute_after_s, fs, "mute_after_s")
         self._window = as_sample_count(window_s, fs, "window_s")
         self._pause = self._first_pause = as_sample_count(pause_s, fs, "pause_s")
-        self._samples = 0  # processed since the start
-        self._gain, self._target = 1.0, 1.0  # of the control signal, and where it fades to
+        self.blocks_can_repeat = blocks_can_repeat
+        self.divergence_times_s: deque[float] = deque(maxlen=3)
+        self._samples = 0  # since the start, lost ones included
+        self._gain = 1.0  # of the control signal
+        self._wanted = True  # whether the user wants control
         self._waiting = 0  # samples left of a pause
         self._replacement_due = False  # a fresh controller takes over when the loudspeakers are silent
         self._frozen = 0  # samples left without adaptation
-        self._since_bad_reference = self.recovery_samples
+        self._since_bad_reference = self._since_fade = self.recovery_samples
         self._unusable = 0  # samples since the last usable one
         self._paused_for_input = False
         self._last_y = np.zeros(self.n_loudspeakers)
         self._last_blocks: tuple[Any, Any] = (None, None)
-        self._usual, self._windows, self._loud_windows = np.nan, 0, 0
+        self._usual, self._usual_reference, self._normal_gain = np.nan, np.nan, np.inf
+        self._windows, self._loud_windows = 0, 0
         self._begin_window()
+
+    @property
+    def _target(self) -> float:
+        """Gain that the control signal fades to."""
+        held_back = self._waiting > 0 or self._paused_for_input or self._replacement_due
+        return 1.0 if self._wanted and not held_back else 0.0
 
     @property
     def muted(self) -> bool:
@@ -181,15 +205,15 @@ class Supervisor:
 
     def fade_in(self) -> None:
         """Let the control fade in over `fade_s`."""
-        self._target = 1.0
+        self._wanted = True
 
     def fade_out(self) -> None:
         """Let the control fade out over `fade_s`; the controller listens while it is silent."""
-        self._target = 0.0
+        self._wanted = False
 
     def start_silent(self) -> None:
         """Begin with silent loudspeakers; `fade_in` starts the control."""
-        self._gain = self._target = 0.0
+        self._gain, self._wanted = 0.0, False
 
     def process(self, references: Any, errors: Any, *, lost: int = 0) -> np.ndarray:
         """Return the control signals of a block.
@@ -214,11 +238,15 @@ class Supervisor:
             Signals of other shapes, or that are not numbers: nothing was changed.
         """
         x, e = self._read(references, errors)
-        usable = self._usable(x, e, lost)
+        if lost:
+            self._note("lost", n_samples=lost)
+            self._samples += lost
+            self._since_bad_reference = 0
+        usable = self._usable(x, e)
         y = self._control(x, e, usable)
         self._limit(y)
         self._samples += y.shape[1]
-        self._watch(y)
+        self._watch(x, y)
         return y if self.multichannel else y[0]
 
     # ---- What comes in
@@ -236,7 +264,10 @@ class Supervisor:
         ]
         lengths = {block.shape[1] for block in given if block is not None}
         if len(lengths) != 1 or 0 in lengths:
-            raise ValueError(f"references and errors must have the same number of samples, at least 1, got {lengths}")
+            raise ValueError(
+                "references and errors must have the same number of samples, at least 1, got "
+                f"{' and '.join(str(length) for length in sorted(lengths))}"
+            )
         (n,) = lengths
         x, e = (
             np.full((channels, n), np.nan) if block is None else block
@@ -244,10 +275,11 @@ class Supervisor:
         )
         return x, e
 
-    def _usable(self, x: np.ndarray, e: np.ndarray, lost: int) -> np.ndarray:
-        """Return which samples can be adapted to, (n,); bad ones are replaced in place and noted."""
-        n = x.shape[1]
-        repeated = is_repeated(x, self._last_blocks[0]) and is_repeated(e, self._last_blocks[1])
+    def _usable(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
+        """Return which samples can be learned from, (n,); bad ones are replaced in place and noted."""
+        repeated = (
+            self.blocks_can_repeat and is_repeated(x, self._last_blocks[0]) and is_repeated(e, self._last_blocks[1])
+        )
         self._last_blocks = (x.copy(), e.copy())
         kinds = [inspector(block) for inspector, block in zip(self._inspectors, (x, e), strict=True)]
         if repeated:
@@ -255,15 +287,9 @@ class Supervisor:
                 kind[kind == GOOD] = REPEATED
         for name, kind in zip(("reference", "error"), kinds, strict=True):
             self._note_kinds(name, kind)
-        if lost:
-            self._note("lost", n_samples=lost)
-            self._since_bad_reference = 0
         bad_x, bad_e = (np.any(kind != GOOD, axis=0) for kind in kinds)
-        index = np.arange(n)
-        last_bad = np.maximum.accumulate(np.where(bad_x, index, -1))
-        since = np.where(last_bad < 0, self._since_bad_reference + index, index - last_bad - 1)
+        since, self._since_bad_reference = _samples_since(bad_x, self._since_bad_reference)
         usable = ~bad_x & ~bad_e & (since >= self.recovery_samples)
-        self._since_bad_reference = int(since[-1]) + 1
         self._count_unusable(usable)
         return usable
 
@@ -289,12 +315,10 @@ class Supervisor:
         if self._unusable > self._mute_after and not self._paused_for_input and self._target == 1.0:
             self._note("silent: no usable input")
             self._paused_for_input = True
-            self.fade_out()
         elif self._paused_for_input and self._unusable == 0:
-            self._note("running again")
             self._paused_for_input = False
-            if self._waiting == 0:
-                self.fade_in()
+            if self._target == 1.0:
+                self._note("running again")
 
     # ---- The control signal
 
@@ -302,16 +326,17 @@ class Supervisor:
         """Return the control signals of a block, (J, n), faded."""
         n = x.shape[1]
         gains = self._gains(n)
+        # The controller does not know that its output is faded: it must forget that before it adapts.
+        since, self._since_fade = _samples_since(gains < 1.0, self._since_fade)
         if not np.any(gains):
             self._listen(x, e, usable)
             y = np.zeros((self.n_loudspeakers, n))
         else:
             frozen = min(self._frozen, n)
             self._frozen -= frozen
-            usable[:frozen] = False
-            y = self._adapted(x, e, usable & (gains == 1.0)) * gains
-            if gains[-1] < 1.0:  # the controller does not know that its output is faded: it must forget that
-                self._since_bad_reference = 0
+            adapt = usable & (since >= self.recovery_samples)
+            adapt[:frozen] = False
+            y = self._adapted(x, e, adapt) * gains
         return self._finite(y)
 
     def _gains(self, n: int) -> np.ndarray:
@@ -327,20 +352,22 @@ class Supervisor:
         """Let the controller follow the noise with silent loudspeakers, and count the pause."""
         if self._replacement_due:
             self.controller, self._replacement_due = deepcopy(self._fresh), False
-        if np.all(usable) and hasattr(self.controller, "listen"):
-            try:
-                self.controller.listen(*(self._shaped(block) for block in (x, e)))
-            except ValueError:
-                self._note("refused", n_samples=x.shape[1])
+        signals = [self._shaped(block) for block in (x, e)]
+        try:
+            if isinstance(self.controller, FilteredReferenceController):
+                self.controller.listen(*signals, adapt=usable)
+            elif np.all(usable) and hasattr(self.controller, "listen"):
+                self.controller.listen(*signals)
+        except ValueError:
+            self._note("refused", n_samples=x.shape[1])
         if self._waiting > 0:
             self._waiting = max(self._waiting - x.shape[1], 0)
-            if self._waiting == 0 and not self._paused_for_input:
+            if self._target == 1.0:
                 self._note("running again")
-                self.fade_in()
 
     def _adapted(self, x: np.ndarray, e: np.ndarray, adapt: np.ndarray) -> np.ndarray:
         """Return the controller's outputs, (J, n); a sample that it refuses is counted, and the rest goes on."""
-        y, begin, n = np.zeros((self.n_loudspeakers, x.shape[1])), 0, x.shape[1]
+        y, begin, n, refusals = np.zeros((self.n_loudspeakers, x.shape[1])), 0, x.shape[1], 0
         process: Callable[..., Any] = getattr(self.controller, "process", None) or partial(
             process_steps, self.controller
         )
@@ -356,6 +383,14 @@ class Supervisor:
                 except RefusedUpdate as refused:
                     done = refused.sample + 1
                     self._note("refused", after=begin + refused.sample)
+                    self._refused += 1
+                    refusals += 1
+                    if refusals == MOST_REFUSALS:
+                        self._refused += int(np.count_nonzero(adapt[done + begin :]))
+                        adapt = np.zeros_like(adapt)
+                except Exception as error:  # whatever it is, the loudspeakers must not be left with it
+                    self._stop(f"diverged: {type(error).__name__}: {error}", at_once=True)
+                    return y
                 y[:, begin : begin + done] = room[:, :done]
                 begin += done
         return y
@@ -385,16 +420,17 @@ class Supervisor:
     # ---- The divergence monitor
 
     def _begin_window(self) -> None:
-        self._counted, self._energy = 0, np.zeros(self.n_loudspeakers)
-        self._limited = np.zeros(self.n_loudspeakers)
+        self._counted, self._energy, self._reference_energy = 0, np.zeros(self.n_loudspeakers), 0.0
+        self._limited, self._refused = np.zeros(self.n_loudspeakers), 0
         self._surprises: list[float] = []
 
-    def _watch(self, y: np.ndarray) -> None:
+    def _watch(self, x: np.ndarray, y: np.ndarray) -> None:
         """Add a block to the window; at its end, act if the adaptation has diverged."""
-        if self.muted:
+        if self._target == 0.0 or self._gain < 1.0 or self._frozen > 0:
             return
         self._counted += y.shape[1]
         self._energy += np.sum(y * y, axis=1)
+        self._reference_energy += float(np.sum(x * x))
         surprise = _surprise(self.controller)
         if np.isfinite(surprise):
             self._surprises.append(surprise)
@@ -402,63 +438,72 @@ class Supervisor:
             what = self._divergence()
             if what:
                 self._stop(f"diverged: {what}")
-            elif self._good is not None:
+            elif self._good is not None and self._loud_windows == 0:
                 self._good = deepcopy(self.controller)
             self._begin_window()
 
     def _divergence(self) -> str:
         """Return what shows a divergence in this window; empty if nothing does."""
         weights = getattr(self.controller, "control_filter", getattr(self.controller, "weights", np.zeros(1)))
-        gains = np.abs(np.atleast_1d(weights)).sum(axis=-1)
-        if not np.all(gains <= self.largest_gain):
+        gain = float(np.max(np.abs(np.atleast_1d(weights)).sum(axis=-1)))
+        if not gain <= self.largest_gain:
             return "weights"
-        rated = getattr(self.controller, "rated_power", None)
-        over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
-        loud = over or np.any(self._limited > OFTEN_LIMITED * self._counted)
-        self._loud_windows = self._loud_windows + 1 if loud else 0
-        if self._loud_windows == PATIENCE:
-            self._loud_windows = 0
-            return "power"
+        if self._refused > OFTEN_REFUSED * self._counted:
+            return "refused"
+        if self._is_loud():
+            self._loud_windows += 1
+            if self._loud_windows >= PATIENCE and not gain <= GROWN * self._normal_gain < np.inf:
+                return "power"
+        else:
+            self._loud_windows, self._normal_gain = 0, gain
         return "innovation" if self._is_surprised() else ""
 
+    def _is_loud(self) -> bool:
+        """Return whether a control signal far exceeds its rated power, or is often at its limit."""
+        rated = getattr(self.controller, "rated_power", None)
+        over = rated is not None and np.any(self._energy / self._counted > OVER_POWER * np.asarray(rated))
+        return bool(over or np.any(self._limited > OFTEN_LIMITED * self._counted))
+
     def _is_surprised(self) -> bool:
-        """Return whether the innovations are far larger than usual."""
+        """Return whether the innovations are far larger than usual and predicted, and the reference does not explain it."""
         if not self._surprises:
             return False
-        mean = float(np.mean(self._surprises))
+        mean, reference = float(np.mean(self._surprises)), self._reference_energy / self._counted
         self._windows += 1
         if self._windows <= SETTLING_WINDOWS or not np.isfinite(self._usual):
-            self._usual = mean
+            self._usual, self._usual_reference = mean, reference
             return False
-        if mean > SURPRISE * self._usual:
+        rise = max(reference / self._usual_reference, 1.0) if self._usual_reference > 0.0 else np.inf
+        if mean > SURPRISE * max(self._usual, 1.0) * rise:
             self._windows = 0
             return True
         self._usual += (mean - self._usual) / USUAL_WINDOWS
+        self._usual_reference += (reference - self._usual_reference) / USUAL_WINDOWS
         return False
 
     def _stop(self, why: str, at_once: bool = False) -> None:
         """Act on a divergence."""
+        now = self._samples / self.fs
+        if self.divergence_times_s and now - self.divergence_times_s[-1] > FORGOTTEN_S:
+            self._pause = self._first_pause
+        self.divergence_times_s.append(now)
         self._note(why)
-        action = self.on_divergence
-        if action == "freeze":
+        if self.on_divergence == "freeze":
+            self._note("frozen")
             self.controller = deepcopy(self._good)
             self._frozen = self._pause
-            self._note("frozen")
+        elif self.on_divergence == "reset":
+            self._note("reset")
+            self.controller = deepcopy(self._fresh)
         else:
-            if action == "mute":
-                self._note("muted")
-                self._waiting = self._pause
-                self._target = 0.0
-                if at_once:
-                    self._gain = 0.0
-            else:
-                self._note("reset")
-            if at_once or action == "reset":
-                self.controller = deepcopy(self._fresh)
-            else:  # it goes on until it is silent
-                self._replacement_due = True
+            self._note("muted")
+            self._waiting = self._pause
+            self._replacement_due = True  # it goes on until it is silent
+            if at_once:
+                self._gain = 0.0
         self._pause = min(2 * self._pause, LONGEST_PAUSE * self._first_pause)
         self._since_bad_reference = 0
+        self._loud_windows, self._windows, self._normal_gain = 0, 0, np.inf
         self._begin_window()
 
     def _note(self, what: str, channel: str = "", *, after: int = 0, n_samples: int = 1) -> None:
@@ -482,10 +527,25 @@ def _channels(value: Any, n_channels: int, name: str) -> np.ndarray:
     return np.ascontiguousarray(block)
 
 
+def _samples_since(bad: np.ndarray, before: int) -> tuple[np.ndarray, int]:
+    """Return the number of good samples between the last bad one and each sample, and the number after the last.
+
+    `before` is the number at the start.
+    """
+    index = np.arange(bad.size)
+    last_bad = np.maximum.accumulate(np.where(bad, index, -1))
+    since = np.where(last_bad < 0, before + index, index - last_bad - 1)
+    return since, 0 if bad[-1] else int(since[-1]) + 1
+
+
 def _remembered(controller: Any) -> int:
     """Return the number of samples for which a reference has an effect on what a controller learns."""
-    path = getattr(controller, "secondary_path", None)
-    return int(getattr(controller, "n_taps", 0)) + (0 if path is None else int(np.shape(path)[-1]))
+    path, n_taps = getattr(controller, "secondary_path", None), getattr(controller, "n_taps", None)
+    if path is None or n_taps is None:
+        return 0
+    primary = getattr(controller, "primary_path", None)
+    longest = n_taps if primary is None else max(n_taps, np.shape(primary)[-1])
+    return int(longest + np.shape(path)[-1] + GUARD_TAPS)
 
 
 def _surprise(controller: Any) -> float:

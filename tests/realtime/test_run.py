@@ -177,7 +177,7 @@ def test_channels_that_do_not_fit_are_refused() -> None:
         run(FxLMS(8, np.ones((2, 1, 70)), step_size=1e-3), plant(), amplitude_limit=1.0, listen_s=0.1)
     with pytest.raises(ValueError, match="latency must be at least a block"):
         plant(latency=31)
-    with pytest.raises(ValueError, match="either primary_path= or disturbance="):
+    with pytest.raises(ValueError, match="exactly one of primary_path= and disturbance="):
         plant(disturbance=X)
     with pytest.raises(ValueError, match="feedback_path must lead"):
         SimulatedInterface(X, np.ones((1, 1, 2)), disturbance=X[np.newaxis], feedback_path=np.zeros((2, 1, 4)))
