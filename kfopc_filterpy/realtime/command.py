@@ -8,12 +8,13 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from .._validate import as_positive
 from ..controllers.power_budget import kf_pb
 from ..paths.reading import read_path
 from ..power.limiter import OutputLimiter
 from ..signals.recordings import read_recording
 from .interfaces import Interface, SimulatedInterface
-from .running import IdentifiedPlant, Levels, RunReport, run
+from .running import FaultError, IdentifiedPlant, Levels, RunReport, run
 from .sound_device import SoundDevice
 
 EXAMPLES = """examples:
@@ -59,17 +60,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run_command(options: argparse.Namespace) -> int:
     """Run with the options of `add_options`; return 0, or 1 if a fault ended the run."""
     interface = _interface(options)
+    as_positive(options.rated_power, "--rated-power")
     limit = 4.0 * options.rated_power**0.5 if options.amplitude_limit is None else options.amplitude_limit
     show = None if options.quiet else _Screen(sys.stderr)
-    report = run(
-        lambda plant: _controller(plant, options, limit),
-        interface,
-        amplitude_limit=limit,
-        seconds=options.seconds,
-        listen_s=options.listen,
-        identify_s=options.identify,
-        on_report=show,
-    )
+    try:
+        report = run(
+            lambda plant: _controller(plant, options, limit),
+            interface,
+            amplitude_limit=limit,
+            seconds=options.seconds,
+            listen_s=options.listen,
+            identify_s=options.identify,
+            on_report=show,
+        )
+    except FaultError as fault:
+        print(f"{options.prog}: {fault}", file=sys.stderr)
+        return 1
     if show is not None:
         show.end()
     print(_summary(report, interface.fs))
