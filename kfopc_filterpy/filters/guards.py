@@ -45,7 +45,7 @@ def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[No
     """
     for argument, value in arguments.items():
         if value is not None:
-            require_finite(np.asarray(value, dtype=np.float64), argument)
+            require_finite(as_real_array(value, argument), argument)
     before = state_of(kf)
     try:
         with np.errstate(all="ignore"):  # overflow and division by zero are detected below
