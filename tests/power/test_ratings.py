@@ -156,9 +156,9 @@ def test_a_loudspeakers_peak_volts_and_watts_are_in_units_of_the_control_signal(
     assert rating.watt(rating.rated_power) == pytest.approx(2.0)
     assert rating.watt(1.0) == pytest.approx(volts_per_unit**2 / 8.0)
     peak_alone = LoudspeakerRating(8.0, peak_volts=12.0, volts_per_unit=volts_per_unit)
-    assert np.mean((volts_per_unit * tone(400.0, 1.0, fs=FS, amplitude=math.sqrt(2 * peak_alone.rated_power))) ** 2) == (
-        pytest.approx(72.0)
-    )
+    assert np.mean(
+        (volts_per_unit * tone(400.0, 1.0, fs=FS, amplitude=math.sqrt(2 * peak_alone.rated_power))) ** 2
+    ) == (pytest.approx(72.0))
     assert LoudspeakerRating(8.0, noise_watt=2.0).amplitude_limit is None
     assert "_curve" not in repr(rating)
 

@@ -363,7 +363,11 @@ def test_its_results_depend_on_the_blocks_only_through_the_windows() -> None:
 
 @pytest.mark.parametrize(
     ("lost", "error", "message"),
-    [(..., TypeError, "lost must be a whole number"), (-1, ValueError, "lost must be at least 0"), (1.5, TypeError, "lost")],
+    [
+        (..., TypeError, "lost must be a whole number"),
+        (-1, ValueError, "lost must be at least 0"),
+        (1.5, TypeError, "lost"),
+    ],
     ids=["ellipsis", "negative", "fraction"],
 )
 def test_a_wrong_number_of_lost_samples_changes_nothing(lost: Any, error: type[Exception], message: str) -> None:
