@@ -111,8 +111,9 @@ def refused(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
     try:
         return call(), None
     except (TypeError, ValueError) as error:
-        assert str(error).strip(), repr(error)
-        return None, error
+        caught = error
+    assert str(caught).strip(), repr(caught)
+    return None, caught
 
 
 def magnitude(value: Any) -> float:
@@ -283,7 +284,7 @@ def test_a_wrong_command_is_told_in_one_line(
             code = cli.main(arguments)
         except SystemExit as end:
             code = end.code
-        out, err = capsys.readouterr()
+        err = capsys.readouterr().err
         assert code in (0, 1, 2), arguments
         if code == 2:
             assert err.startswith("kfopc"), (arguments, err)
