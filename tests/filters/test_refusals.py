@@ -271,11 +271,12 @@ def test_an_H_that_was_assigned_or_written_into_is_used(kind: str) -> None:
 def test_numbers_that_are_no_floats_are_refused(name, value, error):
     kf = KFOPC(3, 1)
     x, P = kf.x.copy(), kf.P.copy()
+
+    def step():
+        return kf.update(1.0, R=value, H=[[1.0, 0.0, 0.0]]) if name == "R" else kf.predict(**{name: value})
+
     with pytest.raises(error, match=name):
-        if name == "R":
-            kf.update(1.0, R=value, H=[[1.0, 0.0, 0.0]])
-        else:
-            kf.predict(**{name: value})
+        step()
     np.testing.assert_array_equal(kf.x, x)
     np.testing.assert_array_equal(kf.P, P)
 
