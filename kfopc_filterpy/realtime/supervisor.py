@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_choice, as_count, as_positive, as_real_array, as_sample_count, per_loudspeaker
+from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..controllers.base import Controller
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..power.constraint import DEFAULT_FS
@@ -214,6 +214,7 @@ class Supervisor:
             Signals of other shapes, or that are not numbers, or a negative number of lost samples: nothing was changed.
         """
         lost = as_count(lost, "lost", minimum=0)
+        as_number(lost, "lost")  # an integer of Python can be too large for a time
         x, e = self._read(references, errors)
         usable = self._usable(x, e, lost)
         y = self._control(x, e, usable)

@@ -367,8 +367,9 @@ def test_its_results_depend_on_the_blocks_only_through_the_windows() -> None:
         (..., TypeError, "lost must be a whole number"),
         (-1, ValueError, "lost must be at least 0"),
         (1.5, TypeError, "lost"),
+        (10**400, ValueError, "lost must be finite"),
     ],
-    ids=["ellipsis", "negative", "fraction"],
+    ids=["ellipsis", "negative", "fraction", "beyond a float"],
 )
 def test_a_wrong_number_of_lost_samples_changes_nothing(lost: Any, error: type[Exception], message: str) -> None:
     supervisor, block = supervised(MAKERS["FxLMS"]()), np.full(8, np.nan)
