@@ -37,6 +37,8 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
         raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
+    except OverflowError as error:  # an integer of Python
+        raise ValueError(f"{name} must be finite, but holds a number that is too large for a float") from error
     if real is None:  # numpy would drop the imaginary part with only a warning
         raise TypeError(f"{name} must be a sequence of real numbers, got complex ones")
     return real
@@ -85,6 +87,8 @@ def as_number(value: Any, name: str, *, unit: str = "") -> float:
         number = float(np.asarray(value).reshape(()))
     except (TypeError, ValueError) as error:
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}") from error
+    except OverflowError as error:  # an integer of Python
+        raise ValueError(f"{name} must be finite, got a number that is too large for a float") from error
     if not math.isfinite(number):
         raise ValueError(f"{name} must be finite, got {number}")
     return number
@@ -170,6 +174,8 @@ def as_sample_count(duration_s: Any, fs: Any, name: str) -> int:
     """Return a duration in seconds as a number of samples, at least one."""
     rate = as_positive(fs, "fs", unit="Hz")
     duration = as_positive(duration_s, name, unit="s")
+    if not math.isfinite(duration * rate):
+        raise ValueError(f"{name} must be a finite number of samples, got {duration:g} s at {rate:g} Hz")
     count = round(duration * rate)
     if count < 1:
         raise ValueError(f"{name} must be at least one sample, {1 / rate:g} s, got {duration:g} s")

@@ -45,7 +45,7 @@ def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[No
     """
     for argument, value in arguments.items():
         if value is not None:
-            require_finite(np.asarray(value, dtype=np.float64), argument)
+            require_finite(as_real_array(value, argument), argument)
     before = state_of(kf)
     try:
         with np.errstate(all="ignore"):  # overflow and division by zero are detected below
@@ -129,7 +129,7 @@ def require_matrix(value: Any, shape: tuple[int, ...], name: str) -> None:
     """Raise ValueError unless `value` is finite and has this shape."""
     if np.shape(value) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
-    require_finite(value, name)
+    require_finite(as_real_array(value, name), name)
 
 
 def require_variance(value: Any, size: int, name: str) -> None:
@@ -137,7 +137,7 @@ def require_variance(value: Any, size: int, name: str) -> None:
     if np.ndim(value) > 0 and np.size(value) > 1:
         require_matrix(value, (size, size), name)
     else:
-        require_finite(np.asarray(value, dtype=np.float64), name)
+        require_finite(as_real_array(value, name), name)
     if np.min(np.diagonal(value) if np.ndim(value) == 2 else value) < 0:
         raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")
 

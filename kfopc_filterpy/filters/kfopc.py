@@ -344,6 +344,8 @@ class KFOPC(KalmanFilter, Checkpointed):
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
         n = self.dim_x
         F = _as_matrix(F, "F")
+        if F is not None and np.ndim(F) == 0:
+            F = np.float64(as_number(F, "F"))  # filterpy transposes it, which Python's numbers cannot
         transition = self.F if F is None else F
         require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
         require_variance(self.Q if Q is None else Q, n, "Q")

@@ -14,7 +14,7 @@ from ..paths.reading import read_path
 from ..power.limiter import OutputLimiter
 from ..signals.recordings import read_recording
 from .interfaces import Interface, SimulatedInterface
-from .running import IdentifiedPlant, Levels, RunReport, run
+from .running import FaultError, IdentifiedPlant, Levels, RunReport, run
 from .sound_device import SoundDevice
 
 EXAMPLES = """examples:
@@ -61,17 +61,22 @@ def run_command(options: argparse.Namespace) -> int:
     """Run with the options of `add_options`; return 0, or 1 if a fault ended the run."""
     as_positive(options.rated_power, "--rated-power")
     interface = _interface(options)
+    as_positive(options.rated_power, "--rated-power")
     limit = 4.0 * options.rated_power**0.5 if options.amplitude_limit is None else options.amplitude_limit
     show = None if options.quiet else _Screen(sys.stderr)
-    report = run(
-        lambda plant: _controller(plant, options, limit),
-        interface,
-        amplitude_limit=limit,
-        seconds=options.seconds,
-        listen_s=options.listen,
-        identify_s=options.identify,
-        on_report=show,
-    )
+    try:
+        report = run(
+            lambda plant: _controller(plant, options, limit),
+            interface,
+            amplitude_limit=limit,
+            seconds=options.seconds,
+            listen_s=options.listen,
+            identify_s=options.identify,
+            on_report=show,
+        )
+    except FaultError as fault:
+        print(f"{options.prog}: {fault}", file=sys.stderr)
+        return 1
     if show is not None:
         show.end()
     print(_summary(report, interface.fs))

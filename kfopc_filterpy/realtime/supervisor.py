@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_choice, as_positive, as_real_array, as_sample_count, per_loudspeaker
+from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..controllers.base import Controller, FilteredReferenceController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
@@ -235,8 +235,10 @@ class Supervisor:
         Raises
         ------
         TypeError, ValueError
-            Signals of other shapes, or that are not numbers: nothing was changed.
+            Signals of other shapes, or that are not numbers, or a negative number of lost samples: nothing was changed.
         """
+        lost = as_count(lost, "lost", minimum=0)
+        as_number(lost, "lost")  # an integer of Python can be too large for a time
         x, e = self._read(references, errors)
         if lost:
             self._note("lost", n_samples=lost)
@@ -517,8 +519,6 @@ class Supervisor:
 
 def _channels(value: Any, n_channels: int, name: str) -> np.ndarray:
     """Return a copy of a block as (n_channels, n_samples); None becomes NaN."""
-    if (isinstance(value, np.ndarray) and value.dtype == object) or isinstance(value, list | tuple):
-        value = np.array(value, dtype=np.float64)
     block = np.array(as_real_array(value, name))
     block = block[np.newaxis] if block.ndim == 1 and n_channels == 1 else block
     if block.ndim != 2 or len(block) != n_channels:

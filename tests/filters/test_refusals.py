@@ -262,3 +262,26 @@ def test_an_H_that_was_assigned_or_written_into_is_used(kind: str) -> None:
     np.testing.assert_array_equal(assigned.x, written.x)
     assert assigned.x.any()
     assert not zeros.x.any()
+
+
+@pytest.mark.parametrize("name", ["F", "Q", "u", "R"])
+@pytest.mark.parametrize(
+    ("value", "error"), [(1j, TypeError), (10**400, ValueError)], ids=["complex", "beyond a float"]
+)
+def test_numbers_that_are_no_floats_are_refused(name, value, error):
+    kf = KFOPC(3, 1)
+    x, P = kf.x.copy(), kf.P.copy()
+
+    def step():
+        return kf.update(1.0, R=value, H=[[1.0, 0.0, 0.0]]) if name == "R" else kf.predict(**{name: value})
+
+    with pytest.raises(error, match=name):
+        step()
+    np.testing.assert_array_equal(kf.x, x)
+    np.testing.assert_array_equal(kf.P, P)
+
+
+def test_a_number_of_python_is_a_transition():
+    kf = KFOPC(2, 1)
+    kf.predict(F=0.5, Q=0.0)
+    np.testing.assert_array_equal(kf.P, 0.25 * np.eye(2))

@@ -146,3 +146,25 @@ def test_the_limiter_of_a_thermal_rating_lets_a_burst_pass_and_holds_the_mean():
 def test_a_rating_that_says_nothing_or_too_much_is_refused(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+@pytest.mark.parametrize("volts_per_unit", [0.5, 1.0, 4.0])
+def test_a_loudspeakers_peak_volts_and_watts_are_in_units_of_the_control_signal(volts_per_unit):
+    rating = LoudspeakerRating(8.0, noise_watt=2.0, peak_volts=12.0, volts_per_unit=volts_per_unit)
+    y = np.full(4, rating.amplitude_limit)
+    np.testing.assert_allclose(volts_per_unit * y, 12.0)
+    assert rating.watt(rating.rated_power) == pytest.approx(2.0)
+    assert rating.watt(1.0) == pytest.approx(volts_per_unit**2 / 8.0)
+    peak_alone = LoudspeakerRating(8.0, peak_volts=12.0, volts_per_unit=volts_per_unit)
+    assert np.mean(
+        (volts_per_unit * tone(400.0, 1.0, fs=FS, amplitude=math.sqrt(2 * peak_alone.rated_power))) ** 2
+    ) == (pytest.approx(72.0))
+    assert LoudspeakerRating(8.0, noise_watt=2.0).amplitude_limit is None
+    assert "_curve" not in repr(rating)
+
+
+def test_limits_are_ratings_themselves():
+    limits = OutputLimits(1.5, 3.0, 0.25, "fuse")
+    assert output_limits(limits) == limits
+    both = output_limits([limits, AmplifierRating(ohm=8.0, sine_watt=1.0)])
+    assert (both.rated_power, both.amplitude_limit, both.decided_by) == (1.5, 3.0, "fuse")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy.realtime import Health
+from kfopc_filterpy.realtime import Fault, Health
 from kfopc_filterpy.realtime.faults import CLIPPED, GOOD, NOT_FINITE, OFFSET, STUCK, Inspector, is_repeated
 
 FS = 8000.0
@@ -113,3 +113,20 @@ def test_the_record_stays_small_and_counts_go_on() -> None:
     health.note("clipped", "error 1", time_s=4999.005, until_s=4999.1)
     assert health.counts["clipped"] == 5001  # another channel
     assert repr(health) == "<Health: 5001 clipped>"
+
+
+def test_the_record_joins_events_that_are_close_and_keeps_others_apart() -> None:
+    health = Health()
+    health.note("clipped", "error 0", time_s=10.0, n_samples=3, until_s=10.2)
+    health.note("clipped", "error 0", time_s=10.28, n_samples=4, until_s=10.4)  # 0.08 s after the end: the same event
+    (event,) = health.events
+    assert event == Fault(10.0, "clipped", "error 0", 7, 10.4)
+    health.note("clipped", "error 0", time_s=10.47, n_samples=1, until_s=10.48)  # counted from its new end
+    assert (health.counts["clipped"], event.n_samples) == (1, 8)
+    health.note("clipped", "error 0", time_s=10.6, until_s=10.61)  # 0.12 s later: another one
+    assert (health.counts["clipped"], health.samples["clipped"], len(health.events)) == (2, 9, 2)
+    for _ in range(2):  # what has no duration is never joined
+        health.note("muted", time_s=11.0)
+    assert (health.counts["muted"], health.samples["muted"]) == (2, 2)
+    assert health.events[-1] == Fault(11.0, "muted", "", 1, 11.0)
+    assert Fault(1.0, "muted").n_samples == 1

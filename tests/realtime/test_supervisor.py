@@ -426,3 +426,32 @@ def test_silence_with_bad_samples_keeps_the_delay_lines_in_time() -> None:
     assert supervisor.controller.disturbance_power == other.disturbance_power
     np.testing.assert_array_equal(supervisor.process(x[:50], e[:50]), 0.0)
     supervisor.controller.listen(x[:1], e[:1])
+
+
+@pytest.mark.parametrize(
+    ("lost", "error", "message"),
+    [
+        (..., TypeError, "lost must be a whole number"),
+        (-1, ValueError, "lost must be at least 0"),
+        (1.5, TypeError, "lost"),
+        (10**400, ValueError, "lost must be finite"),
+    ],
+    ids=["ellipsis", "negative", "fraction", "beyond a float"],
+)
+def test_a_wrong_number_of_lost_samples_changes_nothing(lost: Any, error: type[Exception], message: str) -> None:
+    supervisor, block = supervised(MAKERS["FxLMS"]()), np.full(8, np.nan)
+    with pytest.raises(error, match=message):
+        supervisor.process(block, block, lost=lost)
+    assert not supervisor.health.samples
+    supervisor.process([None] * 7 + [1.0], block, lost=2)
+    assert supervisor.health.samples == {"not finite": 15, "lost": 2}
+
+
+def test_an_integer_beyond_a_float_is_refused() -> None:
+    supervisor = supervised(MAKERS["FxLMS"]())
+    with pytest.raises(ValueError, match="references must be finite, but holds a number that is too large"):
+        supervisor.process([10**400], [0.0])
+    with pytest.raises(ValueError, match="must be finite, got a number that is too large"):
+        supervisor.controller.control_signal(10**400)
+    with pytest.raises(ValueError, match="stuck_s must be a finite number of samples"):
+        supervised(MAKERS["FxLMS"](), stuck_s=1e308)

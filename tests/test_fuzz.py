@@ -1,0 +1,292 @@
+"""Arguments of any type, shape, size and value: refused with nothing changed, or a finite result; no other outcome.
+
+For a longer search: `FUZZ_SECONDS=180 pytest tests/test_fuzz.py -n0`, which gives each test so many seconds.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import KFOPC, FxLMS, OutputPowerConstraint, cli, kf_opc
+from kfopc_filterpy.controllers import RefusedUpdate
+from kfopc_filterpy.realtime import Supervisor
+from kfopc_filterpy.signals import write_wav
+
+SECONDS = float(os.environ.get("FUZZ_SECONDS") or "0")
+FS = 8000.0
+PATH = np.array([0.0, 0.0, 0.8, -0.3])
+PATHS = np.random.default_rng(3).standard_normal((2, 2, 4))
+LIMIT = 2.0
+KALMAN: dict[str, Any] = {"state_noise": 1e-7, "measurement_noise": 1e-2, "initial_variance": 1e-2}
+CONTROLLERS: dict[str, Callable[[], Any]] = {
+    "FxLMS": lambda: FxLMS(8, PATH, step_size=1e-3),
+    "KF-OPC": lambda: kf_opc(8, PATH, constraint=OutputPowerConstraint(0.5, fs=FS), **KALMAN),
+    "FxLMS of several channels": lambda: FxLMS(8, PATHS, step_size=1e-3),
+}
+SCALARS: list[Any] = [
+    *(0.0, -0.0, 1.0, -3.5, 5e-324, 1e-160, 1e-30, 1e30, 1e80, 1e154, -1e155, 1e300, np.finfo(float).max),
+    *(np.nan, np.inf, -np.inf, 0, 1, True, False, -7, 10**25, 10**400, 1j, 1 + 0j, np.complex128(2.0)),
+    *(
+        None,
+        "",
+        "1.0",
+        b"1",
+        "nan",
+        object,
+        {},
+        {1.0},
+        (),
+        [],
+        [[]],
+        [1.0],
+        [None],
+        [[1.0, 2.0], [3.0]],
+        ["x"],
+        range(3),
+    ),
+    *(
+        Fraction(1, 3),
+        np.float32(2.5),
+        np.float16(6e4),
+        np.longdouble(1.5),
+        np.int8(-3),
+        np.uint64(2**63),
+        np.bool_(True),
+    ),
+    *(np.datetime64("2020-01-01"), np.timedelta64(3, "s"), np.str_("a"), np.void(b"abc"), slice(3), Ellipsis),
+]
+DTYPES = ["f8", "f8", "f8", "f4", "f2", "i8", "u1", "bool", "c16", "O", ">f8", "U3", "M8[s]", "longdouble"]
+
+
+def rounds(few: int) -> Iterator[np.random.Generator]:
+    """Give a generator of random numbers for each round: `few` rounds, or `FUZZ_SECONDS` of them from a new seed."""
+    if not SECONDS:
+        yield from (np.random.default_rng(seed) for seed in range(few))
+        return
+    end, first = time.monotonic() + SECONDS, time.time_ns() % 2**40
+    for seed in itertools.count(first):
+        if time.monotonic() > end:
+            print(f"{seed - first} rounds in {SECONDS:g} s")
+            return
+        yield np.random.default_rng(seed)
+
+
+def anything(rng: np.random.Generator, good: tuple[int, ...]) -> Any:
+    """Return an argument: what is wanted, of shape `good`, or nearly that, or something quite different."""
+    kind = rng.integers(10)
+    if kind < 2:
+        return SCALARS[rng.integers(len(SCALARS))]
+    shape = good
+    if kind < 5:  # another shape
+        shape = tuple(int(n) for n in rng.choice([0, 1, 2, 3, 8, 9], size=rng.integers(0, 4)))
+    values = rng.standard_normal(shape) * 10.0 ** rng.choice([0.0, 0.0, 0.0, -200.0, -30.0, 30.0, 100.0, 154.0, 300.0])
+    if kind in (4, 5, 6) and values.size:
+        number = rng.choice([np.nan, np.inf, 1e200, 1e308, -1e154, 0.0, 5e-324])
+        values = np.where(rng.random(shape) < 0.2, number, values)
+    if kind != 7:
+        return values if values.ndim else float(values)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        values = np.asarray(values).astype(DTYPES[rng.integers(len(DTYPES))])
+    if rng.random() < 0.3:
+        return values.tolist()
+    return values[..., ::-1] if values.ndim else values
+
+
+def refused(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
+    """Return what a call gives, and the TypeError or ValueError with a message that it raised instead."""
+    try:
+        return call(), None
+    except (TypeError, ValueError) as error:
+        caught = error
+    assert str(caught).strip(), repr(caught)
+    return None, caught
+
+
+def magnitude(value: Any) -> float:
+    """Return the largest magnitude of an argument; 0 if it is no number, which is refused."""
+    try:
+        numbers = np.abs(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError, OverflowError):
+        return 0.0
+    return float(np.max(numbers, where=np.isfinite(numbers), initial=0.0))
+
+
+def trace(controller: Any, n: int = 12) -> np.ndarray:
+    """Return the control signals of a copy that goes on with sound."""
+    controller, rng = deepcopy(controller), np.random.default_rng(9)
+    several = getattr(controller, "multichannel", False)
+    ys = []
+    for x, e in rng.standard_normal((n, 2, 2)):
+        y = np.ravel(controller.control_signal(x[:1] if several else x[0]))
+        # A huge value that was accepted before can make this update impossible: then it must be so for both.
+        _, error = refused(lambda: controller.update(e if several else e[0]))  # noqa: B023 - called at once
+        ys.append([*y, error is None])
+    return np.array(ys)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_controller_refuses_and_goes_on_or_gives_finite_numbers(name: str) -> None:
+    for rng in rounds(4):
+        controller = CONTROLLERS[name]()
+        several, largest = controller.multichannel, 0.0
+        for _ in range(20):
+            before, method = deepcopy(controller), rng.choice(["control_signal", "update", "process"])
+            if method == "process":
+                n = int(rng.integers(1, 9))
+                x, e = (anything(rng, (channels, n) if several else (n,)) for channels in (1, 2))
+                options = {"adapt": anything(rng, (n,))} if rng.random() < 0.2 else {}
+                if rng.random() < 0.2:
+                    options["out"] = anything(rng, (2, n) if several else (n,))
+                given: tuple[Any, ...] = (x, e, options)
+                y, error = refused(lambda: controller.process(x, e, **options))  # noqa: B023 - called at once
+            else:
+                channels = (1 if method == "control_signal" else 2,) if several else ()
+                given = (anything(rng, channels),)
+                y, error = refused(lambda: getattr(controller, method)(*given))  # noqa: B023 - called at once
+            if error is not None and not isinstance(error, RefusedUpdate):
+                np.testing.assert_array_equal(trace(controller), trace(before), err_msg=f"{method}{given}")
+            if method != "update":
+                largest = max(largest, magnitude(given[0]))
+            weights = max(np.max(np.abs(one.weights)) for one in (before, controller))
+            # Without a limiter, weights of 1e200 or a reference of 1e300 are allowed; only then an output can overflow.
+            if y is not None and float(weights) * largest < 1e300:
+                assert np.all(np.isfinite(y)), (method, given)
+        assert np.all(np.isfinite(controller.weights))
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_a_supervisor_is_finite_and_within_its_limit(name: str) -> None:
+    for rng in rounds(12):
+        action = rng.choice(["mute", "reset", "freeze"])
+        supervisor = Supervisor(
+            CONTROLLERS[name](),
+            fs=FS,
+            amplitude_limit=LIMIT,
+            on_divergence=str(action),
+            window_s=0.002,
+            fade_s=0.001,
+            pause_s=0.002,
+        )
+        several = supervisor.multichannel
+        for _ in range(40):
+            n = int(rng.integers(1, 17))
+            given = [anything(rng, (channels, n) if several else (n,)) for channels in (1, 2)]
+            lost = SCALARS[rng.integers(len(SCALARS))] if rng.random() < 0.1 else 0
+            samples, health = supervisor._samples, dict(supervisor.health.samples)
+            y, error = refused(lambda: supervisor.process(*given, lost=lost))  # noqa: B023 - called at once
+            if error is None:
+                assert np.all(np.isfinite(y)), given
+                assert np.max(np.abs(y)) <= LIMIT
+            else:
+                assert (supervisor._samples, dict(supervisor.health.samples)) == (samples, health), (given, lost, error)
+
+
+def test_a_filter_refuses_and_stays_or_is_finite() -> None:
+    for rng in rounds(60):
+        kf = KFOPC(3, 1, rated_power=1.0 if rng.random() < 0.5 else None)
+        kf.P *= 0.1
+        for _ in range(12):
+            before = deepcopy(kf)
+            if rng.random() < 0.4:
+                shapes = {"u": (1,), "B": (3, 1), "F": (3, 3), "Q": (3, 3)}
+                options = {key: anything(rng, shape) for key, shape in shapes.items() if rng.random() < 0.4}
+                _, error = refused(lambda: kf.predict(**options))  # noqa: B023 - called at once
+            else:
+                options = {"z": anything(rng, (1, 1)), "H": anything(rng, (1, 3))}
+                options |= {"R": anything(rng, (1, 1))} if rng.random() < 0.3 else {}
+                options |= {"reference": anything(rng, ())} if rng.random() < 0.3 else {}
+                _, error = refused(lambda: kf.update(**options))  # noqa: B023 - called at once
+            if error is not None:
+                for key in ("x", "P", "constraint_factor"):
+                    np.testing.assert_array_equal(
+                        getattr(kf, key, None), getattr(before, key, None), err_msg=str(options)
+                    )
+            assert np.all(np.isfinite(kf.x)), options
+            assert np.all(np.isfinite(kf.P)), options
+
+
+WORDS = [
+    *("verdict", "compare", "paths", "identify", "inspect", "convert", "resample", "run", "data", "list", "where"),
+    *(
+        "noise.wav",
+        "P.wav",
+        "S.wav",
+        "d.wav",
+        "empty.wav",
+        "text.wav",
+        "zeros.wav",
+        "nan.npy",
+        "stereo.wav",
+        "tiny.csv",
+    ),
+    *("missing.wav", ".", "/dev/null", "", "-", "é\u0000"[:1], "out.wav", "no/folder/out.wav", "out.xyz", "--", "-o"),
+    *("--primary", "--secondary", "--disturbance", "--fs", "--channel", "--variable", "--taps", "--memory", "--watt"),
+    *("--ohm", "--rated-power", "--want-db", "--volts-per-unit", "--peak-volts", "--json", "--algorithm", "--seconds"),
+    *("0", "-1", "1", "1e-300", "1e300", "1e400", "nan", "inf", "-inf", "8000", "8000.5", "0.1", "abc", "10" * 30),
+    *("KF-PB", "FxLMS", "KF-OPC,FxLMS", "--impedance", "--path-error-samples", "--no-such-option"),
+]
+# Complete commands that one word at a time is changed in; `run` is short, and `verdict` has so few taps that it is fast.
+SCENE = ["noise.wav", "--primary", "P.wav", "--secondary", "S.wav", "--rated-power", "0.1"]
+COMMANDS = [
+    ["paths", "inspect", "S.wav", "--primary", "P.wav", "--fs", "8000"],
+    ["paths", "convert", "S.wav", "S2.csv", "--channel", "0"],
+    ["paths", "resample", "S.wav", "S3.wav", "--fs", "4000"],
+    ["paths", "identify", "noise.wav", "d.wav", "--taps", "16", "-o", "S4.wav"],
+    ["data", "list", "--json"],
+    ["verdict", *SCENE, "--ohm", "8", "--want-db", "nan"],
+    ["compare", *SCENE, "--algorithm", "none"],
+    ["run", *SCENE, "--seconds", "nan"],
+]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working folder with good and bad files."""
+    noise = np.random.default_rng(0).standard_normal(800)
+    files = {"noise": noise, "d": np.roll(noise, 3), "P": np.eye(16)[6], "S": np.eye(16)[2], "zeros": np.zeros(64)}
+    for name, samples in (files | {"stereo": np.stack((noise, noise))}).items():
+        write_wav(tmp_path / f"{name}.wav", 0.2 * samples, 8000)
+    (tmp_path / "empty.wav").write_bytes(b"")
+    (tmp_path / "text.wav").write_text("these are words")
+    (tmp_path / "tiny.csv").write_text("1\n")
+    np.save(tmp_path / "nan.npy", np.full(8, np.nan))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_wrong_command_is_told_in_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(b"")))
+    for rng in rounds(60):
+        arguments = list(COMMANDS[rng.integers(len(COMMANDS))])
+        for _ in range(rng.integers(1, 3)):
+            place = int(rng.integers(1, len(arguments) + 1))
+            word = WORDS[rng.integers(len(WORDS))]
+            if word in ("verdict", "compare", "run"):
+                continue  # a whole run takes longer than all the wrong ones
+            arguments[place : place + int(rng.integers(0, 2))] = [word]
+        try:
+            code = cli.main(arguments)
+        except SystemExit as end:
+            code = end.code
+        err = capsys.readouterr().err
+        assert code in (0, 1, 2), arguments
+        if code == 2:
+            assert err.startswith("kfopc"), (arguments, err)
+            assert err.count("\n") == 1, (arguments, err)
+            assert len(err.split(": ", 1)[1].strip()) > 3, (arguments, err)
