@@ -100,10 +100,11 @@ def test_version_is_the_same_everywhere():
     version = kfopc_filterpy.__version__
     cited = re.search(r"^version: *[\"']?([^\"'\s]+)", read("CITATION.cff"), flags=re.MULTILINE)
     assert importlib.metadata.version(DISTRIBUTION) == version
-    assert tomllib.loads(read("pyproject.toml"))["project"]["version"] == version
     assert cited is not None
     assert cited[1] == version
-    assert version in read("CHANGELOG.md")
+    released = re.search(r"^date-released: *(\S+)$", read("CITATION.cff"), flags=re.MULTILINE)
+    assert released is not None
+    assert f"## [{version}] - {released[1]}" in read("CHANGELOG.md").splitlines()
 
 
 def test_every_requirement_is_pinned_within_its_range():
