@@ -94,3 +94,5 @@ def leave_links_offline(app):
 def setup(app):
     app.connect("builder-inited", leave_links_offline)
     app.connect("env-before-read-docs", spread_notebooks)
+
+suppress_warnings = ["misc.highlighting_failure"]  # IPython's lexer does not know a shell line that continues
