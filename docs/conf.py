@@ -95,4 +95,5 @@ def setup(app):
     app.connect("builder-inited", leave_links_offline)
     app.connect("env-before-read-docs", spread_notebooks)
 
+
 suppress_warnings = ["misc.highlighting_failure"]  # IPython's lexer does not know a shell line that continues
