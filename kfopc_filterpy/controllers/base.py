@@ -382,7 +382,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         """Filter the stored reference with the present estimate, and the result with the guard."""
         lines, guard = self._lines, self._state.lines.guard
         n, s = int(lines.filtered[TAPS]), lines.secondary_estimate
-        filtered = np.correlate(newest.py_func(lines.reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
+        filtered = np.correlate(newest(lines.reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
         refill(lines.filtered, filtered)
         if guard is not None:
             refill(guard.filtered, np.correlate(filtered, guard.taps, mode="valid"))
@@ -604,7 +604,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:
         s, heard = self._lines.secondary_estimate, self._lines.reference
-        before = newest.py_func(heard, s.size - 1)[::-1]  # as Python: compiling it takes longer than all of this
+        before = newest(heard, s.size - 1)[::-1]
         with np.errstate(over="ignore", invalid="ignore"):
             filtered = np.convolve(np.concatenate((before, x)), s, mode="valid")
             fine = np.isfinite(x**2) & np.isfinite(e**2) & np.isfinite(filtered**2)

@@ -71,7 +71,7 @@ def channel_lines(
     filtered = [delay_lines(n_references, filtered_taps) for _ in range(K * J)] if filtered_taps else []
     size = filtered[0].shape[1] if filtered else 0
     return ChannelLines(
-        secondary_estimate=secondary,
+        secondary_estimate=secondary.copy(),  # a read-only array would be another type, and compile again
         reference=delay_lines(n_references, max(reference_taps, taps)),
         filtered=np.array(filtered).reshape(K if filtered else 0, J, n_references, size),
         output=delay_lines(J, taps),

@@ -19,7 +19,7 @@ import numpy as np
 from .._validate import as_choice, as_positive
 from ..filters.kfopc import KFOPC
 from ..filters.random_walk import RandomWalkKFOPC
-from ..kernels.compiling import inlined
+from ..kernels.compiling import compiled, inlined
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest, newest
 from ..kernels.records import new_record
@@ -74,7 +74,7 @@ def adapt_repaired(state, error, control_signal):
     return True
 
 
-@inlined
+@compiled()
 def gain_samples(repair, filtered, x, error, d, y):
     """Return the samples whose powers give G_s: x' and x (eq. 11), or s^ * y = d^ - e and y."""
     if repair[0].of_control == 0:
@@ -82,7 +82,7 @@ def gain_samples(repair, filtered, x, error, d, y):
     return d - error, y
 
 
-@inlined
+@compiled()
 def measurement_factor(repair, factor):
     """Return the factor of the measurement (eq. 9)."""
     return 1.0 if repair[0].at_output != 0 else trimmed(repair, factor)
@@ -94,7 +94,7 @@ def trimmed(repair, factor):
     return min(factor * math.exp(repair[0].trim), 1.0)
 
 
-@inlined
+@compiled()
 def advance_repair(repair, constraint, y):
     """Record the factor used, and trim the next one by the power of y: up if it is below the rated power, else down.
 

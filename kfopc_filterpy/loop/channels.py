@@ -14,10 +14,10 @@ from ..controllers.base import FilteredReferenceController
 from ..controllers.channels import amplifier_models, delay_lines
 from ..controllers.step import adapt_step, control_filter, emit_step, emitted
 from ..kernels.borrowing import borrowed
-from ..kernels.compiling import compiled, compiled_for_states, inlined
+from ..kernels.compiling import compiled, compiled_for_states, inlined, part
 from ..kernels.delay_lines import newest, push
 from ..kernels.holding import Held
-from ..kernels.vectors import dot
+from ..kernels.vectors import copy_into, dot
 from ..paths.channels import is_path_matrix, path_matrix, primary_paths, secondary_paths
 from ..power.amplifiers import amplify, compiled_model
 from .inputs import (
@@ -81,6 +81,14 @@ def play(plant, y, signals, n):
         signals.error[k, n] = signals.disturbance[k, n] - a + signals.sensor_noise[k, n]
 
 
+@part()
+def note_channel_weights(rows, row, weights):
+    """Store the control filters, (J, I, L), by loops for the reason given in `copy_into`."""
+    for j in range(weights.shape[0]):
+        for i in range(weights.shape[1]):
+            copy_into(rows[row, j, i], weights[j, i])
+
+
 @compiled_for_states(nogil=True)
 def run_channels(held, plant, signals, weights, limit, every, begin, end):
     """Run a controller, whose state is `Held`, over the samples from `begin` to `end` of a run.
@@ -104,7 +112,7 @@ def run_channels(held, plant, signals, weights, limit, every, begin, end):
         for j in range(y.size):
             signals.constraint_factor[j, n] = state.lines.constraint_factor[j]
         if weights.shape[0] > 0 and n % every == 0:
-            weights[n // every] = control_filter(state)
+            note_channel_weights(weights, n // every, control_filter(state))
     return RUNNING, end
 
 

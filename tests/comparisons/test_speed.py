@@ -7,6 +7,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers.compiled import from_python
 
 from comparisons.__main__ import main
 from comparisons.speed import study as speed
@@ -167,7 +168,11 @@ def test_memory_of_1024_taps():
 def test_a_part_called_from_python_gives_what_it_gives_inside():
     constraint = OutputPowerConstraint(0.5, secondary_path_gain=1.0)
     inside = constraint.preview(2.0)
-    assert preview_constraint(constraint.state, 2.0, 0.0, np.nan)[0] == inside == pytest.approx(np.sqrt(0.5) / 2)
+    assert (
+        from_python(preview_constraint)(constraint.state, 2.0, 0.0, np.nan)[0]
+        == inside
+        == pytest.approx(np.sqrt(0.5) / 2)
+    )
 
 
 # ---- Sweeps over budgets

@@ -71,6 +71,11 @@ def lines(file):
     return file.read_bytes().count(b"\n") if file.exists() else 0
 
 
+def heed_interrupts():
+    """Undo what a shell does for a command in its background, whose children then ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @contextlib.contextmanager
 def started(*command, folder, log):
     """A process in a group of its own, which is killed in the end with all its children."""
@@ -82,6 +87,7 @@ def started(*command, folder, log):
             stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
+            preexec_fn=heed_interrupts,
         )
     try:
         yield process

@@ -8,8 +8,11 @@ import numpy as np
 import scipy.linalg
 from filterpy.kalman import KalmanFilter
 
+from helpers.compiled import from_python
 from kfopc_filterpy.filters import PowerBudgetKalmanFilter
-from kfopc_filterpy.power.allocation import constrained_filter
+from kfopc_filterpy.power import allocation
+
+constrained_filter = from_python(allocation.constrained_filter)
 
 N_TAPS = 8
 SETTINGS: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.05}

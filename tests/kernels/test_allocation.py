@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
+from helpers.compiled import from_python
 from helpers.power_budget import correlation, within
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy.kernels.toeplitz import solve_toeplitz, toeplitz_power, toeplitz_times
+from kfopc_filterpy.kernels import toeplitz
+from kfopc_filterpy.kernels.toeplitz import solve_toeplitz
 from kfopc_filterpy.power.allocation import POWER_TOLERANCE, RIDGE
+
+toeplitz_power, toeplitz_times = from_python(toeplitz.toeplitz_power), from_python(toeplitz.toeplitz_times)
 
 EPS = np.finfo(np.float64).eps
 toeplitz = scipy.linalg.toeplitz

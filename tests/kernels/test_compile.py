@@ -203,7 +203,7 @@ def first_doubled(state, offset):
     return state.factor * state.values[0] + offset
 
 
-@part()
+@compiled(cache=False)
 def first_of(state, offset):
     """Call `first_value` from compiled code."""
     return first_value(state, offset)
@@ -215,7 +215,7 @@ def first_of_inlined(state, offset):
     return first_value(state, offset)
 
 
-@part()
+@compiled(cache=False)
 def first_within(state, offset):
     """Call that."""
     return first_of_inlined(state, offset=offset)
@@ -226,6 +226,26 @@ def test_the_type_chooses_the_body_in_python_and_compiled(call: Any) -> None:
     values = np.array([2.0, 5.0])
     assert call(Plain(values), 1.0) == 3.0
     assert call(Doubled(values, 10.0), 1.0) == 21.0
+
+
+@part()
+def half_of(state):
+    """A part of `halved`; what runs in Python is seen by the kind of its result."""
+    return state.values.sum() / 2
+
+
+@compiled(cache=False)
+def halved(state):
+    """Call it from compiled code."""
+    return half_of(state)
+
+
+def test_a_part_is_compiled_for_compiled_callers_and_stays_python_in_python() -> None:
+    """A result of numpy's own type comes from Python only."""
+    state = Plain(np.array([2.0, 5.0]))
+    assert halved(state) == half_of(state) == 3.5
+    assert type(half_of(state)) is np.float64
+    assert type(halved(state)) is float
 
 
 def test_a_body_can_be_added_after_others_were_compiled() -> None:
@@ -287,7 +307,7 @@ def outer() -> Outer:
     return Outer(np.arange(4.0), np.ones(2, np.float32), np.arange(6.0).reshape(2, 3), inner, 3.0)
 
 
-@part()
+@compiled(cache=False)
 def spend(state):
     """Read and write every array of a borrowed state."""
     state = borrowed(state)
@@ -301,7 +321,7 @@ def spend(state):
     return numbers.total
 
 
-@part()
+@compiled(cache=False)
 def spend_what_fails(state):
     """Leave in the middle."""
     state = borrowed(state)
@@ -363,7 +383,7 @@ def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
 def test_an_array_with_gaps_is_not_read_as_one_without() -> None:
     """A pointer and a shape say nothing of strides: such an array is refused, or read as it is."""
 
-    @part()
+    @compiled(cache=False)
     def second(state):
         return borrowed(state).values[1]
 
@@ -470,7 +490,7 @@ def test_stacked_arrays_and_numbers_get_a_leading_axis() -> None:
     np.testing.assert_array_equal(stack.factor, [2.0, 3.0, 4.0, 5.0])
 
 
-@part()
+@compiled(cache=False)
 def advance_members(stack, count):
     """Change each member, and what they share."""
     total = 0.0

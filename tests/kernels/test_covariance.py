@@ -10,7 +10,7 @@ from filterpy.kalman import KalmanFilter
 from helpers.comparing import assert_close
 from helpers.rows import rows_of
 
-from kfopc_filterpy.kernels.compiling import part
+from kfopc_filterpy.kernels.compiling import compiled
 from kfopc_filterpy.kernels.covariance import (
     CANCELLATION,
     Covariance,
@@ -35,13 +35,13 @@ def some_covariance(n: int, owed: tuple[float, float, float]) -> tuple[Covarianc
     return cov, scale * (A @ A.T - inverse_S * np.outer(g, g)) + diagonal * np.eye(n)
 
 
-@part()
+@compiled(cache=False)
 def projected(cov, h):
     """Call `project_covariance`."""
     return project_covariance(cov, h)
 
 
-@part()
+@compiled(cache=False)
 def stepped(cov, w, h, z, r, q, alpha_sq):
     """Call `kalman_step`."""
     return kalman_step(cov, w, h, z, r, q, alpha_sq)

@@ -10,12 +10,16 @@ import scipy.linalg
 import scipy.optimize
 import scipy.signal
 import scipy.stats
+from helpers.compiled import from_python
 
 from kfopc_filterpy import OutputLimiter, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.power import PowerBudget
-from kfopc_filterpy.power.budget import LIMITER_MEMORY_S, LOUDEST, TARGET_LEAST, TARGET_MOST, hear_limiter
-from kfopc_filterpy.power.ceiling import balance_of_power
+from kfopc_filterpy.power import budget as parts
+from kfopc_filterpy.power import ceiling as ceiling_parts
+from kfopc_filterpy.power.budget import LIMITER_MEMORY_S, LOUDEST, TARGET_LEAST, TARGET_MOST
 from kfopc_filterpy.signals import band_limited_noise, tone
+
+balance_of_power, hear_limiter = from_python(ceiling_parts.balance_of_power), from_python(parts.hear_limiter)
 
 FS = 16000
 N_TAPS = 16

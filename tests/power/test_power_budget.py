@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from helpers.comparing import numbers_of
+from helpers.compiled import from_python
 from helpers.naming import plain
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,6 +22,7 @@ from hypothesis import strategies as st
 from kfopc_filterpy import SimulationResult, kf_pb, simulate
 from kfopc_filterpy.controllers import PowerBudgetController
 from kfopc_filterpy.power import PowerBudget
+from kfopc_filterpy.power import budget as parts
 from kfopc_filterpy.power.allocation import POWER_TOLERANCE, RIDGE
 from kfopc_filterpy.power.budget import (
     AGREEMENT,
@@ -40,12 +42,11 @@ from kfopc_filterpy.power.budget import (
     TARGET_LEAST,
     TARGET_MOST,
     USUAL,
-    choose_span,
-    level_forecast,
-    sum_correlations,
-    target_power,
 )
 from kfopc_filterpy.signals import band_limited_noise, swelling, tone
+
+choose_span, level_forecast = from_python(parts.choose_span), from_python(parts.level_forecast)
+sum_correlations, target_power = from_python(parts.sum_correlations), from_python(parts.target_power)
 
 FS = 16000
 SEGMENT = 100

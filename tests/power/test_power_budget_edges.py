@@ -9,14 +9,18 @@ import pytest
 import scipy.linalg
 import scipy.signal
 from filterpy.common import Saver
+from helpers.compiled import from_python
 from helpers.power_budget import correlation, made, signals, step, within
 
 from kfopc_filterpy import bandpass_path
 from kfopc_filterpy.filters import PowerBudgetKalmanFilter
+from kfopc_filterpy.kernels import toeplitz
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.power import PowerBudget
-from kfopc_filterpy.power.allocation import POWER_TOLERANCE, toeplitz_power
+from kfopc_filterpy.power.allocation import POWER_TOLERANCE
 from kfopc_filterpy.signals import band_limited_noise
+
+toeplitz_power = from_python(toeplitz.toeplitz_power)
 
 
 def test_two_tones_heard_20_db_apart():
