@@ -43,7 +43,6 @@ def folder(tmp_path_factory):
 def command(folder, monkeypatch, capsys):
     """Run the command in the folder; return its exit code, output and errors."""
     monkeypatch.chdir(folder)
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
 
     def run(*arguments: object) -> tuple[int, str, str]:
         try:
@@ -56,7 +55,7 @@ def command(folder, monkeypatch, capsys):
 
 
 def process(folder: Path, *arguments: str, standard_input: bytes | None = None) -> subprocess.CompletedProcess:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "kfopc_filterpy", *arguments]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, input=standard_input)
 

@@ -36,7 +36,9 @@ def pair(n: int, r: float = 1e-4, q: float = 0.5, P0: float = 1.0, x_ndim: int =
     ours = KFOPC.random_walk(n, state_noise=r, measurement_noise=q, initial_variance=P0)
     for f in (kf, ours):
         f.x = np.zeros((n, 1)[:x_ndim])
-        f.M = np.full((n, 1), 0.01)  # 1.4.5 makes it (1, 1), which its own update_correlated cannot use
+        # 1.4.5 makes it (1, 1), which its own update_correlated cannot use. So small that 15 updates without a prediction
+        # leave P positive: filterpy keeps a negative P, and ours raises it above zero.
+        f.M = np.full((n, 1), 1e-3 / n**0.5)
     return kf, ours
 
 
