@@ -91,11 +91,12 @@ class Runs:
         `worth` gives the number of planned runs that an item counts for.
         """
         items, outcomes = list(items), []
-        for item, outcome in zip(items, self._pool.map(job, items), strict=True):
-            outcomes.append(outcome)
-            self.done += worth(item)
-            if self.bar is not None:
-                self.bar.update(worth(item))
+        with one_blas_thread():
+            for item, outcome in zip(items, self._pool.map(job, items), strict=True):
+                outcomes.append(outcome)
+                self.done += worth(item)
+                if self.bar is not None:
+                    self.bar.update(worth(item))
         return outcomes
 
 
