@@ -310,7 +310,11 @@ def _compare_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--taps", type=int, metavar="N", help="taps of the control filters (default: found, at most 256)"
     )
-    parser.add_argument("--algorithm", metavar="NAME,...", help="algorithms to compare (default: all)")
+    parser.add_argument(
+        "--algorithm",
+        metavar="NAME,...",
+        help="algorithms to compare (default: all; with several channels those that are fast enough)",
+    )
     parser.add_argument(
         "--seconds",
         type=float,
@@ -331,9 +335,12 @@ def _compare(options: argparse.Namespace) -> int:
     matplotlib.use("Agg")
     from .bench import algorithms, compare_recordings, results_table, write_report
 
-    names = list(algorithms()) if options.algorithm is None else options.algorithm.split(",")
     files = Files(options)
     noise, primary, secondary, disturbance = scene_of(options, files)
+    several = (len(noise), *secondary.shape[:2]) != (1, 1, 1)
+    names = None if several else list(algorithms())
+    if options.algorithm is not None:
+        names = options.algorithm.split(",")
     rating = ratings_of(options, secondary.shape[1])
     with _bar(options.quiet, "run") as bar:
         report = compare_recordings(
@@ -400,35 +407,62 @@ def _identify(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> int:
-    from .paths import achieved_band, causality_margin, secondary_path_gain
+    from .paths import causality_margin
 
     files = Files(options)
-    taps = files.path(options.path)
-    primary = None if options.primary is None else files.path(options.primary)
+    paths = files.matrix([options.path], "path")
+    primary = None if options.primary is None else files.matrix([options.primary], "--primary")
     fs = files.fs or 0.0
-    facts: dict[str, Any] = {"n_taps": taps.size, "fs": fs, "duration_s": taps.size / fs}
-    facts["power_gain_db"] = _db(secondary_path_gain(taps, band=(0.0, fs / 2), fs=fs))
-    band = achieved_band(taps, fs=fs)
-    facts |= {"low_hz": band.low_hz, "high_hz": band.high_hz}
-    margin = causality_margin(taps if primary is None else primary, taps, fs=fs)
-    facts["onset_s"] = margin.secondary_onset_s
+    several = paths.shape[:2] != (1, 1)
+    each = [
+        ({"microphone": k + 1, "loudspeaker": j + 1} if several else {}) | _facts(paths[k, j], fs)
+        for k, j in np.ndindex(*paths.shape[:2])
+    ]
+    facts: dict[str, Any] = {"paths": each} if several else each[0]
     if primary is not None:
-        facts["causality_margin_s"] = margin.margin_s
+        facts["causality_margin_s"] = causality_margin(primary, paths, fs=fs).margin_s
     if options.json:
         from .bench.items import jsonable
 
         print(json.dumps(jsonable(facts), allow_nan=False))
         return ENOUGH
-    print(
-        f"{taps.size} taps at {fs:g} Hz, {1e3 * taps.size / fs:.3g} ms; its energy begins at {1e3 * margin.secondary_onset_s:.3g} ms"
-    )
-    print(
-        f"power gain {facts['power_gain_db']:.1f} dB; within 3 dB of its peak from {band.low_hz:.0f} to {band.high_hz:.0f} Hz"
-    )
+    for one in each:
+        if several:
+            print(f"microphone {one['microphone']}, loudspeaker {one['loudspeaker']}:")
+        print(_described(one))
     if primary is not None:
-        late = "early enough" if margin.margin_s > 0 else "too late for anything but tones"
-        print(f"causality margin {1e3 * margin.margin_s:+.2f} ms: the anti-noise is {late}")
+        margin = facts["causality_margin_s"]
+        late = "early enough" if margin > 0 else "too late for anything but tones"
+        print(f"causality margin {1e3 * margin:+.2f} ms: the anti-noise is {late}")
     return ENOUGH
+
+
+def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
+    """Return what a path does; no band and no onset if it is silent."""
+    from .paths import achieved_band, causality_margin, secondary_path_gain
+
+    facts: dict[str, Any] = {"n_taps": taps.size, "fs": fs, "duration_s": taps.size / fs}
+    if not np.any(taps):
+        return facts | {"power_gain_db": None, "low_hz": None, "high_hz": None, "onset_s": None}
+    band = achieved_band(taps, fs=fs)
+    return facts | {
+        "power_gain_db": _db(secondary_path_gain(taps, band=(0.0, fs / 2), fs=fs)),
+        "low_hz": band.low_hz,
+        "high_hz": band.high_hz,
+        "onset_s": causality_margin(taps, taps, fs=fs).secondary_onset_s,
+    }
+
+
+def _described(facts: dict[str, Any]) -> str:
+    """Return what a path does in two lines."""
+    length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {1e3 * facts['duration_s']:.3g} ms"
+    if facts["onset_s"] is None:
+        return f"{length}; silent"
+    return (
+        f"{length}; its energy begins at {1e3 * facts['onset_s']:.3g} ms\n"
+        f"power gain {facts['power_gain_db']:.1f} dB; within 3 dB of its peak from {facts['low_hz']:.0f} to "
+        f"{facts['high_hz']:.0f} Hz"
+    )
 
 
 def _db(power: float) -> float:

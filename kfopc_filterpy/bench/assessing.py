@@ -181,7 +181,7 @@ def assess(
             fs=fs,
             memory_s=memory_s,
             n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
-            max_taps=min(LONGEST, max(MOST_WEIGHTS // (J * n_references), 1)),
+            max_taps=longest_filter(J * n_references),
         )
         bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, delta)
         limits = with_excursion(limits, ratings, bounds)
@@ -255,6 +255,11 @@ def assess(
         channels=(n_references, J, K) if several else None,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
+
+
+def longest_filter(n_filters: int) -> int:
+    """Return the taps of each of several control filters at most, unless a length is given."""
+    return min(LONGEST, max(MOST_WEIGHTS // n_filters, 1))
 
 
 def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: float) -> tuple[np.ndarray, ...]:

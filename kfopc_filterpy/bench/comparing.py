@@ -8,17 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import suggest_settings
+from kfopc_filterpy import SimulationResult, output_power, suggest_settings
 from kfopc_filterpy._validate import as_choice, as_count, as_positive
-from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.power import output_limits
 
 from .assessed_runs import recorded_scene
-from .assessing import LONGEST, recorded_signals, switch_on_sample
-from .items import FigureItem, Parameter, Sound, StudyReport
+from .assessing import longest_filter, recorded_signals, switch_on_sample
+from .items import FigureItem, Parameter, Sound, StudyReport, Table
+from .limits import ChannelLimits, limits_of, ratings_of_each
 from .registry import REGISTRY, algorithms
-from .scene import Runs, figures_of_merit, one_blas_thread
+from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution
 from .tuning import RULE, AllDivergedError, run_setting, tune
+
+OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
+OF_SEVERAL_CHANNELS = ("KF-PB (shared gain)", "MOV-FxLMS", "FxLMS")
+SCALED = " Powers are over the rated power, of the loudspeaker for which that is most."
 
 
 @one_blas_thread()
@@ -30,7 +33,7 @@ def compare_recordings(
     rating: Any,
     fs: float,
     disturbance: Any = None,
-    names: Sequence[str] = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS"),
+    names: Sequence[str] | None = None,
     n_taps: int | None = None,
     seconds: float | None = None,
     bar: Any = None,
@@ -38,14 +41,16 @@ def compare_recordings(
     """Return a comparison of algorithms on recordings, each tuned by the rule of the studies.
 
     They are tuned and judged on the same recording, which gives every algorithm the same advantage. No algorithm has a
-    limiter; the amplifier clips if the rating has a peak.
+    limiter; the amplifier clips if the rating has a peak. With several loudspeakers, the report's powers are those of
+    the loudspeaker that is closest to its rating, or furthest above it, over that rating.
 
     Parameters
     ----------
     noise, primary, secondary, rating, fs, disturbance, n_taps
         As for `assess`.
-    names : sequence of str, default ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
-        Algorithms, see `algorithms`.
+    names : sequence of str, optional
+        Algorithms, see `algorithms`; by default "KF-PB", "KF-OPC", "MOV-FxLMS" and "FxLMS". With several channels, by
+        default "KF-PB (shared gain)", "MOV-FxLMS" and "FxLMS": the filters that estimate all weights together take long.
     seconds : float, optional
         Part of the record that is used, from its start; by default all of it.
     bar : tqdm bar, optional
@@ -71,31 +76,29 @@ def compare_recordings(
     >>> list(report.algorithms)
     ['FxLMS']
     """
-    import matplotlib.pyplot as plt
-
-    from kfopc_filterpy.plot import plot_error_spectra, plot_nse, plot_output_power
-
     fs = as_positive(fs, "fs", unit="Hz")
+    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
+    several = s.ndim == 3
+    if names is None:
+        names = OF_SEVERAL_CHANNELS if several else OF_ONE_CHANNEL
     if not names:
         raise ValueError("names must hold at least one algorithm, got none")
     for name in names:
-        as_choice(name, "names", algorithms())
-    x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
-    if s.ndim > 1:
-        raise ValueError(
-            "noise, primary, secondary and disturbance must have one channel for a comparison: choose one. `assess` runs "
-            "KF-PB, KF-OPC and FxLMS with several"
-        )
+        as_choice(name, "names", algorithms(several_channels=several))
     if seconds is not None:
         kept = slice(0, round(as_positive(seconds, "seconds", unit="s") * fs))
-        x, d = x[kept], d[kept]
-    limits = output_limits(rating)
-    start = switch_on_sample(None, fs, x.size)
+        x, d = x[..., kept], d[..., kept]
+    n_loudspeakers, n_references = (s.shape[1], len(x)) if several else (1, 1)
+    n_filters = n_loudspeakers * n_references
+    limits = limits_of(ratings_of_each(rating, n_loudspeakers), several)
+    start = switch_on_sample(None, fs, x.shape[-1])
     taps = None if n_taps is None else as_count(n_taps, "n_taps")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)  # about weights that no controller reaches
-        settings = suggest_settings(x[start:], d[start:], s, fs=fs, n_taps=taps, max_taps=LONGEST)
-        free = wiener_solution(x[start:], d[start:], s, settings.n_taps)
+        settings = suggest_settings(
+            x[..., start:], d[..., start:], s, fs=fs, n_taps=taps, max_taps=longest_filter(n_filters)
+        )
+        free = reachable_solution(x[..., start:], d[..., start:], s, settings.n_taps, fs)
     scene = recorded_scene(x, d, s, fs, start, limits, settings, free.control_power)
     if bar is not None:
         bar.total = sum(len(REGISTRY[name].grid) for name in names)
@@ -120,34 +123,64 @@ def compare_recordings(
             notes.append(f"{name}: the best setting is at the edge of those tried.")
     if not results:
         raise ValueError(f"every algorithm diverged: {' '.join(notes)} Check the secondary path, and its sign")
-    figures = []
-    for stem, draw, caption in (
-        ("nse", plot_nse, "Error power over that of the disturbance."),
-        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half."),
-        ("power", plot_output_power, "Mean power of the control signal, and the rated power."),
-    ):
-        figure, ax = plt.subplots(figsize=(7, 4.5), layout="constrained")
-        draw(results, ax=ax)
-        figures.append(FigureItem(stem, caption, figure))
     first = next(iter(results.values()))
-    settled = first.n_samples / fs / 2
-    sounds = [Sound("before", "Without control", first.disturbance, "at the error microphone", settled)]
+    settled, where = first.n_samples / fs / 2, "at the first error microphone" if several else "at the error microphone"
+    sounds = [Sound("before", "Without control", np.atleast_2d(first.disturbance)[0], where, settled)]
     for name, result in results.items():
-        sounds.append(Sound(name.lower().translate(_FILE), name, result.error, "at the error microphone", settled))
+        sounds.append(Sound(name.lower().translate(_FILE), name, np.atleast_2d(result.error)[0], where, settled))
     return StudyReport(
         "own-data",
         "Your recordings",
-        f"{x.size / fs:.3g} s of the recordings, {settings.n_taps} taps; full control would take "
-        f"{free.control_power / limits.rated_power:.3g} times the rated power.",
+        f"{x.shape[-1] / fs:.3g} s of the recordings, {settings.n_taps} taps; full control would take "
+        f"{_listed(free.control_power / limits.rated_power)} times the rated power.{SCALED if several else ''}",
         fs,
-        limits.rated_power,
+        1.0 if isinstance(limits, ChannelLimits) else limits.rated_power,
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
         {name: figures_of_merit([result], scene) for name, result in results.items()},
-        figures=figures,
+        figures=_figures(results, np.atleast_1d(limits.rated_power)),
         sounds=sounds,
         notes=notes,
-        extra={"amplitude_limit": limits.amplitude_limit, "rating_decided_by": limits.decided_by},
+        tables=[_power_table(results, scene)] if several else [],
+        extra={
+            "rated_power": limits.rated_power,
+            "amplitude_limit": limits.amplitude_limit,
+            "rating_decided_by": limits.decided_by,
+        },
     )
+
+
+def _figures(results: dict[str, SimulationResult], rated_powers: np.ndarray) -> list[FigureItem]:
+    """Return the figures of the runs: the error, and the power of each loudspeaker."""
+    import matplotlib.pyplot as plt
+
+    from kfopc_filterpy.plot import plot_error_spectra, plot_nse, plot_output_power
+
+    drawn: list[tuple[str, Any, str, dict[str, Any]]] = [
+        ("nse", plot_nse, "Error power over that of the disturbance.", {}),
+        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half.", {}),
+    ]
+    for j, rated in enumerate(rated_powers):
+        which = f" of loudspeaker {j + 1}" if rated_powers.size > 1 else ""
+        caption = f"Mean power of the control signal{which}, and its rated power."
+        stem = f"power-{j + 1}" if rated_powers.size > 1 else "power"
+        drawn.append((stem, plot_output_power, caption, {"channel": j, "rated_power": rated}))
+    items = []
+    for stem, draw, caption, options in drawn:
+        figure, ax = plt.subplots(figsize=(7, 4.5), layout="constrained")
+        draw(results, ax=ax, **options)
+        items.append(FigureItem(stem, caption, figure))
+    return items
+
+
+def _power_table(results: dict[str, SimulationResult], scene: Scene) -> Table:
+    """Return the power of each loudspeaker over its rated power."""
+    rows = [[name, *(output_power(run.control_signal) / scene.rated_power)] for name, run in results.items()]
+    headings = ["", *(f"loudspeaker {j + 1}" for j in range(len(scene.rated_power)))]
+    return Table("powers", "Output power of each loudspeaker over its rated power, in the steady half", headings, rows)
+
+
+def _listed(values: Any) -> str:
+    return ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
 
 
 _FILE = str.maketrans({" ": "-", "(": None, ")": None})

@@ -306,7 +306,7 @@ def make_scene(
     first = next(iter(signals.values()))
     settled = (..., slice(int(switch_on_s * fs), None))  # after the start-up of the primary path
     d = _heard(first, primary, s, fs)
-    wiener = _reachable(first[settled], d[settled], s, n_taps, fs)
+    wiener = reachable_solution(first[settled], d[settled], s, n_taps, fs)
     asked = power_multiple * np.sum(rated_power * np.ones(np.shape(wiener.control_power)))
     share = wiener.control_power / np.sum(wiener.control_power)
     power = _power(first) * asked / np.sum(wiener.control_power)
@@ -400,7 +400,7 @@ def _heard(x: np.ndarray, primary: Any, s: np.ndarray, fs: float) -> np.ndarray:
     return channel_disturbances(x, primary, None, fs, len(s))
 
 
-def _reachable(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
+def reachable_solution(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> WienerSolution:
     """Return the unconstrained Wiener solution whose weights a controller can reach."""
     if s.ndim == 1:
         with reachable_weights():
@@ -414,7 +414,7 @@ def _unexplained(x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: f
     if s.ndim == 1:
         with reachable_weights():
             return measurement_noise_from_run(x, d, s, n_taps)
-    return float(_reachable(x, d, s, n_taps, fs).error_power)
+    return float(reachable_solution(x, d, s, n_taps, fs).error_power)
 
 
 @contextmanager
@@ -430,6 +430,10 @@ def reachable_weights() -> Iterator[None]:
 
 def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[str, float | None]:
     """Return the figures of merit of one algorithm: means over seeds, the NSE pooled over seeds.
+
+    With several loudspeakers, the figures of the control signal are those of the loudspeaker for which they are largest
+    over its rating: powers over the rated power, peaks over its root. With several microphones, the errors are taken
+    together.
 
     Parameters
     ----------
@@ -453,16 +457,17 @@ def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[
     >>> round(figures["output_power"], 2)
     1.0
     """
+    rating = np.asarray(scene.rated_power)[..., np.newaxis] if np.ndim(scene.rated_power) else 1.0
+    limit = np.sqrt(2.0) if np.ndim(scene.rated_power) else scene.amplitude_limit
+    control = [r.control_signal / np.sqrt(rating) for r in results]
     diverged = [r.diverged_at_s for r in results if r.diverged_at_s is not None]
     errors = np.array([r.error for r in results])
     disturbances = np.array([r.disturbance for r in results])
     return {
         "noise_reduction_db": float(np.mean([noise_reduction_db(r.error, r.disturbance) for r in results])),
-        "output_power": float(np.mean([output_power(r.control_signal) for r in results])),
-        "peak_control_signal": float(np.mean([peak_control_signal(r.control_signal) for r in results])),
-        "clipped_fraction": float(
-            np.mean([clipped_fraction(r.control_signal, scene.amplitude_limit) for r in results])
-        ),
+        "output_power": float(np.mean([np.max(output_power(y)) for y in control])),
+        "peak_control_signal": float(np.mean([np.max(peak_control_signal(y)) for y in control])),
+        "clipped_fraction": float(np.mean([np.max(clipped_fraction(y, limit)) for y in control])),
         "harmonics_db": None,
         "convergence_time_s": convergence_time_s(
             errors, disturbances, scene.fs, window_s=scene.nse_window_s, runs=True
