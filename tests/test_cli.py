@@ -432,7 +432,7 @@ def test_several_channels_are_compared_each_loudspeaker_with_its_rating(command,
     x, primary, secondary = several
     x = x[: round(1.5 * FS)] - np.mean(x[: round(1.5 * FS)])
     again = simulate(
-        FxLMS(32, secondary, step_size=study["parameters"]["FxLMS mu"]["value"], n_references=1),
+        FxLMS(32, secondary, step_size=study["parameters"]["FxLMS mu"], n_references=1),
         x[np.newaxis],
         primary_path=primary,
         secondary_path=secondary,
@@ -441,7 +441,8 @@ def test_several_channels_are_compared_each_loudspeaker_with_its_rating(command,
     )
     powers = output_power(again.control_signal) / [4.0, 0.05]
     figures = study["algorithms"]
-    assert figures["FxLMS"]["output_power"] == pytest.approx(powers.max(), rel=0.02) > 1.0
+    assert powers.max() > 1.0
+    assert figures["FxLMS"]["output_power"] == pytest.approx(powers.max(), rel=0.02)
     assert figures["FxLMS"]["noise_reduction_db"] == pytest.approx(
         noise_reduction_db(again.error, again.disturbance), abs=0.2
     )

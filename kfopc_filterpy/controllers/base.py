@@ -221,11 +221,13 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     def _new_lines(self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int) -> Any:
         filtered_taps = max(filtered_taps, GUARD_TAPS) if filtered_taps else 0  # a guard can be assigned later
+        # with another path, and then with a guard
+        to_filter_again = filtered_taps + secondary.shape[-1] + GUARD_TAPS - 2 if filtered_taps else 0
         if self.multichannel:
             return channel_lines(
                 secondary,
                 self.n_references,
-                reference_taps=reference_taps,
+                reference_taps=max(reference_taps, to_filter_again),
                 filtered_taps=filtered_taps,
                 amplifier=amplifier,
                 limiter=states_of(self._limiter),
@@ -233,7 +235,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         model = compiled_model(amplifier)
         if model is None:
             raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
-        to_filter_again = filtered_taps + secondary.size + GUARD_TAPS - 2  # with another path, and then with a guard
         return Lines(
             secondary_estimate=secondary.copy(),  # a new estimate is written into it
             reference=delay_line(max(reference_taps, to_filter_again)),
@@ -326,8 +327,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         guard = None if exact else self._new_guard(guard_filter(uncertainty))
         self._uncertainty, self._stated_uncertainty = None if exact else uncertainty, deepcopy(value)
         self._state = self._state._replace(lines=lines._replace(guard=guard))
-        if not self.multichannel:
-            self._filter_again()
+        self._filter_again()
 
     def _new_guard(self, taps: np.ndarray) -> GuardLine | ChannelGuard:
         """Return a guard that has heard nothing yet."""
@@ -343,11 +343,12 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def secondary_path(self) -> np.ndarray:
         """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
-        A controller of one channel takes a new estimate between two samples, also during a run: assign taps or an FIR
-        system, no longer than the present estimate. The stored reference is filtered again with it, so the next update
-        knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's covariance
-        grows, because its weights belong to the old path. Running powers, and KF-PB's correlations, forget the old path
-        within their memory.
+        A new estimate can be assigned between two samples, also during a run: taps or an FIR system, or paths with the
+        same channels, no longer than the present estimate. The stored references are filtered again with it, so the
+        next update knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's
+        covariance grows, because its weights belong to the old path. Running powers, and KF-PB's correlations, forget
+        the old path within their memory. The forms of KF-PB that estimate the primary paths solve for the new path from
+        the end of the block.
         """
         return self._lines.secondary_estimate.copy()
 
@@ -363,38 +364,46 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     def _checked_estimate(self, path: Any) -> np.ndarray:
         """Return the taps of a new estimate, filled with zeros to the length of the present one."""
+        present = self._lines.secondary_estimate.shape
         if self.multichannel:
+            taps, rate = secondary_paths(path, name="secondary_path")
+        else:
+            taps = path_taps(path, name="secondary_path")
+            rate = sampling_rate(path, name="secondary_path") if is_system(path) else None
+        if taps.shape[:-1] != present[:-1]:
             raise ValueError(
-                "a controller of several channels cannot take a new secondary path: make a new one with it"
+                f"secondary_path must have the channels (microphones, loudspeakers) = {present[:-1]} of the present "
+                f"estimate, got {taps.shape[:-1]}: make a new controller for other channels"
             )
-        taps, size = path_taps(path, name="secondary_path"), self._lines.secondary_estimate.size
-        if taps.size > size:
+        if taps.shape[-1] > present[-1]:
             raise ValueError(
-                f"secondary_path must have at most the {size} taps of the present estimate, got {taps.size}: make the "
-                "controller with an estimate filled with zeros to the longest path"
+                f"secondary_path must have at most the {present[-1]} taps of the present estimate, got "
+                f"{taps.shape[-1]}: make the controller with an estimate filled with zeros to the longest path"
             )
-        rate = sampling_rate(path, name="secondary_path") if is_system(path) else None
         if self._path_fs is not None:
             require_rates(self._path_fs, {"new secondary path": rate})
-        return np.pad(taps, (0, size - taps.size))
+        return np.pad(taps, [(0, 0)] * (taps.ndim - 1) + [(0, present[-1] - taps.shape[-1])])
 
     def _filter_again(self) -> None:
-        """Filter the stored reference with the present estimate, and the result with the guard."""
+        """Filter the stored references with the present estimate, and the results with the guard."""
         lines, guard = self._lines, self._state.lines.guard
-        n, s = int(lines.filtered[TAPS]), lines.secondary_estimate
-        filtered = np.correlate(newest(lines.reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
-        refill(lines.filtered, filtered)
-        if guard is not None:
-            refill(guard.filtered, np.correlate(filtered, guard.taps, mode="valid"))
+        if not self.multichannel:
+            guarded = None if guard is None else guard.filtered
+            _filter_line_again(lines.reference, lines.filtered, lines.secondary_estimate, guard, guarded)
+            return
+        for k, j, i in np.ndindex(lines.filtered.shape[:3]):
+            guarded = None if guard is None else guard.filtered[k, j, i]
+            s = lines.secondary_estimate[k, j]
+            _filter_line_again(lines.reference[i], lines.filtered[k, j, i], s, guard, guarded)
 
     def _after_new_path(self, before: np.ndarray) -> None:
-        """Adapt what the algorithm knows to the new estimate; `before` is the last one, (n_path,)."""
+        """Adapt what the algorithm knows to the new estimate; `before` is the last one, of the same shape."""
 
     def _variance_by_new_path(self, before: np.ndarray) -> float:
         """Return the variance of each weight after a new path: they are wrong by the share by which the path changed."""
         after, w = self._lines.secondary_estimate, self.weights
-        energy = max(before @ before, after @ after)
-        return float(np.sum((after - before) ** 2) / energy * (w @ w) / w.size) if energy > 0.0 else 0.0
+        energy = max(np.sum(before**2), np.sum(after**2))
+        return float(np.sum((after - before) ** 2) / energy * np.mean(w**2)) if energy > 0.0 else 0.0
 
     @property
     def weights(self) -> np.ndarray:
@@ -661,3 +670,12 @@ def states_of(value: Any) -> Any:
 def listed(values: Any, form: str) -> str:
     """Return a number, or several after each other, as text."""
     return ", ".join(format(value, form) for value in np.ravel(values))
+
+
+def _filter_line_again(reference: np.ndarray, filtered: np.ndarray, s: np.ndarray, guard: Any, guarded: Any) -> None:
+    """Fill the delay line `filtered` by a stored reference after the path s, and the line `guarded` by that after W."""
+    n = int(filtered[TAPS])
+    again = np.correlate(newest(reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
+    refill(filtered, again)
+    if guard is not None:
+        refill(guarded, np.correlate(again, guard.taps, mode="valid"))

@@ -6,6 +6,7 @@ what the forms of KF-PB have in common: the blocks, the recent correlation of th
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,7 @@ class BlockController(FilteredReferenceController):
         limits = np.full(secondary.shape[1], np.inf) if self._rated is None else self._rated
         self._path_weights = np.sqrt(microphone_weights)[:, np.newaxis, np.newaxis]
         guard = guard_against(secondary_path_uncertainty, secondary)
+        self._tolerance = deepcopy(secondary_path_uncertainty)
         self._budget = ChannelBudget(
             self._path_weights * secondary,
             n_taps,
@@ -95,6 +97,12 @@ class BlockController(FilteredReferenceController):
     @property
     def _powers_fs(self) -> float:
         return self.fs
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Solve for the new paths from the end of this block on, with a guard if there was one."""
+        secondary = self.secondary_path
+        guard = guard_against(self._tolerance, secondary) if self._budget.n_guard > 1 else None
+        self._budget.use_paths(self._path_weights * secondary, guard)
 
     def samples_to_block(self) -> int:
         """Return the number of samples until the end of the block."""

@@ -260,6 +260,10 @@ class DirectKalman(FilteredReferenceController):
     def _takes_guard(self) -> bool:
         return True
 
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let P grow by the variance that the new paths give to the weights."""
+        self._state.correction.gains.owed["diagonal"] += self._variance_by_new_path(before)
+
     @property
     def covariance(self) -> np.ndarray:
         """State covariance P, (J I L, J I L), in the order of ``weights.ravel()``; a new array."""
@@ -372,6 +376,11 @@ class DirectPowerBudget(BlockController):
     def control_filter(self) -> np.ndarray:
         """Control filters within the rated powers, which generate y, (J, I, L); a copy."""
         return self._state.control_filter.copy()
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let P grow too, by the variance that the new paths give to the weights."""
+        super()._after_new_path(before)
+        self._state.correction.gains.owed["diagonal"] += self._variance_by_new_path(before)
 
     def _end_block(self, references: np.ndarray) -> None:
         """Find the control filters for the present estimate and correlation."""

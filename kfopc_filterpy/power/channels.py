@@ -68,17 +68,22 @@ class ChannelBudget:
         self.account = np.zeros(len(rated_power))  # seconds of rated power spent beyond the rated power
         self.target_power = rated_power.copy()
         _, self.n_loudspeakers, n_secondary = secondary.shape
-        guard = np.zeros(1) if guard is None else guard
-        self._inner = n_taps + n_secondary + guard.size - 1  # lags of R_x that the left side depends on
+        self.n_guard = 1 if guard is None else guard.size
+        self._inner = n_taps + n_secondary + self.n_guard - 1  # lags of R_x that the left side depends on
         self.n_lags = max(n_taps + n_secondary + n_primary, self._inner)  # and the right side
         self._size = fft.next_fast_len(self.n_lags + max(n_primary, self._inner), real=True)
         self._inner_size = fft.next_fast_len(2 * self._inner, real=True)
+        self.use_paths(secondary, guard)
+        self.weights = np.zeros((self.n_loudspeakers, n_references, n_taps))
+        self.penalty: np.ndarray | None = None  # lambda, (J,)
+
+    def use_paths(self, secondary: np.ndarray, guard: np.ndarray | None) -> None:
+        """Solve for other secondary paths, (K, J, n_secondary), and another guard of `n_guard` taps, or none."""
         self._spectra = fft.rfft(secondary, self._size)
         inner = fft.rfft(secondary, self._inner_size)
         self._gram = np.einsum("kaf,kbf->fab", inner.conj(), inner)
+        guard = np.zeros(1) if guard is None else guard
         self._guarded = 1.0 + np.abs(fft.rfft(guard, self._inner_size)[:, np.newaxis]) ** 2
-        self.weights = np.zeros((self.n_loudspeakers, n_references, n_taps))
-        self.penalty: np.ndarray | None = None  # lambda, (J,)
 
     def spend(self, power: np.ndarray, duration_s: float) -> None:
         """Add what each loudspeaker spent in a time to its account, and set the powers to solve for.

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from helpers.channels import random_paths, through
 from helpers.loop import FS, MU, N_TAPS, P0, S_HAT, Q, R, noises
 
 from kfopc_filterpy import (
@@ -21,8 +22,10 @@ from kfopc_filterpy import (
     kf_opc,
     kf_opc_repaired,
     kf_pb,
+    noise_reduction_db,
+    simulate,
 )
-from kfopc_filterpy.paths import fir_path
+from kfopc_filterpy.paths import PathTolerance, fir_path
 
 NEW = np.array([0.0, 0.0, -0.7, 0.2])
 KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
@@ -192,5 +195,102 @@ def test_what_is_refused_changes_nothing() -> None:
     np.testing.assert_array_equal(controller.secondary_path, S_HAT)
     several = FxLMS(N_TAPS, [[S_HAT]], step_size=MU)
     assert several.secondary_path.shape == (1, 1, 4)
-    with pytest.raises(ValueError, match="several channels cannot take a new secondary path"):
-        several.secondary_path = S_HAT
+    for bad, message in (
+        (
+            random_paths(2, 1, 4, seed=0),
+            r"channels \(microphones, loudspeakers\) = \(1, 1\) of the present .* got \(2, 1\)",
+        ),
+        (np.ones((1, 1, 5)), "at most the 4 taps"),
+        ([[[np.nan, 1.0]]], "secondary_path"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            several.secondary_path = bad
+    np.testing.assert_array_equal(several.secondary_path, [[S_HAT]])
+
+
+# ---- Several channels: 2 microphones, 3 loudspeakers, 2 references
+
+OLD_PATHS, NEW_PATHS = random_paths(2, 3, 6, seed=1), random_paths(2, 3, 5, seed=2)
+MANY: dict[str, Any] = {"n_references": 2}
+BUDGET: dict[str, Any] = {"rated_power": [0.1, 0.2, 1.0], "fs": FS, "memory_s": 0.5, **MANY}
+OF_SEVERAL: dict[str, Any] = {
+    "FxLMS": lambda s: FxLMS(N_TAPS, s, step_size=0.1 * MU, **MANY),
+    "KF-ANC": lambda s: kf_anc(N_TAPS, s, **KALMAN, **MANY),
+}
+OF_BLOCKS: dict[str, Any] = {
+    "direct": lambda s: kf_pb(N_TAPS, s, form="direct", **KALMAN, **BUDGET),
+    "shared gain": lambda s: kf_pb(N_TAPS, s, form="shared gain", **BUDGET),
+    "frequency domain": lambda s: kf_pb(N_TAPS, s, form="frequency domain", **BUDGET),
+}
+
+
+def several_noises(n_samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """References (2, n) and disturbances (2, n)."""
+    x = np.random.default_rng(5).standard_normal((2, n_samples))
+    return x, through(random_paths(2, 2, 8, seed=3, delay=3), x)
+
+
+def drive_several(controller: Any, first: int, last: int) -> np.ndarray:
+    """Return the control signals for samples that do not depend on them."""
+    x, d = several_noises(2000)
+    emitted = []
+    for n in range(first, last):
+        emitted.append(np.array(controller.control_signal(x[:, n])))
+        controller.update(d[:, n])
+    return np.array(emitted)
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+@pytest.mark.parametrize("name", OF_SEVERAL)
+def test_several_channels_go_on_as_if_they_had_always_had_the_new_paths(name: str, guarded: bool) -> None:
+    """After listening no weight has moved yet; the filtered references and the guard's are the whole past again."""
+    x, d = several_noises(2000)
+    padded = np.pad(NEW_PATHS, [(0, 0), (0, 0), (0, 1)])
+    one, other = OF_SEVERAL[name](OLD_PATHS), OF_SEVERAL[name](padded)
+    for controller in (one, other):
+        if guarded:
+            controller.secondary_path_uncertainty = PathTolerance(delay_samples=0.5)
+        controller.listen(x[:, :100], d[:, :100])
+    one.secondary_path = NEW_PATHS
+    np.testing.assert_array_equal(one.secondary_path, padded)
+    np.testing.assert_allclose(drive_several(one, 100, 300), drive_several(other, 100, 300), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(one.weights, other.weights, rtol=1e-9, atol=1e-12)
+    assert np.abs(one.weights).max() > 0.001
+
+
+@pytest.mark.parametrize("form", OF_BLOCKS)
+def test_a_budget_of_several_channels_solves_for_the_new_paths(form: str) -> None:
+    """A path that is assigned before the first sample counts as the one that the controller was made with."""
+    told, made = OF_BLOCKS[form](OLD_PATHS), OF_BLOCKS[form](np.pad(NEW_PATHS, [(0, 0), (0, 0), (0, 1)]))
+    told.secondary_path = NEW_PATHS
+    emitted = drive_several(made, 0, 2000)
+    np.testing.assert_allclose(drive_several(told, 0, 2000), emitted, rtol=1e-9, atol=1e-12)
+    assert np.abs(emitted[-1]).max() > 0.01
+
+
+def test_the_covariance_of_several_channels_grows_by_what_the_paths_changed() -> None:
+    controller = OF_SEVERAL["KF-ANC"](OLD_PATHS)
+    drive_several(controller, 0, 200)
+    before = controller.covariance
+    controller.secondary_path = 0.5 * OLD_PATHS  # a quarter of the energy of the change, over that of the larger
+    grown = before + 0.25 * np.mean(controller.weights**2) * np.eye(len(before))
+    np.testing.assert_allclose(controller.covariance, grown, rtol=1e-12, atol=1e-15)
+    drive_several(controller, 200, 300)
+    np.linalg.cholesky(controller.covariance)
+
+
+@pytest.mark.parametrize("form", OF_BLOCKS)
+def test_after_a_jump_of_the_plant_the_new_paths_are_as_good_as_a_new_controller(form: str) -> None:
+    x, d = several_noises(3 * 8000)
+    plant = np.pad(NEW_PATHS, [(0, 0), (0, 0), (0, 1)])
+    kept, told = OF_BLOCKS[form](OLD_PATHS), OF_BLOCKS[form](OLD_PATHS)
+    for controller in (kept, told):
+        simulate(controller, x, disturbance=d, secondary_path=OLD_PATHS, fs=FS)
+    told.secondary_path = plant
+    reached = []
+    for controller in (told, OF_BLOCKS[form](plant), kept):
+        run = simulate(controller, x, disturbance=d, secondary_path=plant, fs=FS)
+        diverged = run.diverged_at_s is not None
+        reached.append(-np.inf if diverged else noise_reduction_db(run.error, run.disturbance))
+    assert abs(reached[0] - reached[1]) < 0.5
+    assert reached[2] < reached[0] - 3.0
