@@ -308,7 +308,10 @@ def _verdict(options: argparse.Namespace) -> int:
 def _compare_options(parser: argparse.ArgumentParser) -> None:
     _scene_options(parser)
     parser.add_argument(
-        "--taps", type=int, metavar="N", help="taps of the control filters (default: found, at most 256)"
+        "--taps",
+        type=int,
+        metavar="N",
+        help="taps of the control filters (default: found, at most 256, and 1024 in all)",
     )
     parser.add_argument(
         "--algorithm",

@@ -9,6 +9,7 @@ from pathlib import Path
 # One BLAS thread in each worker and subprocess; set here, before anything imports numpy. On two cores, the threads of two
 # workers wait for each other: that took a third of the time of some files.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("MKL_NUM_THREADS", "1")
 # Figures are drawn without a display, in subprocesses too; set before anything imports matplotlib.
 os.environ.setdefault("MPLBACKEND", "Agg")
 

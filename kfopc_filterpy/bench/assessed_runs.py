@@ -12,7 +12,7 @@ import numpy as np
 from kfopc_filterpy import FxLMS, OutputPowerConstraint, SimulationResult, kf_opc, kf_pb, simulate
 from kfopc_filterpy.bounds import SuggestedSettings
 
-from .limits import ChannelLimits, Limits, amplifiers, each_of, scaled
+from .limits import ChannelLimits, Limits, amplifiers, clipping_limits, each_of, scaled
 from .registry import REGISTRY
 from .scene import Runs, Scene
 from .tuning import AllDivergedError, tune
@@ -137,6 +137,7 @@ def recorded_scene(
         initial_variance=settings.initial_variance,
         unconstrained_power=unconstrained_power,
         seeds=[0],
+        clips_at=clipping_limits(limits),
     )
 
 

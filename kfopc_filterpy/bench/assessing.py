@@ -258,7 +258,7 @@ def assess(
 
 
 def longest_filter(n_filters: int) -> int:
-    """Return the taps of each of several control filters at most, unless a length is given."""
+    """Return the largest number of taps of each of `n_filters` control filters, if no length is given."""
     return min(LONGEST, max(MOST_WEIGHTS // n_filters, 1))
 
 

@@ -21,7 +21,10 @@ from .tuning import RULE, AllDivergedError, run_setting, tune
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
 OF_SEVERAL_CHANNELS = ("KF-PB (shared gain)", "MOV-FxLMS", "FxLMS")
-SCALED = " Powers are over the rated power, of the loudspeaker for which that is most."
+SCALED = (
+    " The rated powers are {}. Powers are relative to the rated power, and peaks to its square root, of the loudspeaker "
+    "for which they are largest."
+)
 
 
 @one_blas_thread()
@@ -41,8 +44,8 @@ def compare_recordings(
     """Return a comparison of algorithms on recordings, each tuned by the rule of the studies.
 
     They are tuned and judged on the same recording, which gives every algorithm the same advantage. No algorithm has a
-    limiter; the amplifier clips if the rating has a peak. With several loudspeakers, the report's powers are those of
-    the loudspeaker that is closest to its rating, or furthest above it, over that rating.
+    limiter; the amplifier clips if the rating has a peak. With several loudspeakers, the report gives the largest ratio
+    of output power to rated power of any loudspeaker, and a table with all of them.
 
     Parameters
     ----------
@@ -132,7 +135,8 @@ def compare_recordings(
         "own-data",
         "Your recordings",
         f"{x.shape[-1] / fs:.3g} s of the recordings, {settings.n_taps} taps; full control would take "
-        f"{_listed(free.control_power / limits.rated_power)} times the rated power.{SCALED if several else ''}",
+        f"{_listed(free.control_power / limits.rated_power)} times the rated power."
+        + (SCALED.format(_listed(limits.rated_power)) if several else ""),
         fs,
         1.0 if isinstance(limits, ChannelLimits) else limits.rated_power,
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
@@ -142,7 +146,7 @@ def compare_recordings(
         notes=notes,
         tables=[_power_table(results, scene)] if several else [],
         extra={
-            "rated_power": limits.rated_power,
+            "rated_powers": limits.rated_power,
             "amplitude_limit": limits.amplitude_limit,
             "rating_decided_by": limits.decided_by,
         },

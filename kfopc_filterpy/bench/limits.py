@@ -136,6 +136,12 @@ def amplifiers(limits: Limits) -> Any:
     return each if isinstance(limits, ChannelLimits) else each[0]
 
 
+def clipping_limits(limits: Limits) -> Any:
+    """Return the limit at which the amplifier clips, or one for each loudspeaker; a huge one if it does not."""
+    each = [np.finfo(float).max if one.amplitude_limit is None else one.amplitude_limit for one in each_of(limits)]
+    return np.array(each) if isinstance(limits, ChannelLimits) else each[0]
+
+
 def share_taken(run: SimulationResult, limits: Limits) -> float:
     """Return the least share of the limits, at most 1, that would have left a run as it is."""
     worst = overshoot(run.control_signal, limits.rated_power, run.fs, window_s=limits.window_s)

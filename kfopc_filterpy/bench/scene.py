@@ -147,6 +147,8 @@ class Scene:
         Amplifier that disturbance estimates know; by default they take it to be linear.
     power_memory_s : float, default 0.5
         Memory in seconds of the power estimates of the constrained algorithms.
+    clips_at : float or ndarray, shape (J,), optional
+        Limit of the amplifiers, if it is not the peak of a sine at rated power.
     """
 
     fs: float
@@ -169,6 +171,7 @@ class Scene:
     secondary_path_uncertainty: Any = None
     known_amplifier: Amplifier | None = None
     power_memory_s: float = 0.5
+    clips_at: Any = None
 
     @property
     def sensor_noise_seeds(self) -> list[int]:
@@ -176,9 +179,10 @@ class Scene:
         return [SENSOR_NOISE_SEED + seed for seed in self.seeds]
 
     @property
-    def amplitude_limit(self) -> float:
-        """Peak of a sine at rated power: the limit of the clipping amplifiers."""
-        return float(np.sqrt(2 * self.rated_power))
+    def amplitude_limit(self) -> Any:
+        """Limit of the clipping amplifiers, or of each: `clips_at`, by default the peak of a sine at rated power."""
+        limit = np.sqrt(2 * self.rated_power) if self.clips_at is None else self.clips_at
+        return limit if np.ndim(limit) else float(limit)
 
     @property
     def settled(self) -> tuple[np.ndarray, np.ndarray]:
@@ -457,9 +461,8 @@ def figures_of_merit(results: Sequence[SimulationResult], scene: Scene) -> dict[
     >>> round(figures["output_power"], 2)
     1.0
     """
-    rating = np.asarray(scene.rated_power)[..., np.newaxis] if np.ndim(scene.rated_power) else 1.0
-    limit = np.sqrt(2.0) if np.ndim(scene.rated_power) else scene.amplitude_limit
-    control = [r.control_signal / np.sqrt(rating) for r in results]
+    scale = np.sqrt(scene.rated_power) if np.ndim(scene.rated_power) else np.ones(())
+    limit, control = scene.amplitude_limit / scale, [r.control_signal / scale[..., np.newaxis] for r in results]
     diverged = [r.diverged_at_s for r in results if r.diverged_at_s is not None]
     errors = np.array([r.error for r in results])
     disturbances = np.array([r.disturbance for r in results])

@@ -116,6 +116,15 @@ class WrappedController(BlockProcessing, Checkpointed):
             raise AttributeError(name)
         return getattr(self.controller, name)
 
+    @property
+    def secondary_path(self) -> Any:
+        """Estimated secondary path of the inner controller; a new one can be assigned, which that controller takes."""
+        return self.controller.secondary_path  # type: ignore[attr-defined]
+
+    @secondary_path.setter
+    def secondary_path(self, path: Any) -> None:
+        self.controller.secondary_path = path  # type: ignore[attr-defined]
+
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if a part of the wrapper or the controller is for another sample rate than `fs` in Hz."""
         require_rates(fs, self._rates())
@@ -346,9 +355,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         A new estimate can be assigned between two samples, also during a run: taps or an FIR system, or paths with the
         same channels, no longer than the present estimate. The stored references are filtered again with it, so the
         next update knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's
-        covariance grows, because its weights belong to the old path. Running powers, and KF-PB's correlations, forget
-        the old path within their memory. The forms of KF-PB that estimate the primary paths solve for the new path from
-        the end of the block.
+        covariance grows, because its weights belong to the old path. Running powers, and the correlations of KF-PB for
+        one channel, forget the old path within their memory. KF-PB for several channels solves for the new paths at the
+        end of the block.
         """
         return self._lines.secondary_estimate.copy()
 
@@ -356,7 +365,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def secondary_path(self, path: Any) -> None:
         before = self.secondary_path
         self._lines.secondary_estimate[:] = self._checked_estimate(path)
-        if self._uncertainty is None:
+        if self._stated_uncertainty is None:
             self._filter_again()
         else:  # measured paths, for example, have another distance from the new path
             self.secondary_path_uncertainty = self._stated_uncertainty

@@ -134,7 +134,7 @@ class MonitoredController(WrappedController):
         self.margin_db = as_nonnegative(margin_db, "margin_db", unit="dB")
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} monitored"
         self.health: list[HealthEvent] = []
-        self._fresh = deepcopy(controller)
+        self._fresh = deepcopy(controller)  # with which it tries again
         self._samples = 0
         self._silent_ratio = np.nan  # power of the error over that of the reference, without control
         self._suspicious_ratio = np.nan  # the same with control, while a test is under way
@@ -153,6 +153,16 @@ class MonitoredController(WrappedController):
 
     def _rates(self) -> dict[str, float | None]:
         return {"monitor": self.fs}
+
+    @property
+    def secondary_path(self) -> Any:
+        """Estimated secondary path; a new one that is assigned also counts after a silence."""
+        return self.controller.secondary_path  # type: ignore[attr-defined]
+
+    @secondary_path.setter
+    def secondary_path(self, path: Any) -> None:
+        self.controller.secondary_path = path  # type: ignore[attr-defined]
+        self._fresh.secondary_path = path  # type: ignore[attr-defined]
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest `reference` x(n), or silence."""

@@ -361,6 +361,16 @@ class PathTracker(WrappedController):
         self._path = path
         self._reversed = path[::-1].copy()
 
+    @property
+    def secondary_path(self) -> Any:
+        """Secondary path in use; one that is assigned counts until a test says that another one is better."""
+        return self.controller.secondary_path
+
+    @secondary_path.setter
+    def secondary_path(self, path: Any) -> None:
+        self.controller.secondary_path = path
+        self._know(self.controller.secondary_path)
+
     def control_signal(self, reference: float) -> float:
         """Return the control signal with the probe, y(n) + v(n), for the newest reference sample x(n)."""
         y = self.controller.control_signal(reference)

@@ -25,6 +25,7 @@ from kfopc_filterpy import (
     noise_reduction_db,
     simulate,
 )
+from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker
 from kfopc_filterpy.paths import PathTolerance, fir_path
 
 NEW = np.array([0.0, 0.0, -0.7, 0.2])
@@ -272,7 +273,7 @@ def test_the_covariance_of_several_channels_grows_by_what_the_paths_changed() ->
     controller = OF_SEVERAL["KF-ANC"](OLD_PATHS)
     drive_several(controller, 0, 200)
     before = controller.covariance
-    controller.secondary_path = 0.5 * OLD_PATHS  # a quarter of the energy of the change, over that of the larger
+    controller.secondary_path = 0.5 * OLD_PATHS  # the change has a quarter of the larger path's energy
     grown = before + 0.25 * np.mean(controller.weights**2) * np.eye(len(before))
     np.testing.assert_allclose(controller.covariance, grown, rtol=1e-12, atol=1e-15)
     drive_several(controller, 200, 300)
@@ -294,3 +295,21 @@ def test_after_a_jump_of_the_plant_the_new_paths_are_as_good_as_a_new_controller
         reached.append(-np.inf if diverged else noise_reduction_db(run.error, run.disturbance))
     assert abs(reached[0] - reached[1]) < 0.5
     assert reached[2] < reached[0] - 3.0
+
+
+def test_wrappers_pass_a_new_path_on() -> None:
+    inner = FxLMS(N_TAPS, S_HAT, step_size=MU)
+    for wrapped in (FeedbackNeutralizer(inner, [0.0, 0.1]), MonitoredController(inner, fs=FS)):
+        wrapped.secondary_path = NEW
+        np.testing.assert_array_equal(inner.secondary_path, NEW)
+        np.testing.assert_array_equal(wrapped.secondary_path, NEW)
+        wrapped.secondary_path = S_HAT
+        np.testing.assert_array_equal(inner.secondary_path, S_HAT)
+
+
+def test_a_tracker_knows_a_path_that_is_assigned() -> None:
+    """It judges other paths against this one."""
+    tracker = PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), fs=FS)
+    tracker.secondary_path = NEW
+    np.testing.assert_array_equal(tracker.controller.secondary_path, NEW)
+    np.testing.assert_array_equal(tracker._path, NEW)

@@ -14,11 +14,11 @@ from helpers.power_budget import correlation, within
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kfopc_filterpy.kernels import toeplitz
+from kfopc_filterpy.kernels import toeplitz as parts
 from kfopc_filterpy.kernels.toeplitz import solve_toeplitz
 from kfopc_filterpy.power.allocation import POWER_TOLERANCE, RIDGE
 
-toeplitz_power, toeplitz_times = from_python(toeplitz.toeplitz_power), from_python(toeplitz.toeplitz_times)
+toeplitz_power, toeplitz_times = from_python(parts.toeplitz_power), from_python(parts.toeplitz_times)
 
 EPS = np.finfo(np.float64).eps
 toeplitz = scipy.linalg.toeplitz
