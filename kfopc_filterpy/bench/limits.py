@@ -138,7 +138,8 @@ def amplifiers(limits: Limits) -> Any:
 
 def clipping_limits(limits: Limits) -> Any:
     """Return the limit at which the amplifier clips, or one for each loudspeaker; a huge one if it does not."""
-    each = [np.finfo(float).max if one.amplitude_limit is None else one.amplitude_limit for one in each_of(limits)]
+    never = np.sqrt(np.finfo(float).max)
+    each = [never if one.amplitude_limit is None else one.amplitude_limit for one in each_of(limits)]
     return np.array(each) if isinstance(limits, ChannelLimits) else each[0]
 
 

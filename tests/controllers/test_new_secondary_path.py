@@ -309,7 +309,7 @@ def test_wrappers_pass_a_new_path_on() -> None:
 
 def test_a_tracker_knows_a_path_that_is_assigned() -> None:
     """It judges other paths against this one."""
-    tracker = PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), fs=FS)
+    tracker = PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), fs=FS, rng=1)
     tracker.secondary_path = NEW
     np.testing.assert_array_equal(tracker.controller.secondary_path, NEW)
     np.testing.assert_array_equal(tracker._path, NEW)
