@@ -123,6 +123,10 @@ class WrappedController(BlockProcessing, Checkpointed):
 
     @secondary_path.setter
     def secondary_path(self, path: Any) -> None:
+        self._take_path(path)
+
+    def _take_path(self, path: Any) -> None:
+        """Give a new path to the inner controller; a wrapper that knows the path itself extends this."""
         self.controller.secondary_path = path  # type: ignore[attr-defined]
 
     def require_sample_rate(self, fs: float) -> None:

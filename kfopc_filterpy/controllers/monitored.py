@@ -154,15 +154,9 @@ class MonitoredController(WrappedController):
     def _rates(self) -> dict[str, float | None]:
         return {"monitor": self.fs}
 
-    @property
-    def secondary_path(self) -> Any:
-        """Estimated secondary path; a new one that is assigned also counts after a silence."""
-        return self.controller.secondary_path  # type: ignore[attr-defined]
-
-    @secondary_path.setter
-    def secondary_path(self, path: Any) -> None:
-        self.controller.secondary_path = path  # type: ignore[attr-defined]
-        self._fresh.secondary_path = path  # type: ignore[attr-defined]
+    def _take_path(self, path: Any) -> None:
+        super()._take_path(path)
+        self._fresh.secondary_path = path  # type: ignore[attr-defined]  # which takes over after a silence
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest `reference` x(n), or silence."""

@@ -361,14 +361,8 @@ class PathTracker(WrappedController):
         self._path = path
         self._reversed = path[::-1].copy()
 
-    @property
-    def secondary_path(self) -> Any:
-        """Secondary path in use; one that is assigned counts until a test says that another one is better."""
-        return self.controller.secondary_path
-
-    @secondary_path.setter
-    def secondary_path(self, path: Any) -> None:
-        self.controller.secondary_path = path
+    def _take_path(self, path: Any) -> None:
+        super()._take_path(path)
         self._know(self.controller.secondary_path)
 
     def control_signal(self, reference: float) -> float:

@@ -335,13 +335,7 @@ class VirtualMicrophones(WrappedController):
         """Last estimate of the error at the virtual microphones, (K_v,); a copy."""
         return self._virtual_error.copy()
 
-    @property
-    def secondary_path(self) -> Any:
-        """Estimated secondary paths that the inner controller uses, to the microphones that it hears."""
-        return self.controller.secondary_path  # type: ignore[attr-defined]
-
-    @secondary_path.setter
-    def secondary_path(self, path: Any) -> None:
+    def _take_path(self, path: Any) -> None:
         raise AttributeError(
             "VirtualMicrophones takes no new secondary path: its observer belongs to the paths that it was made with; "
             "make it again with the new ones"
