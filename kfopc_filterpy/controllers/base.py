@@ -11,7 +11,6 @@ import numpy as np
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
-from ..kernels.holding import Held
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
 from ..paths.uncertainty import GUARD_TAPS, guard_filter, path_uncertainty
@@ -28,7 +27,7 @@ from .processing import (
     require_one_length,
     require_room,
 )
-from .step import GuardLine, Lines, adapt_once, emit_once, estimate_once, listen, process_samples
+from .step import Compiled, GuardLine, Lines, estimate_once, listen, process_samples
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
@@ -187,7 +186,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     _stated_uncertainty: Any = None  # as it was assigned
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
-    _holding: Held | None = None
+    _code: Compiled | None = None
     _rows: Rows | None = None
 
     def __init__(
@@ -491,31 +490,47 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         """
         if self.multichannel:
             x = channel_sample(reference, self.n_references, "reference", "references")
-            emit_once.with_held(self._held(), x)
+            code = self._compiled()
+            self._lines.heard[:] = x
+            code.emit(code.address)
             return self._y.copy()
-        self._y = emit_once.with_held(self._held(), as_number(reference, "reference"))
+        return self._emit(as_number(reference, "reference"))
+
+    def _emit(self, reference: float) -> float:
+        """Return y(n) for a reference of one channel."""
+        code = self._compiled()
+        self._y = code.emit(code.address, reference)
         return self._y
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for a copy or a file, which holds a state of its own."""
-        return {name: value for name, value in vars(self).items() if name not in ("_holding", "_rows")}
+        return {name: value for name, value in vars(self).items() if name not in ("_code", "_rows")}
 
-    def _held(self) -> Held:
-        """Return the state, held for compiled code."""
-        if self._holding is None or self._holding.state is not self._state:
-            self._holding = Held(self._state)
-        return self._holding
+    def _compiled(self) -> Compiled:
+        """Return the state, held for compiled code, and its steps."""
+        if self._code is None or self._code.state is not self._state:
+            self._code = Compiled(self._state)
+        return self._code
 
     def update(self, error: Any) -> None:
         """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
         if self.multichannel:
             error = channel_sample(error, self.n_microphones, "error", "microphones")
+            code = self._compiled()
+            self._lines.error[:] = error
+            adapted = bool(code.adapt(code.address, True))
         else:
             error = as_number(error, "error")
-        if not adapt_once.with_held(self._held(), error, self._y):
+            adapted = self._adapt(error)
+        if not adapted:
             raise ValueError(self._reason(error))
         if self.multichannel:
             self.after_compiled(self._state)  # a solution may be due
+
+    def _adapt(self, error: float) -> bool:
+        """Adapt to an error of one channel; return False if that fails."""
+        code = self._compiled()
+        return bool(code.adapt(code.address, error, self._y, True))
 
     def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
@@ -560,9 +575,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         done = 0
         while done < len(x):
             end = min(done + (self.samples_to_block() or len(x)), len(x))
-            held = self._held()
-            done = process_samples.with_held(held, x, e, flags, y, done, end)
-            self.after_compiled(held.state)
+            code = self._compiled()
+            done = process_samples(code.steps, x, e, flags, y, done, end)
+            self.after_compiled(code.state)
             if done < end:
                 break
         return done
@@ -612,7 +627,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         """Follow signals whose first axis is time; return the number of samples before a refusal."""
-        return listen(self._state, references, errors, adapting)
+        return listen(self._compiled().held, references, errors, adapting)
 
     def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return references and errors with a sample in each row."""

@@ -10,23 +10,31 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
 
 from .._validate import as_real_array
 from ..kernels.compiling import inlined, part
 from ..kernels.delay_lines import delay_line, latest, newest, push
+from ..kernels.holding import Held, calling, for_states, state_at
 from ..kernels.records import as_records
-from ..kernels.vectors import at, dot
+from ..kernels.vectors import at, copy_into, dot
 from ..power.amplifiers import LinearAmplifier, amplify, compiled_model
 from ..power.constraint import advance_squares, preview_squares
 from ..power.limiter import LimiterState, limit_sample
 from .step import (
+    adapt,
+    adapt_step,
     advance_powers,
+    control_filter,
+    emit,
     emit_outputs,
     emit_silence,
-    emitted,
+    emit_step,
     filter_output,
     loudspeakers,
     output,
+    skip,
+    steps_of_lines,
     take_reference,
     weights_of,
 )
@@ -55,6 +63,21 @@ class ChannelLines(NamedTuple):
     disturbance: np.ndarray  # (K,) the last estimate d^
     modified_error: np.ndarray  # (K,) room for an algorithm that adapts to another error
     constraint_factor: np.ndarray  # (J,) the last factors
+    heard: np.ndarray  # (I,) room for x, where the entry points find it
+    error: np.ndarray  # (K,) room for e, likewise
+
+
+class ChannelSteps(NamedTuple):
+    """A controller of several channels, as compiled loops see it."""
+
+    address: int  # of its state
+    emit: int  # address of the function of `emit_channels_entry`
+    adapt: int  # and of that of `adapt_channels_entry`
+    control_filter: np.ndarray  # (J, I, L)
+    control_signal: np.ndarray  # the last four are those of its lines
+    constraint_factor: np.ndarray
+    heard: np.ndarray
+    error: np.ndarray
 
 
 def channel_lines(
@@ -83,6 +106,8 @@ def channel_lines(
         disturbance=np.zeros(K),
         modified_error=np.zeros(K),
         constraint_factor=np.ones(J),
+        heard=np.zeros(n_references),
+        error=np.zeros(K),
     )
 
 
@@ -145,10 +170,66 @@ def emit_channel_outputs(lines, state):
     return 0.0
 
 
-@emitted.register(ChannelLines)
-def emitted_channels(lines, y):
+EMIT = types.float64(types.intp)
+ADAPT = types.intp(types.intp, types.intp)
+call_emit, call_adapt = calling(EMIT), calling(ADAPT)
+
+
+@for_states(EMIT)
+def emit_channels_entry(key):
+    """Compile `emit` for a type of state of several channels."""
+
+    def emit_channels_at(address):
+        state = state_at(address, key)
+        return emit(state, state.lines.heard)
+
+    return emit_channels_at
+
+
+@for_states(ADAPT)
+def adapt_channels_entry(key):
+    """Compile `adapt` or `skip` for a type of state of several channels."""
+
+    def adapt_channels_at(address, adapting):
+        state = state_at(address, key)
+        if adapting:
+            return adapt(state, state.lines.error, state.lines.control_signal)
+        skip(state)
+        return True
+
+    return adapt_channels_at
+
+
+@steps_of_lines.register(ChannelLines)
+def channel_steps(lines: ChannelLines, held: Held) -> tuple[ChannelSteps, Any, Any]:
+    """Return the steps of a controller of several channels, for loops and for Python."""
+    emit, adapt = emit_channels_entry.of(held), adapt_channels_entry.of(held)
+    steps = ChannelSteps(
+        held.address,
+        emit.address,
+        adapt.address,
+        control_filter(held.state),
+        lines.control_signal,
+        lines.constraint_factor,
+        lines.heard,
+        lines.error,
+    )
+    return steps, emit.ctypes, adapt.ctypes
+
+
+@emit_step.register(ChannelSteps)
+def emit_channel_step(steps, x):
     """Return y(n), (J,)."""
-    return lines.control_signal
+    copy_into(steps.heard, x)
+    call_emit(steps.emit, steps.address)
+    return steps.control_signal
+
+
+@adapt_step.register(ChannelSteps)
+def adapt_channel_step(steps, error, control_signal, adapting):
+    """Adapt to the errors, (K,), or skip the sample; return False if that fails."""
+    copy_into(steps.error, error)
+    return call_adapt(steps.adapt, steps.address, adapting) != 0
 
 
 @emit_silence.register(ChannelLines)

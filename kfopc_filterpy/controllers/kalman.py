@@ -26,7 +26,7 @@ from ..power.constraint import (
 from ..power.limiter import OutputLimiter
 from .base import NO_SOLUTION, FilteredReferenceController, calls_of, constraint_for
 from .direct import DirectKalman
-from .step import Lines, adapt, adapt_once, disturbance_estimate, emit_once, estimate_once
+from .step import Lines, adapt, disturbance_estimate, estimate_once
 
 
 class KalmanState(NamedTuple):
@@ -206,8 +206,7 @@ class KalmanController(FilteredReferenceController):
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         reference = as_number(reference, "reference")
         self._see_weights()
-        self._y = emit_once.with_held(self._held(), reference)
-        return self._y
+        return self._emit(reference)
 
     def _see_weights(self) -> None:
         """Copy the estimator's weights into the state."""
@@ -220,7 +219,7 @@ class KalmanController(FilteredReferenceController):
         state = self._steppable_state()
         if state is None:
             self._update_through_estimator(error)
-        elif adapt_once.with_held(self._held(), error, self._y):
+        elif self._adapt(error):
             self.estimator.after_compiled(state.weights.copy())
         else:
             self._update_through_estimator(error)  # raises, with the reason

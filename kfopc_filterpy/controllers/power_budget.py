@@ -65,9 +65,10 @@ def filter_of_power_budget(state):
 
 
 @power_weight.register(PowerBudgetState)
-def weight_of_power_budget(state):
-    """Return lambda."""
-    return state.budget.numbers[0].weight
+def weight_of_power_budget(state: PowerBudgetState) -> np.ndarray:
+    """Return lambda, (1,)."""
+    weight: np.ndarray = state.budget.numbers["weight"]
+    return weight
 
 
 class PowerBudgetController(KalmanController):

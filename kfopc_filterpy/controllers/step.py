@@ -12,15 +12,15 @@ and whatever else its algorithm stores. `adapt` must have a body for the type, r
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import singledispatch
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba.extending import overload
+from numba import types
 
-from ..kernels.borrowing import borrowed
-from ..kernels.compiling import OPTIONS, by_type, compiled, compiled_for_states, inlined, part
+from ..kernels.compiling import by_type, compiled, inlined, part
 from ..kernels.delay_lines import latest, newest, push
-from ..kernels.holding import kind_of_held
+from ..kernels.holding import Held, calling, for_states, state_at
 from ..kernels.vectors import dot
 from ..power.amplifiers import amplify
 from ..power.constraint import advance_constraint, squares_are_finite
@@ -64,7 +64,7 @@ def output(state, j):
 @by_type
 def adapt(state, error, control_signal):
     """Adapt to the error that the emitted control signal left; return False, with nothing changed, if that fails."""
-    raise NotImplementedError("no step is registered for this type of state: adapt.register(State)(step)")
+    return False  # `Compiled` refuses a state without a body of its own
 
 
 @by_type
@@ -79,10 +79,10 @@ def follow(state, error):
     return finite
 
 
-@by_type
-def power_weight(state):
-    """Return the weight lambda of the control power; NaN for an algorithm without one."""
-    return np.nan
+@singledispatch
+def power_weight(state: Any) -> np.ndarray:
+    """Return the weight lambda of the control power, (1,), which the steps update; NaN for an algorithm without one."""
+    return np.array([np.nan])
 
 
 # Functions chosen by the type of the lines: `Lines` here, `ChannelLines` in `channels`.
@@ -117,14 +117,8 @@ def take_reference(lines, x):
 
 @by_type
 def emit_outputs(lines, state):
-    """Return y(n), after any limiter, and add it to its delay line; with several channels, only `emitted` has it."""
+    """Return y(n), after any limiter, and add it to its delay line; with several channels, the lines keep it."""
     return emit_limited(lines, output(state, 0))
-
-
-@by_type
-def emitted(lines, y):
-    """Return the control signal after `emit` has returned y; with several channels (J,)."""
-    return y
 
 
 @by_type
@@ -186,42 +180,107 @@ def disturbance_estimate(lines, error):
     return error + dot(s, newest(lines.output, s.size))
 
 
-# Entry points from Python. The loops call `emit_step` and `adapt_step`, which are the same compiled functions: an
-# algorithm is compiled once, and a loop over its samples is small.
+# Entry points. Loops are given them as arguments, and so are compiled once for all algorithms; Python calls them by
+# `ctypes`. They find the state at its address.
 
 
-@compiled_for_states()
-def emit_once(held, x):
-    """Call `emit` with a `Held` state."""
-    return emit(borrowed(held.state), x)
+EMIT = types.float64(types.intp, types.float64)
+ADAPT = types.intp(types.intp, types.float64, types.float64, types.intp)
+call_emit, call_adapt = calling(EMIT), calling(ADAPT)
 
 
-@compiled_for_states()
-def adapt_once(held, error, control_signal):
-    """Call `adapt` with a `Held` state."""
-    return adapt(borrowed(held.state), error, control_signal)
+@for_states(EMIT)
+def emit_entry(key):
+    """Compile `emit` for a type of state."""
+
+    def emit_at(address, x):
+        return emit(state_at(address, key), x)
+
+    return emit_at
 
 
-def emit_step(held, x):
-    """Call `emit_once` in a compiled loop."""
-    return emit(held.state, x)
+@for_states(ADAPT)
+def adapt_entry(key):
+    """Compile `adapt`, or `skip` for a sample to which it is not to adapt, for a type of state."""
+
+    def adapt_at(address, error, control_signal, adapting):
+        state = state_at(address, key)
+        if adapting:
+            return adapt(state, error, control_signal)
+        skip(state)
+        return True
+
+    return adapt_at
 
 
-def adapt_step(held, error, control_signal):
-    """Call `adapt_once` in a compiled loop."""
-    return adapt(held.state, error, control_signal)
+@for_states(nogil=True)
+def listen(key):
+    """Compile, for a type of state, the loop over signals that are heard while the loudspeakers are silent.
+
+    It returns the number of samples processed before a refusal. The first axis is time; with several channels, each row
+    is a sample.
+    """
+
+    def listen_at(address, references, errors, adapting):
+        state = state_at(address, key)
+        for n in range(references.shape[0]):
+            take_reference(state.lines, references[n])
+            emit_silence(state.lines)
+            if not adapting[n]:
+                skip(state)
+            elif not follow(state, errors[n]):
+                return n
+        return references.shape[0]
+
+    return listen_at
 
 
-@overload(emit_step, jit_options=OPTIONS)
-def _emit_step(held, x):
-    step = emit_once.for_states(kind_of_held(held))
-    return lambda held, x: step(held, x)
+class Steps(NamedTuple):
+    """A controller, as compiled loops see it."""
+
+    address: int  # of its state
+    emit: int  # address of the function of `emit_entry`
+    adapt: int  # and of that of `adapt_entry`
+    control_filter: np.ndarray  # (L,)
+    power_weight: np.ndarray  # (1,) lambda
+    used: np.ndarray  # record of the constraint: factor, power and gain that were used last
 
 
-@overload(adapt_step, jit_options=OPTIONS)
-def _adapt_step(held, error, control_signal):
-    step = adapt_once.for_states(kind_of_held(held))
-    return lambda held, error, control_signal: step(held, error, control_signal)
+class Compiled:
+    """A controller's state, held, and its compiled steps: `steps` for loops; `emit` and `adapt` for Python.
+
+    It must exist for as long as its `steps` are used: they hold the address of the state, and not the state.
+    """
+
+    def __init__(self, state: Any) -> None:
+        if adapt.dispatch(type(state)) is adapt.dispatch(object):
+            raise NotImplementedError(
+                f"no step is registered for this type of state: adapt.register({type(state).__name__})(step)"
+            )
+        self.state, self.held = state, Held(state)
+        self.address = self.held.address
+        self.steps, self.emit, self.adapt = steps_of_lines(state.lines, self.held)
+
+
+@singledispatch
+def steps_of_lines(lines: Any, held: Held) -> tuple[Any, Any, Any]:
+    """Return the steps of a controller for loops, then those for Python, by the type of its lines."""
+    state, emit, adapt = held.state, emit_entry.of(held), adapt_entry.of(held)
+    used = state.constraint.numbers
+    steps = Steps(held.address, emit.address, adapt.address, control_filter(state), power_weight(state), used)
+    return steps, emit.ctypes, adapt.ctypes
+
+
+@by_type
+def emit_step(steps, x):
+    """Return y(n) for the newest reference."""
+    return call_emit(steps.emit, steps.address, x)
+
+
+@by_type
+def adapt_step(steps, error, control_signal, adapting):
+    """Adapt to the error that the emitted control signal left, or skip the sample; return False if that fails."""
+    return call_adapt(steps.adapt, steps.address, error, control_signal, adapting) != 0
 
 
 @compiled()
@@ -230,36 +289,16 @@ def estimate_once(lines, error):
     return disturbance_estimate(lines, error)
 
 
-@compiled_for_states(nogil=True)
-def listen(state, references, errors, adapting):
-    """Follow signals while the loudspeakers are silent; return the number of samples processed before a refusal.
-
-    The first axis is time; with several channels, each row is a sample.
-    """
-    state = borrowed(state)
-    for n in range(references.shape[0]):
-        take_reference(state.lines, references[n])
-        emit_silence(state.lines)
-        if not adapting[n]:
-            skip(state)
-        elif not follow(state, errors[n]):
-            return n
-    return references.shape[0]
-
-
-@compiled_for_states(nogil=True)
-def process_samples(held, references, errors, adapting, outputs, begin, end):
+@compiled(nogil=True)
+def process_samples(steps, references, errors, adapting, outputs, begin, end):
     """Process the samples from `begin` to `end` of a block, and set their control signals.
 
     Return the number of samples processed, or the sample to which the controller could not adapt. The first axis is
     time; with several channels, each row is a sample.
     """
-    state = borrowed(held.state)
     for n in range(begin, end):
-        y = emitted(state.lines, emit_step(held, references[n]))
+        y = emit_step(steps, references[n])
         outputs[n] = y
-        if not adapting[n]:
-            skip(state)
-        elif not adapt_step(held, errors[n], y):
+        if not adapt_step(steps, errors[n], y, adapting[n]):
             return n
     return end

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_number, require_finite
-from ..kernels.compiling import compiled_for_states, part
+from ..kernels.compiling import part
 from ..kernels.covariance import Covariance, project_covariance, update_weights
+from ..kernels.holding import for_states, state_at
 from ..kernels.records import new_record
 from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
 from .covariance import RandomWalkCovariance, require_covariance
@@ -23,10 +24,15 @@ CORRECTED, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE, OVERFLOWING_SQUARE, SIL
 UNTOUCHED = (NOT_FINITE, OVERFLOWING_SQUARE, SILENT)  # refused before the pass over the covariance
 
 
-@compiled_for_states()
-def correct_once(held, weights, z, h, reference, noise, factor):
-    """Call `correct` from Python, with a held `FilterArrays`."""
-    return correct(held.state.covariance, held.state.constraint, weights, z, h, reference, noise, factor)
+@for_states()
+def correct_once(key):
+    """Compile `correct` for a type of `FilterArrays`."""
+
+    def correct_at(address, weights, z, h, reference, noise, factor):
+        state = state_at(address, key)
+        return correct(state.covariance, state.constraint, weights, z, h, reference, noise, factor)
+
+    return correct_at
 
 
 @part()
@@ -408,7 +414,7 @@ class RandomWalkKFOPC(KFOPC):
             self._weights()  # raises, with the reason
         held, before, prior = self._covariance.before_update(state)
         x = np.nan if reference is None else reference
-        outcome, y, S = correct_once.with_held(held, weights.reshape(-1), z, h, x, noise, factor)
+        outcome, y, S = correct_once(held, weights.reshape(-1), z, h, x, noise, factor)
         if outcome not in UNTOUCHED:
             self._covariance.projected(before, prior)
         if outcome != CORRECTED:

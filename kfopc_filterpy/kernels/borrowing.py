@@ -31,13 +31,13 @@ def _without_owner(typing_context: Any, value: Any) -> Any:
     """Return a value whose arrays have no owner."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _disown(context, builder, value, arguments[0])
+        return disowned(context, builder, value, arguments[0])
 
     return value(value), generate
 
 
-def _disown(context: Any, builder: Any, kind: Any, value: Any) -> Any:
-    """Set the owners in the arrays of an LLVM value to null."""
+def disowned(context: Any, builder: Any, kind: Any, value: Any) -> Any:
+    """Return an LLVM value with the owners of its arrays set to null."""
     if isinstance(kind, types.Array):
         if kind.layout != "C":
             raise errors.TypingError("arrays of a state must be contiguous: numpy.ascontiguousarray makes them so")
@@ -46,6 +46,6 @@ def _disown(context: Any, builder: Any, kind: Any, value: Any) -> Any:
         return array._getvalue()
     if isinstance(kind, types.BaseTuple):
         for i in range(len(kind)):
-            item = _disown(context, builder, kind[i], builder.extract_value(value, i))  # type: ignore[index]
+            item = disowned(context, builder, kind[i], builder.extract_value(value, i))  # type: ignore[index]
             value = builder.insert_value(value, item, i)
     return value

@@ -60,38 +60,22 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
+def callback(signature: Any) -> Callable[..., Any]:
+    """Compile functions that compiled code can be given as arguments, and Python calls by `ctypes`."""
+
+    def compiled_callback(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+        def decorate(function: Callable[..., Any]) -> Any:
+            with _cache_folder():
+                return numba.cfunc(signature, error_model="numpy", **options)(function)
+
+        return decorate
+
+    return compiled_callback
+
+
 def is_ours(kind: type) -> bool:
     """Return whether a type is defined in this package."""
     return kind.__module__.startswith(PACKAGE.name)
-
-
-class StateEntry:
-    """A compiled function whose first argument is a controller's state.
-
-    What is compiled for a state type of the package is kept on disk. For a type defined elsewhere it is not: no process
-    without that module could read the index again, and nobody would notice that the module has changed.
-    """
-
-    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
-        self.kept = compiled(**options)(function)
-        self.passing = numba.njit(**(OPTIONS | options))(function)
-        self.__doc__, self.__name__ = function.__doc__, function.__name__
-
-    def for_states(self, kind: type) -> Any:
-        """Return the compiled function for a type of state; compiled callers call it, so that it is compiled once."""
-        return self.kept if is_ours(kind) else self.passing
-
-    def __call__(self, state: Any, *arguments: Any) -> Any:
-        return self.for_states(type(state))(state, *arguments)
-
-    def with_held(self, held: Any, *arguments: Any) -> Any:
-        """Call it with a `Held` state, of which it reads the field `state`."""
-        return (self.kept if held.ours else self.passing)(held.passed, *arguments)
-
-
-def compiled_for_states(**options: Any) -> Callable[[Callable[..., Any]], StateEntry]:
-    """Decorator of functions that Python calls with the state of a controller (see `StateEntry`)."""
-    return lambda function: StateEntry(function, **options)
 
 
 def by_type(default: Callable[..., Any]) -> Any:

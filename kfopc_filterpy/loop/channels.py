@@ -12,11 +12,10 @@ from scipy.signal import fftconvolve
 from .._validate import as_channels, as_count, as_positive, per_loudspeaker
 from ..controllers.base import FilteredReferenceController
 from ..controllers.channels import amplifier_models, delay_lines
-from ..controllers.step import adapt_step, control_filter, emit_step, emitted
+from ..controllers.step import Compiled, adapt_step, emit_step
 from ..kernels.borrowing import borrowed
-from ..kernels.compiling import compiled, compiled_for_states, inlined, part
+from ..kernels.compiling import compiled, inlined, part
 from ..kernels.delay_lines import newest, push
-from ..kernels.holding import Held
 from ..kernels.vectors import copy_into, dot
 from ..paths.channels import is_path_matrix, path_matrix, primary_paths, secondary_paths
 from ..power.amplifiers import amplify, compiled_model
@@ -89,30 +88,30 @@ def note_channel_weights(rows, row, weights):
             copy_into(rows[row, j, i], weights[j, i])
 
 
-@compiled_for_states(nogil=True)
-def run_channels(held, plant, signals, weights, limit, every, begin, end):
-    """Run a controller, whose state is `Held`, over the samples from `begin` to `end` of a run.
+@compiled(nogil=True)
+def run_channels(steps, plant, signals, weights, limit, every, begin, end):
+    """Run a controller, given by its `ChannelSteps`, over the samples from `begin` to `end` of a run.
 
     Return the status and the first sample not done. The control filters are stored in `weights`, (rows, J, I, L), at
     every `every`-th sample.
     """
-    state, plant, signals = borrowed(held.state), borrowed(plant), borrowed(signals)
+    steps, plant, signals = borrowed(steps), borrowed(plant), borrowed(signals)
     x, e = np.empty(signals.reference.shape[0]), np.empty(signals.error.shape[0])
     for n in range(begin, end):
         hear(plant, signals, n, x)
-        y = emitted(state.lines, emit_step(held, x))
+        y = emit_step(steps, x)
         for j in range(y.size):
             if not abs(y[j]) <= limit[j]:
                 return DIVERGED, n
         play(plant, y, signals, n)
         for k in range(e.size):
             e[k] = signals.error[k, n]
-        if not adapt_step(held, e, y):
+        if not adapt_step(steps, e, y, True):
             return REFUSED, n
         for j in range(y.size):
-            signals.constraint_factor[j, n] = state.lines.constraint_factor[j]
+            signals.constraint_factor[j, n] = steps.constraint_factor[j]
         if weights.shape[0] > 0 and n % every == 0:
-            note_channel_weights(weights, n // every, control_filter(state))
+            note_channel_weights(weights, n // every, steps.control_filter)
     return RUNNING, end
 
 
@@ -148,12 +147,12 @@ class ChannelRun:
 
     def _blocks(self, state: Any, signals: ChannelSignals) -> tuple[int, int]:
         """Run in compiled code, block by block: a run can be interrupted between blocks, and the controller may work."""
-        held, status, begin, n_samples = Held(state), RUNNING, 0, signals.error.shape[1]
+        code, status, begin, n_samples = Compiled(state), RUNNING, 0, signals.error.shape[1]
         while begin < n_samples and status == RUNNING:
             end = min(begin + (self.controller.samples_to_block() or STEP), n_samples)
             try:
-                status, done = run_channels.with_held(
-                    held, self.plant, signals, self.weights, self.limit, self.every, begin, end
+                status, done = run_channels(
+                    code.steps, self.plant, signals, self.weights, self.limit, self.every, begin, end
                 )
             finally:  # even if interrupted, the controller must have the state of its last sample
                 self.controller.after_compiled(state)

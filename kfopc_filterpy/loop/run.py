@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..controllers.step import adapt_step, control_filter, emit_step, power_weight
+from ..controllers.step import adapt_step, emit_step
 from ..kernels.borrowing import borrowed
-from ..kernels.compiling import compiled, compiled_for_states, inlined
+from ..kernels.compiling import compiled, inlined
 from ..kernels.delay_lines import newest, push
 from ..kernels.vectors import copy_into, dot
 from ..power.amplifiers import amplify
@@ -82,33 +82,30 @@ def note_weights(rows, weights, every, n):
         copy_into(rows[n // every], weights)
 
 
-@compiled_for_states(nogil=True)
-def run(held, plant, signals, weights, limit, every, first):
-    """Run a controller, whose state is `Held`, over a stretch, whose first sample is sample `first` of the run.
+@compiled(nogil=True)
+def run(steps, plant, signals, weights, limit, every, first):
+    """Run a controller, given by its `Steps`, over a stretch, whose first sample is sample `first` of the run.
 
     Return the status and the number of samples done. The control filter is stored in `weights`, (rows, L), at every
     `every`-th sample.
     """
-    state, plant, signals = borrowed(held.state), borrowed(plant), borrowed(signals)
+    steps, plant, signals = borrowed(steps), borrowed(plant), borrowed(signals)
+    used = steps.used[0]
     for k in range(signals.reference.size):
-        y = emit_step(held, measured_reference(plant, signals.reference[k]))
+        y = emit_step(steps, measured_reference(plant, signals.reference[k]))
         if not abs(y) <= limit:
             return DIVERGED, k
         y_amplified = amplify(plant.amplifier, y)
         a = anti_noise(plant, y_amplified)
         e = signals.disturbance[k] - a + signals.sensor_noise[k]
         signals.error[k], signals.control_signal[k] = e, y
-        if not adapt_step(held, e, y):
+        if not adapt_step(steps, e, y, True):
             return REFUSED, k
         signals.amplifier_output[k], signals.anti_noise[k] = y_amplified, a
-        used = state.constraint.numbers[0]
         signals.constraint_factor[k], signals.disturbance_power[k] = used.factor, used.power
-        signals.secondary_path_gain[k], signals.power_weight[k] = used.gain, power_weight(state)
-        note_weights(weights, control_filter(state), every, first + k)
+        signals.secondary_path_gain[k], signals.power_weight[k] = used.gain, steps.power_weight[0]
+        note_weights(weights, steps.control_filter, every, first + k)
     return RUNNING, signals.reference.size
-
-
-run_kept = run.kept  # for compiled callers
 
 
 @compiled()

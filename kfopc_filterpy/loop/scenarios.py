@@ -9,7 +9,7 @@ import numpy as np
 
 from .._validate import as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, FilteredReferenceController
-from ..controllers.step import Lines
+from ..controllers.step import Compiled, Lines, Steps
 from ..kernels.compiling import compiled
 from ..kernels.covariance import (
     CANCELLATION,
@@ -25,7 +25,7 @@ from ..kernels.covariance import (
     project_covariance,
 )
 from ..kernels.delay_lines import TAPS, delay_line, newest, refill
-from ..kernels.holding import hold
+from ..kernels.holding import for_states, store
 from ..kernels.stacking import member, stacked, unstack
 from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
@@ -33,12 +33,11 @@ from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
 from .result import SimulationResult
-from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run_kept
+from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run
 from .simulation import POWERS, RECORDED
 
 BLOCK = 512  # samples whose gains are stored at a time
 VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
-hold_kept = hold.kept  # for compiled callers
 SAFE = 1e290  # a smaller correction cannot overflow finite weights
 
 
@@ -86,17 +85,28 @@ def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
     return m
 
 
-@compiled(nogil=True)
-def run_scenarios(states, plants, signals, limits, status, done, begin, end):
-    """Run each scenario that has not ended from sample `begin` to `end`; all arguments but the gains are stacked."""
-    no_weights = np.empty((0, 0))
-    for i in range(limits.size):
-        if status[i] == RUNNING:
-            states.gains.taken[0] = 0
-            state, plant = member(states, i), member(plants, i)
-            block = part_of(member(signals, i), begin, end)
-            status[i], taken = run_kept(hold_kept(state), plant, block, no_weights, limits[i], 1, 0)
-            done[i] += taken
+@for_states(nogil=True)
+def run_scenarios(key):
+    """Compile a run of all scenarios for a type of state.
+
+    It runs each scenario that has not ended from sample `begin` to `end`. `address` has room for the state of one of
+    them, and `steps` are those of such a state. All other arguments but the gains are stacked.
+    """
+
+    def run_all(address, steps, states, plants, signals, limits, status, done, begin, end):
+        no_weights = np.empty((0, 0))
+        for i in range(limits.size):
+            if status[i] == RUNNING:
+                states.gains.taken[0] = 0
+                state, plant = member(states, i), member(plants, i)
+                store(state, address, key)
+                used = state.constraint.numbers
+                own = Steps(address, steps.emit, steps.adapt, state.weights, steps.power_weight, used)
+                block = part_of(member(signals, i), begin, end)
+                status[i], taken = run(own, plant, block, no_weights, limits[i], 1, 0)
+                done[i] += taken
+
+    return run_all
 
 
 def simulate_scenarios(
@@ -217,8 +227,11 @@ def simulate_scenarios(
     recorded = {name: np.empty((count, x.size)) for name in names}
     signals = _signals(x, d, noises, recorded)
     status, done = np.full(count, RUNNING), np.zeros(count, np.int64)
+    code: Compiled | None = None
     for first, shared, solved in gains.blocks():
-        run_scenarios(scenarios._replace(gains=shared), plants, signals, limits, status, done, first, first + solved)
+        code = code or Compiled(own[0]._replace(gains=shared))
+        together = scenarios._replace(gains=shared)
+        run_scenarios(code.held, code.steps, together, plants, signals, limits, status, done, first, first + solved)
         _raise_if_refused(status, done, first + solved if solved < shared.variances.size else None)
         if progress:
             progress(count * solved)

@@ -10,8 +10,8 @@ import numpy as np
 
 from .._validate import as_count, as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
+from ..controllers.step import Compiled
 from ..kernels.delay_lines import delay_line
-from ..kernels.holding import Held
 from ..paths.models import path_taps
 from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
@@ -218,8 +218,9 @@ def _run_compiled(
     progress: Callable[[int], Any] | None,
 ) -> tuple[int, int]:
     """Run a stretch by `run.run`."""
+    code = Compiled(state)  # named, so that it outlives the run
     try:
-        status, done = run.with_held(Held(state), plant, stretch, weights, limit, every, first)
+        status, done = run(code.steps, plant, stretch, weights, limit, every, first)
     finally:  # even if interrupted, the controller must have the state of its last sample
         controller.after_compiled(state)
     if progress:

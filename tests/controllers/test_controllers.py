@@ -3,7 +3,6 @@
 import copy
 import math
 import pickle
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -99,11 +98,11 @@ def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, place, monkey
 
     def interrupt(*arguments):
         if place == "run":
-            run.with_held(*arguments)
+            run(*arguments)
         raise KeyboardInterrupt
 
     if place == "run":  # control-C comes through when the compiled loop returns, before its answer is kept
-        monkeypatch.setattr(simulation, "run", SimpleNamespace(with_held=interrupt))
+        monkeypatch.setattr(simulation, "run", interrupt)
     with pytest.raises(KeyboardInterrupt):
         simulate(made, X, disturbance=D, secondary_path=S, progress=interrupt if place == "progress" else None)
     monkeypatch.setattr(simulation, "run", run)

@@ -61,13 +61,13 @@ def test_with_the_true_path_nothing_is_left_of_the_feedback(name: str) -> None:
 
 def test_several_channels() -> None:
     rng = np.random.default_rng(0)
-    x, d = rng.standard_normal((2, 400)), rng.standard_normal((2, 400))
-    s = 0.5 * rng.standard_normal((2, 3, 6))  # two microphones, three loudspeakers
-    feedback = 0.2 * rng.standard_normal((2, 3, 5))  # to two reference microphones
+    x, d = rng.standard_normal((3, 400)), rng.standard_normal((4, 400))
+    s = 0.5 * rng.standard_normal((4, 2, 6))  # four microphones, two loudspeakers
+    feedback = 0.2 * rng.standard_normal((3, 2, 5))  # to three reference microphones
     feedback[:, :, 0] = 0.0
 
     def made() -> FxLMS:
-        return FxLMS(7, s, step_size=2e-3, n_references=2)
+        return FxLMS(7, s, step_size=2e-3, n_references=3)
 
     free = simulate(made(), x, disturbance=d, secondary_path=s, fs=FS)
     neutral = FeedbackNeutralizer(made(), feedback)

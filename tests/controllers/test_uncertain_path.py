@@ -183,12 +183,12 @@ def test_a_guarded_diagonal_filter_is_its_literal_equations() -> None:
     np.testing.assert_allclose(controller.variances, p, rtol=1e-9)
 
 
-SEVERAL = np.random.default_rng(6).standard_normal((2, 3, 5))  # two microphones, three loudspeakers
+SEVERAL = np.random.default_rng(6).standard_normal((3, 2, 5))  # three microphones, two loudspeakers
 CHANNEL_TAPS = 6
 
 
 def channel_rows(x: np.ndarray, signal_of: Any) -> np.ndarray:
-    """The rows of both microphones, (n_samples, K, J L): `signal_of` x' with their delays."""
+    """The rows of all microphones, (n_samples, K, J L): `signal_of` x' with their delays."""
     filtered = [[rows(signal_of(np.convolve(x, s)[: x.size]), CHANNEL_TAPS) for s in each] for each in SEVERAL]
     return np.moveaxis(np.array(filtered), (0, 1, 2, 3), (1, 2, 0, 3)).reshape(x.size, len(SEVERAL), -1)
 
@@ -218,7 +218,7 @@ def test_guarded_lms_filters_of_several_channels_are_their_literal_equation(norm
 def test_a_guarded_kalman_filter_of_several_channels_is_the_batch_solution() -> None:
     n_samples, q, P0 = 300, 0.01, 2.0
     x = np.random.default_rng(7).standard_normal((1, n_samples))
-    d = np.random.default_rng(8).standard_normal((2, n_samples))
+    d = np.random.default_rng(8).standard_normal((len(SEVERAL), n_samples))
     controller = kf_anc(CHANNEL_TAPS, SEVERAL, state_noise=0.0, measurement_noise=q, initial_variance=P0)
     controller.secondary_path_uncertainty = TOLERANCE
     simulate(controller, x, disturbance=d, secondary_path=SEVERAL, fs=FS)

@@ -15,13 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from helpers.loop import S_HAT, noises, run
+from numba import types
 from numba.core.errors import NumbaError
 
 from kfopc_filterpy import FxLMS, OutputLimiter, kf_opc, kf_pb
 from kfopc_filterpy.kernels.borrowing import borrowed
-from kfopc_filterpy.kernels.compiling import by_type, compiled, compiled_for_states, inlined, part
+from kfopc_filterpy.kernels.compiling import by_type, compiled, inlined, part
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
-from kfopc_filterpy.kernels.holding import Held
+from kfopc_filterpy.kernels.holding import Held, calling, for_states, state_at, store
 from kfopc_filterpy.kernels.records import new_record
 from kfopc_filterpy.kernels.stacking import member, stacked, unstack
 
@@ -413,17 +414,60 @@ def made_for_8_khz(name: str) -> Any:
 # ---- States that are held
 
 
-@compiled_for_states()
-def spend_held(held, factor):
-    """Call `spend` with the state that is held."""
-    return factor * spend(held.state)
+@for_states()
+def spend_held(key):
+    def spend_at(address, factor):
+        return factor * spend(state_at(address, key))
+
+    return spend_at
+
+
+SPEND = types.float64(types.intp, types.float64)
+call_spend = calling(SPEND)
+
+
+@for_states(SPEND)
+def spend_by_its_address(key):
+    def spend_at(address, factor):
+        return factor * spend(state_at(address, key))
+
+    return spend_at
+
+
+@compiled(cache=False)
+def call(function, address, factor):
+    """A loop that knows no type of state."""
+    return call_spend(function, address, factor)
 
 
 def test_a_held_state_is_the_state_itself() -> None:
     state = outer()
-    assert spend_held.with_held(Held(state), 2.0) == 36.0
+    assert spend_held(Held(state), 2.0) == 36.0
     assert state.inner.numbers.item() == (18.0, 1)
     np.testing.assert_array_equal(state.values, [0.0, 3.0, 6.0, 9.0])
+
+
+def test_one_compiled_loop_calls_the_functions_of_all_types() -> None:
+    floating, integer = Held(outer()), Held(outer()._replace(factor=2))
+    assert floating.key != integer.key
+    assert call(spend_by_its_address.of(floating).address, floating.address, 2.0) == 36.0
+    assert call(spend_by_its_address.of(integer).address, integer.address, 2.0) == 24.0
+    assert len(call.signatures) == 1
+
+
+def test_a_state_is_not_written_where_another_type_is_held() -> None:
+    """Its memory may be too small."""
+    held = Held(outer())
+    key = held.key
+
+    @compiled(cache=False)
+    def overwrite(state, address):
+        store(state, address, key)
+
+    overwrite(outer()._replace(factor=2.0), held.address)
+    assert spend_held(held, 1.0) == 24.0 / 2.0
+    with pytest.raises(NumbaError, match="the address is for a state of the type"):
+        overwrite(Plain(np.arange(6.0)), held.address)
 
 
 def test_held_arrays_are_given_back() -> None:
@@ -432,7 +476,7 @@ def test_held_arrays_are_given_back() -> None:
     counts = [sys.getrefcount(array) for array in arrays]
     held = Held(state)
     for _ in range(100):
-        spend_held.with_held(held, 1.0)
+        spend_held(held, 1.0)
     del held
     assert [sys.getrefcount(array) for array in arrays] == counts
 
