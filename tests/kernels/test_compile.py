@@ -20,7 +20,7 @@ from numba.core.errors import NumbaError
 
 from kfopc_filterpy import FxLMS, OutputLimiter, kf_opc, kf_pb
 from kfopc_filterpy.kernels.borrowing import borrowed
-from kfopc_filterpy.kernels.compiling import by_type, compiled, inlined, part
+from kfopc_filterpy.kernels.compiling import CONFIG, by_type, compiled, inlined, part
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
 from kfopc_filterpy.kernels.holding import Held, calling, for_states, state_at, store
 from kfopc_filterpy.kernels.records import new_record
@@ -468,6 +468,12 @@ def test_a_state_is_not_written_where_another_type_is_held() -> None:
     assert spend_held(held, 1.0) == 24.0 / 2.0
     with pytest.raises(NumbaError, match="the address is for a state of the type"):
         overwrite(Plain(np.arange(6.0)), held.address)
+
+
+def test_without_the_compiler_nothing_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CONFIG, "DISABLE_JIT", 1)
+    with pytest.raises(RuntimeError, match="unset NUMBA_DISABLE_JIT"):
+        Held(outer())
 
 
 def test_held_arrays_are_given_back() -> None:
