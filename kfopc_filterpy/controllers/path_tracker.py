@@ -22,7 +22,6 @@ from .channels import amplifier_functions, channel_sample
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
 FEWEST_FRAMES = 8  # with fewer, no better prediction is significant
-LESS = 0.5  # exponent
 RIDGE = 1e-9  # relative to the mean power of the regressors, so that a narrow-band reference has a solution
 
 
@@ -37,7 +36,8 @@ class PathChange:
     change_db : float
         ``10 log10(sum (new - old)^2 / sum old^2)``: by how much the estimate changed.
     prediction_gain_db : float
-        By how many dB less of this microphone's error the new estimate left unexplained, on samples that it had not been fitted to.
+        By how many dB less of this microphone's error the new estimate left unexplained, on samples that it had not
+        been fitted to.
     memory_s : float
         Memory of the fit that it comes from.
     source : str
@@ -265,8 +265,8 @@ class PathTracker(WrappedController):
     check_s : float, default 0.25
         Time between two tests in s, rounded to whole frames.
     p_value : float, default 1e-6
-        Largest probability of a difference by chance with which an estimate is taken over. Each of K microphones
-        gets a K-th of it.
+        Largest probability of a difference by chance with which an estimate is taken over. It is divided among the
+        microphones. If the paths to one have changed, its square root is enough for the others.
     use_control_signal : bool, default True
         Whether the estimates "control signal" take part.
     hold_db : float, default 6
@@ -414,7 +414,7 @@ class PathTracker(WrappedController):
         """Set the paths in use, from those of the controller."""
         K, J = self.controller.n_microphones, self.controller.n_loudspeakers
         self._paths = np.reshape(path, (K, J, -1))
-        self._reversed = self._paths[..., ::-1].reshape(K, -1)  # oldest sample first, as in the signals
+        self._reversed = self._paths[..., ::-1].copy().reshape(K, -1)  # oldest sample first, as in the signals
 
     def _of_controller(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
@@ -521,15 +521,16 @@ class PathTracker(WrappedController):
         self._n = 0
 
     def _is_better(self, candidate: tuple[int, int, str], p_value: float) -> bool:
+        """Return whether the evidence for a candidate (microphone, fit, source) is significant."""
         return self._models[candidate[1]] is not None and self._evidence[candidate].p_value < p_value
 
     def _best(self, microphone: int) -> tuple[int, int, str] | None:
-        """Return the candidate (microphone, fit, source) of the largest gain, if there is one.
+        """Return the better candidate (microphone, fit, source) of the largest gain, after one was found to be better.
 
-        Once the paths to one microphone have changed, those to another have probably changed too. With only some of
-        them right, the controller may diverge, so less evidence is asked of the others.
+        If it belongs to another microphone, the paths to this one have probably changed too. With only some of the paths
+        right, the controller may diverge, so less evidence is enough.
         """
-        for p_value in (self.p_value / len(self._e), self.p_value**LESS):
+        for p_value in (self.p_value / len(self._e), np.sqrt(self.p_value)):
             found = [one for one in self._evidence if one[0] == microphone and self._is_better(one, p_value)]
             if found:
                 return max(found, key=lambda one: self._evidence[one].mean)
@@ -556,17 +557,16 @@ class PathTracker(WrappedController):
 
     def _take_over(self, better: list[tuple[int, int, str]]) -> None:
         """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone."""
-        new = self._paths.copy()
+        new, old = self._paths.copy(), self._paths
         for k, i, source in better:
-            model = self._models[i]
-            assert model is not None
-            new[k], old = model.secondary[source][k], self._paths[k]
-            change = np.sum((new[k] - old) ** 2) / max(np.sum(old**2), np.finfo(float).tiny)
+            new[k] = self._models[i].secondary[source][k]  # type: ignore[union-attr]  # whoever is better has a model
+        self.controller.secondary_path = new if self.controller.multichannel else new[0, 0]
+        for k, i, source in better:
+            change = np.sum((new[k] - old[k]) ** 2) / max(np.sum(old[k] ** 2), np.finfo(float).tiny)
             gain = self._evidence[k, i, source].gain_db
             self.changes.append(
                 PathChange(self._done / self.fs, float(10 * np.log10(change)), gain, self._memories[i], source, k)
             )
-        self.controller.secondary_path = new if self.controller.multichannel else new[0, 0]
         self._know(new)
         self._held, self._recovering_from = False, float(np.sum(np.mean(self._e[:, -self._frame :] ** 2, axis=1)))
         shortest = min(i for _, i, _ in better)
