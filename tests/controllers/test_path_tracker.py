@@ -330,8 +330,7 @@ def several_reduction_db(errors: np.ndarray, d: np.ndarray, begin_s: float, end_
     return float(-10 * np.log10(np.sum(errors[:, part] ** 2) / np.sum(d[:, part] ** 2)))
 
 
-@pytest.mark.parametrize("name", OF_SEVERAL)
-@pytest.mark.parametrize("jump", ["all paths", "one path"])
+@pytest.mark.parametrize(("name", "jump"), [("FxLMS", "all paths"), ("FxLMS", "one path"), ("KF-ANC", "all paths")])
 def test_several_paths_that_jump_are_found(name: str, jump: str) -> None:
     x, d = noises_of_several(12.0)
     now = NOW.copy() if jump == "all paths" else THEN.copy()
@@ -348,68 +347,65 @@ def test_several_paths_that_jump_are_found(name: str, jump: str) -> None:
     reached = several_reduction_db(errors, d, 11.0, 12.0)
     assert not several_reduction_db(alone, d, 11.0, 12.0) > reached - 3.0  # it diverges, or is worse
     assert reached > several_reduction_db(fresh, d[:, since], 9.0, 10.0) - 1.0
-    assert misalignment_db(tracker.secondary_path, now) < -6.0 < misalignment_db(THEN, now)
+    assert misalignment_db(tracker.secondary_path, now) < -8.0
     assert tracker.secondary_path.shape == (2, 2, 12)
-    found = {change.microphone for change in tracker.changes}
-    assert found == {0, 1} if jump == "all paths" else 1 in found
-    assert 2.0 < tracker.changes[0].time_s < 5.0
-    tenths = np.mean(np.sum(errors**2, axis=0).reshape(-1, 200), axis=1) / np.mean(np.sum(d**2, axis=0))
-    assert 10 * np.log10(tenths.max()) < 18.0
+    assert 2.0 < tracker.changes[0].time_s < 4.0
+    assert tracker.changes[0].microphone == 1 or jump == "all paths"
+    assert {change.microphone for change in tracker.changes} >= ({0, 1} if jump == "all paths" else {1})
+    if name == "FxLMS":
+        tenths = np.mean(np.sum(errors**2, axis=0).reshape(-1, 200), axis=1) / np.mean(np.sum(d**2, axis=0))
+        assert 10 * np.log10(tenths.max()) < 18.0
 
 
 def test_a_drift_of_several_paths_is_followed() -> None:
-    x, d = noises_of_several(15.0)
+    """Within six seconds all paths become later by a sample, and weaker. FxLMS is slow to unlearn what it did then."""
+    x, d = noises_of_several(13.0)
+    later = 0.7 * np.concatenate((np.zeros((2, 2, 1)), THEN[..., :-1]), axis=-1)
 
     def paths_at(t: float) -> np.ndarray:
-        share = np.clip((t - 2.0) / 8.0, 0.0, 1.0)
-        return (1.0 - share) * THEN + share * NOW
+        share = np.clip((t - 2.0) / 6.0, 0.0, 1.0)
+        return (1.0 - share) * THEN + share * later
 
     tracker = tracked_several("FxLMS")
     errors, _ = run_several(tracker, x, d, paths_at)
-    alone, _ = run_several(OF_SEVERAL["FxLMS"](THEN), x, d, paths_at)
-    assert not several_reduction_db(alone, d, 9.0, 10.0) > 0.0
-    assert {change.microphone for change in tracker.changes} == {0, 1}
-    assert several_reduction_db(errors, d, 2.0, 10.0) > 2.0  # half-way, the mean of both hardly has an inverse
-    since = slice(round(10 * SLOW_FS), None)
-    fresh, _ = run_several(OF_SEVERAL["FxLMS"](NOW), x[:, since], d[:, since], lambda t: NOW)
-    assert several_reduction_db(errors, d, 14.0, 15.0) > several_reduction_db(fresh, d[:, since], 4.0, 5.0) - 1.0
-    assert misalignment_db(tracker.secondary_path, NOW) < -6.0
+    alone, _ = run_several(OF_SEVERAL["FxLMS"](THEN), x[:, :16000], d[:, :16000], paths_at)
+    assert not several_reduction_db(alone, d, 7.0, 8.0) > -10.0  # it diverges
+    for microphone in (0, 1):
+        assert sum(change.microphone == microphone for change in tracker.changes) >= 2
+    assert several_reduction_db(errors, d, 12.0, 13.0) > 5.0
+    assert misalignment_db(tracker.secondary_path, later) < -12.0
 
 
-@pytest.mark.parametrize("change", ["nothing", "primary path"])
-def test_no_other_change_is_taken_for_one_of_several_paths(change: str) -> None:
-    x, d = noises_of_several(12.0)
-    if change == "primary path":
-        drift = np.clip((np.arange(d.shape[1]) / SLOW_FS - 4.0) / 6.0, 0.0, 1.0)
-        d = d + drift * (np.roll(d, 3, axis=1) - d)
-    name = "FxLMS" if change == "nothing" else "KF-ANC"
-    tracker = tracked_several(name)
-    errors, _ = run_several(tracker, x, d, lambda t: THEN)
+def test_a_change_of_several_primary_paths_is_not_taken_for_one_of_the_secondary_paths() -> None:
+    x, d = noises_of_several(9.0)
+    drift = np.clip((np.arange(d.shape[1]) / SLOW_FS - 3.0) / 5.0, 0.0, 1.0)
+    d = d + drift * (np.roll(d, 3, axis=1) - d)
+    tracker = tracked_several("KF-ANC")
+    run_several(tracker, x, d, lambda t: THEN)
     assert tracker.changes == []
-    if change == "nothing":
-        alone, _ = run_several(OF_SEVERAL[name](THEN), x, d, lambda t: THEN)
-        loss = several_reduction_db(alone, d, 4.0, 12.0) - several_reduction_db(errors, d, 4.0, 12.0)
-        assert 0.0 < loss < 0.1
 
 
-def test_each_loudspeaker_has_its_share_of_the_probe_and_none_is_heard_by_the_controller() -> None:
-    x, d = noises_of_several(6.0)
+def test_several_paths_that_stay_are_kept_and_the_controller_does_not_hear_the_probes() -> None:
+    x, d = noises_of_several(9.0)
     alone, tracker = OF_SEVERAL["FxLMS"](THEN), tracked_several("FxLMS", hold_db=200.0)
     clean, quiet = run_several(alone, x, d, lambda t: THEN)
     errors, emitted = run_several(tracker, x, d, lambda t: THEN)
+    assert tracker.changes == []
     np.testing.assert_allclose(tracker.weights, alone.weights, rtol=1e-9, atol=1e-12)
-    late = slice(8000, None)
+    assert 0.0 < several_reduction_db(clean, d, 4.0, 9.0) - several_reduction_db(errors, d, 4.0, 9.0) < 0.1
+    # each loudspeaker has a probe of its own and an equal share
+    late = slice(12000, None)
     residual = np.mean(errors[:, late] ** 2, axis=1)
     heard = np.mean((errors - clean)[:, late] ** 2, axis=1) / residual
     assert 10 * np.log10(heard.mean()) == pytest.approx(-20.0, abs=0.5)
     probes = (emitted - quiet)[:, late]
     assert abs(np.corrcoef(probes)[0, 1]) < 0.05
-    ratios = np.mean(probes**2, axis=1) * np.mean(np.sum(THEN**2, axis=2) / residual[:, np.newaxis], axis=0)
-    np.testing.assert_allclose(ratios, 0.005, rtol=0.1)  # half of -20 dB each
+    shares = np.mean(probes**2, axis=1) * np.mean(np.sum(THEN**2, axis=2) / residual[:, np.newaxis], axis=0)
+    np.testing.assert_allclose(shares, 0.005, rtol=0.1)  # half of -20 dB
 
 
 def test_several_channels_of_one_are_one_channel() -> None:
-    x, d = noises(3.0)
+    x, d = noises(1.2)
     one = PathTracker(FxLMS(L, BEFORE, step_size=0.0005), rng=3, fs=FS)
     many = PathTracker(FxLMS(L, [[BEFORE]], step_size=0.0005), rng=3, fs=FS)
     for n in range(x.size):
@@ -434,7 +430,7 @@ def test_several_channels_listen_before_the_control_begins() -> None:
 
 def test_each_loudspeaker_may_have_an_amplifier_that_is_known() -> None:
     """Without knowing them, the doubled loudspeaker would be taken for other paths."""
-    x, d = noises_of_several(6.0)
+    x, d = noises_of_several(3.0)
     amplifiers = [HardClipAmplifier(0.6), lambda y: 2.0 * y]
     plant: dict[str, Any] = {"disturbance": d, "secondary_path": THEN, "fs": SLOW_FS, "amplifier": amplifiers}
     changes = []
