@@ -243,7 +243,8 @@ class PathTracker(WrappedController):
 
     Between a jump of the path and its discovery, the controller may diverge. So if the error, as a sum of powers over
     the microphones, becomes more than `hold_db` louder than expected without control, the controller's updates are
-    skipped until the error is 3 dB below that threshold or another path is taken over.
+    skipped until the error is 3 dB below that threshold or another path is taken over. This is decided once in a frame,
+    in which a fast algorithm can become much louder.
 
     Parameters
     ----------
