@@ -1,9 +1,10 @@
-"""A secondary path that changes: it is identified while the control runs."""
+"""Secondary paths that change: they are identified while the control runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ from scipy.special import stdtr
 
 from .._validate import as_generator, as_number, as_positive, as_signal
 from ..paths.least_squares import correlation_matrix, cross_correlation, cross_correlation_matrix
+from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from .base import FilteredReferenceController, WrappedController
+from .channels import amplifier_functions, channel_sample
 
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
@@ -24,7 +27,7 @@ RIDGE = 1e-9  # relative to the mean power of the regressors, so that a narrow-b
 
 @dataclass(frozen=True)
 class PathChange:
-    """New estimate of the secondary path that a `PathTracker` took over.
+    """New estimate of the secondary paths to a microphone that a `PathTracker` took over.
 
     Attributes
     ----------
@@ -33,11 +36,14 @@ class PathChange:
     change_db : float
         ``10 log10(sum (new - old)^2 / sum old^2)``: by how much the estimate changed.
     prediction_gain_db : float
-        By how many dB less of the error the new estimate left unexplained, on samples that it had not been fitted to.
+        By how many dB less of this microphone's error the new estimate left unexplained, on samples that it had not
+        been fitted to.
     memory_s : float
         Memory of the fit that it comes from.
     source : str
         "probe" or "control signal".
+    microphone : int
+        Error microphone to which the paths lead, from 0; with one channel 0.
     """
 
     time_s: float
@@ -45,39 +51,46 @@ class PathChange:
     prediction_gain_db: float
     memory_s: float
     source: str
+    microphone: int = 0
 
 
 @dataclass(frozen=True)
 class Model:
-    """What a fit found: taps of the primary path, and of the secondary path by source."""
+    """What a fit found: the primary paths, (K, I, P), and by source the secondary paths, (K, J, S)."""
 
     primary: np.ndarray
     secondary: dict[str, np.ndarray]
 
 
 class JointFit:
-    """Least squares of the error ``e = p * x - s * (y + v)``, with the sums of the past forgotten exponentially.
+    """Least squares of the errors ``e_k = sum_i p_ki * x_i - sum_j s_kj * (y_j + v_j)``.
+
+    The sums of the past are forgotten exponentially. All microphones have the regressors in common, and so the matrix.
 
     Parameters
     ----------
+    shape : tuple of int
+        Numbers of microphones K, loudspeakers J and references I.
     n_primary, n_secondary : int
-        Numbers of taps of p and s.
+        Numbers of taps P of a primary path and S of a secondary path.
     keep : float
         Factor of the past sums at each addition.
     """
 
-    def __init__(self, n_primary: int, n_secondary: int, keep: float) -> None:
-        self.n_primary, self.n_secondary, self.keep = n_primary, n_secondary, keep
-        size = n_primary + 2 * n_secondary
-        self.matrix, self.right = np.zeros((size, size)), np.zeros(size)  # of the regressors x, -y, -v
-        self.energy = self.count = self.noise = 0.0
+    def __init__(self, shape: tuple[int, int, int], n_primary: int, n_secondary: int, keep: float) -> None:
+        K, J, n_references = shape
+        self.n_x, self.n_y = n_references * n_primary, J * n_secondary  # regressors
+        self.n_references, self.keep = n_references, keep
+        size = self.n_x + 2 * self.n_y
+        self.matrix, self.right = np.zeros((size, size)), np.zeros((size, K))  # of the regressors x, -y, -v
+        self.energy, self.noise, self.count = np.zeros(K), np.zeros(K), 0.0
 
     def take_from(self, other: JointFit) -> None:
         """Replace the sums by those of another fit."""
         self.matrix, self.right = other.matrix.copy(), other.right.copy()
-        self.energy, self.count, self.noise = other.energy, other.count, other.noise
+        self.energy, self.noise, self.count = other.energy.copy(), other.noise.copy(), other.count
 
-    def add(self, sums: tuple[np.ndarray, np.ndarray, float, int]) -> None:
+    def add(self, sums: tuple[np.ndarray, np.ndarray, np.ndarray, int]) -> None:
         """Add the sums of a block, see `block_sums`."""
         matrix, right, energy, count = sums
         self.matrix = self.keep * self.matrix + matrix
@@ -88,52 +101,80 @@ class JointFit:
         r"""Return p and the estimates of s by source; None without a signal.
 
         "control signal": p and s are fitted together, with the samples of y and v alike. "probe": s is fitted to v alone,
-        after subtracting what p * x and s * y explain. Both are drawn towards the `known` path. The weight is right for
-        a path that may change by all of its energy: :math:`\sigma_e^2 / (|s|^2 / n)`, with the noise that the last fit
-        left.
+        after subtracting what p * x and s * y explain. Both are drawn towards the `known` paths, (K, J, S). The weight is
+        right for paths that may change by all of their energy: :math:`\sigma_k^2 / (|s_{kj}|^2 / S)` with the noise
+        that the last fit left at microphone k. So that one matrix serves all microphones, it is their `common_ratio`.
         """
-        P, S = self.n_primary, self.n_secondary
+        K, _, S = known.shape
         floor = RIDGE * np.trace(self.matrix) / len(self.matrix)
         if not floor > 0.0:
             return None
-        noise = self.noise or self.energy / self.count
-        ridge = max(noise * S / max(known @ known, np.finfo(float).tiny), floor)
-        # y and v have the path in common: their rows and columns are added.
-        xy, v = slice(P + S), slice(P + S, None)
+        noise = np.where(self.noise > 0.0, self.noise, self.energy / self.count)
+        # y and v have the paths in common: their rows and columns are added.
+        n_x, before = self.n_x, known.reshape(K, -1).T
+        xy, v = slice(n_x + self.n_y), slice(n_x + self.n_y, None)
         matrix, right = self.matrix[xy, xy].copy(), self.right[xy].copy()
-        matrix[:, P:] += self.matrix[xy, v]
-        matrix[P:] += np.hstack((self.matrix[v, :P], self.matrix[v, P : P + S] + self.matrix[v, v]))
-        right[P:] += self.right[v]
-        ridges = np.repeat([floor, ridge], [P, S])
-        drawn = right + ridges * np.concatenate((np.zeros(P), known))
+        matrix[:, n_x:] += self.matrix[xy, v]
+        matrix[n_x:] += np.hstack((self.matrix[v, :n_x], self.matrix[v, n_x : v.start] + self.matrix[v, v]))
+        right[n_x:] += self.right[v]
+        ridge = np.clip(S * common_ratio(noise, known), floor, floor / RIDGE**2)
+        ridges = np.concatenate((np.full(n_x, floor), np.repeat(ridge, S)))
+        towards_known = ridges[n_x:, np.newaxis] * before
+        drawn = right.copy()
+        drawn[n_x:] += towards_known
         try:
             theta = cho_solve(cho_factor(matrix + np.diag(ridges)), drawn)
-            left = self.right[v] - self.matrix[v, xy] @ theta
-            probed = cho_solve(cho_factor(self.matrix[v, v] + ridge * np.eye(S)), left + ridge * known)
+            left = self.right[v] - self.matrix[v, xy] @ theta + towards_known
+            probed = cho_solve(cho_factor(self.matrix[v, v] + np.diag(ridges[n_x:])), left)
         except LinAlgError:
             return None
-        unexplained = self.energy - 2.0 * theta @ right + theta @ (drawn - ridges * theta)
-        self.noise = max(unexplained, 1e-12 * self.energy) / self.count
-        return Model(theta[:P], {"probe": probed, "control signal": theta[P:]})
+        unexplained = self.energy + np.sum(theta * (drawn - ridges[:, np.newaxis] * theta - 2.0 * right), axis=0)
+        self.noise = np.maximum(unexplained, 1e-12 * self.energy) / self.count
+        secondary = {"probe": probed, "control signal": theta[n_x:]}
+        return Model(
+            theta[:n_x].T.reshape(K, self.n_references, -1),
+            {source: taps.T.reshape(K, -1, S) for source, taps in secondary.items()},
+        )
+
+
+def common_ratio(powers: np.ndarray, paths: np.ndarray) -> np.ndarray:
+    """Return for each loudspeaker, (J,), a mean of ``powers[k] / sum(paths[k, j]**2)`` over the microphones.
+
+    A harmonic mean does not depend on how sensitive each microphone is. Silent microphones are left out. It is infinite
+    for a loudspeaker that no microphone hears, and 0 if all microphones are silent.
+    """
+    heard = powers > 0.0
+    if not heard.any():
+        return np.zeros(paths.shape[1])
+    with np.errstate(divide="ignore"):
+        return 1.0 / np.mean(np.sum(paths[heard] ** 2, axis=-1) / powers[heard, np.newaxis], axis=0)
 
 
 def block_sums(
-    x: np.ndarray, y: np.ndarray, v: np.ndarray, error: np.ndarray, n_primary: int, n_secondary: int
-) -> tuple[np.ndarray, np.ndarray, float, int]:
-    """Return the sums of products for `JointFit.add`: matrix, right side, energy of the error, number of samples.
+    x: np.ndarray, y: np.ndarray, v: np.ndarray, errors: np.ndarray, n_primary: int, n_secondary: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Return the sums of products for `JointFit.add`: matrix, right sides, energies of the errors, number of samples.
 
-    `error` is (n,). The other signals begin ``n_primary - 1`` samples earlier.
+    `errors` is (K, n). The other signals, (I, m), (J, m), (J, m), begin ``n_primary - 1`` samples earlier.
     """
-    P, S, n, start = n_primary, n_secondary, error.size, n_primary - 1
-    matrix, right = np.empty((P + 2 * S, P + 2 * S)), np.empty(P + 2 * S)
-    parts = ((x, P, slice(P)), (-y, S, slice(P, P + S)), (-v, S, slice(P + S, P + 2 * S)))
-    for i, (first, taps, rows) in enumerate(parts):
-        right[rows] = cross_correlation(error, first[start - taps + 1 :])
+    n, start = errors.shape[1], n_primary - 1
+    parts = [(one, n_primary) for one in x] + [(-one, n_secondary) for one in (*y, *v)]
+    ends = np.cumsum([taps for _, taps in parts])
+    matrix, right = np.empty((ends[-1], ends[-1])), np.empty((ends[-1], len(errors)))
+    for i, (first, taps) in enumerate(parts):
+        rows = slice(ends[i] - taps, ends[i])
+        right[rows] = np.transpose([cross_correlation(error, first[start - taps + 1 :]) for error in errors])
         matrix[rows, rows] = correlation_matrix(first, taps, start)
-        for second, others, columns in parts[i + 1 :]:
+        for (second, others), end in zip(parts[i + 1 :], ends[i + 1 :], strict=True):
+            columns = slice(end - others, end)
             matrix[rows, columns] = cross_correlation_matrix(first, second, taps, start, others)
             matrix[columns, rows] = matrix[rows, columns].T
-    return n * matrix, n * right, float(error @ error), n
+    return n * matrix, n * right, np.array([error @ error for error in errors]), n
+
+
+def through(paths: np.ndarray, signals: np.ndarray) -> np.ndarray:
+    """Return what arrives through paths (K, J, taps) of signals (J, n) once the taps are filled, (K, n - taps + 1)."""
+    return oaconvolve(signals[np.newaxis], paths, mode="valid", axes=-1).sum(axis=1)
 
 
 class Evidence:
@@ -179,10 +220,11 @@ class Evidence:
 class PathTracker(WrappedController):
     r"""A controller that identifies its secondary path while it runs, and follows it if it changes.
 
-    White noise v(n), the probe, is added to the control signal, far below the residual noise. Two least-squares fits, one
-    of which remembers the last `memory_s` and the other an eighth of it, describe the error by
+    White noise v(n), the probe, is added to the control signal, far below the residual noise. Each loudspeaker has a
+    probe of its own, independent of the others. Two least-squares fits, one of which remembers the last `memory_s` and
+    the other an eighth of it, describe the error at microphone k by
 
-    .. math:: e = p * x - s * (y + v)
+    .. math:: e_k = \sum_i p_{ki} * x_i - \sum_j s_{kj} * (y_j + v_j)
 
     Each fit offers two estimates of s. "control signal" is the s of the fit itself, in which the samples of the control
     signal y count like those of the probe. It is exact if only the secondary path changes. If the primary path changes
@@ -193,26 +235,29 @@ class PathTracker(WrappedController):
     A new estimate is taken over only if a test says that it is better. The test uses samples that no fit has seen yet,
     and only the probe. Over the frames of 20 ms since the new estimate began to lead, it must leave less of the error
     unexplained than the one in use, and the probability of such a difference by chance must be below `p_value`. Then
-    the controller's `secondary_path` is set. Its weights stay, so the control signal does not jump.
+    the controller's `secondary_path` is set. Its weights stay, so the control signal does not jump. Each microphone has a
+    test of its own, for all paths that lead to it; the other microphones keep their paths.
 
     The controller does not hear the probe: what the probe contributes to the error, according to the estimate in use,
     is subtracted.
 
-    Between a jump of the path and its discovery, the controller may diverge. So if the error becomes more than
-    `hold_db` louder than expected without control, the controller's updates are skipped until the error is 3 dB below
-    that threshold or another path is taken over.
+    Between a jump of the path and its discovery, the controller may diverge. So if the error, as a sum of powers over
+    the microphones, becomes more than `hold_db` louder than expected without control, the controller's updates are
+    skipped until the error is 3 dB below that threshold or another path is taken over. This is decided once in a frame,
+    in which a fast algorithm can become much louder.
 
     Parameters
     ----------
     controller : FilteredReferenceController
-        Any built-in controller of one channel.
+        Any built-in controller, of one channel or several.
     rng : int or numpy.random.Generator
         Seed of the probe.
     fs : float, default 16000
         Sample rate in Hz.
     probe_db : float, default -20
         Power of the probe at the error microphone, in dB of that of the residual noise. At -20 dB it raises the
-        residual by 0.04 dB, at -25 dB by 0.014 dB, but a change of the path is then found later.
+        residual by 0.04 dB, at -25 dB by 0.014 dB, but a change of the path is then found later. With several
+        microphones it is the mean of these ratios; every loudspeaker has an equal share in it.
     probe_filter : array_like, shape (n,), optional
         Impulse response that colours the probe, for example to make it inaudible; only its shape counts. By default the
         probe is white. Where it has no power, the estimate stays as it is.
@@ -221,23 +266,24 @@ class PathTracker(WrappedController):
     check_s : float, default 0.25
         Time between two tests in s, rounded to whole frames.
     p_value : float, default 1e-6
-        Largest probability of a difference by chance with which an estimate is taken over.
+        Largest probability of a difference by chance with which an estimate is taken over. It is divided among the
+        microphones. If the paths to one have changed, its square root is enough for the others.
     use_control_signal : bool, default True
         Whether the estimates "control signal" take part.
     hold_db : float, default 6
         See above; with a large number, no update is skipped.
-    amplifier : callable, optional
-        Known amplifier, a function of a sample, as for the controller. An unknown one that clips distorts the fits.
+    amplifier : callable or sequence of J of them, optional
+        Known amplifiers, functions of a sample, as for the controller. An unknown one that clips distorts the fits.
 
     Attributes
     ----------
     changes : list of PathChange
-        The estimates that were taken over.
+        The estimates that were taken over, one for each microphone.
 
     Raises
     ------
     TypeError
-        A controller that is not built in or has several channels; an amplifier that is not a function.
+        A controller that is not built in; an amplifier that is not a function, or not one for each loudspeaker.
     ValueError
         A setting that is out of range, `memory_s` below eight times `check_s`, or a probe filter that is all zeros.
 
@@ -246,8 +292,10 @@ class PathTracker(WrappedController):
     The estimate has as many taps as the controller's. So make the controller with an estimate that is padded with zeros
     to the length of the longest path that may occur. The probe is added after the controller's limiter.
 
-    `simulate` calls it from Python sample by sample. For L taps of the control filter and n of the path, a test takes
-    about :math:`(L + 2n)^3 / 3` multiplications for each fit.
+    `simulate` calls it from Python sample by sample. For I references, J loudspeakers, L taps of a control filter and n
+    of a path, a test takes about :math:`(I (L + n) + J n)^3 / 3` multiplications for each fit, however many microphones
+    there are, and each fit stores a matrix of :math:`(I (L + n) + 2 J n)^2` numbers. In real time, this work is due
+    within one sample, at the end of every `check_s`.
 
     The path must be heard in the error. Where neither probe nor control signal reaches the microphone above its noise,
     the estimate is drawn towards the one in use.
@@ -294,13 +342,12 @@ class PathTracker(WrappedController):
         p_value: float = 1e-6,
         use_control_signal: bool = True,
         hold_db: float = 6.0,
-        amplifier: Callable[[float], float] | None = None,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
     ) -> None:
         super().__init__(controller)
-        if not isinstance(controller, FilteredReferenceController) or controller.multichannel:
-            raise TypeError(f"controller must be a built-in controller of one channel, got {controller!r}")
-        if amplifier is not None and not callable(amplifier):
-            raise TypeError(f"amplifier must be a function of a sample, or None, got {amplifier!r}")
+        if not isinstance(controller, FilteredReferenceController):
+            raise TypeError(f"controller must be a built-in controller, not one around another one, got {controller!r}")
+        self._amplifiers = amplifier_functions(amplifier, controller.n_loudspeakers)
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.p_value = as_positive(p_value, "p_value")
@@ -312,7 +359,6 @@ class PathTracker(WrappedController):
             raise ValueError("probe_filter must not be all zeros: the probe would be silent")
         self._shape = shape / np.sqrt(shape @ shape)
         self._rng = as_generator(rng)
-        self._amplifier = amplifier
         self.changes: list[PathChange] = []
         self.name = f"{controller.name} with path tracking"
         self._allocate(as_positive(check_s, "check_s", unit="s"))
@@ -320,7 +366,12 @@ class PathTracker(WrappedController):
 
     def _allocate(self, check_s: float) -> None:
         """Set the lengths, and make the fits and the room for a block of signals."""
-        S = self.controller.secondary_path.size
+        K, J, n_references = (
+            self.controller.n_microphones,
+            self.controller.n_loudspeakers,
+            self.controller.n_references,
+        )
+        S = self.controller.secondary_path.shape[-1]
         P = self.controller.n_taps + S - 1  # length of control filter and path in series: s * y has no older x in it
         self._frame = max(round(FRAME_S * self.fs), S)
         self._block = self._frame * max(round(check_s * self.fs / self._frame), 1)
@@ -330,18 +381,22 @@ class PathTracker(WrappedController):
                 f"got {self.memory_s:g} s"
             )
         self._memories = (self.memory_s * SHORT, self.memory_s)
-        self._fits = [JointFit(P, S, np.exp(-self._block / (memory * self.fs))) for memory in self._memories]
+        self._fits = [
+            JointFit((K, J, n_references), P, S, np.exp(-self._block / (m * self.fs))) for m in self._memories
+        ]
         self._models: list[Model | None] = [None] * len(self._fits)
-        self._evidence = {(i, source): Evidence() for i in range(len(self._fits)) for source in self._sources()}
+        candidates = product(range(K), range(len(self._fits)), self._sources())
+        self._evidence = {candidate: Evidence() for candidate in candidates}
         self._past = P - 1
-        self._x, self._y, self._v = np.zeros((3, self._past + self._block))
-        self._e = np.zeros(self._block)
+        self._x, self._y, self._v = (np.zeros((n, self._past + self._block)) for n in (n_references, J, J))
+        self._e = np.zeros((K, self._block))
         self._n = self._done = 0  # samples of this block, and of all
-        self._residual_power = 0.0
-        self._level, self._held = 0.0, False
-        self._powers, self._frames = np.zeros(2), 0  # of the disturbance estimate and of the reference, over the memory
+        self._residual_power = np.zeros(K)
+        self._level, self._held = np.zeros(J), False
+        # Of the disturbance estimates, in total, and of each reference, over the memory.
+        self._powers, self._frames = np.zeros(1 + n_references), 0
         self._recovering_from = 0.0  # power of the error when the last path was taken over, until it has fallen
-        self._white = self._rng.standard_normal(self._shape.size - 1)
+        self._white = self._rng.standard_normal((J, self._shape.size - 1))
         self._probe = self._next_probe()
 
     def __repr__(self) -> str:
@@ -351,41 +406,57 @@ class PathTracker(WrappedController):
         return ("probe", "control signal") if self.use_control_signal else ("probe",)
 
     def _next_probe(self) -> np.ndarray:
-        """Return the probe of unit power for a frame."""
-        white = np.concatenate((self._white, self._rng.standard_normal(self._frame)))
-        self._white = white[self._frame :]
-        return np.convolve(white, self._shape, mode="valid")
+        """Return the probes of unit power for a frame, (J, n)."""
+        white = np.concatenate((self._white, self._rng.standard_normal((len(self._white), self._frame))), axis=1)
+        self._white = white[:, self._frame :]
+        return np.array([np.convolve(one, self._shape, mode="valid") for one in white])
 
     def _know(self, path: np.ndarray) -> None:
-        """Set the path in use."""
-        self._path = path
-        self._reversed = path[::-1].copy()
+        """Set the paths in use, from those of the controller."""
+        K, J = self.controller.n_microphones, self.controller.n_loudspeakers
+        self._paths = np.reshape(path, (K, J, -1))
+        self._reversed = self._paths[..., ::-1].copy().reshape(K, -1)  # oldest sample first, as in the signals
+
+    def _of_controller(self, channels: np.ndarray) -> Any:
+        """Return values as the controller has them: without an axis of channels if it has one channel."""
+        return channels if self.controller.multichannel else float(channels[0])
 
     def _take_path(self, path: Any) -> None:
         super()._take_path(path)
         self._know(self.controller.secondary_path)
 
-    def control_signal(self, reference: float) -> float:
-        """Return the control signal with the probe, y(n) + v(n), for the newest reference sample x(n)."""
-        y = self.controller.control_signal(reference)
-        emitted = y + self._level * self._probe[self._n % self._frame]
-        if not np.isfinite(emitted):
-            return emitted  # a divergence: return it, so that the loop detects it
-        at = self._past + self._n
-        played, alone = (emitted, y) if self._amplifier is None else (self._amplifier(emitted), self._amplifier(y))
-        self._x[at], self._y[at], self._v[at] = reference, alone, played - alone
-        return emitted
+    def control_signal(self, reference: Any) -> Any:
+        """Return the control signal with the probe, y(n) + v(n), for the newest reference sample x(n).
 
-    def update(self, error: float) -> None:
-        """Let the controller adapt to the error e(n), less what the probe is known to contribute."""
-        error = as_number(error, "error")
+        With several channels, x(n) is (I,), and the control signal is (J,).
+        """
+        y = np.reshape(self.controller.control_signal(reference), -1)
+        emitted = y + self._level * self._probe[:, self._n % self._frame]
+        if np.isfinite(emitted).all():  # otherwise it is a divergence, which the loop detects
+            at = self._past + self._n
+            alone = self._amplified(y)
+            self._x[:, at], self._y[:, at], self._v[:, at] = reference, alone, self._amplified(emitted) - alone
+        return self._of_controller(emitted)
+
+    def _amplified(self, y: np.ndarray) -> np.ndarray:
+        if self._amplifiers is None:
+            return y
+        return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
+
+    def update(self, error: Any) -> None:
+        """Let the controller adapt to the error e(n), or (K,), less what the probe is known to contribute."""
+        if self.controller.multichannel:
+            errors = channel_sample(error, len(self._e), "error", "microphones")
+        else:
+            errors = np.array([as_number(error, "error")])
         if not self._held:
             end = self._past + self._n + 1
-            self.controller.update(error + self._reversed @ self._v[end - self._reversed.size : end])
-        self._take(error)
+            heard = self._reversed @ self._v[:, end - self._paths.shape[-1] : end].reshape(-1)
+            self.controller.update(self._of_controller(errors + heard))
+        self._take(errors)
 
-    def _take(self, error: float) -> None:
-        self._e[self._n] = error
+    def _take(self, errors: np.ndarray) -> None:
+        self._e[:, self._n] = errors
         self._n += 1
         if self._n % self._frame == 0:
             self._end_frame()
@@ -395,12 +466,13 @@ class PathTracker(WrappedController):
     def _end_frame(self) -> None:
         """Set the level of the probe, and whether the adaptation is held, for the next frame."""
         begin, end = self._n - self._frame, self._n
-        power = float(np.mean(self._e[begin:end] ** 2))
-        rate = self._frame / self._block if self._residual_power > 0.0 else 1.0
-        self._residual_power += rate * (power - self._residual_power)
-        gain = float(self._path @ self._path)
-        self._level = np.sqrt(self._probe_share * self._residual_power / gain) if gain > 0.0 else 0.0
+        powers = np.mean(self._e[:, begin:end] ** 2, axis=1)
+        rate = np.where(self._residual_power > 0.0, self._frame / self._block, 1.0)
+        self._residual_power += rate * (powers - self._residual_power)
+        ratio = common_ratio(self._residual_power, self._paths)
+        self._level = np.sqrt(self._probe_share / ratio.size * np.where(np.isfinite(ratio), ratio, 0.0))
         self._probe = self._next_probe()
+        power = float(np.sum(powers))
         bound = self._hold_share * self._power_without_control(begin)
         if power <= bound:
             self._recovering_from = 0.0
@@ -408,88 +480,109 @@ class PathTracker(WrappedController):
         self._held = power > max(bound, 2.0 * self._recovering_from)
 
     def _power_without_control(self, begin: int) -> float:
-        """Return the power that the error would have without control, in the frame that starts at sample `begin`.
+        """Return the power that the errors would have without control, in the frame that starts at sample `begin`.
 
-        It is the mean power of the disturbance estimate over the memory, times the ratio of the reference's power to its
-        own mean if that is above 1. The estimate grows if the path is wrong, so a frame counts as `hold_db` above what
-        was expected of it at most.
+        It is the mean power of the disturbance estimates over the memory, times the ratio of a reference's power to its
+        own mean if that is above 1, for the reference whose ratio is largest. The estimate grows if the path is wrong,
+        so a frame counts as `hold_db` above what was expected of it at most.
         """
         samples = slice(self._past + begin, self._past + begin + self._frame)
-        played = (self._y + self._v)[samples.start - self._path.size + 1 : samples.stop]
-        disturbance = self._e[begin : begin + self._frame] + np.convolve(played, self._path, mode="valid")
-        power, reference_power = np.mean(disturbance**2), np.mean(self._x[samples] ** 2)
-        mean, reference_mean = self._powers
-        expected = mean * max(reference_power / reference_mean, 1.0) if reference_mean > 0.0 else np.inf
+        played = (self._y + self._v)[:, samples.start - self._paths.shape[-1] + 1 : samples.stop]
+        disturbances = self._e[:, begin : begin + self._frame] + through(self._paths, played)
+        power = np.sum(np.mean(disturbances**2, axis=1))
+        references = np.mean(self._x[:, samples] ** 2, axis=1)
+        mean, usual = self._powers[0], self._powers[1:]
+        known = usual > 0.0
+        expected = mean * max(np.max(references[known] / usual[known]), 1.0) if known.any() else np.inf
         self._frames += 1
         rate = max(self._frame / (self.memory_s * self.fs), 1.0 / self._frames)
-        self._powers += rate * (np.array([min(power, self._hold_share * expected), reference_power]) - self._powers)
-        return expected
+        self._powers += rate * (np.array([min(power, self._hold_share * expected), *references]) - self._powers)
+        return float(expected)
 
     def _end_block(self) -> None:
-        """Test the models on this block, take over a better path, then fit the models to this block too."""
+        """Test the models on this block, take over better paths, then fit the models to this block too."""
         self._done += self._block
         for i, model in enumerate(self._models):
             if model is not None:
                 self._judge(i, model)
-        sums = block_sums(self._x, self._y, self._v, self._e, self._past + 1, self._path.size)
+        sums = block_sums(self._x, self._y, self._v, self._e, self._past + 1, self._paths.shape[-1])
         for fit in self._fits:
             fit.add(sums)
-        self._models = [fit.solve(self._path) for fit in self._fits]
-        best = max(self._evidence, key=lambda one: self._evidence[one].mean * self._is_significant(one))
-        if self._is_significant(best):
-            self._take_over(*best)
+        self._models = [fit.solve(self._paths) for fit in self._fits]
+        if any(self._is_better(candidate, self.p_value / len(self._e)) for candidate in self._evidence):
+            self._take_over([best for k in range(len(self._e)) if (best := self._best(k)) is not None])
         for line in (self._x, self._y, self._v):
-            line[: self._past] = line[self._block :].copy()
+            line[:, : self._past] = line[:, self._block :].copy()
         self._n = 0
 
-    def _is_significant(self, candidate: tuple[int, str]) -> bool:
-        i, _ = candidate
-        return self._models[i] is not None and self._evidence[candidate].p_value < self.p_value
+    def _is_better(self, candidate: tuple[int, int, str], p_value: float) -> bool:
+        """Return whether the evidence for a candidate (microphone, fit, source) is significant."""
+        return self._models[candidate[1]] is not None and self._evidence[candidate].p_value < p_value
+
+    def _best(self, microphone: int) -> tuple[int, int, str] | None:
+        """Return the better candidate (microphone, fit, source) of the largest gain, after one was found to be better.
+
+        If it belongs to another microphone, the paths to this one have probably changed too. With only some of the paths
+        right, the controller may diverge, so less evidence is enough.
+        """
+        for p_value in (self.p_value / len(self._e), np.sqrt(self.p_value)):
+            found = [one for one in self._evidence if one[0] == microphone and self._is_better(one, p_value)]
+            if found:
+                return max(found, key=lambda one: self._evidence[one].mean)
+        return None
 
     def _judge(self, i: int, model: Model) -> None:
-        """Compare how well the path in use and those of a model predict what the probe does, on fresh samples.
+        """Compare how well the paths in use and those of a model predict what the probe does, on fresh samples.
 
         Only the probe counts: it is independent of all else, so that no change of the primary path, and no adaptation
         of the control filter, can make a wrong path look better.
         """
-        late = self._past + 1 - self._path.size
-        left = self._e - oaconvolve(self._x, model.primary, mode="valid")
-        left += oaconvolve(self._y[late:], model.secondary["control signal"], mode="valid")
+        late = self._past + 1 - self._paths.shape[-1]
+        left = self._e - through(model.primary, self._x)
+        left += through(model.secondary["control signal"], self._y[:, late:])
 
-        def unexplained(path: np.ndarray) -> np.ndarray:
-            squares = (left + oaconvolve(self._v[late:], path, mode="valid")) ** 2
-            return squares.reshape(-1, self._frame).mean(axis=1)
+        def unexplained(paths: np.ndarray) -> np.ndarray:
+            squares = (left + through(paths, self._v[:, late:])) ** 2
+            return squares.reshape(len(left), -1, self._frame).mean(axis=2)
 
-        in_use = unexplained(self._path)
+        in_use = unexplained(self._paths)
         for source in self._sources():
-            self._evidence[i, source].add(in_use, unexplained(model.secondary[source]))
+            for k, (one, other) in enumerate(zip(in_use, unexplained(model.secondary[source]), strict=True)):
+                self._evidence[k, i, source].add(one, other)
 
-    def _take_over(self, i: int, source: str) -> None:
-        """Give a model's path to the controller."""
-        model = self._models[i]
-        assert model is not None
-        new, old = model.secondary[source], self._path
-        self.controller.secondary_path = new
-        change = np.sum((new - old) ** 2) / max(old @ old, np.finfo(float).tiny)
-        gain = self._evidence[i, source].gain_db
-        self.changes.append(
-            PathChange(self._done / self.fs, float(10 * np.log10(change)), gain, self._memories[i], source)
-        )
+    def _take_over(self, better: list[tuple[int, int, str]]) -> None:
+        """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone."""
+        new, old = self._paths.copy(), self._paths
+        for k, i, source in better:
+            new[k] = self._models[i].secondary[source][k]  # type: ignore[union-attr]  # whoever is better has a model
+        self.controller.secondary_path = new if self.controller.multichannel else new[0, 0]
+        for k, i, source in better:
+            change = np.sum((new[k] - old[k]) ** 2) / max(np.sum(old[k] ** 2), np.finfo(float).tiny)
+            gain = self._evidence[k, i, source].gain_db
+            self.changes.append(
+                PathChange(self._done / self.fs, float(10 * np.log10(change)), gain, self._memories[i], source, k)
+            )
         self._know(new)
-        self._held, self._recovering_from = False, float(np.mean(self._e[-self._frame :] ** 2))
-        for fit in self._fits[i + 1 :]:  # the longer memories hold a path that no longer exists
-            fit.take_from(self._fits[i])
+        self._held, self._recovering_from = False, float(np.sum(np.mean(self._e[:, -self._frame :] ** 2, axis=1)))
+        shortest = min(i for _, i, _ in better)
+        for fit in self._fits[shortest + 1 :]:  # the longer memories hold paths that no longer exist
+            fit.take_from(self._fits[shortest])
         self._models = [fit.solve(new) for fit in self._fits]
-        for evidence in self._evidence.values():
-            evidence.forget()
+        changed = {k for k, _, _ in better}
+        for (k, i, _), evidence in self._evidence.items():
+            if k in changed or i > shortest:
+                evidence.forget()
 
     def listen(self, references: Any, errors: Any) -> None:
-        """Let the controller and the fits follow `references` and `errors`, (n_samples,), while the output is silent."""
+        """Let the controller and the fits follow the noise while the output is silent.
+
+        `references` and `errors` are (n_samples,), with several channels (I, n_samples) and (K, n_samples).
+        """
         self.controller.listen(references, errors)
-        for x, e in zip(references, errors, strict=True):
+        for x, e in zip(np.atleast_2d(references).T, np.atleast_2d(errors).T, strict=True):
             at = self._past + self._n
-            self._x[at], self._y[at], self._v[at] = x, 0.0, 0.0
-            self._take(float(e))
+            self._x[:, at], self._y[:, at], self._v[:, at] = x, 0.0, 0.0
+            self._take(e)
 
     def _rates(self) -> dict[str, float | None]:
         return {"path tracker": self.fs}

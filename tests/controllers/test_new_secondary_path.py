@@ -312,4 +312,4 @@ def test_a_tracker_knows_a_path_that_is_assigned() -> None:
     tracker = PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), fs=FS, rng=1)
     tracker.secondary_path = NEW
     np.testing.assert_array_equal(tracker.controller.secondary_path, NEW)
-    np.testing.assert_array_equal(tracker._path, NEW)
+    np.testing.assert_array_equal(tracker._paths, [[NEW]])

@@ -7,12 +7,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.changing_plant import FS, N_PATH, noises, reduction_db, resonant_path, run
+from helpers.changing_plant import (
+    FS,
+    N_PATH,
+    SLOW_FS,
+    crossed_paths,
+    noises,
+    noises_of_several,
+    reduction_db,
+    resonant_path,
+    run,
+    run_several,
+)
 from scipy.special import stdtr
 
 from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, OutputLimiter, kf_anc, kf_pb, simulate
 from kfopc_filterpy.controllers import PathTracker
-from kfopc_filterpy.controllers.path_tracker import Evidence, JointFit, block_sums
+from kfopc_filterpy.controllers.path_tracker import Evidence, JointFit, block_sums, common_ratio
 from kfopc_filterpy.paths import identify_secondary_path
 
 L = 64
@@ -140,47 +151,77 @@ def test_the_probe_has_the_colour_of_its_filter() -> None:
 
 
 @pytest.mark.parametrize("source", ["probe", "control signal"])
-def test_the_fit_is_least_squares(source: str) -> None:
-    """Against numpy's least squares on the rows written out, with the two penalties as further rows."""
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 2, 2), (3, 2, 1)], ids=["1x1x1", "2x2x2", "3x2x1"])
+def test_the_fit_is_least_squares(shape: tuple[int, int, int], source: str) -> None:
+    """Against numpy's least squares on the rows written out, with the penalties as further rows."""
     rng = np.random.default_rng(0)
+    K, J, n_references = shape
     P, S, n = 9, 4, 200
-    known = np.array([0.0, 1.0, 0.3, 0.0])
-    fit = JointFit(P, S, 0.6)
+    known = np.array([0.0, 1.0, 0.3, 0.0]) * rng.uniform(0.5, 2.0, (K, J, 1))
+    fit = JointFit(shape, P, S, 0.6)
     blocks = []
     for _ in range(3):
-        x, y, v = rng.standard_normal((3, n + P - 1))
-        e = rng.standard_normal(n)
+        x, y, v = (rng.standard_normal((count, n + P - 1)) for count in (n_references, J, J))
+        e = rng.standard_normal((K, n)) * np.arange(1, K + 1)[:, np.newaxis]
         fit.add(block_sums(x, y, v, e, P, S))
 
-        def rows(signal: np.ndarray, taps: int, start: int = P - 1, count: int = n) -> np.ndarray:
-            return np.array([[signal[start + i - k] for k in range(taps)] for i in range(count)])
+        def rows(signals: np.ndarray, taps: int, start: int = P - 1, count: int = n) -> np.ndarray:
+            return np.array([[s[start + i - k] for s in signals for k in range(taps)] for i in range(count)])
 
-        blocks.append((rows(x, P), -rows(y, S), -rows(v, S), e))
+        blocks.append((rows(x, P), -rows(y, S), -rows(v, S), e.T))
     weights = [0.6, np.sqrt(0.6), 1.0]  # roots of 0.36, 0.6, 1
-    rx, ry, rv = (np.vstack([w * block[i] for w, block in zip(weights, blocks, strict=True)]) for i in range(3))
-    e = np.concatenate([w * block[3] for w, block in zip(weights, blocks, strict=True)])
+    rx, ry, rv, e = (np.vstack([w * block[i] for w, block in zip(weights, blocks, strict=True)]) for i in range(4))
     model = fit.solve(known)
     assert model is not None
-    ridge = (e @ e) / (n * 1.96) * S / (known @ known)  # the first solution knows no residual: the error's own power
-    penalty = np.sqrt(ridge) * np.eye(S)
-    A = np.vstack((np.hstack((rx, ry + rv)), np.hstack((np.zeros((S, P)), penalty))))
-    theta, *_ = np.linalg.lstsq(A, np.concatenate((e, penalty @ known)), rcond=None)
+    # The first solution knows no residual, so the errors' own powers count.
+    noise = np.sum(e**2, axis=0) / (n * 1.96)
+    ridges = [S * K / sum(known[k, j] @ known[k, j] / noise[k] for k in range(K)) for j in range(J)]
+    penalty = np.diag(np.sqrt(np.repeat(ridges, S)))
+    drawn = penalty @ known.reshape(K, J * S).T
+    A = np.vstack((np.hstack((rx, ry + rv)), np.hstack((np.zeros((J * S, rx.shape[1])), penalty))))
+    theta, *_ = np.linalg.lstsq(A, np.vstack((e, drawn)), rcond=None)
     if source == "control signal":
-        np.testing.assert_allclose(model.primary, theta[:P], rtol=1e-6, atol=1e-7)
-        np.testing.assert_allclose(model.secondary[source], theta[P:], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(model.primary.reshape(K, -1).T, theta[: rx.shape[1]], rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(model.secondary[source].reshape(K, -1).T, theta[rx.shape[1] :], rtol=1e-6, atol=1e-7)
     else:
-        left = e - rx @ theta[:P] - ry @ theta[P:]
-        probed, *_ = np.linalg.lstsq(np.vstack((rv, penalty)), np.concatenate((left, penalty @ known)), rcond=None)
-        np.testing.assert_allclose(model.secondary[source], probed, rtol=1e-6, atol=1e-7)
-    unexplained = np.sum((e - A[: e.size] @ theta) ** 2) / (n * 1.96)
-    assert fit.noise == pytest.approx(unexplained, rel=1e-6)
+        left = e - np.hstack((rx, ry)) @ theta
+        probed, *_ = np.linalg.lstsq(np.vstack((rv, penalty)), np.vstack((left, drawn)), rcond=None)
+        np.testing.assert_allclose(model.secondary[source].reshape(K, -1).T, probed, rtol=1e-6, atol=1e-7)
+    unexplained = np.sum((e - A[: len(e)] @ theta) ** 2, axis=0) / (n * 1.96)
+    np.testing.assert_allclose(fit.noise, unexplained, rtol=1e-6)
 
 
 def test_silence_has_no_solution() -> None:
-    fit = JointFit(5, 2, 0.5)
-    silent = np.zeros(54)
-    fit.add(block_sums(silent, silent, silent, np.zeros(50), 5, 2))
-    assert fit.solve(np.array([1.0, 0.0])) is None
+    fit = JointFit((1, 1, 1), 5, 2, 0.5)
+    silent = np.zeros((1, 54))
+    fit.add(block_sums(silent, silent, silent, np.zeros((1, 50)), 5, 2))
+    assert fit.solve(np.array([[[1.0, 0.0]]])) is None
+
+
+def test_a_loudspeaker_that_nobody_is_known_to_hear_keeps_its_paths() -> None:
+    """Its penalty is as large as rounding allows, and not infinite."""
+    rng = np.random.default_rng(0)
+    x, y, v = rng.standard_normal((3, 2, 54))
+    fit = JointFit((2, 2, 2), 5, 2, 0.5)
+    fit.add(block_sums(x, y, v, rng.standard_normal((2, 50)), 5, 2))
+    known = np.zeros((2, 2, 2))
+    known[:, 0, 1] = 1.0
+    model = fit.solve(known)
+    assert model is not None
+    assert np.abs(model.secondary["probe"][:, 1]).max() < 1e-6 < np.abs(model.secondary["probe"][:, 0]).max()
+
+
+def test_the_common_ratio_does_not_depend_on_the_microphones_sensitivity() -> None:
+    paths = np.random.default_rng(0).standard_normal((3, 2, 4))
+    powers, gains = np.array([1.0, 4.0, 0.5]), np.array([10.0, 0.1, 3.0])
+    expected = common_ratio(powers, paths)
+    np.testing.assert_allclose(common_ratio(gains**2 * powers, gains[:, np.newaxis, np.newaxis] * paths), expected)
+    probes = np.sum(paths**2, axis=2) * expected  # of each loudspeaker at each microphone
+    np.testing.assert_allclose(np.mean(probes / powers[:, np.newaxis], axis=0), 1.0)
+    paths[:, 1] = 0.0
+    assert common_ratio(powers, paths)[1] == np.inf
+    np.testing.assert_array_equal(common_ratio(np.zeros(3), paths), 0.0)
+    np.testing.assert_allclose(common_ratio(np.array([0.0, 4.0, 0.5]), paths), common_ratio(powers[1:], paths[1:]))
 
 
 def test_evidence_is_students_t_test_since_the_second_prediction_leads() -> None:
@@ -208,6 +249,7 @@ def test_a_wrong_estimate_is_replaced_before_the_control_begins() -> None:
     result = simulate(tracker, x, disturbance=d, secondary_path=BEFORE, fs=FS, switch_on_s=1.0)
     assert tracker.changes
     assert all(change.source in ("probe", "control signal") for change in tracker.changes)
+    assert {change.microphone for change in tracker.changes} == {0}
     assert all(change.memory_s in (1.0, 8.0) and change.prediction_gain_db > 0.0 for change in tracker.changes)
     assert tracker.changes[0].change_db == pytest.approx(
         misalignment_db(BEFORE, AFTER), abs=3.0
@@ -250,9 +292,7 @@ def test_a_divergence_is_passed_on() -> None:
 
 
 def test_what_is_refused() -> None:
-    with pytest.raises(TypeError, match="built-in controller of one channel"):
-        PathTracker(FxLMS(4, [[[1.0]]], step_size=0.1), rng=0)
-    with pytest.raises(TypeError, match="built-in controller of one channel"):
+    with pytest.raises(TypeError, match="built-in controller, not one around another one"):
         PathTracker(tracked("FxLMS"), rng=0)
     with pytest.raises(TypeError, match="amplifier must be a function"):
         tracked("FxLMS", amplifier=3.0)
@@ -269,3 +309,153 @@ def test_what_is_refused() -> None:
     tracker.controller.limiter = OutputLimiter(1.0, fs=16000.0)
     with pytest.raises(ValueError, match="limiter is for 16000 Hz"):
         tracker.require_sample_rate(FS)
+
+
+# ---- Several channels: 2 microphones, 2 loudspeakers, 2 references
+
+THEN, NOW = crossed_paths(2, 1.0, seed=1), crossed_paths(4, 0.7, seed=2)
+OF_SEVERAL: dict[str, Any] = {
+    "FxLMS": lambda s: FxLMS(24, s, step_size=0.002, n_references=2),
+    "KF-ANC": lambda s: kf_anc(24, s, state_noise=1e-8, measurement_noise=0.01, initial_variance=0.1, n_references=2),
+}
+
+
+def tracked_several(name: str, paths: np.ndarray = THEN, **settings: Any) -> PathTracker:
+    return PathTracker(OF_SEVERAL[name](paths), **{"rng": 3, "fs": SLOW_FS} | settings)
+
+
+def several_reduction_db(errors: np.ndarray, d: np.ndarray, begin_s: float, end_s: float) -> float:
+    """Return the noise reduction between two times, over the sum of the microphones; NaN after a divergence."""
+    part = slice(round(begin_s * SLOW_FS), round(end_s * SLOW_FS))
+    return float(-10 * np.log10(np.sum(errors[:, part] ** 2) / np.sum(d[:, part] ** 2)))
+
+
+@pytest.mark.parametrize(("name", "jump"), [("FxLMS", "all paths"), ("FxLMS", "one path"), ("KF-ANC", "all paths")])
+def test_several_paths_that_jump_are_found(name: str, jump: str) -> None:
+    x, d = noises_of_several(12.0)
+    now = NOW.copy() if jump == "all paths" else THEN.copy()
+    now[1, 1] = NOW[1, 1]
+
+    def paths_at(t: float) -> np.ndarray:
+        return THEN if t < 2.0 else now
+
+    tracker = tracked_several(name)
+    errors, _ = run_several(tracker, x, d, paths_at)
+    alone, _ = run_several(OF_SEVERAL[name](THEN), x, d, paths_at)
+    since = slice(round(2 * SLOW_FS), None)
+    fresh, _ = run_several(OF_SEVERAL[name](now), x[:, since], d[:, since], lambda t: now)
+    reached = several_reduction_db(errors, d, 11.0, 12.0)
+    assert not several_reduction_db(alone, d, 11.0, 12.0) > reached - 3.0  # it diverges, or is worse
+    assert reached > several_reduction_db(fresh, d[:, since], 9.0, 10.0) - 1.0
+    assert misalignment_db(tracker.secondary_path, now) < -8.0
+    assert tracker.secondary_path.shape == (2, 2, 12)
+    assert 2.0 < tracker.changes[0].time_s < 4.0
+    assert tracker.changes[0].microphone == 1 or jump == "all paths"
+    assert {change.microphone for change in tracker.changes} >= ({0, 1} if jump == "all paths" else {1})
+    if name == "FxLMS":
+        tenths = np.mean(np.sum(errors**2, axis=0).reshape(-1, 200), axis=1) / np.mean(np.sum(d**2, axis=0))
+        assert 10 * np.log10(tenths.max()) < 18.0
+
+
+def test_a_drift_of_several_paths_is_followed() -> None:
+    """Within six seconds all paths become later by a sample, and weaker. FxLMS is slow to unlearn what it did then."""
+    x, d = noises_of_several(13.0)
+    later = 0.7 * np.concatenate((np.zeros((2, 2, 1)), THEN[..., :-1]), axis=-1)
+
+    def paths_at(t: float) -> np.ndarray:
+        share = np.clip((t - 2.0) / 6.0, 0.0, 1.0)
+        return (1.0 - share) * THEN + share * later
+
+    tracker = tracked_several("FxLMS")
+    errors, _ = run_several(tracker, x, d, paths_at)
+    alone, _ = run_several(OF_SEVERAL["FxLMS"](THEN), x[:, :16000], d[:, :16000], paths_at)
+    assert not several_reduction_db(alone, d, 7.0, 8.0) > -10.0  # it diverges
+    for microphone in (0, 1):
+        assert sum(change.microphone == microphone for change in tracker.changes) >= 2
+    assert several_reduction_db(errors, d, 12.0, 13.0) > 5.0
+    assert misalignment_db(tracker.secondary_path, later) < -12.0
+
+
+def test_a_change_of_several_primary_paths_is_not_taken_for_one_of_the_secondary_paths() -> None:
+    x, d = noises_of_several(9.0)
+    drift = np.clip((np.arange(d.shape[1]) / SLOW_FS - 3.0) / 5.0, 0.0, 1.0)
+    d = d + drift * (np.roll(d, 3, axis=1) - d)
+    tracker = tracked_several("KF-ANC")
+    run_several(tracker, x, d, lambda t: THEN)
+    assert tracker.changes == []
+
+
+def test_several_paths_that_stay_are_kept_and_the_controller_does_not_hear_the_probes() -> None:
+    x, d = noises_of_several(9.0)
+    alone, tracker = OF_SEVERAL["FxLMS"](THEN), tracked_several("FxLMS", hold_db=200.0)
+    clean, quiet = run_several(alone, x, d, lambda t: THEN)
+    errors, emitted = run_several(tracker, x, d, lambda t: THEN)
+    assert tracker.changes == []
+    np.testing.assert_allclose(tracker.weights, alone.weights, rtol=1e-9, atol=1e-12)
+    assert 0.0 < several_reduction_db(clean, d, 4.0, 9.0) - several_reduction_db(errors, d, 4.0, 9.0) < 0.1
+    # each loudspeaker has a probe of its own and an equal share
+    late = slice(12000, None)
+    residual = np.mean(errors[:, late] ** 2, axis=1)
+    heard = np.mean((errors - clean)[:, late] ** 2, axis=1) / residual
+    assert 10 * np.log10(heard.mean()) == pytest.approx(-20.0, abs=0.5)
+    probes = (emitted - quiet)[:, late]
+    assert abs(np.corrcoef(probes)[0, 1]) < 0.05
+    shares = np.mean(probes**2, axis=1) * np.mean(np.sum(THEN**2, axis=2) / residual[:, np.newaxis], axis=0)
+    np.testing.assert_allclose(shares, 0.005, rtol=0.1)  # half of -20 dB
+
+
+def test_several_channels_of_one_are_one_channel() -> None:
+    x, d = noises(1.2)
+    one = PathTracker(FxLMS(L, BEFORE, step_size=0.0005), rng=3, fs=FS)
+    many = PathTracker(FxLMS(L, [[BEFORE]], step_size=0.0005), rng=3, fs=FS)
+    for n in range(x.size):
+        y, ys = one.control_signal(x[n]), many.control_signal(x[n : n + 1])
+        assert np.shape(y) == ()
+        assert ys.shape == (1,)
+        one.update(d[n]), many.update(d[n : n + 1])
+        assert ys[0] == pytest.approx(y, rel=1e-9, abs=1e-12)
+    assert many.secondary_path.shape == (1, 1, N_PATH)
+    np.testing.assert_allclose(many.weights[0, 0], one.weights, rtol=1e-9, atol=1e-12)
+
+
+def test_several_channels_listen_before_the_control_begins() -> None:
+    x, d = noises_of_several(6.0)
+    tracker = tracked_several("FxLMS", NOW)
+    tracker.listen(x[:, :2000], d[:, :2000])
+    np.testing.assert_array_equal(tracker.weights, 0.0)
+    errors, _ = run_several(tracker, x[:, 2000:], d[:, 2000:], lambda t: THEN)
+    assert {change.microphone for change in tracker.changes} == {0, 1}
+    assert several_reduction_db(errors, d[:, 2000:], 4.0, 5.0) > 3.0
+
+
+def test_each_loudspeaker_may_have_an_amplifier_that_is_known() -> None:
+    """Without knowing them, the doubled loudspeaker would be taken for other paths."""
+    x, d = noises_of_several(3.0)
+    amplifiers = [HardClipAmplifier(0.6), lambda y: 2.0 * y]
+    plant: dict[str, Any] = {"disturbance": d, "secondary_path": THEN, "fs": SLOW_FS, "amplifier": amplifiers}
+    changes = []
+    for known in (amplifiers, None):
+        tracker = PathTracker(FxLMS(24, THEN, step_size=0.001, n_references=2), rng=3, fs=SLOW_FS, amplifier=known)
+        result = simulate(tracker, x, **plant)
+        assert np.abs(result.control_signal[0]).max() > 0.8  # it does clip
+        changes.append(len(tracker.changes))
+    assert changes[0] == 0 < changes[1]
+
+
+def test_what_is_refused_of_several_channels_changes_nothing() -> None:
+    with pytest.raises(TypeError, match="one for each of the 2 loudspeakers"):
+        tracked_several("FxLMS", amplifier=[HardClipAmplifier(1.0)])
+    tracker = tracked_several("FxLMS")
+    with pytest.raises(ValueError, match="each of the 2 references"):
+        tracker.control_signal([1.0])
+    tracker.control_signal([1.0, 2.0])
+    for bad, message in (([1.0], "each of the 2 microphones"), ([1.0, np.nan], "error must be finite")):
+        with pytest.raises(ValueError, match=message):
+            tracker.update(bad)
+    with pytest.raises(ValueError, match=r"channels \(microphones, loudspeakers\) = \(2, 2\)"):
+        tracker.secondary_path = NOW[:1]
+    np.testing.assert_array_equal(tracker.secondary_path, THEN)
+    np.testing.assert_array_equal(tracker.weights, 0.0)
+    tracker.secondary_path = NOW
+    np.testing.assert_array_equal(tracker._paths, NOW)
+    assert repr(tracker).startswith("<FxLMS with path tracking: 0 change(s), <FxLMS: 2 microphones, 2 loudspeakers")

@@ -225,6 +225,7 @@ AROUND: dict[str, Any] = {
     "PathTracker, KF-OPC": lambda: _tracked(MAKERS["KF-OPC"](), rng=np.random.Generator(np.random.MT19937(3))),
     "PathTracker, amplifier": lambda: _tracked(MAKERS["KF-PB"](), amplifier=HardClipAmplifier(0.7)),
     "PathTracker, a user's amplifier": lambda: _tracked(MAKERS["KF-ANC"](), amplifier=own_amplifier),
+    "PathTracker, many": lambda: _tracked(SEVERAL["FxLMS"]()),
     "FeedbackNeutralizer": lambda: FeedbackNeutralizer(_tracked(MAKERS["FxLMS"]()), [0.0, 0.1, 0.05]),
     "FeedbackNeutralizer, many": lambda: FeedbackNeutralizer(
         SEVERAL["kf_anc"](), random_paths(I, J, 3, seed=4), amplifier=HardClipAmplifier(0.7)
