@@ -114,11 +114,14 @@ class BlockController(FilteredReferenceController):
             return
         state.numbers["waiting"] = 0
         references = np.array([newest(line, self._past)[::-1] for line in self._lines.reference])
-        energy = self._lines.energy.copy()
-        self._lines.energy[:] = 0.0
+        energy, emitted = (
+            self._lines.energy.copy(),
+            float(self._lines.emitted[0]),
+        )  # more than a block, if some were skipped
+        self._lines.energy[:] = self._lines.emitted[:] = 0.0
         if np.all(np.abs(references) < LOUDEST):
             if np.any(energy):  # otherwise the control was off
-                self._budget.spend(energy / self.block, self.block / self.fs)
+                self._budget.spend(energy / emitted, emitted / self.fs)
             self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
             self._end_block(references)
 

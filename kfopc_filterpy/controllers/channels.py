@@ -60,6 +60,7 @@ class ChannelLines(NamedTuple):
     guard: ChannelGuard | None
     control_signal: np.ndarray  # (J,) the last y
     energy: np.ndarray  # (J,) sum of y^2 since the start of the block; without blocks, of all samples
+    emitted: np.ndarray  # (1,) number of samples in that sum
     disturbance: np.ndarray  # (K,) the last estimate d^
     modified_error: np.ndarray  # (K,) room for an algorithm that adapts to another error
     constraint_factor: np.ndarray  # (J,) the last factors
@@ -103,6 +104,7 @@ def channel_lines(
         guard=None,
         control_signal=np.zeros(J),
         energy=np.zeros(J),
+        emitted=np.zeros(1),
         disturbance=np.zeros(K),
         modified_error=np.zeros(K),
         constraint_factor=np.ones(J),
@@ -167,6 +169,7 @@ def emit_channel_outputs(lines, state):
     """Set y(n), (J,)."""
     for j in range(lines.output.shape[0]):
         emit_channel(lines, j, output(state, j))
+    lines.emitted[0] += 1.0
     return 0.0
 
 
@@ -237,6 +240,7 @@ def emit_channel_silence(lines):
     """Add y_j(n) = 0 to their delay lines."""
     for j in range(lines.output.shape[0]):
         emit_channel(lines, j, 0.0)
+    lines.emitted[0] += 1.0
 
 
 @inlined

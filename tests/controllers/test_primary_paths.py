@@ -36,6 +36,28 @@ def made(form: str, secondary: np.ndarray = SECONDARY, **changed: Any) -> Any:
 # ---- The powers
 
 
+def test_samples_that_it_does_not_adapt_to_are_accounted_for_with_their_duration(
+    form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second without adaptation counts as a second, and not as one loud block."""
+    controller = made(form, rated_power=[0.1, 0.2])
+    spent, durations = np.zeros(J), []
+
+    def spend(power: np.ndarray, duration_s: float) -> None:
+        spent[:] += power * duration_s
+        durations.append(duration_s)
+
+    monkeypatch.setattr(controller._budget, "spend", spend)
+    n_samples = 9 * 50 * controller.block
+    x, adapt = references(n_samples), np.ones(n_samples, bool)
+    adapt[n_samples // 3 : 2 * n_samples // 3] = False
+    y = controller.process(x, through(PRIMARY_PATHS, x), adapt=adapt)
+    active = int(np.flatnonzero(np.any(y != 0.0, axis=0))[0]) // controller.block * controller.block
+    np.testing.assert_allclose(spent, np.sum(y**2, axis=1) / FS, rtol=1e-9)
+    np.testing.assert_allclose(np.sum(durations), (n_samples - active) / FS, rtol=1e-9)
+    assert np.max(durations) > 0.3 * n_samples / FS
+
+
 @pytest.mark.parametrize("share", [0.25, 0.5])
 @pytest.mark.parametrize("noise", ["white", "coloured"])
 def test_each_loudspeaker_keeps_its_power_and_the_error_is_close_to_the_bound(
