@@ -1,4 +1,4 @@
-"""Checkpoints: a filter or a controller in a file, from which an interrupted run continues to the bit.
+"""Checkpoints: a filter, a controller or a supervisor in a file, from which an interrupted run continues to the bit.
 
 A file has four parts::
 
@@ -30,7 +30,7 @@ import secrets
 import sys
 import time
 import types
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -47,7 +47,7 @@ import numpy as np
 FORMAT = 1
 PACKAGE = __package__
 MAGIC = b"kfopc checkpoint "
-FOLDERS = ("kernels", "paths", "power", "filters", "controllers")  # whose classes a file may name
+FOLDERS = ("kernels", "paths", "power", "filters", "controllers", "realtime")  # whose classes a file may name
 OUTSIDE = (  # what else it may name
     "filterpy.kalman.KalmanFilter",
     "filterpy.common.inv_diagonal",
@@ -68,7 +68,7 @@ class CheckpointError(ValueError):
 
 
 class Checkpointed:
-    """Base class of the filters and controllers, which can be saved in a file."""
+    """Base class of the filters, the controllers and the supervisor, which can be saved in a file."""
 
     __slots__ = ()
 
@@ -194,8 +194,8 @@ class _Writer:
         if kind in (list, deque):
             items = [self.value(item, f"{where}[{i}]") for i, item in enumerate(value)]
             return {"kind": "list", "items": items} | ({"most": value.maxlen} if kind is deque else {})
-        if kind is dict:
-            return {"kind": "dict", "items": self._pairs(value, where)}
+        if kind in (dict, Counter):
+            return {"kind": "dict", "items": self._pairs(value, where)} | ({"counts": True} if kind is Counter else {})
         if kind is np.random.Generator and value.bit_generator.state.get("bit_generator") in GENERATORS:
             return {"kind": "generator", "state": self.value(value.bit_generator.state, where)}
         if _is_function(value):
@@ -537,9 +537,10 @@ class _Reader:
         return items
 
     def _dict(self, index: int, node: dict[str, Any]) -> dict[Any, Any]:
-        items: dict[Any, Any] = {}
+        items: dict[Any, Any] = Counter() if "counts" in node else {}
         self._made[index] = items
-        items.update((self.value(key), self.value(value)) for key, value in node["items"])
+        for key, value in node["items"]:
+            items[self.value(key)] = self.value(value)
         return items
 
     def _generator(self, index: int, node: dict[str, Any]) -> np.random.Generator:

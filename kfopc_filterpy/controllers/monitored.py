@@ -46,7 +46,8 @@ class Recent:
     def add(self, sample: Any) -> None:
         """Add a sample, a number or (channels,)."""
         if self._count == 0:
-            self._samples = np.empty((self._most, *np.shape(sample)))
+            # Zeros: a file must not hold what happened to be in memory.
+            self._samples = np.zeros((self._most, *np.shape(sample)))
         self._samples[self._count % self._most] = sample
         self._count += 1
 

@@ -202,7 +202,7 @@ def _summary(report: RunReport, fs: float) -> str:
         f"noise reduction {', '.join(f'{r:.1f}' for r in report.reduction_db)} dB over the second half, against the silence before",
         f"output power {powers}",
         f"{report.overruns} of {report.blocks} blocks took longer than their duration, the longest {100 * report.load:.0f} % of it; "
-        f"{report.lost} samples lost",
+        f"{report.lost} samples lost, {report.underflows} blocks too late for the output",
     ]
     if trip is not None:
         lines.insert(1, f"round trip {trip} samples, {1e3 * trip / fs:.1f} ms")

@@ -47,8 +47,9 @@ class Health:
         Number of samples concerned, by what happened.
     counts : collections.Counter
         Number of events, by what happened: "not finite", "clipped", "stuck", "offset", "repeated" and "lost" samples
-        of the microphones; "refused" updates; "limited" control signals; "diverged: ..." and what was done about it,
-        "frozen", "reset" or "muted"; "silent: no usable input" and "running again".
+        of the microphones; "refused" updates; "limited" control signals; "output underflow", a block that came too
+        late for the output; "diverged: ..." and what was done about it, "frozen", "reset" or "muted"; "silent: no usable
+        input" and "running again".
 
     Examples
     --------

@@ -60,6 +60,8 @@ class Levels:
         Blocks so far whose processing took longer than the block.
     lost : int
         Samples lost so far.
+    underflows : int
+        Blocks so far that came too late for the output.
     health : Health
         Health record.
     """
@@ -73,6 +75,7 @@ class Levels:
     load: float
     overruns: int
     lost: int
+    underflows: int
     health: Health
 
 
@@ -102,6 +105,8 @@ class RunReport:
         not checked.
     overruns, blocks, lost : int
         Blocks whose processing took longer than the block, all blocks, samples lost.
+    underflows : int
+        Blocks that came too late for the output. `health` has the times of those under control.
     load : float
         Largest share of a block's duration that its processing has taken.
     health : Health
@@ -121,6 +126,7 @@ class RunReport:
     overruns: int
     blocks: int
     lost: int
+    underflows: int
     load: float
     health: Health
     controller: Any = field(repr=False)
@@ -188,6 +194,16 @@ class _Session:
         self.block_s = interface.block / interface.fs
         self.blocks = self.overruns = self.lost = 0
         self.load = self.load_since_report = 0.0
+        self._dry_before = self._dry
+
+    @property
+    def _dry(self) -> int:
+        return int(getattr(self.interface, "dry", 0))
+
+    @property
+    def underflows(self) -> int:
+        """Blocks of this run that came too late for the output."""
+        return self._dry - self._dry_before
 
     def play(self, signal: np.ndarray) -> _Heard:
         """Play a signal (J, n), and return what was heard meanwhile; a value that is not finite becomes 0."""
@@ -215,7 +231,10 @@ class _Session:
         began = time.perf_counter()
         x, e = (signals if supervisor.multichannel else signals[0] for signals in (block.references, block.errors))
         y = np.atleast_2d(supervisor.process(x, e, lost=block.lost))
+        before = self.underflows
         self.interface.write(y)
+        if self.underflows > before:
+            supervisor.note("output underflow")
         share = (time.perf_counter() - began) / self.block_s
         self.blocks += 1
         self.overruns += share > 1.0
@@ -331,6 +350,10 @@ def run(
     of the interface; check that a control filter can reduce the noise in time; fade in; control; fade out. A `Supervisor`
     stands between the controller and the interface. The run stops by itself after three divergences within ten minutes.
 
+    The interface is started twice: to listen and identify, and to control. In between the controller is made and
+    compiled, which takes seconds. Nobody reads or writes meanwhile, and streams that were left open would overflow and
+    run dry, after which the round trip may be another one than was identified.
+
     Parameters
     ----------
     controller : Controller or callable
@@ -374,7 +397,8 @@ def run(
     NotCausalError
         The anti-noise comes too late.
     FaultError
-        No loudspeaker is heard, or the interface ends too early.
+        No loudspeaker is heard; samples were lost, or the output ran dry, while the path was identified; the interface
+        ends too early.
     TypeError, ValueError
         A setting that is out of range, or numbers of channels that do not fit.
 
@@ -562,6 +586,7 @@ class _Watch:
             load=self._session.load_since_report,
             overruns=self._session.overruns,
             lost=self._session.lost,
+            underflows=self._session.underflows,
             health=self._supervisor.health,
         )
 
@@ -588,6 +613,7 @@ class _Watch:
             overruns=self._session.overruns,
             blocks=self._session.blocks,
             lost=self._session.lost,
+            underflows=self._session.underflows,
             load=self._session.load,
             health=self._supervisor.health,
             controller=self._supervisor.controller,
@@ -612,7 +638,7 @@ def _identified(
 ) -> IdentifiedPlant:
     """Play noise from each loudspeaker in turn, and return what this tells about the plant."""
     interface = session.interface
-    n, recordings, lost = round(identify_s * interface.fs), [], session.lost
+    n, recordings, lost, underflows = round(identify_s * interface.fs), [], session.lost, session.underflows
     for j in range(interface.n_loudspeakers):
         signal = np.zeros((interface.n_loudspeakers, n))
         signal[j] = np.clip(level * rng.standard_normal(n), -limits[j], limits[j])
@@ -622,6 +648,11 @@ def _identified(
         raise FaultError(
             f"{session.lost - lost} samples were lost while the path was identified, so that it would be wrong: use "
             "longer blocks, or run again"
+        )
+    if session.underflows > underflows:
+        raise FaultError(
+            f"{session.underflows - underflows} blocks came too late for the output while the path was identified, so "
+            "that it would be wrong: use longer blocks or more of them ahead, or run again"
         )
     longest = n // 4
     arrivals = [_arrival(r.y[j], e, longest) for j, r in enumerate(recordings) for e in r.e]

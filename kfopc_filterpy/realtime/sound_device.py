@@ -40,7 +40,7 @@ class SoundDevice:
     full_scale : float
         1, the largest value of a sample.
     dry : int
-        Blocks that came too late for the output.
+        Blocks that came too late for the output, which PortAudio calls an output underflow.
 
     Raises
     ------
@@ -96,8 +96,10 @@ class SoundDevice:
             latency=self.latency,
         )
         self._stream.start()
+        before = self.dry
         for _ in range(self.ahead):
             self.write(np.zeros((self.n_loudspeakers, self.block)))
+        self.dry = before  # the output is empty until then
 
     def read(self) -> Block | None:
         """Return the next block; a block is counted as lost if the driver reports that the input overflowed."""

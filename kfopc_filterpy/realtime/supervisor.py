@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
+from ..checkpoint import Checkpointed
 from ..controllers.base import Controller, FilteredReferenceController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
@@ -34,7 +35,7 @@ SETTLING_WINDOWS = 4  # before the usual surprise is known
 USUAL_WINDOWS = 40.0  # over which it is averaged
 
 
-class Supervisor:
+class Supervisor(Checkpointed):
     """Run a controller block by block, and keep faults from the loudspeakers.
 
     Three things hold, whatever the inputs are. The control signal is finite and within `amplitude_limit`. A bad sample is
@@ -104,6 +105,9 @@ class Supervisor:
     - updates that the controller refuses for a tenth of the samples;
     - squared innovations 40 dB above what is usual or predicted, if the reference has not risen as much, for the
       controllers around a Kalman filter (of the last sample of each block).
+
+    `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call
+    `save` between two blocks.
 
     It cannot see that the noise becomes louder in the room: put the controller into a `MonitoredController` for that, for
     example for a microphone or a loudspeaker whose sign was flipped.
@@ -214,6 +218,16 @@ class Supervisor:
     def start_silent(self) -> None:
         """Begin with silent loudspeakers; `fade_in` starts the control."""
         self._gain, self._wanted = 0.0, False
+
+    def note(self, what: str) -> None:
+        """Record an event of the interface in `health`, at the present time.
+
+        Parameters
+        ----------
+        what : str
+            What happened, for example "output underflow".
+        """
+        self._note(what)
 
     def process(self, references: Any, errors: Any, *, lost: int = 0) -> np.ndarray:
         """Return the control signals of a block.

@@ -190,7 +190,7 @@ class Card:
         self.interface = interface
         self.asked: dict[str, Any] = {}
         self.states: list[str] = []
-        self.reads = 0
+        self.reads, self.lost_at, self.dry_at = 0, [100], [120, 700, 701]  # block numbers
         self.ahead: list[Any] = []
 
     def __call__(self, **asked: Any) -> Card:
@@ -199,6 +199,7 @@ class Card:
 
     def start(self) -> None:
         self.states.append("start")
+        self.reads_before_control = self.reads
 
     def read(self, n: int) -> tuple[Any, bool]:
         block = self.interface.read()
@@ -206,14 +207,14 @@ class Card:
         self.reads += 1
         frames = np.zeros((n, 4), np.float32)
         frames[:, 2], frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
-        return frames, self.reads == 100
+        return frames, self.reads in self.lost_at
 
     def write(self, frames: Any) -> bool:
         assert frames.dtype == np.float32
         assert frames.shape[1] == 2
         assert not np.any(frames[:, 0])
         self.interface.write(10.0 * frames[:, 1:].T.astype(float))
-        return self.reads == 120
+        return self.reads in self.dry_at
 
     def stop(self) -> None:
         self.states.append("stop")
@@ -232,8 +233,26 @@ def test_a_sound_card_is_driven_through_its_stream(monkeypatch: pytest.MonkeyPat
     assert (card.asked["samplerate"], card.asked["blocksize"], card.asked["device"]) == (FS, 32, "duplex")
     assert card.states == ["start", "stop", "close"] * 2
     assert report.reduction_db[0] > 6.0
-    assert device.dry == 1
+    assert (device.dry, report.underflows) == (3, 3)
+    assert report.lost == 32
     assert report.round_trip_samples == 65
+    # Those under control are in the health record: the two blocks follow each other, and are one event.
+    assert report.health.samples == {"output underflow": 2}
+    assert report.health.counts == {"output underflow": 1}
+    (event,) = report.health.events
+    assert event.time_s == pytest.approx((700 - card.reads_before_control) * 32 / FS)
+
+
+@pytest.mark.parametrize(
+    ("what", "message"), [("lost_at", "32 samples were lost"), ("dry_at", "1 blocks came too late")]
+)
+def test_a_path_is_not_identified_across_a_gap(what: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    card = Card(plant())
+    setattr(card, what, [200])
+    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
+    with pytest.raises(FaultError, match=f"{message}.* while the path was identified"):
+        started(SoundDevice([2], [3], [1], fs=FS, block=32), amplitude_limit=0.8)
+    assert card.states == ["start", "stop", "close"]
 
 
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

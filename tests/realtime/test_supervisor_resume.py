@@ -1,0 +1,139 @@
+"""Checkpoints of a supervisor: saved between any two blocks, it continues to the bit."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.checkpoints import assert_same_contents
+
+from kfopc_filterpy import FxLMS
+from kfopc_filterpy.controllers import MonitoredController
+from kfopc_filterpy.realtime import Supervisor
+
+FS, BLOCK, BLOCKS = 8000.0, 32, 60
+PATH = np.concatenate((np.zeros(BLOCK), [0.8, -0.3]))
+PATHS = np.concatenate((np.zeros((2, 2, BLOCK)), np.random.default_rng(2).standard_normal((2, 2, 3))), axis=2)
+
+
+def own_gain() -> float:
+    return 0.5
+
+
+class OwnController:
+    """A controller of a user."""
+
+    def __init__(self) -> None:
+        self.gain = own_gain()
+
+    def control_signal(self, reference: float) -> float:
+        return self.gain * reference
+
+    def update(self, error: float) -> None:
+        self.gain = 0.99 * self.gain + 0.01 * min(abs(error), 1.0)
+
+
+MAKERS: dict[str, Any] = {
+    "one channel": lambda: FxLMS(8, PATH, step_size=1e-3),
+    "two of each": lambda: FxLMS(8, PATHS, step_size=3e-4, n_references=2),
+    "monitored": lambda: MonitoredController(FxLMS(8, PATH, step_size=1e-3), fs=FS, window_s=0.02, pause_s=0.02),
+    "own": OwnController,
+}
+
+
+def supervised(name: str, action: str = "") -> Supervisor:
+    """Return a supervisor; with an action, one that soon finds the weights too large."""
+    times = {"window_s": 0.008, "fade_s": 0.01, "pause_s": 0.04, "stuck_s": 0.002, "mute_after_s": 0.03}
+    acts = {"on_divergence": action, "largest_gain": 0.02} if action else {}
+    return Supervisor(MAKERS[name](), fs=FS, amplitude_limit=2.0, full_scale=20.0, **times, **acts)
+
+
+def block(supervisor: Supervisor, b: int) -> tuple[Any, Any, int]:
+    """Return what is heard in a block: noise with all kinds of faults."""
+    shape = (2, BLOCK) if supervisor.multichannel else (BLOCK,)
+    x, e = np.random.default_rng(b).standard_normal((2, *shape))
+    if b % 9 == 3:
+        x[..., 3:5], e[..., 7] = np.nan, 30.0
+    if b in (17, 18):
+        e[...] = 0.25
+    return (None if 30 <= b < 42 else x), e, 64 * (b % 13 == 12)
+
+
+def run(supervisor: Supervisor, begin: int, end: int) -> np.ndarray:
+    """Process some blocks, and let the user fade out and in again meanwhile."""
+    kept = []
+    for b in range(begin, end):
+        if b == 50:
+            supervisor.fade_out()
+        if b == 55:
+            supervisor.fade_in()
+        x, e, lost = block(supervisor, b)
+        kept.append(supervisor.process(x, e, lost=lost))
+    return np.array(kept)
+
+
+@pytest.mark.parametrize(
+    ("name", "action"),
+    [
+        ("one channel", ""),
+        ("one channel", "mute"),
+        ("one channel", "reset"),
+        ("one channel", "freeze"),
+        ("two of each", "mute"),
+        ("monitored", ""),
+        ("own", ""),
+    ],
+)
+def test_a_supervisor_that_is_saved_between_any_blocks_continues_to_the_bit(
+    name: str, action: str, tmp_path: Path
+) -> None:
+    """At every fifth block, what was loaded goes on with five more and with the rest, and the original with all."""
+    original, path, ys = supervised(name, action), tmp_path / "run.kfopc", []
+    states: list[tuple[Supervisor, int]] = []
+    for begin in range(0, BLOCKS, 5):
+        original.save(path)
+        loaded = Supervisor.load(path, trusted=[OwnController])
+        assert_same_contents(loaded, original)
+        states.append((loaded, begin))
+        ys.append(run(original, begin, begin + 5))
+        np.testing.assert_array_equal(run(loaded, begin, begin + 5), ys[-1])
+        assert_same_contents(loaded, original)
+    # Something has happened to be remembered.
+    counts = original.health.counts
+    happened = {"not finite", "clipped", "stuck", "lost"}
+    happened |= {
+        "": {"silent: no usable input", "running again"},
+        "mute": {"diverged: weights", "muted", "running again"},
+        "reset": {"diverged: weights", "reset"},
+        "freeze": {"diverged: weights", "frozen"},
+    }[action]
+    assert happened <= set(counts), counts
+    first, _ = states[0]
+    np.testing.assert_array_equal(run(first, 5, BLOCKS), np.concatenate(ys[1:]))
+    assert_same_contents(first, original)
+
+
+def test_the_health_record_goes_on_counting(tmp_path: Path) -> None:
+    supervisor, path = supervised("one channel"), tmp_path / "run.kfopc"
+    run(supervisor, 0, 20)
+    supervisor.save(path)
+    loaded, twin = Supervisor.load(path), deepcopy(supervisor)
+    for one in (loaded, twin):
+        one.note("output underflow")  # a kind that was not counted yet
+    assert loaded.health.counts["never"] == 0  # it counts, as before
+    assert repr(loaded) == repr(twin)
+    assert loaded.health.events == twin.health.events
+    assert loaded.health.events.maxlen == 1000
+
+
+def test_a_supervisor_is_not_a_controller(tmp_path: Path) -> None:
+    path = tmp_path / "run.kfopc"
+    supervised("one channel").save(path)
+    with pytest.raises(TypeError, match="Supervisor"):
+        FxLMS.load(path)
+    MAKERS["one channel"]().save(path)
+    with pytest.raises(TypeError, match="FxLMS"):
+        Supervisor.load(path)
