@@ -32,6 +32,7 @@ OFTEN_REFUSED = 0.1  # of a window's samples
 MOST_REFUSALS = 3  # in a block; then the rest of it is not adapted to
 FORGOTTEN_S = 600.0  # without a divergence, after which the pauses are short again
 SETTLING_WINDOWS = 4  # before the usual surprise is known
+MOST_LOST = 2**53  # samples at once; many times as many are still a number that converts to a time
 USUAL_WINDOWS = 40.0  # over which it is averaged
 
 
@@ -253,6 +254,8 @@ class Supervisor(Checkpointed):
         """
         lost = as_count(lost, "lost", minimum=0)
         as_number(lost, "lost")  # an integer of Python can be too large for a time
+        if lost > MOST_LOST:
+            raise ValueError(f"lost must be at most {MOST_LOST} samples, got {lost}")
         x, e = self._read(references, errors)
         if lost:
             self._note("lost", n_samples=lost)
@@ -315,13 +318,13 @@ class Supervisor(Checkpointed):
             for kind in range(1, len(KINDS)):
                 where = np.flatnonzero(kinds[channel] == kind)
                 if where.size:
-                    begin, end = (self._samples + where[[0, -1]]) / self.fs
+                    begin, end = ((self._samples + int(n)) / self.fs for n in where[[0, -1]])
                     self.health.note(
                         KINDS[kind],
                         f"{name} {channel}",
-                        time_s=float(begin),
+                        time_s=begin,
                         n_samples=where.size,
-                        until_s=float(end + 1 / self.fs),
+                        until_s=end + 1 / self.fs,
                     )
 
     def _count_unusable(self, usable: np.ndarray) -> None:

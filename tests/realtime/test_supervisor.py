@@ -435,8 +435,9 @@ def test_silence_with_bad_samples_keeps_the_delay_lines_in_time() -> None:
         (-1, ValueError, "lost must be at least 0"),
         (1.5, TypeError, "lost"),
         (10**400, ValueError, "lost must be finite"),
+        (2**53 + 1, ValueError, "lost must be at most 9007199254740992 samples"),
     ],
-    ids=["ellipsis", "negative", "fraction", "beyond a float"],
+    ids=["ellipsis", "negative", "fraction", "beyond a float", "beyond a clock"],
 )
 def test_a_wrong_number_of_lost_samples_changes_nothing(lost: Any, error: type[Exception], message: str) -> None:
     supervisor, block = supervised(MAKERS["FxLMS"]()), np.full(8, np.nan)
@@ -445,6 +446,14 @@ def test_a_wrong_number_of_lost_samples_changes_nothing(lost: Any, error: type[E
     assert not supervisor.health.samples
     supervisor.process([None] * 7 + [1.0], block, lost=2)
     assert supervisor.health.samples == {"not finite": 15, "lost": 2}
+
+
+def test_the_clock_goes_on_after_more_lost_samples_than_an_integer_of_64_bits() -> None:
+    supervisor, rng = supervised(MAKERS["FxLMS"]()), np.random.default_rng(0)
+    for _ in range(1025):
+        supervisor.process([*rng.standard_normal(2), np.nan], rng.standard_normal(3), lost=2**53)
+    assert supervisor.health.events[-1].time_s == pytest.approx(1025 * 2**53 / FS)
+    assert supervisor.health.samples == {"not finite": 1025, "lost": 1025 * 2**53}
 
 
 def test_an_integer_beyond_a_float_is_refused() -> None:
