@@ -178,7 +178,7 @@ class ChannelCorrelations:
         size = 1.0 / np.sqrt(np.maximum(np.diag(slopes), np.finfo(float).tiny))  # of loudspeakers, loud or faint
 
         def solved(right: np.ndarray) -> np.ndarray:
-            return np.asarray(size * np.linalg.lstsq(size[:, np.newaxis] * slopes * size, size * right)[0])
+            return np.asarray(size * np.linalg.lstsq(size[:, np.newaxis] * slopes * size, size * right, rcond=None)[0])
 
         powers = self.powers(weights)
         excess, step = (powers - rated_power)[free], np.zeros(J)

@@ -84,7 +84,8 @@ def _resampled(taps: np.ndarray, fs: float, new_fs: float) -> np.ndarray:
     turns = math.ceil(spread / (up * down))
     resampled = resample_poly(np.pad(taps, turns * down), up, down) * (fs / new_fs)
     early, rest = np.split(resampled, [turns * up])
-    share = np.sum(early**2) / np.sum(resampled**2)
+    energy = np.sum(resampled**2)
+    share = np.sum(early**2) / energy if energy > 0.0 else 0.0  # a silent path stays silent
     if share > _LOST_AT_START:
         raise ValueError(
             f"path must begin with more delay: {10 * np.log10(share):.1f} dB of its energy would come before the first "

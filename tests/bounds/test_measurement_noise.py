@@ -56,7 +56,7 @@ def test_is_the_residual_of_least_squares(n_taps):
     filtered = np.convolve(x, S)[:900]
     start = n_taps + S.size - 2  # delay lines full
     rows = np.array([filtered[n - n_taps + 1 : n + 1][::-1] for n in range(start, 900)])
-    _, (squares,), rank, _ = np.linalg.lstsq(rows, d[start:])
+    _, (squares,), rank, _ = np.linalg.lstsq(rows, d[start:], rcond=None)
     assert rank == n_taps
     expected = squares / (len(rows) - n_taps)
     assert measurement_noise_from_run(x, d, S, n_taps) == pytest.approx(expected, rel=1e-9)

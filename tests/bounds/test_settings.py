@@ -63,7 +63,7 @@ def test_the_error_powers_of_all_lengths_are_those_of_separate_least_squares_fit
     for n in (1, 2, 7, 24, 40):
         below = np.sqrt(ridge * len(rows)) * np.eye(40)[:, :n]  # the ridge as 40 samples more
         left = np.concatenate([rows[:, :n], below])
-        residual = right - left @ np.linalg.lstsq(left, right)[0]
+        residual = right - left @ np.linalg.lstsq(left, right, rcond=None)[0]
         # without a ridge there is one of 1e-11, which float64 correlations need: it costs less than 1e-6
         assert errors[n - 1] == pytest.approx(residual @ residual / (len(rows) - n), rel=1e-6)
 
@@ -78,7 +78,7 @@ def test_of_several_channels_the_error_powers_are_those_of_separate_least_square
     for n in (1, 4, 10):
         rows = np.concatenate([np.moveaxis(one[..., :n], 2, 0).reshape(one.shape[2], -1) for one in windows])
         right = stretch.d.ravel()
-        residual = right - rows @ np.linalg.lstsq(rows, right)[0]
+        residual = right - rows @ np.linalg.lstsq(rows, right, rcond=None)[0]
         weights = rows.shape[1] / 2  # for each microphone
         assert errors[n - 1] == pytest.approx(residual @ residual / 2 / (len(rows) / 2 - weights), rel=1e-6)
 

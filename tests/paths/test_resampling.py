@@ -121,3 +121,7 @@ def test_refusals(arguments, message):
     path, new_fs, *fs = arguments
     with pytest.raises(ValueError, match=message):
         resample_path(path, new_fs, fs=fs[0] if fs else None)
+
+
+def test_a_silent_path_stays_silent() -> None:
+    np.testing.assert_array_equal(resample_path(np.zeros(64), 8000, fs=16000), 0.0)
