@@ -143,10 +143,10 @@ def sequential_would_fail(kf: KalmanFilter, name: str) -> bool:
     ("n", "m", "k", "x_ndim"),
     [(1, 1, 0, 2), (2, 1, 1, 1), (3, 2, 2, 2), (4, 3, 0, 1), (5, 1, 0, 2), (6, 3, 2, 2), (6, 2, 1, 1)],
 )
-def test_ten_thousand_steps_of_any_kind(n: int, m: int, k: int, x_ndim: int) -> None:
+def test_thousands_of_steps_of_any_kind(n: int, m: int, k: int, x_ndim: int) -> None:
     kf, ours = (random_system(cls, n, m, k, x_ndim, seed=n + m) for cls in (KalmanFilter, KFOPC))
     rng = np.random.default_rng(n)
-    for step in range(10_000):
+    for step in range(4000):
         for name, args, kwargs in random_step(rng, kf):
             if sequential_would_fail(kf, name):
                 continue
