@@ -243,8 +243,8 @@ class PathTracker(WrappedController):
 
     Between a jump of the path and its discovery, the controller may diverge. So if the error, as a sum of powers over
     the microphones, becomes more than `hold_db` louder than expected without control, the controller's updates are
-    skipped until the error is 3 dB below that threshold or another path is taken over. A frame of 20 ms is enough to
-    decide that, or less if the error has the energy of such a frame before its end.
+    skipped until the error is 3 dB below that threshold or another path is taken over. This is decided once in a frame,
+    in which a fast algorithm can become much louder.
 
     Parameters
     ----------
@@ -393,7 +393,6 @@ class PathTracker(WrappedController):
         self._n = self._done = 0  # samples of this block, and of all
         self._residual_power = np.zeros(K)
         self._level, self._held = np.zeros(J), False
-        self._energy, self._most_energy = 0.0, np.inf  # of the errors in this frame; with more, updates are skipped
         # Of the disturbance estimates, in total, and of each reference, over the memory.
         self._powers, self._frames = np.zeros(1 + n_references), 0
         self._recovering_from = 0.0  # power of the error when the last path was taken over, until it has fallen
@@ -450,9 +449,6 @@ class PathTracker(WrappedController):
             errors = channel_sample(error, len(self._e), "error", "microphones")
         else:
             errors = np.array([as_number(error, "error")])
-        self._energy += float(errors @ errors)
-        if self._energy > self._most_energy:  # a fast algorithm grows much within a frame, so do not wait for its end
-            self._held = True
         if not self._held:
             end = self._past + self._n + 1
             heard = self._reversed @ self._v[:, end - self._paths.shape[-1] : end].reshape(-1)
@@ -482,8 +478,6 @@ class PathTracker(WrappedController):
             self._recovering_from = 0.0
         bound *= 0.5 if self._held else 1.0  # once held, the error must become 3 dB softer than the bound
         self._held = power > max(bound, 2.0 * self._recovering_from)
-        usual = self._hold_share * self._powers[0]
-        self._energy, self._most_energy = 0.0, self._frame * max(usual, 2.0 * self._recovering_from)
 
     def _power_without_control(self, begin: int) -> float:
         """Return the power that the errors would have without control, in the frame that starts at sample `begin`.
