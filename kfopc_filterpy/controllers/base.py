@@ -117,7 +117,7 @@ class WrappedController(BlockProcessing, Checkpointed):
 
     @property
     def secondary_path(self) -> Any:
-        """Estimated secondary path of the inner controller; a new one can be assigned, which that controller takes."""
+        """Estimated secondary path of the inner controller; a new one can be assigned, unless the wrapper refuses it."""
         return self.controller.secondary_path  # type: ignore[attr-defined]
 
     @secondary_path.setter

@@ -114,14 +114,12 @@ class BlockController(FilteredReferenceController):
             return
         state.numbers["waiting"] = 0
         references = np.array([newest(line, self._past)[::-1] for line in self._lines.reference])
-        energy, emitted = (
-            self._lines.energy.copy(),
-            float(self._lines.emitted[0]),
-        )  # more than a block, if some were skipped
-        self._lines.energy[:] = self._lines.emitted[:] = 0.0
+        # More samples than a block have been emitted if some were skipped.
+        energy, n_emitted = self._lines.energy.copy(), float(self._lines.n_emitted[0])
+        self._lines.energy[:] = self._lines.n_emitted[:] = 0.0
         if np.all(np.abs(references) < LOUDEST):
             if np.any(energy):  # otherwise the control was off
-                self._budget.spend(energy / emitted, emitted / self.fs)
+                self._budget.spend(energy / n_emitted, n_emitted / self.fs)
             self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
             self._end_block(references)
 

@@ -60,7 +60,7 @@ class ChannelLines(NamedTuple):
     guard: ChannelGuard | None
     control_signal: np.ndarray  # (J,) the last y
     energy: np.ndarray  # (J,) sum of y^2 since the start of the block; without blocks, of all samples
-    emitted: np.ndarray  # (1,) number of samples in that sum
+    n_emitted: np.ndarray  # (1,) number of samples in that sum; silence before the control is not counted
     disturbance: np.ndarray  # (K,) the last estimate d^
     modified_error: np.ndarray  # (K,) room for an algorithm that adapts to another error
     constraint_factor: np.ndarray  # (J,) the last factors
@@ -104,7 +104,7 @@ def channel_lines(
         guard=None,
         control_signal=np.zeros(J),
         energy=np.zeros(J),
-        emitted=np.zeros(1),
+        n_emitted=np.zeros(1),
         disturbance=np.zeros(K),
         modified_error=np.zeros(K),
         constraint_factor=np.ones(J),
@@ -169,16 +169,16 @@ def emit_channel_outputs(lines, state):
     """Set y(n), (J,)."""
     for j in range(lines.output.shape[0]):
         emit_channel(lines, j, output(state, j))
-    lines.emitted[0] += 1.0
+    lines.n_emitted[0] += 1.0
     return 0.0
 
 
-EMIT = types.float64(types.intp)
-ADAPT = types.intp(types.intp, types.intp)
-call_emit, call_adapt = calling(EMIT), calling(ADAPT)
+EMIT_CHANNELS = types.float64(types.intp)
+ADAPT_CHANNELS = types.intp(types.intp, types.intp)
+call_emit_channels, call_adapt_channels = calling(EMIT_CHANNELS), calling(ADAPT_CHANNELS)
 
 
-@for_states(EMIT)
+@for_states(EMIT_CHANNELS)
 def emit_channels_entry(key):
     """Compile `emit` for a type of state of several channels."""
 
@@ -189,9 +189,9 @@ def emit_channels_entry(key):
     return emit_channels_at
 
 
-@for_states(ADAPT)
+@for_states(ADAPT_CHANNELS)
 def adapt_channels_entry(key):
-    """Compile `adapt` or `skip` for a type of state of several channels."""
+    """Compile `adapt`, or `skip` for samples to which it is not to adapt, for a type of state of several channels."""
 
     def adapt_channels_at(address, adapting):
         state = state_at(address, key)
@@ -224,7 +224,7 @@ def channel_steps(lines: ChannelLines, held: Held) -> tuple[ChannelSteps, Any, A
 def emit_channel_step(steps, x):
     """Return y(n), (J,)."""
     copy_into(steps.heard, x)
-    call_emit(steps.emit, steps.address)
+    call_emit_channels(steps.emit, steps.address)
     return steps.control_signal
 
 
@@ -232,7 +232,7 @@ def emit_channel_step(steps, x):
 def adapt_channel_step(steps, error, control_signal, adapting):
     """Adapt to the errors, (K,), or skip the sample; return False if that fails."""
     copy_into(steps.error, error)
-    return call_adapt(steps.adapt, steps.address, adapting) != 0
+    return call_adapt_channels(steps.adapt, steps.address, adapting) != 0
 
 
 @emit_silence.register(ChannelLines)
@@ -240,7 +240,6 @@ def emit_channel_silence(lines):
     """Add y_j(n) = 0 to their delay lines."""
     for j in range(lines.output.shape[0]):
         emit_channel(lines, j, 0.0)
-    lines.emitted[0] += 1.0
 
 
 @inlined

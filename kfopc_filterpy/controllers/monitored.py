@@ -157,7 +157,8 @@ class MonitoredController(WrappedController):
 
     def _take_path(self, path: Any) -> None:
         super()._take_path(path)
-        self._fresh.secondary_path = path  # type: ignore[attr-defined]  # which takes over after a silence
+        # This one takes over after a silence.
+        self._fresh.secondary_path = path  # type: ignore[attr-defined]
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest `reference` x(n), or silence."""

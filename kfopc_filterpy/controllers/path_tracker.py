@@ -140,7 +140,7 @@ class JointFit:
 def common_ratio(powers: np.ndarray, paths: np.ndarray) -> np.ndarray:
     """Return for each loudspeaker, (J,), a mean of ``powers[k] / sum(paths[k, j]**2)`` over the microphones.
 
-    A harmonic mean does not depend on how sensitive each microphone is. Silent microphones are left out. It is infinite
+    A harmonic mean does not depend on how sensitive each microphone is. Silent microphones are left out. The result is infinite
     for a loudspeaker that no microphone hears, and 0 if all microphones are silent.
     """
     heard = powers > 0.0
@@ -267,7 +267,7 @@ class PathTracker(WrappedController):
         Time between two tests in s, rounded to whole frames.
     p_value : float, default 1e-6
         Largest probability of a difference by chance with which an estimate is taken over. It is divided among the
-        microphones. If the paths to one have changed, its square root is enough for the others.
+        microphones. Once the paths to one are found to have changed, its square root is enough for the others.
     use_control_signal : bool, default True
         Whether the estimates "control signal" take part.
     hold_db : float, default 6
@@ -417,13 +417,17 @@ class PathTracker(WrappedController):
         self._paths = np.reshape(path, (K, J, -1))
         self._reversed = self._paths[..., ::-1].copy().reshape(K, -1)  # oldest sample first, as in the signals
 
-    def _of_controller(self, channels: np.ndarray) -> Any:
+    def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
         return channels if self.controller.multichannel else float(channels[0])
 
     def _take_path(self, path: Any) -> None:
         super()._take_path(path)
         self._know(self.controller.secondary_path)
+        self._held, self._recovering_from = False, 0.0
+        self._models = [fit.solve(self._paths) for fit in self._fits]
+        for evidence in self._evidence.values():  # it was against the path in use before
+            evidence.forget()
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal with the probe, y(n) + v(n), for the newest reference sample x(n).
@@ -436,7 +440,7 @@ class PathTracker(WrappedController):
             at = self._past + self._n
             alone = self._amplified(y)
             self._x[:, at], self._y[:, at], self._v[:, at] = reference, alone, self._amplified(emitted) - alone
-        return self._of_controller(emitted)
+        return self._shaped(emitted)
 
     def _amplified(self, y: np.ndarray) -> np.ndarray:
         if self._amplifiers is None:
@@ -452,7 +456,7 @@ class PathTracker(WrappedController):
         if not self._held:
             end = self._past + self._n + 1
             heard = self._reversed @ self._v[:, end - self._paths.shape[-1] : end].reshape(-1)
-            self.controller.update(self._of_controller(errors + heard))
+            self.controller.update(self._shaped(errors + heard))
         self._take(errors)
 
     def _take(self, errors: np.ndarray) -> None:
@@ -484,7 +488,7 @@ class PathTracker(WrappedController):
 
         It is the mean power of the disturbance estimates over the memory, times the ratio of a reference's power to its
         own mean if that is above 1, for the reference whose ratio is largest. The estimate grows if the path is wrong,
-        so a frame counts as `hold_db` above what was expected of it at most.
+        so a frame counts at most `hold_db` above what was expected of it.
         """
         samples = slice(self._past + begin, self._past + begin + self._frame)
         played = (self._y + self._v)[:, samples.start - self._paths.shape[-1] + 1 : samples.stop]
@@ -493,7 +497,8 @@ class PathTracker(WrappedController):
         references = np.mean(self._x[:, samples] ** 2, axis=1)
         mean, usual = self._powers[0], self._powers[1:]
         known = usual > 0.0
-        expected = mean * max(np.max(references[known] / usual[known]), 1.0) if known.any() else np.inf
+        # Before anything was heard, nothing is expected: the noise may reach the microphones later than the reference.
+        expected = mean * max(np.max(references[known] / usual[known]), 1.0) if mean > 0.0 and known.any() else np.inf
         self._frames += 1
         rate = max(self._frame / (self.memory_s * self.fs), 1.0 / self._frames)
         self._powers += rate * (np.array([min(power, self._hold_share * expected), *references]) - self._powers)
@@ -520,7 +525,7 @@ class PathTracker(WrappedController):
         return self._models[candidate[1]] is not None and self._evidence[candidate].p_value < p_value
 
     def _best(self, microphone: int) -> tuple[int, int, str] | None:
-        """Return the better candidate (microphone, fit, source) of the largest gain, after one was found to be better.
+        """Return the significant candidate (microphone, fit, source) of the largest gain, once any candidate is significant.
 
         If it belongs to another microphone, the paths to this one have probably changed too. With only some of the paths
         right, the controller may diverge, so less evidence is enough.
@@ -554,7 +559,7 @@ class PathTracker(WrappedController):
         """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone."""
         new, old = self._paths.copy(), self._paths
         for k, i, source in better:
-            new[k] = self._models[i].secondary[source][k]  # type: ignore[union-attr]  # whoever is better has a model
+            new[k] = self._models[i].secondary[source][k]  # type: ignore[union-attr]  # a better candidate has a model
         self.controller.secondary_path = new if self.controller.multichannel else new[0, 0]
         for k, i, source in better:
             change = np.sum((new[k] - old[k]) ** 2) / max(np.sum(old[k] ** 2), np.finfo(float).tiny)

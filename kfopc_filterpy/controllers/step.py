@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import types
 
+from ..kernels.borrowing import borrowed
 from ..kernels.compiling import by_type, compiled, inlined, part
 from ..kernels.delay_lines import latest, newest, push
 from ..kernels.holding import Held, calling, for_states, state_at
@@ -180,8 +181,8 @@ def disturbance_estimate(lines, error):
     return error + dot(s, newest(lines.output, s.size))
 
 
-# Entry points. Loops are given them as arguments, and so are compiled once for all algorithms; Python calls them by
-# `ctypes`. They find the state at its address.
+# Entry points. A loop is given their addresses, and so is compiled once for all algorithms; Python calls them by
+# `ctypes`. They find the state at its address. numba prints an exception that a step raises, and goes on.
 
 
 EMIT = types.float64(types.intp, types.float64)
@@ -296,6 +297,7 @@ def process_samples(steps, references, errors, adapting, outputs, begin, end):
     Return the number of samples processed, or the sample to which the controller could not adapt. The first axis is
     time; with several channels, each row is a sample.
     """
+    steps = borrowed(steps)
     for n in range(begin, end):
         y = emit_step(steps, references[n])
         outputs[n] = y

@@ -1,4 +1,4 @@
-"""numba's `njit` as this package uses it: `compiled` for functions that Python calls, `part` for those they call.
+"""numba as this package uses it: `compiled` for functions that Python calls, `part` for those they call.
 
 Compiled code is cached on disk. numba looks for changes only in the file that defines a function, but the compiled loop
 contains functions from other files. The cache folder is therefore named after everything that can change: all sources
@@ -13,6 +13,7 @@ import os
 import shutil
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,6 +26,7 @@ from numba.extending import overload
 
 PACKAGE = Path(__file__).parents[1]
 CONFIG: Any = numba.config
+LOCK = threading.RLock()  # held while a function is compiled for the cache, whose folder is numba's global setting
 
 # Divide as numpy does: division by zero gives Inf or NaN, which the callers check for, and no exception.
 OPTIONS: Any = {"error_model": "numpy", "no_cfunc_wrapper": True}
@@ -61,7 +63,7 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def callback(signature: Any) -> Callable[..., Any]:
-    """Compile functions that compiled code can be given as arguments, and Python calls by `ctypes`."""
+    """Compile functions that compiled code calls by address, and Python by `ctypes`."""
 
     def compiled_callback(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         def decorate(function: Callable[..., Any]) -> Any:
@@ -75,7 +77,7 @@ def callback(signature: Any) -> Callable[..., Any]:
 
 def is_ours(kind: type) -> bool:
     """Return whether a type is defined in this package."""
-    return kind.__module__.startswith(PACKAGE.name)
+    return kind.__module__.split(".")[0] == PACKAGE.name
 
 
 def by_type(default: Callable[..., Any]) -> Any:
@@ -148,8 +150,9 @@ FOLDER = _choose_folder()
 @contextmanager
 def _cache_folder() -> Iterator[None]:
     """Make numba use `FOLDER`. numba chooses the cache folder of a function once, when it is decorated."""
-    before, CONFIG.CACHE_DIR = CONFIG.CACHE_DIR, FOLDER
-    try:
-        yield
-    finally:
-        CONFIG.CACHE_DIR = before
+    with LOCK:
+        before, CONFIG.CACHE_DIR = CONFIG.CACHE_DIR, FOLDER
+        try:
+            yield
+        finally:
+            CONFIG.CACHE_DIR = before

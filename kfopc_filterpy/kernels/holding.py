@@ -2,11 +2,12 @@
 
 numba unpacks a tuple at each call: 0.25 us for each array, 0.85 us for each tuple in it, 5 to 10 us for the state of a
 controller. Held, the state is one number, its address. Moreover, a function of an address has the same signature for
-every type of state. So a loop can call it by its own address, and is compiled once for all algorithms.
+every type of state. So a loop can call the function by address, and the loop is compiled once for all algorithms.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from typing import Any
 
@@ -17,10 +18,10 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .borrowing import disowned
-from .compiling import CONFIG, callback, compiled, is_ours
+from .compiling import CONFIG, LOCK, callback, compiled, is_ours
 
 KINDS: dict[str, Any] = {}  # numba's types of states, by the keys that compiled functions know
-KEYS: dict[Any, str] = {}  # these keys, by what the types depend on
+KEYS: dict[Any, tuple[str, bool]] = {}  # these keys, and whether a type is the package's, by what the types depend on
 SIZES: dict[str, int] = {}  # bytes of a state, by its key
 
 
@@ -108,9 +109,17 @@ class ForStates:
         notice that its module has changed.
         """
         if held.key not in self._compiled:
-            decorate = compiled if self._signature is None else callback(self._signature)
-            self._compiled[held.key] = decorate(cache=held.ours, **self._options)(self._make(held.key))
+            with LOCK:
+                if held.key not in self._compiled:
+                    self._compiled[held.key] = self._compile(held.key, held.ours)
         return self._compiled[held.key]
+
+    def _compile(self, key: str, keep: bool) -> Any:
+        function = self._make(key)
+        # A file of its own in the cache: processes that compile for different types at one time would mix them up in one.
+        function.__qualname__ += "_" + hashlib.sha256(key.encode()).hexdigest()[:16]
+        decorate = compiled if self._signature is None else callback(self._signature)
+        return decorate(cache=keep, **self._options)(function)
 
     def __call__(self, held: Held, *arguments: Any) -> Any:
         """Call the function with the address of a held state."""
@@ -120,7 +129,7 @@ class ForStates:
 def for_states(signature: Any = None, **options: Any) -> Callable[[Callable[[str], Callable[..., Any]]], ForStates]:
     """Decorator of ``make(key)``, which returns a function of an address, where it finds ``state_at(address, key)``.
 
-    With a `signature`, of numbers as C knows them, loops can call the function by its own address, see `calling`.
+    Given a `signature` of C numbers, the function can be called by its address, see `calling`.
     """
     return lambda make: ForStates(make, signature, options)
 
@@ -141,15 +150,15 @@ _hold = ForStates(_make_hold, None, {})
 class Held:
     """A state at an `address`, where compiled code finds it.
 
-    The arrays are those of the state: what compiled code writes into them, Python sees. It cannot be copied: a copy of
-    its owner makes another one.
+    The arrays are those of the state: what compiled code writes into them, Python sees. It must not be copied; a copy
+    of its owner makes a new one.
     """
 
     def __init__(self, state: Any) -> None:
         if CONFIG.DISABLE_JIT:
             raise RuntimeError("controllers and random-walk filters run as compiled code: unset NUMBA_DISABLE_JIT")
-        self.state, self.ours = state, is_ours(type(state))
-        self.key = _key_of(state)
+        self.state = state
+        self.key, self.ours = _key_of(state)
         hold = _hold.of(self)
         if self.key not in SIZES:
             SIZES[self.key] = hold(state, 0)
@@ -158,15 +167,22 @@ class Held:
         hold(state, self.address)
 
 
-def _key_of(state: Any) -> str:
-    """Return the key of a state's type, and enter the type if it is new."""
+def _key_of(state: Any) -> tuple[str, bool]:
+    """Return the key of a state's type, and whether that is the package's; enter the type if it is new."""
     layout = _layout(state)
     if layout not in KEYS:
-        kind = typeof(state)
-        # Two types of users can have one name.
-        KEYS[layout] = str(kind) if is_ours(type(state)) else f"{len(KEYS)} {kind}"
-        KINDS[KEYS[layout]] = kind
+        kind, ours = typeof(state), _is_ours_throughout(state)
+        key = str(kind) if ours else f"{len(KEYS)} {kind}"  # two types of users can have one name
+        KINDS[key] = kind
+        KEYS[layout] = key, ours
     return KEYS[layout]
+
+
+def _is_ours_throughout(value: Any) -> bool:
+    """Return whether a NamedTuple and all in it are of types that are defined in this package."""
+    if not isinstance(value, tuple):
+        return True
+    return (type(value) is tuple or is_ours(type(value))) and all(_is_ours_throughout(item) for item in value)
 
 
 def _layout(value: Any) -> Any:

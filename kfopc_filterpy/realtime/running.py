@@ -234,7 +234,7 @@ class _Session:
         before = self.underflows
         self.interface.write(y)
         if self.underflows > before:
-            supervisor.note("output underflow")
+            supervisor.note("output underflow", y.shape[1])
         share = (time.perf_counter() - began) / self.block_s
         self.blocks += 1
         self.overruns += share > 1.0
@@ -351,8 +351,8 @@ def run(
     stands between the controller and the interface. The run stops by itself after three divergences within ten minutes.
 
     The interface is started twice: to listen and identify, and to control. In between the controller is made and
-    compiled, which takes seconds. Nobody reads or writes meanwhile, and streams that were left open would overflow and
-    run dry, after which the round trip may be another one than was identified.
+    compiled, which takes seconds. Meanwhile no blocks are read or written. If the streams stayed open, they would overflow
+    and run dry, and the round trip could then differ from the one identified.
 
     Parameters
     ----------
@@ -646,13 +646,13 @@ def _identified(
         session.play(np.zeros((interface.n_loudspeakers, round(0.1 * interface.fs))))  # let it die away
     if session.lost > lost:
         raise FaultError(
-            f"{session.lost - lost} samples were lost while the path was identified, so that it would be wrong: use "
+            f"{session.lost - lost} samples were lost while the path was identified, so it would be wrong: use "
             "longer blocks, or run again"
         )
     if session.underflows > underflows:
         raise FaultError(
-            f"{session.underflows - underflows} blocks came too late for the output while the path was identified, so "
-            "that it would be wrong: use longer blocks or more of them ahead, or run again"
+            f"the output ran dry while the path was identified, {session.underflows - underflows} time(s), so the path "
+            "would be wrong: use longer blocks or more of them ahead, or run again"
         )
     longest = n // 4
     arrivals = [_arrival(r.y[j], e, longest) for j, r in enumerate(recordings) for e in r.e]

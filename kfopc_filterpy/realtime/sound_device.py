@@ -33,7 +33,7 @@ class SoundDevice:
     latency : float or {"low", "high"}, default "low"
         What sounddevice is asked for. `measure_round_trip` measures what came of it.
     ahead : int, default 2
-        Blocks of silence that are written first, so that the output never runs dry.
+        Blocks of silence that are written first, so that the output does not run dry at once.
 
     Attributes
     ----------

@@ -220,15 +220,17 @@ class Supervisor(Checkpointed):
         """Begin with silent loudspeakers; `fade_in` starts the control."""
         self._gain, self._wanted = 0.0, False
 
-    def note(self, what: str) -> None:
+    def note(self, what: str, n_samples: int = 1) -> None:
         """Record an event of the interface in `health`, at the present time.
 
         Parameters
         ----------
         what : str
             What happened, for example "output underflow".
+        n_samples : int, default 1
+            Number of samples concerned.
         """
-        self._note(what)
+        self._note(what, n_samples=as_count(n_samples, "n_samples"))
 
     def process(self, references: Any, errors: Any, *, lost: int = 0) -> np.ndarray:
         """Return the control signals of a block.

@@ -459,3 +459,26 @@ def test_what_is_refused_of_several_channels_changes_nothing() -> None:
     tracker.secondary_path = NOW
     np.testing.assert_array_equal(tracker._paths, NOW)
     assert repr(tracker).startswith("<FxLMS with path tracking: 0 change(s), <FxLMS: 2 microphones, 2 loudspeakers")
+
+
+def test_noise_that_comes_later_than_the_reference_is_controlled() -> None:
+    """Nothing is heard in the first frame, so nothing may be expected from it."""
+    x = np.random.default_rng(3).standard_normal(8000)
+    primary = np.zeros(120)
+    primary[100] = 1.0  # 50 ms
+    tracker = PathTracker(FxLMS(110, [0.0, 1.0], step_size=0.002), rng=1, fs=2000.0)
+    result = simulate(tracker, x, primary_path=primary, secondary_path=[0.0, 1.0], fs=2000.0)
+    assert np.mean(result.error[-2000:] ** 2) < 0.1
+    assert not np.any(result.error[:100])
+
+
+def test_a_path_that_is_assigned_inherits_nothing_from_the_one_before() -> None:
+    """Neither the evidence against it, nor a pause of the adaptation."""
+    x = np.random.default_rng(3).standard_normal(3000)
+    tracker = PathTracker(FxLMS(8, [0.0, 1.0, 0.0], step_size=0.002), rng=1, fs=2000.0, p_value=1e-300)
+    simulate(tracker, x, disturbance=np.roll(x, 5), secondary_path=[0.0, 0.0, -0.8], fs=2000.0)
+    assert tracker._held
+    assert any(evidence.count for evidence in tracker._evidence.values())
+    tracker.secondary_path = [0.0, 0.0, -0.8]
+    assert not tracker._held
+    assert not any(evidence.count for evidence in tracker._evidence.values())

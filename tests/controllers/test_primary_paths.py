@@ -48,6 +48,8 @@ def test_samples_that_it_does_not_adapt_to_are_accounted_for_with_their_duration
         durations.append(duration_s)
 
     monkeypatch.setattr(controller._budget, "spend", spend)
+    silence = references(1000)
+    controller.listen(silence, through(PRIMARY_PATHS, silence), adapt=False)  # not counted: the control was off
     n_samples = 9 * 50 * controller.block
     x, adapt = references(n_samples), np.ones(n_samples, bool)
     adapt[n_samples // 3 : 2 * n_samples // 3] = False

@@ -19,12 +19,14 @@ from numba import types
 from numba.core.errors import NumbaError
 
 from kfopc_filterpy import FxLMS, OutputLimiter, kf_opc, kf_pb
+from kfopc_filterpy.controllers.step import Steps, adapt_entry, emit_entry, listen, process_samples
 from kfopc_filterpy.kernels.borrowing import borrowed
 from kfopc_filterpy.kernels.compiling import CONFIG, by_type, compiled, inlined, part
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
 from kfopc_filterpy.kernels.holding import Held, calling, for_states, state_at, store
 from kfopc_filterpy.kernels.records import new_record
 from kfopc_filterpy.kernels.stacking import member, stacked, unstack
+from kfopc_filterpy.loop.run import run as compiled_run
 
 PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
 ANNOUNCED = "kfopc_filterpy: compiling, once; the first runs take some seconds longer\n"
@@ -455,6 +457,35 @@ def test_one_compiled_loop_calls_the_functions_of_all_types() -> None:
     assert len(call.signatures) == 1
 
 
+def test_each_type_has_a_file_of_its_own_in_the_cache() -> None:
+    """In a common one, processes that compile for two types at one time could exchange their code."""
+    held = [Held(made_for_8_khz(name)._state) for name in ("FxLMS", "KF-OPC")]
+    for entry in (emit_entry, adapt_entry, listen):
+        names = {entry._make(one.key).__qualname__ for one in held}
+        compiled_names = {entry.of(one).__qualname__ for one in held}
+        assert len(names) == 1
+        assert len(compiled_names) == 2
+    assert len({emit_entry.of(one).native_name for one in held}) == 2
+
+
+def test_the_loops_are_compiled_once_for_all_algorithms() -> None:
+    for name in ("FxLMS", "KF-OPC", "KF-PB"):
+        made = made_for_8_khz(name)
+        run(made, n=60)
+        made.process(np.ones(5), np.ones(5))
+    assert len(compiled_run.signatures) == 1
+    assert sum(one[0].instance_class is Steps for one in process_samples.signatures) == 1
+
+
+def test_what_holds_a_users_type_is_not_kept_on_disk() -> None:
+    class Own(NamedTuple):
+        values: np.ndarray
+
+    state = made_for_8_khz("FxLMS")._state
+    assert Held(state).ours
+    assert not Held(state._replace(lines=state.lines._replace(guard=Own(np.zeros(3))))).ours
+
+
 def test_a_state_is_not_written_where_another_type_is_held() -> None:
     """Its memory may be too small."""
     held = Held(outer())
@@ -464,7 +495,8 @@ def test_a_state_is_not_written_where_another_type_is_held() -> None:
     def overwrite(state, address):
         store(state, address, key)
 
-    overwrite(outer()._replace(factor=2.0), held.address)
+    fitting = outer()._replace(factor=2.0)  # named, because its arrays are borrowed
+    overwrite(fitting, held.address)
     assert spend_held(held, 1.0) == 24.0 / 2.0
     with pytest.raises(NumbaError, match="the address is for a state of the type"):
         overwrite(Plain(np.arange(6.0)), held.address)

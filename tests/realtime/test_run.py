@@ -237,14 +237,15 @@ def test_a_sound_card_is_driven_through_its_stream(monkeypatch: pytest.MonkeyPat
     assert report.lost == 32
     assert report.round_trip_samples == 65
     # Those under control are in the health record: the two blocks follow each other, and are one event.
-    assert report.health.samples == {"output underflow": 2}
+    assert report.health.samples == {"output underflow": 2 * 32}
     assert report.health.counts == {"output underflow": 1}
     (event,) = report.health.events
     assert event.time_s == pytest.approx((700 - card.reads_before_control) * 32 / FS)
 
 
 @pytest.mark.parametrize(
-    ("what", "message"), [("lost_at", "32 samples were lost"), ("dry_at", "1 blocks came too late")]
+    ("what", "message"),
+    [("lost_at", "32 samples were lost"), ("dry_at", "the output ran dry")],
 )
 def test_a_path_is_not_identified_across_a_gap(what: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     card = Card(plant())
