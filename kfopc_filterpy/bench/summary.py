@@ -119,6 +119,7 @@ def _in_common(claims: Sequence[tuple[bool, frozenset[str]]]) -> dict[str, list[
 def glance(studies: Sequence[StudyReport]) -> FigureItem | None:
     """Return output power and noise reduction of every algorithm in every study, None if no study has figures of merit."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator
 
     shown = [study for study in studies if study.algorithms]
     if not shown:
@@ -134,7 +135,10 @@ def glance(studies: Sequence[StudyReport]) -> FigureItem | None:
     powers.axhline(1.0, color="0.35", linewidth=1.2)
     powers.set(yscale="log", ylabel="output power,\ntimes the rated power")
     low, high = powers.get_ylim()
-    powers.set_ylim(min(low, 0.2), max(high, 5.0))  # a decade at least, which has ticks
+    low, high = min(low, 0.2), max(high, 5.0)
+    powers.set_ylim(low, high)
+    if high < 100.0 * low:  # powers of ten alone would be one tick or two
+        powers.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     powers.yaxis.set_major_formatter("{x:g}")
     powers.yaxis.set_minor_formatter("")
     reductions.set(xlabel="study", ylabel="noise reduction (dB)", xlim=(-0.5, len(shown) - 0.5))

@@ -332,6 +332,7 @@ def test_whose_claims_the_verdicts_are_on(tmp_path):
 
 
 def test_figures_held_for_the_report_are_unknown_to_pyplot():
+    plt.close("all")  # those that tests before this one have left
     for i in range(25):  # pyplot warns from 21 open figures on
         FigureItem(f"f{i}", "", plt.subplots()[0])
     assert not plt.get_fignums()

@@ -105,6 +105,7 @@ def test_the_figure_holds_every_algorithm_of_every_study():
     np.testing.assert_allclose(shown["KF-ANC"], [10.0, np.nan])
     np.testing.assert_allclose(shown["KF-OPC"], [0.5, 1.5])
     np.testing.assert_allclose([line.get_ydata() for line in reductions.get_lines()][:2], [[20, np.nan], [np.nan, 5]])
+    assert {0.2, 0.5, 1.0, 2.0, 5.0} <= set(powers.get_yticks())
     assert "KF-OPC asks for 0.50 to 1.50 times the rated power." in item.caption
     assert "KF-ANC" in item.alt
     assert "noise reduction (dB)" in item.alt
