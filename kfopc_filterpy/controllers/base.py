@@ -492,14 +492,14 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             x = channel_sample(reference, self.n_references, "reference", "references")
             code = self._compiled()
             self._lines.heard[:] = x
-            code.emit(code.address)
+            code.emit(code.held.address)
             return self._y.copy()
         return self._emit(as_number(reference, "reference"))
 
     def _emit(self, reference: float) -> float:
         """Return y(n) for a reference of one channel."""
         code = self._compiled()
-        self._y = code.emit(code.address, reference)
+        self._y = code.emit(code.held.address, reference)
         return self._y
 
     def __getstate__(self) -> dict[str, Any]:
@@ -508,7 +508,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     def _compiled(self) -> Compiled:
         """Return the state, held for compiled code, and its steps."""
-        if self._code is None or self._code.state is not self._state:
+        if self._code is None or self._code.held.state is not self._state:
             self._code = Compiled(self._state)
         return self._code
 
@@ -518,7 +518,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             error = channel_sample(error, self.n_microphones, "error", "microphones")
             code = self._compiled()
             self._lines.error[:] = error
-            adapted = bool(code.adapt(code.address, True))
+            adapted = bool(code.adapt(code.held.address, True))
         else:
             error = as_number(error, "error")
             adapted = self._adapt(error)
@@ -530,7 +530,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def _adapt(self, error: float) -> bool:
         """Adapt to an error of one channel; return False if that fails."""
         code = self._compiled()
-        return bool(code.adapt(code.address, error, self._y, True))
+        return bool(code.adapt(code.held.address, error, self._y, True))
 
     def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
@@ -577,7 +577,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             end = min(done + (self.samples_to_block() or len(x)), len(x))
             code = self._compiled()
             done = process_samples(code.steps, x, e, flags, y, done, end)
-            self.after_compiled(code.state)
+            self.after_compiled(code.held.state)
             if done < end:
                 break
         return done

@@ -6,7 +6,7 @@ taps. Secondary paths are (K, J, taps), control filters (J, I, taps), primary pa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from numba import types
 from .._validate import as_real_array
 from ..kernels.compiling import inlined, part
 from ..kernels.delay_lines import delay_line, latest, newest, push
-from ..kernels.holding import Held, calling, for_states, state_at
+from ..kernels.holding import ForStates, Held, calling, for_states, state_at
 from ..kernels.records import as_records
 from ..kernels.vectors import at, copy_into, dot
 from ..power.amplifiers import LinearAmplifier, amplify, compiled_model
@@ -30,11 +30,11 @@ from .step import (
     emit_outputs,
     emit_silence,
     emit_step,
+    entries_of,
     filter_output,
     loudspeakers,
     output,
     skip,
-    steps_of_lines,
     take_reference,
     weights_of,
 )
@@ -203,21 +203,24 @@ def adapt_channels_entry(key):
     return adapt_channels_at
 
 
-@steps_of_lines.register(ChannelLines)
-def channel_steps(lines: ChannelLines, held: Held) -> tuple[ChannelSteps, Any, Any]:
-    """Return the steps of a controller of several channels, for loops and for Python."""
-    emit, adapt = emit_channels_entry.of(held), adapt_channels_entry.of(held)
-    steps = ChannelSteps(
+@entries_of.register(ChannelLines)
+def entries_of_channels(lines: ChannelLines) -> tuple[ForStates, ForStates, Callable[[Held, int, int], Any]]:
+    """Return what compiles the two steps, and what makes `ChannelSteps` of their addresses."""
+    return emit_channels_entry, adapt_channels_entry, _steps
+
+
+def _steps(held: Held, emit_address: int, adapt_address: int) -> ChannelSteps:
+    lines, filters = held.state.lines, control_filter(held.state)
+    return ChannelSteps(
         held.address,
-        emit.address,
-        adapt.address,
-        control_filter(held.state),
+        emit_address,
+        adapt_address,
+        filters,
         lines.control_signal,
         lines.constraint_factor,
         lines.heard,
         lines.error,
     )
-    return steps, emit.ctypes, adapt.ctypes
 
 
 @emit_step.register(ChannelSteps)

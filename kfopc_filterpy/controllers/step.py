@@ -12,7 +12,8 @@ and whatever else its algorithm stores. `adapt` must have a body for the type, r
 
 from __future__ import annotations
 
-from functools import singledispatch
+from collections.abc import Callable
+from functools import cached_property, singledispatch
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from numba import types
 from ..kernels.borrowing import borrowed
 from ..kernels.compiling import by_type, compiled, inlined, part
 from ..kernels.delay_lines import latest, newest, push
-from ..kernels.holding import Held, calling, for_states, state_at
+from ..kernels.holding import ForStates, Held, calling, for_states, state_at
 from ..kernels.vectors import dot
 from ..power.amplifiers import amplify
 from ..power.constraint import advance_constraint, squares_are_finite
@@ -206,7 +207,7 @@ def adapt_entry(key):
 
     def adapt_at(address, error, control_signal, adapting):
         state = state_at(address, key)
-        if adapting:
+        if adapting:  # not a `part` for one and several channels: the compiler would optimise the whole step once more
             return adapt(state, error, control_signal)
         skip(state)
         return True
@@ -250,7 +251,8 @@ class Steps(NamedTuple):
 class Compiled:
     """A controller's state, held, and its compiled steps: `steps` for loops; `emit` and `adapt` for Python.
 
-    It must exist for as long as its `steps` are used: they hold the address of the state, and not the state.
+    It must exist for as long as its `steps` are used: they hold the address of the state, and not the state. A step is
+    compiled when it is first asked for: a controller around somebody's own filter never asks for `adapt`.
     """
 
     def __init__(self, state: Any) -> None:
@@ -258,18 +260,35 @@ class Compiled:
             raise NotImplementedError(
                 f"no step is registered for this type of state: adapt.register({type(state).__name__})(step)"
             )
-        self.state, self.held = state, Held(state)
-        self.address = self.held.address
-        self.steps, self.emit, self.adapt = steps_of_lines(state.lines, self.held)
+        self.held = Held(state)
+        self._emit, self._adapt, self._steps = entries_of(state.lines)
+
+    @cached_property
+    def emit(self) -> Any:
+        """Function of the address, and with one channel of x(n), that returns y(n)."""
+        return self._emit.of(self.held).ctypes
+
+    @cached_property
+    def adapt(self) -> Any:
+        """Function of the address, with one channel of e(n) and y(n), and of whether to adapt; it returns 0 if that fails."""
+        return self._adapt.of(self.held).ctypes
+
+    @cached_property
+    def steps(self) -> Any:
+        """The controller as loops see it: `Steps`, or `ChannelSteps` for several channels."""
+        return self._steps(self.held, self._emit.of(self.held).address, self._adapt.of(self.held).address)
 
 
 @singledispatch
-def steps_of_lines(lines: Any, held: Held) -> tuple[Any, Any, Any]:
-    """Return the steps of a controller for loops, then those for Python, by the type of its lines."""
-    state, emit, adapt = held.state, emit_entry.of(held), adapt_entry.of(held)
+def entries_of(lines: Any) -> tuple[ForStates, ForStates, Callable[[Held, int, int], Any]]:
+    """Return what compiles the two steps, and what makes `Steps` of their addresses, by the type of the lines."""
+    return emit_entry, adapt_entry, _steps
+
+
+def _steps(held: Held, emit_address: int, adapt_address: int) -> Steps:
+    state = held.state
     used = state.constraint.numbers
-    steps = Steps(held.address, emit.address, adapt.address, control_filter(state), power_weight(state), used)
-    return steps, emit.ctypes, adapt.ctypes
+    return Steps(held.address, emit_address, adapt_address, control_filter(state), power_weight(state), used)
 
 
 @by_type

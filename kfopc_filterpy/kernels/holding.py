@@ -22,7 +22,6 @@ from .compiling import CONFIG, LOCK, callback, compiled, is_ours
 
 KINDS: dict[str, Any] = {}  # numba's types of states, by the keys that compiled functions know
 KEYS: dict[Any, tuple[str, bool]] = {}  # these keys, and whether a type is the package's, by what the types depend on
-SIZES: dict[str, int] = {}  # bytes of a state, by its key
 
 
 def _size(typing_context: Any, state: Any) -> Any:
@@ -160,9 +159,7 @@ class Held:
         self.state = state
         self.key, self.ours = _key_of(state)
         hold = _hold.of(self)
-        if self.key not in SIZES:
-            SIZES[self.key] = hold(state, 0)
-        self._memory = np.empty(-(-SIZES[self.key] // 8), np.float64)
+        self._memory = np.empty(-(-hold(state, 0) // 8), np.float64)
         self.address = self._memory.ctypes.data
         hold(state, self.address)
 

@@ -28,8 +28,8 @@ class Interface(Protocol):
     """Describe what `run` needs: sample rate and counts, and four methods.
 
     Signals have a channel axis, also for one channel. `full_scale`, the magnitude at which the converters of the
-    microphones clip, is used if it is there; so is `dry`, the number of blocks that came
-    too late for the output since the interface was made, which `start` does not reset.
+    microphones clip, is used if it is there; so is `dry`, the number of blocks that came too late for the output since
+    the interface was made, which `start` does not reset.
 
     Examples
     --------

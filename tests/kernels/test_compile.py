@@ -469,12 +469,15 @@ def test_each_type_has_a_file_of_its_own_in_the_cache() -> None:
 
 
 def test_the_loops_are_compiled_once_for_all_algorithms() -> None:
+    compiled_for = []
     for name in ("FxLMS", "KF-OPC", "KF-PB"):
         made = made_for_8_khz(name)
         run(made, n=60)
         made.process(np.ones(5), np.ones(5))
+        compiled_for.append((set(compiled_run.signatures), set(process_samples.signatures)))
+    assert compiled_for[0] == compiled_for[1] == compiled_for[2]  # other tests may have used arrays of other types
     assert len(compiled_run.signatures) == 1
-    assert sum(one[0].instance_class is Steps for one in process_samples.signatures) == 1
+    assert any(one[0].instance_class is Steps for one in process_samples.signatures)
 
 
 def test_what_holds_a_users_type_is_not_kept_on_disk() -> None:
