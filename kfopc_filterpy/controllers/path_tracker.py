@@ -18,6 +18,7 @@ from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from .base import FilteredReferenceController, WrappedController
 from .channels import amplifier_functions, channel_sample
+from .divergence import DivergenceGuard
 
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
@@ -241,10 +242,14 @@ class PathTracker(WrappedController):
     The controller does not hear the probe: what the probe contributes to the error, according to the estimate in use,
     is subtracted.
 
-    Between a jump of the path and its discovery, the controller may diverge. So if the error, as a sum of powers over
-    the microphones, becomes more than `hold_db` louder than expected without control, the controller's updates are
-    skipped until the error is 3 dB below that threshold or another path is taken over. This is decided once in a frame,
-    in which a fast algorithm can become much louder.
+    Between a jump of the path and its discovery, the controller may diverge. Two things keep the noise from becoming
+    much more than `hold_db` louder than it is expected to be without control, as a sum of powers over the microphones.
+    The controller's updates are skipped, until the error is 3 dB below that limit or another path is taken over. And
+    the control signal is turned down while the error is above the limit. Afterwards its gain returns to 1, by 6 dB in
+    each frame. Both act within a frame. What is expected is the mean power of the disturbance estimates over the
+    memory, times the power of the reference relative to its own mean if that is above 1. So noise that becomes more
+    than `hold_db` louder than control can make up for, without a louder reference, is taken for a divergence for some
+    seconds.
 
     Parameters
     ----------
@@ -271,7 +276,7 @@ class PathTracker(WrappedController):
     use_control_signal : bool, default True
         Whether the estimates "control signal" take part.
     hold_db : float, default 6
-        See above; with a large number, no update is skipped.
+        See above; with a large number, no update is skipped, and the control signal is never turned down.
     amplifier : callable or sequence of J of them, optional
         Known amplifiers, functions of a sample, as for the controller. An unknown one that clips distorts the fits.
 
@@ -388,14 +393,15 @@ class PathTracker(WrappedController):
         candidates = product(range(K), range(len(self._fits)), self._sources())
         self._evidence = {candidate: Evidence() for candidate in candidates}
         self._past = P - 1
-        self._x, self._y, self._v = (np.zeros((n, self._past + self._block)) for n in (n_references, J, J))
+        # References, control signal as emitted, probe, and control signal as the controller has made it.
+        self._x, self._y, self._v, self._own = (
+            np.zeros((n, self._past + self._block)) for n in (n_references, J, J, J)
+        )
         self._e = np.zeros((K, self._block))
         self._n = self._done = 0  # samples of this block, and of all
         self._residual_power = np.zeros(K)
-        self._level, self._held = np.zeros(J), False
-        # Of the disturbance estimates, in total, and of each reference, over the memory.
-        self._powers, self._frames = np.zeros(1 + n_references), 0
-        self._recovering_from = 0.0  # power of the error when the last path was taken over, until it has fallen
+        self._level = np.zeros(J)
+        self._guard = DivergenceGuard(n_references, self._frame, self.memory_s * self.fs, self._hold_share)
         self._white = self._rng.standard_normal((J, self._shape.size - 1))
         self._probe = self._next_probe()
 
@@ -424,7 +430,7 @@ class PathTracker(WrappedController):
     def _take_path(self, path: Any) -> None:
         super()._take_path(path)
         self._know(self.controller.secondary_path)
-        self._held, self._recovering_from = False, 0.0
+        self._guard.begin_anew()
         self._models = [fit.solve(self._paths) for fit in self._fits]
         for evidence in self._evidence.values():  # it was against the path in use before
             evidence.forget()
@@ -434,12 +440,14 @@ class PathTracker(WrappedController):
 
         With several channels, x(n) is (I,), and the control signal is (J,).
         """
-        y = np.reshape(self.controller.control_signal(reference), -1)
+        own = np.reshape(self.controller.control_signal(reference), -1)
+        y = self._guard.gain * own
         emitted = y + self._level * self._probe[:, self._n % self._frame]
         if np.isfinite(emitted).all():  # otherwise it is a divergence, which the loop detects
             at = self._past + self._n
-            alone = self._amplified(y)
-            self._x[:, at], self._y[:, at], self._v[:, at] = reference, alone, self._amplified(emitted) - alone
+            played = self._amplified(y)
+            self._x[:, at], self._y[:, at], self._v[:, at] = reference, played, self._amplified(emitted) - played
+            self._own[:, at] = self._amplified(own)
         return self._shaped(emitted)
 
     def _amplified(self, y: np.ndarray) -> np.ndarray:
@@ -448,19 +456,26 @@ class PathTracker(WrappedController):
         return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
 
     def update(self, error: Any) -> None:
-        """Let the controller adapt to the error e(n), or (K,), less what the probe is known to contribute."""
+        """Let the controller adapt to the error e(n), or (K,), that it would hear if it played alone and at full volume."""
         if self.controller.multichannel:
             errors = channel_sample(error, len(self._e), "error", "microphones")
         else:
             errors = np.array([as_number(error, "error")])
-        if not self._held:
-            end = self._past + self._n + 1
-            heard = self._reversed @ self._v[:, end - self._paths.shape[-1] : end].reshape(-1)
-            self.controller.update(self._shaped(errors + heard))
-        self._take(errors)
+        disturbance, alone = self._without_probe(errors)
+        if self._guard.allows(alone, self._x[:, self._past + self._n]):
+            self.controller.update(self._shaped(alone))
+        self._take(errors, disturbance, alone)
 
-    def _take(self, errors: np.ndarray) -> None:
+    def _without_probe(self, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the disturbance estimate, (K,), and the error if the controller played alone and with a gain of 1, (K,)."""
+        newest = slice(self._past + self._n + 1 - self._paths.shape[-1], self._past + self._n + 1)
+        played = self._y[:, newest] + self._v[:, newest]
+        disturbance = errors + self._reversed @ played.reshape(-1)
+        return disturbance, disturbance - self._reversed @ self._own[:, newest].reshape(-1)
+
+    def _take(self, errors: np.ndarray, disturbance: np.ndarray, alone: np.ndarray) -> None:
         self._e[:, self._n] = errors
+        self._guard.add(errors, alone, disturbance, self._x[:, self._past + self._n])
         self._n += 1
         if self._n % self._frame == 0:
             self._end_frame()
@@ -468,7 +483,7 @@ class PathTracker(WrappedController):
                 self._end_block()
 
     def _end_frame(self) -> None:
-        """Set the level of the probe, and whether the adaptation is held, for the next frame."""
+        """Set the level of the probe for the next frame, and let the guard decide for it."""
         begin, end = self._n - self._frame, self._n
         powers = np.mean(self._e[:, begin:end] ** 2, axis=1)
         rate = np.where(self._residual_power > 0.0, self._frame / self._block, 1.0)
@@ -476,33 +491,7 @@ class PathTracker(WrappedController):
         ratio = common_ratio(self._residual_power, self._paths)
         self._level = np.sqrt(self._probe_share / ratio.size * np.where(np.isfinite(ratio), ratio, 0.0))
         self._probe = self._next_probe()
-        power = float(np.sum(powers))
-        bound = self._hold_share * self._power_without_control(begin)
-        if power <= bound:
-            self._recovering_from = 0.0
-        bound *= 0.5 if self._held else 1.0  # once held, the error must become 3 dB softer than the bound
-        self._held = power > max(bound, 2.0 * self._recovering_from)
-
-    def _power_without_control(self, begin: int) -> float:
-        """Return the power that the errors would have without control, in the frame that starts at sample `begin`.
-
-        It is the mean power of the disturbance estimates over the memory, times the ratio of a reference's power to its
-        own mean if that is above 1, for the reference whose ratio is largest. The estimate grows if the path is wrong,
-        so a frame counts at most `hold_db` above what was expected of it.
-        """
-        samples = slice(self._past + begin, self._past + begin + self._frame)
-        played = (self._y + self._v)[:, samples.start - self._paths.shape[-1] + 1 : samples.stop]
-        disturbances = self._e[:, begin : begin + self._frame] + through(self._paths, played)
-        power = np.sum(np.mean(disturbances**2, axis=1))
-        references = np.mean(self._x[:, samples] ** 2, axis=1)
-        mean, usual = self._powers[0], self._powers[1:]
-        known = usual > 0.0
-        # Before anything was heard, nothing is expected: the noise may reach the microphones later than the reference.
-        expected = mean * max(np.max(references[known] / usual[known]), 1.0) if mean > 0.0 and known.any() else np.inf
-        self._frames += 1
-        rate = max(self._frame / (self.memory_s * self.fs), 1.0 / self._frames)
-        self._powers += rate * (np.array([min(power, self._hold_share * expected), *references]) - self._powers)
-        return float(expected)
+        self._guard.end_frame()
 
     def _end_block(self) -> None:
         """Test the models on this block, take over better paths, then fit the models to this block too."""
@@ -516,7 +505,7 @@ class PathTracker(WrappedController):
         self._models = [fit.solve(self._paths) for fit in self._fits]
         if any(self._is_better(candidate, self.p_value / len(self._e)) for candidate in self._evidence):
             self._take_over([best for k in range(len(self._e)) if (best := self._best(k)) is not None])
-        for line in (self._x, self._y, self._v):
+        for line in (self._x, self._y, self._v, self._own):
             line[:, : self._past] = line[:, self._block :].copy()
         self._n = 0
 
@@ -568,7 +557,7 @@ class PathTracker(WrappedController):
                 PathChange(self._done / self.fs, float(10 * np.log10(change)), gain, self._memories[i], source, k)
             )
         self._know(new)
-        self._held, self._recovering_from = False, float(np.sum(np.mean(self._e[:, -self._frame :] ** 2, axis=1)))
+        self._guard.begin_anew(self._power_alone())
         shortest = min(i for _, i, _ in better)
         for fit in self._fits[shortest + 1 :]:  # the longer memories hold paths that no longer exist
             fit.take_from(self._fits[shortest])
@@ -578,6 +567,12 @@ class PathTracker(WrappedController):
             if k in changed or i > shortest:
                 evidence.forget()
 
+    def _power_alone(self) -> float:
+        """Return the power, in the last frame of a block, of the error if the controller played alone with a gain of 1."""
+        late = slice(-(self._frame + self._paths.shape[-1] - 1), None)
+        errors = self._e[:, -self._frame :] + through(self._paths, (self._y + self._v - self._own)[:, late])
+        return float(np.mean(np.sum(errors**2, axis=0)))
+
     def listen(self, references: Any, errors: Any) -> None:
         """Let the controller and the fits follow the noise while the output is silent.
 
@@ -586,8 +581,8 @@ class PathTracker(WrappedController):
         self.controller.listen(references, errors)
         for x, e in zip(np.atleast_2d(references).T, np.atleast_2d(errors).T, strict=True):
             at = self._past + self._n
-            self._x[:, at], self._y[:, at], self._v[:, at] = x, 0.0, 0.0
-            self._take(e)
+            self._x[:, at], self._y[:, at], self._v[:, at], self._own[:, at] = x, 0.0, 0.0, 0.0
+            self._take(np.atleast_1d(e), *self._without_probe(np.atleast_1d(e)))
 
     def _rates(self) -> dict[str, float | None]:
         return {"path tracker": self.fs}

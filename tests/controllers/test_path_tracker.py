@@ -62,10 +62,10 @@ def test_after_a_jump_it_is_as_good_as_one_that_was_identified_anew(name: str) -
     assert 2.0 < tracker.changes[0].time_s < 6.0
     assert reduction_db(error, d, 11.0, 12.0) > reduction_db(fresh.error, d[round(2 * FS) :], 9.0, 10.0) - 1.0
     assert misalignment_db(tracker.secondary_path, AFTER) < -8.0
-    # Held at 6 dB; a first estimate that is still rough may let the error grow further before a better one follows.
+    # Held at 6 dB of what is expected, which has grown by then; and what is louder until the guard has turned it down.
     tenths = np.mean(error.reshape(-1, 800) ** 2, axis=1) / np.mean(d**2)
-    assert 10 * np.log10(tenths.max()) < 18.0
-    assert np.abs(emitted).max() < 30.0
+    assert 10 * np.log10(tenths.max()) < 15.0
+    assert np.abs(emitted).max() < 60.0
 
 
 def test_a_drift_over_ten_seconds_is_followed() -> None:
@@ -127,6 +127,22 @@ def test_the_updates_are_held_while_the_error_is_louder_than_without_control() -
         loudest.append(np.mean(error[-800:] ** 2) / np.mean(d**2))
     assert 10 * np.log10(loudest[0]) < 10.0  # 6 dB, and what it overshoots in the first frame
     assert loudest[1] > 2.0 * loudest[0]
+
+
+def test_an_algorithm_that_runs_away_within_milliseconds_is_turned_down() -> None:
+    """A first, rough estimate makes this filter 40 dB louder within a frame; then the weights are held as they are."""
+    x, d = noises(6.0, seed=9)
+    before, after = resonant_path(8.219, 504.68, 0.784, 0.664), resonant_path(3.528, 1216.42, 0.722, 0.577)
+
+    def path_at(t: float) -> np.ndarray:
+        return before if t < 2.0 else after
+
+    tracker = tracked("KF-ANC", before, rng=5009)
+    error, _ = run(tracker, x, d, path_at)
+    tenths = 10 * np.log10(np.mean(error.reshape(-1, 800) ** 2, axis=1) / np.mean(d**2))
+    assert tenths.max() < 16.0
+    assert tenths[-1] < -10.0
+    assert tracker._guard.gain == 1.0  # full volume again
 
 
 def test_the_controller_does_not_hear_the_probe() -> None:
@@ -352,9 +368,8 @@ def test_several_paths_that_jump_are_found(name: str, jump: str) -> None:
     assert 2.0 < tracker.changes[0].time_s < 4.0
     assert tracker.changes[0].microphone == 1 or jump == "all paths"
     assert {change.microphone for change in tracker.changes} >= ({0, 1} if jump == "all paths" else {1})
-    if name == "FxLMS":
-        tenths = np.mean(np.sum(errors**2, axis=0).reshape(-1, 200), axis=1) / np.mean(np.sum(d**2, axis=0))
-        assert 10 * np.log10(tenths.max()) < 18.0
+    tenths = np.mean(np.sum(errors**2, axis=0).reshape(-1, 200), axis=1) / np.mean(np.sum(d**2, axis=0))
+    assert 10 * np.log10(tenths.max()) < 15.0
 
 
 def test_a_drift_of_several_paths_is_followed() -> None:
@@ -475,10 +490,10 @@ def test_noise_that_comes_later_than_the_reference_is_controlled() -> None:
 def test_a_path_that_is_assigned_inherits_nothing_from_the_one_before() -> None:
     """Neither the evidence against it, nor a pause of the adaptation."""
     x = np.random.default_rng(3).standard_normal(3000)
-    tracker = PathTracker(FxLMS(8, [0.0, 1.0, 0.0], step_size=0.002), rng=1, fs=2000.0, p_value=1e-300)
+    tracker = PathTracker(FxLMS(8, [0.0, 1.0, 0.0], step_size=0.02), rng=1, fs=2000.0, p_value=1e-300)
     simulate(tracker, x, disturbance=np.roll(x, 5), secondary_path=[0.0, 0.0, -0.8], fs=2000.0)
-    assert tracker._held
+    assert tracker._guard.held
     assert any(evidence.count for evidence in tracker._evidence.values())
     tracker.secondary_path = [0.0, 0.0, -0.8]
-    assert not tracker._held
+    assert not tracker._guard.held
     assert not any(evidence.count for evidence in tracker._evidence.values())

@@ -1,0 +1,117 @@
+"""A guard against an adaptation that makes the noise louder, for a controller whose secondary path may be wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+LOWEST_GAIN = 1e-3  # so that the control signal comes back in a few frames
+FIRST_AVERAGE = 1 / 8  # of the memory: all frames count alike in the averages until then
+
+
+class DivergenceGuard:
+    """Powers of the signals at the microphones, and what follows from them: whether to adapt, and how loud to play.
+
+    All powers are sums over the microphones. Each is compared, over frames of some milliseconds, with the power of the
+    disturbance that is expected.
+
+    Parameters
+    ----------
+    n_references : int
+        Number of references I.
+    frame : int
+        Number of samples in a frame.
+    memory : float
+        Memory of the averages in samples.
+    share : float
+        Power of the error, relative to the expected power of the disturbance, that is too loud.
+
+    Attributes
+    ----------
+    held : bool
+        Whether the controller must not adapt.
+    """
+
+    def __init__(self, n_references: int, frame: int, memory: float, share: float) -> None:
+        self._frame, self._memory, self._share = frame, memory, share
+        self.held = False
+        self._gain = 1.0  # of the control signal, at the beginning of this frame
+        self._energies = np.zeros(3 + n_references)  # of error, alone, disturbance, references, in this frame
+        self._last_references = np.zeros(n_references)  # their powers in the frame before
+        self._mean = np.zeros(1 + n_references)  # of the powers of disturbance and references
+        self._frames = 0
+        self._harmless = np.inf  # energy of an error in a frame that is not too loud, whatever the references are
+        self._recovering_from = 0.0  # power of the error when a path was taken over, until it has fallen
+
+    @property
+    def gain(self) -> float:
+        """Factor of the control signal. It falls within a frame once the error has more energy than a frame may have."""
+        energy = self._energies[0]
+        if energy <= self._harmless:
+            return self._gain
+        most = self._frame * self._share * self._expected(self._energies[3:] / self._frame)
+        return float(self._gain * min(most / energy, 1.0))
+
+    def allows(self, alone: np.ndarray, references: np.ndarray) -> bool:
+        """Return whether the controller may adapt to the newest error, after the newest references, (I,).
+
+        `alone` is the error, (K,), that the controller would hear if it played alone and with a gain of 1.
+        """
+        energy = self._energies[1] + alone @ alone
+        if not self.held and energy > self._harmless:
+            expected = self._expected((self._energies[3:] + references**2) / self._frame)
+            self.held = self._is_too_loud(energy / self._frame, expected)
+        return not self.held
+
+    def add(self, error: np.ndarray, alone: np.ndarray, disturbance: np.ndarray, references: np.ndarray) -> None:
+        """Add a sample of each signal, (K,), (K,), (K,) and (I,)."""
+        self._energies[:3] += error @ error, alone @ alone, disturbance @ disturbance
+        self._energies[3:] += references**2
+
+    def end_frame(self) -> None:
+        """Decide for the next frame, and take this frame into the averages."""
+        (error, alone, disturbance), references = np.split(self._energies / self._frame, [3])
+        expected = self._expected(references)
+        self._gain = max(self.gain, LOWEST_GAIN)
+        if alone <= self._share * expected:
+            self._recovering_from = 0.0
+        if self.held:
+            # The path may be wrong, so it is not asked what the error would be with a gain of 1. What exceeds the
+            # expected power comes from the control: with it at full volume, the error must be 3 dB below the limit.
+            self.held = bool(error > expected * (1.0 + (0.5 * self._share - 1.0) * self._gain**2))
+        else:
+            self.held = self._is_too_loud(alone, expected)
+        if not self.held and error <= 0.5 * self._share * expected:
+            self._gain = min(2.0 * self._gain, 1.0)
+        self._frames += 1
+        rate = (
+            1.0 / self._frames
+            if self._frames * self._frame <= FIRST_AVERAGE * self._memory
+            else self._frame / self._memory
+        )
+        # A wrong path makes the disturbance estimate louder, so a frame does not count more than the share.
+        heard = min(disturbance, self._share * expected)
+        self._mean += rate * (np.concatenate(([heard], references)) - self._mean)
+        self._last_references = references
+        self._energies = np.zeros_like(self._energies)
+        self._harmless = self._frame * self._share * self._expected(np.zeros_like(references))
+
+    def begin_anew(self, alone: float = 0.0) -> None:
+        """Adapt again, with another path, by which the error alone had this power in the last frame."""
+        self.held, self._recovering_from = False, alone
+
+    def _is_too_loud(self, power: float, expected: float) -> bool:
+        return bool(power > max(self._share * expected, 2.0 * self._recovering_from))
+
+    def _expected(self, references: np.ndarray) -> float:
+        """Return the power of the disturbance that is expected with these powers of the references, (I,).
+
+        It is the mean power of the disturbance estimates, times the ratio of a reference's power, in this frame or the
+        one before, to its own mean if that is above 1, for the reference whose ratio is largest.
+        """
+        disturbance, usual = self._mean[0], self._mean[1:]
+        known = usual > 0.0
+        # Before anything was heard, nothing is expected: the noise may reach the microphones later than the reference.
+        if not (disturbance > 0.0 and known.any()):
+            return np.inf
+        ratios = np.maximum(references, self._last_references)[known] / usual[known]
+        return float(disturbance * max(ratios.max(), 1.0))
