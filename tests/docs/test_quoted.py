@@ -21,7 +21,6 @@ DEFINITIONS = {
         "a second that is 20 dB louder",
         "A sudden rise of 20 dB",
         "it is within 0.5 dB",
-        "those of the run without it, to 1 dB",
     ],
     "limits.md": ["settles to 3 dB of a steady value", "falls to -20 dB of the filter's"],
 }
