@@ -12,7 +12,18 @@ from textwrap import fill
 
 from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
 
-from .studies import amplifier, broadband, constraint, duct, mismatch, multichannel, power_budget, tonal, tracking
+from .studies import (
+    amplifier,
+    broadband,
+    constraint,
+    duct,
+    mismatch,
+    multichannel,
+    power_budget,
+    tonal,
+    tracking,
+    uncertain_path,
+)
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
 SPEED, SWEEP, SOAK = "speed", "sweep", "soak"
@@ -27,6 +38,7 @@ FURTHER: dict[str, Study] = {  # beyond the paper
     "constraint": (constraint.main, constraint.planned_runs),
     "power_budget": (power_budget.main, power_budget.planned_runs),
     "mismatch": (mismatch.main, mismatch.planned_runs),
+    "uncertain_path": (uncertain_path.main, uncertain_path.planned_runs),
     "tracking": (tracking.main, tracking.planned_runs),
     "amplifier": (amplifier.main, amplifier.planned_runs),
     "multichannel": (multichannel.main, multichannel.planned_runs),

@@ -1,0 +1,153 @@
+"""The study of a secondary path that is known within a tolerance: small, and its verdicts from rows made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons import __main__ as command
+from comparisons.studies import cases, uncertain_path
+from comparisons.studies.uncertain_path import (
+    DEFAULT,
+    ERRORS,
+    NO_GUARD,
+    STATED,
+    GuardRow,
+    jobs,
+    seconds_db,
+    stated,
+    verdicts,
+)
+from kfopc_filterpy import SimulationResult, simulate
+from kfopc_filterpy.bench import Runs, StudyReport
+from kfopc_filterpy.paths import PathTolerance
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """Few taps, two seconds, one pair of short paths, two noises, no measured data."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KFOPC_DATA", "/no/such/folder")
+        cases.measured_data.cache_clear()
+        short = {"duct": (np.array([0.0] * 8 + [0.8, 0.4]), np.array([0.0, 0.0, 0.0, 1.0, -0.6]))}
+        noises = uncertain_path.study_noises()
+        assert list(noises) == ["compressor", "band noise", "wide band", "white", "high tone"]
+        patch.setattr(uncertain_path, "study_noises", lambda: {name: noises[name] for name in ("band noise", "white")})
+        patch.setattr(uncertain_path, "paths", lambda: short)
+        patch.setattr(uncertain_path, "N_TAPS", 16)
+        patch.setattr(uncertain_path, "DURATION_S", 2.0)
+        runs = Runs()
+        report = uncertain_path.main(runs)
+        planned = uncertain_path.planned_runs()
+    cases.measured_data.cache_clear()
+    return report, runs.done, planned
+
+
+def test_planned_runs_are_those_taken(small: Any) -> None:
+    _, done, planned = small
+    assert planned == done == 2 * (5 + 2 + 3 * (len(ERRORS) - 1))  # settings, the exact path, the others with 3 guards
+
+
+def test_the_report_is_complete(small: Any) -> None:
+    report: StudyReport = small[0]
+    assert (report.name, report.claims, len(report.verdicts)) == ("uncertain-path", "Findings", 4)
+    assert [item.stem for item in report.figures] == ["worst-seconds"]
+    assert report.notes[0] == "The measured duct was not at hand (KFOPC_DATA): it is left out."
+    rows = report.extra["rows"]
+    keys = [(row["noise"], row["error"], row["guard"]) for row in rows]
+    assert len(keys) == len(set(keys)) == 2 * len(jobs())
+    for table, figure in zip(report.tables, ("worst_second_db", "noise_reduction_db"), strict=True):
+        assert table.headings == ["paths", "noise", "estimate", NO_GUARD, DEFAULT, STATED]
+        line = next(line for line in table.rows if line[1:3] == ["white", "a sample late"])
+        own = {r["guard"]: r[figure] for r in rows if (r["noise"], r["error"]) == ("white", "a sample late")}
+        assert line[3:] == [own[NO_GUARD], own[DEFAULT], own[STATED]]
+
+
+def test_the_guard_costs_something_and_the_rated_power_is_kept(small: Any) -> None:
+    rows = [GuardRow(**row) for row in small[0].extra["rows"] if row["error"] == "exact" and row["noise"] == "white"]
+    bare, guarded = rows
+    assert (bare.guard, guarded.guard) == (NO_GUARD, DEFAULT)
+    assert bare.noise_reduction_db > guarded.noise_reduction_db > 0.0
+    assert bare.power == pytest.approx(1.0, abs=0.1)
+
+
+def test_what_is_stated_covers_the_error() -> None:
+    assert stated("a sample early") == PathTolerance(delay_samples=1.0)
+    assert stated("45 degrees behind") == PathTolerance(phase_deg=45.0)
+    assert stated("exact") == PathTolerance()
+
+
+def test_each_second_counts_by_itself() -> None:
+    x = np.ones(35)
+    result: SimulationResult = simulate(_Half(), x, disturbance=x, secondary_path=[1.0], fs=10.0)
+    assert seconds_db(result) == pytest.approx([20 * np.log10(2.0)] * 2 + [0.0])
+
+
+class _Half:
+    """Plays half of the reference until it has heard two seconds."""
+
+    def __init__(self) -> None:
+        self.n = 0
+
+    def control_signal(self, reference: float) -> float:
+        self.n += 1
+        return 0.5 * reference if self.n <= 20 else 0.0
+
+    def update(self, error: float) -> None:
+        pass
+
+
+# ---- Verdicts on rows made by hand
+
+
+def row(noise: str = "white", error: str = "a sample late", guard: str = DEFAULT, **figures: Any) -> GuardRow:
+    place = {"path": "duct", "noise": noise, "algorithm": "KF-PB", "error": error, "guard": guard}
+    return GuardRow(**place, **{"noise_reduction_db": 5.0, "worst_second_db": 1.0, "power": 1.0} | figures)
+
+
+GOOD = [
+    *(
+        row(noise, error, guard, noise_reduction_db=5.0 if guard == NO_GUARD else 4.6)
+        for noise in ("motor", "white")
+        for error, guard in (
+            ("exact", NO_GUARD),
+            ("exact", DEFAULT),
+            ("a sample late", DEFAULT),
+            ("a sample late", STATED),
+        )
+    ),
+    row(guard=NO_GUARD, worst_second_db=-7.0),
+]
+
+
+def changed(at: int, **figures: Any) -> list[GuardRow]:
+    return [replace(one, **figures) if n == at else one for n, one in enumerate(GOOD)]
+
+
+def test_all_findings_hold_on_good_rows() -> None:
+    found = verdicts(GOOD)
+    assert all(verdict.reproduced for verdict in found)
+    assert "without a guard 1 of 1 do, the worst second is -7.0 dB (duct, white, a sample late)" in found[0].figure
+    assert found[2].figure == "0.40 dB on average, 0.40 dB at most (duct, motor)"
+
+
+@pytest.mark.parametrize(
+    ("at", "figures", "finding"),
+    [
+        (2, {"worst_second_db": -0.1}, 0),
+        (2, {"diverged_at_s": 1.0}, 0),
+        (3, {"worst_second_db": -0.1}, 1),
+        (3, {"worst_second_db": np.nan}, 1),
+        (1, {"noise_reduction_db": 4.4}, 2),
+        (5, {"noise_reduction_db": 4.4}, 3),
+    ],
+)
+def test_each_finding_fails_alone(at: int, figures: dict[str, Any], finding: int) -> None:
+    assert [n for n, verdict in enumerate(verdicts(changed(at, **figures))) if not verdict.reproduced] == [finding]
+
+
+def test_the_command_knows_the_study() -> None:
+    assert command.FURTHER["uncertain_path"] == (uncertain_path.main, uncertain_path.planned_runs)
