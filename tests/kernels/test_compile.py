@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import shutil
@@ -373,6 +374,7 @@ def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
     run(made, n=60)
     run(made, n=60, compiled=False)  # what is made once is there
     held = list(arrays_of(made._state))
+    gc.collect()  # a reference from garbage must not go away meanwhile
     counts = [sys.getrefcount(array) for array in held]
     for _ in range(5):
         run(made, n=60)
@@ -380,6 +382,7 @@ def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
         made.listen(x, d)
         with pytest.raises(ValueError, match="finite square"):
             made.update(1e200)
+    gc.collect()
     assert [a is b for a, b in zip(arrays_of(made._state), held, strict=True)] == [True] * len(held)
     assert [sys.getrefcount(array) for array in held] == counts
 
