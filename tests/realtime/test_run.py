@@ -256,6 +256,26 @@ def test_a_path_is_not_identified_across_a_gap(what: str, message: str, monkeypa
     assert card.states == ["start", "stop", "close"]
 
 
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [("lost_at", "32 samples were lost"), ("dry_at", "the output ran dry")],
+)
+def test_a_round_trip_is_not_measured_across_a_gap(what: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(gaps: list[int]) -> int:
+        card = Card(plant(primary_path=None, disturbance=np.zeros_like(X)))
+        card.lost_at, card.dry_at = [], []
+        setattr(card, what, gaps)
+        monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
+        try:
+            return measure_round_trip(SoundDevice([2], [3], [1], fs=FS, block=32), level=0.1, longest=256)
+        finally:
+            assert card.states == ["start", "stop", "close"]
+
+    assert measured([]) == 65
+    with pytest.raises(FaultError, match=f"{message}.* while the round trip was measured, so it .* run again"):
+        measured([200])
+
+
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     device = SoundDevice([0], [1])
     monkeypatch.setitem(sys.modules, "sounddevice", None)
