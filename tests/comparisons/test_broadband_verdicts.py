@@ -90,7 +90,7 @@ def test_twice_as_fast(opc: float | None, mov: float | None, held: bool) -> None
     verdict = broadband.faster_verdict({"KF-ANC": 1.0, "KF-OPC": opc, "FxLMS": 1.0, "MOV-FxLMS": mov})
     assert verdict.reproduced is held
     both = opc is not None and mov is not None and np.isfinite(opc)
-    assert (f"{mov / opc:.2f} times as long" if both else "no ratio") in verdict.figure  # type: ignore[operator]
+    assert (f"{mov / opc:.2f} times as long" if both else "no ratio") in verdict.figure
 
 
 @pytest.mark.parametrize(("coherence", "held"), [(1.0, True), (0.991, True), (0.989, False), (np.nan, False)])

@@ -150,6 +150,65 @@ def test_the_round_trip_is_measured_under_noise(delay: int) -> None:
     assert measure_round_trip(interface, level=0.3, longest=1000) == delay + 1
 
 
+class Recorded(SimulatedInterface):
+    """A simulated plant that remembers what was played."""
+
+    def start(self) -> None:
+        super().start()
+        self.played: list[Any] = []
+
+    def write(self, control_signals: Any) -> None:
+        self.played.append(np.array(control_signals))
+        super().write(control_signals)
+
+
+def test_the_round_trip_is_measured_with_one_loudspeaker_after_the_other_at_the_level_asked_for() -> None:
+    paths = np.zeros((1, 2, 30))
+    paths[0, 0, 20], paths[0, 1, 5] = 1.0, 1.0  # the second one is nearer
+    interface = Recorded(np.zeros(16000), paths, disturbance=np.zeros((1, 16000)), fs=FS, block=32, latency=64)
+    assert measure_round_trip(interface, level=0.3, seconds=0.5, longest=256) == 64 + 5
+    played = np.concatenate(interface.played, axis=1)
+    n = -(-(4000 + 256) // 32) * 32
+    np.testing.assert_allclose(np.std(played[0, :4256]), 0.3, rtol=0.04)  # 4256 samples: 3.5 standard errors
+    np.testing.assert_array_equal(played[1, n:], played[0, :n])
+    assert not np.any(played[0, n:])
+    assert not np.any(played[1, :n])
+
+
+def test_a_round_trip_needs_as_much_time_as_the_longest_one() -> None:
+    def measured(seconds: float) -> int:
+        silent = np.zeros(16000)
+        interface = SimulatedInterface(silent, S, disturbance=silent, fs=FS, block=32, latency=64)
+        return measure_round_trip(interface, level=0.1, seconds=seconds, longest=1000)
+
+    assert measured(1000 / FS) == 65
+    with pytest.raises(ValueError, match=r"seconds must be at least longest / fs, 0\.125 s, got 0\.124875 s"):
+        measured(999 / FS)
+
+
+def test_a_run_takes_the_blocks_that_its_time_needs() -> None:
+    def blocks(samples: int) -> int:
+        controller = FxLMS(24, plant().total_secondary_path, step_size=1e-3)
+        report = run(
+            controller, plant(), amplitude_limit=8.0, seconds=samples / FS, listen_s=0.5, fade_s=32 / FS, pause_s=0.1
+        )
+        return report.blocks
+
+    assert [blocks(samples) for samples in (319, 320, 321)] == [11, 11, 12]  # the last one fades out
+
+
+def test_an_error_in_a_report_is_raised_after_the_loudspeakers_have_faded_out() -> None:
+    def fails(levels: Levels) -> None:
+        raise RuntimeError("disk full")
+
+    interface = plant()
+    controller = FxLMS(24, interface.total_secondary_path, step_size=2e-3)
+    with pytest.raises(RuntimeError, match="disk full"):
+        run(controller, interface, amplitude_limit=8.0, seconds=3.0, listen_s=0.5, on_report=fails, fade_s=0.02)
+    assert np.any(interface._queue[:, :32])
+    assert not np.any(interface._queue[:, -32:])
+
+
 def test_a_run_stops_on_a_fault_when_told_to_and_on_ctrl_c() -> None:
     wrong = FxLMS(24, np.concatenate((np.zeros(64), -S)), step_size=5e-3)
     settings: dict[str, Any] = {"amplitude_limit": 3.0, "listen_s": 0.5, "pause_s": 0.1, "check_causality": False}
@@ -190,7 +249,7 @@ class Card:
         self.interface = interface
         self.asked: dict[str, Any] = {}
         self.states: list[str] = []
-        self.reads, self.lost_at, self.dry_at = 0, [100], [120, 700, 701]  # block numbers
+        self.reads, self.lost_at, self.dry_at, self.repeated_at = 0, [100], [120, 700, 701], []  # block numbers
         self.ahead: list[Any] = []
 
     def __call__(self, **asked: Any) -> Card:
@@ -205,9 +264,10 @@ class Card:
         block = self.interface.read()
         assert block is not None
         self.reads += 1
-        frames = np.zeros((n, 4), np.float32)
-        frames[:, 2], frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
-        return frames, self.reads in self.lost_at
+        if self.reads not in self.repeated_at:
+            self.frames = np.zeros((n, 4), np.float32)
+            self.frames[:, 2], self.frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
+        return self.frames, self.reads in self.lost_at
 
     def write(self, frames: Any) -> bool:
         assert frames.dtype == np.float32
@@ -241,6 +301,22 @@ def test_a_sound_card_is_driven_through_its_stream(monkeypatch: pytest.MonkeyPat
     assert report.health.counts == {"output underflow": 1}
     (event,) = report.health.events
     assert event.time_s == pytest.approx((700 - card.reads_before_control) * 32 / FS)
+
+
+def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = Card(plant())
+    card.lost_at, card.dry_at, card.repeated_at = [640, 641], [], [680]
+    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
+    reports: list[Levels] = []
+    device = SoundDevice([2], [3], [1], fs=FS, block=32)
+    report = started(
+        device, step_size=0.2, amplitude_limit=0.8, seconds=1.6, on_report=reports.append, report_every_s=0.8
+    )
+    assert report.health.samples == {"lost": 2 * 32, "repeated": 2 * 32}  # of the reference and of the error
+    assert report.lost == reports[-1].lost == 64
+    # The time goes on while samples are lost; a report is due after so many that were heard.
+    assert [levels.time_s for levels in reports] == [0.8 + 64 / FS, 1.6 + 64 / FS]
+    assert report.seconds == pytest.approx(1.6 + 64 / FS)
 
 
 @pytest.mark.parametrize(
