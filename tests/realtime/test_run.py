@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
 from kfopc_filterpy.cli import main
 from kfopc_filterpy.realtime import (
+    Block,
     FaultError,
     Interface,
     Levels,
@@ -25,6 +26,7 @@ from kfopc_filterpy.realtime import (
     measure_round_trip,
     run,
 )
+from kfopc_filterpy.realtime.running import _Watch
 from kfopc_filterpy.signals import write_wav
 
 FS = 8000.0
@@ -195,6 +197,26 @@ def test_a_run_takes_the_blocks_that_its_time_needs() -> None:
         return report.blocks
 
     assert [blocks(samples) for samples in (319, 320, 321)] == [11, 11, 12]  # the last one fades out
+
+
+@pytest.mark.parametrize("blocks", [1, 3, 101, 4094, 4095, 9999, 20001])
+def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int) -> None:
+    """The error power is 1, then 3 and the output power 5, then 2; seconds are joined in runs of more than 2048 s."""
+    session: Any = SimpleNamespace(overruns=0, blocks=blocks, lost=0, underflows=0, load=0.0, load_since_report=0.0)
+    supervisor: Any = SimpleNamespace(
+        fs=4.0, n_references=1, n_microphones=1, n_loudspeakers=1, controller=None, health=None
+    )
+    silence: Any = SimpleNamespace(e=np.full((1, 10), 2.0))  # a power of 4 before
+    watch = _Watch(session, supervisor, silence, 1e9, None)
+    ones = np.ones((1, 2))  # two blocks are a second
+    for n in range(blocks):
+        late = 2 * n >= blocks - 1
+        watch.add(Block(ones, np.sqrt(3.0 if late else 1.0) * ones), np.sqrt(2.0 if late else 5.0) * ones)
+    report = watch.report("end", None, np.nan)
+    assert report.seconds == blocks / 2
+    # The half is one of whole parts, of which there are 1024 or more in a long run, and 50 in 101 blocks.
+    np.testing.assert_allclose(report.powers, 2.0, rtol=0.05 if blocks > 3 else 0.5)
+    np.testing.assert_allclose(4.0 / 10 ** (report.reduction_db / 10), 3.0, rtol=0.05 if blocks > 3 else 0.5)
 
 
 def test_an_error_in_a_report_is_raised_after_the_loudspeakers_have_faded_out() -> None:
