@@ -26,7 +26,7 @@ from kfopc_filterpy.realtime import (
     measure_round_trip,
     run,
 )
-from kfopc_filterpy.realtime.running import _Watch
+from kfopc_filterpy.realtime.running import _first_arrival, _Watch
 from kfopc_filterpy.signals import write_wav
 
 FS = 8000.0
@@ -135,6 +135,21 @@ def test_a_plant_that_is_not_causal_is_refused_with_the_way_out() -> None:
     assert report.possible_db > 10.0
     report = started(plant(block=64, latency=192), seconds=0.5, check_causality=False)
     assert np.isnan(report.possible_db)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_the_first_arrival_is_of_the_nearest_loudspeaker_at_any_level(scale: float) -> None:
+    near, far = [0.0, 0.049, 0.051, 0.3, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]  # 5 % of the largest tap of all counts
+    assert _first_arrival(scale * np.array([[near, far]])) == 2
+    assert _first_arrival(scale * np.array(far)) == 4
+
+
+def test_simulated_noise_may_repeat_itself_from_block_to_block() -> None:
+    periodic = np.tile(np.random.default_rng(2).standard_normal(32), 500)
+    interface = SimulatedInterface(periodic, S, primary_path=PRIMARY, fs=FS, block=32, latency=64)
+    silent = FxLMS(8, interface.total_secondary_path, step_size=1e-12)  # so that the errors repeat themselves too
+    report = run(silent, interface, amplitude_limit=1.0, seconds=1.0, listen_s=0.1, check_causality=False)
+    assert not report.health.counts
 
 
 def test_a_loudspeaker_that_is_not_heard_is_a_fault() -> None:
