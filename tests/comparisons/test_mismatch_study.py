@@ -242,6 +242,9 @@ def test_the_loss_to_a_wrong_gain_is_against_the_exact_path(left_db: float, met:
 def test_one_divergence_is_one_too_many() -> None:
     rows = [_row(algorithm=name) for name in mismatch.KEEPS_POWER] + [_row(algorithm="FxLMS", tuned_with=EXACT)]
     assert mismatch._bounded(rows).reproduced
+    loud = mismatch._bounded([*rows, _row(algorithm="KF-PB", noise_reduction_db=-3.5)])
+    assert loud.reproduced  # louder, but bounded
+    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in loud.figure
     assert not mismatch._bounded([*rows, _row(algorithm="KF-PB", diverged_at_s=2.0)]).reproduced
     assert mismatch._bounded([*rows, _row(algorithm="FxLMS", tuned_with=EXACT, diverged_at_s=2.0)]).reproduced
 
