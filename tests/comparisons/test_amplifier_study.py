@@ -187,6 +187,14 @@ def test_overrunning_is_claimed_from_5_db_on(overdrive_db: float, met: bool) -> 
     assert amplifier._overruns(rows, "KF-ANC").reproduced == met
 
 
+def test_overruns_are_told_of_the_runs_that_went_on() -> None:
+    rows = [_row("KF-ANC", asked_power=9.0, weight_growth=1.5), _row("KF-ANC", asked_power=4.0, weight_growth=1.25)]
+    rows += [_row("KF-ANC", diverged_at_s=at, asked_power=np.nan, weight_growth=np.nan) for at in (0.5, 0.0, 1.0)]
+    figure = amplifier._overruns(rows, "KF-ANC").figure
+    assert figure.startswith("5 of 5 runs; their weights end up asking for 4 to 9 times the power")
+    assert "and grow 1.25 to 1.5 times over the second half; 3 passed 1e6 times the rated amplitude" in figure
+
+
 def test_overruns_of_no_run_prove_nothing() -> None:
     assert not amplifier._overruns([_row("KF-ANC", 0.0, asked_power=9.0)], "KF-ANC").reproduced
 
