@@ -212,6 +212,23 @@ def test_harmonics_are_compared_at_each_overdrive(level: float, met: bool) -> No
     assert amplifier._clean(rows).reproduced == met
 
 
+@pytest.mark.parametrize(
+    ("anc_db", "pb_db", "said"),
+    [
+        (-20.0, -60.0, "by 40.0 dB at least (KF-PB, duct, hard clip, 0.5 dB), by 50.0 dB at most"),
+        (np.nan, -20.0, "by 50.0 dB at least (KF-OPC, duct, hard clip, 10.0 dB), by inf dB at most"),
+        (-20.0, np.nan, "by -inf dB at least (KF-PB, duct, hard clip, 0.5 dB), by 50.0 dB at most"),
+        (np.nan, np.nan, "by -inf dB at least"),
+    ],
+)
+def test_harmonics_of_a_run_that_diverged_are_behind_all(anc_db: float, pb_db: float, said: str) -> None:
+    rows = [_row("KF-ANC"), _row("KF-OPC", harmonics_db=-70.0)]
+    rows += [_row("KF-ANC", 0.5, harmonics_db=anc_db), _row("KF-PB", 0.5, harmonics_db=pb_db)]
+    verdict = amplifier._clean(rows)
+    assert verdict.reproduced == np.isfinite(pb_db)
+    assert verdict.figure.startswith(said)
+
+
 @pytest.mark.parametrize(("power", "met"), [(1.02, True), (1.021, False), (np.nan, False)])
 def test_power_is_kept_at_every_overdrive(power: float, met: bool) -> None:
     rows = [_row("KF-OPC"), _row("KF-PB"), _row("KF-PB", 20.0, power=power)]
