@@ -214,9 +214,11 @@ def test_a_run_takes_the_blocks_that_its_time_needs() -> None:
     assert [blocks(samples) for samples in (319, 320, 321)] == [11, 11, 12]  # the last one fades out
 
 
-@pytest.mark.parametrize("blocks", [1, 3, 101, 4094, 4095, 9999, 20001])
-def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int) -> None:
-    """The error power is 1, then 3 and the output power 5, then 2; seconds are joined in runs of more than 2048 s."""
+@pytest.mark.parametrize(
+    ("blocks", "begin"), [(1, 0), (3, 2), (4, 2), (101, 50), (4094, 2046), (4095, 2048), (9999, 5000), (20001, 10000)]
+)
+def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int, begin: int) -> None:
+    """The error power rises and the output power falls; the half is one of seconds, joined in runs beyond 2048 s."""
     session: Any = SimpleNamespace(overruns=0, blocks=blocks, lost=0, underflows=0, load=0.0, load_since_report=0.0)
     supervisor: Any = SimpleNamespace(
         fs=4.0, n_references=1, n_microphones=1, n_loudspeakers=1, controller=None, health=None
@@ -224,14 +226,42 @@ def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int) ->
     silence: Any = SimpleNamespace(e=np.full((1, 10), 2.0))  # a power of 4 before
     watch = _Watch(session, supervisor, silence, 1e9, None)
     ones = np.ones((1, 2))  # two blocks are a second
-    for n in range(blocks):
-        late = 2 * n >= blocks - 1
-        watch.add(Block(ones, np.sqrt(3.0 if late else 1.0) * ones), np.sqrt(2.0 if late else 5.0) * ones)
+    rising = (np.arange(blocks) + 0.5) / blocks
+    falling = 1.0 - rising
+    for of_error, of_output in zip(rising, falling, strict=True):
+        watch.add(Block(ones, np.sqrt(of_error) * ones), np.sqrt(of_output) * ones)
     report = watch.report("end", None, np.nan)
     assert report.seconds == blocks / 2
-    # The half is one of whole parts, of which there are 1024 or more in a long run, and 50 in 101 blocks.
-    np.testing.assert_allclose(report.powers, 2.0, rtol=0.05 if blocks > 3 else 0.5)
-    np.testing.assert_allclose(4.0 / 10 ** (report.reduction_db / 10), 3.0, rtol=0.05 if blocks > 3 else 0.5)
+    rtol = 1e-12 if blocks < 4096 else 5e-3  # a joined part is less than a thousandth of the run
+    np.testing.assert_allclose(report.powers, np.mean(falling[begin:]), rtol=rtol)
+    np.testing.assert_allclose(4.0 / 10 ** (report.reduction_db / 10), np.mean(rising[begin:]), rtol=rtol)
+    assert len(watch._parts) <= 2048  # memory is bounded
+
+
+def test_a_report_has_the_levels_since_the_last_one() -> None:
+    session: Any = SimpleNamespace(overruns=0, blocks=0, lost=0, underflows=0, load=0.0, load_since_report=0.0)
+    supervisor: Any = SimpleNamespace(
+        fs=4.0,
+        n_references=1,
+        n_microphones=1,
+        n_loudspeakers=1,
+        controller=SimpleNamespace(rated_power=0.5),
+        health=None,
+    )
+    silence: Any = SimpleNamespace(e=np.full((1, 10), 2.0))  # a power of 4 before
+    reports: list[Levels] = []
+    watch = _Watch(session, supervisor, silence, 1.0, reports.append)
+    for n, power in enumerate([1.0, 3.0, 4.0, 4.0, 10.0, 30.0]):  # blocks of half a second
+        session.load_since_report = max(session.load_since_report, 0.1 * (6 - n))
+        watch.add(Block(np.full((1, 2), 10.0), np.full((1, 2), np.sqrt(power))), np.full((1, 2), np.sqrt(2.0 * power)))
+    assert [levels.time_s for levels in reports] == [1.0, 2.0, 3.0]
+    error = np.array([2.0, 4.0, 20.0])
+    np.testing.assert_allclose([levels.powers[0] for levels in reports], 2.0 * error)
+    np.testing.assert_allclose([levels.error_level_db[0] for levels in reports], 10 * np.log10(error))
+    np.testing.assert_allclose([levels.reduction_db[0] for levels in reports], 10 * np.log10(4.0 / error))
+    np.testing.assert_allclose([levels.reference_level_db[0] for levels in reports], 20.0)
+    np.testing.assert_allclose([levels.load for levels in reports], [0.6, 0.4, 0.2])
+    assert reports[0].rated_power == [0.5]
 
 
 def test_an_error_in_a_report_is_raised_after_the_loudspeakers_have_faded_out() -> None:
