@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._validate import as_count
+from ._validate import as_count, as_positive
 
 if TYPE_CHECKING:
     from .signals import Recording
@@ -146,6 +146,9 @@ def _rating(options: argparse.Namespace) -> list[Any]:
     """Return the ratings of one loudspeaker."""
     from .power import AmplifierRating, LoudspeakerRating
 
+    for name, value in (("--ohm", options.ohm), ("--volts-per-unit", options.volts_per_unit)):
+        if value is not None:  # also where no rating uses it
+            as_positive(value, name)
     ratings: list[Any] = []
     volts = 1.0 if options.volts_per_unit is None else options.volts_per_unit
     if options.watt is not None or options.peak_volts is not None:

@@ -115,6 +115,11 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", *SCENE, "--loudspeaker-watt", "1"], "a loudspeaker's rating needs --ohm"),
         (["verdict", *SCENE, "--rated-power", "1", "--ohm", "8", "--x-max-mm", "1"], "must be given together"),
         (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "names must be one of"),
+        (
+            ["compare", *SCENE, "--rated-power", "1", "--ohm", "-1", "--algorithm", "none"],
+            "--ohm must be greater than 0",
+        ),
+        (["verdict", *SCENE, "--rated-power", "1", "--volts-per-unit", "0"], "--volts-per-unit must be greater than 0"),
         (["paths", "convert", "S.wav", "S.xyz"], "must end in .wav, .npy, .csv, .txt"),
         (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "n_taps must be at least 1"),
     ],

@@ -119,7 +119,9 @@ def refused(call: Callable[[], Any]) -> tuple[Any, Exception | None]:
 def magnitude(value: Any) -> float:
     """Return the largest magnitude of an argument; 0 if it is no number, which is refused."""
     try:
-        numbers = np.abs(np.asarray(value, dtype=np.float64))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # complex numbers, which are refused
+            numbers = np.abs(np.asarray(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
         return 0.0
     return float(np.max(numbers, where=np.isfinite(numbers), initial=0.0))
@@ -142,7 +144,7 @@ def trace(controller: Any, n: int = 12) -> np.ndarray:
 def test_a_controller_refuses_and_goes_on_or_gives_finite_numbers(name: str) -> None:
     for rng in rounds(4):
         controller = CONTROLLERS[name]()
-        several, largest = controller.multichannel, 0.0
+        several, largest, loudest = controller.multichannel, 0.0, 0.0  # of the references, of the errors
         for _ in range(20):
             before, method = deepcopy(controller), rng.choice(["control_signal", "update", "process"])
             if method == "process":
@@ -158,14 +160,21 @@ def test_a_controller_refuses_and_goes_on_or_gives_finite_numbers(name: str) -> 
                 given = (anything(rng, channels),)
                 y, error = refused(lambda: getattr(controller, method)(*given))  # noqa: B023 - called at once
             if error is not None and not isinstance(error, RefusedUpdate):
-                np.testing.assert_array_equal(trace(controller), trace(before), err_msg=f"{method}{given}")
+                # A Kalman filter takes the prediction of a refused sample back by subtraction, which rounds.
+                rtol = 1e-6 if name == "KF-OPC" else 0.0
+                np.testing.assert_allclose(
+                    trace(controller), trace(before), rtol=rtol, atol=0, err_msg=f"{method}{given}"
+                )
             if method != "update":
                 largest = max(largest, magnitude(given[0]))
+            if method != "control_signal":
+                loudest = max(loudest, magnitude(given[-2 if method == "process" else 0]))
             weights = max(np.max(np.abs(one.weights)) for one in (before, controller))
             # Without a limiter, weights of 1e200 or a reference of 1e300 are allowed; only then an output can overflow.
             if y is not None and float(weights) * largest < 1e300:
                 assert np.all(np.isfinite(y)), (method, given)
-        assert np.all(np.isfinite(controller.weights))
+            # CONTRIBUTING names it: the products of an LMS step can overflow. Until then, weights are finite.
+            assert np.all(np.isfinite(controller.weights)) or largest * loudest > 1e300, (method, given)
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)

@@ -378,7 +378,8 @@ def _jump(rows: Sequence[TrackingRow]) -> Verdict:
 
 def _change(rows: Sequence[TrackingRow]) -> Verdict:
     own = [row for row in rows if row.event in CHANGES and row.algorithm in CONSTRAINED]
-    worst = max(own, key=lambda row: row.stretch_worst_window["changed"])
+    powers = [row.stretch_worst_window["changed"] for row in own]
+    worst = own[int(np.argmax(powers))]  # NaN, of a run that diverged, counts as the largest
     before = _by(rows, "KF-ANC")
     unconstrained = max(row.stretch_worst_window["changed"] for (event, _), row in before.items() if event in CHANGES)
     return Verdict(

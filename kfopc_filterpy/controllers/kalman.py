@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -222,7 +223,8 @@ class KalmanController(FilteredReferenceController):
         elif self._adapt(error):
             self.estimator.after_compiled(state.weights.copy())
         else:
-            self._update_through_estimator(error)  # raises, with the reason
+            # This raises, with the reason. On a copy, because its prediction would stay.
+            deepcopy(self)._update_through_estimator(error)
             raise ValueError(NO_SOLUTION)
 
     def _update_through_estimator(self, error: float) -> None:

@@ -223,6 +223,22 @@ class _Session:
         x, e = (_finite(np.concatenate([block[i] for block in heard], axis=1)) for i in (0, 1))
         return _Heard(x, e, padded[:, : x.shape[1]])
 
+    @contextmanager
+    def without_gaps(self, task: str) -> Iterator[None]:
+        """Raise FaultError if samples are lost, or the output runs dry, during a task: its result would be wrong."""
+        lost, underflows = self.lost, self.underflows
+        yield
+        lost, underflows = self.lost - lost, self.underflows - underflows
+        if lost:
+            raise FaultError(
+                f"{lost} samples were lost while {task}, so it would be wrong: use longer blocks, or run again"
+            )
+        if underflows:
+            raise FaultError(
+                f"the output ran dry {underflows} time(s) while {task}, so it would be wrong: use longer blocks or more of "
+                "them ahead, or run again"
+            )
+
     def step(self, supervisor: Supervisor) -> tuple[Any, np.ndarray] | None:
         """Process a block; return it with its control signals, None at the end."""
         block = self.interface.read()
@@ -277,7 +293,7 @@ def measure_round_trip(
     Raises
     ------
     FaultError
-        No loudspeaker is heard: the correlation has no clear peak.
+        No loudspeaker is heard: the correlation has no clear peak. Or samples were lost, or the output ran dry.
     TypeError, ValueError
         A level or time that is not positive.
 
@@ -298,11 +314,12 @@ def measure_round_trip(
     try:
         session = _Session(interface)
         arrivals = []
-        for j in range(interface.n_loudspeakers):
-            signal = np.zeros((interface.n_loudspeakers, n))
-            signal[j] = noise
-            heard = session.play(signal)
-            arrivals += [_arrival(heard.y[j], e, longest) for e in heard.e]
+        with session.without_gaps("the round trip was measured"):
+            for j in range(interface.n_loudspeakers):
+                signal = np.zeros((interface.n_loudspeakers, n))
+                signal[j] = noise
+                heard = session.play(signal)
+                arrivals += [_arrival(heard.y[j], e, longest) for e in heard.e]
     finally:
         interface.stop()
     clear = [arrival for arrival in arrivals if arrival is not None]
@@ -638,22 +655,13 @@ def _identified(
 ) -> IdentifiedPlant:
     """Play noise from each loudspeaker in turn, and return what this tells about the plant."""
     interface = session.interface
-    n, recordings, lost, underflows = round(identify_s * interface.fs), [], session.lost, session.underflows
-    for j in range(interface.n_loudspeakers):
-        signal = np.zeros((interface.n_loudspeakers, n))
-        signal[j] = np.clip(level * rng.standard_normal(n), -limits[j], limits[j])
-        recordings.append(session.play(signal))
-        session.play(np.zeros((interface.n_loudspeakers, round(0.1 * interface.fs))))  # let it die away
-    if session.lost > lost:
-        raise FaultError(
-            f"{session.lost - lost} samples were lost while the path was identified, so it would be wrong: use "
-            "longer blocks, or run again"
-        )
-    if session.underflows > underflows:
-        raise FaultError(
-            f"the output ran dry while the path was identified, {session.underflows - underflows} time(s), so the path "
-            "would be wrong: use longer blocks or more of them ahead, or run again"
-        )
+    n, recordings = round(identify_s * interface.fs), []
+    with session.without_gaps("the path was identified"):
+        for j in range(interface.n_loudspeakers):
+            signal = np.zeros((interface.n_loudspeakers, n))
+            signal[j] = np.clip(level * rng.standard_normal(n), -limits[j], limits[j])
+            recordings.append(session.play(signal))
+            session.play(np.zeros((interface.n_loudspeakers, round(0.1 * interface.fs))))  # let it die away
     longest = n // 4
     arrivals = [_arrival(r.y[j], e, longest) for j, r in enumerate(recordings) for e in r.e]
     clear = [arrival for arrival in arrivals if arrival is not None]

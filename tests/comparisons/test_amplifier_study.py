@@ -187,6 +187,14 @@ def test_overrunning_is_claimed_from_5_db_on(overdrive_db: float, met: bool) -> 
     assert amplifier._overruns(rows, "KF-ANC").reproduced == met
 
 
+def test_overruns_are_told_of_the_runs_that_went_on() -> None:
+    rows = [_row("KF-ANC", asked_power=9.0, weight_growth=1.5), _row("KF-ANC", asked_power=4.0, weight_growth=1.25)]
+    rows += [_row("KF-ANC", diverged_at_s=at, asked_power=np.nan, weight_growth=np.nan) for at in (0.5, 0.0, 1.0)]
+    figure = amplifier._overruns(rows, "KF-ANC").figure
+    assert figure.startswith("5 of 5 runs; their weights end up asking for 4 to 9 times the power")
+    assert "and grow 1.25 to 1.5 times over the second half; 3 passed 1e6 times the rated amplitude" in figure
+
+
 def test_overruns_of_no_run_prove_nothing() -> None:
     assert not amplifier._overruns([_row("KF-ANC", 0.0, asked_power=9.0)], "KF-ANC").reproduced
 
@@ -202,6 +210,23 @@ def test_harmonics_are_compared_at_each_overdrive(level: float, met: bool) -> No
     rows = [_row("KF-ANC"), _row("KF-OPC", harmonics_db=-70.0), _row("KF-PB", harmonics_db=level)]
     rows += [_row("KF-ANC", 0.0, harmonics_db=-62.0), _row("KF-OPC", 0.0, harmonics_db=-62.0)]  # nothing is clipped
     assert amplifier._clean(rows).reproduced == met
+
+
+@pytest.mark.parametrize(
+    ("anc_db", "pb_db", "said"),
+    [
+        (-20.0, -60.0, "by 40.0 dB at least (KF-PB, duct, hard clip, 0.5 dB), by 50.0 dB at most"),
+        (np.nan, -20.0, "by 50.0 dB at least (KF-OPC, duct, hard clip, 10.0 dB), by inf dB at most"),
+        (-20.0, np.nan, "by -inf dB at least (KF-PB, duct, hard clip, 0.5 dB), by 50.0 dB at most"),
+        (np.nan, np.nan, "by -inf dB at least"),
+    ],
+)
+def test_harmonics_of_a_run_that_diverged_are_behind_all(anc_db: float, pb_db: float, said: str) -> None:
+    rows = [_row("KF-ANC"), _row("KF-OPC", harmonics_db=-70.0)]
+    rows += [_row("KF-ANC", 0.5, harmonics_db=anc_db), _row("KF-PB", 0.5, harmonics_db=pb_db)]
+    verdict = amplifier._clean(rows)
+    assert verdict.reproduced == np.isfinite(pb_db)
+    assert verdict.figure.startswith(said)
 
 
 @pytest.mark.parametrize(("power", "met"), [(1.02, True), (1.021, False), (np.nan, False)])

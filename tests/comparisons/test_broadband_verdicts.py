@@ -89,9 +89,11 @@ def test_not_slower(opc: float | None, anc: float | None, held: bool) -> None:
 def test_twice_as_fast(opc: float | None, mov: float | None, held: bool) -> None:
     verdict = broadband.faster_verdict({"KF-ANC": 1.0, "KF-OPC": opc, "FxLMS": 1.0, "MOV-FxLMS": mov})
     assert verdict.reproduced is held
+    both = opc is not None and mov is not None and np.isfinite(opc)
+    assert (f"{mov / opc:.2f} times as long" if both else "no ratio") in verdict.figure
 
 
-@pytest.mark.parametrize(("coherence", "held"), [(1.0, True), (0.991, True), (0.989, False), (np.nan, False)])
+@pytest.mark.parametrize(("coherence", "held"), [(1.0, True), (0.991, True), (0.99, False), (np.nan, False)])
 def test_linear(coherence: float, held: bool) -> None:
     assert broadband.linear_verdict(coherence, 0.5, 6.0).reproduced is held
 
@@ -112,6 +114,7 @@ def clipped(**own: list[float]) -> dict[str, dict[str, Any]]:
     [
         ({}, True),
         ({"first_second_noise_reduction_db": [3.61, 4.8]}, True),
+        ({"first_second_noise_reduction_db": [4.0, 4.8], "steady_noise_reduction_db": [5.0, 4.6]}, True),  # 1 dB less
         ({"first_second_noise_reduction_db": [3.59, 4.8]}, False),  # one seed will do
         ({"first_second_noise_reduction_db": [4.8, 3.59]}, False),
         ({"first_second_noise_reduction_db": [4.8, np.nan]}, False),
@@ -125,6 +128,13 @@ def test_clipped(own: dict[str, list[float]], held: bool) -> None:
     verdict = broadband.clipped_verdict(clipped(**own), 1.265)
     assert verdict.reproduced is held
     assert "15.7 % of the samples are clipped" in verdict.figure
+    # The first second of the q of a linear amplifier and of the known amplifier, which stay as they are.
+    assert verdict.figure.count("4.7 to 4.8 dB, control signal up to 3.9 to 4.7") >= 2
+
+
+def test_the_power_of_a_run_that_diverged_is_undefined() -> None:
+    assert broadband._power({"output_power": 0.81234}) == "0.812"
+    assert broadband._power({"output_power": np.nan}) == broadband._power({"output_power": np.inf}) == "undefined"
 
 
 def test_the_first_second_is_a_whole_second_and_no_more() -> None:

@@ -259,11 +259,11 @@ def test_verdict_on_varying_noise(changes: dict, kept: bool) -> None:
     ("changes", "kept"),
     [
         ({}, True),
-        ({"loss_db": 0.99}, True),
+        ({"loss_db": 1.0}, True),
         ({"loss_db": 1.01}, False),
-        ({"loss_db": -0.99}, True),
+        ({"loss_db": -1.0}, True),
         ({"loss_db": -1.01}, False),
-        ({"weight_db": 0.99}, True),
+        ({"weight_db": 1.0}, True),
         ({"weight_db": 1.01}, False),
         ({"weight_db": -1.01}, False),
     ],
@@ -351,6 +351,24 @@ def test_verdict_on_convergence() -> None:
     assert not constraint._convergence_claim(kept | {"c": {"KF-PB": 1.51, "KF-ANC": 1.0}}).reproduced
     for order in (kept | {"c": {"KF-PB": 1.6, "KF-ANC": 1.0}}, {"c": {"KF-PB": 1.6, "KF-ANC": 1.0}} | kept):
         assert not constraint._convergence_claim(order).reproduced
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "ratio"),
+    [
+        (0.3, 0.2, 1.5),
+        (0.0, 0.2, 0.0),
+        (0.0, 0.0, 0.0),  # both at once
+        (0.1, 0.0, np.inf),
+        (None, 0.2, np.inf),
+        (np.nan, 0.0, np.inf),
+        (5.0, None, 0.0),
+        (5.0, np.nan, 0.0),
+        (None, None, 1.0),  # neither settles: no slower
+    ],
+)
+def test_ratio_of_convergence_times(ours: float | None, theirs: float | None, ratio: float) -> None:
+    assert constraint._ratio(ours, theirs) == pytest.approx(ratio)
 
 
 def test_a_diverged_run_is_told_in_the_table_of_amplifiers() -> None:

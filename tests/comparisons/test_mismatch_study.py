@@ -199,10 +199,23 @@ def test_the_bound_of_90_degrees_needs_both_sides(below_db: float, above_db: flo
         _row(amount=105.0, noise_reduction_db=20.0, noise="tone"),  # another noise
         _row(amount=105.0, noise_reduction_db=20.0, tuned_with=EXACT),  # another tuning
     ]
-    assert mismatch._quarter_turn(rows, "FxLMS").reproduced == met
+    verdict = mismatch._quarter_turn(rows, "FxLMS")
+    assert verdict.reproduced == met
+    # The least of those below, and the best of those above.
+    assert verdict.figure.startswith(
+        f"{1 + (below_db > 0.0)} of 2 runs below reduce it, the least by {below_db:.1f} dB"
+    )
+    assert "phase +89 degrees" in verdict.figure
+    best = "-inf" if np.isnan(above_db) else f"{above_db:.1f}"
+    assert f"{int(above_db > 0.0)} of 1 above, the best of which is {best} dB" in verdict.figure
 
 
-@pytest.mark.parametrize(("left_db", "met"), [(5.1, True), (4.9, False), (np.nan, False)])
+def test_the_best_above_90_degrees_is_told() -> None:
+    rows = [_row(amount=0.0), *(_row(amount=a, noise_reduction_db=-a) for a in (120.0, 100.0, 150.0))]
+    assert "0 of 3 above, the best of which is -100.0 dB" in mismatch._quarter_turn(rows, "FxLMS").figure
+
+
+@pytest.mark.parametrize(("left_db", "met"), [(5.1, True), (5.0, True), (4.9, False), (np.nan, False)])
 def test_the_loss_to_a_wrong_gain_is_against_the_exact_path(left_db: float, met: bool) -> None:
     rows = [
         _row("gain", amount, name, tuned_with=EXACT)
@@ -219,14 +232,23 @@ def test_the_loss_to_a_wrong_gain_is_against_the_exact_path(left_db: float, met:
             diverged_at_s=0.1 if np.isnan(left_db) else None,
         )
     )
-    assert mismatch._gain(rows).reproduced == met
+    verdict = mismatch._gain(rows)
+    assert verdict.reproduced == met
+    lost = "diverges" if np.isnan(left_db) else f"{6.0 - left_db:.1f} dB"
+    assert verdict.figure == f"largest loss: KF-ANC 0.0 dB, KF-PB {lost}, FxLMS 0.0 dB, MOV-FxLMS 0.0 dB"
+    assert verdict.claim.startswith("A gain up to 12 dB off")
 
 
 def test_one_divergence_is_one_too_many() -> None:
     rows = [_row(algorithm=name) for name in mismatch.KEEPS_POWER] + [_row(algorithm="FxLMS", tuned_with=EXACT)]
     assert mismatch._bounded(rows).reproduced
+    loud = mismatch._bounded([*rows, _row(algorithm="KF-PB", noise_reduction_db=-3.5)])
+    assert loud.reproduced  # louder, but bounded
+    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in loud.figure
     assert not mismatch._bounded([*rows, _row(algorithm="KF-PB", diverged_at_s=2.0)]).reproduced
-    assert mismatch._bounded([*rows, _row(algorithm="FxLMS", tuned_with=EXACT, diverged_at_s=2.0)]).reproduced
+    others = mismatch._bounded([*rows, _row(algorithm="FxLMS", tuned_with=EXACT, diverged_at_s=2.0)])
+    assert others.reproduced
+    assert others.figure.endswith("Of the unconstrained algorithms tuned with the exact path 1 of 2 diverged")
 
 
 @pytest.mark.parametrize(

@@ -184,6 +184,9 @@ def held(**changes: float) -> list[bool]:
     [
         ({}, [True, True, True, True, True]),
         ({"power": 0.96}, [False, True, True, True, True]),
+        ({"power": 0.97}, [True, True, True, True, True]),
+        ({"power": 1.02}, [True, True, True, True, True]),
+        ({"power": 1.05}, [False, True, True, True, True]),
         ({"power": 1.03}, [False, True, True, True, True]),
         ({"power": 1.06}, [False, True, False, True, True]),
         ({"loss_db": 0.6}, [True, False, True, True, True]),
@@ -195,6 +198,42 @@ def held(**changes: float) -> list[bool]:
 )
 def test_verdicts_on_both_sides_of_each_threshold(changes: dict[str, float], expected: list[bool]) -> None:
     assert held(**changes) == expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "failed"),
+    [
+        ({}, []),
+        ({"power": 0.96}, [0]),
+        ({"power": 1.03}, [0]),
+        ({"loss_db": 0.6}, [1]),
+        ({"loss_db": 0.6, "rival_db": 7.8}, [1, 4]),
+        ({"rival_db": 8.2}, [4]),
+    ],
+)
+def test_one_case_of_several_is_enough_to_fail_a_claim(changes: dict[str, float], failed: list[int]) -> None:
+    case = [replace(row, noise="white noise") for row in rows_of(**changes) if row.path != MEASURED]
+    for rows in (rows_of() + case, case + rows_of()):
+        assert [k for k, verdict in enumerate(claims(rows)) if not verdict.reproduced] == failed
+        loss = max(changes.get("loss_db", 0.2), 0.2)
+        assert f"{loss:.2f} dB at worst" in claims(rows)[1].figure
+        lead = min(3.0 - 0.2, 8.0 - changes.get("loss_db", 0.2) - changes.get("rival_db", 5.0))
+        assert f"{lead:+.2f} dB at worst" in claims(rows)[-1].figure
+        assert claims(rows)[-1].figure.endswith("+2.80 dB at best")  # a rival in every case
+
+
+def test_the_rival_is_the_best_of_those_that_keep_every_rating() -> None:
+    rows = rows_of()
+    rival = next(row for row in rows if row.algorithm == "MOV-FxLMS")
+    others = [name for name, own in algorithms(several_channels=True).items() if own.keeps_budget]
+    name = next(name for name in others if not name.startswith("KF-PB") and name != "MOV-FxLMS")
+    better = replace(rival, algorithm=name, noise_reduction_db=8.2)
+    assert [claims(order)[-1].reproduced for order in ([*rows, better], [better, *rows])] == [False, False]
+    assert f"-0.40 dB at worst (4 x 4, tones: {name})" in claims([*rows, better])[-1].figure
+    worse = replace(better, noise_reduction_db=1.0)
+    assert "+2.80 dB at worst (4 x 4, tones: MOV-FxLMS)" in claims([*rows, worse])[-1].figure
+    alone = [row for row in rows if (row.path, row.algorithm) != (MEASURED, "MOV-FxLMS")]
+    assert claims(alone)[-1].figure.endswith("+2.80 dB at best; in 1 of 2 cases no other keeps them")
 
 
 @pytest.mark.parametrize("place", [0, 1])

@@ -20,7 +20,7 @@ STILL = Growth(over_optimal=0.7, over_half=1.0, of_quarters=0.0)
     ("anc_db", "opc_db", "held"),
     [
         (-8.5, -88.0, True),
-        (-29.9, -60.1, True),
+        (-30.0, -60.0, True),
         (-30.1, -88.0, False),  # KF-ANC as good as clean
         (-8.5, -59.9, False),
         (-8.5, -48.5, False),  # 40 dB below those of KF-ANC are harmonics still

@@ -203,7 +203,13 @@ def _row(event: str, algorithm: str, **more: Any) -> TrackingRow:
 def test_mean_nse_is_compared_event_by_event(nse: float, met: bool) -> None:
     rows = [_row("sign", "KF-ANC", mean_nse_db=-9.0), _row("sign", "FxLMS")]
     rows += [_row("delay", "KF-ANC", mean_nse_db=nse), _row("delay", "FxLMS")]
-    assert tracking._mean_nse(rows).reproduced == met
+    verdict = tracking._mean_nse(rows)
+    assert verdict.reproduced == met
+    if np.isfinite(nse):
+        assert (
+            verdict.figure
+            == f"by {(4.0 - 5.0 - nse) / 2:.1f} dB on average, by {-5.0 - nse:.2f} dB at least (delay, duct)"
+        )
 
 
 @pytest.mark.parametrize(("time", "met"), [(0.099, True), (0.1, False), (None, False)])
@@ -224,7 +230,13 @@ def test_a_jump_breaks_every_constraint(worst: float, met: bool) -> None:
 def test_a_change_is_judged_by_its_stretch(worst: float, met: bool) -> None:
     rows = [_row("delay", "KF-PB", worst_window=5.0, stretch_worst_window={"changed": worst})]
     rows.append(_row("delay", "KF-ANC", stretch_worst_window={"changed": 9.0}))
-    assert tracking._change(rows).reproduced == met
+    others = [
+        _row("delay", name, stretch_worst_window={"changed": 1.5}) for name in tracking.CONSTRAINED if name != "KF-PB"
+    ]
+    for all_rows in (rows, [*rows, *others], [*others, *rows]):  # one is enough, wherever it stands
+        verdict = tracking._change(all_rows)
+        assert verdict.reproduced == met
+        assert verdict.figure.startswith(f"{worst:.2f} of it at worst (KF-PB, delay, duct)")
 
 
 @pytest.mark.parametrize(

@@ -213,6 +213,23 @@ def test_steps_refuse_what_is_not_finite(name, bad):
 # ---- What they settle to
 
 
+@pytest.mark.parametrize("by_block", [False, True])
+@pytest.mark.parametrize(("q", "heard"), [(1e-2, [1e200, 1.0]), (0.0, [0.5] + 8 * [0.0])])
+def test_a_refused_update_leaves_no_prediction_behind(q, heard, by_block):
+    """S overflows, or is zero in a silence without measurement noise: each attempt would add the state noise to P."""
+    controller = kf_opc(8, [1.0], rated_power=1.0, state_noise=1e-3, measurement_noise=q)
+    for x in heard:
+        controller.control_signal(x)
+    before = copy.deepcopy(controller)
+    for _ in range(3):
+        with pytest.raises(ValueError, match=r"S = H P H' \+ R|tells nothing"):
+            controller.process([heard[-1]], [0.5]) if by_block else controller.update(0.5)
+    # to rounding: the compiled step takes its prediction back by subtraction
+    np.testing.assert_allclose(controller.estimator.P, before.estimator.P, rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(controller.weights, before.weights)
+    assert controller.constraint.disturbance_power == before.constraint.disturbance_power
+
+
 @pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
 def test_constrained_control_of_a_flat_path_keeps_its_rated_power(name):
     """The control signal that cancels all has four times the rated power; alpha = 1/2 leaves it the rated power."""

@@ -250,6 +250,12 @@ def test_update_sequential_without_any_H_is_refused() -> None:
     require_same_course(kf, twin)
 
 
+def test_update_sequential_says_which_filterpy_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(KalmanFilter, "update_sequential", raising=False)  # as in 1.4.5
+    with pytest.raises(AttributeError, match=r"needs filterpy 2\.0\.0 or later"):
+        KFOPC(2, 1).update_sequential(0, 1.0, H_i=np.ones((1, 2)))
+
+
 @pytest.mark.parametrize("kind", ["general", "random walk"])
 def test_an_H_that_was_assigned_or_written_into_is_used(kind: str) -> None:
     assigned, written, zeros = (MAKERS[kind]() for _ in range(3))

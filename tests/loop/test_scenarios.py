@@ -129,6 +129,7 @@ def test_the_length_of_the_blocks_does_not_show(block, monkeypatch):
 def test_options_of_the_run():
     late = require_as_alone(9, 400, switch_on_s=123 / FS)
     np.testing.assert_array_equal(late[0].reference, differing(9, 400)[0][123:])
+    require_as_alone(2, 200, switch_on_s=60 / FS)  # each of the two has heard its own disturbance before
     for result in require_as_alone(9, 400, window="sliding", switch_on_s=30 / FS):
         assert 0.0 < result.constraint_factor.min() < 1.0
     assert {r.rated_power for r in require_as_alone(3, 100, rated_power=2.0)} == {2.0}

@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
 from kfopc_filterpy.cli import main
 from kfopc_filterpy.realtime import (
+    Block,
     FaultError,
     Interface,
     Levels,
@@ -25,6 +26,7 @@ from kfopc_filterpy.realtime import (
     measure_round_trip,
     run,
 )
+from kfopc_filterpy.realtime.running import _first_arrival, _Watch
 from kfopc_filterpy.signals import write_wav
 
 FS = 8000.0
@@ -133,6 +135,24 @@ def test_a_plant_that_is_not_causal_is_refused_with_the_way_out() -> None:
     assert report.possible_db > 10.0
     report = started(plant(block=64, latency=192), seconds=0.5, check_causality=False)
     assert np.isnan(report.possible_db)
+    known = FxLMS(24, plant(block=64, latency=192).total_secondary_path, step_size=1e-4)
+    report = run(known, plant(block=64, latency=192), amplitude_limit=8.0, seconds=0.1, listen_s=0.05)
+    assert np.isnan(report.possible_db)  # 400 samples of silence are too few to tell
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_the_first_arrival_is_of_the_nearest_loudspeaker_at_any_level(scale: float) -> None:
+    near, far = [0.0, 0.049, 0.051, 0.3, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]  # 5 % of the largest tap of all counts
+    assert _first_arrival(scale * np.array([[near, far]])) == 2
+    assert _first_arrival(scale * np.array(far)) == 4
+
+
+def test_simulated_noise_may_repeat_itself_from_block_to_block() -> None:
+    periodic = np.tile(np.random.default_rng(2).standard_normal(32), 500)
+    interface = SimulatedInterface(periodic, S, primary_path=PRIMARY, fs=FS, block=32, latency=64)
+    silent = FxLMS(8, interface.total_secondary_path, step_size=1e-12)  # so that the errors repeat themselves too
+    report = run(silent, interface, amplitude_limit=1.0, seconds=1.0, listen_s=0.1, check_causality=False)
+    assert not report.health.counts
 
 
 def test_a_loudspeaker_that_is_not_heard_is_a_fault() -> None:
@@ -148,6 +168,115 @@ def test_a_loudspeaker_that_is_not_heard_is_a_fault() -> None:
 def test_the_round_trip_is_measured_under_noise(delay: int) -> None:
     interface = SimulatedInterface(X, [0.0, 0.9, 0.2], disturbance=0.3 * X[::-1], fs=FS, block=64, latency=delay)
     assert measure_round_trip(interface, level=0.3, longest=1000) == delay + 1
+
+
+class Recorded(SimulatedInterface):
+    """A simulated plant that remembers what was played."""
+
+    def start(self) -> None:
+        super().start()
+        self.played: list[Any] = []
+
+    def write(self, control_signals: Any) -> None:
+        self.played.append(np.array(control_signals))
+        super().write(control_signals)
+
+
+def test_the_round_trip_is_measured_with_one_loudspeaker_after_the_other_at_the_level_asked_for() -> None:
+    paths = np.zeros((1, 2, 30))
+    paths[0, 0, 20], paths[0, 1, 5] = 1.0, 1.0  # the second one is nearer
+    interface = Recorded(np.zeros(16000), paths, disturbance=np.zeros((1, 16000)), fs=FS, block=32, latency=64)
+    assert measure_round_trip(interface, level=0.3, seconds=0.5, longest=256) == 64 + 5
+    played = np.concatenate(interface.played, axis=1)
+    n = -(-(4000 + 256) // 32) * 32
+    np.testing.assert_allclose(np.std(played[0, :4256]), 0.3, rtol=0.04)  # 4256 samples: 3.5 standard errors
+    np.testing.assert_array_equal(played[1, n:], played[0, :n])
+    assert not np.any(played[0, n:])
+    assert not np.any(played[1, :n])
+
+
+def test_a_round_trip_needs_as_much_time_as_the_longest_one() -> None:
+    def measured(seconds: float) -> int:
+        silent = np.zeros(16000)
+        interface = SimulatedInterface(silent, S, disturbance=silent, fs=FS, block=32, latency=64)
+        return measure_round_trip(interface, level=0.1, seconds=seconds, longest=1000)
+
+    assert measured(1000 / FS) == 65
+    with pytest.raises(ValueError, match=r"seconds must be at least longest / fs, 0\.125 s, got 0\.124875 s"):
+        measured(999 / FS)
+
+
+def test_a_run_takes_the_blocks_that_its_time_needs() -> None:
+    def blocks(samples: int) -> int:
+        controller = FxLMS(24, plant().total_secondary_path, step_size=1e-3)
+        report = run(
+            controller, plant(), amplitude_limit=8.0, seconds=samples / FS, listen_s=0.5, fade_s=32 / FS, pause_s=0.1
+        )
+        return report.blocks
+
+    assert [blocks(samples) for samples in (319, 320, 321)] == [11, 11, 12]  # the last one fades out
+
+
+@pytest.mark.parametrize(
+    ("blocks", "begin"), [(1, 0), (3, 2), (4, 2), (101, 50), (4094, 2046), (4095, 2048), (9999, 5000), (20001, 10000)]
+)
+def test_the_report_is_of_the_second_half_of_a_run_of_any_length(blocks: int, begin: int) -> None:
+    """The error power rises and the output power falls; the half is one of seconds, joined in runs beyond 2048 s."""
+    session: Any = SimpleNamespace(overruns=0, blocks=blocks, lost=0, underflows=0, load=0.0, load_since_report=0.0)
+    supervisor: Any = SimpleNamespace(
+        fs=4.0, n_references=1, n_microphones=1, n_loudspeakers=1, controller=None, health=None
+    )
+    silence: Any = SimpleNamespace(e=np.full((1, 10), 2.0))  # a power of 4 before
+    watch = _Watch(session, supervisor, silence, 1e9, None)
+    ones = np.ones((1, 2))  # two blocks are a second
+    rising = (np.arange(blocks) + 0.5) / blocks
+    falling = 1.0 - rising
+    for of_error, of_output in zip(rising, falling, strict=True):
+        watch.add(Block(ones, np.sqrt(of_error) * ones), np.sqrt(of_output) * ones)
+    report = watch.report("end", None, np.nan)
+    assert report.seconds == blocks / 2
+    rtol = 1e-12 if blocks < 4096 else 5e-3  # a joined part is less than a thousandth of the run
+    np.testing.assert_allclose(report.powers, np.mean(falling[begin:]), rtol=rtol)
+    np.testing.assert_allclose(4.0 / 10 ** (report.reduction_db / 10), np.mean(rising[begin:]), rtol=rtol)
+    assert len(watch._parts) <= 2048  # memory is bounded
+
+
+def test_a_report_has_the_levels_since_the_last_one() -> None:
+    session: Any = SimpleNamespace(overruns=0, blocks=0, lost=0, underflows=0, load=0.0, load_since_report=0.0)
+    supervisor: Any = SimpleNamespace(
+        fs=4.0,
+        n_references=1,
+        n_microphones=1,
+        n_loudspeakers=1,
+        controller=SimpleNamespace(rated_power=0.5),
+        health=None,
+    )
+    silence: Any = SimpleNamespace(e=np.full((1, 10), 2.0))  # a power of 4 before
+    reports: list[Levels] = []
+    watch = _Watch(session, supervisor, silence, 1.0, reports.append)
+    for n, power in enumerate([1.0, 3.0, 4.0, 4.0, 10.0, 30.0]):  # blocks of half a second
+        session.load_since_report = max(session.load_since_report, 0.1 * (6 - n))
+        watch.add(Block(np.full((1, 2), 10.0), np.full((1, 2), np.sqrt(power))), np.full((1, 2), np.sqrt(2.0 * power)))
+    assert [levels.time_s for levels in reports] == [1.0, 2.0, 3.0]
+    error = np.array([2.0, 4.0, 20.0])
+    np.testing.assert_allclose([levels.powers[0] for levels in reports], 2.0 * error)
+    np.testing.assert_allclose([levels.error_level_db[0] for levels in reports], 10 * np.log10(error))
+    np.testing.assert_allclose([levels.reduction_db[0] for levels in reports], 10 * np.log10(4.0 / error))
+    np.testing.assert_allclose([levels.reference_level_db[0] for levels in reports], 20.0)
+    np.testing.assert_allclose([levels.load for levels in reports], [0.6, 0.4, 0.2])
+    assert reports[0].rated_power == [0.5]
+
+
+def test_an_error_in_a_report_is_raised_after_the_loudspeakers_have_faded_out() -> None:
+    def fails(levels: Levels) -> None:
+        raise RuntimeError("disk full")
+
+    interface = plant()
+    controller = FxLMS(24, interface.total_secondary_path, step_size=2e-3)
+    with pytest.raises(RuntimeError, match="disk full"):
+        run(controller, interface, amplitude_limit=8.0, seconds=3.0, listen_s=0.5, on_report=fails, fade_s=0.02)
+    assert np.any(interface._queue[:, :32])
+    assert not np.any(interface._queue[:, -32:])
 
 
 def test_a_run_stops_on_a_fault_when_told_to_and_on_ctrl_c() -> None:
@@ -190,7 +319,7 @@ class Card:
         self.interface = interface
         self.asked: dict[str, Any] = {}
         self.states: list[str] = []
-        self.reads, self.lost_at, self.dry_at = 0, [100], [120, 700, 701]  # block numbers
+        self.reads, self.lost_at, self.dry_at, self.repeated_at = 0, [100], [120, 700, 701], []  # block numbers
         self.ahead: list[Any] = []
 
     def __call__(self, **asked: Any) -> Card:
@@ -205,9 +334,10 @@ class Card:
         block = self.interface.read()
         assert block is not None
         self.reads += 1
-        frames = np.zeros((n, 4), np.float32)
-        frames[:, 2], frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
-        return frames, self.reads in self.lost_at
+        if self.reads not in self.repeated_at:
+            self.frames = np.zeros((n, 4), np.float32)
+            self.frames[:, 2], self.frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
+        return self.frames, self.reads in self.lost_at
 
     def write(self, frames: Any) -> bool:
         assert frames.dtype == np.float32
@@ -243,6 +373,22 @@ def test_a_sound_card_is_driven_through_its_stream(monkeypatch: pytest.MonkeyPat
     assert event.time_s == pytest.approx((700 - card.reads_before_control) * 32 / FS)
 
 
+def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    card = Card(plant())
+    card.lost_at, card.dry_at, card.repeated_at = [640, 641], [], [680]
+    monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
+    reports: list[Levels] = []
+    device = SoundDevice([2], [3], [1], fs=FS, block=32)
+    report = started(
+        device, step_size=0.2, amplitude_limit=0.8, seconds=1.6, on_report=reports.append, report_every_s=0.8
+    )
+    assert report.health.samples == {"lost": 2 * 32, "repeated": 2 * 32}  # of the reference and of the error
+    assert report.lost == reports[-1].lost == 64
+    # The time goes on while samples are lost; a report is due after so many that were heard.
+    assert [levels.time_s for levels in reports] == [0.8 + 64 / FS, 1.6 + 64 / FS]
+    assert report.seconds == pytest.approx(1.6 + 64 / FS)
+
+
 @pytest.mark.parametrize(
     ("what", "message"),
     [("lost_at", "32 samples were lost"), ("dry_at", "the output ran dry")],
@@ -254,6 +400,26 @@ def test_a_path_is_not_identified_across_a_gap(what: str, message: str, monkeypa
     with pytest.raises(FaultError, match=f"{message}.* while the path was identified"):
         started(SoundDevice([2], [3], [1], fs=FS, block=32), amplitude_limit=0.8)
     assert card.states == ["start", "stop", "close"]
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [("lost_at", "32 samples were lost"), ("dry_at", "the output ran dry")],
+)
+def test_a_round_trip_is_not_measured_across_a_gap(what: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def measured(gaps: list[int]) -> int:
+        card = Card(plant(primary_path=None, disturbance=np.zeros_like(X)))
+        card.lost_at, card.dry_at = [], []
+        setattr(card, what, gaps)
+        monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
+        try:
+            return measure_round_trip(SoundDevice([2], [3], [1], fs=FS, block=32), level=0.1, longest=256)
+        finally:
+            assert card.states == ["start", "stop", "close"]
+
+    assert measured([]) == 65
+    with pytest.raises(FaultError, match=f"{message}.* while the round trip was measured, so it .* run again"):
+        measured([200])
 
 
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

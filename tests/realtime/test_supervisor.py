@@ -386,6 +386,41 @@ def test_a_user_who_fades_out_is_not_overruled() -> None:
     assert np.any(y)
 
 
+@pytest.mark.parametrize("user", ["leaves it alone", "fades out in the pause"])
+def test_a_pause_lasts_as_long_as_it_says_and_its_end_is_noted_once(user: str) -> None:
+    """Blocks of 64: NaN in block 3, silence from block 4 on, 13 blocks are the first to make 800 samples."""
+    faults = [200]  # the controller that replaces the first one is sound
+
+    class Once:
+        n = 0
+
+        def control_signal(self, reference: float) -> float:
+            self.n += 1
+            return np.nan if faults and self.n == faults[0] and faults.pop() else 1.0
+
+        def update(self, error: float) -> None:
+            pass
+
+    supervisor = Supervisor(Once(), fs=FS, amplitude_limit=2.0, pause_s=0.1, fade_s=0.016)
+    rng = np.random.default_rng(0)
+    y = []
+    for block in range(30):
+        if user != "leaves it alone" and block == 10:
+            supervisor.fade_out()
+        y.append(supervisor.process(*rng.standard_normal((2, 64))))
+    again = [event.time_s for event in supervisor.health.events if event.what == "running again"]
+    assert np.any(y[3])
+    assert not np.any(y[4:17])
+    if user == "leaves it alone":
+        assert again == [16 * 64 / FS]
+        np.testing.assert_allclose(y[17], np.arange(1, 65) / 128)  # fades in over 0.016 s
+        np.testing.assert_array_equal(y[19:], 1.0)
+    else:
+        assert not again
+        assert not np.any(y[17:])
+        assert supervisor.muted
+
+
 @pytest.mark.parametrize("kind", ["refuses", "fails"])
 def test_a_controller_that_cannot_go_on_is_replaced(kind: str) -> None:
     class Broken:
