@@ -22,7 +22,6 @@ N_TAPS = 128
 DURATION_S = 5.0
 RATED_SHARE = 0.25  # of the unconstrained control power
 WIDE_HZ, HIGH_TONE_HZ = (100.0, 6000.0), 4000.0
-RECORDED = ("motor",)
 BELOW_A_SIXTH = ("compressor", "band noise", "motor")  # their power lies below a sixth of the sample rate
 HALF_A_SAMPLE = PathTolerance(delay_samples=0.5)
 ERRORS: dict[str, dict[str, float]] = {  # of the estimate
@@ -197,7 +196,7 @@ def _cost(rows: Iterable[GuardRow], below: bool) -> Verdict:
     return Verdict(
         f"With an exact path the default guard costs at most {COST_DB:g} dB, "
         + ("noises below a sixth of the sample rate" if below else "noises that reach beyond it"),
-        max(costs.values()) <= COST_DB,
+        bool(np.max(list(costs.values())) <= COST_DB),  # NaN, of a run that diverged, counts as the largest
         f"{np.mean(list(costs.values())):.2f} dB on average, {costs[where]:.2f} dB at most ({where})",
     )
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-LOWEST_GAIN = 1e-3  # so that the control signal comes back in a few frames
+LOWEST_GAIN = 1e-3  # at which the control is not heard
+GAIN_STEP = 10 ** (2 / 20)  # by which it changes from frame to frame
 FIRST_AVERAGE = 1 / 8  # of the memory: all frames count alike in the averages until then
 
 
@@ -23,7 +24,7 @@ class DivergenceGuard:
     memory : float
         Memory of the averages in samples.
     share : float
-        Power of the error, relative to the expected power of the disturbance, that is too loud.
+        Power of the error, relative to the expected power of the disturbance, that is too loud; above 2.
 
     Attributes
     ----------
@@ -35,6 +36,7 @@ class DivergenceGuard:
         self._frame, self._memory, self._share = frame, memory, share
         self.held = False
         self._gain = 1.0  # of the control signal, at the beginning of this frame
+        self._is_heard = False  # whether the control was heard in this frame
         self._energies = np.zeros(3 + n_references)  # of error, alone, disturbance, references, in this frame
         self._last_references = np.zeros(n_references)  # their powers in the frame before
         self._mean = np.zeros(1 + n_references)  # of the powers of disturbance and references
@@ -49,7 +51,7 @@ class DivergenceGuard:
         if energy <= self._harmless:
             return self._gain
         most = self._frame * self._share * self._expected(self._energies[3:] / self._frame)
-        return float(self._gain * min(most / energy, 1.0))
+        return max(float(self._gain * min(most / energy, 1.0)), LOWEST_GAIN)
 
     def allows(self, alone: np.ndarray, references: np.ndarray) -> bool:
         """Return whether the controller may adapt to the newest error, after the newest references, (I,).
@@ -64,40 +66,60 @@ class DivergenceGuard:
 
     def add(self, error: np.ndarray, alone: np.ndarray, disturbance: np.ndarray, references: np.ndarray) -> None:
         """Add a sample of each signal, (K,), (K,), (K,) and (I,)."""
-        self._energies[:3] += error @ error, alone @ alone, disturbance @ disturbance
+        self._energies[:2] += error @ error, alone @ alone
+        self._is_heard |= self._gain > LOWEST_GAIN
+        self.follow(disturbance, references)
+
+    def follow(self, disturbance: np.ndarray, references: np.ndarray) -> None:
+        """Add a sample that was heard while nothing was played: no loudness is the control's fault."""
+        self._energies[2] += disturbance @ disturbance
         self._energies[3:] += references**2
 
     def end_frame(self) -> None:
         """Decide for the next frame, and take this frame into the averages."""
         (error, alone, disturbance), references = np.split(self._energies / self._frame, [3])
         expected = self._expected(references)
-        self._gain = max(self.gain, LOWEST_GAIN)
+        if not self._is_heard and disturbance > 0.5 * self._share * expected:  # then the noise itself is louder
+            self._mean[0] *= disturbance / expected
+            expected = disturbance
         if alone <= self._share * expected:
             self._recovering_from = 0.0
-        if self.held:
-            # The path may be wrong, so it is not asked what the error would be with a gain of 1. What exceeds the
-            # expected power comes from the control: with it at full volume, the error must be 3 dB below the limit.
-            self.held = bool(error > expected * (1.0 + (0.5 * self._share - 1.0) * self._gain**2))
-        else:
-            self.held = self._is_too_loud(alone, expected)
-        if not self.held and error <= 0.5 * self._share * expected:
-            self._gain = min(2.0 * self._gain, 1.0)
-        self._frames += 1
-        rate = (
-            1.0 / self._frames
-            if self._frames * self._frame <= FIRST_AVERAGE * self._memory
-            else self._frame / self._memory
-        )
-        # A wrong path makes the disturbance estimate louder, so a frame does not count more than the share.
-        heard = min(disturbance, self._share * expected)
-        self._mean += rate * (np.concatenate(([heard], references)) - self._mean)
+        self._gain = self.gain
+        is_soft = bool(error <= 0.5 * self._share * expected)
+        self._decide(is_soft, self._is_too_loud(alone, expected))
+        suspect = self.held or not is_soft
+        # A wrong path makes the disturbance estimate louder, so a frame raises the average little, or not at all.
+        self._average(min(disturbance, expected if suspect else self._share * expected), references)
         self._last_references = references
-        self._energies = np.zeros_like(self._energies)
+        self._energies, self._is_heard = np.zeros_like(self._energies), False
         self._harmless = self._frame * self._share * self._expected(np.zeros_like(references))
 
     def begin_anew(self, alone: float = 0.0) -> None:
         """Adapt again, with another path, by which the error alone had this power in the last frame."""
         self.held, self._recovering_from = False, alone
+        self._energies[1] = 0.0  # it was by the path before
+
+    def _decide(self, is_soft: bool, is_too_loud: bool) -> None:
+        """Set whether to adapt in the next frame, and the gain at its beginning.
+
+        `is_soft` says whether the error was 3 dB below the limit, `is_too_loud` whether the error alone was above it.
+        """
+        if not self.held:
+            self.held = is_too_loud
+        elif is_soft and self._gain == 1.0:
+            self.held = False
+        # Whoever is to blame, it comes to rest: at 3 dB below the limit, or at 1 once louder noise is expected.
+        if is_soft:
+            self._gain = min(GAIN_STEP * self._gain, 1.0)
+        elif self.held or self._gain < 1.0:
+            self._gain = max(self._gain / GAIN_STEP, LOWEST_GAIN)
+
+    def _average(self, disturbance: float, references: np.ndarray) -> None:
+        """Take the powers of a frame into the averages."""
+        self._frames += 1
+        is_first = self._frames * self._frame <= FIRST_AVERAGE * self._memory
+        rate = 1.0 / self._frames if is_first else self._frame / self._memory
+        self._mean += rate * (np.concatenate(([disturbance], references)) - self._mean)
 
     def _is_too_loud(self, power: float, expected: float) -> bool:
         return bool(power > max(self._share * expected, 2.0 * self._recovering_from))

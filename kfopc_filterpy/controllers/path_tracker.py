@@ -16,7 +16,7 @@ from .._validate import as_generator, as_number, as_positive, as_signal
 from ..paths.least_squares import correlation_matrix, cross_correlation, cross_correlation_matrix
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
-from .base import FilteredReferenceController, WrappedController
+from .base import OVERFLOW, FilteredReferenceController, WrappedController
 from .channels import amplifier_functions, channel_sample
 from .divergence import DivergenceGuard
 
@@ -244,12 +244,14 @@ class PathTracker(WrappedController):
 
     Between a jump of the path and its discovery, the controller may diverge. Two things keep the noise from becoming
     much more than `hold_db` louder than it is expected to be without control, as a sum of powers over the microphones.
-    The controller's updates are skipped, until the error is 3 dB below that limit or another path is taken over. And
-    the control signal is turned down while the error is above the limit. Afterwards its gain returns to 1, by 6 dB in
-    each frame. Both act within a frame. What is expected is the mean power of the disturbance estimates over the
-    memory, times the power of the reference relative to its own mean if that is above 1. So noise that becomes more
-    than `hold_db` louder than control can make up for, without a louder reference, is taken for a divergence for some
-    seconds.
+    The controller's updates are skipped, until the error at full volume is 3 dB below that limit or another path is
+    taken over. And the control signal is turned down. Both act within a frame, as soon as the error exceeds the limit.
+    From then on the gain falls or rises by 2 dB in each frame, to where the error is 3 dB below the limit, or to 1.
+
+    What is expected is the mean power of the disturbance estimates over the memory, times the power of the reference
+    relative to its own mean if that is above 1. So noise that becomes much louder than the reference tells is taken for
+    a divergence at first: the control signal is turned down, which shows that the noise is to blame, and up again. This
+    takes a second or two.
 
     Parameters
     ----------
@@ -276,7 +278,8 @@ class PathTracker(WrappedController):
     use_control_signal : bool, default True
         Whether the estimates "control signal" take part.
     hold_db : float, default 6
-        See above; with a large number, no update is skipped, and the control signal is never turned down.
+        See above. It must be above 3.01. With a large number, no update is skipped, and the control signal is never
+        turned down.
     amplifier : callable or sequence of J of them, optional
         Known amplifiers, functions of a sample, as for the controller. An unknown one that clips distorts the fits.
 
@@ -359,6 +362,10 @@ class PathTracker(WrappedController):
         self.use_control_signal = bool(use_control_signal)
         self._probe_share = 10 ** (as_number(probe_db, "probe_db", unit="dB") / 10)
         self._hold_share = 10 ** (as_number(hold_db, "hold_db", unit="dB") / 10)
+        if not self._hold_share > 2.0:
+            raise ValueError(
+                f"hold_db must be above 3.01 dB, got {hold_db:g} dB: held, the error must fall 3 dB below it"
+            )
         shape = as_signal(probe_filter, "probe_filter")
         if not shape.any():
             raise ValueError("probe_filter must not be all zeros: the probe would be silent")
@@ -462,9 +469,14 @@ class PathTracker(WrappedController):
         else:
             errors = np.array([as_number(error, "error")])
         disturbance, alone = self._without_probe(errors)
-        if self._guard.allows(alone, self._x[:, self._past + self._n]):
+        references = self._x[:, self._past + self._n]
+        with np.errstate(over="ignore"):
+            if not np.isfinite([errors @ errors, disturbance @ disturbance, alone @ alone]).all():
+                raise ValueError(OVERFLOW)
+        if self._guard.allows(alone, references):
             self.controller.update(self._shaped(alone))
-        self._take(errors, disturbance, alone)
+        self._guard.add(errors, alone, disturbance, references)
+        self._take(errors)
 
     def _without_probe(self, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the disturbance estimate, (K,), and the error if the controller played alone and with a gain of 1, (K,)."""
@@ -473,9 +485,8 @@ class PathTracker(WrappedController):
         disturbance = errors + self._reversed @ played.reshape(-1)
         return disturbance, disturbance - self._reversed @ self._own[:, newest].reshape(-1)
 
-    def _take(self, errors: np.ndarray, disturbance: np.ndarray, alone: np.ndarray) -> None:
+    def _take(self, errors: np.ndarray) -> None:
         self._e[:, self._n] = errors
-        self._guard.add(errors, alone, disturbance, self._x[:, self._past + self._n])
         self._n += 1
         if self._n % self._frame == 0:
             self._end_frame()
@@ -568,7 +579,10 @@ class PathTracker(WrappedController):
                 evidence.forget()
 
     def _power_alone(self) -> float:
-        """Return the power, in the last frame of a block, of the error if the controller played alone with a gain of 1."""
+        """Return the power, in the last frame of a block, of the error if the controller played alone with a gain of 1.
+
+        It is by the paths that have just been taken over, unlike what the guard has heard in that frame.
+        """
         late = slice(-(self._frame + self._paths.shape[-1] - 1), None)
         errors = self._e[:, -self._frame :] + through(self._paths, (self._y + self._v - self._own)[:, late])
         return float(np.mean(np.sum(errors**2, axis=0)))
@@ -582,7 +596,8 @@ class PathTracker(WrappedController):
         for x, e in zip(np.atleast_2d(references).T, np.atleast_2d(errors).T, strict=True):
             at = self._past + self._n
             self._x[:, at], self._y[:, at], self._v[:, at], self._own[:, at] = x, 0.0, 0.0, 0.0
-            self._take(np.atleast_1d(e), *self._without_probe(np.atleast_1d(e)))
+            self._guard.follow(self._without_probe(np.atleast_1d(e))[0], self._x[:, at])
+            self._take(np.atleast_1d(e))
 
     def _rates(self) -> dict[str, float | None]:
         return {"path tracker": self.fs}

@@ -143,6 +143,7 @@ def test_all_findings_hold_on_good_rows() -> None:
         (3, {"worst_second_db": np.nan}, 1),
         (1, {"noise_reduction_db": 4.4}, 2),
         (5, {"noise_reduction_db": 4.4}, 3),
+        (5, {"noise_reduction_db": np.nan, "diverged_at_s": 1.0}, 3),
     ],
 )
 def test_each_finding_fails_alone(at: int, figures: dict[str, Any], finding: int) -> None:

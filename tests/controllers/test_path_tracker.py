@@ -322,6 +322,12 @@ def test_what_is_refused() -> None:
     tracker.control_signal(1.0)
     with pytest.raises(ValueError, match="error"):
         tracker.update(np.nan)
+    with pytest.raises(ValueError, match="overflows: nothing was changed"):
+        tracker.update(1e200)
+    tracker.update(0.5)
+    assert tracker._guard._energies[0] == 0.25  # of the sample that was not refused
+    with pytest.raises(ValueError, match=r"hold_db must be above 3\.01 dB, got 3 dB"):
+        tracked("FxLMS", hold_db=3.0)
     tracker.controller.limiter = OutputLimiter(1.0, fs=16000.0)
     with pytest.raises(ValueError, match="limiter is for 16000 Hz"):
         tracker.require_sample_rate(FS)
@@ -485,6 +491,16 @@ def test_noise_that_comes_later_than_the_reference_is_controlled() -> None:
     result = simulate(tracker, x, primary_path=primary, secondary_path=[0.0, 1.0], fs=2000.0)
     assert np.mean(result.error[-2000:] ** 2) < 0.1
     assert not np.any(result.error[:100])
+
+
+def test_noise_that_begins_while_it_listens_is_no_divergence() -> None:
+    """The reference is a tachometer's: it does not tell that the machine has become loud."""
+    n = np.arange(20000)
+    x, loud = np.sin(0.3 * n), np.where(n < 6000, 0.001, 1.0)
+    d = loud * np.roll(x, 5) + 1e-4 * np.random.default_rng(1).standard_normal(n.size)
+    tracker = PathTracker(FxLMS(8, [0.0, 1.0], step_size=0.002), rng=1, fs=2000.0)
+    result = simulate(tracker, x, disturbance=d, secondary_path=[0.0, 1.0], fs=2000.0, switch_on_s=5.0)
+    assert np.mean(result.error[-4000:] ** 2) < 1e-3 * np.mean(d[-4000:] ** 2)
 
 
 def test_a_path_that_is_assigned_inherits_nothing_from_the_one_before() -> None:
