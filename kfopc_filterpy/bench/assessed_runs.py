@@ -46,6 +46,11 @@ class Plan:
         except AllDivergedError as error:
             return error
 
+    def planned_samples(self, name: str) -> int:
+        """Return how many samples an algorithm runs over, its tuning included."""
+        tuned_on = len(REGISTRY[name].grid) * self.tuning_samples if name == "FxLMS" else 0
+        return tuned_on + self.x.shape[-1] - self.start
+
     def advance(self, samples: int) -> None:
         """Move the bar, which several threads share."""
         with self.lock:
@@ -101,14 +106,30 @@ class Plan:
         is_safe = settings.state_noise > LEAST_STATE_NOISE * settings.initial_variance
         return np.float32 if is_safe and settings.n_taps >= MANY_TAPS else np.float64
 
+    @property
+    def tuning_samples(self) -> int:
+        """Samples of the record's start on which each step size is tried."""
+        return min(round(TUNED_ON_S * self.fs), self.x.shape[-1] - self.start)
+
     @cached_property
     def step_size(self) -> float:
         """Step size of FxLMS by the rule of the studies, on the start of the record."""
-        excerpt = slice(0, self.start + round(TUNED_ON_S * self.fs))
+        excerpt = slice(0, self.start + self.tuning_samples)
         scene = recorded_scene(
             self.x[..., excerpt], self.d[..., excerpt], self.s, self.fs, self.start, self.limits, self.settings
         )
-        return REGISTRY["FxLMS"].value(scene, tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting)
+        runs = Runs(None if self.bar is None else _TuningBar(self))
+        return REGISTRY["FxLMS"].value(scene, tune(runs, scene, ["FxLMS"])["FxLMS"].setting)
+
+
+@dataclass
+class _TuningBar:
+    """The bar of a plan, for runs of the tuning: it counts samples."""
+
+    plan: Plan
+
+    def update(self, runs: int) -> None:
+        self.plan.advance(runs * self.plan.tuning_samples)
 
 
 def recorded_scene(

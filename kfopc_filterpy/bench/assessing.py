@@ -113,7 +113,8 @@ def assess(
     switch_on_s : float, optional
         Time in s at which the control is switched on; by default 0.5 s, or a tenth of a shorter record.
     bar : tqdm bar, optional
-        Bar that advances with the samples that are run; its total is set, and it is described by what is going on.
+        Bar that advances with the samples that are run, those on which FxLMS is tuned included; its total is set, and it
+        is described by what is going on.
 
     Returns
     -------
@@ -199,7 +200,7 @@ def assess(
     names = [algorithm, *(name for name in others if name != algorithm)]
 
     plan = Plan(x, d, s, fs, start, limits, settings, memory_s, secondary_path_uncertainty, bar)
-    announce(bar, len(names) * (x.shape[-1] - start), ", ".join(names))
+    announce(bar, sum(map(plan.planned_samples, names)), ", ".join(names))
     runs: dict[str, SimulationResult] = {}
     for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
         if isinstance(outcome, SimulationResult):

@@ -13,7 +13,7 @@ import pytest
 import soundfile
 
 from kfopc_filterpy import kf_pb, noise_reduction_db
-from kfopc_filterpy.bench import assess, assessed_runs
+from kfopc_filterpy.bench import algorithms, assess, assessed_runs
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import PathTolerance
@@ -123,6 +123,33 @@ def test_the_run_keeps_the_rating_and_the_figures_are_those_of_the_run():
     figures = verdict.figures["KF-PB"]
     assert figures["worst_window"] <= 1 + 1e-12
     assert figures["output_power"] == pytest.approx(0.1 * figures["of_rated_power"])
+
+
+class Bar:
+    """A progress bar that keeps how far it moved."""
+
+    total: int | None = None
+
+    def __init__(self) -> None:
+        self.moved: list[int] = []
+
+    def update(self, samples: int) -> None:
+        self.moved.append(samples)
+
+    def set_description(self, text: str) -> None:
+        pass
+
+
+@pytest.mark.parametrize("tuned_on_s", [0.5, 60.0], ids=["excerpt", "whole record"])
+def test_the_bar_moves_while_fxlms_is_tuned_and_ends_at_its_total(monkeypatch, tuned_on_s):
+    monkeypatch.setattr(assessed_runs, "TUNED_ON_S", tuned_on_s)
+    bar, options = Bar(), {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "want_db": 0.0}
+    assess(noise(), arriving(20), arriving(6, length=16), algorithm="FxLMS", beside=("KF-PB",), bar=bar, **options)
+    after_switch_on = round(0.9 * SECONDS * FS)
+    tried = min(round(tuned_on_s * FS), after_switch_on)
+    grid = len(algorithms()["FxLMS"].grid)
+    assert bar.total == sum(bar.moved) == 2 * after_switch_on + grid * tried
+    assert bar.moved.count(tried) >= grid
 
 
 def test_the_required_power_is_that_of_the_bound_and_the_estimate_is_not_below():
