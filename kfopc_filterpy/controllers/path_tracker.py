@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -471,7 +472,7 @@ class PathTracker(WrappedController):
         disturbance, alone = self._without_probe(errors)
         references = self._x[:, self._past + self._n]
         with np.errstate(over="ignore"):
-            if not np.isfinite([errors @ errors, disturbance @ disturbance, alone @ alone]).all():
+            if not isfinite(errors @ errors + disturbance @ disturbance + alone @ alone):
                 raise ValueError(OVERFLOW)
         if self._guard.allows(alone, references):
             self.controller.update(self._shaped(alone))
