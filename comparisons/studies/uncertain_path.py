@@ -9,12 +9,26 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
+from kfopc_filterpy import SimulationResult, noise_reduction_db
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, Verdict, run_setting
 from kfopc_filterpy.paths import PathTolerance, path_taps, perturbed_path
+from kfopc_filterpy.paths.uncertainty import HALF_A_SAMPLE
 from kfopc_filterpy.signals import band_limited_noise, tone
 
-from .cases import FS, SEED, SWITCH_ON_S, Noise, Row, grid_runs, grids, make_case, noises, paths, tune_all
+from .cases import (
+    FS,
+    SEED,
+    SWITCH_ON_S,
+    Noise,
+    WindowRow,
+    figures_of,
+    grid_runs,
+    grids,
+    make_case,
+    noises,
+    paths,
+    tune_all,
+)
 from .parts import MARK, by_algorithm, case_parameters, cell, legend_of, new_figure, tuned_in_words, without_measured
 
 ALGORITHM = "KF-PB"
@@ -23,7 +37,6 @@ DURATION_S = 5.0
 RATED_SHARE = 0.25  # of the unconstrained control power
 WIDE_HZ, HIGH_TONE_HZ = (100.0, 6000.0), 4000.0
 BELOW_A_SIXTH = ("compressor", "band noise", "motor")  # their power lies below a sixth of the sample rate
-HALF_A_SAMPLE = PathTolerance(delay_samples=0.5)
 ERRORS: dict[str, dict[str, float]] = {  # of the estimate
     "exact": {},
     "a sample late": {"delay_samples": 1.0},
@@ -40,7 +53,7 @@ BOTTOM_DB = -8.0  # of the figure
 
 
 @dataclass(frozen=True, kw_only=True)
-class GuardRow(Row):
+class GuardRow(WindowRow):
     """KF-PB with an estimate that is wrong by `error`, and a guard; the noise reduction is over the steady half."""
 
     error: str
@@ -122,17 +135,12 @@ def run_job(
     error, guard = job
     place: dict[str, Any] = {"path": path, "noise": noise, "algorithm": ALGORITHM, "error": error, "guard": guard}
     tolerance = {NO_GUARD: None, DEFAULT: HALF_A_SAMPLE, STATED: stated(error)}[guard]
-    if best is None:
-        return GuardRow(**place, diverged_at_s=0.0)
     known = replace(scene, secondary_estimate=estimates[error], secondary_path_uncertainty=tolerance)
-    result = run_setting(known, ALGORITHM, best.setting)
-    if result is None or result.diverged_at_s is not None:
-        return GuardRow(**place, diverged_at_s=0.0 if result is None else result.diverged_at_s)
-    half = result.error.size // 2
-    power = float(np.mean(result.control_signal[half:] ** 2)) / scene.rated_power
-    reductions = seconds_db(result)
-    steady = float(-10 * np.log10(np.sum(result.error[half:] ** 2) / np.sum(result.disturbance[half:] ** 2)))
-    return GuardRow(**place, noise_reduction_db=steady, power=power, worst_second_db=min(reductions[1:]))
+    result = None if best is None else run_setting(known, ALGORITHM, best.setting)
+    row = GuardRow(**place, **figures_of(result, scene.rated_power))
+    if result is None or row.diverged_at_s is not None:
+        return row
+    return replace(row, worst_second_db=min(seconds_db(result)[1:]))
 
 
 def stated(error: str) -> PathTolerance:
@@ -142,12 +150,10 @@ def stated(error: str) -> PathTolerance:
 
 def seconds_db(result: SimulationResult) -> list[float]:
     """Return the noise reduction of each whole second in dB."""
-    seconds = int(result.error.size / result.fs)
-    error, disturbance = (
-        np.sum(np.reshape(signal[: seconds * round(result.fs)], (seconds, -1)) ** 2, axis=1)
-        for signal in (result.error, result.disturbance)
-    )
-    return (-10 * np.log10(error / disturbance)).tolist()
+    second = round(result.fs)
+    begins = range(0, result.error.size - second + 1, second)
+    parts = [slice(begin, begin + second) for begin in begins]
+    return [noise_reduction_db(result.error[part], result.disturbance[part], steady=1.0) for part in parts]
 
 
 # ---- Claims and notes
