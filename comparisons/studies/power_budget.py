@@ -401,7 +401,8 @@ def _case(rows: Sequence[BudgetRow], case: Case) -> FigureItem:
                 hollow = np.isin(shares, over)
                 ax.plot(shares[hollow], values[hollow], **style | {"linestyle": "", "markerfacecolor": "white"})
         above.set_title(family, fontsize="medium")
-        above.legend(fontsize="small", frameon=False)
+        # Below, where the powers leave room; above, it would cover curves.
+        below.legend(*above.get_legend_handles_labels(), loc="upper right", fontsize="small", frameon=False)
         below.axhline(1.0, color=MARK, linewidth=1)
         below.set_xlabel("Rated power (dB over the unconstrained)")
         for ax in (above, below):
