@@ -577,7 +577,7 @@ def _parameters(tuned: Mapping[Case, Mapping[str, Tuned]]) -> dict[str, Paramete
         "durations_s": Parameter(list(DURATIONS_S), "from switch-on on; the steady half counts"),
         "seeds": Parameter(list(SEEDS), "of noise; of a tone, its phase; of the recording, where it begins"),
         "limiter_window_s": Parameter(WINDOW_S, "default of OutputLimiter"),
-        "KF-PB memory_s, credit_s": Parameter([defaults.memory_s, defaults.credit_s], "defaults of PowerBudget"),
+        "KF-PB memory_s, averaging_s": Parameter([defaults.memory_s, defaults.averaging_s], "defaults of PowerBudget"),
         "r E[x'^2]/q": Parameter(
             {str(case): {name: own[name].setting for name in TUNED} for case, own in tuned.items()},
             f"tuned on the first seed, {DURATIONS_S[0]:g} s, 25 %: {Tuned.RULE}",

@@ -13,7 +13,7 @@ from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
 from ..paths.uncertainty import HALF_A_SAMPLE, guard_against
 from ..power.amplifiers import Amplifier
-from ..power.budget import BudgetState, advance_budget, take_correlations
+from ..power.budget import BudgetState, advance_budget, follow_noise
 from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
@@ -54,7 +54,7 @@ def follow_power_budget(state, error):
         latest(state.lines.reference),
     )
     advance_constraint(state.constraint, d, filtered, x)
-    take_correlations(state.budget, x, filtered)
+    follow_noise(state.budget, x, filtered)
     return True
 
 
@@ -190,9 +190,8 @@ def kf_pb(
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
         (`FrequencyDomainKalman`). By default direct for one channel, shared gain for several.
     **settings
-        Further settings. The direct form takes `fs`, `memory_s`, `credit_s` and `averaging_s` for one channel (see
-        `PowerBudget`), `fs`, `memory_s` and `averaging_s` for several (see `DirectPowerBudget`). For the other forms, see
-        their classes.
+        Further settings. The direct form takes `fs`, `memory_s` and `averaging_s`, see `PowerBudget` for one channel and
+        `DirectPowerBudget` for several. For the other forms, see their classes.
 
     Returns
     -------

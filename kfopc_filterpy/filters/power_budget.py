@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..power.budget import DEFAULT_AVERAGING_S, DEFAULT_CORRELATION_MEMORY_S, DEFAULT_CREDIT_S, PowerBudget
+from ..power.budget import DEFAULT_AVERAGING_S, DEFAULT_CORRELATION_MEMORY_S, PowerBudget
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from .random_walk import RandomWalkKFOPC
 
@@ -27,7 +27,7 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         r, q, P(0|0) = initial_variance I and the precision of P, see `KFOPC.random_walk`.
     rated_power : float
         Rated output power (mean square of the control signal).
-    fs, memory_s, credit_s, averaging_s, guard
+    fs, memory_s, averaging_s, guard
         See `PowerBudget`.
 
     Raises
@@ -78,7 +78,6 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         dtype: Any = np.float64,
         fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
-        credit_s: float = DEFAULT_CREDIT_S,
         averaging_s: float = DEFAULT_AVERAGING_S,
         guard: Any = None,
     ) -> None:
@@ -95,7 +94,6 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
             rated_power,
             fs=fs,
             memory_s=memory_s,
-            credit_s=credit_s,
             averaging_s=averaging_s,
             guard=guard,
         )

@@ -1,7 +1,7 @@
 """The power budget: from the unconstrained control filter to the best one within the rated power, sample by sample.
 
-`allocation` solves for the control filter. This module computes what it needs: the correlations of the recent signals,
-a forecast of their level, and a target power that accounts for the power spent so far.
+`allocation` solves for the control filter, `spending` says how much power to spend now. This module computes what they
+need from the signals, and listens to a limiter.
 """
 
 from __future__ import annotations
@@ -15,32 +15,22 @@ from .._validate import as_count, as_number, as_positive, as_signal
 from ..kernels.compiling import compiled, part
 from ..kernels.delay_lines import delay_line, newest, push
 from ..kernels.records import new_record
+from ..kernels.toeplitz import toeplitz_power
 from ..kernels.vectors import FAST, add_scaled, dot
 from .allocation import constrained_filter, guarded
 from .ceiling import balance_of_power
 from .constraint import DEFAULT_FS, SILENCE
+from .spending import BINS, LEAST, MOST, Spending, book, new_spending, power_left, power_to_spend
 
-DEFAULT_CORRELATION_MEMORY_S = 1.25
-DEFAULT_CREDIT_S = 0.1
+DEFAULT_CORRELATION_MEMORY_S = 2.5
 DEFAULT_AVERAGING_S = 10.0
-SHORT, USUAL, LONG = 6, 10, 24  # complete segments in a window; one more is being filled
-AGREEMENT = 1.0  # levels differ if their squared difference exceeds this multiple of the sum of their variances
-REPAYMENT = 3.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account / (1 + PATIENCE chance))
-PATIENCE = 6.0  # 1/s: repayment is slower if much of the account is due to chance
-LARGEST_CHANCE_S = 0.5
-UNSPENT = 0.4  # of the averaging time: memory of the share of the rated power that was spent
-UNSPENT_GAIN, UNSPENT_MOST = 10.0, 1.3  # an unspent share raises the target by ten times itself, 30 % at most
-PACE = 0.5  # of the rated power at most repays a debt, more only if the debt exceeds a quarter of the averaging time
-TARGET_LEAST, TARGET_MOST = 0.1, 3.0  # target power over rated power
+SEGMENTS = 10  # in the window of the correlations; one more is being filled
 LIMITER_MEMORY_S = 1.0  # memory of what a limiter took
 CEILING_RATE = 2.0  # the ceiling moves by exp(2 dt / T) at most, with T = averaging time, or the time so far if shorter
 SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
 LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
 INTERVAL = 128  # samples between two solutions; fewer at the start
-STEADY = 6.0  # a trend counts if it is larger than sqrt(STEADY) times its standard error
-SHORTEST_PART = 0.25  # of a segment: a shorter part is ignored
 X, XF = 0, 1  # the reference and the filtered reference, in the correlations
-FORECAST_LEAST, FORECAST_MOST = 0.5, 4.0  # bounds of the forecast change of power; the lower one is cautious
 
 
 class BudgetState(NamedTuple):
@@ -49,10 +39,11 @@ class BudgetState(NamedTuple):
     control_filter: np.ndarray  # (L,) v, which makes the control signal
     reference: np.ndarray  # delay line of x
     filtered: np.ndarray  # delay line of x'
-    own: np.ndarray  # (2, LONG + 1, lags) for x and x': sums of products of a segment's samples at lags 0, 1, ...
-    across: np.ndarray  # (2, LONG + 1, lags) the same, of its samples with samples before it
-    counts: np.ndarray  # (LONG + 1,) samples in each segment
+    own: np.ndarray  # (2, SEGMENTS + 1, lags) for x and x': sums of products of a segment's samples at lags 0, 1, ...
+    across: np.ndarray  # (2, SEGMENTS + 1, lags) the same, of its samples with samples before it
+    counts: np.ndarray  # (SEGMENTS + 1,) samples in each segment
     guard: np.ndarray  # correlation of the guard filter W at lags 0, 1, ...; one zero without a guard
+    spending: Spending  # of the averaging time
     numbers: np.ndarray  # record: rated power, account, lambda, ...; see `PowerBudget`
 
 
@@ -84,66 +75,16 @@ def take_correlations(budget, x, xf):
 
 
 @part()
-def choose_span(budget):
-    """Choose the window: short if the level has risen, long if its changes can be due to chance.
-
-    Chance is estimated from the differences of neighbouring segments' powers (von Neumann). They are large for bursts,
-    which are then averaged over a long window. They are small for a noise that swells, so that even a small difference
-    between the means of two windows counts. (This is a rule of intersecting confidence intervals, after Goldenshluger
-    and Nemirovski.) The estimate follows a fall of the level more slowly than a rise: a pause between bursts is no
-    reason to spend more on the next one.
-    """
-    numbers = budget.numbers[0]
-    numbers.span, numbers.chance = USUAL, 0.0
-    usual, variance, _ = _mean_level(budget, USUAL)
-    if not usual > SILENCE:
-        return
-    # A segment's variance is 12 times the mean's. With fewer segments, at the start, this overestimates the chance.
-    chance = math.sqrt(2.0 * SHORT * variance * numbers.segment / numbers.fs)
-    numbers.chance = min(chance, LARGEST_CHANCE_S)
-    short, short_variance, _ = _mean_level(budget, SHORT)
-    long, long_variance, segments = _mean_level(budget, LONG)
-    if short > usual and math.log(short / usual) ** 2 > AGREEMENT * (short_variance + variance):
-        numbers.span = SHORT
-    elif segments >= 0.8 * LONG and math.log(long / usual) ** 2 <= AGREEMENT * (long_variance + variance):
-        numbers.span = LONG
-
-
-@part()
-def _mean_level(budget, span):
-    """Return the mean power of x' in the newest segments, its relative variance by chance, and their number."""
-    total = weight = 0.0
-    for j in range(span + 1):
-        share = _share(budget, j)
-        if share > 0.0:
-            weight += share
-            total += share * _power(budget, j)
-    if not (total > 0.0 and total < np.inf):
-        return 0.0, 0.0, 0.0
-    mean = total / weight
-    differences = count = 0.0
-    last = -1.0
-    for j in range(span + 1):
-        if _share(budget, j) > 0.0:
-            level = _power(budget, j) / mean
-            if last >= 0.0:
-                differences += (level - last) ** 2
-                count += 1.0
-            last = level
-    return mean, 0.5 * differences / max(count, 1.0) / max(weight, 1.0), weight
-
-
-@part()
 def sum_correlations(budget, of_x, of_xf):
     """Set the first rows of R_x and R_x' to the means over the window."""
-    count, kept, span, current = 0.0, len(budget.counts), budget.numbers[0].span, budget.numbers[0].current
+    count, kept, current = 0.0, len(budget.counts), budget.numbers[0].current
     for k in range(of_x.size):
         of_x[k] = of_xf[k] = 0.0
-    for j in range(span + 1):
+    for j in range(kept):
         i = (current - j) % kept
         add_scaled(of_x, 1.0, budget.own[X, i], 0, of_x.size)
         add_scaled(of_xf, 1.0, budget.own[XF, i], 0, of_x.size)
-        if j < span:  # zeros precede the oldest segment
+        if j < kept - 1:  # zeros precede the oldest segment
             add_scaled(of_x, 1.0, budget.across[X, i], 0, of_x.size)
             add_scaled(of_xf, 1.0, budget.across[XF, i], 0, of_x.size)
         count += budget.counts[i]
@@ -152,120 +93,34 @@ def sum_correlations(budget, of_x, of_xf):
         of_xf[k] /= count
 
 
-@part()
-def level_forecast(budget, mean_power):
-    """Return the ratio of the present power of x' to its mean in the window; 1 unless there is a significant trend.
-
-    The trend is a straight line through the logarithm of the segments' powers. Its slope is shrunk by the part that
-    scatter alone would cause (James and Stein). Bursts scatter, so they are averaged; a swelling noise is followed.
-    """
-    floor, segments = 1e-12 * mean_power, budget.numbers[0].span + 1
-    weight = times = levels = 0.0
-    for j in range(segments):
-        share = _share(budget, j)
-        if share > 0.0:
-            weight += share
-            times += share * _age(budget, j)
-            levels += share * math.log(_power(budget, j) + floor)
-    if not (weight > 3.0 and floor > SILENCE):
-        return 1.0
-    times, levels = times / weight, levels / weight
-    spread = together = scatter = 0.0
-    for j in range(segments):
-        share = _share(budget, j)
-        if share > 0.0:
-            t, level = _age(budget, j) - times, math.log(_power(budget, j) + floor) - levels
-            spread += share * t * t
-            together += share * t * level
-            scatter += share * level * level
-    slope = together / spread
-    error = max(scatter - slope * together, 0.0) / (weight - 2.0) / spread
-    if not slope * slope > STEADY * error:
-        return 1.0
-    slope *= 1.0 - STEADY * error / (slope * slope)
-    mean = 0.0  # mean power along the line, over the power at its middle
-    for j in range(segments):
-        mean += _share(budget, j) / weight * math.exp(slope * (_age(budget, j) - times))
-    return min(max(math.exp(-slope * times) / mean, FORECAST_LEAST), FORECAST_MOST)
-
-
-@part(forceinline=True)
-def _share(budget, j):
-    """Return the filled share of the j-th newest segment, 0 if it is too short to count."""
-    count = budget.counts[(budget.numbers[0].current - j) % len(budget.counts)] / budget.numbers[0].segment
-    return count if count >= SHORTEST_PART else 0.0
-
-
-@part(forceinline=True)
-def _age(budget, j):
-    """Return the time of the middle of the j-th newest segment, in segments from now (negative)."""
-    newest_part = budget.counts[budget.numbers[0].current] / budget.numbers[0].segment
-    return -0.5 * newest_part if j == 0 else -newest_part - j + 0.5
-
-
-@part(forceinline=True)
-def _power(budget, j):
-    """Return the power of x' in the j-th newest segment, which must not be empty."""
-    i = (budget.numbers[0].current - j) % len(budget.counts)
-    return budget.own[XF, i, 0] / budget.counts[i]
-
-
-@part()
-def target_power(budget, forecast):
-    """Return the power to solve for: the rated one, corrected by the account, over the forecast change of level.
-
-    A limiter that acts sets a ceiling, which holds whatever credit the account has.
-
-    Repayment of debt starts at once, but is slower the larger `chance` is. The error is convex in the power, so a large
-    debt costs least if it is repaid evenly, in what is left of the averaging time. Credit of up to half of `chance` is
-    left to even out by itself: to react to chance would cost noise reduction.
-    """
-    numbers = budget.numbers[0]
-    account, chance = numbers.account, numbers.chance
-    excess = account if account > 0.0 else min(account + 0.5 * chance, 0.0)
-    share = unspent(numbers) * math.exp(-REPAYMENT / (1.0 + PATIENCE * chance) * excess)
-    repaid = max(PACE, 2.0 * account / numbers.averaging)
-    return numbers.rated_power * min(max(share, 1.0 - repaid, TARGET_LEAST), numbers.ceiling) / forecast
-
-
-@part()
-def unspent(numbers):
-    """Return the factor that raises the target if, beyond what chance explains, power was recently left unspent.
-
-    The account loses credit that could not be spent in time. A noise that swells loses a part of the power at each
-    swell, since falls of the level are followed slowly. How large a part is measured from the noise's own past.
-    """
-    left = 1.0 - numbers.spent - numbers.chance / math.sqrt(2.0 * UNSPENT * numbers.averaging)
-    return min(1.0 + UNSPENT_GAIN * max(left, 0.0), UNSPENT_MOST)
-
-
 @compiled()
 def allocate(budget, w):
     """Set the control filter for the estimate w."""
-    L, lags = budget.control_filter.size, budget.own.shape[2]
+    L, lags, numbers = budget.control_filter.size, budget.own.shape[2], budget.numbers[0]
     of_x, of_xf = np.empty(lags), np.empty(lags)
-    choose_span(budget)
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
-    forecast = level_forecast(budget, of_xf[0])
-    power = target_power(budget, forecast)
+    per_level, level = power_to_spend(budget.spending, numbers.ceiling, numbers.limited > 0.0)
+    mean = of_xf[0]
+    share = per_level * mean if mean > 0.0 and per_level < np.inf else 1.0
     if lags > L:
         of_xf, w = guarded(of_xf, budget.guard, w)
-    budget.numbers[0].weight = constrained_filter(
-        of_x[:L], of_xf, w, power, budget.numbers[0].weight, budget.control_filter
+    numbers.weight = constrained_filter(
+        of_x[:L], of_xf, w, share * numbers.rated_power, numbers.weight, budget.control_filter
     )
-    if budget.numbers[0].limited > 0.0:
-        move_ceiling(budget, of_x[:L], of_xf, forecast)
-        budget.numbers[0].acts = False
+    numbers.gain = toeplitz_power(of_x[:L], budget.control_filter) / mean if mean > 0.0 else 0.0
+    if numbers.limited > 0.0 and level > 0.0:
+        move_ceiling(budget, of_x[:L], of_xf, level / mean)
+        numbers.acts = False
 
 
 @part()
-def hear_limiter(budget, y):
+def hear_limiter(budget, asked, y):
     """Add the newest sample to the means of what a limiter left as it was, and of what it took (see `ceiling`)."""
-    numbers, v = budget.numbers[0], budget.control_filter
+    numbers = budget.numbers[0]
     amplitude = math.sqrt(numbers.rated_power)
-    asked = min(max(dot(v, newest(budget.reference, v.size)) / amplitude, -LOUDEST), LOUDEST)
+    asked = min(max(asked / amplitude, -LOUDEST), LOUDEST)
     played = min(max(y / amplitude, -LOUDEST), LOUDEST)
     passed, limited = asked * asked, 0.0
     if abs(asked - played) > SAME:
@@ -293,26 +148,32 @@ def move_ceiling(budget, of_x, of_xf, forecast):
         if numbers.weight == 0.0 and not numbers.acts:
             return
         numbers.ceiling = min(numbers.ceiling, power * forecast / numbers.rated_power)
-    step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, numbers.averaging * numbers.fs)
-    numbers.ceiling = min(max(numbers.ceiling * math.exp(step), TARGET_LEAST), TARGET_MOST)
+    step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, numbers.averaging)
+    numbers.ceiling = min(max(numbers.ceiling * math.exp(step), LEAST), MOST)
 
 
 @part()
 def advance_budget(budget, w, x, xf, y):
     """Process a sample of reference, filtered reference and emitted control signal; solve again if it is due."""
-    numbers = budget.numbers[0]
+    numbers, v = budget.numbers[0], budget.control_filter
     take_correlations(budget, x, xf)
-    hear_limiter(budget, y)
-    spent = numbers.account + (y * y / numbers.rated_power - 1.0) / numbers.fs
-    numbers.account = min(max(spent, -numbers.credit - numbers.chance), numbers.averaging)
-    if numbers.weight > 0.0:
-        numbers.spent += (y * y / numbers.rated_power - numbers.spent) / (UNSPENT * numbers.averaging * numbers.fs)
+    asked = dot(v, newest(budget.reference, v.size))
+    # The level of the noise as the control filter sees it: the power it asks for, over what it asks for at level 1.
+    book(budget.spending, asked * asked / numbers.gain if numbers.gain > 0.0 else xf * xf, y * y / numbers.rated_power)
+    hear_limiter(budget, asked, y)
     numbers.taken += 1.0
     numbers.waited += 1.0
     # At the start the estimate grows fast, so the interval is an eighth of the time so far.
     if numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
         numbers.interval, numbers.waited = numbers.waited, 0.0
         allocate(budget, w)
+
+
+@part()
+def follow_noise(budget, x, xf):
+    """Process a sample while the control is switched off: no power is saved in this time."""
+    take_correlations(budget, x, xf)
+    book(budget.spending, xf * xf, 1.0)
 
 
 @compiled(fastmath=FAST)
@@ -333,8 +194,14 @@ def advance_sample(budget, w, x, xf, y):
 
 @compiled()
 def listen_sample(budget, x, xf):
-    """Call `take_correlations` from Python."""
-    take_correlations(budget, x, xf)
+    """Call `follow_noise` from Python."""
+    follow_noise(budget, x, xf)
+
+
+@compiled()
+def left_of(spending):
+    """Call `power_left` from Python."""
+    return power_left(spending)
 
 
 def correlation_of(guard: Any) -> np.ndarray:
@@ -358,20 +225,17 @@ class PowerBudget:
     error is quadratic in w, so the conditional mean of w can replace it (certainty equivalence). The constraint never
     enters the estimate, so the estimate has nothing to forget when the level changes.
 
-    Three things determine :math:`\lambda`:
+    The power :math:`\rho` follows the level of the noise, so that :math:`\lambda` stays the same while the spectrum does.
+    This is the best way to spend a mean power: a noise that recurs within the averaging time is controlled as well as
+    by the best fixed filter with the same mean power. The averaging time so far says how much power each unit of level
+    gets, so that the mean is the rated power. Newer noise counts more.
 
-    - the correlations of reference and filtered reference over a sliding window. The window is usually 1.25 s long,
-      0.75 s if the noise has become louder, and 3 s if changes of its level can be due to chance;
-    - a forecast of the level. If a straight line through the logarithm of the power differs significantly from a
-      constant, its present value replaces the mean of the window;
-    - an account of the power spent beyond the rated power, in seconds of rated power. The target is the rated power
-      times ``exp(-3 excess / (1 + 6 chance))``. This steers the mean power to the rated one and repays overspending. A
-      large debt is repaid evenly within the averaging time, because the error is convex in the power. Half of the rated
-      power repays it, or up to 90 % if the debt exceeds a quarter of the averaging time. `chance` is the standard
-      deviation, in seconds, that random changes of the noise's level give to the account within a second. It enlarges
-      the credit that can be saved, and a credit of up to half of `chance` is left to even out by itself. If more power
-      than chance explains was left unspent over about 0.4 of the averaging time, although it could have been used, the
-      target rises by up to 30 %.
+    - If power is left of the last `averaging_s`, up to twice the rated power is spent, but only on a level that has
+      come and gone within this time. A noise that has just become louder gets the rated power at most.
+    - If more than the rated power was spent, it is repaid within a quarter of `averaging_s`.
+
+    So after a noise becomes softer for good, the power rises only slowly to the rated one, within `averaging_s`. The
+    correlations are those of a sliding window of `memory_s`.
 
     If a limiter follows the budget (the `control_signal` given to `advance` then differs from the budget's own), the
     target has a ceiling. At the ceiling, more power would lower the error in samples that pass the limiter by as much
@@ -386,14 +250,10 @@ class PowerBudget:
         Rated output power (mean square of the control signal).
     fs : float, default 16000
         Sample rate in Hz.
-    memory_s : float, default 1.25
-        Usual length of the window of the correlations in seconds, at least 10 n_taps samples. A short window is 0.6
-        times as long, a long one 2.4 times.
-    credit_s : float, default 0.1
-        Seconds of rated power that can be saved while the noise needs less.
+    memory_s : float, default 2.5
+        Length of the window of the correlations in seconds, at least 10 n_taps samples.
     averaging_s : float, default 10
-        Time in seconds over which the mean power is kept to the rated one, even if the noise suddenly gets louder. Debt
-        beyond this many seconds of rated power is forgotten.
+        Time in seconds over which the mean power is kept to the rated one.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
@@ -412,8 +272,6 @@ class PowerBudget:
     M. D. Hebden, "An algorithm for minimization using exact second derivatives", AERE report TP515, 1973, and
     J. J. More, D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4(3), 1983, for the search
     for lambda. N. Levinson, "The Wiener RMS error criterion in filter design and prediction", J. Math. Phys. 25, 1947.
-    A. Goldenshluger, A. Nemirovski, "On spatially adaptive estimation of nonparametric regression", Math. Methods
-    Statist. 6, 1997, for the window.
 
     Examples
     --------
@@ -434,7 +292,6 @@ class PowerBudget:
         *,
         fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
-        credit_s: float = DEFAULT_CREDIT_S,
         averaging_s: float = DEFAULT_AVERAGING_S,
         guard: Any = None,
     ) -> None:
@@ -444,35 +301,31 @@ class PowerBudget:
         rated_power = as_positive(rated_power, "rated_power")
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
-        self.credit_s = as_positive(credit_s, "credit_s", unit="s")
         self.averaging_s = as_positive(averaging_s, "averaging_s", unit="s")
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(lags),
             filtered=delay_line(lags),
-            own=np.zeros((2, LONG + 1, lags)),
-            across=np.zeros((2, LONG + 1, lags)),
-            counts=np.zeros(LONG + 1),
+            own=np.zeros((2, SEGMENTS + 1, lags)),
+            across=np.zeros((2, SEGMENTS + 1, lags)),
+            counts=np.zeros(SEGMENTS + 1),
             guard=of_guard,
+            spending=new_spending(self.averaging_s * self.fs),
             numbers=new_record(
                 rated_power=rated_power,
                 fs=self.fs,
-                credit=self.credit_s,
-                averaging=self.averaging_s,
-                segment=float(max(round(self.memory_s * self.fs / USUAL), lags)),  # samples
+                averaging=self.averaging_s * self.fs,  # samples
+                segment=float(max(round(self.memory_s * self.fs / SEGMENTS), lags)),  # samples
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
                 waited=0.0,  # of these, since the last solution
                 interval=0.0,  # and between the last two
-                account=0.0,  # seconds of rated power spent beyond the rated power
                 weight=0.0,  # lambda
-                span=USUAL,  # segments in the window
-                chance=0.0,  # seconds of rated power: std that the scatter of levels gives the account in a second
-                ceiling=TARGET_MOST,  # of the target over the rated power, behind a limiter
+                gain=0.0,  # power of the control signal for each unit of level
+                ceiling=MOST,  # of the target over the rated power, behind a limiter
                 passed=0.0,  # recent mean, over the rated power, of what a limiter left as it was
                 limited=0.0,  # the same, of y (u - y) for what it changed from u to y
                 acts=False,  # whether it changed anything since the last solution
-                spent=1.0,  # recent mean share of the rated power spent while the noise needed all of it
             ),
         )
 
@@ -507,13 +360,17 @@ class PowerBudget:
 
     @property
     def ceiling(self) -> float:
-        """Ceiling of the target power behind a limiter, over the rated power; 3 if no limiter ever acts."""
+        """Ceiling of the target power behind a limiter, over the rated power; 2 if no limiter ever acts."""
         return float(self._state.numbers["ceiling"][0])
 
     @property
     def account_s(self) -> float:
-        """Power spent beyond the rated power, in seconds of rated power; negative: credit."""
-        return float(self._state.numbers["account"][0])
+        """Power spent in the averaging time beyond the rated power, in seconds of it; negative: power is left.
+
+        The time before the first sample counts as if the rated power had been spent.
+        """
+        left, _ = left_of(self._state.spending)
+        return -float(left) * self.averaging_s / BINS
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the `reference` x(n); call it before `advance` with the same x(n)."""

@@ -24,8 +24,12 @@ from ..kernels.block_toeplitz import (
     toeplitz_energy,
     toeplitz_product,
 )
-from .budget import DEFAULT_AVERAGING_S, DEFAULT_CREDIT_S, PACE, REPAYMENT, TARGET_LEAST
+from .budget import DEFAULT_AVERAGING_S
+from .spending import LEAST
 
+CREDIT_S = 0.1  # seconds of rated power that can be saved while the noise needs less
+REPAYMENT = 3.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account)
+PACE = 0.5  # of the rated power at most repays a debt, more only if the debt exceeds a quarter of the averaging time
 SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
 MOST_SWEEPS = 6  # as long as a power exceeds its target by more than
 EXCESS = 1.1  # times; what is left after the last sweep is scaled down
@@ -101,9 +105,9 @@ class ChannelBudget:
             The time in seconds.
         """
         spent = self.account + (power / self.rated_power - 1.0) * duration_s
-        self.account = np.clip(spent, -DEFAULT_CREDIT_S, self.averaging_s)
+        self.account = np.clip(spent, -CREDIT_S, self.averaging_s)
         repaid = np.maximum(PACE, 2.0 * self.account / self.averaging_s)
-        share = np.maximum(np.exp(-REPAYMENT * self.account), np.maximum(1.0 - repaid, TARGET_LEAST))
+        share = np.maximum(np.exp(-REPAYMENT * self.account), np.maximum(1.0 - repaid, LEAST))
         self.target_power = self.rated_power * share
 
     def solve(self, correlation: np.ndarray, primary: np.ndarray) -> None:

@@ -1,0 +1,178 @@
+"""How much of a rated power to spend now, so that the mean over the averaging time is the rated power.
+
+An output power p reduces the noise best over time if its price, the Lagrange multiplier lambda of the power-constrained
+control filter, is the same at all times. For a noise whose spectrum does not change, lambda is constant if the control
+filter is, and then p is proportional to the level of the noise. So the law is
+
+    p = u l,
+
+with the level l now, and u such that the noise of the last averaging time T would have used the rated power. A noise
+that recurs within T is then controlled as well as by the best fixed filter.
+
+That a noise recurs is a forecast. If it fails, what was spent within the last T, S(n), limits p: no more is spent than
+brings S back to T soon. Powers are fractions of the rated power here, times are in bins, each 1/80 of T.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..kernels.compiling import part
+from ..kernels.records import new_record
+
+BINS = 80  # in the averaging time
+NOW = 3  # newest bins, whose mean is the level now; power that is left may be spent within as many
+REPAYMENT = 0.25  # of the averaging time, within which overspending is repaid
+ALIKE = 0.5  # a level that was at least this share of the present one is taken for the same
+LEAST, MOST = 0.1, 2.0  # of the rated power: bounds of what is spent, whatever was spent before
+TOLERANCE = 1e-4  # relative error of u
+TRIES = 20
+
+
+class Spending(NamedTuple):
+    """Levels and powers in the averaging time, bin by bin; the bin that is being filled is an extra one."""
+
+    levels: np.ndarray  # (BINS + 1,) sums of the level over the samples of a bin
+    spent: np.ndarray  # (BINS + 1,) sums of the squared control signal over the rated power
+    counts: np.ndarray  # (BINS + 1,) samples; 0: before the first sample
+    numbers: np.ndarray  # record: samples in a full bin, index of the newest one
+
+
+def new_spending(averaging_samples: float) -> Spending:
+    """Return the state before the first sample, as if the rated power had been spent so far."""
+    size = max(round(averaging_samples / BINS), 1)
+    return Spending(
+        np.zeros(BINS + 1), np.full(BINS + 1, float(size)), np.zeros(BINS + 1), new_record(full=float(size), newest=0)
+    )
+
+
+@part()
+def book(spending, level, spent):
+    """Add a sample's level and what was spent in it."""
+    numbers = spending.numbers[0]
+    if spending.counts[numbers.newest] >= numbers.full:
+        numbers.newest = (numbers.newest + 1) % (BINS + 1)
+        spending.counts[numbers.newest] = 0.0
+    newest = numbers.newest
+    if spending.counts[newest] == 0.0:
+        spending.levels[newest] = spending.spent[newest] = 0.0
+    spending.levels[newest] += level
+    spending.spent[newest] += spent
+    spending.counts[newest] += 1.0
+
+
+@part()
+def level_now(spending):
+    """Return the mean level of the newest bins."""
+    total = count = 0.0
+    for j in range(NOW):
+        i = _bin(spending, j)
+        total += spending.levels[i]
+        count += spending.counts[i]
+    return total / max(count, 1.0)
+
+
+@part()
+def power_left(spending):
+    """Return T - S, what is left of the averaging time's power; and the mean that will leave S in the next T/4."""
+    size, filled = spending.numbers[0].full, _filled(spending)
+    first = BINS - int(REPAYMENT * BINS) + 1
+    total = leaving = 0.0
+    for j in range(BINS + 1):
+        share = 1.0 if j < BINS else 1.0 - filled  # a part of the oldest bin has left
+        spent = share * spending.spent[_bin(spending, j)] / size
+        total += spent
+        if j >= first:
+            leaving += spent
+    return BINS - total, leaving / (BINS - first + 1.0 - filled)
+
+
+@part()
+def price(spending, ceiling, limited):
+    """Return u, the power to spend for each unit of level, or Inf if the noise needs less than the rated power.
+
+    It solves ``sum_j a_j min(u l_j, p_j) = sum_j a_j`` over the bins. Newer ones have larger weights a_j, because the
+    future is more like them. A bin counts with at most p_j, the power that was spent in it, or MOST if that was less:
+    a single loud second is not to use up the whole power of the following ones. Behind a limiter that acts, p_j is the
+    ceiling, or the rated power if that is less, because the limiter lets no more pass.
+    """
+    count = rest = 0.0
+    for j in range(BINS + 1):
+        i = _bin(spending, j)
+        count += _weight(j) * spending.counts[i]
+        rest += _weight(j) * spending.levels[i]
+    u = np.inf
+    for _ in range(TRIES):
+        if not rest > 0.0:
+            return np.inf
+        last, u = u, count / rest
+        if not u < np.inf or abs(u - last) <= TOLERANCE * u:
+            break
+        rest, count = 0.0, 0.0
+        for j in range(BINS + 1):
+            i = _bin(spending, j)
+            bound = max(MOST * spending.counts[i], spending.spent[i])
+            if limited:
+                bound = min(ceiling, 1.0) * spending.counts[i]
+            count += _weight(j) * spending.counts[i]
+            if u * spending.levels[i] > bound:
+                count -= _weight(j) * bound
+            else:
+                rest += _weight(j) * spending.levels[i]
+    return u
+
+
+@part()
+def known(spending, level):
+    """Return whether a level as high as this has come and gone within the averaging time, or lasted for all of it.
+
+    Only then is the power that it can have known from the past. A noise that has just become louder may stay so.
+    """
+    gone = False
+    for j in range(NOW, BINS):
+        i = _bin(spending, j)
+        if spending.counts[i] == 0.0:
+            return False
+        loud = spending.levels[i] >= ALIKE * level * spending.counts[i]
+        if loud and gone:
+            return True
+        gone = gone or not loud
+    return not gone
+
+
+@part()
+def power_to_spend(spending, ceiling, limited):
+    """Return the power to spend for each unit of level, and the level now.
+
+    `ceiling` is another bound of the power, and `limited` says whether a limiter acts on the control signal.
+
+    If power is left, u is a little larger: what was left will not all be needed.
+    """
+    left, leaving = power_left(spending)
+    level = level_now(spending)
+    limit = min(leaving, 1.0) + left / (NOW if left > 0.0 else REPAYMENT * BINS)
+    limit = min(max(limit, LEAST), MOST, ceiling)
+    if not known(spending, level):
+        limit = min(limit, 1.0)
+    u = price(spending, ceiling, limited) * (1.0 + max(left, 0.0) / BINS)
+    return (min(u, limit / level) if level > 0.0 else u), level
+
+
+@part(forceinline=True)
+def _bin(spending, j):
+    """Return the index of the j-th newest bin."""
+    return (spending.numbers[0].newest - j) % (BINS + 1)
+
+
+@part(forceinline=True)
+def _weight(j):
+    """Return the weight of the j-th newest bin."""
+    return 1.0 - j / (BINS + 1.0)
+
+
+@part(forceinline=True)
+def _filled(spending):
+    """Return the filled part of the newest bin."""
+    return spending.counts[spending.numbers[0].newest] / spending.numbers[0].full
