@@ -27,6 +27,7 @@ DEFAULT_AVERAGING_S = 10.0
 SEGMENTS = 10  # in the window of the correlations; one more is being filled
 LIMITER_MEMORY_S = 1.0  # memory of what a limiter took
 CEILING_RATE = 2.0  # the ceiling moves by exp(2 dt / T) at most, with T = averaging time, or the time so far if shorter
+SOFT = 0.5  # a noise for which less than this share of the rated power is spent does not lower the ceiling
 SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
 LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
 INTERVAL = 128  # samples between two solutions; fewer at the start
@@ -134,9 +135,8 @@ def hear_limiter(budget, asked, y):
 def move_ceiling(budget, of_x, of_xf, forecast):
     """Move the ceiling to where the limiter takes as much from the noise reduction as more power would add.
 
-    It moves fast at the start and then slowly, so that single bursts do not move it. It falls from the power in use,
-    because a ceiling above that has no effect. If the whole estimate fits, it falls only if the limiter acts now: what
-    the limiter took from a louder noise says nothing about a quiet one.
+    It moves fast at the start and then slowly, so that single bursts do not move it. It falls only if the limiter acts
+    now or the noise is loud: what the limiter took from a louder noise says nothing about a soft one.
     """
     numbers = budget.numbers[0]
     balance, power = balance_of_power(
@@ -144,10 +144,8 @@ def move_ceiling(budget, of_x, of_xf, forecast):
     )
     if not abs(balance) <= 1.0:
         return
-    if balance < 0.0:
-        if numbers.weight == 0.0 and not numbers.acts:
-            return
-        numbers.ceiling = min(numbers.ceiling, power * forecast / numbers.rated_power)
+    if balance < 0.0 and not (numbers.acts or power * forecast >= SOFT * numbers.rated_power):
+        return
     step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, numbers.averaging)
     numbers.ceiling = min(max(numbers.ceiling * math.exp(step), LEAST), MOST)
 

@@ -27,6 +27,7 @@ NOW = 3  # newest bins, whose mean is the level now; power that is left may be s
 REPAYMENT = 0.25  # of the averaging time, within which overspending is repaid
 ALIKE = 0.5  # a level that was at least this share of the present one is taken for the same
 LEAST, MOST = 0.1, 2.0  # of the rated power: bounds of what is spent, whatever was spent before
+LARGEST = 1e200  # a sample's level or power counts as this if it is larger
 TOLERANCE = 1e-4  # relative error of u
 TRIES = 20
 
@@ -58,8 +59,8 @@ def book(spending, level, spent):
     newest = numbers.newest
     if spending.counts[newest] == 0.0:
         spending.levels[newest] = spending.spent[newest] = 0.0
-    spending.levels[newest] += level
-    spending.spent[newest] += spent
+    spending.levels[newest] += min(level, LARGEST)
+    spending.spent[newest] += min(spent, LARGEST)
     spending.counts[newest] += 1.0
 
 

@@ -55,7 +55,7 @@ def controller(name: str, path: Any = S, **options: Any) -> FilteredReferenceCon
     if name == "KF-ANC":
         return kf_anc(N_TAPS, path, **kalman)
     if name == "KF-PB":
-        return kf_pb(N_TAPS, path, rated_power=RATED_POWER, fs=FS, memory_s=0.05, credit_s=0.05, **kalman)
+        return kf_pb(N_TAPS, path, rated_power=RATED_POWER, fs=FS, memory_s=0.05, **kalman)
     make = kf_opc if name == "KF-OPC" else kf_opc_repaired
     return make(N_TAPS, path, constraint=constraint, **kalman)
 

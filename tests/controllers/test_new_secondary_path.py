@@ -158,10 +158,7 @@ def test_the_running_gain_forgets_the_old_path() -> None:
 def test_kf_pb_solves_for_the_new_path() -> None:
     """After the window of its correlations, KF-PB spends its power as one that was made with the new path."""
     x, d, _ = noises(6000)
-    made = [
-        kf_pb(N_TAPS, path, rated_power=0.1, fs=FS, memory_s=0.05, credit_s=0.05, **KALMAN)
-        for path in (S_HAT, 0.5 * S_HAT)
-    ]
+    made = [kf_pb(N_TAPS, path, rated_power=0.1, fs=FS, memory_s=0.05, **KALMAN) for path in (S_HAT, 0.5 * S_HAT)]
     for controller in made:
         controller.listen(x[:500], d[:500])
     made[0].secondary_path = 0.5 * S_HAT

@@ -16,7 +16,8 @@ from kfopc_filterpy import OutputLimiter, kf_pb, noise_reduction_db, power_const
 from kfopc_filterpy.power import PowerBudget
 from kfopc_filterpy.power import budget as parts
 from kfopc_filterpy.power import ceiling as ceiling_parts
-from kfopc_filterpy.power.budget import LIMITER_MEMORY_S, LOUDEST, TARGET_LEAST, TARGET_MOST
+from kfopc_filterpy.power.budget import LIMITER_MEMORY_S, LOUDEST
+from kfopc_filterpy.power.spending import LEAST, MOST
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 balance_of_power, hear_limiter = from_python(ceiling_parts.balance_of_power), from_python(parts.hear_limiter)
@@ -112,7 +113,7 @@ def test_what_passed_and_what_was_taken_are_running_means() -> None:
     for n in range(500):
         budget.listen(u[n], u[n])
         budget.state.numbers["taken"] = float(n)
-        hear_limiter(budget.state, y[n])
+        hear_limiter(budget.state, u[n], y[n])
         asked, played = (np.clip(z / 0.5, -LOUDEST, LOUDEST) for z in (u[n], y[n]))
         same = abs(y[n] - u[n]) < 1e-9
         share = 1.0 / min(n + 1.0, LIMITER_MEMORY_S * fs + 1.0)
@@ -172,7 +173,7 @@ def test_the_best_share_is_found(share: float, name: str) -> None:
     shares = np.array([0.2, 0.3, 0.45, 0.65, 0.8, 1.0, 1.4])
     fixed = of_fixed_filters(STEEP, x, rated_power, shares)
     assert noise_reduction_db(result.error, result.disturbance) > np.max(fixed) - 0.5
-    assert TARGET_LEAST <= budget.ceiling < TARGET_MOST
+    assert LEAST <= budget.ceiling <= MOST
     if (name, share) == ("steady", 0.9):  # more than enough for most of the noise: the limiter's share is what is left
         assert noise_reduction_db(result.error, result.disturbance) > fixed[shares == 1.0][0] + 3.0
 
@@ -189,7 +190,7 @@ def test_of_a_flat_path_no_power_is_given_away(signal: str) -> None:
 
 def test_without_a_limiter_there_is_no_ceiling() -> None:
     _, budget = run(STEEP, noise("steady")[: 2 * FS], 0.25 * float(W @ W), limited=False)
-    assert budget.ceiling == TARGET_MOST
+    assert budget.ceiling == MOST
     assert budget.state.numbers["limited"][0] == 0.0
     assert budget.power_weight > 0.0
 
@@ -219,6 +220,6 @@ def test_a_quiet_noise_does_not_lower_the_ceiling() -> None:
 def test_a_ceiling_too_low_rises_until_the_estimate_fits() -> None:
     """What takes half of every sample leaves nothing that more power could add to, so the ceiling falls to its least."""
     budget, after, needed = limited_then_quiet(0.5)
-    assert after == TARGET_LEAST < needed
+    assert after == LEAST < needed
     assert budget.power_weight < 1e-3
-    assert budget.ceiling == pytest.approx(needed, rel=0.2)
+    assert needed < budget.ceiling < 1.4 * needed  # what 0.4 s of the quiet noise need scatters by a tenth

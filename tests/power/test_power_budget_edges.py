@@ -132,7 +132,7 @@ def test_the_disturbance_power_of_a_budget():
 
 @pytest.mark.parametrize("scale", [1e154, 1e80, 1e-170])
 def test_levels_whose_squares_leave_the_range_are_forgotten(scale: float) -> None:
-    budget = PowerBudget(2, 1.0, fs=1000.0, memory_s=0.1)
+    budget = PowerBudget(2, 1.0, fs=1000.0, memory_s=0.1, averaging_s=0.3)
     for n, x in enumerate(np.random.default_rng(0).uniform(-1, 1, 1500)):
         budget.advance(x, (scale if 500 <= n < 600 else 1.0) * x, [2.0, 1.0])
     assert np.all(np.isfinite(budget.control_filter))

@@ -1,0 +1,225 @@
+"""How much power to spend: bins, price and bounds against definitions written out from the samples."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers.compiled import from_python
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from kfopc_filterpy.power import spending as parts
+from kfopc_filterpy.power.spending import ALIKE, BINS, LEAST, MOST, NOW, REPAYMENT, TOLERANCE, Spending, new_spending
+
+book, known, level_now = from_python(parts.book), from_python(parts.known), from_python(parts.level_now)
+power_left, power_to_spend, price = map(from_python, (parts.power_left, parts.power_to_spend, parts.price))
+
+SIZE = 4  # samples in a bin
+REPAID = REPAYMENT * BINS
+
+
+def booked(levels: object, spent: object = 1.0) -> Spending:
+    """The state after samples of these levels and powers."""
+    state = new_spending(SIZE * BINS)
+    for level, power in np.broadcast(levels, spent):
+        book(state, float(level), float(power))
+    return state
+
+
+def by_bins(values: np.ndarray) -> list[np.ndarray]:
+    """The samples of each bin, the newest first, of the averaging time and the bin that is being filled."""
+    return [values[i : i + SIZE] for i in range(0, values.size, SIZE)][::-1][: BINS + 1]
+
+
+def in_bins(levels: list[float]) -> np.ndarray:
+    return np.repeat(levels, SIZE).astype(float)
+
+
+LEVELS = st.lists(st.sampled_from([0.0, 0.01, 0.4, 1.0, 1.0, 2.5, 30.0]), min_size=1, max_size=2 * BINS)
+
+
+# ---- The bins
+
+
+@given(levels=LEVELS, part=st.integers(1, SIZE), seed=st.integers(0, 99))
+def test_what_is_left_is_what_was_not_spent_in_the_averaging_time(levels: list, part: int, seed: int) -> None:
+    """Before the first sample the rated power was spent. A bin that has partly left counts in part. To rounding."""
+    samples = in_bins(levels)[: SIZE * (len(levels) - 1) + part] * np.random.default_rng(seed).random()
+    bins = by_bins(np.append(np.ones(2 * BINS * SIZE), samples))
+    spent = np.array([one.sum() / SIZE for one in bins])
+    spent[-1] *= 1.0 - bins[0].size / SIZE
+    left, leaving = power_left(booked(1.0, samples))
+    assert left == pytest.approx(BINS - spent.sum(), abs=1e-9)
+    oldest = spent[-round(REPAID) :]
+    assert leaving == pytest.approx(oldest.sum() / (REPAID - bins[0].size / SIZE), abs=1e-9)
+
+
+@given(levels=LEVELS, part=st.integers(1, SIZE))
+def test_the_level_now_is_the_mean_of_the_newest_bins(levels: list, part: int) -> None:
+    samples = in_bins(levels)[: SIZE * (len(levels) - 1) + part]
+    newest = np.concatenate(by_bins(samples)[:NOW])
+    assert level_now(booked(samples)) == pytest.approx(newest.mean(), rel=1e-12)
+
+
+def test_a_sample_that_has_left_is_as_if_it_had_never_been() -> None:
+    """Bit for bit."""
+    rng = np.random.default_rng(1)
+    levels, spent = rng.random((2, (BINS + 1) * SIZE))
+    old = booked(np.append(1e30 * np.ones(500), levels), np.append(1e20 * np.ones(500), spent))
+    fresh = booked(levels, spent)
+    assert power_left(old) == power_left(fresh)
+    assert power_to_spend(old, MOST, False) == power_to_spend(fresh, MOST, False)
+
+
+# ---- The price
+
+
+def price_written_out(levels: np.ndarray, spent: np.ndarray, bound: float | None = None) -> float:
+    """The root of sum a (min(u l, p) - 1), by Brent's method."""
+    of_level, of_spent = by_bins(levels), by_bins(spent)
+    counts = np.array([part.size for part in of_level])
+    weights = (1.0 - np.arange(counts.size) / (BINS + 1.0)) * counts
+    level = np.array([part.mean() for part in of_level])
+    most = np.array([max(MOST, part.mean()) if bound is None else bound for part in of_spent])
+
+    def beyond(u: float) -> float:
+        return float(weights @ (np.minimum(u * level, most) - 1.0))
+
+    high = np.max(most / np.where(level > 0.0, level, np.inf))
+    if not high > 0.0 or beyond(high) <= 1e-9 * weights.sum():
+        return math.inf
+    return brentq(beyond, 0.0, high, xtol=1e-300, rtol=1e-12)
+
+
+@given(
+    levels=LEVELS,
+    part=st.integers(1, SIZE),
+    spent=st.sampled_from([0.0, 1.0, 5.0]),
+    bound=st.sampled_from([None, 0.3, 1.0]),
+)
+def test_at_the_price_the_recent_noise_uses_the_rated_power(
+    levels: list, part: int, spent: float, bound: float | None
+) -> None:
+    """To the tolerance of its search, which adds up over the few steps."""
+    samples = in_bins(levels)[: SIZE * (len(levels) - 1) + part]
+    powers = spent * np.random.default_rng(2).random(samples.size)
+    expected = price_written_out(samples, powers, bound)
+    ceiling, limited = (MOST, False) if bound is None else (bound, True)
+    got = price(booked(samples, powers), ceiling, limited)
+    assume(math.isfinite(expected) or math.isinf(got))  # all bins at their bounds, to rounding
+    assert got == pytest.approx(expected, rel=20 * TOLERANCE)
+
+
+def test_a_noise_that_recurs_gets_power_in_proportion_to_its_level() -> None:
+    """Loud and soft in turn: the mean over both is the rated power."""
+    levels = np.tile(in_bins([1.5] * 5 + [0.5] * 5), 20)
+    u = price(booked(levels), MOST, False)
+    assert u == pytest.approx(1.0, rel=0.04)  # newer bins have larger weights
+
+
+@pytest.mark.parametrize("loud", [10.0, 1e3, 1e6])
+def test_a_loud_stretch_leaves_power_for_the_rest(loud: float) -> None:
+    """An eighth of the averaging time, however loud, counts with twice the rated power."""
+    levels = in_bins([1.0] * 35 + [loud] * 10 + [1.0] * 35)
+    assert price(booked(levels), MOST, False) == pytest.approx((80 - 2 * 10) / 70, rel=0.02)
+
+
+def test_silence_has_no_price() -> None:
+    assert price(booked(np.zeros(100)), MOST, False) == math.inf
+    assert price(new_spending(100), MOST, False) == math.inf
+    per_level, level = power_to_spend(booked(np.zeros(100)), MOST, False)
+    assert (per_level, level) == (math.inf, 0.0)
+
+
+# ---- What is known
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        ([1.0] * 100, True),  # as loud all the time
+        ([1.0] * 70, False),  # but not yet for all of it
+        ([0.1] * 60 + [1.0] * 30, False),  # has become louder
+        ([1.0] * 60 + [0.1] * 30, True),  # has become softer: it was as loud as this all the time
+        ([0.1] * 40 + [1.0] * 10 + [0.1] * 20 + [1.0] * 10, True),  # has come and gone
+        ([0.1] * 40 + [0.9 * ALIKE] * 10 + [0.1] * 20 + [1.0] * 10, False),  # that was softer
+        ([0.1] * 40 + [1.1 * ALIKE] * 10 + [0.1] * 20 + [1.0] * 10, True),
+        ([1.0] * 10 + [0.1] * 90 + [1.0] * 10, False),  # it is too long ago
+    ],
+)
+def test_a_level_is_known_if_it_has_come_and_gone_or_lasted(levels: list, expected: bool) -> None:
+    state = booked(in_bins(levels))
+    assert known(state, level_now(state)) == expected
+
+
+# ---- The power to spend
+
+
+def to_spend(levels: object, spent: object = 1.0, ceiling: float = MOST, limited: bool = False) -> float:
+    """The power now."""
+    per_level, level = power_to_spend(booked(levels, spent), ceiling, limited)
+    return per_level * level
+
+
+def test_steady_noise_gets_the_rated_power() -> None:
+    assert to_spend(np.ones(100 * SIZE)) == pytest.approx(1.0, rel=1e-9)
+    assert to_spend(np.ones(10)) == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("gain", [2.5, 10.0, 1e4])
+def test_noise_that_has_just_become_louder_gets_the_rated_power_at_most(gain: float) -> None:
+    """Even if power is left."""
+    levels = in_bins([1.0] * 90 + [gain] * 6)
+    assert to_spend(levels) == pytest.approx(1.0, rel=1e-9)
+    assert to_spend(levels, 0.5) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_known_level_gets_what_is_left_within_the_newest_bins_time() -> None:
+    levels = in_bins(([0.1] * 10 + [2.0] * 10) * 5)
+    spent = np.where(levels > 1.0, 1.9, 0.0999)
+    left, leaving = power_left(booked(levels, spent))
+    assert left > 0.0
+    power = to_spend(levels, spent)
+    assert power == pytest.approx(min(leaving, 1.0) + left / NOW, rel=1e-9)
+    assert power < to_spend(levels, 0.99 * spent) < MOST
+
+
+@pytest.mark.parametrize(("beyond", "expected"), [(4.0, 0.8), (10.0, 0.5), (17.0, 0.15), (30.0, LEAST), (400.0, LEAST)])
+def test_what_was_overspent_is_repaid_within_a_quarter_of_the_averaging_time(beyond: float, expected: float) -> None:
+    """`beyond` in bins of rated power."""
+    spent = np.ones(100 * SIZE)
+    spent[-SIZE:] += beyond
+    assert to_spend(np.ones(100 * SIZE), spent) == pytest.approx(expected, rel=1e-9)
+
+
+def test_power_that_is_left_raises_the_price_a_little() -> None:
+    """Noise that has become softer, and so has used half of the power: half as much again."""
+    levels = in_bins([4.0] * 40 + [1.0] * 40)
+    spent = np.where(levels > 1.0, 0.8, 0.2)
+    per_level, _ = power_to_spend(booked(levels, spent), MOST, False)
+    assert per_level == pytest.approx(1.5 * price(booked(levels, spent), MOST, False), rel=1e-9)
+
+
+@pytest.mark.parametrize("ceiling", [0.3, 0.9])
+def test_behind_a_limiter_the_ceiling_bounds_the_power_and_counts_for_the_bins(ceiling: float) -> None:
+    """No more could be used in any bin, so that this is used in all."""
+    levels = in_bins(([0.5] * 5 + [1.5] * 5) * 10)
+    assert to_spend(levels, 0.5, ceiling, True) == pytest.approx(ceiling, rel=1e-9)
+    soft = levels[: -5 * SIZE]
+    assert to_spend(soft, 0.5, ceiling, True) == pytest.approx(ceiling, rel=1e-9)
+    assert to_spend(soft, 0.5, ceiling, False) < to_spend(levels, 0.5, MOST, False)
+
+
+@given(levels=LEVELS, spent=LEVELS, ceiling=st.floats(LEAST, MOST), limited=st.booleans())
+def test_the_power_is_within_its_bounds(levels: list, spent: list, ceiling: float, limited: bool) -> None:
+    size = min(len(levels), len(spent))
+    state = booked(in_bins(levels[:size]), in_bins(spent[:size]))
+    per_level, level = power_to_spend(state, ceiling, limited)
+    assert per_level > 0.0
+    if level > 0.0:
+        assert per_level * level <= min(ceiling, MOST) * (1 + 1e-12)
+        if not known(state, level):
+            assert per_level * level <= 1.0 + 1e-12
