@@ -408,6 +408,7 @@ def _worst_loss(results: Results, noise: str) -> float:
 CASES = (("duct", "band noise"), ("duct", "compressor"), ("measured duct", "compressor"), ("measured duct", "motor"))
 TABLED = (
     "bound",
+    "bound of the record",
     "scaled Wiener",
     "KF-PB",
     "KF-OPC",

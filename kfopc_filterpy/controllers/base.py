@@ -15,7 +15,7 @@ from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
 from ..paths.uncertainty import GUARD_TAPS, guard_filter, path_uncertainty
 from ..power.amplifiers import Amplifier, compiled_model
-from ..power.constraint import OutputPowerConstraint
+from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .channels import ChannelGuard, channel_lines, channel_sample, new_channel_guard
 from .processing import (
@@ -62,8 +62,8 @@ class Controller(Protocol):
         ...
 
 
-def constraint_for(rated_power: Any, constraint: Any) -> Any:
-    """Return a new constraint for a controller: a copy of the one given, or one with default settings.
+def constraint_for(rated_power: Any, constraint: Any, fs: float = DEFAULT_FS) -> Any:
+    """Return a new constraint for a controller: a copy of the one given, or one with default settings for the rate `fs`.
 
     Several rated powers or constraints, one for each loudspeaker, give a tuple.
     """
@@ -73,8 +73,8 @@ def constraint_for(rated_power: Any, constraint: Any) -> Any:
         return tuple(constraint_for(None, one) for one in constraint)
     if constraint is None:
         if np.ndim(rated_power) == 1:
-            return tuple(OutputPowerConstraint(power) for power in rated_power)
-        return OutputPowerConstraint(rated_power)
+            return tuple(OutputPowerConstraint(power, fs=fs) for power in rated_power)
+        return OutputPowerConstraint(rated_power, fs=fs)
     if not isinstance(constraint, OutputPowerConstraint):
         raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {constraint!r}")
     return deepcopy(constraint)

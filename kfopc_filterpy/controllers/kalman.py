@@ -9,6 +9,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from .._validate import as_count, as_number
+from ..bounds.settings import SuggestedSettings
 from ..filters.kfopc import KFOPC
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..filters.random_walk import RandomWalkKFOPC, new_numbers
@@ -293,12 +294,12 @@ class KalmanController(FilteredReferenceController):
 
 
 def kf_anc(
-    n_taps: int,
+    n_taps: int | SuggestedSettings,
     secondary_path: Any,
     *,
     state_noise: float | None = None,
     measurement_noise: Any = None,
-    initial_variance: float = 1.0,
+    initial_variance: float | None = None,
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
@@ -308,16 +309,18 @@ def kf_anc(
 
     Parameters
     ----------
-    n_taps : int
-        Taps L of the control filter, or of each of them.
+    n_taps : int or SuggestedSettings
+        Taps L of the control filter, or of each of them. What `suggest_settings` returns contains them, and the defaults
+        of the next three settings as well.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
-    state_noise : float
-        r, see `KFOPC.random_walk`. It must be given; `suggest_settings` finds it and the next two for a noise.
-    measurement_noise : float or array_like, shape (K,)
-        q of all microphones, or of each. It must be given.
-    initial_variance : float, default 1
-        P(0|0) of each tap. It has the unit of a squared weight, so 1 may be far too much.
+    state_noise : float, optional
+        r, see `KFOPC.random_walk`; by default the suggested one.
+    measurement_noise : float or array_like, shape (K,), optional
+        q of all microphones, or of each; by default the suggested one.
+    initial_variance : float, optional
+        P(0|0) of each tap; by default the suggested one, or 1. It has the unit of a squared weight, so 1 may be far too
+        much.
     n_references : int, default 1
         Number of references I.
     amplifier, limiter : optional
@@ -334,13 +337,22 @@ def kf_anc(
     Raises
     ------
     ValueError, TypeError
-        No state noise or measurement noise; a setting that is out of range, or that does not fit the number of channels.
+        Neither suggested settings nor state noise and measurement noise; a setting that is out of range, or that does not
+        fit the number of channels.
 
     Examples
     --------
     >>> from kfopc_filterpy import kf_anc
     >>> kf_anc(8, [1.0], state_noise=1e-6, measurement_noise=0.1).name
     'KF-ANC'
+
+    With settings from a silent run:
+
+    >>> import numpy as np
+    >>> from kfopc_filterpy import suggest_settings
+    >>> x = np.random.default_rng(0).standard_normal(16000)
+    >>> kf_anc(suggest_settings(x, np.roll(x, 9), [1.0]), [1.0]).n_taps
+    16
     """
     return _kalman(
         n_taps,
@@ -356,14 +368,14 @@ def kf_anc(
 
 
 def kf_opc(
-    n_taps: int,
+    n_taps: int | SuggestedSettings,
     secondary_path: Any,
     *,
     rated_power: Any = None,
     constraint: Any = None,
     state_noise: float | None = None,
     measurement_noise: Any = None,
-    initial_variance: float = 1.0,
+    initial_variance: float | None = None,
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
@@ -378,7 +390,8 @@ def kf_opc(
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o of all loudspeakers, or of each.
     constraint : OutputPowerConstraint or sequence of J of them, optional
-        Alternative to `rated_power`: a rated power with the settings of its power estimates. A copy is kept.
+        Alternative to `rated_power`: a rated power with the settings of its power estimates, for example the sample
+        rate. A copy is kept. With `rated_power`, the sample rate is that of the suggested settings, or 16 kHz.
 
     Returns
     -------
@@ -389,8 +402,9 @@ def kf_opc(
     Raises
     ------
     ValueError, TypeError
-        Neither a rated power nor a constraint, or both; no state noise or measurement noise; a setting that is out of
-        range, or that does not fit the number of channels.
+        Neither a rated power nor a constraint, or both; neither suggested settings nor state noise and measurement noise;
+        a setting that is out of range, or that does not fit the number of channels; another sample rate than that of the
+        suggested settings.
 
     Examples
     --------
@@ -409,7 +423,7 @@ def kf_opc(
         n_references,
         amplifier,
         limiter,
-        constraint=constraint_for(rated_power, constraint),
+        constraint=suggested_constraint(n_taps, rated_power, constraint),
         state_noise=state_noise,
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
@@ -418,23 +432,50 @@ def kf_opc(
 
 
 def _kalman(
-    n_taps: int, secondary_path: Any, n_references: int, amplifier: Any, limiter: Any, **settings: Any
+    n_taps: int | SuggestedSettings,
+    secondary_path: Any,
+    n_references: int,
+    amplifier: Any,
+    limiter: Any,
+    **settings: Any,
 ) -> KalmanController | DirectKalman:
     """Return the controller for one channel or for several."""
-    require_noises(settings["state_noise"], settings["measurement_noise"])
+    taps, settings = with_suggested(n_taps, settings)
     outside = {"amplifier": amplifier, "limiter": limiter}
     if is_multichannel(secondary_path, n_references):
-        return DirectKalman(n_taps, secondary_path, n_references=n_references, **outside, **settings)
-    return KalmanController(KFOPC.random_walk(n_taps, **settings), secondary_path, **outside)
+        return DirectKalman(taps, secondary_path, n_references=n_references, **outside, **settings)
+    return KalmanController(KFOPC.random_walk(taps, **settings), secondary_path, **outside)
 
 
-def require_noises(state_noise: Any, measurement_noise: Any, instead: str = "") -> None:
-    """Raise TypeError if one of the noises is missing; the message says how to find them, or what to give `instead`."""
-    if state_noise is None or measurement_noise is None:
+def with_suggested(n_taps: Any, settings: dict[str, Any], instead: str = "") -> tuple[Any, dict[str, Any]]:
+    """Return the taps and the settings; the suggested ones, if there are any, replace those that are None.
+
+    A noise that is still missing raises TypeError; the message says how to find it, or what to give `instead`.
+    """
+    suggested: dict[str, Any] = {"initial_variance": 1.0}
+    if isinstance(n_taps, SuggestedSettings):
+        n_taps, suggested = n_taps.n_taps, n_taps.settings
+    settings = suggested | {name: value for name, value in settings.items() if value is not None}
+    if not {"state_noise", "measurement_noise"} <= settings.keys():
         raise TypeError(
-            f"give state_noise and measurement_noise{instead}; for one channel, "
-            "suggest_settings(reference, disturbance, secondary_path) finds them from a run with a silent loudspeaker"
+            f"give state_noise and measurement_noise{instead}, or what suggest_settings(reference, disturbance, "
+            "secondary_path) returns for a run with a silent loudspeaker in place of n_taps"
         )
+    return n_taps, settings
+
+
+def suggested_constraint(n_taps: Any, rated_power: Any, constraint: Any) -> Any:
+    """Return `constraint_for`, for the sample rate of suggested settings if `n_taps` are such."""
+    if not isinstance(n_taps, SuggestedSettings):
+        return constraint_for(rated_power, constraint)
+    own = constraint_for(rated_power, constraint, n_taps.fs)
+    for one in own if isinstance(own, tuple) else (own,):
+        if abs(one.fs - n_taps.fs) > 1e-9 * n_taps.fs:
+            raise ValueError(
+                f"the suggested settings are for {n_taps.fs:g} Hz but the constraint is for {one.fs:g} Hz: "
+                "make both with the fs of the signals"
+            )
+    return own
 
 
 def is_multichannel(secondary_path: Any, n_references: int) -> bool:

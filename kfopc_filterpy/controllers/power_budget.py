@@ -8,6 +8,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from .._validate import as_choice
+from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
@@ -18,7 +19,7 @@ from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman
-from .kalman import KalmanController, correct_constrained, is_multichannel, require_noises
+from .kalman import KalmanController, correct_constrained, is_multichannel, with_suggested
 from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
@@ -150,7 +151,7 @@ PRIMARY_PATH_FORMS: dict[str, Any] = {"shared gain": SharedGainKalman, "frequenc
 
 
 def kf_pb(
-    n_taps: int,
+    n_taps: int | SuggestedSettings,
     secondary_path: Any,
     *,
     rated_power: Any,
@@ -169,8 +170,9 @@ def kf_pb(
 
     Parameters
     ----------
-    n_taps : int
-        Taps L of a control filter.
+    n_taps : int or SuggestedSettings
+        Taps L of a control filter. What `suggest_settings` returns contains them, and the defaults of the sample rate
+        and of the noises.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
     rated_power : float or array_like, shape (J,)
@@ -202,8 +204,8 @@ def kf_pb(
     Raises
     ------
     ValueError, TypeError
-        The direct form without `state_noise` and `measurement_noise`, another form with a setting of the direct form, or
-        a setting that the class refuses.
+        The direct form without suggested settings or `state_noise` and `measurement_noise`, another form with a setting
+        of the direct form, or a setting that the class refuses.
 
     Examples
     --------
@@ -220,21 +222,24 @@ def kf_pb(
     form = as_choice(form or ("shared gain" if several else "direct"), "form", FORMS)
     common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
     channels = {"n_references": n_references, "secondary_path_uncertainty": secondary_path_uncertainty}
-    filter_settings = {
+    noises = {
         "state_noise": state_noise,
         "measurement_noise": measurement_noise,
         "initial_variance": initial_variance,
         "dtype": dtype,
     }
-    given = {name: value for name, value in filter_settings.items() if value is not None}
+    if isinstance(n_taps, SuggestedSettings):
+        settings = {"fs": n_taps.fs} | settings
     if form in PRIMARY_PATH_FORMS:
+        given = [name for name, value in noises.items() if value is not None]
         if given:
             raise TypeError(f"the {form} form takes path_memory_s instead of {', '.join(given)}")
-        return PRIMARY_PATH_FORMS[form](n_taps, secondary_path, **channels, **common, **settings)
-    require_noises(state_noise, measurement_noise, ", or form='shared gain', which does not need them")
-    settings |= given
+        taps = n_taps.n_taps if isinstance(n_taps, SuggestedSettings) else n_taps
+        return PRIMARY_PATH_FORMS[form](taps, secondary_path, **channels, **common, **settings)
+    taps, noises = with_suggested(n_taps, noises, ", or form='shared gain', which does not need them")
+    settings |= noises
     if several:
-        return DirectPowerBudget(n_taps, secondary_path, **channels, **common, **settings)
+        return DirectPowerBudget(taps, secondary_path, **channels, **common, **settings)
     guard = guard_against(secondary_path_uncertainty, secondary_path)
-    estimator = PowerBudgetKalmanFilter(n_taps, rated_power=rated_power, guard=guard, **settings)
+    estimator = PowerBudgetKalmanFilter(taps, rated_power=rated_power, guard=guard, **settings)
     return PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)

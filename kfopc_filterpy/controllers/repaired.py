@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_choice, as_positive
+from ..bounds.settings import SuggestedSettings
 from ..filters.kfopc import KFOPC
 from ..filters.random_walk import RandomWalkKFOPC
 from ..kernels.compiling import compiled, inlined
@@ -34,7 +35,7 @@ from ..power.constraint import (
 )
 from ..power.limiter import OutputLimiter
 from .base import constraint_for
-from .kalman import KalmanController, correct
+from .kalman import KalmanController, correct, suggested_constraint, with_suggested
 from .step import Lines, adapt, disturbance_estimate, estimate_once, output
 
 LARGEST_TRIM = math.log(10.0)
@@ -224,14 +225,14 @@ class RepairedKFOPC(KalmanController):
 
 
 def kf_opc_repaired(
-    n_taps: int,
+    n_taps: int | SuggestedSettings,
     secondary_path: Any,
     *,
     rated_power: float | None = None,
     constraint: OutputPowerConstraint | None = None,
-    state_noise: float,
-    measurement_noise: float,
-    initial_variance: float = 1.0,
+    state_noise: float | None = None,
+    measurement_noise: float | None = None,
+    initial_variance: float | None = None,
     gain_of: str = "control",
     trim_s: float | None = DEFAULT_TRIM_S,
     factor_at: str = "output",
@@ -269,9 +270,9 @@ def kf_opc_repaired(
 
     Raises
     ------
-    ValueError
-        Arguments that `KFOPC.random_walk` or `OutputPowerConstraint` refuses; an unknown `gain_of` or `factor_at`; a
-        `trim_s` that is not positive.
+    ValueError, TypeError
+        Arguments that `KFOPC.random_walk` or `OutputPowerConstraint` refuses; neither suggested settings nor state noise
+        and measurement noise; an unknown `gain_of` or `factor_at`; a `trim_s` that is not positive.
 
     Examples
     --------
@@ -279,16 +280,13 @@ def kf_opc_repaired(
     >>> kf_opc_repaired(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).factor_at
     'output'
     """
-    estimator = KFOPC.random_walk(
-        n_taps,
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        initial_variance=initial_variance,
-    )
+    own = suggested_constraint(n_taps, rated_power, constraint)
+    noises = {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance}
+    taps, settings = with_suggested(n_taps, noises)
     return RepairedKFOPC(
-        estimator,
+        KFOPC.random_walk(taps, **settings),
         secondary_path,
-        constraint_for(rated_power, constraint),
+        own,
         gain_of=gain_of,
         trim_s=trim_s,
         factor_at=factor_at,

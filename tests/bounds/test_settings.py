@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +13,11 @@ import scipy.signal
 from helpers.settings_grid import FS, NOISES, ON, compare, made_paths, signals
 
 from kfopc_filterpy import (
+    OutputPowerConstraint,
     bandpass_path,
     kf_anc,
     kf_opc,
+    kf_opc_repaired,
     kf_pb,
     noise_reduction_db,
     simulate,
@@ -258,17 +262,19 @@ def test_the_shortest_record_and_the_longest_filter_that_it_supports():
     assert suggest_settings(X[:332], D[:332], S, n_taps=30).n_taps == 30
 
 
-@pytest.mark.parametrize("make", [kf_anc, lambda *a, **k: kf_opc(*a, rated_power=1.0, **k)], ids=["KF-ANC", "KF-OPC"])
+@pytest.mark.parametrize(
+    "make",
+    [kf_anc, partial(kf_opc, rated_power=1.0), partial(kf_opc_repaired, rated_power=1.0)],
+    ids=["KF-ANC", "KF-OPC", "repaired"],
+)
 @pytest.mark.parametrize("given", [{}, {"state_noise": 1e-9}, {"measurement_noise": 0.1}], ids=["none", "r", "q"])
 def test_controllers_without_the_noises_point_to_it(make, given):
-    with pytest.raises(
-        TypeError, match=r"^give state_noise and measurement_noise; for one channel, suggest_settings\("
-    ):
+    with pytest.raises(TypeError, match=r"^give state_noise and measurement_noise, or what suggest_settings\("):
         make(8, S, **given)
 
 
 def test_kf_pb_without_the_noises_points_to_it():
-    with pytest.raises(TypeError, match=r"or form='shared gain', which does not need them; .* suggest_settings\("):
+    with pytest.raises(TypeError, match=r"or form='shared gain', which does not need them, or what suggest_settings\("):
         kf_pb(8, S, rated_power=1.0)
 
 
@@ -311,3 +317,40 @@ def test_a_large_initial_variance_diverges_where_the_suggested_one_does_not():
         reached[factor] = -np.inf if diverged else noise_reduction_db(result.error, result.disturbance)
     assert reached[1.0] > 35.0
     assert reached[1e4] < 0.0
+
+
+# ---- In place of the taps
+
+
+@pytest.mark.parametrize("make", [kf_anc, kf_opc, kf_opc_repaired, kf_pb], ids=lambda make: make.__name__)
+def test_a_controller_takes_suggested_settings_where_none_is_given(make: Any) -> None:
+    rated = {} if make is kf_anc else {"rated_power": 0.5}
+    suggested = suggest_settings(X, D, S, n_taps=8)
+    ours = make(suggested, S, **rated)
+    by_hand = make(8, S, **rated, **suggested.settings)
+    for name in ("x", "P", "Q", "R"):
+        np.testing.assert_array_equal(getattr(ours.estimator, name), getattr(by_hand.estimator, name), err_msg=name)
+    own = make(suggested, S, measurement_noise=0.25, **rated)
+    assert own.estimator.R == 0.25
+    np.testing.assert_array_equal(own.estimator.P, by_hand.estimator.P)
+
+
+def test_several_channels_take_suggested_settings() -> None:
+    x = np.stack([X[:8000], X[8000:16000]])
+    suggested = suggest_settings(x, np.stack([D[:8000], D[8000:16000]]), PATHS, n_taps=8, fs=8000.0)
+    ours, by_hand = kf_anc(suggested, PATHS, n_references=2), kf_anc(8, PATHS, n_references=2, **suggested.settings)
+    assert ours.n_taps == 8
+    np.testing.assert_array_equal(ours.P, by_hand.P)
+    shared = kf_pb(suggested, PATHS, rated_power=0.5, n_references=2)
+    assert (shared.n_taps, shared.fs) == (8, 8000.0)
+
+
+def test_the_sample_rate_is_that_of_the_suggested_settings() -> None:
+    suggested = suggest_settings(X, D, S, n_taps=8, fs=8000.0)
+    assert kf_opc(suggested, S, rated_power=0.5).estimator.constraint.fs == 8000.0
+    assert kf_pb(suggested, S, rated_power=0.5).estimator.budget.fs == 8000.0
+    assert kf_pb(suggested, S, rated_power=0.5, fs=4000.0).estimator.budget.fs == 4000.0
+    own = OutputPowerConstraint(0.5, fs=8000.0, memory_s=0.1)
+    assert kf_opc(suggested, S, constraint=own).estimator.constraint.memory_s == 0.1
+    with pytest.raises(ValueError, match="suggested settings are for 8000 Hz but the constraint is for 16000 Hz"):
+        kf_opc(suggested, S, constraint=OutputPowerConstraint(0.5))

@@ -11,7 +11,16 @@ import pytest
 from comparisons.__main__ import FURTHER
 from comparisons.studies import cases, power_budget
 from comparisons.studies.cases import Case, make_case, noises, paths
-from comparisons.studies.power_budget import BOUND, SCALED, BudgetRow, _claims, _needed, _sizing_table, mean_rows
+from comparisons.studies.power_budget import (
+    BOUND,
+    RECORD,
+    SCALED,
+    BudgetRow,
+    _claims,
+    _needed,
+    _sizing_table,
+    mean_rows,
+)
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
 from kfopc_filterpy.bench import Runs, StudyReport, run_setting, write_report
 from kfopc_filterpy.bench import registry as algorithms
@@ -83,7 +92,9 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
         assert row["power"] == pytest.approx(output_power(result.control_signal) / 0.1, rel=1e-9)
     assert rows[BOUND, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["whole"], rel=1e-9)
     assert rows[SCALED, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["scaled"], rel=1e-9)
-    assert set(rows) == {(name, share) for name in (*algorithms.algorithms(), BOUND, SCALED) for share in SHARES}
+    assert set(rows) == {
+        (name, share) for name in (*algorithms.algorithms(), BOUND, RECORD, SCALED) for share in SHARES
+    }
     # without a constraint one run serves for all rated powers
     assert rows["FxLMS", -10.0]["power"] == pytest.approx(10 * rows["FxLMS", 0.0]["power"], rel=1e-12)
 
@@ -91,7 +102,7 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
 def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
     report: StudyReport = small[0]
     assert [table.stem for table in report.tables] == ["reduction", "sizing", "tuning"]
-    assert len(report.tables[0].rows) == len(algorithms.algorithms()) + 2
+    assert len(report.tables[0].rows) == len(algorithms.algorithms()) + 3
     assert len(report.tables[2].rows) == len(algorithms.algorithms()) * len(SHARES)
     assert [figure.stem for figure in report.figures] == ["duct-band-noise"]
     assert len(report.verdicts) == 3
@@ -157,7 +168,12 @@ def test_means_are_over_seeds_and_the_worst_window_is_the_worst() -> None:
     ],
 )
 def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
-    rows = rows_of(BOUND, (3.0, 12.0)) + rows_of(SCALED, (2.0, 12.0)) + rows_of("KF-PB", own, powers)
+    rows = (
+        rows_of(BOUND, (3.0, 12.0))
+        + rows_of(RECORD, (3.0, 12.0))
+        + rows_of(SCALED, (2.0, 12.0))
+        + rows_of("KF-PB", own, powers)
+    )
     for name, algorithm in algorithms.algorithms().items():
         if name != "KF-PB" and algorithm.keeps_budget:
             rows += rows_of(name, other, other_powers)
