@@ -417,9 +417,9 @@ def _notes(pairs: Iterable[str], rows: Sequence[TrackingRow]) -> list[str]:
         "of MOV-FxLMS and optimal leaky FxLMS with others' only together with their noise reduction. During a jump of +20 dB "
         "the budget allows less than 1 dB, so the constrained algorithms count as settled whatever they do.",
         "The constrained algorithms recover late from a loud noise because its power stays in their memory. KF-OPC's fades "
-        f"with {Scene.power_memory_s:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB's is a window of "
-        f"{PowerBudget(1, 1.0).memory_s:g} s. It takes a noise to be softer only after the loud part has left the window, and "
-        "then recovers at once. At the jump itself they overspend, since an estimate of power follows behind the noise; only "
+        f"with {Scene.power_memory_s:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB remembers for "
+        f"{PowerBudget(1, 1.0).averaging_s:g} s, because the noise may become loud again. "
+        "At the jump itself they overspend, since an estimate of power follows behind the noise; only "
         "a limiter behind the filter holds from the first sample.",
         "Settings are tuned on the mean NSE over the whole run, which a single change hardly moves: the Kalman filters get "
         "longer memories than the fastest recovery would need.",

@@ -103,17 +103,25 @@ def allocate(budget, w):
     if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
     per_level, level = power_to_spend(budget.spending, numbers.ceiling, numbers.limited > 0.0)
-    mean = of_xf[0]
-    share = per_level * mean if mean > 0.0 and per_level < np.inf else 1.0
+    mean = of_x[0]
+    share = per_level * mean if per_level < np.inf else 1.0
     if lags > L:
         of_xf, w = guarded(of_xf, budget.guard, w)
     numbers.weight = constrained_filter(
         of_x[:L], of_xf, w, share * numbers.rated_power, numbers.weight, budget.control_filter
     )
-    numbers.gain = toeplitz_power(of_x[:L], budget.control_filter) / mean if mean > 0.0 else 0.0
+    numbers.gain = toeplitz_power(of_x[:L], budget.control_filter) / mean
     if numbers.limited > 0.0 and level > 0.0:
         move_ceiling(budget, of_x[:L], of_xf, level / mean)
         numbers.acts = False
+
+
+@part()
+def asked_for(budget, y):
+    """Return what the control filter asked for: y, unless a limiter changed it. (Two sums of it differ by rounding.)"""
+    v = budget.control_filter
+    asked = dot(v, newest(budget.reference, v.size))
+    return y if abs(asked - y) <= SAME * math.sqrt(budget.numbers[0].rated_power) else asked
 
 
 @part()
@@ -153,11 +161,11 @@ def move_ceiling(budget, of_x, of_xf, forecast):
 @part()
 def advance_budget(budget, w, x, xf, y):
     """Process a sample of reference, filtered reference and emitted control signal; solve again if it is due."""
-    numbers, v = budget.numbers[0], budget.control_filter
+    numbers = budget.numbers[0]
     take_correlations(budget, x, xf)
-    asked = dot(v, newest(budget.reference, v.size))
+    asked = asked_for(budget, y)
     # The level of the noise as the control filter sees it: the power it asks for, over what it asks for at level 1.
-    book(budget.spending, asked * asked / numbers.gain if numbers.gain > 0.0 else xf * xf, y * y / numbers.rated_power)
+    book(budget.spending, asked * asked / numbers.gain if numbers.gain > 0.0 else x * x, y * y / numbers.rated_power)
     hear_limiter(budget, asked, y)
     numbers.taken += 1.0
     numbers.waited += 1.0
@@ -171,7 +179,7 @@ def advance_budget(budget, w, x, xf, y):
 def follow_noise(budget, x, xf):
     """Process a sample while the control is switched off: no power is saved in this time."""
     take_correlations(budget, x, xf)
-    book(budget.spending, xf * xf, 1.0)
+    book(budget.spending, x * x, 1.0)
 
 
 @compiled(fastmath=FAST)

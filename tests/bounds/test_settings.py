@@ -340,7 +340,7 @@ def test_several_channels_take_suggested_settings() -> None:
     suggested = suggest_settings(x, np.stack([D[:8000], D[8000:16000]]), PATHS, n_taps=8, fs=8000.0)
     ours, by_hand = kf_anc(suggested, PATHS, n_references=2), kf_anc(8, PATHS, n_references=2, **suggested.settings)
     assert ours.n_taps == 8
-    np.testing.assert_array_equal(ours.P, by_hand.P)
+    np.testing.assert_array_equal(ours.covariance, by_hand.covariance)
     shared = kf_pb(suggested, PATHS, rated_power=0.5, n_references=2)
     assert (shared.n_taps, shared.fs) == (8, 8000.0)
 
