@@ -147,7 +147,8 @@ def known(spending, level):
 def power_to_spend(spending, ceiling, limited):
     """Return the power to spend for each unit of level, and the level now.
 
-    `ceiling` is another bound of the power, and `limited` says whether a limiter acts on the control signal.
+    `ceiling` is another bound of the power, and `limited` says whether a limiter acts on the control signal. Behind one,
+    power that is left cannot be spent later: the rated power is spent at most.
 
     If power is left, u is a little larger: what was left will not all be needed.
     """
@@ -155,7 +156,7 @@ def power_to_spend(spending, ceiling, limited):
     level = level_now(spending)
     limit = min(leaving, 1.0) + left / (NOW if left > 0.0 else REPAYMENT * BINS)
     limit = min(max(limit, LEAST), MOST, ceiling)
-    if not known(spending, level):
+    if limited or not known(spending, level):
         limit = min(limit, 1.0)
     u = price(spending, ceiling, limited) * (1.0 + max(left, 0.0) / BINS)
     return (min(u, limit / level) if level > 0.0 else u), level

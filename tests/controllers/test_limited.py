@@ -210,7 +210,7 @@ def test_the_estimator_is_given_the_true_disturbance(name: str) -> None:
     np.testing.assert_allclose(measured, d, rtol=0, atol=1e-12)
     d, measured, played = driven(controller(name), limiter())
     assert_kept(played)
-    assert np.mean((measured - d) ** 2) > 0.03 * np.mean(d**2)
+    assert np.mean((measured - d) ** 2) > 0.02 * np.mean(d**2)
 
 
 @pytest.mark.parametrize("compiled", [True, False])
