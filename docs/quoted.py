@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
+SHORT_S, LONG_S = 8.0, 60.0  # runs of the constraint study; only the long ones last several averaging times
 STUDIES, CONSTRAINT = "python -m comparisons", "python -m comparisons constraint"
 FIELD = re.compile(r"\{:\.(\d)f\}")
 
@@ -61,10 +62,10 @@ class Results:
         verdicts = [v["reproduced"] for study in PAPER for v in self.studies[study]["verdicts"]]
         return sum(verdicts), len(verdicts)
 
-    def rows(self, algorithm: str, stationary: bool) -> list[dict[str, Any]]:
+    def rows(self, algorithm: str, stationary: bool, duration_s: float = LONG_S) -> list[dict[str, Any]]:
         """Runs of an algorithm in the constraint study, on stationary or on varying noise."""
         steady = ("tone", "compressor", "band noise")
-        rows = self.extra("constraint", "rows")
+        rows = [r for r in self.extra("constraint", "rows") if r["duration_s"] == duration_s]
         return [r for r in rows if r["algorithm"] == algorithm and (r["noise"] in steady) == stationary]
 
     def summary(self, algorithm: str) -> list[float]:
@@ -373,10 +374,10 @@ def _constraint() -> Iterator[Quote]:
         lambda r: r.said("constraint", "KF-PB converges")[:2],
     )
     yield quote(
-        "In {:.0f} of the {:.0f} runs with varying noise KF-PB stays more than 1 dB below",
+        "In {:.0f} of the {:.0f} runs of 8 s with varying noise KF-PB stays more than 1 dB below",
         lambda r: [
-            sum(x["bound_db"] - x["noise_reduction_db"] > 1.0 for x in r.rows("KF-PB", False)),
-            len(r.rows("KF-PB", False)),
+            sum(x["bound_db"] - x["noise_reduction_db"] > 1.0 for x in r.rows("KF-PB", False, SHORT_S)),
+            len(r.rows("KF-PB", False, SHORT_S)),
         ],
     )
     yield quote("up to {:.1f} dB while the recorded motor runs down", lambda r: [_worst_loss(r, "motor")])
@@ -394,7 +395,7 @@ def _power_range() -> Iterator[Quote]:
 
 
 def _least_and_most_power(results: Results) -> list[float]:
-    """Output power over the rated power of KF-OPC and of KF-PB, over all runs."""
+    """Output power over the rated power of KF-OPC and of KF-PB, over all runs of a minute."""
     return [
         extreme(row["power"] for stationary in (True, False) for row in results.rows(name, stationary))
         for name in ("KF-OPC", "KF-PB")
@@ -403,8 +404,8 @@ def _least_and_most_power(results: Results) -> list[float]:
 
 
 def _worst_loss(results: Results, noise: str) -> float:
-    """Largest loss of KF-PB compared with the bound, on one noise."""
-    rows = [row for row in results.rows("KF-PB", False) if row["noise"] == noise]
+    """Largest loss of KF-PB compared with the bound, on one noise, in the short runs of the constraint study."""
+    rows = [row for row in results.rows("KF-PB", False, SHORT_S) if row["noise"] == noise]
     return max(row["bound_db"] - row["noise_reduction_db"] for row in rows)
 
 
