@@ -45,7 +45,7 @@ class BudgetState(NamedTuple):
     counts: np.ndarray  # (SEGMENTS + 1,) samples in each segment
     guard: np.ndarray  # correlation of the guard filter W at lags 0, 1, ...; one zero without a guard
     spending: Spending  # of the averaging time
-    numbers: np.ndarray  # record: rated power, account, lambda, ...; see `PowerBudget`
+    numbers: np.ndarray  # record: rated power, lambda, ...; see `PowerBudget`
 
 
 @part()
@@ -233,11 +233,11 @@ class PowerBudget:
 
     The power :math:`\rho` follows the level of the noise, so that :math:`\lambda` stays the same while the spectrum does.
     This is the best way to spend a mean power: a noise that recurs within the averaging time is controlled as well as
-    by the best fixed filter with the same mean power. The averaging time so far says how much power each unit of level
-    gets, so that the mean is the rated power. Newer noise counts more.
+    by the best fixed filter with the same mean power. Each unit of level gets so much power that the noise of the last
+    `averaging_s` would have used the rated power; newer noise counts more.
 
-    - If power is left of the last `averaging_s`, up to twice the rated power is spent, but only on a level that has
-      come and gone within this time. A noise that has just become louder gets the rated power at most.
+    - If power of the last `averaging_s` is left, up to twice the rated power is spent, but only on a level that has
+      come and gone within this time, or has lasted for all of it. A noise that has just become louder gets the rated power at most.
     - If more than the rated power was spent, it is repaid within a quarter of `averaging_s`.
 
     So after a noise becomes softer for good, the power rises only slowly to the rated one, within `averaging_s`. The
