@@ -19,7 +19,7 @@ import quoted  # noqa: E402
 DEFINITIONS = {
     "constraint.md": [
         "a second that is 20 dB louder",
-        "A sudden rise of 20 dB",
+        "A jump of 20 dB",
         "it is within 0.5 dB",
     ],
     "limits.md": ["settles to 3 dB of a steady value", "falls to -20 dB of the filter's"],
