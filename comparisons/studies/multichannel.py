@@ -31,7 +31,7 @@ from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Row, Setting, bound_of
 from .parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
 from .rooms import MEASURED, RECORDINGS, SIZES, Place, equally_rated, level_map_db, make_rated_scene, places
 
-DURATION_S = 8.0
+DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
 KF_PB = "KF-PB (shared gain)"
 DEFAULT_MEMORY_S = 0.5  # setting of KF_PB by default
@@ -132,7 +132,7 @@ def main(runs: Runs) -> StudyReport | str:
 
 def _outcome(runs: Runs, name: str, noise: str) -> Outcome:
     place = places()[name]
-    scene = make_rated_scene(place, noise, DURATION_S)
+    scene = make_rated_scene(place, noise, RECORDED_S if noise in RECORDINGS else DURATION_S)
     tuned = tune(runs, scene, names(place), trials=try_settings(runs, scene, coarse_grids(place)))
     results = dict(_final_runs(runs, scene, tuned))
     rows = _bound_rows(name, noise, scene) + [
@@ -416,6 +416,7 @@ def _parameters(outcomes: dict[Where, Outcome]) -> dict[str, Parameter]:
         "fs_hz": Parameter({name: place.fs for name, place in places().items()}, "the measured room's own"),
         "n_taps": Parameter({name: place.n_taps for name, place in places().items()}, "of each control filter"),
         "duration_s": Parameter(DURATION_S, "from switch-on; the steady half counts"),
+        "recorded_duration_s": Parameter(RECORDED_S, "the same, of the recordings"),
         "rated_power": Parameter(
             rooms.RATED_SHARE, "of the power that each loudspeaker uses without a limit: (R_x' + q/(N P0) I) w = r"
         ),

@@ -66,8 +66,8 @@ class BlockController(FilteredReferenceController):
             n_primary,
             n_references,
             limits,
+            as_positive(averaging_s, "averaging_s", unit="s") * self.fs / self.block,
             guard,
-            as_positive(averaging_s, "averaging_s", unit="s"),
         )
         n_lags = self._budget.n_lags
         self._past = max(history, n_lags - 1 + self.block)  # samples of the references that a block needs
@@ -114,12 +114,14 @@ class BlockController(FilteredReferenceController):
             return
         state.numbers["waiting"] = 0
         references = np.array([newest(line, self._past)[::-1] for line in self._lines.reference])
-        # More samples than a block have been emitted if some were skipped.
         energy, n_emitted = self._lines.energy.copy(), float(self._lines.n_emitted[0])
         self._lines.energy[:] = self._lines.n_emitted[:] = 0.0
         if np.all(np.abs(references) < LOUDEST):
-            if np.any(energy):  # otherwise the control was off
-                self._budget.spend(energy / n_emitted, n_emitted / self.fs)
+            level = float(np.mean(references[:, -self.block :] ** 2, axis=1).sum())
+            if np.any(energy):  # more samples than a block have been emitted if some were skipped
+                self._budget.spend(level, energy / n_emitted, max(round(n_emitted / self.block), 1))
+            else:
+                self._budget.spend(level, None)  # the control was off
             self._correlation.add(references[:, 1 - len(self._correlation.total) - self.block :])
             self._end_block(references)
 

@@ -20,7 +20,7 @@ from ..kernels.vectors import FAST, add_scaled, dot
 from .allocation import constrained_filter, guarded
 from .ceiling import balance_of_power
 from .constraint import DEFAULT_FS, SILENCE
-from .spending import BINS, LEAST, MOST, Spending, book, new_spending, power_left, power_to_spend
+from .spending import LEAST, MOST, Spending, book, new_spending, power_left, power_to_spend
 
 DEFAULT_CORRELATION_MEMORY_S = 2.5
 DEFAULT_AVERAGING_S = 10.0
@@ -376,7 +376,7 @@ class PowerBudget:
         The time before the first sample counts as if the rated power had been spent.
         """
         left, _ = left_of(self._state.spending)
-        return -float(left) * self.averaging_s / BINS
+        return -float(left) * float(self._state.spending.numbers["full"][0]) / self.fs
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the `reference` x(n); call it before `advance` with the same x(n)."""

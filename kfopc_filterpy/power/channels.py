@@ -24,18 +24,24 @@ from ..kernels.block_toeplitz import (
     toeplitz_energy,
     toeplitz_product,
 )
-from .budget import DEFAULT_AVERAGING_S
-from .spending import LEAST
+from ..kernels.compiling import compiled
+from .spending import MOST, book, new_spending, power_to_spend
 
-CREDIT_S = 0.1  # seconds of rated power that can be saved while the noise needs less
-REPAYMENT = 3.0  # 1/s: the account changes the target by the factor exp(-REPAYMENT account)
-PACE = 0.5  # of the rated power at most repays a debt, more only if the debt exceeds a quarter of the averaging time
 SWEEPS, STEPS = 3, 5  # sweeps of so many conjugate-gradient steps; the penalties are adjusted after each sweep
 MOST_SWEEPS = 6  # as long as a power exceeds its target by more than
 EXCESS = 1.1  # times; what is left after the last sweep is scaled down
 RIDGE = 1e-6  # of the mean energy: limits the weights in directions without energy
 LARGEST_CHANGE = 10.0  # largest ratio of power to rated power that counts in a sweep
 SMALLEST_WEIGHT = 1e-6  # of the natural weight: a penalty that is not needed must be able to grow again
+
+
+@compiled()
+def spend_blocks(spending, level, spent, blocks):
+    """Book the means over some blocks, each as one sample, and return the power to spend for each unit of level."""
+    for _ in range(min(blocks, int(spending.numbers[0].full) * spending.counts.size)):
+        book(spending, level, spent)
+    per_level, _ = power_to_spend(spending, MOST, False)
+    return per_level
 
 
 class ChannelBudget:
@@ -51,10 +57,10 @@ class ChannelBudget:
         Number of references I.
     rated_power : ndarray, shape (J,)
         Rated power of each loudspeaker.
+    averaging_blocks : float
+        Time over which the mean powers are kept to the rated ones, in blocks, see `spend`.
     guard : ndarray, shape (n_guard,), optional
         Guard filter W against uncertain secondary paths; by default none.
-    averaging_s : float, optional
-        Time in seconds over which the mean powers are kept to the rated ones, see `spend`.
     """
 
     def __init__(
@@ -64,12 +70,13 @@ class ChannelBudget:
         n_primary: int,
         n_references: int,
         rated_power: np.ndarray,
+        averaging_blocks: float,
         guard: np.ndarray | None = None,
-        averaging_s: float = DEFAULT_AVERAGING_S,
     ) -> None:
         self.n_taps, self.n_primary, self.n_references, self.rated_power = n_taps, n_primary, n_references, rated_power
-        self.averaging_s = averaging_s
-        self.account = np.zeros(len(rated_power))  # seconds of rated power spent beyond the rated power
+        self._spending = [new_spending(averaging_blocks) for _ in rated_power]
+        self._share = np.full(len(rated_power), np.inf)  # of the rated power to spend for each unit of level
+        self._gain = np.zeros(len(rated_power))  # power of a control signal for each unit of level
         self.target_power = rated_power.copy()
         _, self.n_loudspeakers, n_secondary = secondary.shape
         self.n_guard = 1 if guard is None else guard.size
@@ -89,26 +96,25 @@ class ChannelBudget:
         guard = np.zeros(1) if guard is None else guard
         self._guarded = 1.0 + np.abs(fft.rfft(guard, self._inner_size)[:, np.newaxis]) ** 2
 
-    def spend(self, power: np.ndarray, duration_s: float) -> None:
-        """Add what each loudspeaker spent in a time to its account, and set the powers to solve for.
-
-        The recent correlation predicts the power only roughly. The account corrects the mean: a target is the rated
-        power times ``exp(-3 account)``, with the account in seconds of rated power. As for one loudspeaker (see
-        `PowerBudget`), half of the rated power at most repays a debt, more only if the debt exceeds a quarter of the
-        averaging time, and debt beyond the averaging time is forgotten.
+    def spend(self, level: float, power: np.ndarray | None, blocks: int = 1) -> None:
+        """Process the mean powers of the last blocks, which decide what the next solution spends (see `spending`).
 
         Parameters
         ----------
-        power : ndarray, shape (J,)
-            Mean power of each control signal.
-        duration_s : float
-            The time in seconds.
+        level : float
+            Sum of the references' powers.
+        power : ndarray, shape (J,), or None
+            Power of each control signal; None for a block without control, in which no power is saved.
+        blocks : int, default 1
+            Number of blocks since the last solution.
         """
-        spent = self.account + (power / self.rated_power - 1.0) * duration_s
-        self.account = np.clip(spent, -CREDIT_S, self.averaging_s)
-        repaid = np.maximum(PACE, 2.0 * self.account / self.averaging_s)
-        share = np.maximum(np.exp(-REPAYMENT * self.account), np.maximum(1.0 - repaid, LEAST))
-        self.target_power = self.rated_power * share
+        for j, spending in enumerate(self._spending):
+            seen, spent = level, 1.0
+            if power is not None:
+                # The level as the control filter sees it: the power that it spent, over what it spends at level 1.
+                seen = power[j] / self._gain[j] if self._gain[j] > 0.0 else level
+                spent = power[j] / self.rated_power[j]
+            self._share[j] = spend_blocks(spending, seen, spent, blocks)
 
     def solve(self, correlation: np.ndarray, primary: np.ndarray) -> None:
         """Move `weights` and `penalty` towards the solution for given primary paths.
@@ -141,12 +147,14 @@ class ChannelBudget:
         lags = self._lags_of(self._guarded * self._filtered_spectrum(correlation))
         J, n_references, n = self.n_loudspeakers, self.n_references, self.n_taps
         of_x = _two_sided(correlation[:n], 2 * n)
-        blocks = J * n_references
+        blocks, level = J * n_references, np.trace(of_x[0])
         energy = lags[0, np.equal(*np.triu_indices(blocks))].sum()
-        natural = energy / max(J * np.trace(of_x[0]), np.finfo(float).tiny)
+        natural = energy / max(J * level, np.finfo(float).tiny)
         ridge = RIDGE * energy / blocks
         if not (natural > 0.0 and np.any(r)):
             return  # silence, or nothing known yet
+        share = np.where(np.isfinite(self._share), self._share * level, 1.0)
+        self.target_power = self.rated_power * share
         if self.penalty is None:
             self.penalty = np.full(J, 1e-3 * natural)
         whole = hermitian(circulant_spectrum(lags, n), blocks)
@@ -162,8 +170,9 @@ class ChannelBudget:
             self._adjust_penalty(power, natural)
             if sweep >= SWEEPS and np.all(power <= EXCESS * self.target_power):
                 break
-        excess = power / (EXCESS * self.target_power)
-        self.weights = filters / np.sqrt(np.maximum(excess, 1.0))[:, np.newaxis, np.newaxis]
+        excess = np.maximum(power / (EXCESS * self.target_power), 1.0)
+        self.weights = filters / np.sqrt(excess)[:, np.newaxis, np.newaxis]
+        self._gain = power / excess / level
 
     def _adjust_penalty(self, power: np.ndarray, natural: float) -> None:
         """Correct each penalty by the ratio of its loudspeaker's power to the rated power, raised to an exponent.

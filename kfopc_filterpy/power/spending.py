@@ -10,11 +10,12 @@ with the level l now, and u such that the noise of the last averaging time T wou
 that recurs within T is then controlled as well as by the best fixed filter.
 
 That a noise recurs is a forecast. If it fails, what was spent within the last T, S(n), limits p: no more is spent than
-brings S back to T soon. Powers are fractions of the rated power here, times are in bins, each 1/80 of T.
+brings S back to T soon. Powers are fractions of the rated power here, and times are in bins, 80 of which make up T.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ import numpy as np
 from ..kernels.compiling import part
 from ..kernels.records import new_record
 
-BINS = 80  # in the averaging time
+BINS, FEWEST = 80, 8  # in the averaging time; fewer if a bin had less than a sample, but never fewer than the second
 NOW = 3  # newest bins, whose mean is the level now; power that is left may be spent within as many
 REPAYMENT = 0.25  # of the averaging time, within which overspending is repaid
 ALIKE = 0.5  # a level that was at least this share of the present one is taken for the same
@@ -35,17 +36,18 @@ TRIES = 20
 class Spending(NamedTuple):
     """Levels and powers in the averaging time, bin by bin; the bin that is being filled is an extra one."""
 
-    levels: np.ndarray  # (BINS + 1,) sums of the level over the samples of a bin
-    spent: np.ndarray  # (BINS + 1,) sums of the squared control signal over the rated power
-    counts: np.ndarray  # (BINS + 1,) samples; 0: before the first sample
+    levels: np.ndarray  # (bins + 1,) sums of the level over the samples of a bin
+    spent: np.ndarray  # (bins + 1,) sums of the squared control signal over the rated power
+    counts: np.ndarray  # (bins + 1,) samples; 0: before the first sample
     numbers: np.ndarray  # record: samples in a full bin, index of the newest one
 
 
 def new_spending(averaging_samples: float) -> Spending:
     """Return the state before the first sample, as if the rated power had been spent so far."""
-    size = max(round(averaging_samples / BINS), 1)
+    size = max(math.ceil(averaging_samples / BINS), 1)
+    bins = max(round(averaging_samples / size), FEWEST)
     return Spending(
-        np.zeros(BINS + 1), np.full(BINS + 1, float(size)), np.zeros(BINS + 1), new_record(full=float(size), newest=0)
+        np.zeros(bins + 1), np.full(bins + 1, float(size)), np.zeros(bins + 1), new_record(full=float(size), newest=0)
     )
 
 
@@ -54,7 +56,7 @@ def book(spending, level, spent):
     """Add a sample's level and what was spent in it."""
     numbers = spending.numbers[0]
     if spending.counts[numbers.newest] >= numbers.full:
-        numbers.newest = (numbers.newest + 1) % (BINS + 1)
+        numbers.newest = (numbers.newest + 1) % spending.counts.size
         spending.counts[numbers.newest] = 0.0
     newest = numbers.newest
     if spending.counts[newest] == 0.0:
@@ -78,16 +80,16 @@ def level_now(spending):
 @part()
 def power_left(spending):
     """Return T - S, what is left of the averaging time's power; and the mean that will leave S in the next T/4."""
-    size, filled = spending.numbers[0].full, _filled(spending)
-    first = BINS - int(REPAYMENT * BINS) + 1
+    bins, size, filled = _bins(spending), spending.numbers[0].full, _filled(spending)
+    first = bins - int(REPAYMENT * bins) + 1
     total = leaving = 0.0
-    for j in range(BINS + 1):
-        share = 1.0 if j < BINS else 1.0 - filled  # a part of the oldest bin has left
+    for j in range(bins + 1):
+        share = 1.0 if j < bins else 1.0 - filled  # a part of the oldest bin has left
         spent = share * spending.spent[_bin(spending, j)] / size
         total += spent
         if j >= first:
             leaving += spent
-    return BINS - total, leaving / (BINS - first + 1.0 - filled)
+    return bins - total, leaving / (bins - first + 1.0 - filled)
 
 
 @part()
@@ -99,11 +101,12 @@ def price(spending, ceiling, limited):
     a single loud second is not to use up the whole power of the following ones. Behind a limiter that acts, p_j is the
     ceiling, or the rated power if that is less, because the limiter lets no more pass.
     """
+    bins = _bins(spending)
     count = rest = 0.0
-    for j in range(BINS + 1):
+    for j in range(bins + 1):
         i = _bin(spending, j)
-        count += _weight(j) * spending.counts[i]
-        rest += _weight(j) * spending.levels[i]
+        count += _weight(spending, j) * spending.counts[i]
+        rest += _weight(spending, j) * spending.levels[i]
     u = np.inf
     for _ in range(TRIES):
         if not rest > 0.0:
@@ -112,30 +115,30 @@ def price(spending, ceiling, limited):
         if not u < np.inf or abs(u - last) <= TOLERANCE * u:
             break
         rest, count = 0.0, 0.0
-        for j in range(BINS + 1):
+        for j in range(bins + 1):
             i = _bin(spending, j)
             bound = max(MOST * spending.counts[i], spending.spent[i])
             if limited:
                 bound = min(ceiling, 1.0) * spending.counts[i]
-            count += _weight(j) * spending.counts[i]
+            count += _weight(spending, j) * spending.counts[i]
             if u * spending.levels[i] > bound:
-                count -= _weight(j) * bound
+                count -= _weight(spending, j) * bound
             else:
-                rest += _weight(j) * spending.levels[i]
+                rest += _weight(spending, j) * spending.levels[i]
     return u
 
 
 @part()
 def known(spending, level):
-    """Return whether a level as high as this has come and gone within the averaging time, or lasted for all of it.
+    """Return whether a level as high as this has come and gone within the averaging time, or was there for all of it.
 
     Only then is the power that it can have known from the past. A noise that has just become louder may stay so.
     """
     gone = False
-    for j in range(NOW, BINS):
+    for j in range(NOW, _bins(spending)):
         i = _bin(spending, j)
-        if spending.counts[i] == 0.0:
-            return False
+        if spending.counts[i] == 0.0:  # before the first sample
+            break
         loud = spending.levels[i] >= ALIKE * level * spending.counts[i]
         if loud and gone:
             return True
@@ -144,34 +147,59 @@ def known(spending, level):
 
 
 @part()
+def lasting(spending):
+    """Return the largest power, at most the rated one, that can last: each averaging time that has begun keeps the mean.
+
+    What was overspent in one is spread over the rest of it, or over T/4 if that is longer.
+    """
+    bins, left, power = _bins(spending), 0.0, 1.0
+    for j in range(bins):
+        i = _bin(spending, j)
+        if spending.counts[i] == 0.0:  # before the first sample
+            break
+        left += (spending.counts[i] - spending.spent[i]) / spending.numbers[0].full
+        power = min(power, 1.0 + left / max(bins - j, REPAYMENT * bins))
+    return power
+
+
+@part()
 def power_to_spend(spending, ceiling, limited):
     """Return the power to spend for each unit of level, and the level now.
 
     `ceiling` is another bound of the power, and `limited` says whether a limiter acts on the control signal. Behind one,
-    power that is left cannot be spent later: the rated power is spent at most.
+    power that is left cannot be spent later: the rated power is spent at most. A level that is not known may last, so it
+    gets a power that can.
 
     If power is left, u is a little larger: what was left will not all be needed.
     """
+    bins, level = _bins(spending), level_now(spending)
     left, leaving = power_left(spending)
-    level = level_now(spending)
-    limit = min(leaving, 1.0) + left / (NOW if left > 0.0 else REPAYMENT * BINS)
+    limit = min(leaving, 1.0) + left / (NOW if left > 0.0 else REPAYMENT * bins)
     limit = min(max(limit, LEAST), MOST, ceiling)
-    if limited or not known(spending, level):
+    if limited:
         limit = min(limit, 1.0)
-    u = price(spending, ceiling, limited) * (1.0 + max(left, 0.0) / BINS)
+    elif not known(spending, level):
+        limit = min(limit, max(lasting(spending), LEAST))
+    u = price(spending, ceiling, limited) * (1.0 + max(left, 0.0) / bins)
     return (min(u, limit / level) if level > 0.0 else u), level
+
+
+@part(forceinline=True)
+def _bins(spending):
+    """Return the number of bins in the averaging time."""
+    return spending.counts.size - 1
 
 
 @part(forceinline=True)
 def _bin(spending, j):
     """Return the index of the j-th newest bin."""
-    return (spending.numbers[0].newest - j) % (BINS + 1)
+    return (spending.numbers[0].newest - j) % spending.counts.size
 
 
 @part(forceinline=True)
-def _weight(j):
+def _weight(spending, j):
     """Return the weight of the j-th newest bin."""
-    return 1.0 - j / (BINS + 1.0)
+    return 1.0 - j / spending.counts.size
 
 
 @part(forceinline=True)

@@ -56,7 +56,7 @@ def test_the_budget_of_several_loudspeakers_solves_the_dense_system() -> None:
     secondary, p = random_paths(K, J, path, seed=2), random_paths(K, 1, primary, seed=3, delay=2)
     x = np.random.default_rng(4).standard_normal((1, 20000))
     rated = np.array([0.05, 0.1])
-    budget = ChannelBudget(secondary, taps, primary, 1, rated, GUARD)
+    budget = ChannelBudget(secondary, taps, primary, 1, rated, 100.0, GUARD)
     D = correlation(x, budget.n_lags)
     for _ in range(60):
         budget.solve(D, p)

@@ -12,9 +12,20 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from kfopc_filterpy.power import spending as parts
-from kfopc_filterpy.power.spending import ALIKE, BINS, LEAST, MOST, NOW, REPAYMENT, TOLERANCE, Spending, new_spending
+from kfopc_filterpy.power.spending import (
+    ALIKE,
+    BINS,
+    FEWEST,
+    LEAST,
+    MOST,
+    NOW,
+    REPAYMENT,
+    TOLERANCE,
+    Spending,
+    new_spending,
+)
 
-book, known, level_now = from_python(parts.book), from_python(parts.known), from_python(parts.level_now)
+book, known, level_now, lasting = map(from_python, (parts.book, parts.known, parts.level_now, parts.lasting))
 power_left, power_to_spend, price = map(from_python, (parts.power_left, parts.power_to_spend, parts.price))
 
 SIZE = 4  # samples in a bin
@@ -72,6 +83,25 @@ def test_a_sample_that_has_left_is_as_if_it_had_never_been() -> None:
     fresh = booked(levels, spent)
     assert power_left(old) == power_left(fresh)
     assert power_to_spend(old, MOST, False) == power_to_spend(fresh, MOST, False)
+
+
+@pytest.mark.parametrize(("samples", "expected"), [(160000, 80), (312.5, 78), (125, 62), (79, 79), (10, 10), (2, 8)])
+def test_the_bins_make_up_the_averaging_time(samples: float, expected: int) -> None:
+    state = new_spending(samples)
+    assert state.counts.size == expected + 1
+    if samples >= FEWEST:
+        assert expected * state.numbers["full"][0] == pytest.approx(samples, rel=0.01)
+
+
+def test_few_bins_do_as_well() -> None:
+    state = new_spending(10)
+    rng = np.random.default_rng(3)
+    spent = []
+    for level in rng.uniform(0.5, 1.5, 1000):
+        book(state, level, spent[-1] if spent else 1.0)
+        per_level, now = power_to_spend(state, MOST, False)
+        spent.append(per_level * now)
+    assert np.mean(spent) == pytest.approx(1.0, abs=0.05)
 
 
 # ---- The price
@@ -141,7 +171,7 @@ def test_silence_has_no_price() -> None:
     ("levels", "expected"),
     [
         ([1.0] * 100, True),  # as loud all the time
-        ([1.0] * 70, False),  # but not yet for all of it
+        ([1.0] * 70, True),  # and since the first sample
         ([0.1] * 60 + [1.0] * 30, False),  # has become louder
         ([1.0] * 60 + [0.1] * 30, True),  # has become softer: it was as loud as this all the time
         ([0.1] * 40 + [1.0] * 10 + [0.1] * 20 + [1.0] * 10, True),  # has come and gone
@@ -175,6 +205,28 @@ def test_noise_that_has_just_become_louder_gets_the_rated_power_at_most(gain: fl
     levels = in_bins([1.0] * 90 + [gain] * 6)
     assert to_spend(levels) == pytest.approx(1.0, rel=1e-9)
     assert to_spend(levels, 0.5) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_a_level_that_is_not_known_gets_what_can_last() -> None:
+    """What the jump overspent is spread over the rest of the averaging time that began with it."""
+    quiet, loud = [1.0] * 90, [100.0] * 20
+    spent = np.ones(SIZE * 110)
+    spent[: SIZE * 90] = 0.3
+    spent[SIZE * 90 : SIZE * 91] += 8.0
+    assert to_spend(in_bins(quiet + loud), spent) == pytest.approx(1.0 - 8.0 / (BINS - 19), rel=1e-9)
+
+
+@given(
+    powers=st.lists(st.sampled_from([0.0, 0.5, 0.9, 1.0, 1.1, 3.0]), min_size=1, max_size=3 * BINS),
+    part=st.integers(1, SIZE),
+)
+def test_what_can_last_keeps_the_mean_of_every_averaging_time_that_has_begun(powers: list, part: int) -> None:
+    """If it is spent until the end of that time, or for a quarter of it if that is longer. Against sums of samples."""
+    spent = in_bins(powers)[: SIZE * (len(powers) - 1) + part]
+    lasts = lasting(booked(1.0, spent))
+    overspent = np.cumsum([one.sum() - one.size for one in by_bins(spent)])[:BINS] / SIZE
+    bounds = [1.0 - over / max(BINS - age, REPAID) for age, over in enumerate(overspent)]
+    assert lasts == pytest.approx(min([1.0, *bounds]), rel=1e-9, abs=1e-9)
 
 
 def test_a_known_level_gets_what_is_left_within_the_newest_bins_time() -> None:
