@@ -299,7 +299,7 @@ class DirectPowerBudget(BlockController):
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
     averaging_s : float, default 10
-        Time in seconds over which the mean powers are kept to the rated ones, see `PowerBudget`.
+        Time in seconds over which the mean powers are kept to the rated ones, at least 8 blocks; see `PowerBudget`.
     fs : float, default 16000
         Sample rate in Hz.
 

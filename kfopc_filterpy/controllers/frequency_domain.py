@@ -91,7 +91,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         Memory of the correlation of the references in seconds; by default 0.5 s, or the duration of 16 control filters
         if that is longer.
     averaging_s : float, default 10
-        Time in seconds over which the mean powers are kept to the rated ones, see `PowerBudget`.
+        Time in seconds over which the mean powers are kept to the rated ones, at least 8 blocks; see `PowerBudget`.
     fs : float, default 16000
         Sample rate in Hz.
     block : int, optional

@@ -100,7 +100,7 @@ class SharedGainKalman(PrimaryPathController):
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
     averaging_s : float, default 10
-        Time in seconds over which the mean powers are kept to the rated ones, see `PowerBudget`.
+        Time in seconds over which the mean powers are kept to the rated ones, at least 8 blocks; see `PowerBudget`.
     fs : float, default 16000
         Sample rate in Hz.
     microphone_weights : array_like, shape (K,), optional

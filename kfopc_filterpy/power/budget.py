@@ -237,7 +237,8 @@ class PowerBudget:
     `averaging_s` would have used the rated power; newer noise counts more.
 
     - If power of the last `averaging_s` is left, up to twice the rated power is spent, but only on a level that has
-      come and gone within this time, or has lasted for all of it. A noise that has just become louder gets the rated power at most.
+      come and gone within this time, or has been there for all of it. A noise that has just become louder may stay so:
+      it gets the rated power at most, and less if the jump has spent more.
     - If more than the rated power was spent, it is repaid within a quarter of `averaging_s`.
 
     So after a noise becomes softer for good, the power rises only slowly to the rated one, within `averaging_s`. The
