@@ -102,6 +102,27 @@ def test_the_powers_are_kept_from_the_first_block_on(switch_on_s: float, form: s
     assert powers[:, -10:].mean() > 0.9  # and they are used
 
 
+@pytest.mark.parametrize("course", ["jump", "swell"])
+def test_the_mean_over_the_averaging_time_is_kept_if_the_level_changes(course: str, form: str) -> None:
+    """Swelling by 18 dB within half an averaging time: in every averaging time. A jump of 20 dB: in every one after it.
+
+    The block in which the noise jumps is played with a hundred times the power, before anything can be known of it.
+    """
+    averaging_s, n_samples = 8.0, 100000
+    t = np.arange(n_samples) / FS
+    level = np.where(t < 5.0, 0.1, 1.0) if course == "jump" else 10 ** (9 * np.sin(np.pi * t / 2) / 20)
+    x, rated = level * references(n_samples, 1), np.array([0.02, 0.01])
+    controller = kf_pb(
+        TAPS, SECONDARY, rated_power=rated, fs=FS, n_primary=PRIMARY, form=form, averaging_s=averaging_s, **EXACT
+    )
+    y = simulate(controller, x, primary_path=PRIMARY_PATHS[:, :1], secondary_path=SECONDARY, fs=FS).control_signal
+    total = np.cumsum(np.pad(y**2, ((0, 0), (1, 0))), axis=1)
+    size = round(averaging_s * FS)
+    means = (total[:, size:] - total[:, :-size]) / size / rated[:, np.newaxis]
+    assert means[:, round(5.0 * FS) if course == "jump" else 0 :].max() < 1.06
+    assert means[:, -size:].min() > 0.85
+
+
 # ---- One definition of the step
 
 

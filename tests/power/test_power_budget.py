@@ -322,6 +322,17 @@ def test_the_mean_over_the_averaging_time_is_kept_after_a_loud_second(averaging_
     assert means(spent, averaging_s).max() < 1.05
 
 
+def test_the_mean_over_the_averaging_time_is_kept_after_a_jump_to_a_louder_noise_that_stays() -> None:
+    """20 dB. What it spends before the budget knows, the rest of its averaging time makes up for."""
+    averaging_s = 4.0
+    x = LONG_NOISE.copy()
+    x[: round(4.1 * FS)] *= 0.1
+    spent = run(x, averaging_s=averaging_s).control_signal ** 2 / 0.25
+    assert spent[4 * FS : round(4.1 * FS)].mean() > 2.0
+    assert means(spent, averaging_s).max() < 1.02
+    assert spent[9 * FS :].mean() > 0.95
+
+
 def test_noise_that_recurs_within_the_averaging_time_is_controlled_as_well_as_by_the_best_fixed_filter() -> None:
     """Loud and 10 dB softer in turn. The fixed filter is the power-constrained one for the whole record.
 
