@@ -93,7 +93,7 @@ def power_left(spending):
 
 
 @part()
-def price(spending, ceiling, limited):
+def unit_power(spending, ceiling, limited):
     """Return u, the power to spend for each unit of level, or Inf if the noise needs less than the rated power.
 
     It solves ``sum_j a_j min(u l_j, p_j) = sum_j a_j`` over the bins. Newer ones have larger weights a_j, because the
@@ -180,7 +180,7 @@ def power_to_spend(spending, ceiling, limited):
         limit = min(limit, 1.0)
     elif not known(spending, level):
         limit = min(limit, max(lasting(spending), LEAST))
-    u = price(spending, ceiling, limited) * (1.0 + max(left, 0.0) / bins)
+    u = unit_power(spending, ceiling, limited) * (1.0 + max(left, 0.0) / bins)
     return (min(u, limit / level) if level > 0.0 else u), level
 
 

@@ -1,4 +1,4 @@
-"""How much power to spend: bins, price and bounds against definitions written out from the samples."""
+"""How much power to spend: bins, power for a unit of level, and bounds against definitions written out from the samples."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from kfopc_filterpy.power.spending import (
 )
 
 book, known, level_now, lasting = map(from_python, (parts.book, parts.known, parts.level_now, parts.lasting))
-power_left, power_to_spend, price = map(from_python, (parts.power_left, parts.power_to_spend, parts.price))
+power_left, power_to_spend, unit_power = map(from_python, (parts.power_left, parts.power_to_spend, parts.unit_power))
 
 SIZE = 4  # samples in a bin
 REPAID = REPAYMENT * BINS
@@ -104,10 +104,10 @@ def test_few_bins_do_as_well() -> None:
     assert np.mean(spent) == pytest.approx(1.0, abs=0.05)
 
 
-# ---- The price
+# ---- The power for a unit of level
 
 
-def price_written_out(levels: np.ndarray, spent: np.ndarray, bound: float | None = None) -> float:
+def unit_power_written_out(levels: np.ndarray, spent: np.ndarray, bound: float | None = None) -> float:
     """The root of sum a (min(u l, p) - 1), by Brent's method."""
     of_level, of_spent = by_bins(levels), by_bins(spent)
     counts = np.array([part.size for part in of_level])
@@ -130,15 +130,15 @@ def price_written_out(levels: np.ndarray, spent: np.ndarray, bound: float | None
     spent=st.sampled_from([0.0, 1.0, 5.0]),
     bound=st.sampled_from([None, 0.3, 1.0]),
 )
-def test_at_the_price_the_recent_noise_uses_the_rated_power(
+def test_with_it_the_recent_noise_uses_the_rated_power(
     levels: list, part: int, spent: float, bound: float | None
 ) -> None:
     """To the tolerance of its search, which adds up over the few steps."""
     samples = in_bins(levels)[: SIZE * (len(levels) - 1) + part]
     powers = spent * np.random.default_rng(2).random(samples.size)
-    expected = price_written_out(samples, powers, bound)
+    expected = unit_power_written_out(samples, powers, bound)
     ceiling, limited = (MOST, False) if bound is None else (bound, True)
-    got = price(booked(samples, powers), ceiling, limited)
+    got = unit_power(booked(samples, powers), ceiling, limited)
     assume(math.isfinite(expected) or math.isinf(got))  # all bins at their bounds, to rounding
     assert got == pytest.approx(expected, rel=20 * TOLERANCE)
 
@@ -146,7 +146,7 @@ def test_at_the_price_the_recent_noise_uses_the_rated_power(
 def test_a_noise_that_recurs_gets_power_in_proportion_to_its_level() -> None:
     """Loud and soft in turn: the mean over both is the rated power."""
     levels = np.tile(in_bins([1.5] * 5 + [0.5] * 5), 20)
-    u = price(booked(levels), MOST, False)
+    u = unit_power(booked(levels), MOST, False)
     assert u == pytest.approx(1.0, rel=0.04)  # newer bins have larger weights
 
 
@@ -154,12 +154,12 @@ def test_a_noise_that_recurs_gets_power_in_proportion_to_its_level() -> None:
 def test_a_loud_stretch_leaves_power_for_the_rest(loud: float) -> None:
     """An eighth of the averaging time, however loud, counts with twice the rated power."""
     levels = in_bins([1.0] * 35 + [loud] * 10 + [1.0] * 35)
-    assert price(booked(levels), MOST, False) == pytest.approx((80 - 2 * 10) / 70, rel=0.02)
+    assert unit_power(booked(levels), MOST, False) == pytest.approx((80 - 2 * 10) / 70, rel=0.02)
 
 
-def test_silence_has_no_price() -> None:
-    assert price(booked(np.zeros(100)), MOST, False) == math.inf
-    assert price(new_spending(100), MOST, False) == math.inf
+def test_silence_has_none() -> None:
+    assert unit_power(booked(np.zeros(100)), MOST, False) == math.inf
+    assert unit_power(new_spending(100), MOST, False) == math.inf
     per_level, level = power_to_spend(booked(np.zeros(100)), MOST, False)
     assert (per_level, level) == (math.inf, 0.0)
 
@@ -247,12 +247,12 @@ def test_what_was_overspent_is_repaid_within_a_quarter_of_the_averaging_time(bey
     assert to_spend(np.ones(100 * SIZE), spent) == pytest.approx(expected, rel=1e-9)
 
 
-def test_power_that_is_left_raises_the_price_a_little() -> None:
+def test_power_that_is_left_raises_it_a_little() -> None:
     """Noise that has become softer, and so has used half of the power: half as much again."""
     levels = in_bins([4.0] * 40 + [1.0] * 40)
     spent = np.where(levels > 1.0, 0.8, 0.2)
     per_level, _ = power_to_spend(booked(levels, spent), MOST, False)
-    assert per_level == pytest.approx(1.5 * price(booked(levels, spent), MOST, False), rel=1e-9)
+    assert per_level == pytest.approx(1.5 * unit_power(booked(levels, spent), MOST, False), rel=1e-9)
 
 
 @pytest.mark.parametrize("ceiling", [0.3, 0.9])
