@@ -380,6 +380,10 @@ def _constraint() -> Iterator[Quote]:
             len(r.rows("KF-PB", False, SHORT_S)),
         ],
     )
+    yield quote(
+        "last four of eight seconds is {:.3f} to {:.3f} of the rated one",
+        lambda r: r.said("constraint", "KF-PB on stationary noise")[1:3],
+    )
     yield quote("up to {:.1f} dB while the recorded motor runs down", lambda r: [_worst_loss(r, "motor")])
     yield quote(
         "In the runs of 60 s it is {:.2f} dB above it on average, and {:.2f} dB below it at worst",
@@ -499,7 +503,7 @@ def _further() -> Iterator[Quote]:
     yield quote(room, "KF-PB is {:.2f} dB below the bound on average and {:.2f} dB at worst; on the", steady, 0, 1)
     yield quote(room, "each second, {:.2f} dB and {:.2f} dB. The settings", recorded, 0, 1)
     yield quote(room, "of steady noise is {:.2f} to {:.2f} of the rating", "Steady noise: every loudspeaker", 0, 1)
-    yield quote(room, "the recordings at most {:.2f}. In four", "Recordings: every loudspeaker", 1)
+    yield quote(room, "seconds of the recordings at most {:.2f}. KF-PB", "Recordings: every loudspeaker", 1)
     yield quote(room, "rating by {:.1f} dB on average and by {:.1f} dB at worst", "No method of another kind", 0, 1)
     yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
     yield quote("amplifier", "its reduction is at best {:.1f} dB larger", "KF-OPC reduces the noise more", 0)

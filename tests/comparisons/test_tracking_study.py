@@ -244,7 +244,8 @@ def test_a_change_is_judged_by_its_stretch(worst: float, met: bool) -> None:
     [
         (1.01, 1.01, 0.19, True),
         (0.99, 1.3, 0.1, False),
-        (1.3, 0.99, 0.1, False),
+        (1.3, 0.51, 0.1, True),
+        (1.3, 0.49, 0.1, False),
         (1.2, 1.3, 0.21, False),
         (None, 1.3, 0.1, True),
         (1.2, 1.3, None, False),
