@@ -118,7 +118,7 @@ class BlockController(FilteredReferenceController):
         self._lines.energy[:] = self._lines.n_emitted[:] = 0.0
         if np.all(np.abs(references) < LOUDEST):
             level = float(np.mean(references[:, -self.block :] ** 2, axis=1).sum())
-            if np.any(energy):  # more samples than a block have been emitted if some were skipped
+            if n_emitted > 0.0:  # more than a block's if some samples were skipped
                 self._budget.spend(level, energy / n_emitted, max(round(n_emitted / self.block), 1))
             else:
                 self._budget.spend(level, None)  # the control was off

@@ -310,8 +310,8 @@ def kf_anc(
     Parameters
     ----------
     n_taps : int or SuggestedSettings
-        Taps L of the control filter, or of each of them. What `suggest_settings` returns contains them, and the defaults
-        of the next three settings as well.
+        Taps L of the control filter, or of each of them. Or pass the result of `suggest_settings`,
+        which also supplies the defaults of the next three settings.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
     state_noise : float, optional
@@ -458,8 +458,8 @@ def with_suggested(n_taps: Any, settings: dict[str, Any], instead: str = "") -> 
     settings = suggested | {name: value for name, value in settings.items() if value is not None}
     if not {"state_noise", "measurement_noise"} <= settings.keys():
         raise TypeError(
-            f"give state_noise and measurement_noise{instead}, or what suggest_settings(reference, disturbance, "
-            "secondary_path) returns for a run with a silent loudspeaker in place of n_taps"
+            f"give state_noise and measurement_noise{instead}, or pass as n_taps the result of suggest_settings(reference, "
+            "disturbance, secondary_path) for a run with a silent loudspeaker"
         )
     return n_taps, settings
 
@@ -470,12 +470,17 @@ def suggested_constraint(n_taps: Any, rated_power: Any, constraint: Any) -> Any:
         return constraint_for(rated_power, constraint)
     own = constraint_for(rated_power, constraint, n_taps.fs)
     for one in own if isinstance(own, tuple) else (own,):
-        if abs(one.fs - n_taps.fs) > 1e-9 * n_taps.fs:
-            raise ValueError(
-                f"the suggested settings are for {n_taps.fs:g} Hz but the constraint is for {one.fs:g} Hz: "
-                "make both with the fs of the signals"
-            )
+        require_suggested_rate(n_taps, one.fs, "the constraint is for")
     return own
+
+
+def require_suggested_rate(suggested: SuggestedSettings, fs: float, what: str) -> None:
+    """Raise ValueError if a sample rate differs from that of suggested settings."""
+    if abs(fs - suggested.fs) > 1e-9 * suggested.fs:
+        raise ValueError(
+            f"the suggested settings are for {suggested.fs:g} Hz but {what} {fs:g} Hz: "
+            "make both with the fs of the signals"
+        )
 
 
 def is_multichannel(secondary_path: Any, n_references: int) -> bool:

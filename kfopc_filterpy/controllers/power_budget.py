@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_choice
+from .._validate import as_choice, as_positive
 from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
@@ -19,7 +19,7 @@ from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman
-from .kalman import KalmanController, correct_constrained, is_multichannel, with_suggested
+from .kalman import KalmanController, correct_constrained, is_multichannel, require_suggested_rate, with_suggested
 from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
@@ -171,8 +171,8 @@ def kf_pb(
     Parameters
     ----------
     n_taps : int or SuggestedSettings
-        Taps L of a control filter. What `suggest_settings` returns contains them, and the defaults of the sample rate
-        and of the noises.
+        Taps L of a control filter. Or pass the result of `suggest_settings`, which also supplies the defaults of the
+        sample rate and of the noises.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
     rated_power : float or array_like, shape (J,)
@@ -230,6 +230,7 @@ def kf_pb(
     }
     if isinstance(n_taps, SuggestedSettings):
         settings = {"fs": n_taps.fs} | settings
+        require_suggested_rate(n_taps, as_positive(settings["fs"], "fs", unit="Hz"), "fs is")
     if form in PRIMARY_PATH_FORMS:
         given = [name for name, value in noises.items() if value is not None]
         if given:

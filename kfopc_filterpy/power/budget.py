@@ -29,6 +29,7 @@ LIMITER_MEMORY_S = 1.0  # memory of what a limiter took
 CEILING_RATE = 2.0  # the ceiling moves by exp(2 dt / T) at most, with T = averaging time, or the time so far if shorter
 SOFT = 0.5  # a noise for which less than this share of the rated power is spent does not lower the ceiling
 SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
+ACTS = 1e-6  # of the rated power, in the mean of what a limiter took: it counts as one that acts, for about 14 s
 LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
 INTERVAL = 128  # samples between two solutions; fewer at the start
 X, XF = 0, 1  # the reference and the filtered reference, in the correlations
@@ -102,7 +103,7 @@ def allocate(budget, w):
     sum_correlations(budget, of_x, of_xf)
     if not of_x[0] > SILENCE:  # silence so far: nothing to solve
         return
-    per_level, level = power_to_spend(budget.spending, numbers.ceiling, numbers.limited > 0.0)
+    per_level, level = power_to_spend(budget.spending, numbers.ceiling, numbers.limited > ACTS)
     mean = of_x[0]
     share = per_level * mean if per_level < np.inf else 1.0
     if lags > L:
@@ -140,7 +141,7 @@ def hear_limiter(budget, asked, y):
 
 
 @part()
-def move_ceiling(budget, of_x, of_xf, forecast):
+def move_ceiling(budget, of_x, of_xf, relative_level):
     """Move the ceiling to where the limiter takes as much from the noise reduction as more power would add.
 
     It moves fast at the start and then slowly, so that single bursts do not move it. It falls only if the limiter acts
@@ -152,7 +153,7 @@ def move_ceiling(budget, of_x, of_xf, forecast):
     )
     if not abs(balance) <= 1.0:
         return
-    if balance < 0.0 and not (numbers.acts or power * forecast >= SOFT * numbers.rated_power):
+    if balance < 0.0 and not (numbers.acts or power * relative_level >= SOFT * numbers.rated_power):
         return
     step = CEILING_RATE * balance * numbers.interval / min(numbers.taken, numbers.averaging)
     numbers.ceiling = min(max(numbers.ceiling * math.exp(step), LEAST), MOST)
@@ -354,6 +355,7 @@ class PowerBudget:
     @rated_power.setter
     def rated_power(self, value: float) -> None:
         self._state.numbers["rated_power"] = as_positive(value, "rated_power")
+        self._state.numbers["waited"] = float(INTERVAL)  # solve at the next sample
 
     @property
     def control_filter(self) -> np.ndarray:

@@ -23,11 +23,11 @@ import numpy as np
 from ..kernels.compiling import part
 from ..kernels.records import new_record
 
-BINS, FEWEST = 80, 8  # in the averaging time; fewer if a bin had less than a sample, but never fewer than the second
+BINS, FEWEST = 80, 8  # bins in the averaging time; the second if the first would have less than a sample each
 NOW = 3  # newest bins, whose mean is the level now; power that is left may be spent within as many
 REPAYMENT = 0.25  # of the averaging time, within which overspending is repaid
 ALIKE = 0.5  # a level that was at least this share of the present one is taken for the same
-LEAST, MOST = 0.1, 2.0  # of the rated power: bounds of what is spent, whatever was spent before
+LEAST, MOST = 0.1, 2.0  # of the rated power: bounds of the limit that what was spent before sets
 LARGEST = 1e200  # a sample's level or power counts as this if it is larger
 TOLERANCE = 1e-4  # relative error of u
 TRIES = 20
@@ -94,37 +94,33 @@ def power_left(spending):
 
 @part()
 def unit_power(spending, ceiling, limited):
-    """Return u, the power to spend for each unit of level, or Inf if the noise needs less than the rated power.
+    """Return u, the power to spend for each unit of level, or Inf if even all p_j together are below the rated power.
 
     It solves ``sum_j a_j min(u l_j, p_j) = sum_j a_j`` over the bins. Newer ones have larger weights a_j, because the
-    future is more like them. A bin counts with at most p_j, the power that was spent in it, or MOST if that was less:
-    a single loud second is not to use up the whole power of the following ones. Behind a limiter that acts, p_j is the
-    ceiling, or the rated power if that is less, because the limiter lets no more pass.
+    future is more like them. A bin counts with at most p_j, which is the power that was spent in it, at least MOST and at
+    most what can be repaid: a single loud second, or a click, is not to use up the power of the following ones. Behind a
+    limiter that acts, p_j is the ceiling, or the rated power if that is less, because the limiter lets no more pass.
     """
-    bins = _bins(spending)
-    count = rest = 0.0
-    for j in range(bins + 1):
-        i = _bin(spending, j)
-        count += _weight(spending, j) * spending.counts[i]
-        rest += _weight(spending, j) * spending.levels[i]
-    u = np.inf
+    bins, full = _bins(spending), spending.numbers[0].full
+    u = 0.0
     for _ in range(TRIES):
+        count = rest = 0.0
+        for j in range(bins + 1):
+            i, a = _bin(spending, j), _weight(spending, j)
+            if limited:
+                most = min(ceiling, 1.0) * spending.counts[i]
+            else:
+                most = max(MOST * spending.counts[i], min(spending.spent[i], REPAYMENT * bins * full))
+            count += a * spending.counts[i]
+            if u * spending.levels[i] > most:
+                count -= a * most
+            else:
+                rest += a * spending.levels[i]
         if not rest > 0.0:
             return np.inf
         last, u = u, count / rest
         if not u < np.inf or abs(u - last) <= TOLERANCE * u:
             break
-        rest, count = 0.0, 0.0
-        for j in range(bins + 1):
-            i = _bin(spending, j)
-            bound = max(MOST * spending.counts[i], spending.spent[i])
-            if limited:
-                bound = min(ceiling, 1.0) * spending.counts[i]
-            count += _weight(spending, j) * spending.counts[i]
-            if u * spending.levels[i] > bound:
-                count -= _weight(spending, j) * bound
-            else:
-                rest += _weight(spending, j) * spending.levels[i]
     return u
 
 

@@ -349,8 +349,11 @@ def test_the_sample_rate_is_that_of_the_suggested_settings() -> None:
     suggested = suggest_settings(X, D, S, n_taps=8, fs=8000.0)
     assert kf_opc(suggested, S, rated_power=0.5).estimator.constraint.fs == 8000.0
     assert kf_pb(suggested, S, rated_power=0.5).estimator.budget.fs == 8000.0
-    assert kf_pb(suggested, S, rated_power=0.5, fs=4000.0).estimator.budget.fs == 4000.0
+    assert kf_pb(suggested, S, rated_power=0.5, fs=8000).estimator.budget.fs == 8000.0
     own = OutputPowerConstraint(0.5, fs=8000.0, memory_s=0.1)
     assert kf_opc(suggested, S, constraint=own).estimator.constraint.memory_s == 0.1
     with pytest.raises(ValueError, match="suggested settings are for 8000 Hz but the constraint is for 16000 Hz"):
         kf_opc(suggested, S, constraint=OutputPowerConstraint(0.5))
+    for form in ("direct", "shared gain", "frequency domain"):
+        with pytest.raises(ValueError, match="suggested settings are for 8000 Hz but fs is 16000 Hz"):
+            kf_pb(suggested, S, rated_power=0.5, form=form, fs=16000.0)

@@ -223,3 +223,19 @@ def test_a_ceiling_too_low_rises_until_the_estimate_fits() -> None:
     assert after == LEAST < needed
     assert budget.power_weight < 1e-3
     assert needed < budget.ceiling < 1.4 * needed  # what 0.4 s of the quiet noise need scatters by a tenth
+
+
+def test_a_limiter_that_no_longer_acts_is_forgotten() -> None:
+    """Noise that is loud and soft in turn; for five samples after 3 s, half of the control signal is limited."""
+    means = []
+    for limited in (False, True):
+        budget = PowerBudget(2, 0.25, fs=1000.0, memory_s=0.3, averaging_s=2.0)
+        x = np.random.default_rng(5).standard_normal(40_000) * np.tile(np.repeat([1.0, 0.2], 500), 40)
+        spent = np.zeros(x.size)
+        for n, value in enumerate(x):
+            u = budget.control_signal(value)
+            y = 0.5 * u if limited and 3000 <= n < 3005 else u
+            budget.advance(value, value, [1.0, 0.0], control_signal=y)
+            spent[n] = y * y / 0.25
+        means.append(spent[-20_000:].mean())
+    assert means[1] == pytest.approx(means[0], rel=0.01)

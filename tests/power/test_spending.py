@@ -113,7 +113,9 @@ def unit_power_written_out(levels: np.ndarray, spent: np.ndarray, bound: float |
     counts = np.array([part.size for part in of_level])
     weights = (1.0 - np.arange(counts.size) / (BINS + 1.0)) * counts
     level = np.array([part.mean() for part in of_level])
-    most = np.array([max(MOST, part.mean()) if bound is None else bound for part in of_spent])
+    most = np.array(
+        [max(MOST, min(part.mean(), REPAID * SIZE / part.size)) if bound is None else bound for part in of_spent]
+    )
 
     def beyond(u: float) -> float:
         return float(weights @ (np.minimum(u * level, most) - 1.0))
@@ -178,6 +180,7 @@ def test_silence_has_none() -> None:
         ([0.1] * 40 + [0.9 * ALIKE] * 10 + [0.1] * 20 + [1.0] * 10, False),  # that was softer
         ([0.1] * 40 + [1.1 * ALIKE] * 10 + [0.1] * 20 + [1.0] * 10, True),
         ([1.0] * 10 + [0.1] * 90 + [1.0] * 10, False),  # it is too long ago
+        ([0.1] * 90 + [1.0, 0.1, 1.0], False),  # the newest bins do not count
     ],
 )
 def test_a_level_is_known_if_it_has_come_and_gone_or_lasted(levels: list, expected: bool) -> None:
@@ -253,6 +256,37 @@ def test_power_that_is_left_raises_it_a_little() -> None:
     spent = np.where(levels > 1.0, 0.8, 0.2)
     per_level, _ = power_to_spend(booked(levels, spent), MOST, False)
     assert per_level == pytest.approx(1.5 * unit_power(booked(levels, spent), MOST, False), rel=1e-9)
+
+
+def test_what_will_leave_counts_as_the_rated_power_at_most() -> None:
+    """Overspending that is about to leave the averaging time is no reason to overspend again."""
+    levels = in_bins([1.0] * BINS)
+    spent = np.repeat([1.5] * 20 + [0.95] * 60, SIZE)
+    left, leaving = power_left(booked(levels, spent))
+    assert leaving > 1.3
+    assert -8.0 < left < 0.0
+    assert to_spend(levels, spent) == pytest.approx(1.0 + left / REPAID, rel=1e-9)
+
+
+def test_after_a_jump_that_overspent_by_more_than_the_averaging_time_a_little_is_left_to_spend() -> None:
+    spent = np.ones(SIZE * 110)
+    spent[SIZE * 90 : SIZE * 91] += 3.0 * BINS
+    assert to_spend(in_bins([1.0] * 90 + [100.0] * 20), spent) == pytest.approx(LEAST, rel=1e-9)
+
+
+@pytest.mark.parametrize("click", [1e2, 1e4, 1e8])
+def test_a_click_leaves_power_for_the_steady_noise_after_it(click: float) -> None:
+    """However much was spent in its sample: never below the least power."""
+    levels, spent = np.ones(100 * SIZE), np.ones(100 * SIZE)
+    levels[60 * SIZE] = spent[60 * SIZE] = click
+    assert to_spend(levels, spent) * (1 + 1e-9) >= LEAST
+
+
+@pytest.mark.parametrize("ceiling", [1.3, MOST])
+def test_behind_a_limiter_no_more_than_the_rated_power_is_spent(ceiling: float) -> None:
+    levels = in_bins(([0.1] * 10 + [2.0] * 10) * 5)
+    assert to_spend(levels, 0.5, ceiling, False) > 1.2
+    assert to_spend(levels, 0.5, ceiling, True) == pytest.approx(1.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("ceiling", [0.3, 0.9])
