@@ -458,8 +458,8 @@ def with_suggested(n_taps: Any, settings: dict[str, Any], instead: str = "") -> 
     settings = suggested | {name: value for name, value in settings.items() if value is not None}
     if not {"state_noise", "measurement_noise"} <= settings.keys():
         raise TypeError(
-            f"give state_noise and measurement_noise{instead}, or pass as n_taps the result of suggest_settings(reference, "
-            "disturbance, secondary_path) for a run with a silent loudspeaker"
+            f"give state_noise and measurement_noise{instead}, or pass the result of suggest_settings(reference, "
+            "disturbance, secondary_path), from a run with a silent loudspeaker, as n_taps"
         )
     return n_taps, settings
 

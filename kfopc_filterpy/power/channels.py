@@ -104,15 +104,16 @@ class ChannelBudget:
         level : float
             Sum of the references' powers.
         power : ndarray, shape (J,), or None
-            Power of each control signal; None for a block without control, in which no power is saved.
+            Power of each control signal; None for a block without control. No power is saved in it,
+            nor before the first solution.
         blocks : int, default 1
             Number of blocks since the last solution.
         """
         for j, spending in enumerate(self._spending):
             seen, spent = level, 1.0
-            if power is not None:
+            if power is not None and self._gain[j] > 0.0:
                 # The level as the control filter sees it: the power that it spent, over what it spends at level 1.
-                seen = power[j] / self._gain[j] if self._gain[j] > 0.0 else level
+                seen = power[j] / self._gain[j]
                 spent = power[j] / self.rated_power[j]
             self._share[j] = spend_blocks(spending, seen, spent, blocks)
 

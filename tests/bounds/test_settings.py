@@ -269,12 +269,16 @@ def test_the_shortest_record_and_the_longest_filter_that_it_supports():
 )
 @pytest.mark.parametrize("given", [{}, {"state_noise": 1e-9}, {"measurement_noise": 0.1}], ids=["none", "r", "q"])
 def test_controllers_without_the_noises_point_to_it(make, given):
-    with pytest.raises(TypeError, match=r"^give state_noise and measurement_noise, or what suggest_settings\("):
+    with pytest.raises(
+        TypeError, match=r"^give state_noise and measurement_noise, or pass the result of suggest_settings\("
+    ):
         make(8, S, **given)
 
 
 def test_kf_pb_without_the_noises_points_to_it():
-    with pytest.raises(TypeError, match=r"or form='shared gain', which does not need them, or what suggest_settings\("):
+    with pytest.raises(
+        TypeError, match=r"or form='shared gain', which does not need them, or pass the result of suggest_settings\("
+    ):
         kf_pb(8, S, rated_power=1.0)
 
 
