@@ -241,6 +241,8 @@ class PowerBudget:
       come and gone within this time, or has been there for all of it. A noise that has just become louder may stay so:
       it gets the rated power at most, and less if the jump has spent more.
     - If more than the rated power was spent, it is repaid within a quarter of `averaging_s`.
+    - The beginning of a burst gets what keeps the mean if such bursts recur, or what the rules above allow if that is
+      more.
 
     So after a noise becomes softer for good, the power rises only slowly to the rated one, within `averaging_s`. The
     correlations are those of a sliding window of `memory_s`.

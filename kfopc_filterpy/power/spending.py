@@ -67,10 +67,10 @@ def book(spending, level, spent):
 
 
 @part()
-def level_now(spending):
+def level_of(spending, bins):
     """Return the mean level of the newest bins."""
     total = count = 0.0
-    for j in range(NOW):
+    for j in range(bins):
         i = _bin(spending, j)
         total += spending.levels[i]
         count += spending.counts[i]
@@ -94,16 +94,17 @@ def power_left(spending):
 
 @part()
 def unit_power(spending, ceiling, limited):
-    """Return u, the power to spend for each unit of level, or Inf if even all p_j together are below the rated power.
+    """Return u, the power to spend for each unit of level, and what u would be if every bin counted in full.
 
-    It solves ``sum_j a_j min(u l_j, p_j) = sum_j a_j`` over the bins. Newer ones have larger weights a_j, because the
+    u solves ``sum_j a_j min(u l_j, p_j) = sum_j a_j`` over the bins. Newer ones have larger weights a_j, because the
     future is more like them. A bin counts with at most p_j, which is the power that was spent in it, at least MOST and at
     most what can be repaid: a single loud second, or a click, is not to use up the power of the following ones. Behind a
-    limiter that acts, p_j is the ceiling, or the rated power if that is less, because the limiter lets no more pass.
+    limiter that acts, p_j is the ceiling, or the rated power if that is less, because the limiter lets no more pass. If
+    even all p_j together are below the rated power, u is Inf.
     """
     bins, full = _bins(spending), spending.numbers[0].full
-    u = 0.0
-    for _ in range(TRIES):
+    u, in_full = 0.0, np.inf
+    for tried in range(TRIES):
         count = rest = 0.0
         for j in range(bins + 1):
             i, a = _bin(spending, j), _weight(spending, j)
@@ -117,11 +118,13 @@ def unit_power(spending, ceiling, limited):
             else:
                 rest += a * spending.levels[i]
         if not rest > 0.0:
-            return np.inf
+            return np.inf, in_full
         last, u = u, count / rest
+        if tried == 0:  # no bin has reached its p_j yet
+            in_full = u
         if not u < np.inf or abs(u - last) <= TOLERANCE * u:
             break
-    return u
+    return u, in_full
 
 
 @part()
@@ -167,8 +170,11 @@ def power_to_spend(spending, ceiling, limited):
     gets a power that can.
 
     If power is left, u is a little larger: what was left will not all be needed.
+
+    Between rare bursts u is large, because the bursts count with their p_j only. When one begins, the mean level of NOW
+    bins shows it late. So the newest bin alone has a bound, too: the limit, or what a burst gets if all count in full.
     """
-    bins, level = _bins(spending), level_now(spending)
+    bins, level, newest = _bins(spending), level_of(spending, NOW), level_of(spending, 1)
     left, leaving = power_left(spending)
     limit = min(leaving, 1.0) + left / (NOW if left > 0.0 else REPAYMENT * bins)
     limit = min(max(limit, LEAST), MOST, ceiling)
@@ -176,8 +182,14 @@ def power_to_spend(spending, ceiling, limited):
         limit = min(limit, 1.0)
     elif not known(spending, level):
         limit = min(limit, max(lasting(spending), LEAST))
-    u = unit_power(spending, ceiling, limited) * (1.0 + max(left, 0.0) / bins)
-    return (min(u, limit / level) if level > 0.0 else u), level
+    more = 1.0 + max(left, 0.0) / bins
+    u, in_full = unit_power(spending, ceiling, limited)
+    per_level = more * u
+    if level > 0.0:
+        per_level = min(per_level, limit / level)
+    if newest > 0.0:
+        per_level = min(per_level, max(limit / newest, more * in_full))
+    return per_level, level
 
 
 @part(forceinline=True)

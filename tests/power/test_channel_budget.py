@@ -7,6 +7,7 @@ import pytest
 from helpers.channels import constrained_filters, correlation, random_paths
 from scipy.linalg import block_diag
 
+from kfopc_filterpy.power.budget import left_of
 from kfopc_filterpy.power.channels import RIDGE, ChannelBudget
 
 K, J, REFERENCES, TAPS, PATH, PRIMARY = 4, 3, 2, 20, 8, 14
@@ -155,13 +156,19 @@ def test_noise_that_recurs_gets_power_in_proportion_to_its_level() -> None:
     np.testing.assert_allclose(loud.mean(axis=0) / soft.mean(axis=0), 3.0, rtol=0.15)
 
 
-@pytest.mark.parametrize(("power", "expected"), [(None, 1.0), (np.zeros(J), 2.0)])
-def test_nothing_is_saved_while_the_control_is_off(power: np.ndarray | None, expected: float) -> None:
-    """If it was on, but emitted nothing, all of the power is left."""
+def test_nothing_is_saved_while_the_control_is_off_or_before_the_first_solution() -> None:
+    """After it, a loudspeaker that emits nothing saves all of the power. In bins, of which 80 are the averaging time."""
     budget = limited_budget()
-    for _ in range(200):
-        budget.spend(1.0, power)
-    np.testing.assert_allclose(limits(budget), expected * RATED)
+
+    def left_after(power: np.ndarray | None) -> list[float]:
+        for _ in range(200):
+            budget.spend(1.0, power)
+        return [left_of(spending)[0] for spending in budget._spending]
+
+    assert left_after(np.zeros(J)) == [0.0] * J
+    limits(budget)  # solves
+    assert left_after(None) == [0.0] * J
+    assert left_after(np.zeros(J)) == [80.0] * J
 
 
 def test_several_blocks_count_as_many() -> None:

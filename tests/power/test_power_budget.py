@@ -333,6 +333,23 @@ def test_the_mean_over_the_averaging_time_is_kept_after_a_jump_to_a_louder_noise
     assert spent[9 * FS :].mean() > 0.95
 
 
+@pytest.mark.parametrize(
+    ("loud_s", "period_s", "overdrive", "most"),
+    [(0.12, 1.72, 10.0, 1.06), (0.12, 1.72, 4.0, 1.0), (0.2, 0.92, 4.0, 1.0), (0.8, 1.6, 10.0, 1.1)],
+)
+def test_the_mean_over_the_averaging_time_is_kept_by_bursts_after_near_silence(
+    loud_s: float, period_s: float, overdrive: float, most: float
+) -> None:
+    """40 dB below the bursts. Without a bound for the newest bin it would be 1.0 to 1.12."""
+    n, averaging_s = 20 * FS, 4.0
+    x = np.random.default_rng(5).standard_normal(n)
+    x[np.arange(n) % round(period_s * FS) >= loud_s * FS] *= 0.01
+    rated_power = np.mean(np.convolve(x, W)[:n] ** 2) / overdrive
+    spent = run(x, rated_power, averaging_s=averaging_s).control_signal ** 2 / rated_power
+    assert means(spent, averaging_s).max() < most
+    assert spent[n // 2 :].mean() > 0.6
+
+
 def test_noise_that_recurs_within_the_averaging_time_is_controlled_as_well_as_by_the_best_fixed_filter() -> None:
     """Loud and 10 dB softer in turn. The fixed filter is the power-constrained one for the whole record.
 

@@ -25,7 +25,7 @@ from kfopc_filterpy.power.spending import (
     new_spending,
 )
 
-book, known, level_now, lasting = map(from_python, (parts.book, parts.known, parts.level_now, parts.lasting))
+book, known, level_of, lasting = map(from_python, (parts.book, parts.known, parts.level_of, parts.lasting))
 power_left, power_to_spend, unit_power = map(from_python, (parts.power_left, parts.power_to_spend, parts.unit_power))
 
 SIZE = 4  # samples in a bin
@@ -68,11 +68,11 @@ def test_what_is_left_is_what_was_not_spent_in_the_averaging_time(levels: list, 
     assert leaving == pytest.approx(oldest.sum() / (REPAID - bins[0].size / SIZE), abs=1e-9)
 
 
-@given(levels=LEVELS, part=st.integers(1, SIZE))
-def test_the_level_now_is_the_mean_of_the_newest_bins(levels: list, part: int) -> None:
+@given(levels=LEVELS, part=st.integers(1, SIZE), bins=st.sampled_from([1, NOW]))
+def test_the_level_of_the_newest_bins_is_the_mean_of_their_samples(levels: list, part: int, bins: int) -> None:
     samples = in_bins(levels)[: SIZE * (len(levels) - 1) + part]
-    newest = np.concatenate(by_bins(samples)[:NOW])
-    assert level_now(booked(samples)) == pytest.approx(newest.mean(), rel=1e-12)
+    newest = np.concatenate(by_bins(samples)[:bins])
+    assert level_of(booked(samples), bins) == pytest.approx(newest.mean(), rel=1e-12)
 
 
 def test_a_sample_that_has_left_is_as_if_it_had_never_been() -> None:
@@ -107,8 +107,8 @@ def test_few_bins_do_as_well() -> None:
 # ---- The power for a unit of level
 
 
-def unit_power_written_out(levels: np.ndarray, spent: np.ndarray, bound: float | None = None) -> float:
-    """The root of sum a (min(u l, p) - 1), by Brent's method."""
+def unit_power_written_out(levels: np.ndarray, spent: np.ndarray, bound: float | None = None) -> tuple[float, float]:
+    """The root of sum a (min(u l, p) - 1), by Brent's method; and that of sum a (u l - 1)."""
     of_level, of_spent = by_bins(levels), by_bins(spent)
     counts = np.array([part.size for part in of_level])
     weights = (1.0 - np.arange(counts.size) / (BINS + 1.0)) * counts
@@ -120,10 +120,11 @@ def unit_power_written_out(levels: np.ndarray, spent: np.ndarray, bound: float |
     def beyond(u: float) -> float:
         return float(weights @ (np.minimum(u * level, most) - 1.0))
 
+    in_full = weights.sum() / (weights @ level) if np.any(level) else math.inf
     high = np.max(most / np.where(level > 0.0, level, np.inf))
     if not high > 0.0 or beyond(high) <= 1e-9 * weights.sum():
-        return math.inf
-    return brentq(beyond, 0.0, high, xtol=1e-300, rtol=1e-12)
+        return math.inf, in_full
+    return brentq(beyond, 0.0, high, xtol=1e-300, rtol=1e-12), in_full
 
 
 @given(
@@ -138,9 +139,10 @@ def test_with_it_the_recent_noise_uses_the_rated_power(
     """To the tolerance of its search, which adds up over the few steps."""
     samples = in_bins(levels)[: SIZE * (len(levels) - 1) + part]
     powers = spent * np.random.default_rng(2).random(samples.size)
-    expected = unit_power_written_out(samples, powers, bound)
+    expected, expected_in_full = unit_power_written_out(samples, powers, bound)
     ceiling, limited = (MOST, False) if bound is None else (bound, True)
-    got = unit_power(booked(samples, powers), ceiling, limited)
+    got, in_full = unit_power(booked(samples, powers), ceiling, limited)
+    assert in_full == pytest.approx(expected_in_full, rel=1e-12)
     assume(math.isfinite(expected) or math.isinf(got))  # all bins at their bounds, to rounding
     assert got == pytest.approx(expected, rel=20 * TOLERANCE)
 
@@ -148,20 +150,21 @@ def test_with_it_the_recent_noise_uses_the_rated_power(
 def test_a_noise_that_recurs_gets_power_in_proportion_to_its_level() -> None:
     """Loud and soft in turn: the mean over both is the rated power."""
     levels = np.tile(in_bins([1.5] * 5 + [0.5] * 5), 20)
-    u = unit_power(booked(levels), MOST, False)
-    assert u == pytest.approx(1.0, rel=0.04)  # newer bins have larger weights
+    u, in_full = unit_power(booked(levels), MOST, False)
+    assert u == in_full == pytest.approx(1.0, rel=0.04)  # newer bins have larger weights
 
 
 @pytest.mark.parametrize("loud", [10.0, 1e3, 1e6])
 def test_a_loud_stretch_leaves_power_for_the_rest(loud: float) -> None:
     """An eighth of the averaging time, however loud, counts with twice the rated power."""
     levels = in_bins([1.0] * 35 + [loud] * 10 + [1.0] * 35)
-    assert unit_power(booked(levels), MOST, False) == pytest.approx((80 - 2 * 10) / 70, rel=0.02)
+    u, _ = unit_power(booked(levels), MOST, False)
+    assert u == pytest.approx((80 - 2 * 10) / 70, rel=0.02)
 
 
 def test_silence_has_none() -> None:
-    assert unit_power(booked(np.zeros(100)), MOST, False) == math.inf
-    assert unit_power(new_spending(100), MOST, False) == math.inf
+    assert unit_power(booked(np.zeros(100)), MOST, False) == (math.inf, math.inf)
+    assert unit_power(new_spending(100), MOST, False) == (math.inf, math.inf)
     per_level, level = power_to_spend(booked(np.zeros(100)), MOST, False)
     assert (per_level, level) == (math.inf, 0.0)
 
@@ -185,7 +188,7 @@ def test_silence_has_none() -> None:
 )
 def test_a_level_is_known_if_it_has_come_and_gone_or_lasted(levels: list, expected: bool) -> None:
     state = booked(in_bins(levels))
-    assert known(state, level_now(state)) == expected
+    assert known(state, level_of(state, NOW)) == expected
 
 
 # ---- The power to spend
@@ -255,7 +258,38 @@ def test_power_that_is_left_raises_it_a_little() -> None:
     levels = in_bins([4.0] * 40 + [1.0] * 40)
     spent = np.where(levels > 1.0, 0.8, 0.2)
     per_level, _ = power_to_spend(booked(levels, spent), MOST, False)
-    assert per_level == pytest.approx(1.5 * unit_power(booked(levels, spent), MOST, False), rel=1e-9)
+    u, _ = unit_power(booked(levels, spent), MOST, False)
+    assert per_level == pytest.approx(1.5 * u, rel=1e-9)
+
+
+# ---- A burst begins
+
+
+def bursts(length: int, gap: int) -> np.ndarray:
+    """Bursts of level 1 after near silence; a sample of the next one at the end."""
+    return np.append(in_bins(([1e-4] * gap + [1.0] * length) * 6 + [1e-4] * gap), 1.0)
+
+
+@pytest.mark.parametrize(("length", "gap", "expected"), [(1, 9, 10.0), (2, 8, 5.0), (4, 16, 5.0)])
+def test_a_burst_begins_with_what_it_gets_if_all_count_in_full(length: int, gap: int, expected: float) -> None:
+    """A burst in a tenth of the time gets ten times the rated power, and not what u would give; to the weights."""
+    levels = bursts(length, gap)
+    state = booked(levels, np.minimum(levels, 1.0))
+    per_level, _ = power_to_spend(state, MOST, False)
+    left, _ = power_left(state)
+    assert per_level == pytest.approx(expected * (1.0 + left / BINS), rel=0.25)
+    u, _ = unit_power(state, MOST, False)
+    assert u > 100.0 * per_level
+
+
+def test_the_beginning_of_a_burst_gets_at_least_the_limit() -> None:
+    """Here it would get 1.2 times the rated power if all counted in full, but so much power is left that it gets 2."""
+    levels = np.append(in_bins(([0.2] * 6 + [1.0] * 4) * 16 + [0.2] * 6), [1.0] * SIZE)
+    state = booked(levels, 0.3)
+    per_level, level = power_to_spend(state, MOST, False)
+    _, in_full = unit_power(state, MOST, False)
+    assert in_full < MOST < per_level * 1.001
+    assert per_level * level < MOST
 
 
 def test_what_will_leave_counts_as_the_rated_power_at_most() -> None:
