@@ -57,7 +57,7 @@ class SuggestedSettings:
 
     @property
     def settings(self) -> dict[str, float]:
-        """Keyword arguments r, q and P0 of a controller: ``kf_anc(s.n_taps, path, **s.settings)``."""
+        """Keyword arguments r, q and P0 of a filter: ``KFOPC.random_walk(s.n_taps, **s.settings)``."""
         return {
             "state_noise": self.state_noise,
             "measurement_noise": self.measurement_noise,
@@ -112,7 +112,7 @@ def suggest_settings(
     Returns
     -------
     SuggestedSettings
-        The settings; its `settings` are keyword arguments of `kf_anc`, `kf_opc` and `kf_pb`.
+        The settings, which `kf_anc`, `kf_opc` and `kf_pb` take in place of `n_taps`.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def suggest_settings(
     <SuggestedSettings: n_taps=24, state_noise=9.77e-10, measurement_noise=0.01, initial_variance=0.0821, at 16000 Hz>
     >>> print(suggested.reasons["state_noise"])
     the filter averages over 0.25 s; that costs up to 0.03 dB, and a shorter time follows faster
-    >>> kf_opc(suggested.n_taps, path, rated_power=1.0, **suggested.settings).name
+    >>> kf_opc(suggested, path, rated_power=1.0).name
     'KF-OPC'
     """
     fs = as_positive(fs, "fs", unit="Hz")

@@ -263,7 +263,8 @@ class PowerBudget:
     memory_s : float, default 2.5
         Length of the window of the correlations in seconds, at least 10 n_taps samples.
     averaging_s : float, default 10
-        Time in seconds over which the mean power is kept to the rated one.
+        Time in seconds over which the mean power is kept to the rated one. The control filter is solved for every 128
+        samples, so choose ten times as long at least.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
