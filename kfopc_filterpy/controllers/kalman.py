@@ -338,7 +338,7 @@ def kf_anc(
     ------
     ValueError, TypeError
         Neither suggested settings nor state noise and measurement noise; a setting that is out of range, or that does not
-        fit the number of channels.
+        fit the number of channels; another sample rate than that of the suggested settings.
 
     Examples
     --------
@@ -442,9 +442,12 @@ def _kalman(
     """Return the controller for one channel or for several."""
     taps, settings = with_suggested(n_taps, settings)
     outside = {"amplifier": amplifier, "limiter": limiter}
-    if is_multichannel(secondary_path, n_references):
-        return DirectKalman(taps, secondary_path, n_references=n_references, **outside, **settings)
-    return KalmanController(KFOPC.random_walk(taps, **settings), secondary_path, **outside)
+    controller = (
+        DirectKalman(taps, secondary_path, n_references=n_references, **outside, **settings)
+        if is_multichannel(secondary_path, n_references)
+        else KalmanController(KFOPC.random_walk(taps, **settings), secondary_path, **outside)
+    )
+    return at_suggested_rate(controller, n_taps)
 
 
 def with_suggested(n_taps: Any, settings: dict[str, Any], instead: str = "") -> tuple[Any, dict[str, Any]]:
@@ -468,19 +471,17 @@ def suggested_constraint(n_taps: Any, rated_power: Any, constraint: Any) -> Any:
     """Return `constraint_for`, for the sample rate of suggested settings if `n_taps` are such."""
     if not isinstance(n_taps, SuggestedSettings):
         return constraint_for(rated_power, constraint)
-    own = constraint_for(rated_power, constraint, n_taps.fs)
-    for one in own if isinstance(own, tuple) else (own,):
-        require_suggested_rate(n_taps, one.fs, "the constraint is for")
-    return own
+    return constraint_for(rated_power, constraint, n_taps.fs)
 
 
-def require_suggested_rate(suggested: SuggestedSettings, fs: float, what: str) -> None:
-    """Raise ValueError if a sample rate differs from that of suggested settings."""
-    if abs(fs - suggested.fs) > 1e-9 * suggested.fs:
-        raise ValueError(
-            f"the suggested settings are for {suggested.fs:g} Hz but {what} {fs:g} Hz: "
-            "make both with the fs of the signals"
-        )
+def at_suggested_rate(controller: Any, n_taps: Any) -> Any:
+    """Return the controller, or raise ValueError if a part of it has another sample rate than suggested settings."""
+    if isinstance(n_taps, SuggestedSettings):
+        try:
+            controller.require_sample_rate(n_taps.fs)
+        except ValueError as error:
+            raise ValueError(f"in the suggested settings, {error}") from None
+    return controller
 
 
 def is_multichannel(secondary_path: Any, n_references: int) -> bool:

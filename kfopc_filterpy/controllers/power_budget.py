@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_choice, as_positive
+from .._validate import as_choice
 from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
@@ -19,7 +19,7 @@ from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman
-from .kalman import KalmanController, correct_constrained, is_multichannel, require_suggested_rate, with_suggested
+from .kalman import KalmanController, at_suggested_rate, correct_constrained, is_multichannel, with_suggested
 from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
 from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
@@ -205,7 +205,7 @@ def kf_pb(
     ------
     ValueError, TypeError
         The direct form without suggested settings or `state_noise` and `measurement_noise`, another form with a setting
-        of the direct form, or a setting that the class refuses.
+        of the direct form, another sample rate than that of the suggested settings, or a setting that the class refuses.
 
     Examples
     --------
@@ -218,6 +218,7 @@ def kf_pb(
     >>> kf_pb(32, paths, rated_power=[0.5, 0.2])
     <KF-PB (shared gain): 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2>
     """
+    controller: PowerBudgetController | DirectPowerBudget | SharedGainKalman | FrequencyDomainKalman
     several = is_multichannel(secondary_path, n_references)
     form = as_choice(form or ("shared gain" if several else "direct"), "form", FORMS)
     common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
@@ -230,17 +231,19 @@ def kf_pb(
     }
     if isinstance(n_taps, SuggestedSettings):
         settings = {"fs": n_taps.fs} | settings
-        require_suggested_rate(n_taps, as_positive(settings["fs"], "fs", unit="Hz"), "fs is")
     if form in PRIMARY_PATH_FORMS:
         given = [name for name, value in noises.items() if value is not None]
         if given:
             raise TypeError(f"the {form} form takes path_memory_s instead of {', '.join(given)}")
         taps = n_taps.n_taps if isinstance(n_taps, SuggestedSettings) else n_taps
-        return PRIMARY_PATH_FORMS[form](taps, secondary_path, **channels, **common, **settings)
-    taps, noises = with_suggested(n_taps, noises, ", or form='shared gain', which does not need them")
-    settings |= noises
-    if several:
-        return DirectPowerBudget(taps, secondary_path, **channels, **common, **settings)
-    guard = guard_against(secondary_path_uncertainty, secondary_path)
-    estimator = PowerBudgetKalmanFilter(taps, rated_power=rated_power, guard=guard, **settings)
-    return PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
+        controller = PRIMARY_PATH_FORMS[form](taps, secondary_path, **channels, **common, **settings)
+    else:
+        taps, noises = with_suggested(n_taps, noises, ", or form='shared gain', which does not need them")
+        settings |= noises
+        if several:
+            controller = DirectPowerBudget(taps, secondary_path, **channels, **common, **settings)
+        else:
+            guard = guard_against(secondary_path_uncertainty, secondary_path)
+            estimator = PowerBudgetKalmanFilter(taps, rated_power=rated_power, guard=guard, **settings)
+            controller = PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
+    return at_suggested_rate(controller, n_taps)

@@ -35,7 +35,7 @@ from ..power.constraint import (
 )
 from ..power.limiter import OutputLimiter
 from .base import constraint_for
-from .kalman import KalmanController, correct, suggested_constraint, with_suggested
+from .kalman import KalmanController, at_suggested_rate, correct, suggested_constraint, with_suggested
 from .step import Lines, adapt, disturbance_estimate, estimate_once, output
 
 LARGEST_TRIM = math.log(10.0)
@@ -283,7 +283,7 @@ def kf_opc_repaired(
     own = suggested_constraint(n_taps, rated_power, constraint)
     noises = {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance}
     taps, settings = with_suggested(n_taps, noises)
-    return RepairedKFOPC(
+    controller = RepairedKFOPC(
         KFOPC.random_walk(taps, **settings),
         secondary_path,
         own,
@@ -293,3 +293,4 @@ def kf_opc_repaired(
         amplifier=amplifier,
         limiter=limiter,
     )
+    return at_suggested_rate(controller, n_taps)

@@ -13,6 +13,7 @@ import scipy.signal
 from helpers.settings_grid import FS, NOISES, ON, compare, made_paths, signals
 
 from kfopc_filterpy import (
+    OutputLimiter,
     OutputPowerConstraint,
     bandpass_path,
     kf_anc,
@@ -356,8 +357,17 @@ def test_the_sample_rate_is_that_of_the_suggested_settings() -> None:
     assert kf_pb(suggested, S, rated_power=0.5, fs=8000).estimator.budget.fs == 8000.0
     own = OutputPowerConstraint(0.5, fs=8000.0, memory_s=0.1)
     assert kf_opc(suggested, S, constraint=own).estimator.constraint.memory_s == 0.1
-    with pytest.raises(ValueError, match="suggested settings are for 8000 Hz but the constraint is for 16000 Hz"):
+    with pytest.raises(ValueError, match="settings, fs is 8000 Hz but the controller's power memory is for 16000 Hz"):
         kf_opc(suggested, S, constraint=OutputPowerConstraint(0.5))
     for form in ("direct", "shared gain", "frequency domain"):
-        with pytest.raises(ValueError, match="suggested settings are for 8000 Hz but fs is 16000 Hz"):
+        with pytest.raises(ValueError, match="fs is 8000 Hz but the controller's power memory is for 16000 Hz"):
             kf_pb(suggested, S, rated_power=0.5, form=form, fs=16000.0)
+
+
+@pytest.mark.parametrize("make", [kf_anc, kf_opc, kf_opc_repaired, kf_pb], ids=lambda make: make.__name__)
+def test_a_limiter_of_another_sample_rate_than_the_suggested_settings_is_refused(make: Any) -> None:
+    rated = {} if make is kf_anc else {"rated_power": 0.5}
+    suggested = suggest_settings(X, D, S, n_taps=8, fs=8000.0)
+    assert make(suggested, S, limiter=OutputLimiter(0.5, fs=8000.0), **rated).limiter.fs == 8000.0
+    with pytest.raises(ValueError, match="fs is 8000 Hz but the controller's limiter is for 16000 Hz"):
+        make(suggested, S, limiter=OutputLimiter(0.5), **rated)
