@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
 from ..paths.uncertainty import HALF_A_SAMPLE, guard_against
 from ..power.amplifiers import Amplifier
-from ..power.budget import BudgetState, advance_budget, follow_noise
+from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
 from ..power.constraint import ConstraintState, advance_constraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectPowerBudget
@@ -22,7 +23,7 @@ from .frequency_domain import FrequencyDomainKalman
 from .kalman import KalmanController, at_suggested_rate, correct_constrained, is_multichannel, with_suggested
 from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
-from .step import Lines, adapt, control_filter, disturbance_estimate, follow, power_weight
+from .step import Lines, adapt, control_filter, disturbance_estimate, emitted, follow, power_weight, skip, unheard
 
 
 class PowerBudgetState(NamedTuple):
@@ -44,6 +45,24 @@ def adapt_power_budget(state, error, control_signal):
     x, filtered = latest(state.lines.reference), latest(state.lines.filtered)
     advance_budget(state.budget, state.weights, x, filtered, control_signal)
     return True
+
+
+@emitted.register(PowerBudgetState)
+def note_emitted(state, y):
+    """Note what was played: power is spent whether the estimate adapts to the sample or not."""
+    note_sample(state.budget, latest(state.lines.reference), latest(state.lines.filtered), y)
+
+
+@skip.register(PowerBudgetState)
+def skip_power_budget(state):
+    """Let the budget process what was played."""
+    take_noted(state.budget)
+
+
+@unheard.register(PowerBudgetState)
+def unheard_by_power_budget(state):
+    """Add the sample to the correlations."""
+    follow_noise(state.budget, latest(state.lines.reference), latest(state.lines.filtered))
 
 
 @follow.register(PowerBudgetState)
@@ -81,6 +100,9 @@ class PowerBudgetController(KalmanController):
         Filter whose state is the estimate of the unconstrained control filter.
     secondary_path, amplifier, name, limiter
         As for `KalmanController`; the default name is KF-PB.
+    secondary_path_uncertainty : PathTolerance, float or array_like, optional
+        What the guard of the estimator's budget was made for, see `paths.path_uncertainty`. A new secondary path then
+        gets a guard of its own. By default the guard stays.
 
     Raises
     ------
@@ -109,8 +131,10 @@ class PowerBudgetController(KalmanController):
         amplifier: Amplifier | None = None,
         name: str | None = None,
         limiter: OutputLimiter | None = None,
+        secondary_path_uncertainty: Any = None,
     ) -> None:
         super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
+        self._tolerance = deepcopy(secondary_path_uncertainty)
 
     def _require_filter(self, estimator: KalmanFilter) -> None:
         if not isinstance(estimator, PowerBudgetKalmanFilter):
@@ -124,6 +148,12 @@ class PowerBudgetController(KalmanController):
 
     def _takes_guard(self) -> bool:
         return False  # the budget's control filter takes account of it
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let P grow; measured paths, for example, have another distance from the new path, and so another guard."""
+        super()._after_new_path(before)
+        if self._tolerance is not None:
+            self.estimator.budget.use_guard(guard_against(self._tolerance, self.secondary_path))
 
     def _usual_name(self) -> str:
         return "KF-PB"
@@ -245,5 +275,11 @@ def kf_pb(
         else:
             guard = guard_against(secondary_path_uncertainty, secondary_path)
             estimator = PowerBudgetKalmanFilter(taps, rated_power=rated_power, guard=guard, **settings)
-            controller = PowerBudgetController(estimator, secondary_path, amplifier=amplifier, limiter=limiter)
+            controller = PowerBudgetController(
+                estimator,
+                secondary_path,
+                amplifier=amplifier,
+                limiter=limiter,
+                secondary_path_uncertainty=None if guard is None else secondary_path_uncertainty,
+            )
     return at_suggested_rate(controller, n_taps)

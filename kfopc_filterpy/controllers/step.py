@@ -75,6 +75,17 @@ def skip(state):
 
 
 @by_type
+def emitted(state, y):
+    """Take note of the control signal that was emitted for the newest reference, if the algorithm has a use for it."""
+
+
+@by_type
+def unheard(state):
+    """Advance with a sample heard while the loudspeaker is silent, without following it; by default like `skip`."""
+    skip(state)
+
+
+@by_type
 def follow(state, error):
     """Update the powers with a sample heard while the loudspeaker is silent. Return False if that fails."""
     finite, _, _ = advance_powers(state.lines, state.constraint, error)
@@ -149,7 +160,9 @@ def advance_powers(lines, constraint, error):
 def emit(state, x):
     """Return y(n) for the newest reference, after any limiter; add x(n), x'(n) and y(n) to their delay lines."""
     take_reference(state.lines, x)
-    return emit_outputs(state.lines, state)
+    y = emit_outputs(state.lines, state)
+    emitted(state, y)
+    return y
 
 
 @inlined
@@ -229,7 +242,7 @@ def listen(key):
             take_reference(state.lines, references[n])
             emit_silence(state.lines)
             if not adapting[n]:
-                skip(state)
+                unheard(state)
             elif not follow(state, errors[n]):
                 return n
         return references.shape[0]

@@ -27,11 +27,24 @@ class FadingCorrelation:
     def __init__(self, n_lags: int, n_signals: int, keep: float) -> None:
         self.keep, self.mass = keep, 0.0
         self.total = np.zeros((n_lags, n_signals, n_signals))
+        self._before = np.zeros((n_signals, n_lags - 1))  # the samples before the next block, if none is left out
+        self._unbroken = 0  # samples since the last one that was left out
 
     def add(self, signals: np.ndarray) -> None:
-        """Add the samples of a block, the last B of `signals`, (I, M - 1 + B)."""
+        """Add the samples of a block, the last B of `signals`, (I, M - 1 + B).
+
+        If samples between the last block and this one were left out, those before them count as zeros from now on: their
+        products with later samples would have no counterpart in the sum, which then would not be that of any signal.
+        """
         n_lags = len(self.total)
+        if not np.array_equal(signals[:, : n_lags - 1], self._before):
+            self._unbroken = 0
+        self._before = signals[:, signals.shape[1] - (n_lags - 1) :].copy()
+        if self._unbroken < n_lags - 1:
+            signals = signals.copy()
+            signals[:, : n_lags - 1 - self._unbroken] = 0.0
         block = signals.shape[1] - (n_lags - 1)
+        self._unbroken += block
         weights = np.zeros(signals.shape[1])
         weights[n_lags - 1 :] = self.keep ** np.arange(block - 1, -1, -1.0)
         size = fft.next_fast_len(signals.shape[1], real=True)

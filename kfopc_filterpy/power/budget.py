@@ -160,8 +160,8 @@ def move_ceiling(budget, of_x, of_xf, relative_level):
 
 
 @part()
-def advance_budget(budget, w, x, xf, y):
-    """Process a sample of reference, filtered reference and emitted control signal; solve again if it is due."""
+def take_sample(budget, x, xf, y):
+    """Add a sample of reference, filtered reference and emitted control signal to correlations, account and limiter."""
     numbers = budget.numbers[0]
     take_correlations(budget, x, xf)
     asked = asked_for(budget, y)
@@ -170,15 +170,48 @@ def advance_budget(budget, w, x, xf, y):
     hear_limiter(budget, asked, y)
     numbers.taken += 1.0
     numbers.waited += 1.0
+
+
+@part()
+def advance_budget(budget, w, x, xf, y):
+    """Process a sample to which the estimate was adapted; solve again if it is due."""
+    numbers = budget.numbers[0]
+    numbers.noted = False
+    take_sample(budget, x, xf, y)
     # At the start the estimate grows fast, so the interval is an eighth of the time so far.
-    if numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
-        numbers.interval, numbers.waited = numbers.waited, 0.0
+    if numbers.due or numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
+        numbers.interval, numbers.waited, numbers.due = min(numbers.waited, float(INTERVAL)), 0.0, False
         allocate(budget, w)
+
+
+@part()
+def note_sample(budget, x, xf, y):
+    """Store a sample that was played. If the estimate does not adapt to it, `take_noted` processes it."""
+    take_noted(budget)
+    numbers = budget.numbers[0]
+    numbers.noted, numbers.noted_x, numbers.noted_xf, numbers.noted_y = True, x, xf, y
+
+
+@part()
+def take_noted(budget):
+    """Process the last sample that was played, if the estimate did not adapt to it: its power was spent all the same.
+
+    One whose square overflows counts as silence.
+    """
+    numbers = budget.numbers[0]
+    if numbers.noted:
+        numbers.noted = False
+        x, xf, y = numbers.noted_x, numbers.noted_xf, numbers.noted_y
+        if np.isfinite(x * x + xf * xf + y * y):
+            take_sample(budget, x, xf, y)
+        else:
+            take_correlations(budget, 0.0, 0.0)
 
 
 @part()
 def follow_noise(budget, x, xf):
     """Process a sample while the control is switched off: no power is saved in this time."""
+    take_noted(budget)
     take_correlations(budget, x, xf)
     book(budget.spending, x * x, 1.0)
 
@@ -264,7 +297,7 @@ class PowerBudget:
         Length of the window of the correlations in seconds, at least 10 n_taps samples.
     averaging_s : float, default 10
         Time in seconds over which the mean power is kept to the rated one. The control filter is solved for every 128
-        samples, so choose ten times as long at least.
+        samples, so choose 50 times as long at least.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
@@ -313,6 +346,7 @@ class PowerBudget:
         self.fs = as_positive(fs, "fs", unit="Hz")
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.averaging_s = as_positive(averaging_s, "averaging_s", unit="s")
+        memory = as_positive(self.memory_s * self.fs, "memory_s in samples")
         self._state = BudgetState(
             control_filter=np.zeros(n_taps),
             reference=delay_line(lags),
@@ -326,10 +360,11 @@ class PowerBudget:
                 rated_power=rated_power,
                 fs=self.fs,
                 averaging=self.averaging_s * self.fs,  # samples
-                segment=float(max(round(self.memory_s * self.fs / SEGMENTS), lags)),  # samples
+                segment=float(max(round(memory / SEGMENTS), lags)),  # samples
                 current=0,  # segment that is being filled
                 taken=0.0,  # samples since the control was switched on
                 waited=0.0,  # of these, since the last solution
+                due=False,  # whether to solve at the next sample, however few have waited
                 interval=0.0,  # and between the last two
                 weight=0.0,  # lambda
                 gain=0.0,  # power of the control signal for each unit of level
@@ -337,6 +372,10 @@ class PowerBudget:
                 passed=0.0,  # recent mean, over the rated power, of what a limiter left as it was
                 limited=0.0,  # the same, of y (u - y) for what it changed from u to y
                 acts=False,  # whether it changed anything since the last solution
+                noted=False,  # whether the following sample was played, and the estimate has not adapted to it so far
+                noted_x=0.0,
+                noted_xf=0.0,
+                noted_y=0.0,
             ),
         )
 
@@ -358,7 +397,7 @@ class PowerBudget:
     @rated_power.setter
     def rated_power(self, value: float) -> None:
         self._state.numbers["rated_power"] = as_positive(value, "rated_power")
-        self._state.numbers["waited"] = float(INTERVAL)  # solve at the next sample
+        self._state.numbers["due"] = True
 
     @property
     def control_filter(self) -> np.ndarray:
@@ -383,6 +422,21 @@ class PowerBudget:
         """
         left, _ = left_of(self._state.spending)
         return -float(left) * float(self._state.spending.numbers["full"][0]) / self.fs
+
+    def use_guard(self, guard: Any) -> None:
+        """Solve with another guard filter, as long as the present one; None: no guard from now on.
+
+        Raises
+        ------
+        ValueError
+            A guard of another length, or with NaN or Inf. Nothing was changed.
+        """
+        of_guard, present = correlation_of(guard), self._state.guard
+        if guard is not None and of_guard.size != present.size:
+            raise ValueError(
+                f"guard must have the {present.size} taps of the present one, got {of_guard.size}: make a new budget"
+            )
+        present[:] = of_guard if guard is not None else 0.0
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the `reference` x(n); call it before `advance` with the same x(n)."""

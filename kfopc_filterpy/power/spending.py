@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._validate import as_positive
 from ..kernels.compiling import part
 from ..kernels.records import new_record
 
@@ -44,6 +45,7 @@ class Spending(NamedTuple):
 
 def new_spending(averaging_samples: float) -> Spending:
     """Return the state before the first sample, as if the rated power had been spent so far."""
+    averaging_samples = as_positive(averaging_samples, "averaging_s in samples")
     size = max(math.ceil(averaging_samples / BINS), 1)
     bins = max(round(averaging_samples / size), FEWEST)
     return Spending(
@@ -79,7 +81,7 @@ def level_of(spending, bins):
 
 @part()
 def power_left(spending):
-    """Return T - S, what is left of the averaging time's power; and the mean that will leave S in the next T/4."""
+    """Return T - S, what is left of the averaging time's power; and the mean power of the bins that S loses within T/4."""
     bins, size, filled = _bins(spending), spending.numbers[0].full, _filled(spending)
     first = bins - int(REPAYMENT * bins) + 1
     total = leaving = 0.0
@@ -167,12 +169,13 @@ def power_to_spend(spending, ceiling, limited):
 
     `ceiling` is another bound of the power, and `limited` says whether a limiter acts on the control signal. Behind one,
     power that is left cannot be spent later: the rated power is spent at most. A level that is not known may last, so it
-    gets a power that can.
+    gets a power that can be kept up.
 
     If power is left, u is a little larger: what was left will not all be needed.
 
     Between rare bursts u is large, because the bursts count with their p_j only. When one begins, the mean level of NOW
-    bins shows it late. So the newest bin alone has a bound, too: the limit, or what a burst gets if all count in full.
+    bins shows it late. So the newest bin alone has a bound, too: the limit, or what a burst gets if all bins count
+    without the bound p_j.
     """
     bins, level, newest = _bins(spending), level_of(spending, NOW), level_of(spending, 1)
     left, leaving = power_left(spending)

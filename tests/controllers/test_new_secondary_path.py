@@ -169,6 +169,22 @@ def test_kf_pb_solves_for_the_new_path() -> None:
     np.testing.assert_allclose(made[0].control_filter, made[1].control_filter, rtol=0.05, atol=1e-3)
 
 
+@pytest.mark.parametrize("several", [False, True], ids=["one channel", "several"])
+def test_kf_pb_gets_a_guard_for_the_new_path(several: bool) -> None:
+    """The tolerance is given by measured paths, whose distance from the new path is another one."""
+    paths = np.array([S_HAT, 0.5 * S_HAT])
+    measured = paths[:, np.newaxis, np.newaxis] if several else paths
+    settings = {"rated_power": 0.1, "fs": FS, "form": "direct", **KALMAN}
+    one, other = (kf_pb(N_TAPS, s, secondary_path_uncertainty=measured, **settings) for s in measured)
+
+    def guard(controller: Any) -> np.ndarray:
+        return controller._budget._guarded if several else controller.estimator.budget.state.guard
+
+    assert not np.allclose(guard(one), guard(other))
+    one.secondary_path = measured[1]
+    np.testing.assert_array_equal(guard(one), guard(other))
+
+
 def test_a_shorter_path_is_filled_with_zeros_and_the_users_array_is_not_touched() -> None:
     given = S_HAT.copy()
     controller = FxLMS(N_TAPS, given, step_size=MU)

@@ -159,3 +159,18 @@ def test_the_correlation_is_the_faded_sum_of_products() -> None:
     lasting = FadingCorrelation(n_lags, REFERENCES, 1.0)
     lasting.add(past)
     np.testing.assert_allclose(lasting.total / lasting.mass, correlation(x, n_lags), atol=1e-12)
+
+
+def test_a_stretch_that_is_left_out_of_the_correlation_separates_two_signals() -> None:
+    """The sum is that of both, each with zeros around it."""
+    n_lags, n_samples = 37, 6 * BLOCK
+    x = np.random.default_rng(8).standard_normal((REFERENCES, n_samples))
+    past = np.concatenate([np.zeros((REFERENCES, n_lags - 1)), x], axis=1)
+    found, first, second = (FadingCorrelation(n_lags, REFERENCES, 1.0) for _ in range(3))
+    for end in range(BLOCK, n_samples + 1, BLOCK):
+        if not 2 * BLOCK < end <= 3 * BLOCK + 5:
+            found.add(past[:, end - BLOCK : end + n_lags - 1])
+    first.add(past[:, : 2 * BLOCK + n_lags - 1])
+    second.add(np.concatenate([np.zeros((REFERENCES, n_lags - 1)), x[:, 3 * BLOCK :]], axis=1))
+    np.testing.assert_allclose(found.total, first.total + second.total, atol=1e-11)
+    assert found.mass == n_samples - BLOCK

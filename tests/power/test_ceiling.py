@@ -239,3 +239,17 @@ def test_a_limiter_that_no_longer_acts_is_forgotten() -> None:
             spent[n] = y * y / 0.25
         means.append(spent[-20_000:].mean())
     assert means[1] == pytest.approx(means[0], rel=0.01)
+
+
+def test_a_rated_power_that_is_assigned_does_not_hurry_the_ceiling() -> None:
+    """It is solved for at the next sample, but no more time has passed: the ceiling moves by the samples in between."""
+    budget = PowerBudget(2, 0.25, fs=1000.0)
+    for x in np.random.default_rng(6).standard_normal(3000):
+        budget.advance(x, x, [2.0, -0.5])
+    numbers, last = budget.state.numbers, int(budget.state.numbers["waited"][0])
+    budget.rated_power = 0.0625
+    before = budget.control_filter
+    budget.advance(0.1, 0.1, [2.0, -0.5])
+    assert np.sum(budget.control_filter**2) < 0.5 * np.sum(before**2)
+    assert (numbers["interval"][0], numbers["waited"][0]) == (last + 1, 0.0)
+    assert 0 < last < 100

@@ -451,6 +451,28 @@ def test_settings_out_of_range(name: str, bad: object) -> None:
         PowerBudget(bad, 1.0)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("name", ["memory_s", "averaging_s"])
+def test_a_time_of_more_samples_than_a_number_can_say_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} in samples must be finite"):
+        PowerBudget(2, 1.0, **{name: 1e305})  # type: ignore[arg-type]
+
+
+def test_another_guard_counts_from_the_next_solution_on() -> None:
+    """As if the budget had been made with it."""
+    guards = [np.array([0.1, 0.05]), np.array([1.0, -0.5])]
+    budget, other = (made(guard=guard) for guard in guards)
+    budget.use_guard(guards[1])
+    for bad in ([1.0], [1.0, 2.0, 3.0], [math.nan, 1.0]):
+        with pytest.raises(ValueError, match="guard"):
+            budget.use_guard(bad)
+    for x in np.random.default_rng(4).standard_normal(600):
+        for one in (budget, other):
+            one.advance(x, 0.5 * x, [3.0, -1.0, 0.5])
+    np.testing.assert_array_equal(budget.control_filter, other.control_filter)
+    budget.use_guard(None)
+    assert not np.any(budget.state.guard)
+
+
 @pytest.mark.parametrize("clone", [copy.deepcopy, lambda budget: pickle.loads(pickle.dumps(budget))])
 def test_a_copy_goes_on_by_itself(clone) -> None:
     budget = made()
