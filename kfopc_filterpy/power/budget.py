@@ -268,7 +268,7 @@ class PowerBudget:
     The power :math:`\rho` follows the level of the noise, so that :math:`\lambda` stays the same while the spectrum does.
     This is the best way to spend a mean power: a noise that recurs within the averaging time is controlled as well as
     by the best fixed filter with the same mean power. Each unit of level gets so much power that the noise of the last
-    `averaging_s` would have used the rated power; newer noise counts more.
+    `averaging_s` would have used the rated power. Newer noise counts more, and a loud second counts only in part.
 
     - If power of the last `averaging_s` is left, up to twice the rated power is spent, but only on a level that has
       come and gone within this time, or has been there for all of it. A noise that has just become louder may stay so:
@@ -297,7 +297,7 @@ class PowerBudget:
         Length of the window of the correlations in seconds, at least 10 n_taps samples.
     averaging_s : float, default 10
         Time in seconds over which the mean power is kept to the rated one. The control filter is solved for every 128
-        samples, so choose 50 times as long at least.
+        samples, so choose 50 times as long; 8 samples are the least.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
@@ -305,7 +305,8 @@ class PowerBudget:
     Raises
     ------
     ValueError
-        A power, rate or time that is not positive and finite, fewer than one tap, a guard with NaN or Inf.
+        A power, rate or time that is not positive and finite, `averaging_s` below 8 samples, fewer than one tap, a guard
+        with NaN or Inf.
 
     See Also
     --------

@@ -24,7 +24,7 @@ from .._validate import as_positive
 from ..kernels.compiling import part
 from ..kernels.records import new_record
 
-BINS, FEWEST = 80, 8  # bins in the averaging time; the second if the first would have less than a sample each
+BINS, FEWEST = 80, 8  # bins in the averaging time; fewer if they would have less than a sample each
 NOW = 3  # newest bins, whose mean is the level now; power that is left may be spent within as many
 REPAYMENT = 0.25  # of the averaging time, within which overspending is repaid
 ALIKE = 0.5  # a level that was at least this share of the present one is taken for the same
@@ -45,9 +45,13 @@ class Spending(NamedTuple):
 
 def new_spending(averaging_samples: float) -> Spending:
     """Return the state before the first sample, as if the rated power had been spent so far."""
-    averaging_samples = as_positive(averaging_samples, "averaging_s in samples")
+    if as_positive(averaging_samples, "averaging_s in samples") < FEWEST:
+        raise ValueError(
+            f"averaging_s must be at least {FEWEST} samples long, or blocks with several channels, got "
+            f"{averaging_samples:g}: lengthen it"
+        )
     size = max(math.ceil(averaging_samples / BINS), 1)
-    bins = max(round(averaging_samples / size), FEWEST)
+    bins = round(averaging_samples / size)
     return Spending(
         np.zeros(bins + 1), np.full(bins + 1, float(size)), np.zeros(bins + 1), new_record(full=float(size), newest=0)
     )

@@ -85,12 +85,19 @@ def test_a_sample_that_has_left_is_as_if_it_had_never_been() -> None:
     assert power_to_spend(old, MOST, False) == power_to_spend(fresh, MOST, False)
 
 
-@pytest.mark.parametrize(("samples", "expected"), [(160000, 80), (312.5, 78), (125, 62), (79, 79), (10, 10), (2, 8)])
+@pytest.mark.parametrize(
+    ("samples", "expected"), [(160000, 80), (312.5, 78), (125, 62), (79, 79), (10, 10), (8.4, 8), (8, 8)]
+)
 def test_the_bins_make_up_the_averaging_time(samples: float, expected: int) -> None:
     state = new_spending(samples)
     assert state.counts.size == expected + 1
-    if samples >= FEWEST:
-        assert expected * state.numbers["full"][0] == pytest.approx(samples, rel=0.01)
+    assert expected * state.numbers["full"][0] == pytest.approx(samples, rel=0.05)
+
+
+@pytest.mark.parametrize("samples", [7.9, 1.0, 1e-9])
+def test_an_averaging_time_of_a_few_samples_is_refused(samples: float) -> None:
+    with pytest.raises(ValueError, match=f"averaging_s must be at least {FEWEST} samples long.*got {samples:g}"):
+        new_spending(samples)
 
 
 def test_few_bins_do_as_well() -> None:
