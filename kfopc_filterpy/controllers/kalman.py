@@ -310,8 +310,8 @@ def kf_anc(
     Parameters
     ----------
     n_taps : int or SuggestedSettings
-        Taps L of the control filter, or of each of them. Or pass the result of `suggest_settings`,
-        which also supplies the defaults of the next three settings.
+        Taps L of the control filter, or of each of them. Or pass the result of `suggest_settings`, which also supplies
+        the defaults of the next three settings.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
     state_noise : float, optional

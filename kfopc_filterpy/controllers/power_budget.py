@@ -13,7 +13,7 @@ from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
-from ..paths.uncertainty import HALF_A_SAMPLE, guard_against
+from ..paths.uncertainty import GUARD_TAPS, HALF_A_SAMPLE, guard_against
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
 from ..power.constraint import ConstraintState, advance_constraint
@@ -108,6 +108,8 @@ class PowerBudgetController(KalmanController):
     ------
     TypeError
         An estimator without a power budget.
+    ValueError
+        An uncertainty, and a guard in the budget that `paths.guard_filter` did not make.
 
     Examples
     --------
@@ -134,6 +136,12 @@ class PowerBudgetController(KalmanController):
         secondary_path_uncertainty: Any = None,
     ) -> None:
         super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
+        present = estimator.budget.state.guard.size
+        if secondary_path_uncertainty is not None and present != GUARD_TAPS:
+            raise ValueError(
+                f"secondary_path_uncertainty needs a guard of {GUARD_TAPS} taps in the estimator's budget, got {present}: "
+                "make it with paths.guard_filter, or both with kf_pb"
+            )
         self._tolerance = deepcopy(secondary_path_uncertainty)
 
     def _require_filter(self, estimator: KalmanFilter) -> None:

@@ -104,8 +104,8 @@ class ChannelBudget:
         level : float
             Sum of the references' powers.
         power : ndarray, shape (J,), or None
-            Power of each control signal; None for a block without control. No power is saved in it,
-            nor before the first solution.
+            Power of each control signal; None for a block without control. No power is saved in it, nor before the
+            first solution.
         blocks : int, default 1
             Number of blocks since the last solution.
         """

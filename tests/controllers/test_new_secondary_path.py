@@ -25,7 +25,8 @@ from kfopc_filterpy import (
     noise_reduction_db,
     simulate,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker
+from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker, PowerBudgetController
+from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 from kfopc_filterpy.paths import PathTolerance, fir_path
 
 NEW = np.array([0.0, 0.0, -0.7, 0.2])
@@ -183,6 +184,13 @@ def test_kf_pb_gets_a_guard_for_the_new_path(several: bool) -> None:
     assert not np.allclose(guard(one), guard(other))
     one.secondary_path = measured[1]
     np.testing.assert_array_equal(guard(one), guard(other))
+
+
+@pytest.mark.parametrize("guard", [None, [1.0, 0.5]])
+def test_a_budget_whose_guard_could_not_follow_a_new_path_is_refused(guard: Any) -> None:
+    estimator = PowerBudgetKalmanFilter(4, rated_power=1.0, state_noise=R, measurement_noise=Q, guard=guard)
+    with pytest.raises(ValueError, match=r"needs a guard of 48 taps in the estimator's budget, got [12]: make it"):
+        PowerBudgetController(estimator, S_HAT, secondary_path_uncertainty=0.5)
 
 
 def test_a_shorter_path_is_filled_with_zeros_and_the_users_array_is_not_touched() -> None:
