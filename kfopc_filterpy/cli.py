@@ -217,7 +217,7 @@ def _verdict_options(parser: argparse.ArgumentParser) -> None:
         "--path-error-samples",
         type=float,
         metavar="N",
-        help="delay by which the secondary path may be wrong (default: 0.5)",
+        help="delay by which the secondary path may be wrong (default: 1)",
     )
     parser.add_argument(
         "--path-error-deg", type=float, default=0.0, metavar="DEG", help="phase by which it may be wrong"

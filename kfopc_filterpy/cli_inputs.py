@@ -206,7 +206,7 @@ def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndar
         longest = max(secondary.shape[2], others.shape[2])
         every = [np.pad(one, ((0, 0), (0, 0), (0, longest - one.shape[2]))) for one in (secondary, others)]
         return np.concatenate(every, axis=1).reshape(K, -1, J, longest).swapaxes(0, 1)
-    samples = 0.5 if options.path_error_samples is None else options.path_error_samples
+    samples = 1.0 if options.path_error_samples is None else options.path_error_samples
     return PathTolerance(samples, options.path_error_deg, options.path_error_db)
 
 

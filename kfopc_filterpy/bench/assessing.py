@@ -29,9 +29,9 @@ from kfopc_filterpy.metrics import (
     peak_control_signal,
     third_octave_levels_db,
 )
-from kfopc_filterpy.paths import causality_margin, frequency_response, path_uncertainty
+from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
-from kfopc_filterpy.paths.uncertainty import HALF_A_SAMPLE
+from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE, guard_against, is_controllable
 
 from .assessed_runs import ALGORITHMS, Plan, announce
 from .assessment import Assessment, Band, Ceilings, Levels, advice_on
@@ -61,7 +61,7 @@ def assess(
     beside: Sequence[str] | None = None,
     n_taps: int | None = None,
     memory_s: float | None = None,
-    secondary_path_uncertainty: Any = HALF_A_SAMPLE,
+    secondary_path_uncertainty: Any = ONE_SAMPLE,
     pascal_per_unit: Any = None,
     switch_on_s: float | None = None,
     bar: Any = None,
@@ -105,7 +105,7 @@ def assess(
         Memory of the Kalman filters in s; by default 0.25 s, and 1 s with several channels, where KF-PB estimates the
         primary paths.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        How far the true secondary path may differ from `secondary`, see `paths.path_uncertainty`; by default half a
+        How far the true secondary path may differ from `secondary`, see `paths.path_uncertainty`; by default a
         sample of delay. None: it is exact.
     pascal_per_unit : float or array_like, shape (K,), optional
         Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound levels
@@ -170,7 +170,7 @@ def assess(
     if memory_s is None:
         memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
     start = switch_on_sample(switch_on_s, fs, x.shape[-1])
-    delta = path_uncertainty(secondary_path_uncertainty, s)
+    guard = guard_against(secondary_path_uncertainty, s)
     notes: list[str] = []
     announce(bar, 0, "bounds")
     with warnings.catch_warnings(record=True) as caught:
@@ -184,7 +184,7 @@ def assess(
             n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
             max_taps=longest_filter(J * n_references),
         )
-        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, delta)
+        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, guard)
         limits = with_excursion(limits, ratings, bounds)
         official = bounds.within(limits.rated_power)
         required = bounds.needed(want_db, limits.rated_power)
@@ -243,7 +243,7 @@ def assess(
         expected_rated_power=required * _price(share_taken(run, limits), bound_share),
         causality_margin_s=None if primary is None else _margin_s(primary, s, fs),
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
-        band=_band(bounds.d, s, delta, fs),
+        band=_band(bounds.d, s, is_controllable(secondary_path_uncertainty, s), fs),
         levels=None if pascal_per_unit is None else _levels(run, pascal_per_unit),
         excursion_mm=excursion_mm(ratings, run),
         settings=settings,
@@ -354,7 +354,7 @@ def _coherence_db(x: np.ndarray, d: np.ndarray, fs: float) -> float:
     return coherence_bound(x, d, fs, segment=segment).overall_db
 
 
-def _band(d: np.ndarray, s: np.ndarray, delta: np.ndarray, fs: float) -> Band:
+def _band(d: np.ndarray, s: np.ndarray, controllable: np.ndarray, fs: float) -> Band:
     """Return where the disturbance is, and which share of it the loudspeakers together hardly reach."""
     frequencies, powers = welch(np.atleast_2d(d), fs, nperseg=min(4096, d.shape[-1]))
     share = powers.sum(axis=0) / powers.sum()
@@ -364,8 +364,8 @@ def _band(d: np.ndarray, s: np.ndarray, delta: np.ndarray, fs: float) -> Band:
     gain = np.sum([np.abs(frequency_response(one, frequencies, fs=fs)) ** 2 for one in paths], axis=0)
     inside = (frequencies >= low) & (frequencies <= high)
     mean = float(np.mean(gain[inside])) if np.any(inside) else float(gain.max())
-    wrong = np.interp(frequencies, np.linspace(0.0, fs / 2, delta.size), delta) >= 1.0
-    return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()), float(share[wrong].sum()))
+    uncertain = np.interp(frequencies, np.linspace(0.0, fs / 2, controllable.size), controllable) < 0.5
+    return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()), float(share[uncertain].sum()))
 
 
 def _levels(run: SimulationResult, pascal: Any) -> Levels:

@@ -80,7 +80,7 @@ class Band:
         Share of the disturbance's power at frequencies at which the secondary path lies more than 20 dB below its mean
         power gain in that band.
     uncertain_share : float
-        Share of the disturbance's power at frequencies at which the secondary path may be wrong by 100 % or more.
+        Share of the disturbance's power at frequencies at which the secondary path is too uncertain for any control.
     """
 
     low_hz: float
@@ -378,7 +378,7 @@ def advice_on(verdict: Assessment) -> list[str]:
         ]
     if verdict.limited_by == "path":
         return [
-            f"{verdict.band.uncertain_share:.0%} of the noise lies where the path may be wrong by 100 %. Measure the "
+            f"{verdict.band.uncertain_share:.0%} of the noise lies where the path is too uncertain for control. Measure the "
             "secondary path again and state a smaller uncertainty, or use a higher sample rate."
         ]
     if verdict.limited_by == "adaptation":

@@ -323,7 +323,10 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
             f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
             f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
         ),
-        ("Secondary path", f"{band.uncertain_share:.1%} of the noise's power lies where it may be wrong by 100 %"),
+        (
+            "Secondary path",
+            f"{band.uncertain_share:.1%} of the noise's power lies where it is too uncertain for control",
+        ),
     ]
     if verdict.levels is not None:
         before, after = verdict.levels.before_dba, verdict.levels.after_dba

@@ -112,7 +112,7 @@ class ExploreSettings:
         Band of the noise in Hz.
     path_error_samples : float, default 0.0
         Delay in samples by which the true secondary path is longer than the one that the controller knows.
-    path_tolerance_samples : float, default 0.5
+    path_tolerance_samples : float, default 1.0
         Error of that delay which KF-PB takes account of. The other algorithms do not use it.
     state_noise : float, default 1e-7
         State noise r of the Kalman filters, as r E[x'^2]/q.
@@ -139,7 +139,7 @@ class ExploreSettings:
     level_db: float = 0.0
     band: tuple[float, float] = (200.0, 2000.0)
     path_error_samples: float = 0.0
-    path_tolerance_samples: float = 0.5
+    path_tolerance_samples: float = 1.0
     state_noise: float = 1e-7
     step_size: float = 2.0**-5
     clips: bool = True

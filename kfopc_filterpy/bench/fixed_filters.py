@@ -12,7 +12,6 @@ from kfopc_filterpy.bounds import budgeted_rated_power
 from kfopc_filterpy.bounds.channels import ChannelStretch, full_channel_stretch
 from kfopc_filterpy.bounds.power_constrained import weights_within
 from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
-from kfopc_filterpy.paths import guard_filter
 
 LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
 CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.5)  # rated powers of the figure, over the one that full control needs
@@ -32,13 +31,15 @@ class FixedFilters:
         Taps of a filter.
     fs : float
         Sample rate in Hz.
-    delta : ndarray
-        Uncertainty of the path, see `path_uncertainty`.
+    guard : ndarray, optional
+        Filter that guards against an uncertain path, see `guard_filter`.
     """
 
     stretch: Stretch | ChannelStretch
 
-    def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, delta: np.ndarray) -> None:
+    def __init__(
+        self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, guard: np.ndarray | None
+    ) -> None:
         past = s.shape[-1] + n_taps - 2  # samples that fill the delay lines
         first = max(x.shape[-1] // 2 - past, 0)
         self.x, self.d, self.s, self.n_taps, self.fs = x[..., first:], d[..., first:], s, n_taps, fs
@@ -50,7 +51,7 @@ class FixedFilters:
         self.correlations: Any = self.stretch.correlations()
         self.free = self.stretch.solution(self.correlations.weights())
         self.filter_db = self.free.noise_reduction_db
-        self._guarded = self._held_back(guard_filter(delta)) if np.any(delta) else self.correlations
+        self._guarded = self.correlations if guard is None else self._held_back(guard)
         self.path_db = self.stretch.solution(self._guarded.weights()).noise_reduction_db
         ahead = sorted({round(share * n_taps) for share in LOOK_AHEAD} - {0})
         self.ahead = {samples: self._ahead_db(samples) for samples in ahead}

@@ -13,7 +13,7 @@ from ..checkpoint import Checkpointed
 from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.uncertainty import GUARD_TAPS, guard_filter, path_uncertainty
+from ..paths.uncertainty import GUARD_TAPS, guard_against, path_uncertainty
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
@@ -335,9 +335,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             )
         lines = self._state.lines
         uncertainty = path_uncertainty(value, lines.secondary_estimate)
-        exact = not np.any(uncertainty)
-        guard = None if exact else self._new_guard(guard_filter(uncertainty))
-        self._uncertainty, self._stated_uncertainty = None if exact else uncertainty, deepcopy(value)
+        taps = guard_against(value, lines.secondary_estimate)
+        guard = None if taps is None else self._new_guard(taps)
+        self._uncertainty, self._stated_uncertainty = None if taps is None else uncertainty, deepcopy(value)
         self._state = self._state._replace(lines=lines._replace(guard=guard))
         self._filter_again()
 

@@ -20,7 +20,7 @@ from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into
 from ..paths.channels import secondary_paths
-from ..paths.uncertainty import HALF_A_SAMPLE
+from ..paths.uncertainty import ONE_SAMPLE
 from ..power.amplifiers import Amplifier
 from ..power.budget import DEFAULT_AVERAGING_S
 from ..power.constraint import DEFAULT_FS, ConstraintState, OutputPowerConstraint
@@ -294,7 +294,7 @@ class DirectPowerBudget(BlockController):
     rated_power : float or array_like, shape (J,)
         Rated power of each loudspeaker.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default half a sample of delay, None: the
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay, None: the
         paths are exact.
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.
@@ -338,7 +338,7 @@ class DirectPowerBudget(BlockController):
         measurement_noise: Any,
         initial_variance: float = 1.0,
         n_references: int = 1,
-        secondary_path_uncertainty: Any = HALF_A_SAMPLE,
+        secondary_path_uncertainty: Any = ONE_SAMPLE,
         memory_s: float = DEFAULT_MEMORY_S,
         averaging_s: float = DEFAULT_AVERAGING_S,
         fs: float = DEFAULT_FS,

@@ -15,7 +15,7 @@ from scipy import fft
 from .._validate import as_count, as_positive
 from ..kernels.partitioned_kalman import PartitionedKalman
 from ..kernels.records import new_record
-from ..paths.uncertainty import HALF_A_SAMPLE
+from ..paths.uncertainty import ONE_SAMPLE
 from ..power.amplifiers import Amplifier
 from ..power.budget import DEFAULT_AVERAGING_S
 from ..power.constraint import DEFAULT_FS
@@ -82,7 +82,7 @@ class FrequencyDomainKalman(PrimaryPathController):
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default half a sample of delay, None: the
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay, None: the
         paths are exact.
     path_memory_s : float, optional
         Time in seconds over which the primary paths are averaged; by default 1 s, or the duration of 16 primary paths
@@ -161,7 +161,7 @@ class FrequencyDomainKalman(PrimaryPathController):
         rated_power: Any = None,
         n_references: int = 1,
         n_primary: int | None = None,
-        secondary_path_uncertainty: Any = HALF_A_SAMPLE,
+        secondary_path_uncertainty: Any = ONE_SAMPLE,
         path_memory_s: float | None = None,
         memory_s: float | None = None,
         averaging_s: float = DEFAULT_AVERAGING_S,

@@ -13,7 +13,7 @@ from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
-from ..paths.uncertainty import GUARD_TAPS, HALF_A_SAMPLE, guard_against
+from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, guard_against
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
 from ..power.constraint import ConstraintState, advance_constraint
@@ -200,7 +200,7 @@ def kf_pb(
     amplifier: Any = None,
     limiter: Any = None,
     dtype: Any = None,
-    secondary_path_uncertainty: Any = HALF_A_SAMPLE,
+    secondary_path_uncertainty: Any = ONE_SAMPLE,
     form: str | None = None,
     **settings: Any,
 ) -> PowerBudgetController | DirectPowerBudget | PrimaryPathController:
@@ -221,10 +221,10 @@ def kf_pb(
         As for `kf_anc`. Behind its limiter, the direct form for one channel asks for more power only if that lowers the
         error (see `PowerBudget`).
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default half a
-        sample of delay. The control filter is weaker where the path is less certain, and almost zero where the error
-        may exceed 100 % (with half a sample of delay, above a third of the sample rate), so that the noise never
-        becomes louder than without control if the error is within the uncertainty. None: the path is exact.
+        How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default a
+        sample of delay. The control filter is weaker where the path is less certain, and almost zero where no control
+        would be safe (with a sample of delay, above three eighths of the sample rate), so that the noise does not
+        become louder than without control if the error is within the uncertainty. None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths

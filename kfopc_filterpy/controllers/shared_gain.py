@@ -18,7 +18,7 @@ from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_c
 from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
-from ..paths.uncertainty import HALF_A_SAMPLE
+from ..paths.uncertainty import ONE_SAMPLE
 from ..power.amplifiers import Amplifier
 from ..power.budget import DEFAULT_AVERAGING_S
 from ..power.constraint import DEFAULT_FS
@@ -92,7 +92,7 @@ class SharedGainKalman(PrimaryPathController):
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default half a sample of delay, None: the
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay, None: the
         paths are exact.
     path_memory_s : float, default 1
         Time in seconds over which the primary paths are averaged: a longer one is more exact, a shorter one follows
@@ -140,7 +140,7 @@ class SharedGainKalman(PrimaryPathController):
         rated_power: Any = None,
         n_references: int = 1,
         n_primary: int | None = None,
-        secondary_path_uncertainty: Any = HALF_A_SAMPLE,
+        secondary_path_uncertainty: Any = ONE_SAMPLE,
         path_memory_s: float = DEFAULT_PATH_MEMORY_S,
         memory_s: float = DEFAULT_MEMORY_S,
         averaging_s: float = DEFAULT_AVERAGING_S,

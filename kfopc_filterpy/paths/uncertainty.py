@@ -5,10 +5,16 @@ g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y
 
 .. math:: E = D\,\frac{1 - g}{1 + g\Delta}
 
-This is stable if :math:`g\delta < 1`. It is never louder than without control if :math:`\delta \le 1`, for any g from 0
-to 1.
-Where :math:`\delta > 1`, only g = 0 is safe. Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the
-path is known well, g vanishes where :math:`\delta` reaches 1, and :math:`g\delta` is at most 0.62.
+It settles, however fast the adaptation is, if :math:`g\delta < 1`; a slow one settles if
+:math:`1 + g\operatorname{Re}\Delta > 0`. The noise is not louder than without control if
+:math:`|1 + g\Delta| \ge 1 - g`. The part g of the control filter that is safe:
+
+- Within a `PathTolerance`, :math:`1 + \Delta = \rho e^{j\theta}` with a largest phase :math:`\theta` and gains
+  :math:`\rho` from :math:`1/\gamma` to :math:`\gamma`. Then :math:`g = \min(1, 0.94/\delta)`, and g = 0 where no g meets the
+  last two conditions. With an exact gain, that is where :math:`\theta` exceeds 135 degrees.
+- If only :math:`\delta` is known, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
+  Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the path is known well, and :math:`g\delta` is at
+  most 0.62.
 
 A controller gets this g from a penalty on the control signal through the filter W with :math:`|W|^2 = (1 - g)/g`:
 
@@ -21,14 +27,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
+from scipy.signal import minimum_phase, windows
 
 from .._validate import as_nonnegative, as_real_array, require_finite
 from .channels import secondary_paths
 
 N_FREQUENCIES = 257  # from 0 to fs/2
 GUARD_TAPS = 48
-SHARPNESS = 6  # g = 1 - delta^SHARPNESS
+SHARPNESS = 6  # g = 1 - delta^SHARPNESS, if only delta is known
+LARGEST_GAIN = 0.94  # of g delta within a PathTolerance; W adds up to 0.1, and at 1 a fast adaptation runs away
 LEAST_SHARE = 0.03  # g is at least this; a zero would need an infinite penalty
+STEEP = 6  # frequencies by which W's taps make a steep fall of g begin too early
 SMALLEST_PENALTY = 1e-4  # |W|^2 is at least this; a zero would need an infinite impulse response
 
 
@@ -58,6 +68,8 @@ class PathTolerance:
     array([1., 1.])
     >>> PathTolerance(delay_samples=0.5).relative_error(np.array([0.0, np.pi / 3, np.pi])).round(3)
     array([0.   , 0.518, 1.414])
+    >>> PathTolerance(delay_samples=1.0).share(2 * np.pi * np.array([0.1, 0.25, 0.35, 0.4])).round(2)
+    array([1.  , 0.66, 0.53, 0.  ])
     """
 
     delay_samples: float = 0.0
@@ -70,12 +82,26 @@ class PathTolerance:
 
     def relative_error(self, omega: np.ndarray) -> np.ndarray:
         """Return the largest ``|S/S^ - 1|`` within the tolerances, at frequencies `omega` in radians per sample."""
-        phase = np.minimum(np.deg2rad(self.phase_deg) + self.delay_samples * np.asarray(omega), np.pi)
-        gain = 10.0 ** (self.gain_db / 20.0)
-        return np.sqrt((gain - 1.0) ** 2 + 4.0 * gain * np.sin(phase / 2.0) ** 2)
+        gain = self._largest_gain
+        return np.sqrt((gain - 1.0) ** 2 + 4.0 * gain * np.sin(self._largest_phase(omega) / 2.0) ** 2)
+
+    def share(self, omega: np.ndarray) -> np.ndarray:
+        """Return the safe part g of the control filter, from 0 to 1, at frequencies `omega` in radians per sample."""
+        back, gain = np.maximum(-np.cos(self._largest_phase(omega)), 0.0), self._largest_gain
+        not_louder_from = 2.0 * back / (1.0 / gain + 2.0 * back)
+        unstable_from = 1.0 / (1.0 + gain * back)  # if the adaptation is slow
+        share = LARGEST_GAIN / np.maximum(self.relative_error(omega), LARGEST_GAIN)
+        return np.where(not_louder_from < unstable_from, share, 0.0)
+
+    def _largest_phase(self, omega: np.ndarray) -> np.ndarray:
+        return np.minimum(np.deg2rad(self.phase_deg) + self.delay_samples * np.asarray(omega), np.pi)
+
+    @property
+    def _largest_gain(self) -> float:
+        return float(10.0 ** (self.gain_db / 20.0))
 
 
-HALF_A_SAMPLE = PathTolerance(delay_samples=0.5)  # what a careful identification may leave
+ONE_SAMPLE = PathTolerance(delay_samples=1.0)  # what a careful identification may leave
 
 
 def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
@@ -169,38 +195,62 @@ def _response(paths: np.ndarray, omega: np.ndarray) -> np.ndarray:
     return np.moveaxis(paths @ waves.T, -1, -3)
 
 
-def guard_filter(uncertainty: np.ndarray) -> np.ndarray:
+def guard_filter(uncertainty: PathTolerance | np.ndarray) -> np.ndarray:
     """Return the filter W that guards a controller against an uncertainty, see `path_uncertainty`.
 
     Parameters
     ----------
-    uncertainty : ndarray, shape (n_frequencies,)
-        Largest relative error of the path at evenly spaced frequencies from 0 to fs/2.
+    uncertainty : PathTolerance or ndarray, shape (n_frequencies,)
+        Tolerances; or the largest relative error of the path at evenly spaced frequencies from 0 to fs/2. Tolerances
+        allow more control, because they limit the phase of the error.
 
     Returns
     -------
     ndarray, shape (48,)
-        Minimum-phase impulse response, cut off, with ``|W|^2 = (1 - g)/g``, g = 1 - delta^6 (at least 0.03).
+        Minimum-phase impulse response with ``|W|^2 = (1 - g)/g``, where g is `PathTolerance.share` or
+        1 - delta^6, and at least 0.03.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy.paths import PathTolerance, guard_filter, path_uncertainty
-    >>> guard = guard_filter(path_uncertainty(PathTolerance(delay_samples=1.0), [1.0]))
+    >>> from kfopc_filterpy.paths import PathTolerance, guard_filter
+    >>> guard = guard_filter(PathTolerance(delay_samples=1.0))
     >>> share = 1 / (1 + np.abs(np.fft.rfft(guard, 512)) ** 2)  # g
-    >>> share[[16, 32, 64, 128]].round(2)  # at 1/32, 1/16, 1/8 and 1/4 of the sample rate
-    array([1.  , 0.99, 0.75, 0.03])
+    >>> share[[64, 128, 160, 224]].round(2)  # at 1/8, 1/4, 5/16 and 7/16 of the sample rate
+    array([1.  , 0.69, 0.58, 0.03])
     """
-    share = np.clip(1.0 - np.asarray(uncertainty) ** SHARPNESS, LEAST_SHARE, 1.0)
-    penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
-    cepstrum = np.fft.irfft(0.5 * np.log(penalty))
-    half = cepstrum.size // 2
-    cepstrum[1:half] *= 2.0
-    cepstrum[half + 1 :] = 0.0  # causal: minimum phase
-    return np.fft.irfft(np.exp(np.fft.rfft(cepstrum)))[:GUARD_TAPS]
+    share = np.maximum(_safe_share(uncertainty), LEAST_SHARE)
+    return _short_filter(np.maximum((1.0 - share) / share, SMALLEST_PENALTY))
+
+
+def _safe_share(uncertainty: PathTolerance | np.ndarray) -> np.ndarray:
+    if isinstance(uncertainty, PathTolerance):
+        return uncertainty.share(np.linspace(0.0, np.pi, N_FREQUENCIES))
+    return np.maximum(1.0 - np.asarray(uncertainty) ** SHARPNESS, 0.0)
+
+
+def _short_filter(power: np.ndarray) -> np.ndarray:
+    """Return the minimum-phase filter whose ``|W|^2`` is a local mean of `power`, which is given from 0 to fs/2.
+
+    The spectrum of Bohman's window is nowhere negative. So g does not overshoot where it falls steeply, as it would if W
+    were cut off. A steep rise of `power` begins too early in the mean, so it is delayed before.
+    """
+    delayed = minimum_filter1d(power, 2 * STEEP + 1)
+    correlation = np.fft.irfft(delayed)[np.abs(np.arange(1 - GUARD_TAPS, GUARD_TAPS))]
+    return np.ascontiguousarray(minimum_phase(correlation * windows.bohman(correlation.size)))
 
 
 def guard_against(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     """Return the guard filter for an uncertainty, see `path_uncertainty`; None if the path is exact."""
     largest = path_uncertainty(uncertainty, secondary_path)
-    return guard_filter(largest) if np.any(largest) else None
+    return guard_filter(_most_exact(uncertainty, largest)) if np.any(largest) else None
+
+
+def is_controllable(uncertainty: Any, secondary_path: Any) -> np.ndarray:
+    """Return whether an uncertainty allows any control, (257,), at evenly spaced frequencies from 0 to fs/2."""
+    return _safe_share(_most_exact(uncertainty, path_uncertainty(uncertainty, secondary_path))) > 0.0
+
+
+def _most_exact(uncertainty: Any, largest: np.ndarray) -> PathTolerance | np.ndarray:
+    """Return what tells most of an uncertainty: tolerances, or else its largest relative error."""
+    return uncertainty if isinstance(uncertainty, PathTolerance) else largest
