@@ -512,7 +512,7 @@ def _further() -> Iterator[Quote]:
         "With a wrong gain KF-PB",
         *(2, 3, 0, 1),
     )
-    tolerance, cost = "uncertain-path", "With an exact path the default guard costs at most 0.5 dB, noises"
+    tolerance, cost = "uncertain-path", "With an exact path the default guard costs at most 0.5 dB,"
     yield quote(
         tolerance,
         "{:.0f} of {:.0f} runs have a second after the first that is louder than without control; the least reduction is "
@@ -521,8 +521,8 @@ def _further() -> Iterator[Quote]:
         *(0, 1, 2, 3, 5),
     )
     yield quote(tolerance, "it is {:.0f} of {:.0f} runs too", "With the error stated as a tolerance KF-PB", 0, 1)
-    yield quote(tolerance, "({:.2f} dB on average) if the noise lies below", f"{cost} below", 0)
-    yield quote(tolerance, "the guard costs {:.2f} dB on average and {:.2f} dB at most", f"{cost} that reach", 0, 1)
+    yield quote(tolerance, "costs {:.2f} dB on average and {:.2f} dB at most if the noise", f"{cost} noises", 0, 1)
+    yield quote(tolerance, "it costs {:.2f} dB on average and {:.2f} dB at most.", f"{cost} white", 0, 1)
     steady, recorded = "On steady noise KF-PB reaches", "On recordings KF-PB reaches"
     room = "multichannel"
     yield quote(room, "KF-PB is {:.2f} dB below the bound on average and {:.2f} dB at worst; on the", steady, 0, 1)

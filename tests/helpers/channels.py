@@ -54,9 +54,11 @@ def constrained_filters(
     J = rated.size
     natural = np.trace(R) / np.trace(of_x) / J
     penalty = np.full(J, natural)
-    for _ in range(200):
+    for _ in range(2000):
         matrix = R + block_diag(*(p * of_x for p in penalty)) + ridge * np.trace(R) / len(R) * np.eye(len(R))
         w = np.linalg.solve(matrix, r).reshape(J, -1)
         power = np.einsum("ja,ab,jb->j", w, of_x, w)
-        penalty = np.maximum(penalty * power / rated, 1e-12 * natural)
+        before, penalty = penalty, np.maximum(penalty * power / rated, 1e-12 * natural)
+        if np.allclose(before, penalty, rtol=1e-9, atol=0.0):
+            break
     return w, penalty, power

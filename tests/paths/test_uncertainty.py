@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kfopc_filterpy.paths import PathTolerance, fir_path, guard_filter, path_uncertainty
-from kfopc_filterpy.paths.uncertainty import N_FREQUENCIES, guard_against
+from kfopc_filterpy.paths.uncertainty import LARGEST_GAIN, N_FREQUENCIES, guard_against, is_controllable
 
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)
 PATH = np.array([0.0, 0.9, -0.4, 0.2])
@@ -40,7 +40,11 @@ def test_what_can_be_given() -> None:
     assert guard_against(None, PATH) is None
     assert guard_against(0.0, PATH) is None
     tolerance = PathTolerance(delay_samples=1.0)
-    np.testing.assert_array_equal(guard_against(tolerance, PATH), guard_filter(path_uncertainty(tolerance, PATH)))
+    np.testing.assert_array_equal(guard_against(tolerance, PATH), guard_filter(tolerance))
+    np.testing.assert_array_equal(guard_against(0.3, PATH), guard_filter(path_uncertainty(0.3, PATH)))
+    np.testing.assert_array_equal(is_controllable(tolerance, PATH), tolerance.share(OMEGA) > 0.0)
+    np.testing.assert_array_equal(is_controllable([0.0, 2.0], PATH), np.pi / 2 > OMEGA)
+    assert np.all(is_controllable(None, PATH))
 
 
 def test_measured_paths_give_their_largest_distance() -> None:
@@ -67,18 +71,70 @@ def test_a_path_that_is_zero_at_a_frequency_is_unknown_there() -> None:
     assert np.isfinite(guard_filter(uncertainty)).all()
 
 
+def response(guard: np.ndarray) -> np.ndarray:
+    """The share g = 1/(1 + |W|^2) of a guard filter."""
+    return 1.0 / (1.0 + np.abs(np.fft.rfft(guard, 512)) ** 2)
+
+
+@given(phase=st.floats(0.0, 180.0), gain=st.floats(0.0, 12.0))
+def test_a_tolerance_allows_control_only_where_a_search_finds_a_share_that_is_safe(phase: float, gain: float) -> None:
+    """A safe g is stable and not louder for all errors. A search over g in steps of 1/2000 misses the edge by one step."""
+    share = PathTolerance(phase_deg=phase, gain_db=gain).share(np.array([0.0]))[0]
+    error = PathTolerance(phase_deg=phase, gain_db=gain).relative_error(np.array([0.0]))[0]
+    assert share in (0.0, 1.0) or share * error == pytest.approx(LARGEST_GAIN)
+    assert share * error <= LARGEST_GAIN * (1 + 1e-12)
+    ratios = np.exp(1j * np.deg2rad(np.linspace(0.0, phase, 61))) * 10 ** (
+        gain * np.linspace(-1.0, 1.0, 21)[:, None] / 20
+    )
+    g = np.linspace(0.0, 1.0, 2001)[1:, None]
+    changed = 1.0 - g + g * ratios.ravel()  # 1 + g Delta
+    stable = changed.real > 0.0
+    not_louder = np.abs(changed) >= (1.0 - g) * (1 - 1e-12)
+    safe = bool(np.any(np.all(stable & not_louder, axis=1)))
+    edge = 2.0 * max(-np.cos(np.deg2rad(phase)), 0.0)
+    margin = 1.0 / (1.0 + 10 ** (gain / 20) * edge / 2) - edge / (10 ** (-gain / 20) + edge)  # stable above not louder
+    if abs(margin) > 1e-3:
+        assert (share > 0.0) == safe
+
+
+def test_an_exact_gain_allows_control_up_to_135_degrees() -> None:
+    share = PathTolerance(delay_samples=1.0).share(np.pi * np.array([0.0, 0.749, 0.751, 1.0]))
+    np.testing.assert_array_equal(share > 0.0, [True, True, False, False])
+    assert share[0] == 1.0
+
+
 @pytest.mark.parametrize(
-    "tolerance", [PathTolerance(delay_samples=0.5), PathTolerance(1.0), PathTolerance(gain_db=3.0)]
+    "tolerance", [PathTolerance(0.5), PathTolerance(1.0), PathTolerance(2.0), PathTolerance(1.0, 20.0, 2.0)]
 )
-def test_the_guard_has_the_response_wanted(tolerance: PathTolerance) -> None:
+def test_the_guard_of_a_tolerance_has_the_response_wanted(tolerance: PathTolerance) -> None:
+    """But where g falls steeply, which 48 taps need a twelfth of the band for. A fast adaptation stays stable."""
+    share, wanted = response(guard_filter(tolerance)), tolerance.share(OMEGA)
+    gentle = np.convolve(wanted == 0.0, np.ones(43), mode="same") % 43 == 0
+    np.testing.assert_allclose(share[gentle], np.maximum(wanted, 0.03)[gentle], atol=0.1)
+    assert np.max(share * tolerance.relative_error(OMEGA)) < 1.05
+
+
+def test_the_guard_of_a_relative_error_has_the_response_wanted() -> None:
     """The share g to 0.15, which 48 taps reach; hardly any control where the error can exceed 100 %."""
-    delta = tolerance.relative_error(OMEGA)
-    guard = guard_filter(delta)
-    share = 1.0 / (1.0 + np.abs(np.fft.rfft(guard, 512)) ** 2)
-    np.testing.assert_allclose(share, np.clip(1.0 - delta**6, 0.0, 1.0), atol=0.15)
-    assert share[delta >= 1.0].max(initial=0.0) < 0.1
-    assert np.max(share * delta) < 0.7  # stable with a margin
-    assert np.sum(guard[:12] ** 2) > 0.9 * np.sum(guard**2)  # minimum phase: the energy comes early
+    for tolerance in (PathTolerance(0.5), PathTolerance(1.0), PathTolerance(gain_db=3.0)):
+        delta = tolerance.relative_error(OMEGA)
+        share = response(guard_filter(delta))
+        np.testing.assert_allclose(share, np.clip(1.0 - delta**6, 0.0, 1.0), atol=0.15)
+        assert share[delta >= 1.1].max(initial=0.0) < 0.1
+        assert np.max(share * delta) < 0.7  # stable with a margin
+
+
+def test_a_guard_is_minimum_phase_and_does_not_overshoot() -> None:
+    """A constant penalty is kept; where it rises, it stays between the smallest and the largest."""
+    delta = np.full(N_FREQUENCIES, 0.8)
+    penalty = 0.8**6 / (1.0 - 0.8**6)
+    np.testing.assert_allclose(np.abs(np.fft.rfft(guard_filter(delta), 512)) ** 2, penalty, rtol=1e-6)
+    guard = guard_filter(PathTolerance(1.0))
+    power = np.abs(np.fft.rfft(guard, 512)) ** 2
+    assert power.max() < 1.001 * (1.0 - 0.03) / 0.03
+    assert power.min() > 0.9e-4
+    assert np.all(np.diff(power[110:]) > -1e-3 * power.max())  # rises, and never overshoots
+    assert np.abs(np.roots(guard)).max() < 1.0
 
 
 @pytest.mark.parametrize(
