@@ -94,7 +94,7 @@ def main(runs: Runs) -> StudyReport:
         | {
             "duration_s": Parameter(DURATION_S, "from switch-on on"),
             "errors": Parameter(ERRORS, "of the estimate: samples of delay, dB and degrees"),
-            "wide_band_hz": Parameter(list(WIDE_HZ), "far beyond a sixth of the sample rate"),
+            "wide_band_hz": Parameter(list(WIDE_HZ), "up to three eighths of the sample rate"),
             "high_tone_hz": Parameter(HIGH_TONE_HZ, "a quarter of the sample rate: a sample is 90 degrees"),
             "seed": Parameter(SEED, "of noise and sensor noise"),
             "settings": Parameter(settings, "tuned with the exact path and no guard"),
@@ -214,9 +214,10 @@ def _notes(pairs: Mapping[str, Any], rows: Sequence[GuardRow]) -> list[str]:
         *without_measured(pairs),
         f"With its default guard KF-PB spends {min(powers):.2f} to {max(powers):.2f} of its rated power over the steady "
         "half, whatever is wrong with the estimate.",
-        "With a path a sample early or late, no control above three eighths of the sample rate is both stable and never "
-        "louder. That is why the default costs noise reduction where much of the noise is there, if the path is exact "
-        "after all. A path that is known better deserves a smaller tolerance: half a sample costs nothing.",
+        "The default guard weakens the control above a sixth of the sample rate and leaves almost none above three eighths, "
+        "where a path a sample early or late could make a tone louder by more than 3 dB. That costs noise reduction if "
+        "much of the noise is there and the path is exact after all. A path that is known better deserves a smaller "
+        "tolerance.",
         "A constant phase error cannot be had at all frequencies with a causal estimate; it is fitted from 0.01 to 0.45 "
         "of the sample rate.",
         "There is one seed and one record for each case.",

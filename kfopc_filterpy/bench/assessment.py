@@ -80,7 +80,8 @@ class Band:
         Share of the disturbance's power at frequencies at which the secondary path lies more than 20 dB below its mean
         power gain in that band.
     uncertain_share : float
-        Share of the disturbance's power at frequencies at which the secondary path is too uncertain for any control.
+        Share of the disturbance's power at frequencies at which the uncertainty of the secondary path allows less than 90 %
+        of the control filter.
     """
 
     low_hz: float
@@ -378,8 +379,8 @@ def advice_on(verdict: Assessment) -> list[str]:
         ]
     if verdict.limited_by == "path":
         return [
-            f"{verdict.band.uncertain_share:.0%} of the noise lies where the path is too uncertain for control. Measure the "
-            "secondary path again and state a smaller uncertainty, or use a higher sample rate."
+            f"{verdict.band.uncertain_share:.1%} of the noise lies where the uncertainty of the secondary path holds the "
+            "control back. Measure the path again and state a smaller uncertainty, or use a higher sample rate."
         ]
     if verdict.limited_by == "adaptation":
         return [

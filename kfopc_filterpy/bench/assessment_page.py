@@ -325,7 +325,7 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
         ),
         (
             "Secondary path",
-            f"{band.uncertain_share:.1%} of the noise's power lies where it is too uncertain for control",
+            f"{band.uncertain_share:.1%} of the noise's power lies where its uncertainty holds the control back",
         ),
     ]
     if verdict.levels is not None:

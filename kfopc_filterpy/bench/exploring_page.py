@@ -337,7 +337,7 @@ def _controls(setups: list[AcousticSetup]) -> dict[str, Any]:
         ),
         "path_error": slider("path_error", "True path later than the known path (samples)", 0, 4, 0, 0.5),
         "tolerance": slider(
-            "tolerance", "Such an error KF-PB is prepared for (samples)", 0, 4, default.path_tolerance_samples, 0.25
+            "tolerance", "Path error that KF-PB allows for (samples)", 0, 4, default.path_tolerance_samples, 0.25
         ),
         "state_noise": slider(
             "state_noise", "State noise r E[x'²]/q", -9, -3, np.log10(default.state_noise), 0.5, format=power_of_ten

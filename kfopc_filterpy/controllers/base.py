@@ -13,7 +13,7 @@ from ..checkpoint import Checkpointed
 from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.uncertainty import GUARD_TAPS, guard_against, path_uncertainty
+from ..paths.uncertainty import GUARD_TAPS, guard_filter
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
@@ -182,8 +182,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     name = "controller"
     has_gains = False  # True if it has Kalman gains, which scenarios can share
     unshared = ""  # the part that prevents sharing, if any
-    _uncertainty: np.ndarray | None = None
-    _stated_uncertainty: Any = None  # as it was assigned
+    _uncertainty: Any = None  # as it was assigned
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
     _state: Any
     _code: Compiled | None = None
@@ -315,7 +314,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     @property
     def secondary_path_uncertainty(self) -> Any:
-        """Largest relative error of the secondary path, (257,) from 0 to fs/2, or None; can be assigned.
+        """Uncertainty of the secondary path as it was assigned, by default None: the path is exact.
 
         Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
@@ -324,7 +323,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         family, with one channel or several; not for the fast-array filter, which takes one observation. `kf_pb` takes
         it as a setting, and then it is None here.
         """
-        return None if self._uncertainty is None else self._uncertainty.copy()
+        return deepcopy(self._uncertainty)
 
     @secondary_path_uncertainty.setter
     def secondary_path_uncertainty(self, value: Any) -> None:
@@ -334,10 +333,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
                 "KF-ANC, KF-OPC, the diagonal Kalman filter or an LMS algorithm"
             )
         lines = self._state.lines
-        uncertainty = path_uncertainty(value, lines.secondary_estimate)
-        taps = guard_against(value, lines.secondary_estimate)
+        taps = guard_filter(value, lines.secondary_estimate)
         guard = None if taps is None else self._new_guard(taps)
-        self._uncertainty, self._stated_uncertainty = None if taps is None else uncertainty, deepcopy(value)
+        self._uncertainty = deepcopy(value)
         self._state = self._state._replace(lines=lines._replace(guard=guard))
         self._filter_again()
 
@@ -368,10 +366,10 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def secondary_path(self, path: Any) -> None:
         before = self.secondary_path
         self._lines.secondary_estimate[:] = self._checked_estimate(path)
-        if self._stated_uncertainty is None:
+        if self._uncertainty is None:
             self._filter_again()
         else:  # measured paths, for example, have another distance from the new path
-            self.secondary_path_uncertainty = self._stated_uncertainty
+            self.secondary_path_uncertainty = self._uncertainty
         self._after_new_path(before)
 
     def _checked_estimate(self, path: Any) -> np.ndarray:

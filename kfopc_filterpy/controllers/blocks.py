@@ -15,7 +15,7 @@ from .._validate import as_count, as_positive, per_loudspeaker
 from ..kernels.correlation import FadingCorrelation
 from ..kernels.delay_lines import newest
 from ..paths.channels import secondary_paths
-from ..paths.uncertainty import guard_against
+from ..paths.uncertainty import guard_filter
 from ..power.channels import ChannelBudget
 from .base import FilteredReferenceController, listed
 
@@ -58,7 +58,7 @@ class BlockController(FilteredReferenceController):
         self._rated = None if rated_power is None else per_loudspeaker(rated_power, secondary.shape[1], "rated_power")
         limits = np.full(secondary.shape[1], np.inf) if self._rated is None else self._rated
         self._path_weights = np.sqrt(microphone_weights)[:, np.newaxis, np.newaxis]
-        guard = guard_against(secondary_path_uncertainty, secondary)
+        guard = guard_filter(secondary_path_uncertainty, secondary)
         self._tolerance = deepcopy(secondary_path_uncertainty)
         self._budget = ChannelBudget(
             self._path_weights * secondary,
@@ -101,7 +101,7 @@ class BlockController(FilteredReferenceController):
     def _after_new_path(self, before: np.ndarray) -> None:
         """Solve for the new paths from the end of this block on, with a guard if there was one."""
         secondary = self.secondary_path
-        guard = guard_against(self._tolerance, secondary) if self._budget.n_guard > 1 else None
+        guard = guard_filter(self._tolerance, secondary) if self._budget.n_guard > 1 else None
         self._budget.use_paths(self._path_weights * secondary, guard)
 
     def samples_to_block(self) -> int:

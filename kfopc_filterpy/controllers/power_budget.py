@@ -13,7 +13,7 @@ from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
-from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, guard_against
+from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, guard_filter
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
 from ..power.constraint import ConstraintState, advance_constraint
@@ -161,7 +161,7 @@ class PowerBudgetController(KalmanController):
         """Let P grow; measured paths, for example, have another distance from the new path, and so another guard."""
         super()._after_new_path(before)
         if self._tolerance is not None:
-            self.estimator.budget.use_guard(guard_against(self._tolerance, self.secondary_path))
+            self.estimator.budget.use_guard(guard_filter(self._tolerance, self.secondary_path))
 
     def _usual_name(self) -> str:
         return "KF-PB"
@@ -222,9 +222,9 @@ def kf_pb(
         error (see `PowerBudget`).
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
         How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default a
-        sample of delay. The control filter is weaker where the path is less certain, and almost zero where no control
-        would be safe (with a sample of delay, above three eighths of the sample rate), so that the noise does not
-        become louder than without control if the error is within the uncertainty. None: the path is exact.
+        sample of delay. The control filter is weaker where the path is less certain, and almost zero where control
+        could make the noise much louder (with a sample of delay, above three eighths of the sample rate; with several
+        channels, above a quarter). None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
@@ -281,7 +281,7 @@ def kf_pb(
         if several:
             controller = DirectPowerBudget(taps, secondary_path, **channels, **common, **settings)
         else:
-            guard = guard_against(secondary_path_uncertainty, secondary_path)
+            guard = guard_filter(secondary_path_uncertainty, secondary_path)
             estimator = PowerBudgetKalmanFilter(taps, rated_power=rated_power, guard=guard, **settings)
             controller = PowerBudgetController(
                 estimator,

@@ -5,13 +5,13 @@ g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y
 
 .. math:: E = D\,\frac{1 - g}{1 + g\Delta}
 
-It settles, however fast the adaptation is, if :math:`g\delta < 1`; a slow one settles if
-:math:`1 + g\operatorname{Re}\Delta > 0`. The noise is not louder than without control if
-:math:`|1 + g\Delta| \ge 1 - g`. The part g of the control filter that is safe:
+If every frequency adapts for itself, it settles if :math:`g\delta < 1`. The noise is not louder than without control if
+:math:`|1 + g\Delta| \ge 1 - g`. The part g of the control filter that is allowed:
 
-- Within a `PathTolerance`, :math:`1 + \Delta = \rho e^{j\theta}` with a largest phase :math:`\theta` and gains
-  :math:`\rho` from :math:`1/\gamma` to :math:`\gamma`. Then :math:`g = \min(1, 0.94/\delta)`, and g = 0 where no g meets the
-  last two conditions. With an exact gain, that is where :math:`\theta` exceeds 135 degrees.
+- Within a `PathTolerance`, :math:`1 + \Delta = \rho e^{j\theta}` with a largest phase :math:`\theta`. Then
+  :math:`g = \min(1, 0.94/\delta)` up to a phase of 135 degrees, and 0 beyond. With a phase above 90 degrees, some g makes
+  the noise louder, by a factor of at most :math:`1/\sin\theta`, whatever :math:`\rho` is. That is 3 dB at 135 degrees.
+  With several paths, whose errors may differ, 90 degrees is the limit.
 - If only :math:`\delta` is known, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
   Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the path is known well, and :math:`g\delta` is at
   most 0.62.
@@ -27,19 +27,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import minimum_filter1d
 from scipy.signal import minimum_phase, windows
 
 from .._validate import as_nonnegative, as_real_array, require_finite
 from .channels import secondary_paths
 
 N_FREQUENCIES = 257  # from 0 to fs/2
+OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)
 GUARD_TAPS = 48
 SHARPNESS = 6  # g = 1 - delta^SHARPNESS, if only delta is known
-LARGEST_GAIN = 0.94  # of g delta within a PathTolerance; W adds up to 0.1, and at 1 a fast adaptation runs away
+LARGEST_GAIN = 0.94  # of g delta within a PathTolerance; 48 taps of W add up to 0.02, and from 1 on a loop can diverge
 LEAST_SHARE = 0.03  # g is at least this; a zero would need an infinite penalty
-STEEP = 6  # frequencies by which W's taps make a steep fall of g begin too early
 SMALLEST_PENALTY = 1e-4  # |W|^2 is at least this; a zero would need an infinite impulse response
+LARGEST_PHASE_DEG = 135.0  # that is controlled at; no g makes the noise louder by more than 1/sin, 3 dB
+LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several paths; errors of opposite sign would make it louder by 7 dB beyond
+WIDEST_GAIN_DB = 20.0  # of a tolerance; with more, even the least share could make the noise much louder
 
 
 @dataclass(frozen=True)
@@ -53,12 +55,12 @@ class PathTolerance:
     phase_deg : float, default 0
         Largest error of the phase in degrees, at any frequency.
     gain_db : float, default 0
-        Largest error of the gain in dB, too high or too low.
+        Largest error of the gain in dB, too high or too low; at most 20.
 
     Raises
     ------
     TypeError, ValueError
-        A tolerance that is negative or not finite.
+        A tolerance that is negative or not finite; a gain by more than 20 dB.
 
     Examples
     --------
@@ -79,19 +81,25 @@ class PathTolerance:
     def __post_init__(self) -> None:
         for name in ("delay_samples", "phase_deg", "gain_db"):
             as_nonnegative(getattr(self, name), name)
+        if self.gain_db > WIDEST_GAIN_DB:
+            raise ValueError(
+                f"gain_db must be at most {WIDEST_GAIN_DB:g}, got {self.gain_db:g}: a path that is known no better allows "
+                "no control, measure it"
+            )
 
     def relative_error(self, omega: np.ndarray) -> np.ndarray:
         """Return the largest ``|S/S^ - 1|`` within the tolerances, at frequencies `omega` in radians per sample."""
         gain = self._largest_gain
         return np.sqrt((gain - 1.0) ** 2 + 4.0 * gain * np.sin(self._largest_phase(omega) / 2.0) ** 2)
 
-    def share(self, omega: np.ndarray) -> np.ndarray:
-        """Return the safe part g of the control filter, from 0 to 1, at frequencies `omega` in radians per sample."""
-        back, gain = np.maximum(-np.cos(self._largest_phase(omega)), 0.0), self._largest_gain
-        not_louder_from = 2.0 * back / (1.0 / gain + 2.0 * back)
-        unstable_from = 1.0 / (1.0 + gain * back)  # if the adaptation is slow
+    def share(self, omega: np.ndarray, *, n_paths: int = 1) -> np.ndarray:
+        """Return the part g of the control filter that is allowed, from 0 to 1, at `omega` in radians per sample.
+
+        `n_paths` is the number of secondary paths. More than one allow less, because their errors may differ.
+        """
         share = LARGEST_GAIN / np.maximum(self.relative_error(omega), LARGEST_GAIN)
-        return np.where(not_louder_from < unstable_from, share, 0.0)
+        limit = LARGEST_PHASE_DEG if n_paths == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
+        return np.where(self._largest_phase(omega) <= np.deg2rad(limit), share, 0.0)
 
     def _largest_phase(self, omega: np.ndarray) -> np.ndarray:
         return np.minimum(np.deg2rad(self.phase_deg) + self.delay_samples * np.asarray(omega), np.pi)
@@ -140,7 +148,7 @@ def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     if uncertainty is None:
         return np.zeros(N_FREQUENCIES)
     if isinstance(uncertainty, PathTolerance):
-        return uncertainty.relative_error(np.linspace(0.0, np.pi, N_FREQUENCIES))
+        return uncertainty.relative_error(OMEGA)
     if np.ndim(uncertainty) == 0:
         return np.full(N_FREQUENCIES, as_nonnegative(uncertainty, "secondary_path_uncertainty"))
     given = as_real_array(uncertainty, "secondary_path_uncertainty")
@@ -165,9 +173,8 @@ def _distance(measured: np.ndarray, estimate: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"secondary_path_uncertainty must be {wanted} if it holds M measured paths, got shape {measured.shape}"
         )
-    omega = np.linspace(0.0, np.pi, N_FREQUENCIES)
-    known = _response(estimate, omega)
-    error = _response(several, omega) - known
+    known = _response(estimate, OMEGA)
+    error = _response(several, OMEGA) - known
     relative = _norm(error @ np.linalg.pinv(known))
     # The second term counts at frequencies at which the estimated path is zero, where the first one is zero too.
     least = _norm(error) / np.maximum(_norm(known), np.finfo(float).tiny)
@@ -180,7 +187,7 @@ def relative_to(paths: np.ndarray, squared_error: np.ndarray) -> np.ndarray:
     `squared_error` is (K, J, 257). With several paths the bound is ``||E||_F ||pinv(S^)||`` with the matrix E of the
     errors, as their phases are not known.
     """
-    known = _response(paths, np.linspace(0.0, np.pi, N_FREQUENCIES))
+    known = _response(paths, OMEGA)
     smallest = np.linalg.svd(known, compute_uv=False)[..., -1]  # 1/||pinv(S^)||
     return np.sqrt(squared_error.sum(axis=(0, 1))) / np.maximum(smallest, np.finfo(float).tiny)
 
@@ -195,62 +202,58 @@ def _response(paths: np.ndarray, omega: np.ndarray) -> np.ndarray:
     return np.moveaxis(paths @ waves.T, -1, -3)
 
 
-def guard_filter(uncertainty: PathTolerance | np.ndarray) -> np.ndarray:
-    """Return the filter W that guards a controller against an uncertainty, see `path_uncertainty`.
+def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
+    """Return the filter W that guards a controller against an uncertainty, or None if it needs no guard.
 
     Parameters
     ----------
-    uncertainty : PathTolerance or ndarray, shape (n_frequencies,)
-        Tolerances; or the largest relative error of the path at evenly spaced frequencies from 0 to fs/2. Tolerances
-        allow more control, because they limit the phase of the error.
+    uncertainty : PathTolerance, float or array_like, optional
+        Uncertainty of the secondary path, as of `path_uncertainty`. A tolerance allows more control than its
+        relative error, because it limits the phase of the error.
+    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+        Estimated secondary path.
 
     Returns
     -------
-    ndarray, shape (48,)
-        Minimum-phase impulse response with ``|W|^2 = (1 - g)/g``, where g is `PathTolerance.share` or
-        1 - delta^6, and at least 0.03.
+    ndarray, shape (48,), or None
+        Minimum-phase impulse response with ``|W|^2 = (1 - g)/g``, where g is `PathTolerance.share` or 1 - delta^6, and
+        at least 0.03. None if g is 1 at all frequencies.
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `path_uncertainty`.
 
     Examples
     --------
     >>> import numpy as np
     >>> from kfopc_filterpy.paths import PathTolerance, guard_filter
-    >>> guard = guard_filter(PathTolerance(delay_samples=1.0))
+    >>> guard = guard_filter(PathTolerance(delay_samples=1.0), [0.0, 1.0, -0.6])
     >>> share = 1 / (1 + np.abs(np.fft.rfft(guard, 512)) ** 2)  # g
     >>> share[[64, 128, 160, 224]].round(2)  # at 1/8, 1/4, 5/16 and 7/16 of the sample rate
-    array([1.  , 0.69, 0.58, 0.03])
+    array([1.  , 0.66, 0.54, 0.03])
     """
-    share = np.maximum(_safe_share(uncertainty), LEAST_SHARE)
+    share = allowed_share(uncertainty, secondary_path)
+    if np.all(share == 1.0):
+        return None
+    share = np.maximum(share, LEAST_SHARE)
     return _short_filter(np.maximum((1.0 - share) / share, SMALLEST_PENALTY))
 
 
-def _safe_share(uncertainty: PathTolerance | np.ndarray) -> np.ndarray:
+def allowed_share(uncertainty: Any, secondary_path: Any) -> np.ndarray:
+    """Return the part g of the control filter that an uncertainty allows, (257,), at evenly spaced frequencies to fs/2."""
+    largest = path_uncertainty(uncertainty, secondary_path)
     if isinstance(uncertainty, PathTolerance):
-        return uncertainty.share(np.linspace(0.0, np.pi, N_FREQUENCIES))
-    return np.maximum(1.0 - np.asarray(uncertainty) ** SHARPNESS, 0.0)
+        paths, _ = secondary_paths(secondary_path)
+        return uncertainty.share(OMEGA, n_paths=paths.shape[0] * paths.shape[1])
+    return 1.0 - np.minimum(largest, 1.0) ** SHARPNESS
 
 
 def _short_filter(power: np.ndarray) -> np.ndarray:
     """Return the minimum-phase filter whose ``|W|^2`` is a local mean of `power`, which is given from 0 to fs/2.
 
     The spectrum of Bohman's window is nowhere negative. So g does not overshoot where it falls steeply, as it would if W
-    were cut off. A steep rise of `power` begins too early in the mean, so it is delayed before.
+    were cut off.
     """
-    delayed = minimum_filter1d(power, 2 * STEEP + 1)
-    correlation = np.fft.irfft(delayed)[np.abs(np.arange(1 - GUARD_TAPS, GUARD_TAPS))]
+    correlation = np.fft.irfft(power)[np.abs(np.arange(1 - GUARD_TAPS, GUARD_TAPS))]
     return np.ascontiguousarray(minimum_phase(correlation * windows.bohman(correlation.size)))
-
-
-def guard_against(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
-    """Return the guard filter for an uncertainty, see `path_uncertainty`; None if the path is exact."""
-    largest = path_uncertainty(uncertainty, secondary_path)
-    return guard_filter(_most_exact(uncertainty, largest)) if np.any(largest) else None
-
-
-def is_controllable(uncertainty: Any, secondary_path: Any) -> np.ndarray:
-    """Return whether an uncertainty allows any control, (257,), at evenly spaced frequencies from 0 to fs/2."""
-    return _safe_share(_most_exact(uncertainty, path_uncertainty(uncertainty, secondary_path))) > 0.0
-
-
-def _most_exact(uncertainty: Any, largest: np.ndarray) -> PathTolerance | np.ndarray:
-    """Return what tells most of an uncertainty: tolerances, or else its largest relative error."""
-    return uncertainty if isinstance(uncertainty, PathTolerance) else largest

@@ -275,7 +275,11 @@ def test_what_is_unplugged_stays_silent_and_finite(name: str, dead: str) -> None
 
 @pytest.mark.parametrize("name", MAKE)
 def test_two_identical_loudspeakers_share_the_work(name: str) -> None:
-    """Nothing but rounding tells them apart; where hardly anything is known, in the first block of KF-PB, it grows."""
+    """Nothing but rounding tells them apart.
+
+    How they share the work is as good as undetermined, so rounding grows until they differ by 1e-8 of a power of 1; in
+    the first block of KF-PB, where hardly anything is known, by 1e-3.
+    """
     paths = np.repeat(PATHS[:, :1], 2, axis=1)
     controller = MAKE[name](paths, **({} if name != "KF-PB" else {"fs": FS}))
     if name == "KF-PB":

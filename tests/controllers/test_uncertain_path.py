@@ -46,14 +46,16 @@ def run(settings: dict[str, Any], estimate: np.ndarray, x: np.ndarray, **more: A
 
 @pytest.mark.parametrize("settings", [DIRECT, ONE_CHANNEL], ids=["direct", "shared gain"])
 @pytest.mark.parametrize(
-    ("uncertainty", "frequency"), [(DISTANCE, 600.0), (DISTANCE, 1000.0), (TOLERANCE, 2100.0), (TOLERANCE, 2600.0)]
+    ("uncertainty", "frequency"),
+    [(DISTANCE, 600.0), (DISTANCE, 1000.0), (TOLERANCE, 2100.0), (TOLERANCE, 2600.0), (TOLERANCE, 2850.0)],
 )
 def test_a_tone_settles_at_the_closed_form(settings: dict[str, Any], uncertainty: Any, frequency: float) -> None:
     """E/D = (1 - g)/(1 + g Delta), to 1 dB, with the g that the guard filter has at the tone and Delta of one sample."""
     x = tone(frequency, 6.0, fs=FS) + 1e-3 * np.random.default_rng(0).standard_normal(int(6 * FS))
     result = run(settings, LATE, x, secondary_path_uncertainty=uncertainty)
     omega = 2 * np.pi * frequency / FS
-    guard = guard_filter(uncertainty)
+    guard = guard_filter(uncertainty, LATE)
+    assert guard is not None
     share = 1 / (1 + np.abs(np.sum(guard * np.exp(-1j * omega * np.arange(guard.size)))) ** 2)
     delta = np.exp(-1j * omega) - 1
     expected = -20 * np.log10(np.abs((1 - share) / (1 + share * delta)))
@@ -93,6 +95,28 @@ def test_an_exact_path_costs_little(settings: dict[str, Any]) -> None:
     assert -0.1 < loss < 0.5
 
 
+@pytest.mark.parametrize(
+    "errors",
+    [[[-1, -1], [1, 1]], [[-1, 1], [-1, 1]], [[-1, 1], [1, -1]], [[1, -1], [-1, 1]]],
+    ids=["microphones", "loudspeakers", "near paths early", "near paths late"],
+)
+def test_paths_whose_delays_differ_in_opposite_directions_are_left_alone(errors: list[list[int]]) -> None:
+    """By a sample, noise from 2/8 to 3/8 of the sample rate: 0.4 dB louder at most, from what 3 % of the filter do."""
+    near, far = np.pad(TRUE, (0, 2)), 0.5 * np.pad(TRUE, (1, 1))
+    estimate = np.array([[near, far], [far, near]])
+    true = np.array([[np.roll(s, n) for s, n in zip(*row, strict=True)] for row in zip(estimate, errors, strict=True)])
+    primary = np.array([[PRIMARY], [np.roll(PRIMARY, 1)]])
+    x = band_limited_noise((2000.0, 3000.0), 3.0, fs=FS, rng=1)[np.newaxis]
+    reached = []
+    for options in ({}, {"secondary_path_uncertainty": None}):
+        controller = kf_pb(24, estimate, rated_power=1e3, fs=FS, **options)
+        result = simulate(controller, x, primary_path=primary, secondary_path=true, fs=FS)
+        diverged = result.diverged_at_s is not None
+        reached.append(-np.inf if diverged else noise_reduction_db(result.error, result.disturbance))
+    assert reached[0] > -0.4
+    assert reached[1] < -3.0
+
+
 # ---- The filters that adapt the control filter itself
 
 
@@ -112,11 +136,11 @@ def test_a_guarded_kalman_filter_is_the_batch_solution_of_both_observations(comp
     controller.secondary_path_uncertainty = TOLERANCE
     simulate(controller, x, disturbance=d, secondary_path=TRUE, fs=FS, compiled=compiled)
     filtered = np.convolve(x, TRUE)[:n_samples]
-    guarded = np.convolve(filtered, guard_filter(TOLERANCE))[:n_samples]
+    guarded = np.convolve(filtered, guard_filter(TOLERANCE, TRUE))[:n_samples]
     F, G = rows(filtered, taps), rows(guarded, taps)
     expected = np.linalg.solve(F.T @ F / q + G.T @ G / q + np.eye(taps) / P0, F.T @ d / q)
     np.testing.assert_allclose(controller.weights, expected, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(controller.secondary_path_uncertainty, path_uncertainty(TOLERANCE, TRUE))
+    assert controller.secondary_path_uncertainty == TOLERANCE
 
 
 def test_a_guarded_lms_filter_is_its_literal_equation() -> None:
@@ -129,7 +153,7 @@ def test_a_guarded_lms_filter_is_its_literal_equation() -> None:
     result = simulate(controller, x, disturbance=d, secondary_path=TRUE, fs=FS)
     filtered = np.convolve(x, TRUE)[:n_samples]
     F, X = rows(filtered, taps), rows(x, taps)
-    G = rows(np.convolve(filtered, guard_filter(TOLERANCE))[:n_samples], taps)
+    G = rows(np.convolve(filtered, guard_filter(TOLERANCE, TRUE))[:n_samples], taps)
     w, y = np.zeros(taps), np.zeros(n_samples)
     for n in range(n_samples):
         y[n] = w @ X[n]
@@ -144,9 +168,9 @@ def test_a_guarded_lms_filter_is_its_literal_equation() -> None:
     np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-12)
 
 
-def guarded_rows(filtered: np.ndarray, estimate: np.ndarray, taps: int) -> np.ndarray:
+def guarded_rows(filtered: np.ndarray, taps: int) -> np.ndarray:
     """The delayed x'' = W * x', (n_samples, taps)."""
-    guard = guard_filter(TOLERANCE)
+    guard = guard_filter(TOLERANCE, TRUE)
     return rows(np.convolve(filtered, guard)[: filtered.size], taps)
 
 
@@ -157,7 +181,7 @@ def test_a_guarded_normalised_lms_filter_is_its_literal_equation() -> None:
     controller = FxNLMS(taps, TRUE, step_size=mu)
     controller.secondary_path_uncertainty = TOLERANCE
     filtered = np.convolve(x, TRUE)[:n_samples]
-    F, G, w = rows(filtered, taps), guarded_rows(filtered, TRUE, taps), np.zeros(taps)
+    F, G, w = rows(filtered, taps), guarded_rows(filtered, taps), np.zeros(taps)
     for n in range(n_samples):
         controller.control_signal(x[n])
         controller.update(e[n])
@@ -173,7 +197,7 @@ def test_a_guarded_diagonal_filter_is_its_literal_equations() -> None:
     controller = DiagonalKalman(taps, TRUE, state_noise=r, measurement_noise=q, initial_variance=P0)
     controller.secondary_path_uncertainty = TOLERANCE
     filtered = np.convolve(x, TRUE)[:n_samples]
-    F, G, w, p, y = rows(filtered, taps), guarded_rows(filtered, TRUE, taps), np.zeros(taps), np.full(taps, P0), []
+    F, G, w, p, y = rows(filtered, taps), guarded_rows(filtered, taps), np.zeros(taps), np.full(taps, P0), []
     for n in range(n_samples):
         y.append(controller.control_signal(x[n]))
         controller.update(e[n])
@@ -197,7 +221,7 @@ def channel_rows(x: np.ndarray, signal_of: Any) -> np.ndarray:
 
 
 def both_rows(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    guard = guard_filter(TOLERANCE)
+    guard = guard_filter(TOLERANCE, SEVERAL)
     return channel_rows(x, lambda s: s), channel_rows(x, lambda s: np.convolve(s, guard)[: s.size])
 
 
@@ -241,7 +265,7 @@ def test_a_new_path_is_guarded_as_if_it_had_always_been_there() -> None:
         controller.secondary_path_uncertainty = measured
         controller.listen(x[:100], e[:100])
     one.secondary_path = new
-    np.testing.assert_array_equal(one.secondary_path_uncertainty, path_uncertainty(measured, new))
+    np.testing.assert_array_equal(one.secondary_path_uncertainty, measured)  # as assigned
     for n in range(100, 200):
         for controller in (one, other):
             controller.control_signal(x[n])

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kfopc_filterpy.paths import PathTolerance, fir_path, guard_filter, path_uncertainty
-from kfopc_filterpy.paths.uncertainty import LARGEST_GAIN, N_FREQUENCIES, guard_against, is_controllable
+from kfopc_filterpy.paths.uncertainty import N_FREQUENCIES, allowed_share
 
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)
 PATH = np.array([0.0, 0.9, -0.4, 0.2])
@@ -37,14 +37,28 @@ def test_what_can_be_given() -> None:
     np.testing.assert_array_equal(path_uncertainty(None, PATH), 0.0)
     np.testing.assert_array_equal(path_uncertainty(0.3, fir_path(PATH, 8000.0)), 0.3)
     np.testing.assert_allclose(path_uncertainty([0.0, 1.0], PATH), OMEGA / np.pi)
-    assert guard_against(None, PATH) is None
-    assert guard_against(0.0, PATH) is None
+
+
+def test_what_needs_no_guard_has_none() -> None:
+    """A tolerance whose relative error stays well below 1 allows the whole control filter."""
+    for exact in (None, 0.0, PathTolerance(), PathTolerance(gain_db=3.0), PathTolerance(phase_deg=45.0)):
+        assert guard_filter(exact, PATH) is None
+        np.testing.assert_array_equal(allowed_share(exact, PATH), 1.0)
+
+
+def test_a_tolerance_allows_control_at_larger_errors_than_their_size_alone() -> None:
+    """Up to 135 degrees, and with several paths up to 90."""
     tolerance = PathTolerance(delay_samples=1.0)
-    np.testing.assert_array_equal(guard_against(tolerance, PATH), guard_filter(tolerance))
-    np.testing.assert_array_equal(guard_against(0.3, PATH), guard_filter(path_uncertainty(0.3, PATH)))
-    np.testing.assert_array_equal(is_controllable(tolerance, PATH), tolerance.share(OMEGA) > 0.0)
-    np.testing.assert_array_equal(is_controllable([0.0, 2.0], PATH), np.pi / 2 > OMEGA)
-    assert np.all(is_controllable(None, PATH))
+    delta = path_uncertainty(tolerance, PATH)
+    in_any_direction = np.clip(1.0 - delta**6, 0.0, 1.0)
+    np.testing.assert_array_equal(allowed_share(tolerance, PATH), tolerance.share(OMEGA))
+    np.testing.assert_allclose(allowed_share(delta, PATH), in_any_direction, atol=1e-12)
+    for several in (np.ones((1, 2, 4)), np.ones((2, 1, 4)), np.ones((2, 2, 4))):
+        wanted = np.where(np.pi / 2 >= OMEGA, tolerance.share(OMEGA), 0.0)
+        np.testing.assert_array_equal(allowed_share(tolerance, several), wanted)
+        np.testing.assert_allclose(allowed_share(delta, several), in_any_direction, atol=1e-12)
+    np.testing.assert_array_equal(guard_filter(tolerance, PATH[np.newaxis, np.newaxis]), guard_filter(tolerance, PATH))
+    np.testing.assert_allclose(guard_filter([0.0, 1.0], PATH), guard_filter(OMEGA / np.pi, PATH), atol=1e-12)
 
 
 def test_measured_paths_give_their_largest_distance() -> None:
@@ -67,72 +81,102 @@ def test_a_path_that_is_zero_at_a_frequency_is_unknown_there() -> None:
     notch = np.array([1.0, 0.0, 1.0])  # zero at a quarter of the sample rate
     uncertainty = path_uncertainty(np.array([[1.0, 0.1, 1.0]]), notch)
     assert uncertainty[128] > 1e6
-    assert guard_filter(uncertainty) is not None
-    assert np.isfinite(guard_filter(uncertainty)).all()
+    guard = guard_filter(np.array([[1.0, 0.1, 1.0]]), notch)
+    assert guard is not None
+    assert np.isfinite(guard).all()
+    assert response(guard)[128] < 0.1
 
 
-def response(guard: np.ndarray) -> np.ndarray:
+def response(guard: np.ndarray | None) -> np.ndarray:
     """The share g = 1/(1 + |W|^2) of a guard filter."""
+    assert guard is not None
     return 1.0 / (1.0 + np.abs(np.fft.rfft(guard, 512)) ** 2)
 
 
-@given(phase=st.floats(0.0, 180.0), gain=st.floats(0.0, 12.0))
-def test_a_tolerance_allows_control_only_where_a_search_finds_a_share_that_is_safe(phase: float, gain: float) -> None:
-    """A safe g is stable and not louder for all errors. A search over g in steps of 1/2000 misses the edge by one step."""
+def louder_db(share: np.ndarray | float, phase: np.ndarray | float, gain_db: float) -> float:
+    """The most that any g up to a share makes the noise louder, over all phases and gains within the tolerances.
+
+    Searched with u = g/(1 - g), because E/D = 1/(1 + u (1 + Delta)).
+    """
+    steps = np.linspace(0.0, 1.0, 81)
+    largest = np.asarray(share) / (1.0 - np.minimum(share, 1.0 - 1e-12))
+    u = steps[:, None, None] ** 2 * largest
+    ratios = np.exp(1j * np.linspace(0.8, 1.0, 5)[:, None] * phase)
+    gains = 10 ** (gain_db * np.linspace(-1.0, 1.0, 9) / 20)
+    return float(max(np.max(-20 * np.log10(np.abs(1.0 + u * gain * ratios))) for gain in gains))
+
+
+@given(phase=st.floats(0.0, 180.0), gain=st.floats(0.0, 20.0))
+def test_no_share_of_a_tolerance_makes_a_frequency_louder_by_more_than_3_db(phase: float, gain: float) -> None:
+    """And below 90 degrees by nothing. The adaptation settles: g delta < 1 for the largest error that a search finds."""
     share = PathTolerance(phase_deg=phase, gain_db=gain).share(np.array([0.0]))[0]
-    error = PathTolerance(phase_deg=phase, gain_db=gain).relative_error(np.array([0.0]))[0]
-    assert share in (0.0, 1.0) or share * error == pytest.approx(LARGEST_GAIN)
-    assert share * error <= LARGEST_GAIN * (1 + 1e-12)
-    ratios = np.exp(1j * np.deg2rad(np.linspace(0.0, phase, 61))) * 10 ** (
-        gain * np.linspace(-1.0, 1.0, 21)[:, None] / 20
-    )
-    g = np.linspace(0.0, 1.0, 2001)[1:, None]
-    changed = 1.0 - g + g * ratios.ravel()  # 1 + g Delta
-    stable = changed.real > 0.0
-    not_louder = np.abs(changed) >= (1.0 - g) * (1 - 1e-12)
-    safe = bool(np.any(np.all(stable & not_louder, axis=1)))
-    edge = 2.0 * max(-np.cos(np.deg2rad(phase)), 0.0)
-    margin = 1.0 / (1.0 + 10 ** (gain / 20) * edge / 2) - edge / (10 ** (-gain / 20) + edge)  # stable above not louder
-    if abs(margin) > 1e-3:
-        assert (share > 0.0) == safe
-
-
-def test_an_exact_gain_allows_control_up_to_135_degrees() -> None:
-    share = PathTolerance(delay_samples=1.0).share(np.pi * np.array([0.0, 0.749, 0.751, 1.0]))
-    np.testing.assert_array_equal(share > 0.0, [True, True, False, False])
-    assert share[0] == 1.0
+    louder = louder_db(share, np.deg2rad(phase), gain)
+    assert louder <= (1e-9 if phase <= 90.0 else 20 * np.log10(np.sqrt(2.0)) + 1e-9)
+    ratios = np.exp(1j * np.deg2rad(phase)) * 10 ** (gain * np.linspace(-1.0, 1.0, 21) / 20)
+    assert share * np.max(np.abs(ratios - 1.0)) <= 0.94 + 1e-9
+    if phase > 135.001:
+        assert share == 0.0
+    else:  # and no more is held back than that takes
+        assert share == 1.0 or share * np.max(np.abs(ratios - 1.0)) == pytest.approx(0.94)
 
 
 @pytest.mark.parametrize(
-    "tolerance", [PathTolerance(0.5), PathTolerance(1.0), PathTolerance(2.0), PathTolerance(1.0, 20.0, 2.0)]
+    "tolerance",
+    [
+        PathTolerance(0.5),
+        PathTolerance(1.0),
+        PathTolerance(2.0),
+        PathTolerance(8.0),
+        PathTolerance(1.0, 20.0, 2.0),
+        PathTolerance(1.0, gain_db=12.0),
+        PathTolerance(phase_deg=130.0, gain_db=20.0),
+        PathTolerance(phase_deg=180.0, gain_db=20.0),
+    ],
 )
-def test_the_guard_of_a_tolerance_has_the_response_wanted(tolerance: PathTolerance) -> None:
-    """But where g falls steeply, which 48 taps need a twelfth of the band for. A fast adaptation stays stable."""
-    share, wanted = response(guard_filter(tolerance)), tolerance.share(OMEGA)
-    gentle = np.convolve(wanted == 0.0, np.ones(43), mode="same") % 43 == 0
-    np.testing.assert_allclose(share[gentle], np.maximum(wanted, 0.03)[gentle], atol=0.1)
-    assert np.max(share * tolerance.relative_error(OMEGA)) < 1.05
+def test_the_guard_of_a_tolerance_keeps_what_its_share_promises(tolerance: PathTolerance) -> None:
+    """Although 48 taps need a twelfth of the band for a steep fall: settles, and louder by 3.3 dB at most, with any g."""
+    share, wanted = response(guard_filter(tolerance, PATH)), tolerance.share(OMEGA)
+    assert np.max(share * tolerance.relative_error(OMEGA)) < 0.97
+    phase = np.minimum(np.deg2rad(tolerance.phase_deg) + tolerance.delay_samples * OMEGA, np.pi)
+    assert louder_db(share, phase, tolerance.gain_db) < 3.3
+    if tolerance.delay_samples < 8.0:  # whose share changes too fast everywhere
+        jumps = np.pad(wanted == 0.0, 21, mode="edge")
+        gentle = np.convolve(jumps, np.ones(43), mode="valid") % 43 == 0
+        np.testing.assert_allclose(share[gentle], np.maximum(wanted, 0.03)[gentle], atol=0.05)
 
 
 def test_the_guard_of_a_relative_error_has_the_response_wanted() -> None:
-    """The share g to 0.15, which 48 taps reach; hardly any control where the error can exceed 100 %."""
+    """Where it falls steeply, 48 taps make it fall too early; hardly any control where the error can exceed 100 %."""
     for tolerance in (PathTolerance(0.5), PathTolerance(1.0), PathTolerance(gain_db=3.0)):
         delta = tolerance.relative_error(OMEGA)
-        share = response(guard_filter(delta))
-        np.testing.assert_allclose(share, np.clip(1.0 - delta**6, 0.0, 1.0), atol=0.15)
+        share = response(guard_filter(delta, PATH))
+        difference = share - np.clip(1.0 - delta**6, 0.0, 1.0)
+        assert difference.min() > -0.25
+        assert difference.max() < 0.05
+        np.testing.assert_allclose(difference[delta < 0.7], 0.0, atol=0.04)
         assert share[delta >= 1.1].max(initial=0.0) < 0.1
         assert np.max(share * delta) < 0.7  # stable with a margin
+
+
+@pytest.mark.parametrize("n_frequencies", [1, 2, 5, 11])
+def test_a_narrow_peak_of_a_relative_error_is_guarded_against(n_frequencies: int) -> None:
+    """A resonance that has moved, for example: an error of 300 % in a few of 257 frequencies, wherever it is."""
+    for first in (0, 100, N_FREQUENCIES - n_frequencies):
+        delta = np.full(N_FREQUENCIES, 0.1)
+        delta[first : first + n_frequencies] = 3.0
+        assert np.max(response(guard_filter(delta, PATH)) * delta) < 0.95
 
 
 def test_a_guard_is_minimum_phase_and_does_not_overshoot() -> None:
     """A constant penalty is kept; where it rises, it stays between the smallest and the largest."""
     delta = np.full(N_FREQUENCIES, 0.8)
     penalty = 0.8**6 / (1.0 - 0.8**6)
-    np.testing.assert_allclose(np.abs(np.fft.rfft(guard_filter(delta), 512)) ** 2, penalty, rtol=1e-6)
-    guard = guard_filter(PathTolerance(1.0))
+    np.testing.assert_allclose(1.0 / response(guard_filter(delta, PATH)) - 1.0, penalty, rtol=1e-6)
+    guard = guard_filter(PathTolerance(1.0), PATH)
+    assert guard is not None
     power = np.abs(np.fft.rfft(guard, 512)) ** 2
     assert power.max() < 1.001 * (1.0 - 0.03) / 0.03
-    assert power.min() > 0.9e-4
+    assert 1e-4 < power.min() < 3e-4
     assert np.all(np.diff(power[110:]) > -1e-3 * power.max())  # rises, and never overshoots
     assert np.abs(np.roots(guard)).max() < 1.0
 
@@ -153,5 +197,9 @@ def test_a_guard_is_minimum_phase_and_does_not_overshoot() -> None:
 def test_what_is_refused(uncertainty: Any, path: np.ndarray, message: str) -> None:
     with pytest.raises((TypeError, ValueError), match=message):
         path_uncertainty(uncertainty, path)
+    with pytest.raises((TypeError, ValueError), match=message):
+        guard_filter(uncertainty, path)
     with pytest.raises((TypeError, ValueError), match="delay_samples must not"):
         PathTolerance(delay_samples=-1.0)
+    with pytest.raises(ValueError, match="gain_db must be at most 20, got 21: a path that is known no better"):
+        PathTolerance(gain_db=21.0)

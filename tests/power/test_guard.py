@@ -11,7 +11,8 @@ from kfopc_filterpy.power import PowerBudget
 from kfopc_filterpy.power.budget import allocate
 from kfopc_filterpy.power.channels import RIDGE, ChannelBudget
 
-GUARD = guard_filter(path_uncertainty(PathTolerance(delay_samples=1.0), [1.0]))
+GUARD = guard_filter(path_uncertainty(PathTolerance(delay_samples=1.0), [1.0]), [1.0])
+assert GUARD is not None
 SECONDARY = np.array([0.0, 0.8, 0.5, -0.3])
 
 
@@ -55,7 +56,7 @@ def test_the_budget_of_several_loudspeakers_solves_the_dense_system() -> None:
     K, J, taps, path, primary = 2, 2, 10, 6, 8
     secondary, p = random_paths(K, J, path, seed=2), random_paths(K, 1, primary, seed=3, delay=2)
     x = np.random.default_rng(4).standard_normal((1, 20000))
-    rated = np.array([0.05, 0.1])
+    rated = np.array([0.02, 0.001])
     budget = ChannelBudget(secondary, taps, primary, 1, rated, 100.0, GUARD)
     D = correlation(x, budget.n_lags)
     for _ in range(60):
