@@ -231,7 +231,7 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     >>> guard = guard_filter(PathTolerance(delay_samples=1.0), [0.0, 1.0, -0.6])
     >>> share = 1 / (1 + np.abs(np.fft.rfft(guard, 512)) ** 2)  # g
     >>> share[[64, 128, 160, 224]].round(2)  # at 1/8, 1/4, 5/16 and 7/16 of the sample rate
-    array([1.  , 0.66, 0.54, 0.03])
+    array([1.  , 0.66, 0.56, 0.03])
     """
     share = allowed_share(uncertainty, secondary_path)
     if np.all(share == 1.0):
