@@ -44,7 +44,6 @@ MOST_WEIGHTS = 1024  # of all control filters together, unless a length is given
 MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
-HELD_BACK = 0.9  # part of the control filter that an uncertain path allows, below which it holds the control back
 NEARLY_FREE = 1e6  # times the rated power: an amplifier without limits
 
 
@@ -244,7 +243,7 @@ def assess(
         expected_rated_power=required * _price(share_taken(run, limits), bound_share),
         causality_margin_s=None if primary is None else _margin_s(primary, s, fs),
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
-        band=_band(bounds.d, s, allowed_share(secondary_path_uncertainty, s), fs),
+        band=_band(bounds.d, s, 1.0 - allowed_share(secondary_path_uncertainty, s) > 10 ** (-want_db / 20), fs),
         levels=None if pascal_per_unit is None else _levels(run, pascal_per_unit),
         excursion_mm=excursion_mm(ratings, run),
         settings=settings,
@@ -355,7 +354,7 @@ def _coherence_db(x: np.ndarray, d: np.ndarray, fs: float) -> float:
     return coherence_bound(x, d, fs, segment=segment).overall_db
 
 
-def _band(d: np.ndarray, s: np.ndarray, allowed: np.ndarray, fs: float) -> Band:
+def _band(d: np.ndarray, s: np.ndarray, held_back: np.ndarray, fs: float) -> Band:
     """Return where the disturbance is, and which share of it the loudspeakers together hardly reach."""
     frequencies, powers = welch(np.atleast_2d(d), fs, nperseg=min(4096, d.shape[-1]))
     share = powers.sum(axis=0) / powers.sum()
@@ -365,7 +364,7 @@ def _band(d: np.ndarray, s: np.ndarray, allowed: np.ndarray, fs: float) -> Band:
     gain = np.sum([np.abs(frequency_response(one, frequencies, fs=fs)) ** 2 for one in paths], axis=0)
     inside = (frequencies >= low) & (frequencies <= high)
     mean = float(np.mean(gain[inside])) if np.any(inside) else float(gain.max())
-    uncertain = np.interp(frequencies, np.linspace(0.0, fs / 2, allowed.size), allowed) < HELD_BACK
+    uncertain = np.interp(frequencies, np.linspace(0.0, fs / 2, held_back.size), held_back) > 0.5
     return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()), float(share[uncertain].sum()))
 
 

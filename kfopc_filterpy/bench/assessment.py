@@ -80,8 +80,8 @@ class Band:
         Share of the disturbance's power at frequencies at which the secondary path lies more than 20 dB below its mean
         power gain in that band.
     uncertain_share : float
-        Share of the disturbance's power at frequencies at which the uncertainty of the secondary path allows less than 90 %
-        of the control filter.
+        Share of the disturbance's power at frequencies at which the uncertainty of the secondary path allows less than
+        the noise reduction wanted.
     """
 
     low_hz: float
@@ -341,8 +341,8 @@ _REASONS = {
     "causality": "Causality limits: with more time a filter of {taps} taps reaches {time}, in time only {filter}, "
     "with any power.",
     "filter": "The filter limits: {taps} taps reach {filter} with any power, and more time does not help.",
-    "path": "The secondary path limits: a filter of {taps} taps reaches {filter} with any power, but only {path} if it "
-    "must not make the noise louder within the path's uncertainty.",
+    "path": "The secondary path limits: a filter of {taps} taps reaches {filter} with any power, but only {path} if the "
+    "path's uncertainty holds it back.",
     "amplifier": "The amplifier limits: with any power {path} are in reach, with {rated} {power} for a fixed filter.",
     "adaptation": "The adaptation limits: a fixed filter reaches {power} within the rated power, the controller {reached}, "
     "and more power does not help it.",
@@ -379,8 +379,8 @@ def advice_on(verdict: Assessment) -> list[str]:
         ]
     if verdict.limited_by == "path":
         return [
-            f"{verdict.band.uncertain_share:.1%} of the noise lies where the uncertainty of the secondary path holds the "
-            "control back. Measure the path again and state a smaller uncertainty, or use a higher sample rate."
+            f"{verdict.band.uncertain_share:.1%} of the noise lies where the uncertainty of the secondary path allows "
+            f"less than {want}. Measure the path again and state a smaller uncertainty, or use a higher sample rate."
         ]
     if verdict.limited_by == "adaptation":
         return [

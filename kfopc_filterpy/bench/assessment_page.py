@@ -325,7 +325,8 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
         ),
         (
             "Secondary path",
-            f"{band.uncertain_share:.1%} of the noise's power lies where its uncertainty holds the control back",
+            f"{band.uncertain_share:.1%} of the noise's power lies where its uncertainty allows less than "
+            f"{verdict.want_db:g} dB",
         ),
     ]
     if verdict.levels is not None:

@@ -13,7 +13,7 @@ from ..checkpoint import Checkpointed
 from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.uncertainty import GUARD_TAPS, guard_filter
+from ..paths.uncertainty import GUARD_TAPS, as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
@@ -314,14 +314,14 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     @property
     def secondary_path_uncertainty(self) -> Any:
-        """Uncertainty of the secondary path as it was assigned, by default None: the path is exact.
+        """Uncertainty of the secondary path as it was stated; None: the path is exact.
 
         Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
         :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
         LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
         second observation. An uncertainty can be assigned for KF-ANC, KF-OPC, the diagonal Kalman filter and the LMS
         family, with one channel or several; not for the fast-array filter, which takes one observation. `kf_pb` takes
-        it as a setting, and then it is None here.
+        it as a setting, which cannot be changed.
         """
         return deepcopy(self._uncertainty)
 
@@ -335,7 +335,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         lines = self._state.lines
         taps = guard_filter(value, lines.secondary_estimate)
         guard = None if taps is None else self._new_guard(taps)
-        self._uncertainty = deepcopy(value)
+        self._uncertainty = as_uncertainty(value)
         self._state = self._state._replace(lines=lines._replace(guard=guard))
         self._filter_again()
 
@@ -366,7 +366,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def secondary_path(self, path: Any) -> None:
         before = self.secondary_path
         self._lines.secondary_estimate[:] = self._checked_estimate(path)
-        if self._uncertainty is None:
+        if self._uncertainty is None or not self._takes_guard():
             self._filter_again()
         else:  # measured paths, for example, have another distance from the new path
             self.secondary_path_uncertainty = self._uncertainty

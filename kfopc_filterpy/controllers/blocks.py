@@ -6,7 +6,6 @@ what the forms of KF-PB have in common: the blocks, the recent correlation of th
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from .._validate import as_count, as_positive, per_loudspeaker
 from ..kernels.correlation import FadingCorrelation
 from ..kernels.delay_lines import newest
 from ..paths.channels import secondary_paths
-from ..paths.uncertainty import guard_filter
+from ..paths.uncertainty import as_uncertainty, guard_filter
 from ..power.channels import ChannelBudget
 from .base import FilteredReferenceController, listed
 
@@ -59,7 +58,6 @@ class BlockController(FilteredReferenceController):
         limits = np.full(secondary.shape[1], np.inf) if self._rated is None else self._rated
         self._path_weights = np.sqrt(microphone_weights)[:, np.newaxis, np.newaxis]
         guard = guard_filter(secondary_path_uncertainty, secondary)
-        self._tolerance = deepcopy(secondary_path_uncertainty)
         self._budget = ChannelBudget(
             self._path_weights * secondary,
             n_taps,
@@ -76,6 +74,7 @@ class BlockController(FilteredReferenceController):
         )
         keep = np.exp(-1.0 / (self.memory_s * self.fs))
         self._correlation = FadingCorrelation(n_lags, n_references, keep)
+        self._uncertainty = as_uncertainty(secondary_path_uncertainty)
 
     @property
     def rated_power(self) -> np.ndarray | None:
@@ -101,7 +100,7 @@ class BlockController(FilteredReferenceController):
     def _after_new_path(self, before: np.ndarray) -> None:
         """Solve for the new paths from the end of this block on, with a guard if there was one."""
         secondary = self.secondary_path
-        guard = guard_filter(self._tolerance, secondary) if self._budget.n_guard > 1 else None
+        guard = guard_filter(self._uncertainty, secondary) if self._budget.n_guard > 1 else None
         self._budget.use_paths(self._path_weights * secondary, guard)
 
     def samples_to_block(self) -> int:

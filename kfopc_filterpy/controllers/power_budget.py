@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +12,7 @@ from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..kernels.covariance import Covariance
 from ..kernels.delay_lines import latest
-from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, guard_filter
+from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
 from ..power.constraint import ConstraintState, advance_constraint
@@ -102,14 +101,14 @@ class PowerBudgetController(KalmanController):
         As for `KalmanController`; the default name is KF-PB.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
         What the guard of the estimator's budget was made for, see `paths.path_uncertainty`. A new secondary path then
-        gets a guard of its own. By default the guard stays.
+        gets a guard of its own. By default the guard of the budget stays.
 
     Raises
     ------
     TypeError
         An estimator without a power budget.
     ValueError
-        An uncertainty, and a guard in the budget that `paths.guard_filter` did not make.
+        An uncertainty that needs a guard, and a budget whose guard `paths.guard_filter` did not make.
 
     Examples
     --------
@@ -137,12 +136,12 @@ class PowerBudgetController(KalmanController):
     ) -> None:
         super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
         present = estimator.budget.state.guard.size
-        if secondary_path_uncertainty is not None and present != GUARD_TAPS:
+        if guard_filter(secondary_path_uncertainty, self.secondary_path) is not None and present != GUARD_TAPS:
             raise ValueError(
                 f"secondary_path_uncertainty needs a guard of {GUARD_TAPS} taps in the estimator's budget, got {present}: "
                 "make it with paths.guard_filter, or both with kf_pb"
             )
-        self._tolerance = deepcopy(secondary_path_uncertainty)
+        self._uncertainty = as_uncertainty(secondary_path_uncertainty)
 
     def _require_filter(self, estimator: KalmanFilter) -> None:
         if not isinstance(estimator, PowerBudgetKalmanFilter):
@@ -160,8 +159,8 @@ class PowerBudgetController(KalmanController):
     def _after_new_path(self, before: np.ndarray) -> None:
         """Let P grow; measured paths, for example, have another distance from the new path, and so another guard."""
         super()._after_new_path(before)
-        if self._tolerance is not None:
-            self.estimator.budget.use_guard(guard_filter(self._tolerance, self.secondary_path))
+        if self._uncertainty is not None:
+            self.estimator.budget.use_guard(guard_filter(self._uncertainty, self.secondary_path))
 
     def _usual_name(self) -> str:
         return "KF-PB"
@@ -224,7 +223,7 @@ def kf_pb(
         How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default a
         sample of delay. The control filter is weaker where the path is less certain, and almost zero where control
         could make the noise much louder (with a sample of delay, above three eighths of the sample rate; with several
-        channels, above a quarter). None: the path is exact.
+        loudspeakers above a quarter; with more microphones than loudspeakers above a sixth). None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
@@ -288,6 +287,6 @@ def kf_pb(
                 secondary_path,
                 amplifier=amplifier,
                 limiter=limiter,
-                secondary_path_uncertainty=None if guard is None else secondary_path_uncertainty,
+                secondary_path_uncertainty=secondary_path_uncertainty,
             )
     return at_suggested_rate(controller, n_taps)

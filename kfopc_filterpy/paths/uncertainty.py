@@ -11,8 +11,8 @@ If every frequency adapts for itself, it settles if :math:`g\delta < 1`. The noi
 - Within a `PathTolerance`, :math:`1 + \Delta = \rho e^{j\theta}` with a largest phase :math:`\theta`. Then
   :math:`g = \min(1, 0.94/\delta)` up to a phase of 135 degrees, and 0 beyond. With a phase above 90 degrees, some g makes
   the noise louder, by a factor of at most :math:`1/\sin\theta`, whatever :math:`\rho` is. That is 3 dB at 135 degrees.
-  With several paths, whose errors may differ, 90 degrees is the limit.
-- If only :math:`\delta` is known, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
+  With several loudspeakers, 90 degrees is the limit.
+- If only :math:`\delta` is known, or if there are more microphones than loudspeakers, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
   Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the path is known well, and :math:`g\delta` is at
   most 0.62.
 
@@ -36,11 +36,15 @@ N_FREQUENCIES = 257  # from 0 to fs/2
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)
 GUARD_TAPS = 48
 SHARPNESS = 6  # g = 1 - delta^SHARPNESS, if only delta is known
-LARGEST_GAIN = 0.94  # of g delta within a PathTolerance; 48 taps of W add up to 0.02, and from 1 on a loop can diverge
+LARGEST_LOOP_GAIN = 0.94  # of g delta; from 1 on, the adaptation can diverge
+LARGEST_ERROR = 100.0  # delta that is guarded against; a larger penalty would reach too far beyond its frequency
+MOST_PASSES = 50  # of raising a narrow peak
 LEAST_SHARE = 0.03  # g is at least this; a zero would need an infinite penalty
 SMALLEST_PENALTY = 1e-4  # |W|^2 is at least this; a zero would need an infinite impulse response
-LARGEST_PHASE_DEG = 135.0  # that is controlled at; no g makes the noise louder by more than 1/sin, 3 dB
-LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several paths; errors of opposite sign would make it louder by 7 dB beyond
+LARGEST_PHASE_DEG = (
+    135.0  # beyond it, no control; up to it, the noise becomes louder by 1/sin(135 degrees) = 3 dB at most
+)
+LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several loudspeakers, whose errors can differ
 WIDEST_GAIN_DB = 20.0  # of a tolerance; with more, even the least share could make the noise much louder
 
 
@@ -80,7 +84,7 @@ class PathTolerance:
 
     def __post_init__(self) -> None:
         for name in ("delay_samples", "phase_deg", "gain_db"):
-            as_nonnegative(getattr(self, name), name)
+            object.__setattr__(self, name, as_nonnegative(getattr(self, name), name))
         if self.gain_db > WIDEST_GAIN_DB:
             raise ValueError(
                 f"gain_db must be at most {WIDEST_GAIN_DB:g}, got {self.gain_db:g}: a path that is known no better allows "
@@ -92,14 +96,13 @@ class PathTolerance:
         gain = self._largest_gain
         return np.sqrt((gain - 1.0) ** 2 + 4.0 * gain * np.sin(self._largest_phase(omega) / 2.0) ** 2)
 
-    def share(self, omega: np.ndarray, *, n_paths: int = 1) -> np.ndarray:
+    def share(self, omega: np.ndarray, *, largest_phase_deg: float = LARGEST_PHASE_DEG) -> np.ndarray:
         """Return the part g of the control filter that is allowed, from 0 to 1, at `omega` in radians per sample.
 
-        `n_paths` is the number of secondary paths. More than one allow less, because their errors may differ.
+        Where the phase can be wrong by more than `largest_phase_deg`, g is 0.
         """
-        share = LARGEST_GAIN / np.maximum(self.relative_error(omega), LARGEST_GAIN)
-        limit = LARGEST_PHASE_DEG if n_paths == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
-        return np.where(self._largest_phase(omega) <= np.deg2rad(limit), share, 0.0)
+        share = LARGEST_LOOP_GAIN / np.maximum(self.relative_error(omega), LARGEST_LOOP_GAIN)
+        return np.where(self._largest_phase(omega) <= np.deg2rad(largest_phase_deg), share, 0.0)
 
     def _largest_phase(self, omega: np.ndarray) -> np.ndarray:
         return np.minimum(np.deg2rad(self.phase_deg) + self.delay_samples * np.asarray(omega), np.pi)
@@ -145,22 +148,38 @@ def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     array([0.  , 0.28, 0.4 ])
     """
     estimate, _ = secondary_paths(secondary_path)
-    if uncertainty is None:
+    stated = as_uncertainty(uncertainty)
+    if stated is None:
         return np.zeros(N_FREQUENCIES)
-    if isinstance(uncertainty, PathTolerance):
-        return uncertainty.relative_error(OMEGA)
-    if np.ndim(uncertainty) == 0:
-        return np.full(N_FREQUENCIES, as_nonnegative(uncertainty, "secondary_path_uncertainty"))
-    given = as_real_array(uncertainty, "secondary_path_uncertainty")
-    require_finite(given, "secondary_path_uncertainty")
-    if given.ndim > 1:
-        return _distance(given, estimate)
-    if given.size < 2 or np.any(given < 0.0):
+    if isinstance(stated, PathTolerance):
+        return stated.relative_error(OMEGA)
+    if isinstance(stated, float):
+        return np.full(N_FREQUENCIES, stated)
+    if stated.ndim > 1:
+        return _distance(stated, estimate)
+    return np.interp(np.linspace(0.0, 1.0, N_FREQUENCIES), np.linspace(0.0, 1.0, stated.size), stated)
+
+
+def as_uncertainty(value: Any) -> PathTolerance | float | np.ndarray | None:
+    """Return an uncertainty as it is stated, checked, and an array as a copy."""
+    if value is None or isinstance(value, PathTolerance):
+        return value
+    try:
+        stated = as_real_array(value, "secondary_path_uncertainty")
+    except TypeError as error:
+        raise TypeError(
+            f"{error}; give a PathTolerance, a relative error (0.3 is 30 %), relative errors at evenly spaced frequencies "
+            "from 0 to fs/2, or measured paths"
+        ) from error
+    require_finite(stated, "secondary_path_uncertainty")
+    if stated.ndim == 0:
+        return as_nonnegative(float(stated), "secondary_path_uncertainty")
+    if stated.ndim == 1 and (stated.size < 2 or np.any(stated < 0.0)):
         raise ValueError(
             "secondary_path_uncertainty must be zero or above at two or more frequencies from 0 to fs/2, "
-            f"got {given.size} with a minimum of {given.min(initial=np.inf):g}"
+            f"got {stated.size} with a minimum of {stated.min(initial=np.inf):g}; a measured path is (1, n_taps)"
         )
-    return np.interp(np.linspace(0.0, 1.0, N_FREQUENCIES), np.linspace(0.0, 1.0, given.size), given)
+    return stated.copy()
 
 
 def _distance(measured: np.ndarray, estimate: np.ndarray) -> np.ndarray:
@@ -177,7 +196,8 @@ def _distance(measured: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     error = _response(several, OMEGA) - known
     relative = _norm(error @ np.linalg.pinv(known))
     # The second term counts at frequencies at which the estimated path is zero, where the first one is zero too.
-    least = _norm(error) / np.maximum(_norm(known), np.finfo(float).tiny)
+    with np.errstate(over="ignore"):
+        least = _norm(error) / np.maximum(_norm(known), np.finfo(float).tiny)
     return np.maximum(relative, least).max(axis=0)
 
 
@@ -217,7 +237,7 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     -------
     ndarray, shape (48,), or None
         Minimum-phase impulse response with ``|W|^2 = (1 - g)/g``, where g is `PathTolerance.share` or 1 - delta^6, and
-        at least 0.03. None if g is 1 at all frequencies.
+        at least 0.03, or at most 0.94/delta up to a delta of 100. None if g is 1 at all frequencies, whatever the path.
 
     Raises
     ------
@@ -234,26 +254,36 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     array([1.  , 0.66, 0.56, 0.03])
     """
     share = allowed_share(uncertainty, secondary_path)
-    if np.all(share == 1.0):
+    if np.all(share == 1.0) and np.ndim(uncertainty) < 2:  # measured paths may differ from a later estimate
         return None
     share = np.maximum(share, LEAST_SHARE)
-    return _short_filter(np.maximum((1.0 - share) / share, SMALLEST_PENALTY))
+    penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
+    largest = np.minimum(path_uncertainty(uncertainty, secondary_path), LARGEST_ERROR)
+    return _short_filter(penalty, largest / LARGEST_LOOP_GAIN - 1.0)
 
 
 def allowed_share(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     """Return the part g of the control filter that an uncertainty allows, (257,), at evenly spaced frequencies to fs/2."""
-    largest = path_uncertainty(uncertainty, secondary_path)
-    if isinstance(uncertainty, PathTolerance):
-        paths, _ = secondary_paths(secondary_path)
-        return uncertainty.share(OMEGA, n_paths=paths.shape[0] * paths.shape[1])
-    return 1.0 - np.minimum(largest, 1.0) ** SHARPNESS
+    paths, _ = secondary_paths(secondary_path)
+    n_microphones, n_loudspeakers = paths.shape[:2]
+    if isinstance(uncertainty, PathTolerance) and n_microphones <= n_loudspeakers:
+        limit = LARGEST_PHASE_DEG if n_loudspeakers == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
+        return uncertainty.share(OMEGA, largest_phase_deg=limit)
+    return 1.0 - np.minimum(path_uncertainty(uncertainty, secondary_path), 1.0) ** SHARPNESS
 
 
-def _short_filter(power: np.ndarray) -> np.ndarray:
-    """Return the minimum-phase filter whose ``|W|^2`` is a local mean of `power`, which is given from 0 to fs/2.
+def _short_filter(power: np.ndarray, least: np.ndarray) -> np.ndarray:
+    """Return the minimum-phase filter whose ``|W|^2`` is a local mean of `power`, given from 0 to fs/2, and at least `least`.
 
     The spectrum of Bohman's window is nowhere negative. So g does not overshoot where it falls steeply, as it would if W
-    were cut off.
+    were cut off. A narrow peak disappears in the mean, so it is raised until the mean is large enough.
     """
-    correlation = np.fft.irfft(power)[np.abs(np.arange(1 - GUARD_TAPS, GUARD_TAPS))]
-    return np.ascontiguousarray(minimum_phase(correlation * windows.bohman(correlation.size)))
+    lags = np.arange(1 - GUARD_TAPS, GUARD_TAPS)
+    window = windows.bohman(lags.size)
+    for _ in range(MOST_PASSES):
+        correlation = np.fft.irfft(power)[np.abs(lags)] * window
+        short = least / (np.exp(-1j * np.outer(OMEGA, lags)) @ correlation).real
+        if short.max() <= 1.01:
+            break
+        power = power * np.maximum(short, 1.0)
+    return np.ascontiguousarray(minimum_phase(correlation))

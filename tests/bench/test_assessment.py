@@ -106,13 +106,15 @@ def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
 
 
 def test_the_advice_says_how_much_of_the_noise_the_default_uncertainty_holds_back():
-    """White noise: a sample of delay allows less than 90 % from 2 asin(0.94/1.8) = 0.175 of the sample rate on."""
+    """White noise: a sample of delay allows g = 0.94/(2 sin(omega/2)), and 1 - g is what is left of the noise."""
     x = np.random.default_rng(1).standard_normal(round(SECONDS * FS))
     verdict = assess(
         x, arriving(20), arriving(6, length=16), rating=PLENTY, fs=FS, n_taps=TAPS, beside=(), want_db=15.0
     )
     assert verdict.limited_by == "path"
-    assert verdict.band.uncertain_share == pytest.approx(1 - 2 * np.arcsin(0.94 / 1.8) / np.pi, abs=0.01)
+    assert verdict.band.uncertain_share == pytest.approx(
+        1 - 2 * np.arcsin(0.47 / (1 - 10 ** (-15 / 20))) / np.pi, abs=0.01
+    )
     assert verdict.advice[0].startswith(
         f"{verdict.band.uncertain_share:.1%} of the noise lies where the uncertainty of"
     )
