@@ -12,9 +12,9 @@ If every frequency adapts for itself, it settles if :math:`g\delta < 1`. The noi
   :math:`g = \min(1, 0.94/\delta)` up to a phase of 135 degrees, and 0 beyond. With a phase above 90 degrees, some g makes
   the noise louder, by a factor of at most :math:`1/\sin\theta`, whatever :math:`\rho` is. That is 3 dB at 135 degrees.
   With several loudspeakers, 90 degrees is the limit.
-- If only :math:`\delta` is known, or if there are more microphones than loudspeakers, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
-  Therefore :math:`g = 1 - \delta^6`: this costs next to nothing where the path is known well, and :math:`g\delta` is at
-  most 0.62.
+- If only :math:`\delta` is known, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
+  Therefore :math:`g = 1 - \delta^6`, which costs next to nothing where the path is known well; :math:`g\delta` is at most
+  0.62. With more microphones than loudspeakers, the same g is used for a tolerance.
 
 A controller gets this g from a penalty on the control signal through the filter W with :math:`|W|^2 = (1 - g)/g`:
 
@@ -41,9 +41,7 @@ LARGEST_ERROR = 100.0  # delta that is guarded against; a larger penalty would r
 MOST_PASSES = 50  # of raising a narrow peak
 LEAST_SHARE = 0.03  # g is at least this; a zero would need an infinite penalty
 SMALLEST_PENALTY = 1e-4  # |W|^2 is at least this; a zero would need an infinite impulse response
-LARGEST_PHASE_DEG = (
-    135.0  # beyond it, no control; up to it, the noise becomes louder by 1/sin(135 degrees) = 3 dB at most
-)
+LARGEST_PHASE_DEG = 135.0  # up to it, the noise becomes louder by 3 dB at most; beyond it, no control
 LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several loudspeakers, whose errors can differ
 WIDEST_GAIN_DB = 20.0  # of a tolerance; with more, even the least share could make the noise much louder
 
@@ -192,8 +190,8 @@ def _distance(measured: np.ndarray, estimate: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"secondary_path_uncertainty must be {wanted} if it holds M measured paths, got shape {measured.shape}"
         )
-    known = _response(estimate, OMEGA)
-    error = _response(several, OMEGA) - known
+    known = _response(estimate)
+    error = _response(several) - known
     relative = _norm(error @ np.linalg.pinv(known))
     # The second term counts at frequencies at which the estimated path is zero, where the first one is zero too.
     with np.errstate(over="ignore"):
@@ -207,7 +205,7 @@ def relative_to(paths: np.ndarray, squared_error: np.ndarray) -> np.ndarray:
     `squared_error` is (K, J, 257). With several paths the bound is ``||E||_F ||pinv(S^)||`` with the matrix E of the
     errors, as their phases are not known.
     """
-    known = _response(paths, OMEGA)
+    known = _response(paths)
     smallest = np.linalg.svd(known, compute_uv=False)[..., -1]  # 1/||pinv(S^)||
     return np.sqrt(squared_error.sum(axis=(0, 1))) / np.maximum(smallest, np.finfo(float).tiny)
 
@@ -216,9 +214,9 @@ def _norm(matrices: np.ndarray) -> np.ndarray:
     return np.linalg.norm(matrices, ord=2, axis=(-2, -1))
 
 
-def _response(paths: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Return the responses of paths (..., K, J, taps) as matrices (..., n_frequencies, K, J)."""
-    waves = np.exp(-1j * omega[:, np.newaxis] * np.arange(paths.shape[-1]))
+def _response(paths: np.ndarray) -> np.ndarray:
+    """Return the responses of paths (..., K, J, taps) as matrices (..., 257, K, J)."""
+    waves = np.exp(-1j * np.outer(OMEGA, np.arange(paths.shape[-1])))
     return np.moveaxis(paths @ waves.T, -1, -3)
 
 
@@ -229,7 +227,7 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     ----------
     uncertainty : PathTolerance, float or array_like, optional
         Uncertainty of the secondary path, as of `path_uncertainty`. A tolerance allows more control than its
-        relative error, because it limits the phase of the error.
+        relative error, because it limits the phase of the error, unless there are more microphones than loudspeakers.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path.
 
