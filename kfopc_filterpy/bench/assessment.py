@@ -341,8 +341,8 @@ _REASONS = {
     "causality": "Causality limits: with more time a filter of {taps} taps reaches {time}, in time only {filter}, "
     "with any power.",
     "filter": "The filter limits: {taps} taps reach {filter} with any power, and more time does not help.",
-    "path": "The secondary path limits: a filter of {taps} taps reaches {filter} with any power, but only {path} if the "
-    "path's uncertainty holds it back.",
+    "path": "The secondary path limits: a filter of {taps} taps reaches {filter} with any power, but only {path} if it "
+    "is held back because the path is uncertain.",
     "amplifier": "The amplifier limits: with any power {path} are in reach, with {rated} {power} for a fixed filter.",
     "adaptation": "The adaptation limits: a fixed filter reaches {power} within the rated power, the controller {reached}, "
     "and more power does not help it.",

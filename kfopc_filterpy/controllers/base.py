@@ -128,6 +128,18 @@ class WrappedController(BlockProcessing, Checkpointed):
         """Give a new path to the inner controller; a wrapper that knows the path itself extends this."""
         self.controller.secondary_path = path  # type: ignore[attr-defined]
 
+    @property
+    def secondary_path_uncertainty(self) -> Any:
+        """Uncertainty of the secondary path of the inner controller; can be assigned if the inner controller's can."""
+        return self.controller.secondary_path_uncertainty  # type: ignore[attr-defined]
+
+    @secondary_path_uncertainty.setter
+    def secondary_path_uncertainty(self, value: Any) -> None:
+        self._take_uncertainty(value)
+
+    def _take_uncertainty(self, value: Any) -> None:
+        self.controller.secondary_path_uncertainty = value  # type: ignore[attr-defined]
+
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if a part of the wrapper or the controller is for another sample rate than `fs` in Hz."""
         require_rates(fs, self._rates())
@@ -329,8 +341,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def secondary_path_uncertainty(self, value: Any) -> None:
         if not self._takes_guard():
             raise ValueError(
-                f"{self.name} takes no secondary_path_uncertainty: use kf_pb(..., secondary_path_uncertainty=...), or "
-                "KF-ANC, KF-OPC, the diagonal Kalman filter or an LMS algorithm"
+                f"no secondary_path_uncertainty can be assigned to {self.name}: make it with "
+                "kf_pb(..., secondary_path_uncertainty=...), or use KF-ANC, KF-OPC, the diagonal Kalman filter or an LMS "
+                "algorithm"
             )
         lines = self._state.lines
         taps = guard_filter(value, lines.secondary_estimate)

@@ -14,7 +14,7 @@ from .._validate import as_count, as_positive, per_loudspeaker
 from ..kernels.correlation import FadingCorrelation
 from ..kernels.delay_lines import newest
 from ..paths.channels import secondary_paths
-from ..paths.uncertainty import as_uncertainty, guard_filter
+from ..paths.uncertainty import as_uncertainty, guard_filter, path_uncertainty
 from ..power.channels import ChannelBudget
 from .base import FilteredReferenceController, listed
 
@@ -57,7 +57,8 @@ class BlockController(FilteredReferenceController):
         self._rated = None if rated_power is None else per_loudspeaker(rated_power, secondary.shape[1], "rated_power")
         limits = np.full(secondary.shape[1], np.inf) if self._rated is None else self._rated
         self._path_weights = np.sqrt(microphone_weights)[:, np.newaxis, np.newaxis]
-        guard = guard_filter(secondary_path_uncertainty, secondary)
+        self._heard = np.asarray(microphone_weights) > 0.0  # the microphones that count
+        self._uncertainty = as_uncertainty(secondary_path_uncertainty)
         self._budget = ChannelBudget(
             self._path_weights * secondary,
             n_taps,
@@ -65,7 +66,7 @@ class BlockController(FilteredReferenceController):
             n_references,
             limits,
             as_positive(averaging_s, "averaging_s", unit="s") * self.fs / self.block,
-            guard,
+            self._guard_for(secondary),
         )
         n_lags = self._budget.n_lags
         self._past = max(history, n_lags - 1 + self.block)  # samples of the references that a block needs
@@ -74,7 +75,6 @@ class BlockController(FilteredReferenceController):
         )
         keep = np.exp(-1.0 / (self.memory_s * self.fs))
         self._correlation = FadingCorrelation(n_lags, n_references, keep)
-        self._uncertainty = as_uncertainty(secondary_path_uncertainty)
 
     @property
     def rated_power(self) -> np.ndarray | None:
@@ -100,8 +100,16 @@ class BlockController(FilteredReferenceController):
     def _after_new_path(self, before: np.ndarray) -> None:
         """Solve for the new paths from the end of this block on, with a guard if there was one."""
         secondary = self.secondary_path
-        guard = guard_filter(self._uncertainty, secondary) if self._budget.n_guard > 1 else None
+        guard = self._guard_for(secondary) if self._budget.n_guard > 1 else None
         self._budget.use_paths(self._path_weights * secondary, guard)
+
+    def _guard_for(self, secondary: np.ndarray) -> np.ndarray | None:
+        """Return the guard filter for secondary paths (K, J, n_path), or None."""
+        stated = self._uncertainty
+        path_uncertainty(stated, secondary)  # refuses measured paths of other channels
+        if isinstance(stated, np.ndarray) and stated.ndim == 4:
+            stated = stated[:, self._heard]
+        return guard_filter(stated, secondary[self._heard])
 
     def samples_to_block(self) -> int:
         """Return the number of samples until the end of the block."""

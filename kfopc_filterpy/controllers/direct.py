@@ -294,7 +294,7 @@ class DirectPowerBudget(BlockController):
     rated_power : float or array_like, shape (J,)
         Rated power of each loudspeaker.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay, None: the
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay. None: the
         paths are exact.
     memory_s : float, default 0.5
         Memory of the correlation of the references in seconds.

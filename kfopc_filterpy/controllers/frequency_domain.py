@@ -82,7 +82,7 @@ class FrequencyDomainKalman(PrimaryPathController):
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay, None: the
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay. None: the
         paths are exact.
     path_memory_s : float, optional
         Time in seconds over which the primary paths are averaged; by default 1 s, or the duration of 16 primary paths

@@ -160,6 +160,10 @@ class MonitoredController(WrappedController):
         # This one takes over after a silence.
         self._fresh.secondary_path = path  # type: ignore[attr-defined]
 
+    def _take_uncertainty(self, value: Any) -> None:
+        super()._take_uncertainty(value)
+        self._fresh.secondary_path_uncertainty = value  # type: ignore[attr-defined]
+
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest `reference` x(n), or silence."""
         self._newest = reference

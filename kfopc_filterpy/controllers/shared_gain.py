@@ -92,7 +92,7 @@ class SharedGainKalman(PrimaryPathController):
     n_primary : int, optional
         Taps L_p of the estimated primary paths; by default ``n_taps`` plus the taps of the secondary paths.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay, None: the
+        Uncertainty of the secondary paths, see `paths.path_uncertainty`; by default a sample of delay. None: the
         paths are exact.
     path_memory_s : float, default 1
         Time in seconds over which the primary paths are averaged: a longer one is more exact, a shorter one follows

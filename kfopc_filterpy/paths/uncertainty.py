@@ -5,16 +5,16 @@ g times the best one for the disturbance estimate :math:`\hat d = e + \hat s * y
 
 .. math:: E = D\,\frac{1 - g}{1 + g\Delta}
 
-If every frequency adapts for itself, it settles if :math:`g\delta < 1`. The noise is not louder than without control if
+If the frequencies adapt independently, each settles if :math:`g\delta < 1`. The noise is not louder than without control if
 :math:`|1 + g\Delta| \ge 1 - g`. The part g of the control filter that is allowed:
 
 - Within a `PathTolerance`, :math:`1 + \Delta = \rho e^{j\theta}` with a largest phase :math:`\theta`. Then
   :math:`g = \min(1, 0.94/\delta)` up to a phase of 135 degrees, and 0 beyond. With a phase above 90 degrees, some g makes
   the noise louder, by a factor of at most :math:`1/\sin\theta`, whatever :math:`\rho` is. That is 3 dB at 135 degrees.
   With several loudspeakers, 90 degrees is the limit.
-- If only :math:`\delta` is known, the phase of the error can be any, and only g = 0 is safe where :math:`\delta > 1`.
+- If only :math:`\delta` is known, the phase of the error can be anything, and only g = 0 is safe where :math:`\delta > 1`.
   Therefore :math:`g = 1 - \delta^6`, which costs next to nothing where the path is known well; :math:`g\delta` is at most
-  0.62. With more microphones than loudspeakers, the same g is used for a tolerance.
+  0.62, up to a :math:`\delta` of 100. With more microphones than loudspeakers, the same g is used for a tolerance.
 
 A controller gets this g from a penalty on the control signal through the filter W with :math:`|W|^2 = (1 - g)/g`:
 
@@ -36,10 +36,12 @@ N_FREQUENCIES = 257  # from 0 to fs/2
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)
 GUARD_TAPS = 48
 SHARPNESS = 6  # g = 1 - delta^SHARPNESS, if only delta is known
-LARGEST_LOOP_GAIN = 0.94  # of g delta; from 1 on, the adaptation can diverge
+LARGEST_LOOP_GAIN = 0.94  # g delta within a tolerance; from 1 on, the adaptation can diverge
+LARGEST_LOOP_GAIN_OF_SIZE = 0.62  # g delta if only delta is known: the maximum of delta (1 - delta^6)
 LARGEST_ERROR = 100.0  # delta that is guarded against; a larger penalty would reach too far beyond its frequency
 MOST_PASSES = 50  # of raising a narrow peak
-LEAST_SHARE = 0.03  # g is at least this; a zero would need an infinite penalty
+LEAST_SHARE = 0.03  # where g should be 0; a zero would need an infinite penalty
+LEAST_LOOP_GAIN = 0.3  # g delta where that is less; the noise becomes louder by 1/(1 - 0.3) = 3.1 dB at most
 SMALLEST_PENALTY = 1e-4  # |W|^2 is at least this; a zero would need an infinite impulse response
 LARGEST_PHASE_DEG = 135.0  # up to it, the noise becomes louder by 3 dB at most; beyond it, no control
 LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several loudspeakers, whose errors can differ
@@ -234,8 +236,9 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     Returns
     -------
     ndarray, shape (48,), or None
-        Minimum-phase impulse response with ``|W|^2 = (1 - g)/g``, where g is `PathTolerance.share` or 1 - delta^6, and
-        at least 0.03, or at most 0.94/delta up to a delta of 100. None if g is 1 at all frequencies, whatever the path.
+        Minimum-phase impulse response with ``|W|^2 = (1 - g)/g``, where g is `PathTolerance.share` or 1 - delta^6. A
+        smaller g is raised to 0.03, or to 0.3/delta if delta is above 10. A delta above 100 counts as 100. None if g
+        is 1 at all frequencies, whatever the path.
 
     Raises
     ------
@@ -254,20 +257,26 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     share = allowed_share(uncertainty, secondary_path)
     if np.all(share == 1.0) and np.ndim(uncertainty) < 2:  # measured paths may differ from a later estimate
         return None
-    share = np.maximum(share, LEAST_SHARE)
-    penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
     largest = np.minimum(path_uncertainty(uncertainty, secondary_path), LARGEST_ERROR)
-    return _short_filter(penalty, largest / LARGEST_LOOP_GAIN - 1.0)
+    share = np.maximum(share, np.minimum(LEAST_SHARE, LEAST_LOOP_GAIN / np.maximum(largest, 1.0)))
+    penalty = np.maximum((1.0 - share) / share, SMALLEST_PENALTY)
+    loop_gain = LARGEST_LOOP_GAIN if _knows_phase(uncertainty, secondary_path) else LARGEST_LOOP_GAIN_OF_SIZE
+    return _short_filter(penalty, largest / loop_gain - 1.0)
 
 
 def allowed_share(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     """Return the part g of the control filter that an uncertainty allows, (257,), at evenly spaced frequencies to fs/2."""
     paths, _ = secondary_paths(secondary_path)
-    n_microphones, n_loudspeakers = paths.shape[:2]
-    if isinstance(uncertainty, PathTolerance) and n_microphones <= n_loudspeakers:
-        limit = LARGEST_PHASE_DEG if n_loudspeakers == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
+    if _knows_phase(uncertainty, secondary_path):
+        limit = LARGEST_PHASE_DEG if paths.shape[1] == 1 else LARGEST_PHASE_OF_SEVERAL_DEG
         return uncertainty.share(OMEGA, largest_phase_deg=limit)
     return 1.0 - np.minimum(path_uncertainty(uncertainty, secondary_path), 1.0) ** SHARPNESS
+
+
+def _knows_phase(uncertainty: Any, secondary_path: Any) -> bool:
+    """Return whether the phase of the error is limited, and errors at one microphone do not disturb another one."""
+    n_microphones, n_loudspeakers = secondary_paths(secondary_path)[0].shape[:2]
+    return isinstance(uncertainty, PathTolerance) and n_microphones <= n_loudspeakers
 
 
 def _short_filter(power: np.ndarray, least: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
+from kfopc_filterpy.controllers import MonitoredController
 from kfopc_filterpy.paths import PathTolerance, guard_filter, path_uncertainty
 from kfopc_filterpy.signals import band_limited_noise, tone
 
@@ -319,12 +320,40 @@ def test_what_takes_no_uncertainty_says_what_does() -> None:
         KalmanController(KFOPC(dim_x=4, dim_z=1), TRUE),
     ):
         before = controller.secondary_path_uncertainty
-        with pytest.raises(ValueError, match="takes no secondary_path_uncertainty"):
+        with pytest.raises(ValueError, match="no secondary_path_uncertainty can be assigned to"):
             controller.secondary_path_uncertainty = 0.1
         assert controller.secondary_path_uncertainty == before == (TOLERANCE if "KF-PB" in controller.name else None)
+        monitored = MonitoredController(controller, fs=FS)
+        with pytest.raises(ValueError, match="no secondary_path_uncertainty can be assigned to"):
+            monitored.secondary_path_uncertainty = 0.1
     with pytest.raises(ValueError, match="must not be negative"):
         kf_anc(4, TRUE, **settings).secondary_path_uncertainty = -1.0
     guarded = kf_anc(4, TRUE, **settings)
     guarded.secondary_path_uncertainty = 0.1
     with pytest.raises(ValueError, match="has a secondary-path uncertainty, which scenarios do not run"):
         simulate_scenarios([guarded], np.ones(50), disturbance=np.ones(50), secondary_path=TRUE, fs=FS)
+
+
+@pytest.mark.parametrize("measured", [False, True], ids=["tolerance", "measured"])
+def test_microphones_without_weight_do_not_count_for_the_guard(measured: bool) -> None:
+    """Virtual microphones, for example: four are known, two are controlled by two loudspeakers."""
+    rng = np.random.default_rng(3)
+    paths = rng.standard_normal((4, 2, 5))
+    uncertainty = paths + 0.1 * rng.standard_normal((3, 4, 2, 5)) if measured else TOLERANCE
+    of_all = kf_pb(8, paths, rated_power=1.0, microphone_weights=[0, 0, 1, 1], secondary_path_uncertainty=uncertainty)
+    of_two = uncertainty[:, 2:] if isinstance(uncertainty, np.ndarray) else uncertainty
+    alone = kf_pb(8, paths[2:], rated_power=1.0, secondary_path_uncertainty=of_two)
+    np.testing.assert_allclose(of_all._budget._guarded, alone._budget._guarded, rtol=1e-12)  # type: ignore[union-attr]
+    if measured:
+        with pytest.raises(ValueError, match=r"must be \(M, 4, 2, n_taps\) if it holds M measured paths"):
+            kf_pb(8, paths, rated_power=1.0, microphone_weights=[0, 0, 1, 1], secondary_path_uncertainty=of_two)
+
+
+def test_an_uncertainty_assigned_to_a_wrapper_reaches_the_controller() -> None:
+    """And the copy that a monitor starts again with."""
+    monitored = MonitoredController(kf_anc(4, TRUE, state_noise=0.0, measurement_noise=0.1), fs=FS)
+    assert monitored.secondary_path_uncertainty is None
+    monitored.secondary_path_uncertainty = 0.1
+    assert monitored.secondary_path_uncertainty == 0.1
+    for inner in (monitored.controller, monitored._fresh):
+        assert inner.secondary_path_uncertainty == 0.1  # type: ignore[attr-defined]
