@@ -156,8 +156,11 @@ class _Page:
         self._run()
 
     def _changed(self, name: str, attribute: str, old: Any, new: Any) -> None:
-        """Run again, now or after the run that is under way: a slider that is dragged sends more values than can be run."""
-        if self._is_filling:
+        """Run again, now or after the run that is under way: a slider that is dragged sends more values than can be run.
+
+        A control that is disabled does not count for the run. The page itself moves it, and Bokeh tells of that late.
+        """
+        if self._is_filling or self.controls[name].disabled:
             return
         if name == "setup":
             self.setup = self.setups[int(new)]
@@ -253,7 +256,6 @@ class _Page:
         kind = self.controls["rating_kind"].active
         absolute, relative = self.controls["absolute_rating"], self.controls["relative_rating"]
         rated, full = (float(decibels(power)) for power in (result.rated_power, result.full_power))
-        self._is_filling = True
         if self._is_new_setup:
             absolute.update(start=round(full) - 40, end=round(full) + 20)
             self._is_new_setup = False
@@ -261,7 +263,6 @@ class _Page:
             absolute.value = float(np.clip(round(rated, 1), absolute.start, absolute.end))
         else:
             relative.value = float(np.clip(round(rated - full, 1), relative.start, relative.end))
-        self._is_filling = False
 
 
 def curves(result: ExploreResult) -> dict[str, dict[str, np.ndarray]]:

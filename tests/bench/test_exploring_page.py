@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -218,23 +219,50 @@ def test_a_fixed_rating_stays_while_the_noise_gets_louder(address, browser):
     assert browser.execute_script(f"{value}.value", "relative_rating") == pytest.approx(relative - 1.0, abs=0.11)
 
 
-def test_what_cannot_be_computed_is_said_in_the_page():
+class Now:
+    """A pool that runs what it is given at once, and counts it."""
+
+    def __init__(self):
+        self.runs = 0
+
+    def submit(self, job, *arguments):
+        self.runs += 1
+        done = Future()
+        try:
+            done.set_result(job(*arguments))
+        except ValueError as error:
+            done.set_exception(error)
+        return done
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["relative", "absolute"])
+def test_a_move_is_run_once_although_the_page_then_moves_the_other_rating(kind):
     from bokeh.document import Document
 
     from kfopc_filterpy.bench.exploring_page import _Page
 
-    class Now:
-        """A pool that runs what it is given at once."""
+    setup, pool = explore_setups()[0], Now()
+    page = _Page(Document(), [setup], pool)
 
-        def submit(self, job, *arguments):
-            from concurrent.futures import Future
+    def show():  # as the server does when a run has ended
+        page._show(Now().submit(explore, setup, page._settings()), 0.0)
 
-            done = Future()
-            try:
-                done.set_result(job(*arguments))
-            except ValueError as error:
-                done.set_exception(error)
-            return done
+    page.open()
+    show()
+    page.controls["rating_kind"].active = kind
+    show()
+    own, other = ("relative_rating", "absolute_rating")[:: 1 - 2 * kind]
+    before, pool.runs = page.controls[other].value, 0
+    page.controls[own].value -= 1.0
+    show()
+    assert page.controls[other].value == pytest.approx(before - 1.0)
+    assert pool.runs == 1
+
+
+def test_what_cannot_be_computed_is_said_in_the_page():
+    from bokeh.document import Document
+
+    from kfopc_filterpy.bench.exploring_page import _Page
 
     t = np.arange(16000) / 8000
     silent_above = np.round(np.sin(2 * np.pi * 100 * t), 3) * (t > 0)
