@@ -523,6 +523,9 @@ def _further() -> Iterator[Quote]:
     yield quote(tolerance, "it is {:.0f} of {:.0f} runs too", "With the error stated as a tolerance KF-PB", 0, 1)
     yield quote(tolerance, "costs {:.2f} dB on average and {:.2f} dB at most if the noise", f"{cost} noises", 0, 1)
     yield quote(tolerance, "it costs {:.2f} dB on average and {:.2f} dB at most.", f"{cost} white", 0, 1)
+    yield quote(
+        tolerance, "{:.2f} dB are lost on average and {:.2f} dB at most, white", "With a path that was identified", 0, 1
+    )
     steady, recorded = "On steady noise KF-PB reaches", "On recordings KF-PB reaches"
     room = "multichannel"
     yield quote(room, "KF-PB is {:.2f} dB below the bound on average and {:.2f} dB at worst; on the", steady, 0, 1)

@@ -11,15 +11,17 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, Verdict, run_setting
-from kfopc_filterpy.paths import PathTolerance, path_taps, perturbed_path
+from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 from .cases import (
     FS,
     SEED,
+    SENSOR_NOISE_DB,
     SWITCH_ON_S,
     Noise,
+    Pair,
     WindowRow,
     figures_of,
     grid_runs,
@@ -39,7 +41,6 @@ WIDE_HZ, HIGH_TONE_HZ = (100.0, 6000.0), 4000.0
 LOW = ("compressor", "band noise", "motor")  # their power lies below a sixth of the sample rate
 BEYOND = ("white",)  # its power reaches beyond three eighths of the sample rate
 ERRORS: dict[str, dict[str, float]] = {  # of the estimate
-    "exact": {},
     "a sample late": {"delay_samples": 1.0},
     "a sample early": {"delay_samples": -1.0},
     "3 dB too high": {"gain_db": 3.0},
@@ -47,9 +48,12 @@ ERRORS: dict[str, dict[str, float]] = {  # of the estimate
     "45 degrees ahead": {"phase_deg": 45.0},
     "45 degrees behind": {"phase_deg": -45.0},
 }
+EXACT, IDENTIFIED = "exact", "identified"
+IDENTIFICATION_S = 5.0
 NO_GUARD, DEFAULT, STATED = "no guard", "default", "stated"
 GUARDS = (NO_GUARD, DEFAULT, STATED)
 COST_DB = 0.5
+Knowledge = tuple[np.ndarray, Any]  # taps of the estimate, and what is stated of its uncertainty
 BOTTOM_DB = -8.0  # of the figure
 
 
@@ -73,7 +77,7 @@ def main(runs: Runs) -> StudyReport:
     rows: list[GuardRow] = []
     settings = {}
     for path, pair in pairs.items():
-        estimates = {error: path_taps(perturbed_path(pair[1], fs=FS, **own)) for error, own in ERRORS.items()}
+        estimates = known_paths(pair)
         for noise, make in study_noises().items():
             scene = make_case(pair, make(DURATION_S + SWITCH_ON_S, SEED), n_taps=N_TAPS)
             scene = replace(scene, rated_power=RATED_SHARE * scene.unconstrained_power)
@@ -85,8 +89,9 @@ def main(runs: Runs) -> StudyReport:
         title="A secondary path that is known within a tolerance",
         summary=(
             f"KF-PB at {100 * RATED_SHARE:g} % of the power that the unconstrained filter needs. Its estimate of the "
-            "secondary path is a sample, 3 dB or 45 degrees off at all frequencies. Without a guard it takes the "
-            "estimate for exact; by default it allows for a sample of delay; stated is the error as it is."
+            "secondary path is a sample, 3 dB or 45 degrees off at all frequencies, or was identified. Without a guard it "
+            "takes the estimate for exact; by default it allows for a sample of delay; stated is the error as it is, or "
+            "the uncertainty that the identification returned."
         ),
         fs=FS,
         rated_power=RATED_SHARE,
@@ -94,6 +99,7 @@ def main(runs: Runs) -> StudyReport:
         | {
             "duration_s": Parameter(DURATION_S, "from switch-on on"),
             "errors": Parameter(ERRORS, "of the estimate: samples of delay, dB and degrees"),
+            "identification_s": Parameter(IDENTIFICATION_S, "of white noise, for the estimate that is identified"),
             "wide_band_hz": Parameter(list(WIDE_HZ), "up to three eighths of the sample rate"),
             "high_tone_hz": Parameter(HIGH_TONE_HZ, "a quarter of the sample rate: a sample is 90 degrees"),
             "seed": Parameter(SEED, "of noise and sensor noise"),
@@ -124,19 +130,40 @@ def study_noises() -> dict[str, Noise]:
     }
 
 
+def known_paths(pair: Pair) -> dict[str, Knowledge]:
+    """Return the estimates of the secondary path, by what is wrong with them."""
+    secondary = pair[1]
+    found = identify_secondary_path(
+        secondary,
+        n_taps=secondary.size,
+        duration_s=IDENTIFICATION_S,
+        rng=SEED,
+        fs=FS,
+        sensor_noise_std=float(np.sqrt(np.sum(secondary**2)) * 10 ** (SENSOR_NOISE_DB / 20)),
+    )
+    wrong = {error: path_taps(perturbed_path(secondary, fs=FS, **own)) for error, own in ERRORS.items()}
+    return {
+        EXACT: (secondary, None),
+        IDENTIFIED: (found.taps, found.uncertainty),
+        **{error: (taps, stated(error)) for error, taps in wrong.items()},
+    }
+
+
 def jobs() -> list[tuple[str, str]]:
     """Return what is run of each case: error of the estimate and guard. Nothing is to be stated of an exact path."""
-    return [(error, guard) for error in ERRORS for guard in GUARDS if ERRORS[error] or guard != STATED]
+    wrong = [(error, guard) for error in (IDENTIFIED, *ERRORS) for guard in GUARDS]
+    return [(EXACT, NO_GUARD), (EXACT, DEFAULT), *wrong]
 
 
 def run_job(
-    scene: Scene, estimates: Mapping[str, np.ndarray], best: Tuned | None, path: str, noise: str, job: tuple[str, str]
+    scene: Scene, estimates: Mapping[str, Knowledge], best: Tuned | None, path: str, noise: str, job: tuple[str, str]
 ) -> GuardRow:
     """Run KF-PB with an estimate and a guard."""
     error, guard = job
     place: dict[str, Any] = {"path": path, "noise": noise, "algorithm": ALGORITHM, "error": error, "guard": guard}
-    tolerance = {NO_GUARD: None, DEFAULT: ONE_SAMPLE, STATED: stated(error)}[guard]
-    known = replace(scene, secondary_estimate=estimates[error], secondary_path_uncertainty=tolerance)
+    estimate, uncertainty = estimates[error]
+    allowed = {NO_GUARD: None, DEFAULT: ONE_SAMPLE, STATED: uncertainty}[guard]
+    known = replace(scene, secondary_estimate=estimate, secondary_path_uncertainty=allowed)
     result = None if best is None else run_setting(known, ALGORITHM, best.setting)
     row = GuardRow(**place, **figures_of(result, scene.rated_power))
     if result is None or row.diverged_at_s is not None:
@@ -166,6 +193,7 @@ def verdicts(rows: Sequence[GuardRow]) -> list[Verdict]:
         *(_never_louder(rows, guard) for guard in (DEFAULT, STATED)),
         _cost(rows, False),
         _cost(rows, True),
+        _cost_identified(rows),
     ]
 
 
@@ -182,7 +210,7 @@ def _never_louder(rows: Iterable[GuardRow], guard: str) -> Verdict:
         DEFAULT: "With its default guard KF-PB makes the noise louder in no second after the first",
         STATED: "With the error stated as a tolerance KF-PB makes the noise louder in no second after the first",
     }
-    wrong = [row for row in rows if row.error != "exact"]
+    wrong = [row for row in rows if row.error != EXACT]
     own, bare = ([row for row in wrong if row.guard == one] for one in (guard, NO_GUARD))
     louder, bare_louder = ([row for row in some if not _value(row) >= 0.0] for some in (own, bare))
     worst, bare_worst = min(own, key=_value), min(bare, key=_value)
@@ -195,16 +223,27 @@ def _never_louder(rows: Iterable[GuardRow], guard: str) -> Verdict:
     )
 
 
-def _cost(rows: Iterable[GuardRow], beyond: bool) -> Verdict:
-    exact = [row for row in rows if row.error == "exact" and (row.noise in BEYOND) == beyond]
-    bare = {row.case: row.noise_reduction_db for row in exact if row.guard == NO_GUARD}
-    costs = {str(row.case): bare[row.case] - row.noise_reduction_db for row in exact if row.guard == DEFAULT}
+def _cost(rows: Sequence[GuardRow], beyond: bool) -> Verdict:
+    some = [row for row in rows if (row.noise in BEYOND) == beyond]
+    noise = "white noise" if beyond else "noises below three eighths of the sample rate"
+    return _cost_of(some, EXACT, DEFAULT, f"With an exact path the default guard costs at most {COST_DB:g} dB, {noise}")
+
+
+def _cost_identified(rows: Iterable[GuardRow]) -> Verdict:
+    words = f"With a path that was identified and the uncertainty that came with it, at most {COST_DB:g} dB are lost"
+    return _cost_of(rows, IDENTIFIED, STATED, words)
+
+
+def _cost_of(rows: Iterable[GuardRow], error: str, guard: str, words: str) -> Verdict:
+    """Return a verdict on what is lost in comparison with an exact path and no guard."""
+    reduction = {(row.case, row.error, row.guard): row.noise_reduction_db for row in rows}
+    cases = {case: None for case, *_ in reduction}
+    costs = {str(case): reduction[case, EXACT, NO_GUARD] - reduction[case, error, guard] for case in cases}
     where = max(costs, key=lambda case: costs[case])
     return Verdict(
-        f"With an exact path the default guard costs at most {COST_DB:g} dB, "
-        + ("white noise" if beyond else "noises below three eighths of the sample rate"),
+        words,
         bool(np.max(list(costs.values())) <= COST_DB),  # NaN, of a run that diverged, counts as the largest
-        f"{np.mean(list(costs.values())):.2f} dB on average, {costs[where]:.2f} dB at most ({where})",
+        f"{np.mean(list(costs.values())):z.2f} dB on average, {costs[where]:z.2f} dB at most ({where})",
     )
 
 
@@ -216,8 +255,8 @@ def _notes(pairs: Mapping[str, Any], rows: Sequence[GuardRow]) -> list[str]:
         "half, whatever is wrong with the estimate.",
         "The default guard weakens the control above a sixth of the sample rate and leaves almost none above three eighths, "
         "where a path a sample early or late could make a tone louder by more than 3 dB. That costs noise reduction if "
-        "much of the noise is there and the path is exact after all. A path that is known better deserves a smaller "
-        "tolerance.",
+        "much of the noise is there and the path is exact after all. State what is known of the path then.",
+        f"The identification hears {IDENTIFICATION_S:g} s of white noise, {-SENSOR_NOISE_DB:g} dB above the microphone's noise.",
         "A constant phase error cannot be had at all frequencies with a causal estimate; it is fitted from 0.01 to 0.45 "
         "of the sample rate.",
         "There is one seed and one record for each case.",
@@ -237,20 +276,20 @@ def _table(stem: str, caption: str, rows: Sequence[GuardRow], figure: str) -> Ta
 
 def _figure(rows: Sequence[GuardRow]) -> FigureItem:
     """Return a figure of the worst seconds: a panel for each pair of paths, a group for each error."""
-    names = list(dict.fromkeys(row.path for row in rows))
+    names, estimates = list(dict.fromkeys(row.path for row in rows)), [EXACT, IDENTIFIED, *ERRORS]
     figure, axes = new_figure((10.5, 4.2), 1, len(names), sharey=True)
     markers = {NO_GUARD: ("x", "C3"), DEFAULT: ("o", "C0"), STATED: ("^", "C2")}
     bottom = max(BOTTOM_DB, min(_value(row) for row in rows))
     for ax, path in zip(axes[0], names, strict=True):
         for place, guard in enumerate(GUARDS):
             own = [row for row in rows if (row.path, row.guard) == (path, guard)]
-            x = [list(ERRORS).index(row.error) + 0.25 * (place - 1) for row in own]
+            x = [estimates.index(row.error) + 0.25 * (place - 1) for row in own]
             marker, colour = markers[guard]
             ax.plot(
                 x, [max(_value(row), bottom) for row in own], marker, color=colour, markersize=5, alpha=0.8, label=guard
             )
         ax.axhline(0.0, color=MARK, linewidth=1)
-        ax.set_xticks(range(len(ERRORS)), list(ERRORS), rotation=40, ha="right", fontsize="small")
+        ax.set_xticks(range(len(estimates)), estimates, rotation=40, ha="right", fontsize="small")
         ax.set_title(path)
         ax.grid(True, axis="y", alpha=0.3)
     axes[0, 0].set_ylabel("Worst second: noise reduction (dB)")

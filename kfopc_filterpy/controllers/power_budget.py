@@ -223,7 +223,8 @@ def kf_pb(
         How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default a
         sample of delay. The control filter is weaker where the path is less certain, and almost zero where control
         could make the noise much louder (with a sample of delay, above three eighths of the sample rate; with several
-        loudspeakers above a quarter; with more microphones than loudspeakers above a sixth). None: the path is exact.
+        loudspeakers above a quarter; with more microphones than loudspeakers above a sixth). If you have identified the
+        path, pass the `uncertainty` of the result, which costs next to nothing. None: the path is exact.
     form : {"direct", "shared gain", "frequency domain"}, optional
         "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
         estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
