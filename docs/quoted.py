@@ -151,7 +151,7 @@ def _tonal() -> Iterator[Quote]:
     )
     most = ("largest_weight_over_optimal", "peak_control_signal", "output_power")
     yield quote(
-        "With the most of the grid it is {:.0f} times the optimal weight, the control signal goes up to {:.0f}, and the output "
+        "With the largest state noise of the grid it is {:.0f} times the optimal weight, the control signal goes up to {:.0f}, and the output "
         "power is {:.0f} times the rated power",
         lambda r: [r.extra("tonal", "with_most_state_noise", "KF-ANC", key) for key in most],
     )
@@ -276,7 +276,7 @@ def _duct() -> Iterator[Quote]:
     yield quote("With the motor these gains are {:.3f} and {:.3f}", ("duct-motor",), lambda r: gains(r, "duct-motor"))
     kalman = ("KF-OPC", "KF-PB")
     yield quote(
-        "A rated power that is {:.1f} times too high for the amplifier is not a constraint. KF-PB keeps {:.2f} of",
+        "An output power of {:.1f} times the rated power means that the constraint fails. KF-PB keeps {:.2f} of",
         ("duct-measured",),
         lambda r: of(r, "duct-measured", "power", algorithms=kalman),
     )
@@ -361,7 +361,7 @@ def _constraint() -> Iterator[Quote]:
         lambda r: [r.said("constraint", "8 seconds after a jump")[i] for i in (1, 2, 0)],
     )
     yield quote(
-        "Behind the limiter, KF-PB reduces the noise by {:.2f} dB more than KF-OPC on average, and by {:.2f} dB less at worst",
+        "With the limiter, KF-PB reduces the noise by {:.2f} dB more than KF-OPC on average, and by {:.2f} dB less at worst",
         lambda r: [abs(number) for number in r.said("constraint", "Behind the limiter KF-PB")[:2]],
     )
     yield quote(

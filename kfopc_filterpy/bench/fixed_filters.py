@@ -71,7 +71,7 @@ class FixedFilters:
         return later.solution(replace(self.correlations, cross=later.cross()).weights()).noise_reduction_db
 
     def helpful_delay_s(self, want_db: float) -> float | None:
-        """Return the shortest time ahead tried that is enough."""
+        """Return the shortest look-ahead, of those tried, that reaches a noise reduction; None if none does."""
         return next((samples / self.fs for samples, reached in self.ahead.items() if reached >= want_db), None)
 
     def guarded(self, rated_power: Any) -> tuple[np.ndarray, float]:

@@ -44,7 +44,7 @@ def change_filter(lines, weights, j, keep, mu, error, penalty):
 
 @change_filter.register(ChannelLines)
 def change_channel(lines, weights, j, keep, mu, error, penalty):
-    """Do so for the references one by one."""
+    """Change the weights of loudspeaker j, one reference after the other."""
     taps = weights.shape[2]
     leak_channel_guarded(lines.guard, weights, j, mu)
     for i in range(weights.shape[1]):

@@ -99,7 +99,7 @@ def modified_error(lines, weights, disturbance):
 
 @modified_error.register(ChannelLines)
 def modified_channel_errors(lines, weights, disturbance):
-    """Return it for each microphone, (K,)."""
+    """Return d^_k(n) - sum_ji w_ji(n)' x'_kji(n) for each microphone, (K,)."""
     for k in range(disturbance.size):
         lines.modified_error[k] = disturbance[k] - heard_output(lines.filtered, weights, k)
     return lines.modified_error

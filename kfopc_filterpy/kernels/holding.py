@@ -126,7 +126,7 @@ class ForStates:
 
 
 def for_states(signature: Any = None, **options: Any) -> Callable[[Callable[[str], Callable[..., Any]]], ForStates]:
-    """Decorator of ``make(key)``, which returns a function of an address, where it finds ``state_at(address, key)``.
+    """Decorate ``make(key)``, which returns a function of an address, where it finds ``state_at(address, key)``.
 
     Given a `signature` of C numbers, the function can be called by its address, see `calling`.
     """

@@ -89,7 +89,7 @@ def line_style(i: int) -> dict[str, Any]:
 
 
 def frequency_axis(ax: Axes, frequencies: np.ndarray, label: bool = True) -> None:
-    """Logarithmic axis in Hz with ticks at 1, 2 and 5 written out."""
+    """Make a logarithmic axis in Hz with ticks at 1, 2 and 5 written out."""
     from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
 
     ax.set_xscale("log")
@@ -103,7 +103,7 @@ def frequency_axis(ax: Axes, frequencies: np.ndarray, label: bool = True) -> Non
 
 
 def legend_above(ax: Axes) -> None:
-    """Legend above the axes, where it covers no curve."""
+    """Draw the legend above the axes, where it covers no curve."""
     labels = ax.get_legend_handles_labels()[1]
     # One row where it fits the width, for a longer one would squeeze the axes.
     width = sum(len(label) + 6 for label in labels)
@@ -112,18 +112,18 @@ def legend_above(ax: Axes) -> None:
 
 
 def level_axis(ax: Axes, powers: list[np.ndarray], label: str) -> None:
-    """Axis in dB that ends 60 dB below the highest peak: the zeros beneath would take all the room."""
+    """Make an axis in dB that ends 60 dB below the highest peak: the zeros beneath would take all the room."""
     peak = max(float(power.max()) for power in powers)
     ax.set_ylim(decibels(peak) - 60, decibels(peak) + 5)
     ax.set_ylabel(label)
 
 
 def audible(response: np.ndarray) -> np.ndarray:
-    """Where a response lies within 40 dB of its peak: beyond, phase and delay mean nothing."""
+    """Return where a response lies within 40 dB of its peak: elsewhere, phase and delay mean nothing."""
     magnitude = np.abs(response)
     return magnitude > 0.01 * magnitude.max()
 
 
 def decibels(power: Any) -> Any:
-    """Power in dB, floored at -300 dB."""
+    """Return a power in dB, at least -300 dB."""
     return 10 * np.log10(np.maximum(power, 1e-30))

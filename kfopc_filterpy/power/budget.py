@@ -417,7 +417,7 @@ class PowerBudget:
 
     @property
     def account_s(self) -> float:
-        """Power spent in the averaging time beyond the rated power, in seconds of it; negative: power is left.
+        """Excess of the power spent in the averaging time, in seconds of rated power; negative if power is left.
 
         The time before the first sample counts as if the rated power had been spent.
         """
