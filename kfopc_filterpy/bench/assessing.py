@@ -165,8 +165,7 @@ def assess(
     others = ALGORITHMS if beside is None else [as_choice(name, "beside", ALGORITHMS) for name in beside]
     ratings = ratings_of_each(rating, J)
     limits = limits_of(ratings, several)
-    if pascal_per_unit is not None:
-        pascal_per_unit = _pascals(pascal_per_unit, K)
+    pascals = None if pascal_per_unit is None else _pascals(pascal_per_unit, K)
     if memory_s is None:
         memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
     start = switch_on_sample(switch_on_s, fs, x.shape[-1])
@@ -244,7 +243,7 @@ def assess(
         causality_margin_s=None if primary is None else _margin_s(primary, s, fs),
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, 1.0 - allowed_share(secondary_path_uncertainty, s) > 10 ** (-want_db / 20), fs),
-        levels=None if pascal_per_unit is None else _levels(run, pascal_per_unit),
+        levels=None if pascals is None else _levels(run, pascals),
         excursion_mm=excursion_mm(ratings, run),
         settings=settings,
         figures={name: _figures(one, limits, fs) for name, one in runs.items()},
@@ -254,6 +253,7 @@ def assess(
         ohm=scale_of(ratings, "ohm", several),
         fs=fs,
         channels=(n_references, J, K) if several else None,
+        pascal_per_unit=pascal_per_unit,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
 

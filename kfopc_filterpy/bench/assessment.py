@@ -173,6 +173,8 @@ class Assessment:
         Sample rate in Hz.
     channels : tuple of int or None
         Numbers of references, loudspeakers and microphones; None if there is one of each.
+    pascal_per_unit : float, array_like of shape (K,), or None
+        Sound pressure at the error microphones for a value of 1, if the calibration is known.
     """
 
     enough: bool
@@ -201,6 +203,7 @@ class Assessment:
     ohm: Any
     fs: float
     channels: tuple[int, int, int] | None = None
+    pascal_per_unit: Any = None
 
     @property
     def verdict(self) -> str:

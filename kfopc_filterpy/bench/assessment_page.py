@@ -93,18 +93,14 @@ def _figures(verdict: Assessment) -> Any:
     )
     runs = dict(verdict.runs)
     together = "" if verdict.channels is None else " All microphones together."
-    plots: list[tuple[str, Any, str]] = [
-        ("spectra", plot_error_spectra, f"Spectra without control and of the errors, over the steady half.{together}"),
-        (
-            "nse",
-            plot_nse,
-            f"Error power over that of the disturbance; below 0 dB it is quieter than without control.{together}",
-        ),
-    ]
-    for stem, draw, caption in plots:
-        figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-        draw(runs, ax=ax)
-        yield FigureItem(stem, caption, figure)
+    figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
+    plot_error_spectra(runs, pascal_per_unit=verdict.pascal_per_unit, ax=ax)
+    caption = f"Spectra without control and of the errors, over the steady half.{together}"
+    yield FigureItem("spectra", caption, figure)
+    figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
+    plot_nse(runs, ax=ax)
+    caption = f"Error power over that of the disturbance; below 0 dB it is quieter than without control.{together}"
+    yield FigureItem("nse", caption, figure)
     scale = 1.0 if verdict.watt_per_power is None else verdict.watt_per_power
     powers = {name: _scaled(run, scale) for name, run in runs.items()}
     figure, axes = _rows_of_axes(n_loudspeakers(verdict), (6.4, 4))

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._validate import as_band, as_positive
-from ..metrics import coherence_and_gain, output_power, power_spectrum_db
+from .._validate import as_band, as_positive, per_channel
+from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
 from .results import DISTURBANCE, RATED, curves, one_channel, require_common_disturbance, span_axis, span_of, times
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from ..loop.result import SimulationResult
 
 _DEPTH_DB = 120.0  # largest range of a spectrum's axis: numerical floors beneath would take all the room
 _VISIBLE = 0.005  # difference of waveforms, over their peak, that a line's width does not hide
@@ -29,6 +31,7 @@ def plot_error_spectra(
     segment_s: float = 0.128,
     scaling: str = "density",
     channel: int | None = None,
+    pascal_per_unit: Any = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the power spectra of the disturbance and of each error (the paper's Fig. 5 a, 6 b, 7 b).
@@ -45,6 +48,9 @@ def plot_error_spectra(
         As for `power_spectrum_db`.
     channel : int, optional
         Microphone to show, from 0; by default the mean power over all.
+    pascal_per_unit : float or array_like, shape (K,), optional
+        Sound pressure in Pa for a value of 1, of all K microphones or of each, above 0. With it, 0 dB is (20 µPa)²,
+        without it the square of a value of 1.
     ax : matplotlib.axes.Axes, optional
         Axes to draw into, by default new ones.
 
@@ -73,11 +79,14 @@ def plot_error_spectra(
     shown = curves(results)
     require_common_disturbance(shown)
     fs = shown[0].run.fs
+    scale, unit = np.ones(1), "1"
+    if pascal_per_unit is not None:
+        scale, unit = _over_20_micropascal(pascal_per_unit, shown[0].run, channel), "(20 µPa)²"
     low, high = as_band((0.0, fs / 2) if band is None else band, fs)
     part, steady = (slice(None), 0.5) if span_s is None else (span_of(shown[0].run, span_s), 1.0)
     spectra = []
     for curve, name in [(shown[0], "disturbance"), *((curve, "error") for curve in shown)]:
-        signals = curve.stack(name, part, channel)
+        signals = scale * curve.stack(name, part, channel)
         signals = signals.reshape(-1, signals.shape[-1])  # microphones are averaged like runs
         frequencies, level = power_spectrum_db(
             signals, fs, steady=steady, segment_s=segment_s, scaling=scaling, runs=True
@@ -95,10 +104,17 @@ def plot_error_spectra(
         ax.set_ylim(max(np.min(np.concatenate(levels[1:]), initial=top) - 5, top - _DEPTH_DB), top + 5)
     ax.set_xlim(low, high)
     ax.set_xlabel("Frequency (Hz)")
-    ax.set_ylabel("Power per Hz (dB)" if scaling == "density" else "Power (dB)")
+    ax.set_ylabel(f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})")
     ax.grid(True, alpha=0.3)
     legend_above(ax)
     return ax
+
+
+def _over_20_micropascal(pascal_per_unit: Any, run: SimulationResult, channel: int | None) -> np.ndarray:
+    """Return the sound pressure over 20 µPa for a value of 1, (1,), or of each microphone, (K, 1)."""
+    pascals = per_channel(pascal_per_unit, len(np.atleast_2d(run.error)), "microphones", "pascal_per_unit")
+    scale = pascals[:, np.newaxis] / SOUND_PRESSURE
+    return scale if channel is None else one_channel(scale, channel)
 
 
 def plot_anti_noise(

@@ -80,12 +80,21 @@ def _line(ax, label):
 def test_error_spectra_hold_the_disturbance_and_each_error(tonal):
     ax = plotting.plot_error_spectra(list(tonal.values()), band=(100.0, 5000.0), segment_s=0.05, scaling="spectrum")
     assert _labels(ax) == ["Disturbance", *tonal]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Power (dB)")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Power (dB re 1)")
     assert ax.get_xlim() == (100.0, 5000.0)
     for name, run in tonal.items():
         f, level = power_spectrum_db(run.error, FS, segment_s=0.05, scaling="spectrum")
         np.testing.assert_array_equal(_line(ax, name).get_ydata(), level[(f >= 100) & (f <= 5000)])
-    assert plotting.plot_error_spectra(tonal["KF-OPC"]).get_ylabel() == "Power per Hz (dB)"
+    assert plotting.plot_error_spectra(tonal["KF-OPC"]).get_ylabel() == "Power per Hz (dB re 1/Hz)"
+
+
+def test_error_spectra_with_a_calibration_are_sound_pressure_levels(tonal):
+    ax = plotting.plot_error_spectra(tonal["KF-OPC"], pascal_per_unit=0.2, scaling="spectrum")
+    assert ax.get_ylabel() == "Power (dB re (20 µPa)²)"
+    _, level = power_spectrum_db(0.2 * tonal["KF-OPC"].error / 20e-6, FS, scaling="spectrum")
+    np.testing.assert_allclose(_line(ax, "KF-OPC").get_ydata(), level, atol=1e-9)
+    density = plotting.plot_error_spectra(tonal["KF-OPC"], pascal_per_unit=0.2)
+    assert density.get_ylabel() == "Power per Hz (dB re (20 µPa)²/Hz)"
 
 
 def test_error_spectra_of_a_span_and_of_seeds(tonal, noise):
@@ -316,6 +325,12 @@ def test_spectra_of_several_microphones_are_averaged_or_of_one():
     np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(np.mean(powers, axis=0)), rtol=0, atol=1e-9)
     line = _line(plotting.plot_error_spectra(run, channel=2), "KF-OPC")
     np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(powers[2]), rtol=0, atol=1e-9)
+    scale = np.array([0.1, 0.2, 0.4]) / 20e-6
+    line = _line(plotting.plot_error_spectra(run, pascal_per_unit=[0.1, 0.2, 0.4]), "KF-OPC")
+    together = np.mean(scale[:, np.newaxis] ** 2 * powers, axis=0)
+    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(together), rtol=0, atol=1e-9)
+    line = _line(plotting.plot_error_spectra(run, pascal_per_unit=[0.1, 0.2, 0.4], channel=2), "KF-OPC")
+    np.testing.assert_allclose(line.get_ydata(), 10 * np.log10(scale[2] ** 2 * powers[2]), rtol=0, atol=1e-9)
 
 
 def test_output_power_has_a_curve_for_each_loudspeaker():
@@ -399,6 +414,8 @@ def test_refusals_name_the_argument(tonal, noise):
         plotting.plot_anti_noise({"KF-OPC": noise}, span_s=SPAN)
     with pytest.raises(ValueError, match="results must have one disturbance"):
         plotting.plot_error_spectra({"a": noise[0], "b": noise[1]})
+    with pytest.raises(ValueError, match="pascal_per_unit must be greater than 0"):
+        plotting.plot_error_spectra(run, pascal_per_unit=0.0)
     with pytest.raises(ValueError, match="result must be one run, got 2"):
         plotting.plot_disturbance_and_anti_noise([run, tonal["FxLMS"]], span_s=SPAN, band=(200.0, 2000.0))
     with pytest.raises(ValueError, match=r"span_s must satisfy 0 <= start < end <= 0.4 s, got \(0.3, 0.5\) s"):
