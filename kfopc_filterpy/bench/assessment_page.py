@@ -166,7 +166,12 @@ def _draw_bound(verdict: Assessment, ax: Any) -> None:
         if power and own is not None and np.isfinite(power) and np.isfinite(own):
             style = curve_style(name)
             label = name if scale * power <= right else f"{name}, beyond: {scale * power:.2g}"
-            ax.plot(min(scale * power, right), own, style["marker"], color=style["color"], label=label, clip_on=False)
+            # The verdict's own run is filled and in front: the others often lie within its marker.
+            fill, front = (style["color"], 4) if name == verdict.algorithm else ("none", 3)
+            ax.plot(
+                min(scale * power, right), own, style["marker"], color=style["color"], markerfacecolor=fill,
+                markeredgewidth=1.5, markersize=7, label=label, zorder=front, clip_on=False,
+            )  # fmt: skip
     ax.set_xlim(right=right)
     ax.set_xlabel("Power over the rated power" if several else _power_label(verdict))
     ax.set_ylabel("Noise reduction (dB)")

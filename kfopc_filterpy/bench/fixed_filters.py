@@ -14,8 +14,8 @@ from kfopc_filterpy.bounds.power_constrained import weights_within
 from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
 
 LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
-CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.5)  # rated powers of the figure, over the one that full control needs
-CHANNEL_CURVE = CURVE[::2]  # a solution for several loudspeakers takes longer
+CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.125)  # rated powers of the figure, over the one that full control needs
+CHANNEL_CURVE = CURVE[::4]  # a solution for several loudspeakers takes longer
 
 
 class FixedFilters:
