@@ -254,6 +254,7 @@ def assess(
         fs=fs,
         channels=(n_references, J, K) if several else None,
         pascal_per_unit=pascal_per_unit,
+        switch_on_s=start / fs,
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
 

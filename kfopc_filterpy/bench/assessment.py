@@ -175,6 +175,8 @@ class Assessment:
         Numbers of references, loudspeakers and microphones; None if there is one of each.
     pascal_per_unit : float, array_like of shape (K,), or None
         Sound pressure at the error microphones for a value of 1, if the calibration is known.
+    switch_on_s : float
+        Time of the recording in s at which the control is switched on.
     """
 
     enough: bool
@@ -204,6 +206,7 @@ class Assessment:
     fs: float
     channels: tuple[int, int, int] | None = None
     pascal_per_unit: Any = None
+    switch_on_s: float = 0.0
 
     @property
     def verdict(self) -> str:

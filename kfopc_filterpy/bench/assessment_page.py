@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +12,11 @@ import numpy as np
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 
-from .items import EXCERPT_S, HEADROOM, FigureItem, Sound, StudyReport, Table
+from .items import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
 from .page import images, players, rendered
 from .report import prepare_folder, write_files, write_whole
 
 if TYPE_CHECKING:
-    from kfopc_filterpy import SimulationResult
-
     from .assessment import Assessment
 
 TEMPLATE = "verdict.html.jinja"
@@ -98,18 +95,18 @@ def _figures(verdict: Assessment) -> Any:
     caption = f"Spectra without control and of the errors, over the steady half.{together}"
     yield FigureItem("spectra", caption, figure)
     figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-    plot_nse(runs, ax=ax)
-    caption = f"Error power over that of the disturbance; below 0 dB it is quieter than without control.{together}"
-    yield FigureItem("nse", caption, figure)
-    scale = 1.0 if verdict.watt_per_power is None else verdict.watt_per_power
-    powers = {name: _scaled(run, scale) for name, run in runs.items()}
+    plot_nse(runs, ax=ax).set_xlabel(SINCE_SWITCH_ON)
+    begin = SWITCHED_ON.format(verdict.switch_on_s)
+    caption = "Error power over that of the disturbance; below 0 dB it is quieter than without control."
+    yield FigureItem("nse", f"{caption}{together} {begin}", figure)
     figure, axes = _rows_of_axes(n_loudspeakers(verdict), (6.4, 4))
+    watts = verdict.watt_per_power
     for j, ax in enumerate(axes):
-        rated = np.ravel(scale * verdict.limits.rated_power)[j]
-        plot_output_power(powers, channel=j, rated_power=rated, ax=ax)
-        ax.set_ylabel(_power_label(verdict))
+        watt = None if watts is None else np.ravel(watts)[j]
+        rated = np.ravel(verdict.limits.rated_power)[j]
+        plot_output_power(runs, channel=j, rated_power=rated, watt_per_power=watt, ax=ax).set_xlabel(SINCE_SWITCH_ON)
     _number_rows(axes, "Loudspeaker")
-    yield FigureItem("power", "Mean power of the control signal over a sliding window, and the rated power.", figure)
+    yield FigureItem("power", f"Mean power of the control signal, and the rated power. {begin}", figure)
     if verdict.levels is not None:
         levels = verdict.levels
         figure, axes = _rows_of_axes(n_microphones(verdict), (9, 3.6))
@@ -141,13 +138,6 @@ def _number_rows(axes: Any, what: str) -> None:
     if len(axes) > 1:
         for number, ax in enumerate(axes, 1):
             ax.set_ylabel(f"{what} {number}\n{ax.get_ylabel()}")
-
-
-def _scaled(run: SimulationResult, scale: Any) -> SimulationResult:
-    """Return a run whose powers of the control signals are multiplied, by one number or by one for each."""
-    rated = None if run.rated_power is None else scale * run.rated_power
-    factor = np.sqrt(scale) if np.ndim(scale) == 0 else np.sqrt(scale)[:, np.newaxis]
-    return replace(run, control_signal=factor * run.control_signal, rated_power=rated)
 
 
 def _draw_bound(verdict: Assessment, ax: Any) -> None:

@@ -13,8 +13,8 @@ from kfopc_filterpy._validate import as_choice, as_count, as_positive
 
 from .assessed_runs import recorded_scene
 from .assessing import longest_filter, recorded_signals, switch_on_sample
-from .items import FigureItem, Parameter, Sound, StudyReport, Table
-from .limits import ChannelLimits, limits_of, ratings_of_each
+from .items import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
+from .limits import ChannelLimits, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
 from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution
 from .tuning import RULE, AllDivergedError, run_setting, tune
@@ -93,7 +93,8 @@ def compare_recordings(
         x, d = x[..., kept], d[..., kept]
     n_loudspeakers, n_references = (s.shape[1], len(x)) if several else (1, 1)
     n_filters = n_loudspeakers * n_references
-    limits = limits_of(ratings_of_each(rating, n_loudspeakers), several)
+    ratings = ratings_of_each(rating, n_loudspeakers)
+    limits, watts = limits_of(ratings, several), watt_per_power(ratings, several)
     start = switch_on_sample(None, fs, x.shape[-1])
     taps = None if n_taps is None else as_count(n_taps, "n_taps")
     with warnings.catch_warnings():
@@ -141,7 +142,7 @@ def compare_recordings(
         1.0 if isinstance(limits, ChannelLimits) else limits.rated_power,
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
         {name: figures_of_merit([result], scene) for name, result in results.items()},
-        figures=_figures(results, np.atleast_1d(limits.rated_power)),
+        figures=_figures(results, np.atleast_1d(limits.rated_power), watts, start / fs),
         sounds=sounds,
         notes=notes,
         tables=[_power_table(results, scene)] if several else [],
@@ -153,25 +154,31 @@ def compare_recordings(
     )
 
 
-def _figures(results: dict[str, SimulationResult], rated_powers: np.ndarray) -> list[FigureItem]:
+def _figures(
+    results: dict[str, SimulationResult], rated_powers: np.ndarray, watts: Any, switch_on_s: float
+) -> list[FigureItem]:
     """Return the figures of the runs: the error, and the power of each loudspeaker."""
     import matplotlib.pyplot as plt
 
     from kfopc_filterpy.plot import plot_error_spectra, plot_nse, plot_output_power
 
+    begin = SWITCHED_ON.format(switch_on_s)
     drawn: list[tuple[str, Any, str, dict[str, Any]]] = [
-        ("nse", plot_nse, "Error power over that of the disturbance.", {}),
+        ("nse", plot_nse, f"Error power over that of the disturbance. {begin}", {}),
         ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half.", {}),
     ]
     for j, rated in enumerate(rated_powers):
         which = f" of loudspeaker {j + 1}" if rated_powers.size > 1 else ""
-        caption = f"Mean power of the control signal{which}, and its rated power."
+        caption = f"Mean power of the control signal{which}, and its rated power. {begin}"
+        watt = None if watts is None else np.ravel(watts)[j]
         stem = f"power-{j + 1}" if rated_powers.size > 1 else "power"
-        drawn.append((stem, plot_output_power, caption, {"channel": j, "rated_power": rated}))
+        drawn.append((stem, plot_output_power, caption, {"channel": j, "rated_power": rated, "watt_per_power": watt}))
     items = []
     for stem, draw, caption, options in drawn:
         figure, ax = plt.subplots(figsize=(7, 4.5), layout="constrained")
         draw(results, ax=ax, **options)
+        if draw is not plot_error_spectra:
+            ax.set_xlabel(SINCE_SWITCH_ON)
         items.append(FigureItem(stem, caption, figure))
     return items
 

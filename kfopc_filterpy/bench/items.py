@@ -25,6 +25,8 @@ FIGURES_OF_MERIT = (
 )
 OF_THE_PAPER = "Claims of the paper"
 HEADROOM = 4.0  # peak of a sound, over that of the study's first sound, beyond which it is clipped
+SINCE_SWITCH_ON = "Time since switch-on (s)"
+SWITCHED_ON = "The control is switched on {:g} s into the recording."
 EXCERPT_S = 4.0  # what the page plays of a sound; the file has all of it
 
 

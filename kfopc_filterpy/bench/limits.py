@@ -206,6 +206,12 @@ def excursion_mm(ratings: Sequence[Sequence[Rating]], run: SimulationResult) -> 
     return max(moved, default=None)
 
 
+def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> Any:
+    """Return the watts of a mean square of 1, of several loudspeakers as (J,); None if a rating does not tell them."""
+    volts, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
+    return None if volts is None or ohm is None else volts**2 / ohm
+
+
 def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> Any:
     """Return `volts_per_unit` or `ohm` of the first rating that has volts; of several loudspeakers as (J,).
 

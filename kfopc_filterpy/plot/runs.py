@@ -172,8 +172,7 @@ def plot_nse(
     if scale == "log":
         ax.set_xscale("log")
         ax.set_xlim(left=window_s / 5)  # before the first sound has come through the paths
-    shown_window = f"{window_s:g} s" if window_s >= 1 else f"{1e3 * window_s:g} ms"
-    ax.set_ylabel(f"Normalised squared error (dB)\nover {shown_window}")
+    ax.set_ylabel(f"Normalised squared error (dB)\nover {_window_in_words(window_s)}")
     legend_above(ax)
     return ax
 
@@ -194,11 +193,13 @@ def plot_output_power(
     rated_power: float | None = None,
     window_s: float = 0.25,
     channel: int | None = None,
+    watt_per_power: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the short-time output power, the mean square of the control signal before the amplifier, over time.
 
-    The axis is logarithmic if a power exceeds ten times the rated power.
+    The axis says how long the window is. It is logarithmic if the highest power is more than ten times the rated
+    power, or less than a tenth.
 
     Parameters
     ----------
@@ -210,6 +211,8 @@ def plot_output_power(
         Sliding window in seconds; the first values look at the samples there are.
     channel : int, optional
         Loudspeaker to show, from 0; by default a curve for each.
+    watt_per_power : float, optional
+        Power in W of a mean square of 1, above 0: (V per unit)² / ohm. With it, powers are drawn in W.
     ax : matplotlib.axes.Axes, optional
         Axes to draw into, by default new ones.
 
@@ -241,8 +244,10 @@ def plot_output_power(
         rated = sorted({float(power) for each in powers for power in np.atleast_1d(each)})
     else:
         rated = [as_positive(rated_power, "rated_power")]
+    scale, unit = (1.0, "") if watt_per_power is None else (as_positive(watt_per_power, "watt_per_power"), " W")
+    rated = [scale * value for value in rated]
     short_time = [
-        short_time_power(curve.stack("control_signal", channel=channel), curve.run.fs, window_s, runs=True)
+        scale * short_time_power(curve.stack("control_signal", channel=channel), curve.run.fs, window_s, runs=True)
         for curve in shown
     ]
     ax = new_axes(ax)
@@ -252,14 +257,14 @@ def plot_output_power(
         curve.draw(ax, (rows + 1) / curve.run.fs, power[..., rows], i)
         highest = max(highest, np.max(power, initial=0.0, where=~np.isnan(power)))
     for value in rated:
-        ax.axhline(value, label=f"Rated power {value:g}", **RATED)
-    if rated and highest > 10 * rated[-1]:
+        ax.axhline(value, label=f"Rated power {value:.4g}{unit}", **RATED)
+    if rated and highest > 0 and not rated[-1] / 10 <= highest <= 10 * rated[-1]:
         ax.set_yscale("log")
-        ax.set_ylim(rated[0] / 10, 2 * highest)
+        ax.set_ylim(min(rated[0], highest) / 10, 2 * max(rated[-1], highest))
     else:
         ax.set_ylim(0, 1.08 * max([highest, *rated]) or 1.0)
     _whole_time_axis(ax, shown)
-    ax.set_ylabel("Output power (mean square)")
+    ax.set_ylabel(f"Output power ({unit.strip() or 'mean square'})\nover {_window_in_words(window_s)}")
     legend_above(ax)
     return ax
 
@@ -417,6 +422,10 @@ def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> 
         figure.savefig(svg, metadata={"Date": None})
     plt.close(figure)
     return png, svg
+
+
+def _window_in_words(window_s: float) -> str:
+    return f"{window_s:g} s" if window_s >= 1 else f"{1e3 * window_s:g} ms"
 
 
 def _whole_time_axis(ax: Axes, shown: list[Curve]) -> None:

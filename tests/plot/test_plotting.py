@@ -244,7 +244,20 @@ def test_output_power_against_the_rated_power(noise, tonal):
     ax = plotting.plot_output_power(list(tonal.values()), rated_power=0.01)
     ax.figure.canvas.draw()
     assert ax.get_yscale() == "log"
-    assert ax.get_ylabel() == "Output power (mean square)"
+    assert ax.get_ylabel() == "Output power (mean square)\nover 250 ms"
+    ax = plotting.plot_output_power(list(tonal.values()), rated_power=1e4)
+    assert ax.get_yscale() == "log"
+    assert ax.get_ylim()[1] == 2e4
+
+
+def test_output_power_in_watts(noise):
+    ax = plotting.plot_output_power({"KF-OPC": noise}, window_s=1.0, rated_power=0.5, watt_per_power=12.5)
+    assert ax.get_ylabel() == "Output power (W)\nover 1 s"
+    assert _labels(ax) == ["KF-OPC", "Rated power 6.25 W"]
+    plain = plotting.plot_output_power({"KF-OPC": noise}, window_s=1.0, rated_power=0.5)
+    np.testing.assert_allclose(_line(ax, "KF-OPC").get_ydata(), 12.5 * _line(plain, "KF-OPC").get_ydata())
+    with pytest.raises(ValueError, match="watt_per_power must be greater than 0"):
+        plotting.plot_output_power({"KF-OPC": noise}, watt_per_power=0.0)
 
 
 def test_constraint_factor_leaves_out_controllers_that_say_none(tonal):
