@@ -134,6 +134,8 @@ def glance(studies: Sequence[StudyReport]) -> FigureItem | None:
         reductions.plot(at, [_number(s, name, "noise_reduction_db") for s in shown], **style)
     powers.axhline(1.0, color="0.35", linewidth=1.2)
     powers.set(yscale="log", ylabel="output power,\ntimes the rated power")
+    for ax in (powers, reductions):
+        ax.margins(y=0.12)  # no marker is cut off
     low, high = powers.get_ylim()
     low, high = min(low, 0.2), max(high, 5.0)
     powers.set_ylim(low, high)
@@ -141,8 +143,10 @@ def glance(studies: Sequence[StudyReport]) -> FigureItem | None:
         powers.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     powers.yaxis.set_major_formatter("{x:g}")
     powers.yaxis.set_minor_formatter("")
-    reductions.set(xlabel="study", ylabel="noise reduction (dB)", xlim=(-0.5, len(shown) - 0.5))
-    reductions.set_xticks(range(len(shown)), [study.name.replace("-", "\n") for study in shown])
+    reductions.axhline(0.0, color="0.35", linewidth=1.2)  # and so the axis holds 0: small differences look small
+    reductions.set(ylabel="noise reduction (dB)", xlim=(-0.5, len(shown) - 0.5))
+    several = [study.name.replace("-", "\n") for study in shown] if len(shown) > 1 else []
+    reductions.set_xticks(range(len(several)), several)
     for ax in (powers, reductions):
         ax.grid(axis="y", color="0.9")
         ax.set_axisbelow(True)
@@ -157,7 +161,7 @@ def _caption(studies: Sequence[StudyReport]) -> str:
     known = [power for power in powers if np.isfinite(power)]
     text = (
         "What each algorithm asks of the amplifier (above; the line is the rated power), and what it gets for it (below), "
-        "over the steady half of each study."
+        f"over the steady half{' of each study' if len(studies) > 1 else ''}."
     )
     if not known:
         return text
