@@ -26,7 +26,7 @@ from ..paths.analysis import (
 )
 from ..paths.identification import IdentificationResult
 from ..paths.models import finite_taps, is_system, path_taps, sampling_rate
-from .style import MARK, audible, decibels, frequency_axis, legend_above, level_axis, line_style, new_axes
+from .style import MARK, audible, decibels, frequency_axis, legend_above, level_axis, line_style, new_axes, phase_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,7 +104,7 @@ def plot_bode(paths: Any, *, frequencies_hz: Any = None, fs: float | None = None
         angle[~audible(response)] = np.nan
         phase.plot(frequencies, angle, label=f"{label}, less {1e3 * delay:.2f} ms", **line_style(i))
     level_axis(magnitude, powers, "Magnitude (dB)")
-    phase.set_ylabel("Phase less onset delay (degrees)")
+    phase_axis(phase, "Phase less onset delay (degrees)")
     frequency_axis(magnitude, frequencies, label=False)
     frequency_axis(phase, frequencies)
     legend_above(magnitude)
@@ -352,10 +352,11 @@ def plot_secondary_path_gain(
     ax.plot(frequencies, decibels(power), label="$|S(f)|^2$", **line_style(0))
     ends = np.clip([low, high], frequencies[0], frequencies[-1])
     ax.plot(ends, [in_band] * 2, label=f"$G_s$, {low:g} to {high:g} Hz: {in_band:.1f} dB", **line_style(1))
-    ax.axvspan(*ends, color=line_style(1)["color"], alpha=0.08, linewidth=0)
     if reference is not None:
         given = float(decibels(secondary_path_gain(path, reference=reference, fs=fs)))
         ax.axhline(given, label=f"$G_s$, reference: {given:.1f} dB", **line_style(2))
+    if band is not None:
+        ax.axvspan(*ends, color=line_style(1)["color"], alpha=0.08, linewidth=0, label="Band of the white noise")
     level_axis(ax, [power], "Power gain (dB)")
     frequency_axis(ax, frequencies)
     legend_above(ax)
@@ -420,8 +421,7 @@ def plot_phase_error(
         ax.axhspan(sign * STABILITY_BOUND_DEG, sign * 180, color=MARK, alpha=0.1, linewidth=0)
     bound.set_label("Stability bound ±90°")
     ax.set_ylim(-180, 180)
-    ax.set_yticks(np.arange(-180, 181, 45))
-    ax.set_ylabel("Phase error (degrees)")
+    phase_axis(ax, "Phase error (degrees)")
     frequency_axis(ax, frequencies)
     legend_above(ax)
     return ax

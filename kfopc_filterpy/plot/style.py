@@ -102,6 +102,17 @@ def frequency_axis(ax: Axes, frequencies: np.ndarray, label: bool = True) -> Non
         ax.set_xlabel("Frequency (Hz)")
 
 
+def phase_axis(ax: Axes, label: str) -> None:
+    """Make an axis in degrees with about six ticks at multiples of 15, 45, 90 or 180 degrees, or of turns."""
+    from matplotlib.ticker import MultipleLocator
+
+    low, high = ax.get_ylim()
+    turns = 360.0 * np.ceil((high - low) / (6 * 360))
+    step = next((step for step in (15.0, 45.0, 90.0, 180.0) if high - low <= 6 * step), turns)
+    ax.yaxis.set_major_locator(MultipleLocator(step))
+    ax.set_ylabel(label)
+
+
 def legend_above(ax: Axes) -> None:
     """Draw the legend above the axes, where it covers no curve."""
     labels = ax.get_legend_handles_labels()[1]

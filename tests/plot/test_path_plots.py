@@ -21,6 +21,7 @@ from kfopc_filterpy.plot.paths import (
     plot_required_rated_power,
     plot_secondary_path_gain,
 )
+from kfopc_filterpy.plot.style import phase_axis
 
 FS = 16000.0
 P, S = bandpass_path(128), bandpass_path(32)
@@ -61,6 +62,15 @@ def test_bode_draws_magnitude_and_phase_in_hz():
     np.testing.assert_allclose(angle[passed], -360 * 2.5 * f[passed] / FS, atol=1e-6)
     assert np.isnan(angle[-1])  # no phase where the path is silent
     assert _labels(phase)[1] == "S, less 0.81 ms"
+
+
+@pytest.mark.parametrize(("degrees", "step"), [(20, 15), (90, 45), (180, 90), (360, 180), (1800, 720)])
+def test_phase_axes_tick_at_parts_of_a_right_angle_or_at_whole_turns(degrees, step):
+    ax = plt.figure().add_subplot()
+    ax.set_ylim(-degrees, degrees)
+    phase_axis(ax, "Phase (degrees)")
+    np.testing.assert_array_equal(np.diff(ax.get_yticks()), step)
+    assert ax.get_ylabel() == "Phase (degrees)"
 
 
 def test_impulse_responses_over_milliseconds():
@@ -110,6 +120,7 @@ def test_secondary_path_gain_for_band_and_reference():
     assert ax.get_ylabel() == "Power gain (dB)"
     assert _labels(ax)[1] == "$G_s$, 200 to 2000 Hz: -0.1 dB"
     assert "reference" in _labels(ax)[2]
+    assert _labels(ax)[3] == "Band of the white noise"
     assert len(_labels(plot_secondary_path_gain(path_taps(S), fs=FS))) == 2
 
 
