@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,7 +135,9 @@ def main(runs: Runs) -> StudyReport:
                 crossings,
             ),
         ],
-        figures=_figures_of(results, forgetful, scene, sweep, crossings, theirs, primary, secondary),
+        figures=_figures_of(
+            results, forgetful, tuned["KF-ANC"].setting, scene, sweep, crossings, theirs, primary, secondary
+        ),
         sounds=sounds(results),
         notes=[
             *tuning_note(tuned),
@@ -388,6 +390,7 @@ def _number(figures: dict[str, float | None], key: str) -> float:
 def _figures_of(
     results: dict[str, SimulationResult],
     forgetful: dict[str, SimulationResult],
+    setting: Setting,
     scene: Scene,
     sweep: dict[str, np.ndarray],
     crossings: list[float],
@@ -400,16 +403,20 @@ def _figures_of(
     span = (end - 0.02, end)
     assert pair[0].weights is not None
     tap = int(np.argmax(np.abs(pair[0].weights[-1])))
-    laid_over = {"KF-ANC": pair[0], "KF-ANC, filterpy": theirs}
+    assert theirs.weights is not None
+    as_long = {name: getattr(pair[0], name)[: len(theirs.weights)] for name in ("weights", "weights_time_s")}
+    laid_over = {"KF-ANC": dataclasses.replace(pair[0], **as_long), "KF-ANC, filterpy": theirs}
 
     def amplifier(ax: Any, from_s: float = span[0]) -> None:
         plot_amplifier_output(pair, span_s=(from_s, end), limit=scene.amplitude_limit, ax=ax)
 
-    def line(ax: Any) -> None:
-        plot_weight_history(list(forgetful.values()), tap=tap, ax=ax).set_yscale(
-            "linear"
-        )  # a straight line is the point
-        ax.autoscale(axis="y")
+    def weights(group: Sequence[SimulationResult], noise: Setting) -> Callable[[Any], None]:
+        def panel(ax: Any) -> None:
+            plot_weight_history(group, tap=tap, ax=ax).set_yscale("linear")  # a straight line is the point
+            ax.autoscale(axis="y")
+            ax.set_title(f"$r\\,E[x'^2]/q$ = {noise:g}", pad=22, fontsize="medium")  # above the legend
+
+        return panel
 
     def overdrive(ax: Any) -> None:
         plot_noise_reduction_against_overdrive(OVERDRIVES_DB, sweep, flip_db=crossings, ax=ax)
@@ -434,10 +441,10 @@ def _figures_of(
         ),
         draw(
             "d-weight-history",
-            f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d). Left: at the settings tuned; right: with "
-            f"the most state noise of the grid, r E[x'^2]/q = {FORGETFUL:g}. KF-OPC is the same in both.",
-            lambda ax: plot_weight_history(pair, tap=tap, ax=ax),
-            line,
+            f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d). Left: with the state noise r that "
+            "KF-ANC is tuned to; right: with the most of the grid. KF-OPC is the same in both.",
+            weights(pair, setting),
+            weights(list(forgetful.values()), FORGETFUL),
         ),
         draw(
             "overdrive",
@@ -449,7 +456,7 @@ def _figures_of(
             "filterpy",
             f"Weight {tap} of KF-ANC by filterpy's own KalmanFilter over the first {FILTERPY_SAMPLES} samples, laid "
             "over the O(L^2) filter's.",
-            lambda ax: plot_weight_history(laid_over, tap=tap, ax=ax).set_xlim(0, 1.2 * FILTERPY_SAMPLES / FS),
+            lambda ax: plot_weight_history(laid_over, tap=tap, ax=ax).set_xlim(0, FILTERPY_SAMPLES / FS),
         ),
         draw(
             "overview",
