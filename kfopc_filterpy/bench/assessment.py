@@ -1,7 +1,7 @@
 r"""The verdict on an amplifier: enough or not, by how much, what limits, and what to change.
 
-Every cause is found by a measured noise reduction. Each of the following can do no better than the one before it, but
-for what a fit reaches by chance:
+Every cause is found by a measured noise reduction. Each of the following reaches no more than the one before it, apart
+from small differences by chance:
 
 ===================== ==============================================================================================
 ceiling               what it may use
@@ -394,7 +394,8 @@ def advice_on(verdict: Assessment) -> list[str]:
             "controller may not have settled."
         ]
     advice = [
-        f"About {verdict.power(needed)} would do for {want}, an estimate from the bound, and from what this controller loses to it."
+        f"About {verdict.power(needed)} would do for {want}. This is an estimate: the power that the best fixed filter "
+        "needs, raised by as much as this controller takes more than such a filter."
     ]
     if not np.all(np.isfinite(needed)):
         advice = [

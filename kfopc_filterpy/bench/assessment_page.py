@@ -163,7 +163,7 @@ def _draw_bound(verdict: Assessment, ax: Any) -> None:
                 markeredgewidth=1.5, markersize=7, label=label, zorder=front, clip_on=False,
             )  # fmt: skip
     ax.set_xlim(right=right)
-    ax.set_xlabel("Power over the rated power" if several else _power_label(verdict))
+    ax.set_xlabel("Power / rated power" if several else _power_label(verdict))
     ax.set_ylabel("Noise reduction (dB)")
     ax.grid(True, which="both", alpha=0.25)
     ax.legend(fontsize="small")
@@ -226,7 +226,7 @@ def _tables(verdict: Assessment) -> Any:
             "Controller",
             "Noise reduction (dB)",
             _power_label(verdict),
-            "Over the rated power",
+            "Power / rated power",
             "Worst window",
             "Highest peak" if volts is None else "Highest peak (V)",
         ],
