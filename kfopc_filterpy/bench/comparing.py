@@ -22,7 +22,7 @@ from .tuning import RULE, AllDivergedError, run_setting, tune
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
 OF_SEVERAL_CHANNELS = ("KF-PB (shared gain)", "MOV-FxLMS", "FxLMS")
 SCALED = (
-    " The rated powers are {}. Powers are relative to the rated power, and peaks to its square root, of the loudspeaker "
+    " The rated powers are {}{}. Powers are relative to the rated power, and peaks to its square root, of the loudspeaker "
     "for which they are largest."
 )
 
@@ -124,7 +124,7 @@ def compare_recordings(
         if not tuned.within_budget and REGISTRY[name].keeps_budget:
             notes.append(f"{name} keeps the rated power at no setting tried.")
         if tuned.at_edge:
-            notes.append(f"{name}: the best setting is at the edge of those tried.")
+            notes.append(_edge(name, tuned.setting))
     if not results:
         raise ValueError(f"every algorithm diverged: {' '.join(notes)} Check the secondary path, and its sign")
     first = next(iter(results.values()))
@@ -137,7 +137,8 @@ def compare_recordings(
         "Your recordings",
         f"{x.shape[-1] / fs:.3g} s of the recordings, {settings.n_taps} taps; full control would take "
         f"{_listed(free.control_power / limits.rated_power)} times the rated power."
-        + (SCALED.format(_listed(limits.rated_power)) if several else ""),
+        + _clipping(limits.amplitude_limit)
+        + (SCALED.format(*_powers(limits.rated_power, watts)) if several else ""),
         fs,
         1.0 if isinstance(limits, ChannelLimits) else limits.rated_power,
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
@@ -146,8 +147,10 @@ def compare_recordings(
         sounds=sounds,
         notes=notes,
         tables=[_power_table(results, scene)] if several else [],
+        watt_per_power=None if several else watts,
         extra={
             "rated_powers": limits.rated_power,
+            "watt_per_power": watts,
             "amplitude_limit": limits.amplitude_limit,
             "rating_decided_by": limits.decided_by,
         },
@@ -188,6 +191,30 @@ def _power_table(results: dict[str, SimulationResult], scene: Scene) -> Table:
     rows = [[name, *(output_power(run.control_signal) / scene.rated_power)] for name, run in results.items()]
     headings = ["", *(f"loudspeaker {j + 1}" for j in range(len(scene.rated_power)))]
     return Table("powers", "Output power of each loudspeaker over its rated power, in the steady half", headings, rows)
+
+
+def _edge(name: str, setting: Any) -> str:
+    """Return what to do about a best setting at the edge of those tried."""
+    own = REGISTRY[name]
+    kinds = " and ".join(filter(None, (own.kind, own.second_kind)))
+    advice = "a setting beyond it may do better: try one in Python, with simulate"
+    if own.symbol == "r" and setting == min(own.first):
+        advice = "the noise is so steady that the filter hardly has to forget, and nothing is to be done"
+    return f"{name}: the best setting, {kinds} = {_listed(setting)}, is at the edge of those tried; {advice}."
+
+
+def _clipping(limit: Any) -> str:
+    """Return as a sentence where the amplifier clips: a limit of the control signal, None, or one for each loudspeaker."""
+    if not isinstance(limit, tuple):
+        return " The amplifier does not clip." if limit is None else f" The amplifier clips beyond ±{limit:.3g}."
+    if all(one is None for one in limit):
+        return " The amplifiers do not clip."
+    return f" The amplifiers clip beyond: {', '.join('never' if one is None else f'±{one:.3g}' for one in limit)}."
+
+
+def _powers(rated_powers: Any, watts: Any) -> tuple[str, str]:
+    """Return rated powers in words, and their unit, which is W if that is known."""
+    return (_listed(rated_powers), "") if watts is None else (_listed(rated_powers * watts), " W")
 
 
 def _listed(values: Any) -> str:

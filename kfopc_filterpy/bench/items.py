@@ -239,6 +239,8 @@ class StudyReport:
         Further tables in their order.
     claims : str
         Whose claims the verdicts are on.
+    watt_per_power : float, optional
+        Power in W of a mean square of 1, if it is known: page and terminal then show output powers in W.
     conditions : sequence of str
         Conditions that all its verdicts are under, in words that follow "with", such as "a tone". What failed verdicts
         have in common is found among them.
@@ -264,6 +266,7 @@ class StudyReport:
     tables: list[Table] = field(default_factory=list)
     claims: str = OF_THE_PAPER
     conditions: Sequence[str] = ()
+    watt_per_power: float | None = None
 
     def __post_init__(self) -> None:
         _require_stem(self.name, "name")
@@ -280,6 +283,13 @@ class StudyReport:
     def marks(self) -> tuple[str, str]:
         """Words for a verdict that holds, and for one that does not."""
         return ("reproduced", "not reproduced") if self.claims == OF_THE_PAPER else ("met", "not met")
+
+    @property
+    def rating(self) -> str:
+        """The rated power in words, in W if that is known."""
+        if self.watt_per_power is None:
+            return f"{self.rated_power:.4g}"
+        return f"{self.rated_power * self.watt_per_power:.4g} W"
 
     @property
     def result(self) -> dict[str, Any]:
@@ -321,21 +331,22 @@ def jsonable(value: Any, where: str = "value") -> Any:
     raise TypeError(f"{where} must hold numbers, text, arrays, lists or mappings, got {type(value).__name__}")
 
 
-# Headings and units of the table of figures of merit.
-COLUMNS = [
-    ("noise reduction", "dB"),
-    ("output power", ""),
-    ("of rated power", "times"),
-    ("peak control signal", ""),
-    ("clipped", "%"),
-    ("harmonics", "dB"),
-    ("converged", "s"),
-    ("diverged", "s"),
-]
+def columns(study: StudyReport) -> list[tuple[str, str]]:
+    """Return the headings and units of the table of figures of merit."""
+    return [
+        ("noise reduction", "dB"),
+        ("output power", "" if study.watt_per_power is None else "W"),
+        ("of rated power", "times"),
+        ("peak control signal", ""),
+        ("clipped", "%"),
+        ("harmonics", "dB"),
+        ("converged", "s"),
+        ("diverged", "s"),
+    ]
 
 
-def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
-    """Return figures of merit as the table's cells, "-" if there is none."""
+def cells(study: StudyReport, figures: Mapping[str, float | None]) -> list[str]:
+    """Return the figures of merit of one of a study's algorithms as the table's cells, "-" if there is none."""
 
     def cell(key: str, form: str, scale: float = 1.0) -> str:
         value = jsonable(figures.get(key))
@@ -343,8 +354,8 @@ def cells(figures: Mapping[str, float | None], rated_power: float) -> list[str]:
 
     return [
         cell("noise_reduction_db", ".1f"),
-        cell("output_power", ".5g"),
-        cell("output_power", ".4g", 1 / rated_power),
+        cell("output_power", ".5g", study.watt_per_power or 1.0),
+        cell("output_power", ".4g", 1 / study.rated_power),
         cell("peak_control_signal", ".4g"),
         cell("clipped_fraction", ".2f", 100.0),
         cell("harmonics_db", ".1f"),

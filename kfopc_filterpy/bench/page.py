@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from .descriptions import described
 from .items import (
-    COLUMNS,
     EXCERPT_S,
     HEADROOM,
     FigureItem,
@@ -20,6 +20,7 @@ from .items import (
     Sound,
     StudyReport,
     cells,
+    columns,
     figure_file,
     jsonable,
     loudness,
@@ -29,6 +30,7 @@ from .mathematics import mathml, parameter, prose
 from .summary import verdict_sentence
 
 TITLE = "Kalman filter with output power constraint"
+WITHOUT_VERDICTS = "Comparison of algorithms"
 PAPER = (
     "J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo and W.-S. Gan, “Preventing output saturation in active noise control: "
     "An output-constrained Kalman filter approach”."
@@ -49,10 +51,12 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
         first = _image(lead, folder / "figures" / lead.stem)
     elif shown := next(filter(None, figures), None):
         first = shown.pop(0)
+    names = [name for study in studies for name in study.algorithms]
     return rendered(
         TEMPLATE,
-        title=TITLE,
-        paper=PAPER,
+        title=TITLE if any(study.verdicts for study in studies) else WITHOUT_VERDICTS,
+        paper=PAPER if "KF-OPC" in names else "",
+        described=described(name for name in names if name != "KF-OPC"),
         lead=first,
         verdict=verdict_sentence(studies),
         headroom=HEADROOM,
@@ -96,8 +100,8 @@ def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> di
 
 def _merit(study: StudyReport) -> tuple[list[str], list[list[str]]]:
     """Return the headings and rows of the figures of merit, without the columns that say nothing."""
-    headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in COLUMNS]
-    rows = [cells(figures, study.rated_power) for figures in study.algorithms.values()]
+    headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in columns(study)]
+    rows = [cells(study, figures) for figures in study.algorithms.values()]
     kept = [i for i in range(len(headings)) if any(row[i] != "-" for row in rows)]
     shown = [
         [name, *("–" if row[i] == "-" else row[i] for i in kept)]

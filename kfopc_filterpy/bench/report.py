@@ -15,7 +15,6 @@ from kfopc_filterpy.plot import save_figure
 from kfopc_filterpy.signals import write_wav
 
 from .items import (
-    COLUMNS,
     FIGURES_OF_MERIT,
     FigureItem,
     Parameter,
@@ -24,6 +23,7 @@ from .items import (
     Table,
     Verdict,
     cells,
+    columns,
     figure_file,
     loudness,
     require_different,
@@ -177,9 +177,9 @@ def results_table(studies: Sequence[StudyReport]) -> str:
     """
     lines = []
     for study in studies:
-        lines.append(f"{study.name}: {study.title} (rated power {study.rated_power:g})")
-        rows = [[heading for heading, _ in COLUMNS], [unit for _, unit in COLUMNS]]
-        rows += [cells(figures, study.rated_power) for figures in study.algorithms.values()]
+        lines.append(f"{study.name}: {study.title} (rated power {study.rating})")
+        rows = [list(head) for head in zip(*columns(study), strict=True)]
+        rows += [cells(study, figures) for figures in study.algorithms.values()]
         names = ["", "", *study.algorithms]
         if study.algorithms:
             lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})

@@ -2,6 +2,7 @@
 
 import base64
 import csv
+import html
 import io
 import json
 import re
@@ -14,7 +15,10 @@ import soundfile
 from helpers.reports import FS, D, figure, study
 from matplotlib.figure import Figure
 
+from kfopc_filterpy.bench import page as page_module
 from kfopc_filterpy.bench import report
+from kfopc_filterpy.bench.descriptions import DESCRIPTIONS
+from kfopc_filterpy.bench.registry import REGISTRY
 from kfopc_filterpy.bench.report import FigureItem, Sound, Table, results_table, write_report
 from kfopc_filterpy.signals import read_recording
 
@@ -376,3 +380,32 @@ def test_a_report_that_fails_leaves_the_old_one(tmp_path, monkeypatch):
         write_report([study()], tmp_path)
     assert (tmp_path / "report.html").read_bytes() == before
     assert not list(tmp_path.glob(".*"))
+
+
+def test_output_powers_in_watts(tmp_path):
+    """A mean square of 1 is 12.5 W, as 10 V per unit into 8 ohm are; ratios and results.json stay as they are."""
+    made = study(watt_per_power=12.5)
+    lines = results_table([made]).splitlines()
+    assert lines[0] == "tonal: Tone & clip <hard> (rated power 10 W)"
+    assert lines[2].split()[:3] == ["dB", "W", "times"]
+    assert lines[4].split()[:4] == ["KF-OPC", "-", "9.9964", "0.9996"]
+    source = write_report([made], tmp_path).read_text(encoding="utf-8")
+    assert "Output power (W)" in source
+    assert "= 10 W, sampling frequency" in source
+    assert json.loads((tmp_path / "results.json").read_text())["studies"]["tonal"]["rated_power"] == 0.8
+
+
+def test_the_introduction_is_on_the_algorithms_of_the_report(tmp_path):
+    merit = {"noise_reduction_db": 1.0, "output_power": 0.5}
+    with_it = write_report([study()], tmp_path / "with").read_text(encoding="utf-8")
+    assert page_module.PAPER in html.unescape(with_it)
+    assert "KF-ANC, a Kalman filter that learns the control filter" in with_it
+    compared = study(algorithms={"KF-PB": merit, "own": merit}, verdicts=[])
+    without = write_report([compared], tmp_path / "without").read_text(encoding="utf-8")
+    assert f"<h1>{page_module.WITHOUT_VERDICTS}</h1>" in without
+    assert page_module.PAPER not in html.unescape(without)
+    assert "KF-PB, a Kalman filter that keeps the rated power" in without
+
+
+def test_every_algorithm_has_a_description():
+    assert set(DESCRIPTIONS) == set(REGISTRY)

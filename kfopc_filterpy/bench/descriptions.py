@@ -1,0 +1,35 @@
+"""What each algorithm of the registry is, in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+_BUDGET = "keeps the rated power, and spends it where it reduces the noise most"
+
+DESCRIPTIONS = {
+    "KF-ANC": "a Kalman filter that learns the control filter and knows no rated power",
+    "KF-OPC": "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
+    "KF-OPC repaired": "KF-OPC with the secondary path's gain for the control signal, trimmed by the measured power",
+    "KF-PB": f"a Kalman filter that {_BUDGET}",
+    "KF-PB (shared gain)": f"a Kalman filter of the primary paths that {_BUDGET}",
+    "KF-PB (frequency domain)": f"a Kalman filter of the primary paths, in the frequency domain, that {_BUDGET}",
+    "diagonal KF": "KF-ANC that leaves out how the weights' errors depend on each other; it computes and learns less",
+    "diagonal KF-OPC": "the diagonal KF with KF-OPC's constraint factor",
+    "FxRLS": "recursive least squares with exponential forgetting; it knows no rated power",
+    "FxLMS": "the usual gradient descent on the squared error; it knows no rated power",
+    "FxNLMS": "FxLMS with a step size relative to the power of the filtered reference",
+    "leaky FxLMS": "FxLMS whose weights decay all the time, by a leak that was tuned to the rated power",
+    "optimal leaky FxLMS": "leaky FxLMS that computes its leak from the rated power as it runs",
+    "MOV-FxLMS": "FxLMS with a penalty on the output power, computed from the rated power as it runs",
+    "MOV-FxLMS fixed": "MOV-FxLMS with a fixed penalty that was tuned to the rated power",
+    "MOV-FxLMS by variance": "MOV-FxLMS with a fixed penalty, from the variance of the whole disturbance",
+    "MOV-MFxLMS": "MOV-FxLMS without the delay of the secondary path in its loop",
+    "two-gradient FxLMS": "FxLMS that descends on the output power instead while a sample is beyond an amplitude limit",
+    "re-scaling FxLMS": "FxLMS that scales its weights down when a sample is beyond an amplitude limit",
+    "clipping FxLMS": "FxLMS whose control signal is clipped at an amplitude limit",
+}
+
+
+def described(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Return the algorithms among `names` that have a description, each once, with it."""
+    return [(name, DESCRIPTIONS[name]) for name in dict.fromkeys(names) if name in DESCRIPTIONS]

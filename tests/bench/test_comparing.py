@@ -1,0 +1,47 @@
+"""A comparison on one's own recordings: what it says about the amplifier, the units and the settings."""
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy.bench import compare_recordings
+from kfopc_filterpy.bench.comparing import _clipping, _edge
+from kfopc_filterpy.power import AmplifierRating
+from kfopc_filterpy.signals import tone
+
+FS = 8000.0
+
+
+@pytest.fixture(scope="module")
+def compared():
+    """Return a comparison with a rating of 10 W into 8 ohm, 4 V per unit."""
+    rating = AmplifierRating(8.0, sine_watt=10.0, volts_per_unit=4.0)
+    x = tone(400.0, 1.0, fs=FS)
+    return compare_recordings(x, np.eye(32)[20], [0, 1.0], rating=rating, fs=FS, names=["FxLMS"], n_taps=8)
+
+
+def test_powers_are_in_watts_if_the_rating_is(compared):
+    assert compared.watt_per_power == pytest.approx(4.0**2 / 8)
+    assert compared.rating == "10 W"
+    power = next(item.figure.axes[0] for item in compared.figures if item.stem == "power")
+    assert power.get_ylabel() == "Output power (W)\nover 250 ms"
+    assert power.get_legend_handles_labels()[1] == ["FxLMS", "Rated power 10 W"]
+
+
+def test_figures_say_when_the_control_is_switched_on(compared):
+    for item in compared.figures:
+        over_time = item.stem != "spectra"
+        assert ("The control is switched on 0.1 s into the recording." in item.caption) == over_time
+        assert (item.figure.axes[0].get_xlabel() == "Time since switch-on (s)") == over_time
+
+
+def test_the_summary_says_whether_the_amplifier_clips(compared):
+    assert compared.summary.endswith(f"The amplifier clips beyond ±{np.sqrt(2 * 10 * 8) / 4:.3g}.")
+    assert _clipping(None) == " The amplifier does not clip."
+    assert _clipping((None, None)) == " The amplifiers do not clip."
+    assert _clipping((None, 1.5)) == " The amplifiers clip beyond: never, ±1.5."
+
+
+def test_a_setting_at_the_edge_comes_with_advice():
+    assert "nothing is to be done" in _edge("KF-PB", 1e-8)
+    assert "a setting beyond it may do better" in _edge("KF-PB", 1e-4)
+    assert "mu L E[x'^2] and leak over E[x'^2] = 0.000122, 0.00383," in _edge("leaky FxLMS", (1.22e-4, 3.83e-3))
