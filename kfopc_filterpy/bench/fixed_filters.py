@@ -15,6 +15,7 @@ from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reducti
 
 LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
 CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.125)  # rated powers of the figure, over the one that full control needs
+NEARLY_FULL = 1.0 - 2.0 ** -np.arange(4.0, 9.0)  # there the curve turns sharply into the horizontal
 CHANNEL_CURVE = CURVE[::4]  # a solution for several loudspeakers takes longer
 
 
@@ -118,7 +119,7 @@ class FixedFilters:
         own, given = self.correlations, 1.0 if self.several else rated_power
         full = np.max(self.free.control_power / rated_power) if self.several else self.free.control_power
         steps = CHANNEL_CURVE if self.several else CURVE
-        powers = np.unique([*steps * full, given, given / 2, given * 2])
+        powers = np.unique([*steps * full, *NEARLY_FULL * full, given, given / 2, given * 2])
         unit = rated_power if self.several else 1.0
         removed = np.array([own.antinoise(weights_within(self.stretch, own, one * unit)[0]) for one in powers])
         microphones = len(np.atleast_2d(self.d))
