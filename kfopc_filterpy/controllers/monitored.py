@@ -169,9 +169,7 @@ class MonitoredController(WrappedController):
 
     def _sample(self, value: Any, name: str, what: str) -> Any:
         """Return a checked sample of the references or of the microphones. While muted, nobody else checks it."""
-        several = getattr(
-            self.controller, "multichannel", None
-        )  # None: a user's controller, whose channels are not known
+        several = getattr(self.controller, "multichannel", None)  # None: not known of a user's controller
         if several:
             value = channel_sample(value, getattr(self.controller, f"n_{what}"), name, what)
         elif several is False or np.ndim(value) == 0:

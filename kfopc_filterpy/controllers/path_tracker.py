@@ -26,7 +26,7 @@ FRAME_S = 0.02  # the error's power is measured over frames of this length, or o
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
 FEWEST_FRAMES = 8  # with fewer, no better prediction is significant
 FAINT = 1e-2  # of the energy of a loudspeaker's paths: with less of it left, the loudspeaker counts as faulty
-LARGEST_DB = 300.0  # of a level that is stated
+LARGEST_DB = 300.0  # larger settings in dB count as this one; they would overflow
 RIDGE = 1e-9  # relative to the mean power of the regressors, so that a narrow-band reference has a solution
 
 
