@@ -10,12 +10,24 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from .cli_inputs import Files, pascal_per_unit_of, ratings_of, scene_of, uncertainty_of
+from .cli_inputs import (
+    Files,
+    in_options,
+    pascal_per_unit_of,
+    ratings_of,
+    scene_of,
+    uncertainty_of,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from .bench import Assessment
 
 ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
 EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
@@ -88,11 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 done or enough, 1 not enough, 2 wrong input.
     """
-    options = _parser().parse_args(arguments)
+    options, unknown = _parser().parse_known_args(arguments)
     try:
+        if unknown:
+            raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")
         return options.run(options)
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
-        words = " ".join(str(error).split()) or type(error).__name__
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        words = in_options(" ".join(str(error).split()), options) or type(error).__name__
         print(f"{options.prog}: {words}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
@@ -296,6 +310,7 @@ def _verdict(options: argparse.Namespace) -> int:
             pascal_per_unit=pascal_per_unit_of(options),
             bar=bar,
         )
+        verdict = _in_options(verdict, files.remarks, options)
         if options.output is not None:
             bar.set_description("page")
             page = verdict.write(options.output)
@@ -303,6 +318,22 @@ def _verdict(options: argparse.Namespace) -> int:
     if options.output is not None and not options.json:
         print(f"{page} and verdict.json written")
     return ENOUGH if verdict.enough else NOT_ENOUGH
+
+
+def _in_options(verdict: Assessment, remarks: Sequence[str], options: argparse.Namespace) -> Assessment:
+    """Return a verdict that names options in place of arguments, with further remarks."""
+
+    def named(texts: Sequence[str]) -> tuple[str, ...]:
+        return tuple(in_options(text, options) for text in texts)
+
+    settings = verdict.settings
+    reasons = dict(zip(settings.reasons, named(tuple(settings.reasons.values())), strict=True))
+    return replace(
+        verdict,
+        advice=named(verdict.advice),
+        notes=named((*verdict.notes, *remarks)),
+        settings=replace(settings, reasons=reasons),
+    )
 
 
 def _compare_options(parser: argparse.ArgumentParser) -> None:
@@ -358,6 +389,7 @@ def _compare(options: argparse.Namespace) -> int:
             seconds=options.seconds,
             bar=bar,
         )
+    report.notes[:] = [in_options(note, options) for note in (*report.notes, *files.remarks)]
     if options.output is not None:
         page = write_report([report], options.output)
     print(json.dumps(report.result, indent=2, allow_nan=False) if options.json else results_table([report]).rstrip())
@@ -383,7 +415,8 @@ def _path_commands(actions: Any) -> None:
     resample = _command(actions, "resample", _convert, "write an impulse response at another sample rate")
     for parser in (convert, resample):
         parser.add_argument("path", help="the impulse response; - is standard input")
-        parser.add_argument("output", help=f"file to write: {', '.join(WRITTEN)}")
+        parser.add_argument("to", nargs="?", metavar="output", help=f"file to write: {', '.join(WRITTEN)}")
+        parser.add_argument("-o", "--output", metavar="FILE", help="the same")
     plot = _command(actions, "plot", _plot, "draw impulse responses and frequency responses")
     plot.add_argument("path", nargs="+", help="impulse responses of one sample rate")
     plot.add_argument("-o", "--output", metavar="FILE", required=True, help="figure to write: .png, .svg or .pdf")
@@ -475,10 +508,13 @@ def _db(power: float) -> float:
 
 
 def _convert(options: argparse.Namespace) -> int:
+    if (options.to is None) == (options.output is None):
+        raise ValueError(f"one file to write is needed, for example {options.path} S.csv or {options.path} -o S.csv")
+    output = options.to or options.output
     files = Files(options)
     taps = files.path(options.path)
-    _write_path(options.output, taps, files.fs or 0.0)
-    print(f"{options.output}: {taps.size} taps at {files.fs:g} Hz")
+    _write_path(output, taps, files.fs or 0.0)
+    print(f"{output}: {taps.size} taps at {files.fs:g} Hz")
     return ENOUGH
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -19,8 +20,68 @@ if TYPE_CHECKING:
 
 STANDARD_INPUT = "-"
 
+# What sets an argument that the package's messages name.
+OPTIONS = {
+    "algorithm": "--algorithm",
+    "amplitude_limit": "--amplitude-limit",
+    "block": "--block",
+    "channel": "--channel",
+    "clock": "--clock",
+    "delay_samples": "--path-error-samples",
+    "displacement_mm_per_volt": "--displacement",
+    "disturbance": "--disturbance",
+    "errors": "--errors",
+    "fs": "--fs",
+    "gain_db": "--path-error-db",
+    "identify_s": "--identify",
+    "latency": "--latency",
+    "level_db": "--calibrator-db",
+    "listen_s": "--listen",
+    "memory_s": "--memory",
+    "n_taps": "--taps",
+    "names": "--algorithm",
+    "noise_watt": "--loudspeaker-watt",
+    "new_fs": "--fs",
+    "pascal_per_unit": "--pascal-per-unit",
+    "phase_deg": "--path-error-deg",
+    "peak_volts": "--peak-volts",
+    "primary": "--primary",
+    "primary_path": "--primary",
+    "programme_watt": "--programme-watt",
+    "rated_power": "--rated-power",
+    "secondary": "--secondary",
+    "secondary_path": "--secondary",
+    "seconds": "--seconds",
+    "variable": "--variable",
+    "volts_per_unit": "--volts-per-unit",
+    "want_db": "--want-db",
+    "x_max_mm": "--x-max-mm",
+}
+_NAMES = "|".join(OPTIONS)
+_ALONE = re.compile(rf"^({_NAMES})(?=[\s\[])|(?<![\w./-])(\w+_\w+)(?![\w=]|\.\w)")
+_WITH_A_VALUE = re.compile(rf"(?<![\w./-])({_NAMES})=")
 
-def _read(path: Any, *, fs: float | None, channel: int | None, variable: str | None, is_path: bool) -> Recording:
+
+def in_options(message: str, options: argparse.Namespace) -> str:
+    """Return a message of the package with options of the command in place of the arguments that it names.
+
+    An argument stands at the start of a message, has a value, or is no word: "fs must be ...", "with fs=16000", "n_taps".
+    """
+
+    def option(name: str, end: str) -> str:
+        known = OPTIONS.get(name, "")
+        return f"{known}{end}" if hasattr(options, known.lstrip("-").replace("-", "_")) else ""
+
+    message = _ALONE.sub(lambda found: option(found[0], "") or found[0], message)
+    return _WITH_A_VALUE.sub(lambda found: option(found[1], " ") or found[0], message)
+
+
+def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
+    """Print a warning or a note of one line to the standard error."""
+    print(f"{options.prog}: {kind}: {message}", file=sys.stderr)
+
+
+def _read(path: Any, *, fs: float | None, variable: str | None, is_path: bool) -> Recording:
     """Read a recording or an impulse response: the one place that knows how."""
     from .paths import read_path
     from .signals import read_recording
@@ -34,6 +95,7 @@ class Files:
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self.fs: float | None = options.fs
+        self.remarks: list[str] = []  # what resampling hides of the recordings that were read
         self._first = ""
 
     def recording(self, path: str) -> np.ndarray:
@@ -129,7 +191,7 @@ def ratings_of(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
         given = getattr(options, name)
         if given is not None and len(given) not in (1, n_loudspeakers):
             raise ValueError(
-                f"--{name.replace('_', '-')} must be given once, or once for each of the {n_loudspeakers} loudspeaker(s), "
+                f"{_option(name)} must be given once, or once for each of the {n_loudspeakers} loudspeaker(s), "
                 f"got {len(given)}"
             )
     each = []
@@ -142,13 +204,20 @@ def ratings_of(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
     return each[0] if n_loudspeakers == 1 else each
 
 
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def _rating(options: argparse.Namespace) -> list[Any]:
     """Return the ratings of one loudspeaker."""
     from .power import AmplifierRating, LoudspeakerRating
 
-    for name, value in (("--ohm", options.ohm), ("--volts-per-unit", options.volts_per_unit)):
-        if value is not None:  # also where no rating uses it
-            as_positive(value, name)
+    for name in OF_THE_RATING:
+        value = getattr(options, name)
+        if isinstance(value, float):  # also where no rating uses it
+            as_positive(value, _option(name))
+    if options.loudspeaker_watt is not None and options.programme_watt is not None:
+        raise ValueError("--programme-watt stands in place of --loudspeaker-watt: leave out one of them")
     ratings: list[Any] = []
     volts = 1.0 if options.volts_per_unit is None else options.volts_per_unit
     if options.watt is not None or options.peak_volts is not None:

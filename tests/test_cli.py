@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +18,7 @@ import soundfile
 from kfopc_filterpy import FxLMS, cli, noise_reduction_db, output_power, simulate
 from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.cli_inputs import OPTIONS, in_options
 from kfopc_filterpy.paths import resample_path
 from kfopc_filterpy.signals import band_limited_noise, write_wav
 
@@ -100,7 +103,7 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", *SCENE, "--watt", "20"], "need --ohm"),
         (["verdict", *SCENE, "--watt", "20", "--ohm", "8", "--rated-power", "1"], "leave out one of them"),
         (["verdict", *SCENE, "--watt", "twenty", "--ohm", "8"], "invalid float value: 'twenty'"),
-        (["verdict", *SCENE, "--watt", "-20", "--ohm", "8"], "sine_watt must be greater than 0 W"),
+        (["verdict", *SCENE, "--watt", "-20", "--ohm", "8"], "--watt must be greater than 0"),
         (
             ["verdict", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
             "--primary or --disturbance is needed",
@@ -110,11 +113,11 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", *SCENE[:3], "--secondary", "S16.wav", "--rated-power", "1"], "for example with --fs 16000"),
         (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "empty.wav"),
         (["verdict", "text.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
-        (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "algorithm must be one of 'KF-PB'"),
+        (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of 'KF-PB'"),
         (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "cannot be written"),
         (["verdict", *SCENE, "--loudspeaker-watt", "1"], "a loudspeaker's rating needs --ohm"),
         (["verdict", *SCENE, "--rated-power", "1", "--ohm", "8", "--x-max-mm", "1"], "must be given together"),
-        (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "names must be one of"),
+        (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of"),
         (
             ["compare", *SCENE, "--rated-power", "1", "--ohm", "-1", "--algorithm", "none"],
             "--ohm must be greater than 0",
@@ -166,6 +169,22 @@ def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     if arguments != ["paths"]:
         assert "example" in out
         assert f"  kfopc {' '.join(arguments)}".rstrip() in out
+
+
+def test_an_argument_is_translated_only_where_it_is_one():
+    """It stands at the start, has a value, or is no word; and the command has the option."""
+    options = argparse.Namespace(taps=1, fs=None, channel=None)
+    assert in_options("n_taps must be 1, or n_taps=2; with fs=16000", options) == (
+        "--taps must be 1, or --taps 2; with --fs 16000"
+    )
+    assert in_options("the channel of fs and n_taps.wav", options) == "the channel of fs and n_taps.wav"
+    assert in_options("block must be 1, block=2", options) == "block must be 1, block=2"
+
+
+def test_every_option_that_messages_name_exists(command):
+    commands = (["verdict"], ["compare"], ["run"], ["paths", "resample"])
+    helps = " ".join(command(*one, "--help")[1] for one in commands)
+    assert [option for option in OPTIONS.values() if not re.search(rf"{option}\b", helps)] == []
 
 
 def test_rates_that_differ_are_resampled_each_in_its_way(command):
@@ -220,6 +239,13 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
     found, fs = soundfile.read(tmp_path / "S.wav")
     assert fs == FS
     np.testing.assert_allclose(found, taps, atol=1e-4)
+
+
+def test_a_written_path_may_be_named_by_an_option(command, tmp_path):
+    for action, more in (("convert", []), ("resample", ["--fs", FS])):
+        output = tmp_path / f"{action}.npy"
+        assert command("paths", action, "S.wav", "-o", output, *more)[0] == 0
+        np.testing.assert_array_equal(np.load(output), np.eye(64)[12])
 
 
 @pytest.mark.parametrize("suffix", ["wav", "npy", "csv", "txt"])
@@ -465,4 +491,4 @@ def test_an_algorithm_of_one_channel_is_not_compared_with_several(command, sever
     files = ["noise.wav", "--primary", "P1.wav", "--secondary", "S1.wav", "--rated-power", 1]
     code, _, err = command("compare", *files, "--algorithm", "KF-OPC repaired", "--quiet")
     assert code == 2
-    assert "names must be one of" in err
+    assert "--algorithm must be one of" in err
