@@ -315,6 +315,8 @@ def _verdict(options: argparse.Namespace) -> int:
             bar.set_description("page")
             page = verdict.write(options.output)
     print(verdict.json if options.json else verdict)
+    for note in verdict.notes:
+        warn(options, note, "note")
     if options.output is not None and not options.json:
         print(f"{page} and verdict.json written")
     return ENOUGH if verdict.enough else NOT_ENOUGH
@@ -393,6 +395,8 @@ def _compare(options: argparse.Namespace) -> int:
     if options.output is not None:
         page = write_report([report], options.output)
     print(json.dumps(report.result, indent=2, allow_nan=False) if options.json else results_table([report]).rstrip())
+    for note in report.notes:
+        warn(options, note, "note")
     if options.output is not None and not options.json:
         print(f"{page} and results.json written")
     return ENOUGH

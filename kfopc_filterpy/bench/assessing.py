@@ -32,6 +32,7 @@ from kfopc_filterpy.metrics import (
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE, allowed_share, guard_filter
+from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, Plan, announce
 from .assessment import Assessment, Band, Ceilings, Levels, advice_on
@@ -221,7 +222,10 @@ def assess(
     cause = None if reached >= want_db else _cause(ceilings, want_db)
     if cause == "adaptation" and _reduction(plan.run(algorithm, limited=True, freed=NEARLY_FREE)) >= want_db:
         cause = "amplifier"
-    if disturbance is None:
+    notes += recording_remarks(noise, fs, "noise")
+    if disturbance is not None:
+        notes += clipping_remarks(disturbance, "disturbance")
+    else:
         notes.append(
             "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
             "together and give the disturbance."
