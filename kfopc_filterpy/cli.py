@@ -438,6 +438,11 @@ def _identify(options: argparse.Namespace) -> int:
     files = Files(options)
     sent, heard = files.recording(options.excitation), files.recording(options.response)
     shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
+    if options.taps > (shortest + 1) // 2 > 0:
+        raise ValueError(
+            f"--taps must be at most {(shortest + 1) // 2} for recordings of {shortest} samples, got {options.taps}: "
+            "identify a shorter impulse response, or record for longer"
+        )
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs or 0.0)
     _write_path(options.output, found.taps, files.fs or 0.0)
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
@@ -495,7 +500,9 @@ def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
 
 def _described(facts: dict[str, Any]) -> str:
     """Return what a path does in two lines."""
-    length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {1e3 * facts['duration_s']:.3g} ms"
+    seconds = facts["duration_s"]
+    duration = f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+    length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {duration}"
     if facts["onset_s"] is None:
         return f"{length}; silent"
     return (

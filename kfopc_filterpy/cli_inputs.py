@@ -8,12 +8,16 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ._validate import as_count, as_positive
+from .paths.fitting import LONG_PATH_S, require_same_length, require_shorter, require_sound
+from .signals.quality import clipping_remarks
+from .signals.recordings import as_channel
 
 if TYPE_CHECKING:
     from .signals import Recording
@@ -86,7 +90,7 @@ def _read(path: Any, *, fs: float | None, variable: str | None, is_path: bool) -
     from .paths import read_path
     from .signals import read_recording
 
-    return (read_path if is_path else read_recording)(path, fs=fs, channel=channel, variable=variable)
+    return (read_path if is_path else read_recording)(path, fs=fs, variable=variable)
 
 
 class Files:
@@ -109,6 +113,16 @@ class Files:
     def channels(self, path: str) -> np.ndarray:
         """Return all channels of a recording, (n_channels, n_samples)."""
         return np.atleast_2d(self._read(path, is_path=False).samples)
+
+    def noise_paths(
+        self, paths: Sequence[str], option: str, noise: np.ndarray, n_microphones: int | None
+    ) -> np.ndarray:
+        """Return a matrix of paths that are to go with a noise: shorter than it, and not silent."""
+        matrix = self.matrix(paths, option, n_microphones)
+        names, heard = ", ".join(paths), self.options.noise
+        require_shorter(names, matrix.shape[-1], heard, noise.shape[-1], self.fs or 0.0)
+        require_sound(names, matrix)
+        return matrix
 
     def matrix(self, paths: Sequence[str], option: str, n_microphones: int | None = None) -> np.ndarray:
         """Return the taps of paths, (microphones, sources, taps); see the examples of `verdict` for their order."""
@@ -140,13 +154,13 @@ class Files:
     def _read(self, path: str, *, is_path: bool) -> Recording:
         """Read a file, whose rate must be that of the files before it."""
         with _file(path) as source:
-            read = _read(
-                source,
-                fs=self.options.fs,
-                channel=self.options.channel,
-                variable=self.options.variable,
-                is_path=is_path,
-            )
+            read = self._chosen(path, self._as_stored(source, self.options.fs, is_path))
+            if not is_path and read.file_fs not in (None, read.fs):  # resampling hides that samples are equal
+                stored = self._chosen(path, self._as_stored(source, None, is_path))
+                self.remarks += clipping_remarks(stored.samples, path)
+        if is_path and read.samples.shape[-1] > LONG_PATH_S * read.fs:
+            seconds = read.samples.shape[-1] / read.fs
+            warn(self.options, f"{path} lasts {seconds:.3g} s, too long for an impulse response: is it a recording?")
         if self.fs is not None and read.fs != self.fs:
             raise ValueError(
                 f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
@@ -154,6 +168,15 @@ class Files:
             )
         self.fs, self._first = read.fs, self._first or path
         return read
+
+    def _as_stored(self, source: str, fs: float | None, is_path: bool) -> Recording:
+        return _read(source, fs=fs, variable=self.options.variable, is_path=is_path)
+
+    def _chosen(self, path: str, read: Recording) -> Recording:
+        """Return the channel that the options choose; a file with one channel stays as it is."""
+        if self.options.channel is None or read.samples.ndim == 1:
+            return read
+        return replace(read, samples=read.samples[as_channel(self.options.channel, read.samples, path)])
 
 
 @contextmanager
@@ -286,8 +309,8 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
     noise = files.channels(options.noise)
     primary = None
     if options.primary is not None:
-        primary = files.matrix(options.primary, "--primary", options.microphones)
-    secondary = files.matrix(options.secondary, "--secondary", options.microphones)
+        primary = files.noise_paths(options.primary, "--primary", noise, options.microphones)
+    secondary = files.noise_paths(options.secondary, "--secondary", noise, options.microphones)
     if primary is not None and primary.shape[:2] != (len(secondary), len(noise)):
         raise ValueError(
             f"--primary must give a path from each of the {len(noise)} channel(s) of {options.noise} to each of the "
@@ -295,6 +318,8 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
             f"--channel {max(len(noise), 2) - 1}, or see the order of several with --help"
         )
     disturbance = None if options.disturbance is None else files.channels(options.disturbance)
+    if disturbance is not None:
+        require_same_length(options.disturbance, disturbance.shape[-1], options.noise, noise.shape[-1])
     return noise, primary, secondary, disturbance
 
 

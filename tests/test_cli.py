@@ -37,6 +37,8 @@ def folder(tmp_path_factory):
     for name, signal in signals.items():
         write_wav(here / f"{name}.wav", signal, FS)
     write_wav(here / "S16.wav", np.asarray(resample_path(secondary, 2 * FS, fs=FS)), 2 * FS)
+    write_wav(here / "silent.wav", np.zeros(64), FS)
+    write_wav(here / "short.wav", signals["d"][:20000], FS)
     (here / "empty.wav").write_bytes(b"")
     (here / "text.wav").write_text("these are words")
     return here
@@ -124,7 +126,38 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         ),
         (["verdict", *SCENE, "--rated-power", "1", "--volts-per-unit", "0"], "--volts-per-unit must be greater than 0"),
         (["paths", "convert", "S.wav", "S.xyz"], "must end in .wav, .npy, .csv, .txt"),
-        (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "n_taps must be at least 1"),
+        (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "--taps must be at least 1"),
+        (["verdict", *SCENE, "--rated-power", "1", "--want-db", "-3"], "--want-db must not be negative"),
+        (["verdict", *SCENE, "--rated-power", "1", "--taps", "0"], "--taps must be at least 1"),
+        (["verdict", *SCENE, "--rated-power", "1", "--path-error-samples", "-1"], "--path-error-samples must not be"),
+        (
+            ["verdict", *SCENE, "--ohm", "8", "--loudspeaker-watt", "1", "--programme-watt", "2"],
+            "leave out one of them",
+        ),
+        # Files that do not go together are named.
+        (
+            ["verdict", "noise.wav", "--primary", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "noise.wav has 24000 samples (3 s), noise.wav 24000 (3 s): an impulse response must be shorter",
+        ),
+        (
+            ["compare", "S.wav", "--primary", "P.wav", "--secondary", "noise.wav", "--rated-power", "1"],
+            "P.wav has 64 samples (0.008 s), S.wav 64 (0.008 s): an impulse response must be shorter than the noise, and "
+            "at most 10 s long; cut the impulse response, or are the files swapped?",
+        ),
+        (["verdict", *SCENE[:3], "--secondary", "silent.wav", "--rated-power", "1"], "silent.wav is silent"),
+        (
+            ["verdict", "noise.wav", "--disturbance", "short.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "short.wav has 20000 samples, noise.wav 24000: they must be recorded together",
+        ),
+        (
+            ["paths", "identify", "noise.wav", "d.wav", "--taps", "20000", "-o", "x.npy"],
+            "--taps must be at most 12000 for recordings of 24000 samples, got 20000",
+        ),
+        (["paths", "convert", "S.wav"], "S.wav -o S.csv"),
+        (
+            ["paths", "convert", "S.wav", "S.csv", "--bogus", "3"],
+            "unrecognized arguments: --bogus 3; see kfopc paths convert",
+        ),
     ],
     ids=lambda value: "-".join(value).replace("/", "") if isinstance(value, list) else "",
 )
@@ -187,6 +220,26 @@ def test_every_option_that_messages_name_exists(command):
     assert [option for option in OPTIONS.values() if not re.search(rf"{option}\b", helps)] == []
 
 
+def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command):
+    options = ["--rated-power", "4", "--taps", "32", "--json", "--algorithm", "FxLMS"]
+    code, chosen, _ = command("verdict", "stereo.wav", *SCENE[1:], *options, "--channel", "1")
+    assert code == 0
+    assert chosen == command("verdict", *SCENE, *options)[1]
+
+
+def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(command, folder):
+    clipped = np.clip(band_limited_noise((100, 1500), 6.0, fs=FS, rng=1, power=1.0), -1, 1)
+    write_wav(folder / "clipped.wav", clipped, FS)
+    options = [*SCENE[1:], "--rated-power", "4", "--taps", "16", "--json", "--algorithm", "FxLMS"]
+    _, out, err = command("verdict", "noise.wav", *options)
+    assert any("lasts only 3 s" in note for note in json.loads(out)["notes"])
+    assert "kfopc verdict: note: noise lasts only 3 s" in err
+    for resampled in ([], ["--fs", "4000"]):  # which hides that samples are equal
+        _, out, err = command("verdict", "clipped.wav", *options, *resampled)
+        assert sum("is clipped" in note for note in json.loads(out)["notes"]) == 1
+        assert "is clipped" in err
+
+
 def test_rates_that_differ_are_resampled_each_in_its_way(command):
     """An impulse response keeps its gain, so that the power needed stays the same: 1 for full control."""
     scene = [*SCENE[:3], "--secondary", "S16.wav", "--rated-power", "4", "--taps", "32", "--json"]
@@ -239,6 +292,17 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
     found, fs = soundfile.read(tmp_path / "S.wav")
     assert fs == FS
     np.testing.assert_allclose(found, taps, atol=1e-4)
+
+
+def test_a_recording_given_as_a_path_is_analysed_with_a_warning(command, folder):
+    write_wav(folder / "long.wav", np.random.default_rng(0).standard_normal(8 * FS), FS)
+    code, out, err = command("paths", "inspect", "long.wav", "--primary", "long.wav")
+    assert code == 0
+    assert "64000 taps at 8000 Hz, 8 s;" in out
+    assert (
+        "kfopc paths inspect: warning: long.wav lasts 8 s, too long for an impulse response: is it a recording?" in err
+    )
+    assert command("paths", "inspect", "S.wav")[2] == ""
 
 
 def test_a_written_path_may_be_named_by_an_option(command, tmp_path):

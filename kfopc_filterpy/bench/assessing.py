@@ -276,8 +276,10 @@ def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any,
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")
     K, J, _ = s.shape
     for k in np.flatnonzero(~np.any(s, axis=(1, 2))):
-        which = "secondary" if K == 1 else f"secondary[{k}]"
-        raise ValueError(f"{which} must not be silent: every value is 0; leave out a microphone that is not reached")
+        which, mend = "secondary", "record it again"
+        if K > 1:
+            which, mend = f"secondary[{k}]", "leave out a microphone that is not reached"
+        raise ValueError(f"{which} must not be silent: every value is 0; {mend}")
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", length=x.shape[1])
         if len(d) != K:

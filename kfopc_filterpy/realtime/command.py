@@ -10,6 +10,7 @@ import numpy as np
 
 from .._validate import as_positive
 from ..controllers.power_budget import kf_pb
+from ..paths.fitting import require_same_length, require_shorter, require_sound
 from ..paths.reading import read_path
 from ..power.limiter import OutputLimiter
 from ..signals.recordings import read_recording
@@ -107,6 +108,7 @@ def _interface(options: argparse.Namespace) -> Interface:
     if options.secondary is None:
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
     noise = read_recording(options.noise, fs=options.fs)
+    n_samples = noise.samples.shape[-1]
     files = {"secondary": read_path(options.secondary, fs=options.fs)}
     for name, read in (("primary", read_path), ("disturbance", read_recording)):
         if getattr(options, name) is not None:
@@ -117,6 +119,13 @@ def _interface(options: argparse.Namespace) -> Interface:
                 f"--{name} is sampled at {one.fs:g} Hz, the noise at {noise.fs:g} Hz: resample all, for example with "
                 "--fs 16000"
             )
+    for name in ("primary", "secondary"):
+        if name in files:
+            path = files[name]
+            require_shorter(getattr(options, name), path.samples.shape[-1], options.noise, n_samples, noise.fs)
+            require_sound(getattr(options, name), path.samples)
+    if "disturbance" in files:
+        require_same_length(options.disturbance, files["disturbance"].samples.shape[-1], options.noise, n_samples)
     primary = files.get("primary")
     disturbance = files.get("disturbance")
     return SimulatedInterface(

@@ -355,7 +355,7 @@ def test_the_levels_are_those_of_the_sounds(written):
     [
         ({"noise": np.zeros(8000)}, "noise must not be silent"),
         ({"noise": np.ones(8000)}, "noise must not be silent"),
-        ({"secondary": np.zeros(8)}, "secondary must not be silent"),
+        ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
         ({"primary": None}, "primary must be given unless there is a disturbance"),
         ({"disturbance": np.ones(7)}, "disturbance must have 8000 values, got 7"),
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),
