@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
 EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
+UNRELATED_DB, POOR_DB = -1.0, -20.0  # of a response that an identified path leaves unexplained
 
 EXAMPLES = {
     "": """examples:
@@ -444,11 +445,29 @@ def _identify(options: argparse.Namespace) -> int:
             "identify a shorter impulse response, or record for longer"
         )
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs or 0.0)
+    _judge_residual(options, found.residual_db, files.fs or 0.0)
     _write_path(options.output, found.taps, files.fs or 0.0)
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
     text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
     print(json.dumps(facts) if options.json else text)
     return ENOUGH
+
+
+def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float) -> None:
+    """Raise ValueError if a fit explains next to nothing of a response, warn if it explains little."""
+    explained = f"explains {100 * (1 - 10 ** (residual_db / 10)):.1f} % of {options.response}"
+    if residual_db > UNRELATED_DB:
+        raise ValueError(
+            f"{options.excitation} {explained}, less than {100 * (1 - 10 ** (UNRELATED_DB / 10)):.0f} %: are the files "
+            "swapped, or of different recordings? Give what was sent to the amplifier first, then what the microphone "
+            "heard at the same time; nothing was written"
+        )
+    if residual_db > POOR_DB:
+        warn(
+            options,
+            f"{options.excitation} {explained} only: play it louder or wait for silence, check that nothing is clipped, "
+            f"and give more --taps if the impulse response is longer than {1e3 * options.taps / fs:.3g} ms",
+        )
 
 
 def _inspect(options: argparse.Namespace) -> int:

@@ -294,6 +294,27 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
     np.testing.assert_allclose(found, taps, atol=1e-4)
 
 
+def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(command, folder, tmp_path):
+    write_wav(folder / "other.wav", band_limited_noise((100, 1500), 3.0, fs=FS, rng=2), FS)
+    code, out, err = command("paths", "identify", "noise.wav", "other.wav", "--taps", 24, "-o", tmp_path / "S.wav")
+    assert (code, out) == (2, "")
+    assert re.search(r"noise.wav explains \d\.\d % of other.wav, less than 21 %: are the files swapped", err)
+    assert not (tmp_path / "S.wav").exists()
+
+
+def test_a_fit_that_leaves_much_unexplained_is_warned_of(command, folder, tmp_path):
+    sent = np.random.default_rng(1).standard_normal(2 * FS)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "noisy.wav", sent + 0.3 * np.random.default_rng(2).standard_normal(sent.size), FS)
+    code, out, err = command("paths", "identify", "sent.wav", "noisy.wav", "--taps", 8, "-o", tmp_path / "S.wav")
+    assert code == 0
+    assert "8 taps" in out
+    assert "warning: sent.wav explains 91." in err  # 1 / 1.09
+    assert "longer than 1 ms" in err
+    write_wav(folder / "heard.wav", sent + 0.05 * np.random.default_rng(2).standard_normal(sent.size), FS)
+    assert command("paths", "identify", "sent.wav", "heard.wav", "--taps", 8, "-o", tmp_path / "S.wav")[2] == ""
+
+
 def test_a_recording_given_as_a_path_is_analysed_with_a_warning(command, folder):
     write_wav(folder / "long.wav", np.random.default_rng(0).standard_normal(8 * FS), FS)
     code, out, err = command("paths", "inspect", "long.wav", "--primary", "long.wav")
