@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -577,8 +578,10 @@ def _plot(options: argparse.Namespace) -> int:
     figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
     plot_impulse_responses(taps, fs=files.fs, ax=axes[0])
     plot_bode(taps, fs=files.fs, ax=axes[1:])
-    figure.savefig(options.output, dpi=160)
-    print(f"{options.output} written")
+    output = Path(options.output)
+    output = output if output.suffix else output.with_suffix(".png")
+    figure.savefig(output, dpi=160)
+    print(f"{output} written")
     return ENOUGH
 
 
@@ -618,6 +621,9 @@ def _data(options: argparse.Namespace) -> int:
         if name not in known:
             raise ValueError(f"there is no data set {name!r}; there are {', '.join(known)}")
     folder = str(options.folder or dataset_folder())
+    is_named = options.folder or os.environ.get("KFOPC_DATA")
+    if is_named and options.action != "fetch" and not Path(folder).is_dir():
+        warn(options, f"the folder {folder} does not exist: correct --folder or KFOPC_DATA, or run kfopc data fetch")
     if options.action == "where":
         print(json.dumps({"folder": folder}) if options.json else folder)
         return ENOUGH

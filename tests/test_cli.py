@@ -370,6 +370,9 @@ def test_a_path_is_inspected_and_plotted(command, tmp_path):
     code, _, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "paths.png")
     assert code == 0
     assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")
+    code, out, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "plots")
+    assert out == f"{tmp_path / 'plots.png'} written\n"
+    assert (tmp_path / "plots.png").is_file()
 
 
 # Comparisons.
@@ -402,6 +405,14 @@ def test_the_measured_data_are_listed_and_an_unknown_name_is_refused(command, tm
     code, _, err = command("data", "fetch", "fan")
     assert code == 2
     assert "there is no data set 'fan'; there are duct" in err
+
+
+def test_a_folder_of_data_that_is_named_but_does_not_exist_is_said(command, tmp_path, monkeypatch):
+    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
+    code, _, err = command("data", "list")
+    assert code == 0
+    assert f"the folder {tmp_path / 'nowhere'} does not exist: correct --folder or KFOPC_DATA" in err
+    assert command("data", "list", "--folder", tmp_path)[2] == ""
 
 
 def test_a_calibrators_recording_gives_the_levels(command, folder):
