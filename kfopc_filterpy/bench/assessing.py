@@ -34,7 +34,7 @@ from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE, allowed_share, guard_filter
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
-from .assessed_runs import ALGORITHMS, Plan, announce
+from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
 from .assessment import Assessment, Band, Ceilings, Levels, advice_on
 from .fixed_filters import FixedFilters
 from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
@@ -395,7 +395,7 @@ def _figures(run: SimulationResult, limits: Limits, fs: float) -> dict[str, Any]
         "of_rated_power": power / limits.rated_power,
         "worst_window": overshoot(run.control_signal, limits.rated_power, fs, window_s=limits.window_s),
         "peak_control_signal": peak_control_signal(run.control_signal, steady=1.0),
-        "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=0.1),
+        "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=NSE_WINDOW_S),
         "diverged_at_s": run.diverged_at_s,
     }
     if run.error.ndim == 1:

@@ -13,9 +13,9 @@ import pytest
 import soundfile
 
 from kfopc_filterpy import kf_pb, noise_reduction_db
-from kfopc_filterpy.bench import algorithms, assess, assessed_runs
+from kfopc_filterpy.bench import algorithms, assess, assessed_runs, compare_recordings
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
-from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy.metrics import convergence_time_s, overshoot
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import band_limited_noise
@@ -103,6 +103,17 @@ def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
     assert small.limited_by == "amplifier"
     large = assess(x, primary, secondary, rating=AmplifierRating(ohm=1.0, sine_watt=8.0), **options)
     assert large.enough
+
+
+def test_a_comparison_times_convergence_by_the_window_of_a_verdict_and_of_the_figure():
+    report = compare_recordings(
+        noise(), arriving(20), arriving(6, length=16), rating=PLENTY, fs=FS, names=["FxLMS"], n_taps=16
+    )
+    disturbance, error = (sound.signal for sound in report.sounds)
+    time, of_5_ms = (convergence_time_s(error, disturbance, FS, window_s=window_s) for window_s in (0.1, 0.005))
+    assert report.algorithms["FxLMS"]["convergence_time_s"] == time
+    assert time < of_5_ms  # in which the noise itself rises and falls
+    assert any("lasts only 3 s" in note for note in report.notes)
 
 
 def test_the_advice_says_how_much_of_the_noise_the_default_uncertainty_holds_back():
