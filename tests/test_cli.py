@@ -227,6 +227,16 @@ def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command)
     assert chosen == command("verdict", *SCENE, *options)[1]
 
 
+def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path):
+    write = ["-o", tmp_path / "out"]
+    code, out, _ = command("verdict", *SCENE, "--rated-power", "4", "--taps", "8", "--want-db", "12", *write)
+    assert code == 1
+    told = " ".join(out.split())
+    assert "8 taps last 1 ms, but the noise arrives up to 1.9 ms later than the loudspeaker's sound" in told
+    assert "take a longer filter with --taps 32." in told
+    assert "--taps 32" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+
+
 def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(command, folder):
     clipped = np.clip(band_limited_noise((100, 1500), 6.0, fs=FS, rng=1, power=1.0), -1, 1)
     write_wav(folder / "clipped.wav", clipped, FS)

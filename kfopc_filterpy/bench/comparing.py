@@ -13,7 +13,8 @@ from kfopc_filterpy._validate import as_choice, as_count, as_positive
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import recorded_scene
-from .assessing import longest_filter, recorded_signals, switch_on_sample
+from .assessing import recorded_signals, switch_on_sample
+from .fixed_filters import longest_filter
 from .items import FigureItem, Parameter, Sound, StudyReport, Table
 from .limits import ChannelLimits, limits_of, ratings_of_each
 from .registry import REGISTRY, algorithms

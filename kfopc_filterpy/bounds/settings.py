@@ -125,6 +125,7 @@ def suggest_settings(
     measurement_noise_from_run : q alone, for a given length.
     wiener_solution : the best fixed filter.
     causality_margin : whether the paths leave enough time.
+    coherence_bound : how much the reference explains.
 
     Notes
     -----
@@ -298,7 +299,7 @@ def _why_length(errors: np.ndarray, taps: int, d_power: float, n_taps: int | Non
         limit = "max_taps allows" if errors.size == max_taps else "this record supports"
         reason = f"as long as {limit}; {reached}, one of half the length by {reach(-(-taps // 2))}"
     if errors[taps - 1] > LITTLE * d_power:
-        reason += "; if that is too little, see causality_margin and coherence_bound for the cause"
+        reason += "; if that is too little, the causality margin and the coherence tell the cause"
     return reason
 
 

@@ -105,6 +105,36 @@ def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
     assert large.enough
 
 
+def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must_be():
+    """The second arrival comes 94 samples after the loudspeaker's sound and carries half of the energy."""
+    verdict = verdict_on("filter", better=False)
+    assert verdict.response_s == pytest.approx((100 - 6 + 1) / FS)
+    (advice,) = verdict.advice
+    assert advice.startswith(
+        "32 taps last 4 ms, but the noise arrives up to 12 ms later than the loudspeaker's sound: "
+    )
+    assert advice.endswith("resample everything with fs=4000, or take a longer filter with n_taps=128.")
+    assert verdict_on("filter", better=True).noise_reduction_db > 8.0  # with those 128 taps
+
+
+def test_without_a_primary_path_a_short_filter_is_advised_to_be_longer():
+    x, primary = noise(), arriving(12, 30)
+    verdict = assess(
+        x,
+        None,
+        arriving(6, length=16),
+        disturbance=np.convolve(x, primary)[: x.size],
+        rating=PLENTY,
+        fs=FS,
+        n_taps=8,
+        beside=(),
+        secondary_path_uncertainty=None,
+    )
+    assert verdict.limited_by == "filter"
+    assert verdict.response_s is None
+    assert verdict.advice[0].startswith("Try a filter longer than 8 taps: 8 taps last 1 ms at 8000 Hz, more at a lower")
+
+
 def test_a_comparison_times_convergence_by_the_window_of_a_verdict_and_of_the_figure():
     report = compare_recordings(
         noise(), arriving(20), arriving(6, length=16), rating=PLENTY, fs=FS, names=["FxLMS"], n_taps=16
