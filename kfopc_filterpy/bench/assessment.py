@@ -43,6 +43,7 @@ from .limits import Limits
 SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("verdict.schema.json")
 ROOM_FOR_RESPONSE = 1.25  # times the time that a control filter must last
+MOST_TAPS = 1024  # that advice names: longer filters take very long
 RATE_OF_BAND = 2.5  # least sample rate over the highest frequency of the noise
 CAUSES = ("coherence", "causality", "filter", "path", "amplifier", "adaptation")
 
@@ -419,10 +420,16 @@ def _advice_on_length(verdict: Assessment) -> list[str]:
         ]
     enough = 2 ** math.ceil(math.log2(ROOM_FOR_RESPONSE * needed_s * fs))
     slower = _slower_rate(verdict, needed_s)
+    mends = [] if slower is None else [f"resample everything with fs={slower:g}"]
+    if enough <= MOST_TAPS:
+        mends.append(f"take a longer filter with n_taps={enough}")
+    if not mends:
+        mends.append(
+            "move the reference microphone towards the error microphone, or give a primary path that ends sooner"
+        )
+    late = float(f"{1e3 * needed_s:.2g}")
     return [
-        f"{lasts}, but the noise arrives up to {1e3 * needed_s:.2g} ms later than the loudspeaker's sound: "
-        + ("" if slower is None else f"resample everything with fs={slower:g}, or ")
-        + f"take a longer filter with n_taps={enough}."
+        f"{lasts}, but the noise arrives up to {late:g} ms later than the loudspeaker's sound: {', or '.join(mends)}."
     ]
 
 

@@ -6,6 +6,7 @@ import functools
 import itertools
 import json
 import re
+from dataclasses import replace
 
 import jsonschema
 import numpy as np
@@ -14,7 +15,7 @@ import soundfile
 
 from kfopc_filterpy import kf_pb, noise_reduction_db
 from kfopc_filterpy.bench import algorithms, assess, assessed_runs, compare_recordings
-from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
+from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.metrics import convergence_time_s, overshoot
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
@@ -115,6 +116,11 @@ def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must
     )
     assert advice.endswith("resample everything with fs=4000, or take a longer filter with n_taps=128.")
     assert verdict_on("filter", better=True).noise_reduction_db > 8.0  # with those 128 taps
+    late = replace(verdict, response_s=0.9)  # at 4000 Hz 3600 taps, more than anyone runs
+    assert advice_on(late) == [
+        "32 taps last 4 ms, but the noise arrives up to 900 ms later than the loudspeaker's sound: move the reference "
+        "microphone towards the error microphone, or give a primary path that ends sooner."
+    ]
 
 
 def test_without_a_primary_path_a_short_filter_is_advised_to_be_longer():
