@@ -219,7 +219,7 @@ class Assessment:
         if not np.isfinite(missed):
             return f"{answer}: {self.algorithm} diverges with {self.power(self.limits.rated_power)}."
         return (
-            f"{answer}: {self.algorithm} reaches {round(self.noise_reduction_db, 1) + 0.0:.1f} dB with {self.power(self.limits.rated_power)}, "
+            f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} with {self.power(self.limits.rated_power)}, "
             f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted."
         )
 
@@ -240,7 +240,7 @@ class Assessment:
             "path": c.path_db,
             "power": c.power_db,
         }
-        return {name: f"{value:.1f} dB" for name, value in numbers.items()} | {
+        return {name: _db(value) for name, value in numbers.items()} | {
             "taps": str(self.settings.n_taps),
             "rated": self.power(self.limits.rated_power),
         }
@@ -338,6 +338,11 @@ def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -
     if np.ndim(values) and len(set(texts)) == 1:
         return f"{texts[0]}{unit}{all_the_same if len(texts) > 1 else ''}"
     return f"{listed(values, form)}{unit}"
+
+
+def _db(value: float) -> str:
+    """Return a level as text, without a minus sign before zero."""
+    return f"{round(value, 1) + 0.0:.1f} dB"
 
 
 def _plain(value: Any) -> Any:
