@@ -466,8 +466,8 @@ def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float) 
     if residual_db > POOR_DB:
         warn(
             options,
-            f"{options.excitation} {explained} only: play it louder or wait for silence, check that nothing is clipped, "
-            f"and give more --taps if the impulse response is longer than {1e3 * options.taps / fs:.3g} ms",
+            f"{options.excitation} {explained} only: play it louder or wait for silence, check that nothing is "
+            f"clipped, and give more --taps if the impulse response is longer than {1e3 * options.taps / fs:.3g} ms",
         )
 
 

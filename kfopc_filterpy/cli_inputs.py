@@ -69,7 +69,7 @@ _WITH_A_VALUE = re.compile(rf"(?<![\w./-])({_NAMES})=")
 def in_options(message: str, options: argparse.Namespace) -> str:
     """Return a message of the package with options of the command in place of the arguments that it names.
 
-    An argument stands at the start of a message, has a value, or is no word: "fs must be ...", "with fs=16000", "n_taps".
+    An argument stands at the start of a message, has a value, or is no word: "fs must be ...", "fs=16000", "n_taps".
     """
 
     def option(name: str, end: str) -> str:

@@ -141,8 +141,8 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         ),
         (
             ["compare", "S.wav", "--primary", "P.wav", "--secondary", "noise.wav", "--rated-power", "1"],
-            "P.wav has 64 samples (0.008 s), S.wav 64 (0.008 s): an impulse response must be shorter than the noise, and "
-            "at most 10 s long; cut the impulse response, or are the files swapped?",
+            "P.wav has 64 samples (0.008 s), S.wav 64 (0.008 s): an impulse response must be shorter than the noise, "
+            "and at most 10 s long; cut the impulse response, or are the files swapped?",
         ),
         (["verdict", *SCENE[:3], "--secondary", "silent.wav", "--rated-power", "1"], "silent.wav is silent"),
         (

@@ -219,7 +219,8 @@ class Assessment:
         if not np.isfinite(missed):
             return f"{answer}: {self.algorithm} diverges with {self.power(self.limits.rated_power)}."
         return (
-            f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} with {self.power(self.limits.rated_power)}, "
+            f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} with "
+            f"{self.power(self.limits.rated_power)}, "
             f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted."
         )
 
@@ -421,7 +422,8 @@ def _advice_on_length(verdict: Assessment) -> list[str]:
     if needed_s is None or needed_s * fs <= taps:
         return [
             f"Try a filter longer than {taps} taps: {lasts} at {fs:g} Hz, more at a lower sample rate. If that gains "
-            "nothing, the loudspeaker does not reach what is left of the noise, or it needs to be closer to the microphone."
+            "nothing, the loudspeaker does not reach what is left of the noise, or it needs to be closer to the "
+            "microphone."
         ]
     enough = 2 ** math.ceil(math.log2(ROOM_FOR_RESPONSE * needed_s * fs))
     slower = _slower_rate(verdict, needed_s)
@@ -439,7 +441,7 @@ def _advice_on_length(verdict: Assessment) -> list[str]:
 
 
 def _slower_rate(verdict: Assessment, needed_s: float) -> float | None:
-    """Return a whole fraction of the sample rate that keeps the noise's band, and at which the filter is long enough."""
+    """Return a whole fraction of the sample rate that keeps the noise's band and makes the filter long enough."""
     n_references, n_loudspeakers, _ = verdict.channels or (1, 1, 1)
     longest = longest_filter(n_references * n_loudspeakers)
     for divisor in range(2, 13):

@@ -237,8 +237,8 @@ def _summary(report: RunReport, fs: float, block: int) -> str:
         reach = f"the best filter without a rated power would reach {report.possible_db:.1f} dB"
         if report.possible_db < SMALL_BOUND_DB:
             reach += (
-                f"; the buffers, two blocks of {block} samples ({2e3 * block / fs:.2g} ms), make the anti-noise late: use "
-                "a smaller --block"
+                f"; the buffers, two blocks of {block} samples ({2e3 * block / fs:.2g} ms), make the anti-noise late: "
+                "use a smaller --block"
             )
         lines.insert(2, reach)
     faults = [f"{event.time_s:.2f} s: {event.what} {event.channel}".rstrip() for event in report.health.events]

@@ -31,8 +31,8 @@ def clipping_remarks(samples: Any, name: str) -> list[str]:
         if share:
             which = name if len(channels) == 1 else f"channel {number} of {name}"
             remarks.append(
-                f"{which} is clipped: {100 * share:.2g} % of its samples stay at the highest or the lowest value. What was "
-                "cut off is missing from every result: record again with less gain."
+                f"{which} is clipped: {100 * share:.2g} % of its samples stay at the highest or the lowest value. What "
+                "was cut off is missing from every result: record again with less gain."
             )
     return remarks
 
