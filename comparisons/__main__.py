@@ -92,6 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _speed(parser, options)
     began = time.perf_counter()
     reports: list[StudyReport] = []
+    left_out: list[str] = []
     chosen = {name: (STUDIES | FURTHER)[name] for name in options.studies or STUDIES}
     planned = sum(planned_runs() for _, planned_runs in chosen.values())
     with tqdm(total=planned, unit="run", disable=options.quiet, dynamic_ncols=True) as bar:
@@ -102,10 +103,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if isinstance(report, str):
                 bar.total -= planned_runs()
                 tqdm.write(report)
+                left_out.append(report)
             else:
                 reports.append(report)
     if not reports:
         return 1
+    reports[-1].notes.extend(left_out)  # the page would not show otherwise that something is missing
     page = write_report(reports, options.output)
     print(results_table(reports))
     for report in reports:

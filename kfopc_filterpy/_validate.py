@@ -31,16 +31,21 @@ def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None 
 
 def as_real_array(value: Any, name: str) -> np.ndarray:
     """Return `value` as a float64 array of any shape, NaN and Inf included."""
+    if isinstance(value, np.ma.MaskedArray):
+        value = np.ma.filled(value.astype(np.float64), np.nan)  # a masked value is a missing one
     try:
         array = np.asarray(value)
-        real = array.astype(np.float64, copy=False) if array.dtype.kind != "c" else None
+        real = array.astype(np.float64, copy=False) if array.dtype.kind not in "cSU" else None
     except (TypeError, ValueError) as error:
         ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
         raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
     except OverflowError as error:  # an integer of Python
         raise ValueError(f"{name} must be finite, but holds a number that is too large for a float") from error
-    if real is None:  # numpy would drop the imaginary part with only a warning
-        raise TypeError(f"{name} must be a sequence of real numbers, got complex ones")
+    if real is None:  # numpy would drop the imaginary part with only a warning, and read numbers from text
+        text = type(value).__name__ if isinstance(value, str | bytes) else "text"
+        raise TypeError(
+            f"{name} must be a sequence of real numbers, got {'complex ones' if array.dtype.kind == 'c' else text}"
+        )
     return real
 
 

@@ -7,19 +7,33 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from .cli_inputs import Files, pascal_per_unit_of, ratings_of, scene_of, uncertainty_of
+from .cli_inputs import (
+    Files,
+    in_options,
+    pascal_per_unit_of,
+    ratings_of,
+    scene_of,
+    uncertainty_of,
+    warn,
+)
+
+if TYPE_CHECKING:
+    from .bench import Assessment
 
 ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
 EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
+UNRELATED_DB, POOR_DB = -1.0, -20.0  # of a response that an identified path leaves unexplained
 
 EXAMPLES = {
     "": """examples:
@@ -88,11 +102,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         0 done or enough, 1 not enough, 2 wrong input.
     """
-    options = _parser().parse_args(arguments)
+    options, unknown = _parser().parse_known_args(arguments)
     try:
+        if unknown:
+            raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")
         return options.run(options)
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError) as error:
-        words = " ".join(str(error).split()) or type(error).__name__
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        words = in_options(" ".join(str(error).split()), options) or type(error).__name__
         print(f"{options.prog}: {words}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
@@ -296,13 +312,32 @@ def _verdict(options: argparse.Namespace) -> int:
             pascal_per_unit=pascal_per_unit_of(options),
             bar=bar,
         )
+        verdict = _in_options(verdict, files.remarks, options)
         if options.output is not None:
             bar.set_description("page")
             page = verdict.write(options.output)
     print(verdict.json if options.json else verdict)
+    for note in verdict.notes:
+        warn(options, note, "note")
     if options.output is not None and not options.json:
         print(f"{page} and verdict.json written")
     return ENOUGH if verdict.enough else NOT_ENOUGH
+
+
+def _in_options(verdict: Assessment, remarks: Sequence[str], options: argparse.Namespace) -> Assessment:
+    """Return a verdict that names options in place of arguments, with further remarks."""
+
+    def named(texts: Sequence[str]) -> tuple[str, ...]:
+        return tuple(in_options(text, options) for text in texts)
+
+    settings = verdict.settings
+    reasons = dict(zip(settings.reasons, named(tuple(settings.reasons.values())), strict=True))
+    return replace(
+        verdict,
+        advice=named(verdict.advice),
+        notes=named((*verdict.notes, *remarks)),
+        settings=replace(settings, reasons=reasons),
+    )
 
 
 def _compare_options(parser: argparse.ArgumentParser) -> None:
@@ -358,9 +393,12 @@ def _compare(options: argparse.Namespace) -> int:
             seconds=options.seconds,
             bar=bar,
         )
+    report.notes[:] = [in_options(note, options) for note in (*report.notes, *files.remarks)]
     if options.output is not None:
         page = write_report([report], options.output)
     print(json.dumps(report.result, indent=2, allow_nan=False) if options.json else results_table([report]).rstrip())
+    for note in report.notes:
+        warn(options, note, "note")
     if options.output is not None and not options.json:
         print(f"{page} and results.json written")
     return ENOUGH
@@ -383,7 +421,8 @@ def _path_commands(actions: Any) -> None:
     resample = _command(actions, "resample", _convert, "write an impulse response at another sample rate")
     for parser in (convert, resample):
         parser.add_argument("path", help="the impulse response; - is standard input")
-        parser.add_argument("output", help=f"file to write: {', '.join(WRITTEN)}")
+        parser.add_argument("to", nargs="?", metavar="output", help=f"file to write: {', '.join(WRITTEN)}")
+        parser.add_argument("-o", "--output", metavar="FILE", help="the same")
     plot = _command(actions, "plot", _plot, "draw impulse responses and frequency responses")
     plot.add_argument("path", nargs="+", help="impulse responses of one sample rate")
     plot.add_argument("-o", "--output", metavar="FILE", required=True, help="figure to write: .png, .svg or .pdf")
@@ -401,12 +440,35 @@ def _identify(options: argparse.Namespace) -> int:
     files = Files(options)
     sent, heard = files.recording(options.excitation), files.recording(options.response)
     shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
+    if options.taps > (shortest + 1) // 2 > 0:
+        raise ValueError(
+            f"--taps must be at most {(shortest + 1) // 2} for recordings of {shortest} samples, got {options.taps}: "
+            "identify a shorter impulse response, or record for longer"
+        )
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs or 0.0)
+    _judge_residual(options, found.residual_db, files.fs or 0.0)
     _write_path(options.output, found.taps, files.fs or 0.0)
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
     text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
     print(json.dumps(facts) if options.json else text)
     return ENOUGH
+
+
+def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float) -> None:
+    """Raise ValueError if a fit explains next to nothing of a response, warn if it explains little."""
+    explained = f"explains {100 * (1 - 10 ** (residual_db / 10)):.1f} % of {options.response}"
+    if residual_db > UNRELATED_DB:
+        raise ValueError(
+            f"{options.excitation} {explained}, less than {100 * (1 - 10 ** (UNRELATED_DB / 10)):.0f} %: are the files "
+            "swapped, or of different recordings? Give what was sent to the amplifier first, then what the microphone "
+            "heard at the same time; nothing was written"
+        )
+    if residual_db > POOR_DB:
+        warn(
+            options,
+            f"{options.excitation} {explained} only: play it louder or wait for silence, check that nothing is "
+            f"clipped, and give more --taps if the impulse response is longer than {1e3 * options.taps / fs:.3g} ms",
+        )
 
 
 def _inspect(options: argparse.Namespace) -> int:
@@ -458,7 +520,9 @@ def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
 
 def _described(facts: dict[str, Any]) -> str:
     """Return what a path does in two lines."""
-    length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {1e3 * facts['duration_s']:.3g} ms"
+    seconds = facts["duration_s"]
+    duration = f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+    length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {duration}"
     if facts["onset_s"] is None:
         return f"{length}; silent"
     return (
@@ -475,10 +539,13 @@ def _db(power: float) -> float:
 
 
 def _convert(options: argparse.Namespace) -> int:
+    if (options.to is None) == (options.output is None):
+        raise ValueError(f"one file to write is needed, for example {options.path} S.csv or {options.path} -o S.csv")
+    output = options.to or options.output
     files = Files(options)
     taps = files.path(options.path)
-    _write_path(options.output, taps, files.fs or 0.0)
-    print(f"{options.output}: {taps.size} taps at {files.fs:g} Hz")
+    _write_path(output, taps, files.fs or 0.0)
+    print(f"{output}: {taps.size} taps at {files.fs:g} Hz")
     return ENOUGH
 
 
@@ -511,8 +578,10 @@ def _plot(options: argparse.Namespace) -> int:
     figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
     plot_impulse_responses(taps, fs=files.fs, ax=axes[0])
     plot_bode(taps, fs=files.fs, ax=axes[1:])
-    figure.savefig(options.output, dpi=160)
-    print(f"{options.output} written")
+    output = Path(options.output)
+    output = output if output.suffix else output.with_suffix(".png")
+    figure.savefig(output, dpi=160)
+    print(f"{output} written")
     return ENOUGH
 
 
@@ -552,6 +621,9 @@ def _data(options: argparse.Namespace) -> int:
         if name not in known:
             raise ValueError(f"there is no data set {name!r}; there are {', '.join(known)}")
     folder = str(options.folder or dataset_folder())
+    is_named = options.folder or os.environ.get("KFOPC_DATA")
+    if is_named and options.action != "fetch" and not Path(folder).is_dir():
+        warn(options, f"the folder {folder} does not exist: correct --folder or KFOPC_DATA, or run kfopc data fetch")
     if options.action == "where":
         print(json.dumps({"folder": folder}) if options.json else folder)
         return ENOUGH

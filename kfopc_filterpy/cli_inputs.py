@@ -3,29 +3,94 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ._validate import as_count, as_positive
+from .paths.fitting import LONG_PATH_S, require_same_length, require_shorter, require_sound
+from .signals.quality import clipping_remarks
+from .signals.recordings import as_channel
 
 if TYPE_CHECKING:
     from .signals import Recording
 
 STANDARD_INPUT = "-"
 
+# What sets an argument that the package's messages name.
+OPTIONS = {
+    "algorithm": "--algorithm",
+    "amplitude_limit": "--amplitude-limit",
+    "block": "--block",
+    "channel": "--channel",
+    "clock": "--clock",
+    "delay_samples": "--path-error-samples",
+    "displacement_mm_per_volt": "--displacement",
+    "disturbance": "--disturbance",
+    "errors": "--errors",
+    "fs": "--fs",
+    "gain_db": "--path-error-db",
+    "identify_s": "--identify",
+    "latency": "--latency",
+    "level_db": "--calibrator-db",
+    "listen_s": "--listen",
+    "memory_s": "--memory",
+    "n_taps": "--taps",
+    "names": "--algorithm",
+    "noise_watt": "--loudspeaker-watt",
+    "new_fs": "--fs",
+    "pascal_per_unit": "--pascal-per-unit",
+    "phase_deg": "--path-error-deg",
+    "peak_volts": "--peak-volts",
+    "primary": "--primary",
+    "primary_path": "--primary",
+    "programme_watt": "--programme-watt",
+    "rated_power": "--rated-power",
+    "secondary": "--secondary",
+    "secondary_path": "--secondary",
+    "seconds": "--seconds",
+    "variable": "--variable",
+    "volts_per_unit": "--volts-per-unit",
+    "want_db": "--want-db",
+    "x_max_mm": "--x-max-mm",
+}
+_NAMES = "|".join(OPTIONS)
+_ALONE = re.compile(rf"^({_NAMES})(?=[\s\[])|(?<![\w./-])(\w+_\w+)(?![\w=]|\.\w)")
+_WITH_A_VALUE = re.compile(rf"(?<![\w./-])({_NAMES})=")
 
-def _read(path: Any, *, fs: float | None, channel: int | None, variable: str | None, is_path: bool) -> Recording:
+
+def in_options(message: str, options: argparse.Namespace) -> str:
+    """Return a message of the package with options of the command in place of the arguments that it names.
+
+    An argument stands at the start of a message, has a value, or is no word: "fs must be ...", "fs=16000", "n_taps".
+    """
+
+    def option(name: str, end: str) -> str:
+        known = OPTIONS.get(name, "")
+        return f"{known}{end}" if hasattr(options, known.lstrip("-").replace("-", "_")) else ""
+
+    message = _ALONE.sub(lambda found: option(found[0], "") or found[0], message)
+    return _WITH_A_VALUE.sub(lambda found: option(found[1], " ") or found[0], message)
+
+
+def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
+    """Print a warning or a note of one line to the standard error."""
+    print(f"{options.prog}: {kind}: {message}", file=sys.stderr)
+
+
+def _read(path: Any, *, fs: float | None, variable: str | None, is_path: bool) -> Recording:
     """Read a recording or an impulse response: the one place that knows how."""
     from .paths import read_path
     from .signals import read_recording
 
-    return (read_path if is_path else read_recording)(path, fs=fs, channel=channel, variable=variable)
+    return (read_path if is_path else read_recording)(path, fs=fs, variable=variable)
 
 
 class Files:
@@ -34,6 +99,7 @@ class Files:
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self.fs: float | None = options.fs
+        self.remarks: list[str] = []  # what resampling hides of the recordings that were read
         self._first = ""
 
     def recording(self, path: str) -> np.ndarray:
@@ -47,6 +113,16 @@ class Files:
     def channels(self, path: str) -> np.ndarray:
         """Return all channels of a recording, (n_channels, n_samples)."""
         return np.atleast_2d(self._read(path, is_path=False).samples)
+
+    def noise_paths(
+        self, paths: Sequence[str], option: str, noise: np.ndarray, n_microphones: int | None
+    ) -> np.ndarray:
+        """Return a matrix of paths that are to go with a noise: shorter than it, and not silent."""
+        matrix = self.matrix(paths, option, n_microphones)
+        names, heard = ", ".join(paths), self.options.noise
+        require_shorter(names, matrix.shape[-1], heard, noise.shape[-1], self.fs or 0.0)
+        require_sound(names, matrix)
+        return matrix
 
     def matrix(self, paths: Sequence[str], option: str, n_microphones: int | None = None) -> np.ndarray:
         """Return the taps of paths, (microphones, sources, taps); see the examples of `verdict` for their order."""
@@ -78,13 +154,13 @@ class Files:
     def _read(self, path: str, *, is_path: bool) -> Recording:
         """Read a file, whose rate must be that of the files before it."""
         with _file(path) as source:
-            read = _read(
-                source,
-                fs=self.options.fs,
-                channel=self.options.channel,
-                variable=self.options.variable,
-                is_path=is_path,
-            )
+            read = self._chosen(path, self._as_stored(source, self.options.fs, is_path))
+            if not is_path and read.file_fs not in (None, read.fs):  # resampling hides that samples are equal
+                stored = self._chosen(path, self._as_stored(source, None, is_path))
+                self.remarks += clipping_remarks(stored.samples, path)
+        if is_path and read.samples.shape[-1] > LONG_PATH_S * read.fs:
+            seconds = read.samples.shape[-1] / read.fs
+            warn(self.options, f"{path} lasts {seconds:.3g} s, too long for an impulse response: is it a recording?")
         if self.fs is not None and read.fs != self.fs:
             raise ValueError(
                 f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
@@ -92,6 +168,15 @@ class Files:
             )
         self.fs, self._first = read.fs, self._first or path
         return read
+
+    def _as_stored(self, source: str, fs: float | None, is_path: bool) -> Recording:
+        return _read(source, fs=fs, variable=self.options.variable, is_path=is_path)
+
+    def _chosen(self, path: str, read: Recording) -> Recording:
+        """Return the channel that the options choose; a file with one channel stays as it is."""
+        if self.options.channel is None or read.samples.ndim == 1:
+            return read
+        return replace(read, samples=read.samples[as_channel(self.options.channel, read.samples, path)])
 
 
 @contextmanager
@@ -129,7 +214,7 @@ def ratings_of(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
         given = getattr(options, name)
         if given is not None and len(given) not in (1, n_loudspeakers):
             raise ValueError(
-                f"--{name.replace('_', '-')} must be given once, or once for each of the {n_loudspeakers} loudspeaker(s), "
+                f"{_option(name)} must be given once, or once for each of the {n_loudspeakers} loudspeaker(s), "
                 f"got {len(given)}"
             )
     each = []
@@ -142,13 +227,20 @@ def ratings_of(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
     return each[0] if n_loudspeakers == 1 else each
 
 
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def _rating(options: argparse.Namespace) -> list[Any]:
     """Return the ratings of one loudspeaker."""
     from .power import AmplifierRating, LoudspeakerRating
 
-    for name, value in (("--ohm", options.ohm), ("--volts-per-unit", options.volts_per_unit)):
-        if value is not None:  # also where no rating uses it
-            as_positive(value, name)
+    for name in OF_THE_RATING:
+        value = getattr(options, name)
+        if isinstance(value, float):  # also where no rating uses it
+            as_positive(value, _option(name))
+    if options.loudspeaker_watt is not None and options.programme_watt is not None:
+        raise ValueError("--programme-watt stands in place of --loudspeaker-watt: leave out one of them")
     ratings: list[Any] = []
     volts = 1.0 if options.volts_per_unit is None else options.volts_per_unit
     if options.watt is not None or options.peak_volts is not None:
@@ -217,8 +309,8 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
     noise = files.channels(options.noise)
     primary = None
     if options.primary is not None:
-        primary = files.matrix(options.primary, "--primary", options.microphones)
-    secondary = files.matrix(options.secondary, "--secondary", options.microphones)
+        primary = files.noise_paths(options.primary, "--primary", noise, options.microphones)
+    secondary = files.noise_paths(options.secondary, "--secondary", noise, options.microphones)
     if primary is not None and primary.shape[:2] != (len(secondary), len(noise)):
         raise ValueError(
             f"--primary must give a path from each of the {len(noise)} channel(s) of {options.noise} to each of the "
@@ -226,6 +318,8 @@ def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, 
             f"--channel {max(len(noise), 2) - 1}, or see the order of several with --help"
         )
     disturbance = None if options.disturbance is None else files.channels(options.disturbance)
+    if disturbance is not None:
+        require_same_length(options.disturbance, disturbance.shape[-1], options.noise, noise.shape[-1])
     return noise, primary, secondary, disturbance
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +18,7 @@ import soundfile
 from kfopc_filterpy import FxLMS, cli, noise_reduction_db, output_power, simulate
 from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.cli_inputs import OPTIONS, in_options
 from kfopc_filterpy.paths import resample_path
 from kfopc_filterpy.signals import band_limited_noise, write_wav
 
@@ -34,6 +37,8 @@ def folder(tmp_path_factory):
     for name, signal in signals.items():
         write_wav(here / f"{name}.wav", signal, FS)
     write_wav(here / "S16.wav", np.asarray(resample_path(secondary, 2 * FS, fs=FS)), 2 * FS)
+    write_wav(here / "silent.wav", np.zeros(64), FS)
+    write_wav(here / "short.wav", signals["d"][:20000], FS)
     (here / "empty.wav").write_bytes(b"")
     (here / "text.wav").write_text("these are words")
     return here
@@ -100,7 +105,7 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", *SCENE, "--watt", "20"], "need --ohm"),
         (["verdict", *SCENE, "--watt", "20", "--ohm", "8", "--rated-power", "1"], "leave out one of them"),
         (["verdict", *SCENE, "--watt", "twenty", "--ohm", "8"], "invalid float value: 'twenty'"),
-        (["verdict", *SCENE, "--watt", "-20", "--ohm", "8"], "sine_watt must be greater than 0 W"),
+        (["verdict", *SCENE, "--watt", "-20", "--ohm", "8"], "--watt must be greater than 0"),
         (
             ["verdict", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
             "--primary or --disturbance is needed",
@@ -110,18 +115,49 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", *SCENE[:3], "--secondary", "S16.wav", "--rated-power", "1"], "for example with --fs 16000"),
         (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "empty.wav"),
         (["verdict", "text.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
-        (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "algorithm must be one of 'KF-PB'"),
+        (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of 'KF-PB'"),
         (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "cannot be written"),
         (["verdict", *SCENE, "--loudspeaker-watt", "1"], "a loudspeaker's rating needs --ohm"),
         (["verdict", *SCENE, "--rated-power", "1", "--ohm", "8", "--x-max-mm", "1"], "must be given together"),
-        (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "names must be one of"),
+        (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of"),
         (
             ["compare", *SCENE, "--rated-power", "1", "--ohm", "-1", "--algorithm", "none"],
             "--ohm must be greater than 0",
         ),
         (["verdict", *SCENE, "--rated-power", "1", "--volts-per-unit", "0"], "--volts-per-unit must be greater than 0"),
         (["paths", "convert", "S.wav", "S.xyz"], "must end in .wav, .npy, .csv, .txt"),
-        (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "n_taps must be at least 1"),
+        (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "--taps must be at least 1"),
+        (["verdict", *SCENE, "--rated-power", "1", "--want-db", "-3"], "--want-db must not be negative"),
+        (["verdict", *SCENE, "--rated-power", "1", "--taps", "0"], "--taps must be at least 1"),
+        (["verdict", *SCENE, "--rated-power", "1", "--path-error-samples", "-1"], "--path-error-samples must not be"),
+        (
+            ["verdict", *SCENE, "--ohm", "8", "--loudspeaker-watt", "1", "--programme-watt", "2"],
+            "leave out one of them",
+        ),
+        # Files that do not go together are named.
+        (
+            ["verdict", "noise.wav", "--primary", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "noise.wav has 24000 samples (3 s), noise.wav 24000 (3 s): an impulse response must be shorter",
+        ),
+        (
+            ["compare", "S.wav", "--primary", "P.wav", "--secondary", "noise.wav", "--rated-power", "1"],
+            "P.wav has 64 samples (0.008 s), S.wav 64 (0.008 s): an impulse response must be shorter than the noise, "
+            "and at most 10 s long; cut the impulse response, or are the files swapped?",
+        ),
+        (["verdict", *SCENE[:3], "--secondary", "silent.wav", "--rated-power", "1"], "silent.wav is silent"),
+        (
+            ["verdict", "noise.wav", "--disturbance", "short.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "short.wav has 20000 samples, noise.wav 24000: they must be recorded together",
+        ),
+        (
+            ["paths", "identify", "noise.wav", "d.wav", "--taps", "20000", "-o", "x.npy"],
+            "--taps must be at most 12000 for recordings of 24000 samples, got 20000",
+        ),
+        (["paths", "convert", "S.wav"], "S.wav -o S.csv"),
+        (
+            ["paths", "convert", "S.wav", "S.csv", "--bogus", "3"],
+            "unrecognized arguments: --bogus 3; see kfopc paths convert",
+        ),
     ],
     ids=lambda value: "-".join(value).replace("/", "") if isinstance(value, list) else "",
 )
@@ -166,6 +202,52 @@ def test_help_says_what_it_does_and_shows_an_example(command, arguments):
     if arguments != ["paths"]:
         assert "example" in out
         assert f"  kfopc {' '.join(arguments)}".rstrip() in out
+
+
+def test_an_argument_is_translated_only_where_it_is_one():
+    """It stands at the start, has a value, or is no word; and the command has the option."""
+    options = argparse.Namespace(taps=1, fs=None, channel=None)
+    assert in_options("n_taps must be 1, or n_taps=2; with fs=16000", options) == (
+        "--taps must be 1, or --taps 2; with --fs 16000"
+    )
+    assert in_options("the channel of fs and n_taps.wav", options) == "the channel of fs and n_taps.wav"
+    assert in_options("block must be 1, block=2", options) == "block must be 1, block=2"
+
+
+def test_every_option_that_messages_name_exists(command):
+    commands = (["verdict"], ["compare"], ["run"], ["paths", "resample"])
+    helps = " ".join(command(*one, "--help")[1] for one in commands)
+    assert [option for option in OPTIONS.values() if not re.search(rf"{option}\b", helps)] == []
+
+
+def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command):
+    options = ["--rated-power", "4", "--taps", "32", "--json", "--algorithm", "FxLMS"]
+    code, chosen, _ = command("verdict", "stereo.wav", *SCENE[1:], *options, "--channel", "1")
+    assert code == 0
+    assert chosen == command("verdict", *SCENE, *options)[1]
+
+
+def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path):
+    write = ["-o", tmp_path / "out"]
+    code, out, _ = command("verdict", *SCENE, "--rated-power", "4", "--taps", "8", "--want-db", "12", *write)
+    assert code == 1
+    told = " ".join(out.split())
+    assert "8 taps last 1 ms, but the noise arrives up to 1.9 ms later than the loudspeaker's sound" in told
+    assert "take a longer filter with --taps 32." in told
+    assert "--taps 32" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+
+
+def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(command, folder):
+    clipped = np.clip(band_limited_noise((100, 1500), 6.0, fs=FS, rng=1, power=1.0), -1, 1)
+    write_wav(folder / "clipped.wav", clipped, FS)
+    options = [*SCENE[1:], "--rated-power", "4", "--taps", "16", "--json", "--algorithm", "FxLMS"]
+    _, out, err = command("verdict", "noise.wav", *options)
+    assert any("lasts only 3 s" in note for note in json.loads(out)["notes"])
+    assert "kfopc verdict: note: noise lasts only 3 s" in err
+    for resampled in ([], ["--fs", "4000"]):  # which hides that samples are equal
+        _, out, err = command("verdict", "clipped.wav", *options, *resampled)
+        assert sum("is clipped" in note for note in json.loads(out)["notes"]) == 1
+        assert "is clipped" in err
 
 
 def test_rates_that_differ_are_resampled_each_in_its_way(command):
@@ -222,6 +304,45 @@ def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
     np.testing.assert_allclose(found, taps, atol=1e-4)
 
 
+def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(command, folder, tmp_path):
+    write_wav(folder / "other.wav", band_limited_noise((100, 1500), 3.0, fs=FS, rng=2), FS)
+    code, out, err = command("paths", "identify", "noise.wav", "other.wav", "--taps", 24, "-o", tmp_path / "S.wav")
+    assert (code, out) == (2, "")
+    assert re.search(r"noise.wav explains \d\.\d % of other.wav, less than 21 %: are the files swapped", err)
+    assert not (tmp_path / "S.wav").exists()
+
+
+def test_a_fit_that_leaves_much_unexplained_is_warned_of(command, folder, tmp_path):
+    sent = np.random.default_rng(1).standard_normal(2 * FS)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "noisy.wav", sent + 0.3 * np.random.default_rng(2).standard_normal(sent.size), FS)
+    code, out, err = command("paths", "identify", "sent.wav", "noisy.wav", "--taps", 8, "-o", tmp_path / "S.wav")
+    assert code == 0
+    assert "8 taps" in out
+    assert "warning: sent.wav explains 91." in err  # 1 / 1.09
+    assert "longer than 1 ms" in err
+    write_wav(folder / "heard.wav", sent + 0.05 * np.random.default_rng(2).standard_normal(sent.size), FS)
+    assert command("paths", "identify", "sent.wav", "heard.wav", "--taps", 8, "-o", tmp_path / "S.wav")[2] == ""
+
+
+def test_a_recording_given_as_a_path_is_analysed_with_a_warning(command, folder):
+    write_wav(folder / "long.wav", np.random.default_rng(0).standard_normal(8 * FS), FS)
+    code, out, err = command("paths", "inspect", "long.wav", "--primary", "long.wav")
+    assert code == 0
+    assert "64000 taps at 8000 Hz, 8 s;" in out
+    assert (
+        "kfopc paths inspect: warning: long.wav lasts 8 s, too long for an impulse response: is it a recording?" in err
+    )
+    assert command("paths", "inspect", "S.wav")[2] == ""
+
+
+def test_a_written_path_may_be_named_by_an_option(command, tmp_path):
+    for action, more in (("convert", []), ("resample", ["--fs", FS])):
+        output = tmp_path / f"{action}.npy"
+        assert command("paths", action, "S.wav", "-o", output, *more)[0] == 0
+        np.testing.assert_array_equal(np.load(output), np.eye(64)[12])
+
+
 @pytest.mark.parametrize("suffix", ["wav", "npy", "csv", "txt"])
 def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
     output = tmp_path / f"S.{suffix}"
@@ -259,6 +380,9 @@ def test_a_path_is_inspected_and_plotted(command, tmp_path):
     code, _, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "paths.png")
     assert code == 0
     assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")
+    code, out, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "plots")
+    assert out == f"{tmp_path / 'plots.png'} written\n"
+    assert (tmp_path / "plots.png").is_file()
 
 
 # Comparisons.
@@ -291,6 +415,14 @@ def test_the_measured_data_are_listed_and_an_unknown_name_is_refused(command, tm
     code, _, err = command("data", "fetch", "fan")
     assert code == 2
     assert "there is no data set 'fan'; there are duct" in err
+
+
+def test_a_folder_of_data_that_is_named_but_does_not_exist_is_said(command, tmp_path, monkeypatch):
+    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
+    code, _, err = command("data", "list")
+    assert code == 0
+    assert f"the folder {tmp_path / 'nowhere'} does not exist: correct --folder or KFOPC_DATA" in err
+    assert command("data", "list", "--folder", tmp_path)[2] == ""
 
 
 def test_a_calibrators_recording_gives_the_levels(command, folder):
@@ -465,4 +597,4 @@ def test_an_algorithm_of_one_channel_is_not_compared_with_several(command, sever
     files = ["noise.wav", "--primary", "P1.wav", "--secondary", "S1.wav", "--rated-power", 1]
     code, _, err = command("compare", *files, "--algorithm", "KF-OPC repaired", "--quiet")
     assert code == 2
-    assert "names must be one of" in err
+    assert "--algorithm must be one of" in err

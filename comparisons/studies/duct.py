@@ -140,7 +140,10 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
     try:
         data = load_measured_duct(noise=noise, allow_download=True)
     except DataUnavailableError as error:
-        return shorten(f"{name} is left out: {error}", 200, placeholder=" ...")
+        return (
+            f"{name} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "
+            f"({shorten(str(error), 120, placeholder=' ...')})"
+        )
     parameters = {
         "noise": Parameter(f"recorded {noise} noise, mean removed", chosen),
         "primary_path": Parameter(f"measured duct, {data.primary.size} taps", "as published, scale arbitrary"),

@@ -18,6 +18,7 @@ from .scene import Runs, Scene
 from .tuning import AllDivergedError, tune
 
 ALGORITHMS = ("KF-PB", "KF-OPC", "FxLMS")
+NSE_WINDOW_S = 0.1  # of the figures that are drawn beside the time of convergence
 TUNED_ON_S = 5.0  # of the record, for FxLMS's step size
 MANY_TAPS = 192  # from which float32 pays
 LEAST_STATE_NOISE = 3e-7  # over the initial variance, for float32, which rounds that by 6e-8
@@ -152,7 +153,7 @@ def recorded_scene(
         n_taps=settings.n_taps,
         sensor_noise_std=0.0,
         switch_on_s=start / fs,
-        nse_window_s=0.005,
+        nse_window_s=NSE_WINDOW_S,
         amplifier=amplifiers(limits),
         measurement_noise=settings.measurement_noise,
         initial_variance=settings.initial_variance,

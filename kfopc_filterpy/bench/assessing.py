@@ -30,17 +30,17 @@ from kfopc_filterpy.metrics import (
     third_octave_levels_db,
 )
 from kfopc_filterpy.paths import causality_margin, frequency_response
+from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
 from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE, allowed_share, guard_filter
+from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
-from .assessed_runs import ALGORITHMS, Plan, announce
+from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
 from .assessment import Assessment, Band, Ceilings, Levels, advice_on
-from .fixed_filters import FixedFilters
+from .fixed_filters import FixedFilters, longest_filter
 from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
 from .scene import Runs, one_blas_thread
 
-LONGEST = 256
-MOST_WEIGHTS = 1024  # of all control filters together, unless a length is given: the bounds solve for all at once
 MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
 WEAK_DB = -20.0  # gain of the secondary path, over its mean in the noise's band, below which the loudspeaker is weak
@@ -220,7 +220,10 @@ def assess(
     cause = None if reached >= want_db else _cause(ceilings, want_db)
     if cause == "adaptation" and _reduction(plan.run(algorithm, limited=True, freed=NEARLY_FREE)) >= want_db:
         cause = "amplifier"
-    if disturbance is None:
+    notes += recording_remarks(noise, fs, "noise")
+    if disturbance is not None:
+        notes += clipping_remarks(disturbance, "disturbance")
+    else:
         notes.append(
             "The disturbance was computed from the reference, so the coherence is not checked: record both microphones "
             "together and give the disturbance."
@@ -255,13 +258,9 @@ def assess(
         channels=(n_references, J, K) if several else None,
         pascal_per_unit=pascal_per_unit,
         switch_on_s=start / fs,
+        response_s=None if primary is None else _response_s(primary, s, want_db, fs),
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
-
-
-def longest_filter(n_filters: int) -> int:
-    """Return the largest number of taps of each of `n_filters` control filters, if no length is given."""
-    return min(LONGEST, max(MOST_WEIGHTS // n_filters, 1))
 
 
 def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: float) -> tuple[np.ndarray, ...]:
@@ -273,8 +272,10 @@ def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any,
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")
     K, J, _ = s.shape
     for k in np.flatnonzero(~np.any(s, axis=(1, 2))):
-        which = "secondary" if K == 1 else f"secondary[{k}]"
-        raise ValueError(f"{which} must not be silent: every value is 0; leave out a microphone that is not reached")
+        which, mend = "secondary", "record it again"
+        if K > 1:
+            which, mend = f"secondary[{k}]", "leave out a microphone that is not reached"
+        raise ValueError(f"{which} must not be silent: every value is 0; {mend}")
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", length=x.shape[1])
         if len(d) != K:
@@ -317,6 +318,23 @@ def _pascals(value: Any, n_microphones: int) -> Any:
 def _margin_s(primary: Any, s: np.ndarray, fs: float) -> float:
     p, _ = primary_paths(primary, fs=fs, name="primary")
     return causality_margin(p if s.ndim == 3 else p[0, 0], s, fs=fs).margin_s
+
+
+def _response_s(primary: Any, s: np.ndarray, want_db: float, fs: float) -> float:
+    """Return how long a control filter must be to treat enough of the primary path's energy, in s.
+
+    It is the time from the first sound of a loudspeaker until the share of the energy has come that must be removed, at
+    the microphone where this takes longest.
+    """
+    p, _ = primary_paths(primary, fs=fs, name="primary")
+    s = s.reshape(len(p), -1, s.shape[-1])
+    share = 1.0 - 10 ** (-want_db / 10)
+    lasting = [
+        energy_onset(np.sqrt(np.sum(of_all**2, axis=0)), share)
+        - min(energy_onset(one) for one in reached if np.any(one))
+        for of_all, reached in zip(p, s, strict=True)
+    ]
+    return (max(lasting) + 1) / fs
 
 
 def switch_on_sample(switch_on_s: float | None, fs: float, n_samples: int) -> int:
@@ -390,7 +408,7 @@ def _figures(run: SimulationResult, limits: Limits, fs: float) -> dict[str, Any]
         "of_rated_power": power / limits.rated_power,
         "worst_window": overshoot(run.control_signal, limits.rated_power, fs, window_s=limits.window_s),
         "peak_control_signal": peak_control_signal(run.control_signal, steady=1.0),
-        "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=0.1),
+        "convergence_time_s": convergence_time_s(run.error, run.disturbance, fs, window_s=NSE_WINDOW_S),
         "diverged_at_s": run.diverged_at_s,
     }
     if run.error.ndim == 1:

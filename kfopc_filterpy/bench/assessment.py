@@ -21,6 +21,7 @@ of the run.
 from __future__ import annotations
 
 import json
+import math
 import os
 import textwrap
 from collections.abc import Mapping
@@ -35,11 +36,15 @@ from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
+from .fixed_filters import longest_filter
 from .items import jsonable
 from .limits import Limits
 
 SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("verdict.schema.json")
+ROOM_FOR_RESPONSE = 1.25  # times the time that a control filter must last
+MOST_TAPS = 1024  # that advice names: longer filters take very long
+RATE_OF_BAND = 2.5  # least sample rate over the highest frequency of the noise
 CAUSES = ("coherence", "causality", "filter", "path", "amplifier", "adaptation")
 
 
@@ -177,6 +182,9 @@ class Assessment:
         Sound pressure at the error microphones for a value of 1, if the calibration is known.
     switch_on_s : float
         Time of the recording in s at which the control is switched on.
+    response_s : float or None
+        Time from the first sound of a loudspeaker until the primary path has delivered the energy that must be removed:
+        the control filter has to be so long. None without a primary path.
     """
 
     enough: bool
@@ -207,6 +215,7 @@ class Assessment:
     channels: tuple[int, int, int] | None = None
     pascal_per_unit: Any = None
     switch_on_s: float = 0.0
+    response_s: float | None = None
 
     @property
     def verdict(self) -> str:
@@ -216,7 +225,8 @@ class Assessment:
         if not np.isfinite(missed):
             return f"{answer}: {self.algorithm} diverges with {self.power(self.limits.rated_power)}."
         return (
-            f"{answer}: {self.algorithm} reaches {self.noise_reduction_db:.1f} dB with {self.power(self.limits.rated_power)}, "
+            f"{answer}: {self.algorithm} reaches {_db(self.noise_reduction_db)} with "
+            f"{self.power(self.limits.rated_power)}, "
             f"{abs(missed):.1f} dB {'more' if missed >= 0 else 'less'} than the {self.want_db:g} dB wanted."
         )
 
@@ -237,7 +247,7 @@ class Assessment:
             "path": c.path_db,
             "power": c.power_db,
         }
-        return {name: f"{value:.1f} dB" for name, value in numbers.items()} | {
+        return {name: _db(value) for name, value in numbers.items()} | {
             "taps": str(self.settings.n_taps),
             "rated": self.power(self.limits.rated_power),
         }
@@ -337,6 +347,11 @@ def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -
     return f"{listed(values, form)}{unit}"
 
 
+def _db(value: float) -> str:
+    """Return a level as text, without a minus sign before zero."""
+    return f"{round(value, 1) + 0.0:.1f} dB"
+
+
 def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
@@ -379,10 +394,7 @@ def advice_on(verdict: Assessment) -> list[str]:
             "electronics."
         ]
     if verdict.limited_by == "filter":
-        return [
-            f"Try a filter longer than {verdict.settings.n_taps} taps. If that gains nothing, the loudspeaker does not "
-            "reach what is left of the noise, or it needs to be closer to the microphone."
-        ]
+        return _advice_on_length(verdict)
     if verdict.limited_by == "path":
         return [
             f"{verdict.band.uncertain_share:.1%} of the noise lies where the uncertainty of the secondary path allows "
@@ -408,3 +420,41 @@ def advice_on(verdict: Assessment) -> list[str]:
             f"{verdict.band.low_hz:.0f} to {verdict.band.high_hz:.0f} Hz takes less power."
         )
     return advice
+
+
+def _advice_on_length(verdict: Assessment) -> list[str]:
+    """Return what to change about a filter that is too short, or seems to be."""
+    taps, fs, needed_s = verdict.settings.n_taps, verdict.fs, verdict.response_s
+    lasts = f"{taps} taps last {1e3 * taps / fs:.2g} ms"
+    if needed_s is None or needed_s * fs <= taps:
+        return [
+            f"Try a filter longer than {taps} taps: {lasts} at {fs:g} Hz, more at a lower sample rate. If that gains "
+            "nothing, the loudspeaker does not reach what is left of the noise, or it needs to be closer to the "
+            "microphone."
+        ]
+    enough = 2 ** math.ceil(math.log2(ROOM_FOR_RESPONSE * needed_s * fs))
+    slower = _slower_rate(verdict, needed_s)
+    mends = [] if slower is None else [f"resample everything with fs={slower:g}"]
+    if enough <= MOST_TAPS:
+        mends.append(f"take a longer filter with n_taps={enough}")
+    if not mends:
+        mends.append(
+            "move the reference microphone towards the error microphone, or give a primary path that ends sooner"
+        )
+    late = float(f"{1e3 * needed_s:.2g}")
+    return [
+        f"{lasts}, but the noise arrives up to {late:g} ms later than the loudspeaker's sound: {', or '.join(mends)}."
+    ]
+
+
+def _slower_rate(verdict: Assessment, needed_s: float) -> float | None:
+    """Return a whole fraction of the sample rate that keeps the noise's band and makes the filter long enough."""
+    n_references, n_loudspeakers, _ = verdict.channels or (1, 1, 1)
+    longest = longest_filter(n_references * n_loudspeakers)
+    for divisor in range(2, 13):
+        rate = verdict.fs / divisor
+        if rate < RATE_OF_BAND * verdict.band.high_hz:
+            return None
+        if rate.is_integer() and ROOM_FOR_RESPONSE * needed_s * rate <= longest:
+            return rate
+    return None

@@ -10,9 +10,11 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, output_power, suggest_settings
 from kfopc_filterpy._validate import as_choice, as_count, as_positive
+from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import recorded_scene
-from .assessing import longest_filter, recorded_signals, switch_on_sample
+from .assessing import recorded_signals, switch_on_sample
+from .fixed_filters import longest_filter
 from .items import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
 from .limits import ChannelLimits, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
@@ -81,6 +83,9 @@ def compare_recordings(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
+    remarks = recording_remarks(noise, fs, "noise")
+    if disturbance is not None:
+        remarks += clipping_remarks(disturbance, "disturbance")
     several = s.ndim == 3
     if names is None:
         names = OF_SEVERAL_CHANNELS if several else OF_ONE_CHANNEL
@@ -145,7 +150,7 @@ def compare_recordings(
         {name: figures_of_merit([result], scene) for name, result in results.items()},
         figures=_figures(results, np.atleast_1d(limits.rated_power), watts, start / fs),
         sounds=sounds,
-        notes=notes,
+        notes=[*notes, *remarks],
         tables=[_power_table(results, scene)] if several else [],
         watt_per_power=None if several else watts,
         extra={

@@ -17,6 +17,13 @@ LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
 CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.125)  # rated powers of the figure, over the one that full control needs
 NEARLY_FULL = 1.0 - 2.0 ** -np.arange(4.0, 9.0)  # there the curve turns sharply into the horizontal
 CHANNEL_CURVE = CURVE[::4]  # a solution for several loudspeakers takes longer
+LONGEST = 256
+MOST_WEIGHTS = 1024  # of all control filters together, unless a length is given: the bounds solve for all at once
+
+
+def longest_filter(n_filters: int) -> int:
+    """Return the largest number of taps of each of `n_filters` control filters, if no length is given."""
+    return min(LONGEST, max(MOST_WEIGHTS // n_filters, 1))
 
 
 class FixedFilters:

@@ -125,6 +125,7 @@ def suggest_settings(
     measurement_noise_from_run : q alone, for a given length.
     wiener_solution : the best fixed filter.
     causality_margin : whether the paths leave enough time.
+    coherence_bound : how much the reference explains.
 
     Notes
     -----
@@ -262,7 +263,7 @@ def _longest(n_samples: int, n_path: int, n_taps: int | None, max_taps: int, cro
         needed = n_path - 2 + per_tap * wanted
         raise ValueError(
             f"reference must have at least {needed} samples for {wanted} control and {n_path} path taps, got {n_samples}; "
-            "record a longer silent run"
+            f"record a longer silent run{', or cut the impulse response' if 2 * n_path > n_samples else ''}"
         )
     return min(max_taps, supported) if n_taps is None else wanted
 
@@ -298,7 +299,7 @@ def _why_length(errors: np.ndarray, taps: int, d_power: float, n_taps: int | Non
         limit = "max_taps allows" if errors.size == max_taps else "this record supports"
         reason = f"as long as {limit}; {reached}, one of half the length by {reach(-(-taps // 2))}"
     if errors[taps - 1] > LITTLE * d_power:
-        reason += "; if that is too little, see causality_margin and coherence_bound for the cause"
+        reason += "; if that is too little, the causality margin and the coherence tell the cause"
     return reason
 
 

@@ -24,8 +24,9 @@ from .processing import (
     Rows,
     adapt_flags,
     block_signal,
+    require_channels,
     require_one_length,
-    require_room,
+    room,
 )
 from .step import Compiled, GuardLine, Lines, estimate_once, listen, process_samples
 
@@ -101,8 +102,27 @@ def listening(controller: Any) -> Any:
     return controller
 
 
+def passed_on(name: str, doc: str) -> Any:
+    """Return a property of a wrapper that reads and assigns the attribute of this name of its controller."""
+
+    def read(wrapper: Any) -> Any:
+        return getattr(wrapper.controller, name)
+
+    def assign(wrapper: Any, value: Any) -> None:
+        wrapper._pass_on(name, value)
+
+    return property(read, assign, doc=doc)
+
+
 class WrappedController(BlockProcessing, Checkpointed):
     """Base class of a controller that wraps another one and passes on its attributes."""
+
+    secondary_path = passed_on("secondary_path", "Estimated secondary path of the inner controller; can be assigned.")
+    secondary_path_uncertainty = passed_on(
+        "secondary_path_uncertainty", "Uncertainty of that path; can be assigned if the inner controller's can."
+    )
+    rated_power = passed_on("rated_power", "Rated power of the inner controller; can be assigned if that has one.")
+    limiter = passed_on("limiter", "Limiter of the inner controller; can be assigned if the inner controller's can.")
 
     def __init__(self, controller: Controller) -> None:
         if isinstance(controller, type) or not isinstance(controller, Controller):
@@ -115,30 +135,11 @@ class WrappedController(BlockProcessing, Checkpointed):
             raise AttributeError(name)
         return getattr(self.controller, name)
 
-    @property
-    def secondary_path(self) -> Any:
-        """Estimated secondary path of the inner controller; a new one can be assigned, unless the wrapper refuses it."""
-        return self.controller.secondary_path  # type: ignore[attr-defined]
-
-    @secondary_path.setter
-    def secondary_path(self, path: Any) -> None:
-        self._take_path(path)
-
-    def _take_path(self, path: Any) -> None:
-        """Give a new path to the inner controller; a wrapper that knows the path itself extends this."""
-        self.controller.secondary_path = path  # type: ignore[attr-defined]
-
-    @property
-    def secondary_path_uncertainty(self) -> Any:
-        """Uncertainty of the secondary path of the inner controller; can be assigned if the inner controller's can."""
-        return self.controller.secondary_path_uncertainty  # type: ignore[attr-defined]
-
-    @secondary_path_uncertainty.setter
-    def secondary_path_uncertainty(self, value: Any) -> None:
-        self._take_uncertainty(value)
-
-    def _take_uncertainty(self, value: Any) -> None:
-        self.controller.secondary_path_uncertainty = value  # type: ignore[attr-defined]
+    def _pass_on(self, name: str, value: Any) -> None:
+        """Assign an attribute of the inner controller; a wrapper that knows the value itself extends this."""
+        if not hasattr(self.controller, name):
+            raise AttributeError(f"{type(self.controller).__name__} has no {name} that could be assigned")
+        setattr(self.controller, name, value)
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if a part of the wrapper or the controller is for another sample rate than `fs` in Hz."""
@@ -377,8 +378,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     @secondary_path.setter
     def secondary_path(self, path: Any) -> None:
-        before = self.secondary_path
-        self._lines.secondary_estimate[:] = self._checked_estimate(path)
+        before, after = self.secondary_path, self._checked_estimate(path)
+        guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
+        self._lines.secondary_estimate[:] = after
         if self._uncertainty is None or not self._takes_guard():
             self._filter_again()
         else:  # measured paths, for example, have another distance from the new path
@@ -440,8 +442,25 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     @property
     def rated_power(self) -> Any:
-        """Rated output power of the controller, or of each loudspeaker, (J,); None if it has no constraint."""
+        """Rated output power of the controller, or of each loudspeaker, (J,); None if it has none.
+
+        A controller that has a rated power takes another one at any time.
+        """
+        return self._read_rated_power()
+
+    @rated_power.setter
+    def rated_power(self, value: Any) -> None:
+        if self.rated_power is None:
+            raise ValueError(f"{self.name} has no rated power that could be changed: make it with rated_power=")
+        self._take_rated_power(self._each_loudspeaker(value, "rated_power"))
+
+    def _read_rated_power(self) -> Any:
         return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
+
+    def _take_rated_power(self, value: Any) -> None:
+        """Use another rated power, a number or (J,)."""
+        for constraint, power in zip(np.atleast_1d(self._own_constraint), np.atleast_1d(value), strict=True):
+            constraint.rated_power = power
 
     @property
     def constraint(self) -> Any:
@@ -553,8 +572,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         require_one_length(x, e)
         flags = adapt_flags(adapt, x.shape[-1])
         shape = (self.n_loudspeakers, x.shape[-1]) if self.multichannel else x.shape
-        y = np.empty(shape) if out is None else out
-        require_room(y, shape)
+        y = room(out, shape)
         rows = self._rows_of(x, e) if self.multichannel else [x, e, y]
         done = self._process_rows(rows[0], rows[1], rows[2], flags)
         if self.multichannel:
@@ -568,9 +586,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
         """Return a block of samples, (n_samples,) or (n_channels, n_samples)."""
         signal = block_signal(value, name)
-        wanted = "(n_samples,)" if not self.multichannel else f"({n_channels}, n_samples)"
-        if signal.ndim != 1 + self.multichannel or (self.multichannel and len(signal) != n_channels):
-            raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
+        require_channels(signal, name, self.multichannel, n_channels)
         return np.require(signal, requirements=("C", "W"))  # one type of array, which is compiled once
 
     def _rows_of(self, x: np.ndarray, e: np.ndarray) -> list[np.ndarray]:

@@ -76,10 +76,11 @@ class BlockController(FilteredReferenceController):
         keep = np.exp(-1.0 / (self.memory_s * self.fs))
         self._correlation = FadingCorrelation(n_lags, n_references, keep)
 
-    @property
-    def rated_power(self) -> np.ndarray | None:
-        """Rated output power of each loudspeaker, (J,); None if unlimited."""
+    def _read_rated_power(self) -> np.ndarray | None:
         return None if self._rated is None else self._rated.copy()
+
+    def _take_rated_power(self, value: np.ndarray) -> None:
+        self._rated = self._budget.rated_power = value
 
     @property
     def power_weight(self) -> np.ndarray:

@@ -37,6 +37,7 @@ class DivergenceGuard:
         self.held = False
         self._gain = 1.0  # of the control signal, at the beginning of this frame
         self._is_heard = False  # whether the control was heard in this frame
+        self._samples = 0  # of this frame that were added
         self._energies = np.zeros(3 + n_references)  # of error, alone, disturbance, references, in this frame
         self._last_references = np.zeros(n_references)  # their powers in the frame before
         self._mean = np.zeros(1 + n_references)  # of the powers of disturbance and references
@@ -72,12 +73,16 @@ class DivergenceGuard:
 
     def follow(self, disturbance: np.ndarray, references: np.ndarray) -> None:
         """Add a sample that was heard while nothing was played: no loudness is the control's fault."""
+        self._samples += 1
         self._energies[2] += disturbance @ disturbance
         self._energies[3:] += references**2
 
     def end_frame(self) -> None:
-        """Decide for the next frame, and take this frame into the averages."""
-        (error, alone, disturbance), references = np.split(self._energies / self._frame, [3])
+        """Decide for the next frame, and take this frame into the averages, unless no sample of it was added."""
+        if not self._samples:
+            return
+        (error, alone, disturbance), references = np.split(self._energies / self._samples, [3])
+        self._samples = 0
         expected = self._expected(references)
         if not self._is_heard and disturbance > 0.5 * self._share * expected:  # then the noise itself is louder
             self._mean[0] *= disturbance / expected

@@ -166,10 +166,11 @@ class KalmanController(FilteredReferenceController):
     def _usual_name(self) -> str:
         return "KF-ANC" if self.rated_power is None else "KF-OPC"
 
-    @property
-    def rated_power(self) -> float | None:
-        """Rated output power of the estimator; None for KF-ANC."""
+    def _read_rated_power(self) -> float | None:
         return getattr(self.estimator, "rated_power", None)
+
+    def _take_rated_power(self, value: float) -> None:
+        self.estimator.rated_power = value
 
     @property
     def weights(self) -> np.ndarray:
@@ -220,6 +221,12 @@ class KalmanController(FilteredReferenceController):
         error = as_number(error, "error")
         state = self._steppable_state()
         if state is None:
+            if self._state.lines.guard is not None:
+                raise ValueError(
+                    "secondary_path_uncertainty needs the estimator's own step, and its F, Q, P or inv was replaced by "
+                    "something else than that of a random walk: assign None to secondary_path_uncertainty, or make a new "
+                    "controller"
+                )
             self._update_through_estimator(error)
         elif self._adapt(error):
             self.estimator.after_compiled(state.weights.copy())

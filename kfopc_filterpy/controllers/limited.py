@@ -44,13 +44,22 @@ class LimitedController(WrappedController):
     """
 
     def __init__(self, controller: Controller, limiter: OutputLimiter) -> None:
-        if not isinstance(limiter, OutputLimiter):
-            raise TypeError(f"limiter must be an OutputLimiter, got {limiter!r}")
         if isinstance(controller, FilteredReferenceController):
             raise ValueError("this controller has a limiter of its own: set controller.limiter, or pass limiter=")
         super().__init__(controller)
         self.limiter = limiter
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
+
+    @property
+    def limiter(self) -> OutputLimiter:
+        """Limiter of the control signal; can be assigned, but not shared with another controller."""
+        return self._limiter
+
+    @limiter.setter
+    def limiter(self, limiter: OutputLimiter) -> None:
+        if not isinstance(limiter, OutputLimiter):
+            raise TypeError(f"limiter must be an OutputLimiter, got {limiter!r}")
+        self._limiter = limiter
 
     def __repr__(self) -> str:
         return f"<{self.name}: limiter of rated power {self.limiter.rated_power:g}>"

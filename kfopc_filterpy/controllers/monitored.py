@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_channels, as_nonnegative, as_positive, as_sample_count
+from .._validate import as_channels, as_nonnegative, as_number, as_positive, as_sample_count
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController
+from .channels import channel_sample
 
 LONGEST_PAUSE = 64.0  # of the first pause
+WIDEST_MARGIN = 8.0  # of the first margin
 
 
 @dataclass(frozen=True)
@@ -71,8 +73,12 @@ class MonitoredController(WrappedController):
     compares the power of the error, relative to that of the reference, with what it was while the loudspeakers were
     silent. If it exceeds that by `margin_db`, the loudspeakers are muted for `window_s`. The control is to blame if
     this lowers the power by more than half the margin. It is then replaced by a fresh copy, which starts after a pause,
-    and each further failure doubles the pause. Otherwise the control goes on, and the margin is widened by half,
-    because the noise evidently fluctuates.
+    and each further failure doubles the pause. Otherwise the control goes on, and the margin is widened by half, up to
+    eight times the first one, because the noise evidently fluctuates. A window in which reference or error is silent
+    decides nothing.
+
+    A copy keeps the limiter, and the secondary path, its uncertainty and the rated power that were assigned to the
+    monitor. What was changed inside the controller is lost.
 
     Parameters
     ----------
@@ -133,6 +139,7 @@ class MonitoredController(WrappedController):
         self._window = as_sample_count(window_s, fs, "window_s")
         self._pause = self._first_pause = as_sample_count(pause_s, fs, "pause_s")
         self.margin_db = as_nonnegative(margin_db, "margin_db", unit="dB")
+        self._widest_margin_db = WIDEST_MARGIN * self.margin_db
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} monitored"
         self.health: list[HealthEvent] = []
         self._fresh = deepcopy(controller)  # with which it tries again
@@ -155,20 +162,28 @@ class MonitoredController(WrappedController):
     def _rates(self) -> dict[str, float | None]:
         return {"monitor": self.fs}
 
-    def _take_path(self, path: Any) -> None:
-        super()._take_path(path)
-        # This one takes over after a silence.
-        self._fresh.secondary_path = path  # type: ignore[attr-defined]
+    def _pass_on(self, name: str, value: Any) -> None:
+        super()._pass_on(name, value)
+        if name != "limiter":  # the copy that takes over after a silence gets the limiter in use
+            setattr(self._fresh, name, value)
 
-    def _take_uncertainty(self, value: Any) -> None:
-        super()._take_uncertainty(value)
-        self._fresh.secondary_path_uncertainty = value  # type: ignore[attr-defined]
+    def _sample(self, value: Any, name: str, what: str) -> Any:
+        """Return a checked sample of the references or of the microphones. While muted, nobody else checks it."""
+        several = getattr(self.controller, "multichannel", None)  # None: not known of a user's controller
+        if several:
+            value = channel_sample(value, getattr(self.controller, f"n_{what}"), name, what)
+        elif several is False or np.ndim(value) == 0:
+            value = as_number(value, name)
+        with np.errstate(over="ignore"):
+            if not np.isfinite(np.sum(np.square(value))):
+                raise ValueError(f"{name} must be finite and have a finite square, got {value}: nothing was changed")
+        return value
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest `reference` x(n), or silence."""
-        self._newest = reference
+        self._newest = self._sample(reference, "reference", "references")
         if not self.muted:
-            y = self.controller.control_signal(reference)
+            y = self.controller.control_signal(self._newest)
             if np.all(np.isfinite(y)):
                 return y
             self._note("not finite")
@@ -177,6 +192,7 @@ class MonitoredController(WrappedController):
 
     def update(self, error: Any) -> None:
         """Pass the `error` e(n) on to the controller, and compare powers at the end of a window."""
+        error = self._sample(error, "error", "microphones")
         if self.muted:
             self._references.add(self._newest)
             self._errors.add(error)
@@ -190,7 +206,7 @@ class MonitoredController(WrappedController):
             self._muted_for -= 1
             if not self.muted:
                 self._end_silence()
-        elif self._counted == self._window:
+        elif self._counted >= self._window:
             self._compare()
 
     def listen(self, references: Any, errors: Any) -> None:
@@ -199,7 +215,8 @@ class MonitoredController(WrappedController):
         self._follow(x, e)
         if x.shape[-1] >= self._window:
             self._learn(_ratio(float(np.sum(e**2)), float(np.sum(x**2))))
-            self._muted_for = 0
+            if self._after_silence == "learn":  # not during a pause after a failure
+                self._muted_for = 0
         self._begin_window()
 
     # ---- The decisions, each at the end of a window
@@ -208,29 +225,32 @@ class MonitoredController(WrappedController):
         """Mute for a test if the error is louder than in silence, or if that is not known yet."""
         ratio = _ratio(self._error_energy, self._reference_energy)
         self._begin_window()
-        allowed = self._silent_ratio * 10.0 ** (self.margin_db / 10.0)
-        if np.isfinite(ratio) and not ratio <= allowed < np.inf:
+        if np.isfinite(ratio) and not _change_db(ratio, self._silent_ratio) <= self.margin_db:  # NaN: not known yet
             self._suspicious_ratio = ratio
             self._muted_for, self._after_silence = self._window, "judge"
 
     def _judge(self, ratio: float) -> None:
         """Stop the control if the noise is quieter without it."""
-        change_db = float(10.0 * np.log10(self._suspicious_ratio / ratio)) if ratio > 0.0 else np.inf
+        change_db = _change_db(self._suspicious_ratio, ratio)
         if change_db > 0.5 * self.margin_db:
             self._note("louder", change_db)
             self._stop()
-        else:
+        elif np.isfinite(change_db):
             self._note("not louder", change_db)
-            self.margin_db *= 1.5
+            self.margin_db = min(1.5 * self.margin_db, self._widest_margin_db)
         self._learn(ratio)
 
     def _learn(self, ratio: float) -> None:
-        """Take over the ratio of powers that was measured in silence."""
-        self._silent_ratio = ratio
+        """Take over the ratio of powers that was measured in silence, if there was anything to measure."""
+        if np.isfinite(ratio):
+            self._silent_ratio = ratio
 
     def _stop(self) -> None:
-        """Start a pause, after which a fresh controller begins."""
+        """Start a pause, after which a fresh controller begins, behind the same limiter: that knows what was played."""
+        limiter = getattr(self.controller, "limiter", None)
         self.controller = deepcopy(self._fresh)
+        if limiter is not None:
+            self.controller.limiter = limiter  # type: ignore[attr-defined]
         self._muted_for, self._after_silence = self._pause, "retry"
         self._pause = min(2 * self._pause, round(LONGEST_PAUSE * self._first_pause))
         self._references.clear()
@@ -245,11 +265,12 @@ class MonitoredController(WrappedController):
 
     def _end_silence(self) -> None:
         """Let the controller follow what was heard in silence, and decide."""
-        self._follow(self._references.samples, self._errors.samples)
+        heard = self._references.samples, self._errors.samples
+        ratio = _ratio(self._error_energy, self._reference_energy)
         self._references.clear()
         self._errors.clear()
-        ratio = _ratio(self._error_energy, self._reference_energy)
         self._begin_window()
+        self._follow(*heard)
         {"learn": self._learn, "judge": self._judge, "retry": self._retry}[self._after_silence](ratio)
 
     def _follow(self, references: np.ndarray, errors: np.ndarray) -> None:
@@ -270,5 +291,10 @@ class MonitoredController(WrappedController):
 
 
 def _ratio(above: float, below: float) -> float:
-    """Return a ratio of powers; infinite if the reference is silent."""
-    return above / below if below > 0.0 else np.inf
+    """Return a ratio of energies; NaN if one of them is 0, which tells nothing."""
+    return above / below if above > 0.0 and below > 0.0 else np.nan
+
+
+def _change_db(ratio: float, before: float) -> float:
+    """Return a change in dB."""
+    return float(10.0 * np.log10(ratio / before))

@@ -9,6 +9,7 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.signal import oaconvolve
 from scipy.special import stdtr
@@ -24,6 +25,8 @@ from .divergence import DivergenceGuard
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
 FEWEST_FRAMES = 8  # with fewer, no better prediction is significant
+FAINT = 1e-2  # of the energy of a loudspeaker's paths: with less of it left, the loudspeaker counts as faulty
+LARGEST_DB = 300.0  # larger settings in dB count as this one; they would overflow
 RIDGE = 1e-9  # relative to the mean power of the regressors, so that a narrow-band reference has a solution
 
 
@@ -64,6 +67,9 @@ class Model:
     secondary: dict[str, np.ndarray]
 
 
+Sums = tuple[np.ndarray, np.ndarray, np.ndarray, int]  # of a block's products, see `block_sums`
+
+
 class JointFit:
     """Least squares of the errors ``e_k = sum_i p_ki * x_i - sum_j s_kj * (y_j + v_j)``.
 
@@ -92,7 +98,7 @@ class JointFit:
         self.matrix, self.right = other.matrix.copy(), other.right.copy()
         self.energy, self.noise, self.count = other.energy.copy(), other.noise.copy(), other.count
 
-    def add(self, sums: tuple[np.ndarray, np.ndarray, np.ndarray, int]) -> None:
+    def add(self, sums: Sums) -> None:
         """Add the sums of a block, see `block_sums`."""
         matrix, right, energy, count = sums
         self.matrix = self.keep * self.matrix + matrix
@@ -153,11 +159,18 @@ def common_ratio(powers: np.ndarray, paths: np.ndarray) -> np.ndarray:
 
 
 def block_sums(
-    x: np.ndarray, y: np.ndarray, v: np.ndarray, errors: np.ndarray, n_primary: int, n_secondary: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    x: np.ndarray,
+    y: np.ndarray,
+    v: np.ndarray,
+    errors: np.ndarray,
+    n_primary: int,
+    n_secondary: int,
+    unknown: np.ndarray | None = None,
+) -> Sums:
     """Return the sums of products for `JointFit.add`: matrix, right sides, energies of the errors, number of samples.
 
-    `errors` is (K, n). The other signals, (I, m), (J, m), (J, m), begin ``n_primary - 1`` samples earlier.
+    `errors` is (K, n). The other signals, (I, m), (J, m), (J, m), begin ``n_primary - 1`` samples earlier. The errors of
+    samples that are `unknown`, (n,) of bool, must be 0, and these samples are left out.
     """
     n, start = errors.shape[1], n_primary - 1
     parts = [(one, n_primary) for one in x] + [(-one, n_secondary) for one in (*y, *v)]
@@ -171,12 +184,23 @@ def block_sums(
             columns = slice(end - others, end)
             matrix[rows, columns] = cross_correlation_matrix(first, second, taps, start, others)
             matrix[columns, rows] = matrix[rows, columns].T
-    return n * matrix, n * right, np.array([error @ error for error in errors]), n
+    matrix, count = n * matrix, n
+    if unknown is not None and unknown.any():
+        left_out = np.hstack(
+            [sliding_window_view(one[start - taps + 1 :], taps)[:n][unknown, ::-1] for one, taps in parts]
+        )
+        matrix, count = matrix - left_out.T @ left_out, n - len(left_out)
+    return matrix, n * right, np.array([error @ error for error in errors]), count
 
 
 def through(paths: np.ndarray, signals: np.ndarray) -> np.ndarray:
     """Return what arrives through paths (K, J, taps) of signals (J, n) once the taps are filled, (K, n - taps + 1)."""
     return oaconvolve(signals[np.newaxis], paths, mode="valid", axes=-1).sum(axis=1)
+
+
+def strengths(paths: np.ndarray) -> np.ndarray:
+    """Return the energy of each loudspeaker's paths (K, J, taps), summed over the microphones, (J,)."""
+    return np.asarray(np.sum(paths**2, axis=(0, 2)))
 
 
 class Evidence:
@@ -242,6 +266,12 @@ class PathTracker(WrappedController):
 
     The controller does not hear the probe: what the probe contributes to the error, according to the estimate in use,
     is subtracted.
+
+    If a loudspeaker's paths become more than 20 dB weaker than those that the tracker was given, it is taken for a
+    loudspeaker that is broken or not connected, and its paths stay as they are. Otherwise the probe would become louder
+    and louder in order to be heard.
+
+    A sample after which `update` is not called is played, but fits and tests leave out its error, which is not known.
 
     Between a jump of the path and its discovery, the controller may diverge. Two things keep the noise from becoming
     much more than `hold_db` louder than it is expected to be without control, as a sum of powers over the microphones.
@@ -361,8 +391,8 @@ class PathTracker(WrappedController):
         self.memory_s = as_positive(memory_s, "memory_s", unit="s")
         self.p_value = as_positive(p_value, "p_value")
         self.use_control_signal = bool(use_control_signal)
-        self._probe_share = 10 ** (as_number(probe_db, "probe_db", unit="dB") / 10)
-        self._hold_share = 10 ** (as_number(hold_db, "hold_db", unit="dB") / 10)
+        self._probe_share = 10 ** (min(as_number(probe_db, "probe_db", unit="dB"), LARGEST_DB) / 10)
+        self._hold_share = 10 ** (min(as_number(hold_db, "hold_db", unit="dB"), LARGEST_DB) / 10)
         if not self._hold_share > 2.0:
             raise ValueError(
                 f"hold_db must be above 3.01 dB, got {hold_db:g} dB: held, the error must fall 3 dB below it"
@@ -375,7 +405,7 @@ class PathTracker(WrappedController):
         self.changes: list[PathChange] = []
         self.name = f"{controller.name} with path tracking"
         self._allocate(as_positive(check_s, "check_s", unit="s"))
-        self._know(controller.secondary_path)
+        self._begin_with(controller.secondary_path)
 
     def _allocate(self, check_s: float) -> None:
         """Set the lengths, and make the fits and the room for a block of signals."""
@@ -405,8 +435,9 @@ class PathTracker(WrappedController):
         self._x, self._y, self._v, self._own = (
             np.zeros((n, self._past + self._block)) for n in (n_references, J, J, J)
         )
-        self._e = np.zeros((K, self._block))
+        self._e, self._known = np.zeros((K, self._block)), np.zeros(self._block, dtype=bool)
         self._n = self._done = 0  # samples of this block, and of all
+        self._awaits_error = False  # whether a control signal was given, and no error so far
         self._residual_power = np.zeros(K)
         self._level = np.zeros(J)
         self._guard = DivergenceGuard(n_references, self._frame, self.memory_s * self.fs, self._hold_share)
@@ -431,13 +462,23 @@ class PathTracker(WrappedController):
         self._paths = np.reshape(path, (K, J, -1))
         self._reversed = self._paths[..., ::-1].copy().reshape(K, -1)  # oldest sample first, as in the signals
 
+    def _begin_with(self, path: np.ndarray) -> None:
+        """Set the paths in use, and how strong the loudspeakers are with them."""
+        self._know(path)
+        self._strengths = strengths(self._paths)
+
     def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
         return channels if self.controller.multichannel else float(channels[0])
 
-    def _take_path(self, path: Any) -> None:
-        super()._take_path(path)
-        self._know(self.controller.secondary_path)
+    def _pass_on(self, name: str, value: Any) -> None:
+        super()._pass_on(name, value)
+        if name == "secondary_path":
+            self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """Start with the controller's path, and forget what was found in comparison with the one before."""
+        self._begin_with(self.controller.secondary_path)
         self._guard.begin_anew()
         self._models = [fit.solve(self._paths) for fit in self._fits]
         for evidence in self._evidence.values():  # it was against the path in use before
@@ -449,6 +490,7 @@ class PathTracker(WrappedController):
         With several channels, x(n) is (I,), and the control signal is (J,).
         """
         own = np.reshape(self.controller.control_signal(reference), -1)
+        self._end_sample()
         y = self._guard.gain * own
         emitted = y + self._level * self._probe[:, self._n % self._frame]
         if np.isfinite(emitted).all():  # otherwise it is a divergence, which the loop detects
@@ -456,7 +498,13 @@ class PathTracker(WrappedController):
             played = self._amplified(y)
             self._x[:, at], self._y[:, at], self._v[:, at] = reference, played, self._amplified(emitted) - played
             self._own[:, at] = self._amplified(own)
+        self._awaits_error = True
         return self._shaped(emitted)
+
+    def _end_sample(self) -> None:
+        """Go on to the next sample if the last one was played and its error never came."""
+        if self._awaits_error:
+            self._take(None)
 
     def _amplified(self, y: np.ndarray) -> np.ndarray:
         if self._amplifiers is None:
@@ -486,8 +534,11 @@ class PathTracker(WrappedController):
         disturbance = errors + self._reversed @ played.reshape(-1)
         return disturbance, disturbance - self._reversed @ self._own[:, newest].reshape(-1)
 
-    def _take(self, errors: np.ndarray) -> None:
-        self._e[:, self._n] = errors
+    def _take(self, errors: np.ndarray | None) -> None:
+        """Take the errors of a sample; None if they are not known."""
+        self._awaits_error = False
+        self._known[self._n] = errors is not None
+        self._e[:, self._n] = 0.0 if errors is None else errors
         self._n += 1
         if self._n % self._frame == 0:
             self._end_frame()
@@ -496,10 +547,12 @@ class PathTracker(WrappedController):
 
     def _end_frame(self) -> None:
         """Set the level of the probe for the next frame, and let the guard decide for it."""
-        begin, end = self._n - self._frame, self._n
-        powers = np.mean(self._e[:, begin:end] ** 2, axis=1)
-        rate = np.where(self._residual_power > 0.0, self._frame / self._block, 1.0)
-        self._residual_power += rate * (powers - self._residual_power)
+        frame = slice(self._n - self._frame, self._n)
+        count = np.count_nonzero(self._known[frame])
+        if count:
+            powers = np.sum(self._e[:, frame] ** 2, axis=1) / count
+            rate = np.where(self._residual_power > 0.0, self._frame / self._block, 1.0)
+            self._residual_power += rate * (powers - self._residual_power)
         ratio = common_ratio(self._residual_power, self._paths)
         self._level = np.sqrt(self._probe_share / ratio.size * np.where(np.isfinite(ratio), ratio, 0.0))
         self._probe = self._next_probe()
@@ -511,9 +564,11 @@ class PathTracker(WrappedController):
         for i, model in enumerate(self._models):
             if model is not None:
                 self._judge(i, model)
-        sums = block_sums(self._x, self._y, self._v, self._e, self._past + 1, self._paths.shape[-1])
-        for fit in self._fits:
-            fit.add(sums)
+        if self._known.any():
+            lines = (self._x, self._y, self._v)
+            sums = block_sums(*lines, self._e, self._past + 1, self._paths.shape[-1], ~self._known)
+            for fit in self._fits:
+                fit.add(sums)
         self._models = [fit.solve(self._paths) for fit in self._fits]
         if any(self._is_better(candidate, self.p_value / len(self._e)) for candidate in self._evidence):
             self._take_over([best for k in range(len(self._e)) if (best := self._best(k)) is not None])
@@ -548,8 +603,8 @@ class PathTracker(WrappedController):
         left += through(model.secondary["control signal"], self._y[:, late:])
 
         def unexplained(paths: np.ndarray) -> np.ndarray:
-            squares = (left + through(paths, self._v[:, late:])) ** 2
-            return squares.reshape(len(left), -1, self._frame).mean(axis=2)
+            squares = self._known * (left + through(paths, self._v[:, late:])) ** 2
+            return squares.reshape(len(left), -1, self._frame).sum(axis=2)
 
         in_use = unexplained(self._paths)
         for source in self._sources():
@@ -557,10 +612,18 @@ class PathTracker(WrappedController):
                 self._evidence[k, i, source].add(one, other)
 
     def _take_over(self, better: list[tuple[int, int, str]]) -> None:
-        """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone."""
+        """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone.
+
+        Those of a loudspeaker that has become faint stay.
+        """
         new, old = self._paths.copy(), self._paths
         for k, i, source in better:
             new[k] = self._models[i].secondary[source][k]  # type: ignore[union-attr]  # a better candidate has a model
+        faint = strengths(new) < FAINT * self._strengths
+        new[:, faint] = old[:, faint]
+        better = [one for one in better if np.any(new[one[0]] != old[one[0]])]
+        if not better:
+            return
         self.controller.secondary_path = new if self.controller.multichannel else new[0, 0]
         for k, i, source in better:
             change = np.sum((new[k] - old[k]) ** 2) / max(np.sum(old[k] ** 2), np.finfo(float).tiny)
@@ -586,7 +649,8 @@ class PathTracker(WrappedController):
         """
         late = slice(-(self._frame + self._paths.shape[-1] - 1), None)
         errors = self._e[:, -self._frame :] + through(self._paths, (self._y + self._v - self._own)[:, late])
-        return float(np.mean(np.sum(errors**2, axis=0)))
+        known = self._known[-self._frame :]
+        return float(np.sum(known * errors**2)) / max(int(np.count_nonzero(known)), 1)
 
     def listen(self, references: Any, errors: Any) -> None:
         """Let the controller and the fits follow the noise while the output is silent.
@@ -594,6 +658,7 @@ class PathTracker(WrappedController):
         `references` and `errors` are (n_samples,), with several channels (I, n_samples) and (K, n_samples).
         """
         self.controller.listen(references, errors)
+        self._end_sample()
         for x, e in zip(np.atleast_2d(references).T, np.atleast_2d(errors).T, strict=True):
             at = self._past + self._n
             self._x[:, at], self._y[:, at], self._v[:, at], self._own[:, at] = x, 0.0, 0.0, 0.0

@@ -86,12 +86,14 @@ def process_steps(controller: Any, references: Any, errors: Any, *, adapt: Any, 
     require_one_length(x, e)
     flags = adapt_flags(adapt, x.shape[-1])
     y: Any = out
+    if hasattr(controller, "multichannel"):  # otherwise the channels show in the first sample
+        require_channels(x, "references", controller.multichannel, controller.n_references)
+        require_channels(e, "errors", controller.multichannel, controller.n_microphones)
+        y = room(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
     for n in range(x.shape[-1]):
         sample = controller.control_signal(x[..., n])
         if n == 0:
-            shape = (*np.shape(sample), x.shape[-1])
-            y = np.empty(shape) if out is None else out
-            require_room(y, shape)
+            y = room(y, (*np.shape(sample), x.shape[-1]))
         y[..., n] = sample
         if flags[n]:
             try:
@@ -134,12 +136,22 @@ def adapt_flags(adapt: Any, n_samples: int) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(flags, n_samples))
 
 
-def require_room(out: Any, shape: tuple[int, ...]) -> None:
-    """Raise ValueError if control signals of a shape do not fit into `out`."""
+def require_channels(signal: np.ndarray, name: str, multichannel: bool, n_channels: int) -> None:
+    """Raise ValueError if a block of samples has other channels than a controller."""
+    wanted = "(n_samples,)" if not multichannel else f"({n_channels}, n_samples)"
+    if signal.ndim != 1 + multichannel or (multichannel and len(signal) != n_channels):
+        raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
+
+
+def room(out: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return `out`, or a new array if it is None; raise ValueError if control signals of a shape do not fit into it."""
+    if out is None:
+        return np.empty(shape)
     fits = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == shape and out.flags.c_contiguous
     if not fits or not out.flags.writeable:
         got = f"{out.dtype} of shape {out.shape}" if isinstance(out, np.ndarray) else repr(out)
         raise ValueError(f"out must be a writable, C-contiguous array of float64 of shape {shape}, got {got}")
+    return np.asarray(out)
 
 
 class Rows:

@@ -184,10 +184,11 @@ class RepairedKFOPC(KalmanController):
     def _family(self) -> type[KalmanController]:
         return RepairedKFOPC
 
-    @property
-    def rated_power(self) -> float:
-        """Rated output power."""
+    def _read_rated_power(self) -> float:
         return self.constraint.rated_power
+
+    def _take_rated_power(self, value: float) -> None:
+        self.constraint.rated_power = value
 
     @property
     def constraint(self) -> OutputPowerConstraint:

@@ -335,11 +335,13 @@ class VirtualMicrophones(WrappedController):
         """Last estimate of the error at the virtual microphones, (K_v,); a copy."""
         return self._virtual_error.copy()
 
-    def _take_path(self, path: Any) -> None:
-        raise AttributeError(
-            "VirtualMicrophones takes no new secondary path: its observer belongs to the paths that it was made with; "
-            "make it again with the new ones"
-        )
+    def _pass_on(self, name: str, value: Any) -> None:
+        if name == "secondary_path":
+            raise AttributeError(
+                "VirtualMicrophones takes no new secondary path: its observer belongs to the paths that it was made "
+                "with; make it again with the new ones"
+            )
+        super()._pass_on(name, value)
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n), (J,), for the newest reference sample x(n), (I,)."""

@@ -58,6 +58,16 @@ def _response(path: Any, omega: np.ndarray) -> np.ndarray:
     return freqz(taps, worN=omega)[1]
 
 
+def _response_on_grid(path: Any, n_frequencies: int) -> np.ndarray:
+    """Return the response at evenly spaced frequencies from 0 to fs/2, by one FFT if the response is finite."""
+    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
+    if taps is None:
+        return _response(path, np.linspace(0.0, np.pi, n_frequencies))
+    period = 2 * (n_frequencies - 1)  # taps a period apart have the same phase at all of these frequencies
+    padded = np.pad(taps, (0, -taps.size % period))
+    return np.fft.rfft(padded.reshape(-1, period).sum(axis=0))
+
+
 def _frequencies(frequencies_hz: Any, fs: float) -> np.ndarray:
     frequencies = as_signal(frequencies_hz, "frequencies_hz")
     if frequencies.min() < 0 or frequencies.max() > fs / 2:
@@ -157,9 +167,16 @@ def secondary_path_gain(
     low, high = as_band(band, fs)
     # |S|² is the cosine series of the taps' autocorrelation; its mean over a band integrates term by term.
     lags = np.arange(taps.size)
-    autocorrelation = np.correlate(taps, taps, "full")[taps.size - 1 :]
+    autocorrelation = _autocorrelation(taps)
     mean_cosine = (high * np.sinc(2 * lags * high / fs) - low * np.sinc(2 * lags * low / fs)) / (high - low)
     return float(autocorrelation[0] + 2 * autocorrelation[1:] @ mean_cosine[1:])
+
+
+def _autocorrelation(taps: np.ndarray) -> np.ndarray:
+    """Return the autocorrelation at lags from 0 on, of a long response by FFT: the direct sum is quadratic."""
+    from scipy.signal import correlate
+
+    return correlate(taps, taps)[taps.size - 1 :]
 
 
 def _gain_for_reference(taps: np.ndarray, reference: Any) -> float:
@@ -295,7 +312,7 @@ def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None)
     if level_db >= 0:
         raise ValueError(f"level_db must be negative (relative to the peak), got {level_db:g} dB")
     frequencies = np.linspace(0.0, fs / 2, 2**15 + 1)
-    magnitude = np.abs(frequency_response(path, frequencies, fs=fs))
+    magnitude = np.abs(_response_on_grid(path, frequencies.size))
     peak = int(np.argmax(magnitude))
     if magnitude[peak] == 0:
         raise ValueError("path must not be all zeros: a silent path has no band")
@@ -505,7 +522,11 @@ def _margins(primary: Any, secondary: Any, fs: float | None, band: Any, share: f
 
 def _mean_group_delay(taps: np.ndarray, low: float, high: float, fs: float) -> float:
     """Return the group delay weighted by |H|²: mean of Re(conj(H) FT{n h}) over mean of |H|² in the band, in s."""
-    frequencies = low + (high - low) * (np.arange(4 * taps.size) + 0.5) / (4 * taps.size)
-    response = frequency_response(taps, frequencies, fs=fs)
-    ramped = frequency_response(taps * np.arange(taps.size), frequencies, fs=fs)  # transform of n h[n]
+    from scipy.signal import zoom_fft
+
+    n = 4 * taps.size
+    half = (high - low) / (2 * n)
+    between = [low + half, high + half]  # the middles of n parts of the band; the second edge itself is left out
+    response = zoom_fft(taps, between, n, fs=fs)
+    ramped = zoom_fft(taps * np.arange(taps.size), between, n, fs=fs)  # transform of n h[n]
     return float(np.sum(np.real(np.conj(response) * ramped)) / np.sum(np.abs(response) ** 2) / fs)

@@ -157,7 +157,10 @@ def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
         return np.full(N_FREQUENCIES, stated)
     if stated.ndim > 1:
         return _distance(stated, estimate)
-    return np.interp(np.linspace(0.0, 1.0, N_FREQUENCIES), np.linspace(0.0, 1.0, stated.size), stated)
+    places = np.linspace(0.0, N_FREQUENCIES - 1.0, stated.size)
+    error = np.interp(np.arange(N_FREQUENCIES), places, stated)
+    np.maximum.at(error, np.rint(places).astype(int), stated)  # with more values than these, no peak may be lost
+    return error
 
 
 def as_uncertainty(value: Any) -> PathTolerance | float | np.ndarray | None:

@@ -31,7 +31,7 @@ SOFT = 0.5  # a noise for which less than this share of the rated power is spent
 SAME = 1e-9  # of the rated amplitude: what comes out as close to what was asked for has passed the limiter
 ACTS = 1e-6  # of the rated power, in the mean of what a limiter took: it counts as one that acts, for about 14 s
 LOUDEST = 100.0  # rated amplitudes; louder samples count as this loud in what a limiter took
-INTERVAL = 128  # samples between two solutions; fewer at the start
+INTERVAL_S = 0.008  # between two solutions; less at the start
 X, XF = 0, 1  # the reference and the filtered reference, in the correlations
 
 
@@ -179,8 +179,8 @@ def advance_budget(budget, w, x, xf, y):
     numbers.noted = False
     take_sample(budget, x, xf, y)
     # At the start the estimate grows fast, so the interval is an eighth of the time so far.
-    if numbers.due or numbers.waited >= min(float(INTERVAL), 1.0 + numbers.taken // 8.0):
-        numbers.interval, numbers.waited, numbers.due = min(numbers.waited, float(INTERVAL)), 0.0, False
+    if numbers.due or numbers.waited >= min(numbers.longest, 1.0 + numbers.taken // 8.0):
+        numbers.interval, numbers.waited, numbers.due = min(numbers.waited, numbers.longest), 0.0, False
         allocate(budget, w)
 
 
@@ -296,8 +296,8 @@ class PowerBudget:
     memory_s : float, default 2.5
         Length of the window of the correlations in seconds, at least 10 n_taps samples.
     averaging_s : float, default 10
-        Time in seconds over which the mean power is kept to the rated one. The control filter is solved for every 128
-        samples, so choose 50 times as long; 8 samples are the least.
+        Time in seconds over which the mean power is kept to the rated one. The control filter is solved for every 8 ms,
+        so choose 50 times as long; 8 samples are the least.
     guard : array_like, shape (n_guard,), optional
         Short filter W against an uncertain secondary path, see `paths.guard_filter`: the system above gets a third
         term, :math:`R_{W x'}`, the correlation of the filtered reference after W. By default none.
@@ -367,6 +367,7 @@ class PowerBudget:
                 waited=0.0,  # of these, since the last solution
                 due=False,  # whether to solve at the next sample, however few have waited
                 interval=0.0,  # and between the last two
+                longest=float(max(round(INTERVAL_S * self.fs), 1)),  # and at most
                 weight=0.0,  # lambda
                 gain=0.0,  # power of the control signal for each unit of level
                 ceiling=MOST,  # of the target over the rated power, behind a limiter

@@ -10,12 +10,15 @@ import numpy as np
 
 from .._validate import as_positive
 from ..controllers.power_budget import kf_pb
+from ..paths.fitting import require_same_length, require_shorter, require_sound
 from ..paths.reading import read_path
 from ..power.limiter import OutputLimiter
 from ..signals.recordings import read_recording
 from .interfaces import Interface, SimulatedInterface
 from .running import FaultError, IdentifiedPlant, Levels, RunReport, run
 from .sound_device import SoundDevice
+
+SMALL_BOUND_DB = 10.0  # below it, a shorter delay may be worth having
 
 EXAMPLES = """examples:
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
@@ -61,7 +64,8 @@ def run_command(options: argparse.Namespace) -> int:
     """Run with the options of `add_options`; return 0, or 1 if a fault ended the run."""
     as_positive(options.rated_power, "--rated-power")
     interface = _interface(options)
-    as_positive(options.rated_power, "--rated-power")
+    if isinstance(interface, SimulatedInterface):
+        _judge_length(options, interface)
     limit = 4.0 * options.rated_power**0.5 if options.amplitude_limit is None else options.amplitude_limit
     show = None if options.quiet else _Screen(sys.stderr)
     try:
@@ -79,7 +83,7 @@ def run_command(options: argparse.Namespace) -> int:
         return 1
     if show is not None:
         show.end()
-    print(_summary(report, interface.fs))
+    print(_summary(report, interface.fs, interface.block))
     return 1 if report.stopped_by.startswith("fault") else 0
 
 
@@ -107,6 +111,7 @@ def _interface(options: argparse.Namespace) -> Interface:
     if options.secondary is None:
         raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
     noise = read_recording(options.noise, fs=options.fs)
+    n_samples = noise.samples.shape[-1]
     files = {"secondary": read_path(options.secondary, fs=options.fs)}
     for name, read in (("primary", read_path), ("disturbance", read_recording)):
         if getattr(options, name) is not None:
@@ -117,6 +122,13 @@ def _interface(options: argparse.Namespace) -> Interface:
                 f"--{name} is sampled at {one.fs:g} Hz, the noise at {noise.fs:g} Hz: resample all, for example with "
                 "--fs 16000"
             )
+    for name in ("primary", "secondary"):
+        if name in files:
+            path = files[name]
+            require_shorter(getattr(options, name), path.samples.shape[-1], options.noise, n_samples, noise.fs)
+            require_sound(getattr(options, name), path.samples)
+    if "disturbance" in files:
+        require_same_length(options.disturbance, files["disturbance"].samples.shape[-1], options.noise, n_samples)
     primary = files.get("primary")
     disturbance = files.get("disturbance")
     return SimulatedInterface(
@@ -129,6 +141,21 @@ def _interface(options: argparse.Namespace) -> Interface:
         latency=options.latency,
         clock=options.clock,
     )
+
+
+def _judge_length(options: argparse.Namespace, interface: SimulatedInterface) -> None:
+    """Raise ValueError if a recording ends before the control begins, warn if it ends before the seconds asked."""
+    lasts, before = interface.n_samples / interface.fs, options.listen + options.identify
+    text = (
+        f"{options.noise} lasts {lasts:.3g} s, of which listening takes {options.listen:g} s and identifying "
+        f"{options.identify:g} s"
+    )
+    mend = "give a longer recording, or a shorter --listen and --identify"
+    if lasts <= before:
+        raise ValueError(f"{text}: nothing is left to control; {mend}")
+    if options.seconds is not None and lasts - before < options.seconds:
+        left = f"{lasts - before:.3g} s of control are left of the {options.seconds:g} s asked for"
+        print(f"{options.prog}: warning: {text}: {left}; {mend}", file=sys.stderr)
 
 
 def _controller(plant: IdentifiedPlant, options: argparse.Namespace, limit: float) -> Any:
@@ -187,7 +214,7 @@ def describe(levels: Levels) -> str:
     )
 
 
-def _summary(report: RunReport, fs: float) -> str:
+def _summary(report: RunReport, fs: float, block: int) -> str:
     """Return a report as text."""
     rated = report.rated_power
     powers = ", ".join(
@@ -207,7 +234,13 @@ def _summary(report: RunReport, fs: float) -> str:
     if trip is not None:
         lines.insert(1, f"round trip {trip} samples, {1e3 * trip / fs:.1f} ms")
     if np.isfinite(report.possible_db):
-        lines.insert(2, f"the best filter without a rated power would reach {report.possible_db:.1f} dB")
+        reach = f"the best filter without a rated power would reach {report.possible_db:.1f} dB"
+        if report.possible_db < SMALL_BOUND_DB:
+            reach += (
+                f"; the buffers, two blocks of {block} samples ({2e3 * block / fs:.2g} ms), make the anti-noise late: "
+                "use a smaller --block"
+            )
+        lines.insert(2, reach)
     faults = [f"{event.time_s:.2f} s: {event.what} {event.channel}".rstrip() for event in report.health.events]
     lines.append("health: " + ("; ".join(faults[-10:]) or "nothing noticed"))
     return "\n".join(lines)

@@ -6,6 +6,7 @@ import functools
 import itertools
 import json
 import re
+from dataclasses import replace
 
 import jsonschema
 import numpy as np
@@ -13,9 +14,9 @@ import pytest
 import soundfile
 
 from kfopc_filterpy import kf_pb, noise_reduction_db
-from kfopc_filterpy.bench import algorithms, assess, assessed_runs
-from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA
-from kfopc_filterpy.metrics import overshoot
+from kfopc_filterpy.bench import algorithms, assess, assessed_runs, compare_recordings
+from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
+from kfopc_filterpy.metrics import convergence_time_s, overshoot
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
 from kfopc_filterpy.signals import band_limited_noise
@@ -103,6 +104,59 @@ def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
     assert small.limited_by == "amplifier"
     large = assess(x, primary, secondary, rating=AmplifierRating(ohm=1.0, sine_watt=8.0), **options)
     assert large.enough
+
+
+def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must_be():
+    """The second arrival comes 94 samples after the loudspeaker's sound and carries half of the energy."""
+    verdict = verdict_on("filter", better=False)
+    assert verdict.response_s == pytest.approx((100 - 6 + 1) / FS)
+    (advice,) = verdict.advice
+    assert advice.startswith(
+        "32 taps last 4 ms, but the noise arrives up to 12 ms later than the loudspeaker's sound: "
+    )
+    assert advice.endswith("resample everything with fs=4000, or take a longer filter with n_taps=128.")
+    assert verdict_on("filter", better=True).noise_reduction_db > 8.0  # with those 128 taps
+    late = replace(verdict, response_s=0.9)  # at 4000 Hz 3600 taps, more than anyone runs
+    assert advice_on(late) == [
+        "32 taps last 4 ms, but the noise arrives up to 900 ms later than the loudspeaker's sound: move the reference "
+        "microphone towards the error microphone, or give a primary path that ends sooner."
+    ]
+
+
+def test_nothing_is_reported_as_minus_zero():
+    verdict = verdict_on("filter", better=False)
+    nothing = replace(verdict, noise_reduction_db=-0.01, ceilings=replace(verdict.ceilings, filter_db=-0.01), advice=())
+    assert "reaches 0.0 dB" in repr(nothing)
+    assert "taps reach 0.0 dB" in repr(nothing)
+
+
+def test_without_a_primary_path_a_short_filter_is_advised_to_be_longer():
+    x, primary = noise(), arriving(12, 30)
+    verdict = assess(
+        x,
+        None,
+        arriving(6, length=16),
+        disturbance=np.convolve(x, primary)[: x.size],
+        rating=PLENTY,
+        fs=FS,
+        n_taps=8,
+        beside=(),
+        secondary_path_uncertainty=None,
+    )
+    assert verdict.limited_by == "filter"
+    assert verdict.response_s is None
+    assert verdict.advice[0].startswith("Try a filter longer than 8 taps: 8 taps last 1 ms at 8000 Hz, more at a lower")
+
+
+def test_a_comparison_times_convergence_by_the_window_of_a_verdict_and_of_the_figure():
+    report = compare_recordings(
+        noise(), arriving(20), arriving(6, length=16), rating=PLENTY, fs=FS, names=["FxLMS"], n_taps=16
+    )
+    disturbance, error = (sound.signal for sound in report.sounds)
+    time, of_5_ms = (convergence_time_s(error, disturbance, FS, window_s=window_s) for window_s in (0.1, 0.005))
+    assert report.algorithms["FxLMS"]["convergence_time_s"] == time
+    assert time < of_5_ms  # in which the noise itself rises and falls
+    assert any("lasts only 3 s" in note for note in report.notes)
 
 
 def test_the_advice_says_how_much_of_the_noise_the_default_uncertainty_holds_back():
@@ -355,7 +409,7 @@ def test_the_levels_are_those_of_the_sounds(written):
     [
         ({"noise": np.zeros(8000)}, "noise must not be silent"),
         ({"noise": np.ones(8000)}, "noise must not be silent"),
-        ({"secondary": np.zeros(8)}, "secondary must not be silent"),
+        ({"secondary": np.zeros(8)}, "secondary must not be silent: every value is 0; record it again"),
         ({"primary": None}, "primary must be given unless there is a disturbance"),
         ({"disturbance": np.ones(7)}, "disturbance must have 8000 values, got 7"),
         ({"noise": np.full(8000, np.nan)}, "noise must be finite"),

@@ -219,9 +219,9 @@ def test_a_noise_that_cannot_be_controlled_is_called_so():
     other = np.random.default_rng(9).standard_normal(X.size)
     suggested = suggest_settings(X, other, S)
     assert suggested.n_taps == settings.MULTIPLE
-    assert "causality_margin" in suggested.reasons["n_taps"]
+    assert "the causality margin and the coherence tell the cause" in suggested.reasons["n_taps"]
     assert "by 0.0 dB" in suggested.reasons["n_taps"]
-    assert "causality_margin" not in suggest_settings(X, D, S).reasons["n_taps"]
+    assert "causality margin" not in suggest_settings(X, D, S).reasons["n_taps"]
 
 
 def test_the_noise_in_bursts_is_called_so():
@@ -249,6 +249,11 @@ def test_the_noise_in_bursts_is_called_so():
         ({"n_taps": 2.5}, TypeError, "n_taps must be a whole number"),
         ({"max_taps": 0}, ValueError, "max_taps must be at least 1"),
         ({"n_taps": 2909}, ValueError, "at least 32001 samples for 2909 control and 4 path taps, got 32000; record"),
+        (
+            {"reference": X[:2000], "disturbance": D[:2000], "secondary_path": np.ones(1995)},
+            ValueError,
+            "record a longer silent run, or cut the impulse response",
+        ),
         ({"reference": X[:12], "disturbance": D[:12]}, ValueError, "at least 13 samples for 1 control"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",

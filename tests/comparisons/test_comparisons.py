@@ -7,7 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import reports
 
+from comparisons import __main__ as comparisons_command
 from comparisons.__main__ import STUDIES, main
 from comparisons.studies import broadband, duct, tonal
 from comparisons.studies.cases import PAPER
@@ -145,7 +147,7 @@ def test_measured_study_says_in_a_line_why_it_is_left_out(monkeypatch, tmp_path)
     monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
     line = duct.main_measured(Runs())
     assert isinstance(line, str)
-    assert line.startswith("duct-measured is left out: ")
+    assert line.startswith("duct-measured is left out: set KFOPC_DATA to a folder with the measured data")
     assert "\n" not in line
 
 
@@ -174,6 +176,19 @@ def test_command_refuses_an_unknown_study(capsys):
     with pytest.raises(SystemExit):
         main(["tonal", "tidal"])
     assert "no study called tidal" in capsys.readouterr().err
+
+
+def test_a_study_that_is_left_out_is_noted_on_the_page(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(
+        comparisons_command,
+        "STUDIES",
+        {
+            "tonal": (lambda runs: reports.study(), lambda: 1),
+            "duct-measured": (lambda runs: "duct-measured is left out: set KFOPC_DATA", lambda: 1),
+        },
+    )
+    assert main(["--quiet", "--output", str(tmp_path)]) == 0
+    assert "duct-measured is left out: set KFOPC_DATA" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_command_writes_report_and_results(monkeypatch, tmp_path, capsys):

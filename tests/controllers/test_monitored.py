@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import FxLMS, SimulationResult, kf_pb, noise_reduction_db, simulate
+from kfopc_filterpy import FxLMS, OutputLimiter, SimulationResult, kf_pb, noise_reduction_db, simulate
 from kfopc_filterpy.controllers import MonitoredController
 from kfopc_filterpy.signals import compressor_noise
 
@@ -102,6 +102,77 @@ def test_a_control_signal_that_is_not_finite_is_stopped() -> None:
     assert np.isfinite(result.control_signal).all()
     assert [event.what for event in monitored.health][:2] == ["not finite", "retry"]
     assert monitored.health[0].time_s == pytest.approx(0.1 + 299 / FS)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200, "0.1", [1.0, 2.0]])
+def test_a_bad_sample_is_refused_while_muted_too_and_the_monitor_goes_on(bad: Any) -> None:
+    x, d = white(6.0), np.convolve(white(6.0), PRIMARY)[: int(6 * FS)]
+    monitored, untouched = (MonitoredController(FxLMS(24, -PATH, step_size=1e-3), fs=FS) for _ in range(2))
+    for controller in (monitored, untouched):
+        played = np.zeros(PATH.size)
+        for n in range(x.size):
+            if controller is monitored and n % 500 == 100:
+                with pytest.raises((ValueError, TypeError), match="reference must"):
+                    controller.control_signal(bad)
+            played = np.concatenate(([controller.control_signal(float(x[n]))], played[:-1]))
+            if controller is monitored and n % 500 == 100:
+                with pytest.raises((ValueError, TypeError), match="error must"):
+                    controller.update(bad)
+            controller.update(float(d[n] - PATH @ played))
+    assert repr(monitored.health) == repr(untouched.health)
+    assert "louder" in [event.what for event in monitored.health]
+
+
+def test_a_noise_that_comes_and_goes_is_no_reason_to_doubt_the_control() -> None:
+    """Silent windows tell nothing: the margin stays, and so does the control."""
+    x = white(10.0)
+    on = np.arange(x.size) // 2000 % 2 == 1
+    d = np.convolve(x * on, PRIMARY)[: x.size] + 0.01 * x[::-1]
+    monitored = MonitoredController(made(), fs=FS)
+    result = run(monitored, x * on, primary_path=None, disturbance=d)
+    assert monitored.health == []
+    assert monitored.margin_db == 1.5
+    assert noise_reduction_db(result.error, result.disturbance) > 3.0
+
+
+def test_the_margin_has_a_limit() -> None:
+    rng = np.random.default_rng(3)
+    d = rng.standard_normal(int(40 * FS)) * np.repeat(10.0 ** rng.uniform(0.0, 2.0, 80), int(0.5 * FS))
+    monitored = MonitoredController(made(), fs=FS)
+    run(monitored, white(40.0), primary_path=None, disturbance=d)  # the reference knows nothing of the noise
+    assert len(monitored.health) > 6
+    assert monitored.margin_db <= 12.0
+
+
+def test_a_margin_that_is_never_reached_is_taken() -> None:
+    monitored = MonitoredController(made(-PATH), fs=FS, margin_db=1e4)
+    run(monitored, white(3.0))
+    assert monitored.health == []
+
+
+def test_what_was_assigned_survives_a_failure_and_no_window_exceeds_the_limiter() -> None:
+    limiter = OutputLimiter(0.05, fs=FS, window_s=2.0)
+    controller = FxLMS(24, -PATH, step_size=1e-2, limiter=limiter)
+    monitored = MonitoredController(controller, fs=FS, window_s=0.1, pause_s=0.1)
+    result = run(monitored, white(10.0))
+    assert [event.what for event in monitored.health].count("louder") > 2
+    assert monitored.limiter is limiter
+    power = np.convolve(result.control_signal**2, np.full(int(2 * FS), 0.5 / FS))
+    assert power.max() <= 0.05 * (1 + 1e-9)
+    rated = MonitoredController(made(-PATH), fs=FS)
+    rated.rated_power = 0.1
+    run(rated, white(3.0))
+    assert "louder" in [event.what for event in rated.health]
+    assert rated.controller.rated_power == 0.1
+
+
+def test_it_may_listen_during_a_pause_without_ending_it() -> None:
+    monitored = MonitoredController(made(-PATH), fs=FS)
+    run(monitored, white(2.5))
+    assert monitored.muted
+    x = white(1.0)
+    monitored.listen(x, np.convolve(x, PRIMARY)[: x.size])
+    assert monitored.muted
 
 
 def test_several_channels() -> None:

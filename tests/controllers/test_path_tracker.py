@@ -207,6 +207,90 @@ def test_the_fit_is_least_squares(shape: tuple[int, int, int], source: str) -> N
     np.testing.assert_allclose(fit.noise, unexplained, rtol=1e-6)
 
 
+def test_samples_whose_errors_are_unknown_are_left_out_of_the_sums() -> None:
+    """Against the rows of the others, written out."""
+    rng = np.random.default_rng(3)
+    P, S, n = 6, 3, 40
+    x, y, v = (rng.standard_normal((2, n + P - 1)) for _ in range(3))
+    unknown = rng.random(n) < 0.3
+    e = np.where(unknown, 0.0, rng.standard_normal((2, n)))
+    signals = [(one, P) for one in x] + [(-one, S) for one in (*y, *v)]
+    known = np.array(
+        [np.concatenate([one[P - 1 + i - np.arange(taps)] for one, taps in signals]) for i in np.flatnonzero(~unknown)]
+    )
+    matrix, right, energies, count = block_sums(x, y, v, e, P, S, unknown)
+    np.testing.assert_allclose(matrix, known.T @ known, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(right, known.T @ e[:, ~unknown].T, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(energies, np.sum(e**2, axis=1), rtol=1e-12)
+    assert count == n - np.count_nonzero(unknown)
+
+
+@pytest.mark.parametrize("heard", [2, 3, 50], ids=["every 2nd", "every 3rd", "every 50th"])
+def test_a_jump_is_found_although_most_errors_are_not_known(heard: int) -> None:
+    """Every sample is played, but the controller hears few errors; without their places in time, nothing fits."""
+    x, d = noises(10.0)
+    tracker, path = tracked("FxLMS"), BEFORE
+    played = np.zeros(N_PATH)
+    for n in range(x.size):
+        path = BEFORE if n < 2 * FS else AFTER
+        played = np.concatenate(([tracker.control_signal(float(x[n]))], played[:-1]))
+        if n % heard == 0:
+            tracker.update(float(d[n] - path @ played))
+    assert misalignment_db(tracker.secondary_path, AFTER) < -8.0
+
+
+def test_a_pause_of_the_adaptation_has_a_probe_and_is_forgotten_by_the_guard() -> None:
+    """Ten seconds without an error: nothing is expected to be softer than before, and the probe goes on."""
+    x, d = noises(14.0)
+    tracker, alone = tracked("FxLMS"), MAKERS["FxLMS"](BEFORE)
+    played, error, probe = np.zeros(N_PATH), np.zeros(x.size), np.zeros(x.size)
+    for n in range(x.size):
+        y = tracker.control_signal(float(x[n]))
+        probe[n] = y - alone.control_signal(float(x[n]))
+        played = np.concatenate(([y], played[:-1]))
+        error[n] = d[n] - BEFORE @ played
+        if not 2 * FS <= n < 12 * FS:
+            tracker.update(float(error[n]))
+    assert tracker.changes == []
+    assert reduction_db(error, d, 13.0, 14.0) > reduction_db(error, d, 1.0, 2.0) - 0.5
+    pause = tracker._v[0]  # the probe of the newest block
+    assert np.std(pause) > 0.0
+
+
+def test_the_probe_does_not_grow_if_a_loudspeaker_is_unplugged() -> None:
+    """Otherwise it would be a thousand million times too loud after half a minute."""
+    x, d = noises(16.0)
+
+    def path_at(t: float) -> np.ndarray:
+        return BEFORE if not 2.0 <= t < 8.0 else np.zeros(N_PATH)
+
+    tracker, alone = tracked("KF-PB"), MAKERS["KF-PB"](BEFORE)
+    error, emitted = run(tracker, x, d, path_at)
+    _, without = run(alone, x[: round(8 * FS)], d[: round(8 * FS)], path_at)
+    unplugged = slice(round(3 * FS), round(8 * FS))
+    assert np.mean(emitted[unplugged] ** 2) < 2.0 * np.mean(without[unplugged] ** 2)
+    assert np.sum(tracker.secondary_path**2) > 0.01 * np.sum(BEFORE**2)
+    assert reduction_db(error, d, 15.0, 16.0) > 6.0
+
+
+def test_several_loudspeakers_of_which_one_is_unplugged_keep_its_paths() -> None:
+    paths = crossed_paths(3, 1.0, 0)
+    tracker = PathTracker(FxLMS(16, paths, step_size=1e-3, n_references=2), rng=3, fs=SLOW_FS)
+    x, d = noises_of_several(12.0)
+    unplugged = paths.copy()
+    unplugged[:, 1] = 0.0
+    run_several(tracker, x, d, lambda t: paths if t < 2.0 else unplugged)
+    strengths = np.sum(tracker.secondary_path**2, axis=(0, 2)) / np.sum(paths**2, axis=(0, 2))
+    assert strengths[0] > 0.5
+    assert strengths[1] >= 0.01
+
+
+def test_a_limit_that_is_far_too_large_to_count_is_taken() -> None:
+    tracker = tracked("FxLMS", hold_db=1e4)
+    x, d = noises(1.0)
+    assert np.isfinite(run(tracker, x, d, lambda t: BEFORE)[0]).all()
+
+
 def test_silence_has_no_solution() -> None:
     fit = JointFit((1, 1, 1), 5, 2, 0.5)
     silent = np.zeros((1, 54))

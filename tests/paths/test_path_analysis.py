@@ -1,5 +1,7 @@
 """Responses, delays, gain and phase error. Oracles: numpy.fft, scipy.signal.group_delay, closed forms."""
 
+import time
+
 import control
 import numpy as np
 import pytest
@@ -246,3 +248,37 @@ def test_a_single_pair_has_its_margin_as_a_matrix_too():
     assert isinstance(margin.margin_s, float)
     as_matrix = causality_margin(_arriving([[20]]), _arriving(4), fs=FS)
     assert as_matrix.margin_s == margin.margin_s
+
+
+@pytest.mark.parametrize("n_taps", [3, 64, 70_000])  # the last is longer than the grid's period of 65536
+def test_the_peak_of_a_band_is_that_of_the_response(n_taps):
+    taps = np.zeros(n_taps)
+    taps[[0, 1, -1]] = 0.5, 0.3, 0.4
+    band = achieved_band(taps, fs=FS)
+    at_peak = frequency_response(taps, [band.peak_hz], fs=FS)[0]
+    assert band.peak_db == pytest.approx(20 * np.log10(np.abs(at_peak)), abs=1e-9)
+
+
+def test_a_mean_group_delay_is_the_mean_over_the_responses():
+    taps = np.random.default_rng(3).standard_normal(300) * 0.98 ** np.arange(300)
+    low, high = 200.0, 3000.0
+    frequencies = low + (high - low) * (np.arange(1200) + 0.5) / 1200
+    weight = np.abs(frequency_response(taps, frequencies, fs=FS)) ** 2
+    mean = np.sum(weight * group_delay(taps, frequencies, fs=FS)) / np.sum(weight)
+    margin = causality_margin(taps, [1.0], fs=FS, band=(low, high))
+    assert margin.primary_delay_s == pytest.approx(mean, rel=1e-11)
+
+
+def test_a_recording_taken_for_a_path_is_analysed_in_seconds():
+    """A sum over all taps for every frequency would take minutes."""
+    taps = np.zeros(160_000)
+    taps[[120_000, 120_001]] = 0.5, 0.5
+    began = time.process_time()
+    margin = causality_margin(taps, np.eye(1, 8, 4)[0], fs=FS)
+    band = achieved_band(taps, fs=FS)
+    gain = secondary_path_gain(taps, band=(0.0, FS / 2), fs=FS)
+    assert time.process_time() - began < 10
+    assert margin.margin_samples == pytest.approx(119_996)
+    assert margin.group_delay_margin_samples == pytest.approx(119_996.5, abs=1e-3)
+    assert band.high_hz == pytest.approx(np.arccos(10 ** (-3 / 20)) * FS / np.pi, abs=1e-3)
+    assert gain == pytest.approx(0.5)

@@ -39,6 +39,17 @@ def test_what_can_be_given() -> None:
     np.testing.assert_allclose(path_uncertainty([0.0, 1.0], PATH), OMEGA / np.pi)
 
 
+@pytest.mark.parametrize("size", [300, 513, 5000])
+def test_no_peak_of_a_finer_array_is_lost(size: int) -> None:
+    fine = np.zeros(size)
+    for place in (0, 1, size // 3, size // 2 + 1, size - 2):
+        fine[place] = 3.0
+        assert path_uncertainty(fine, PATH).max() == 3.0
+        assert guard_filter(fine, PATH) is not None
+        assert np.argmax(path_uncertainty(fine, PATH)) == pytest.approx(place / (size - 1) * 256, abs=0.51)
+        fine[place] = 0.0
+
+
 def test_what_needs_no_guard_has_none() -> None:
     """A tolerance whose relative error stays well below 1 allows the whole control filter."""
     for exact in (None, 0.0, PathTolerance(), PathTolerance(gain_db=3.0), PathTolerance(phase_deg=45.0)):

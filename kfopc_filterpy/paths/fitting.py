@@ -1,0 +1,37 @@
+"""Checks of files that are to go together: impulse responses with a noise, recordings with each other."""
+
+from __future__ import annotations
+
+import numpy as np
+
+LONG_PATH_S = 5.0  # hardly any impulse response is longer
+LONGEST_PATH_S = 10.0
+
+
+def require_shorter(path: str, n_taps: int, noise: str, n_samples: int, fs: float) -> None:
+    """Raise ValueError if an impulse response is not shorter than the noise, or too long for any.
+
+    `path` and `noise` are the names of the files.
+    """
+    if n_taps < n_samples and n_taps <= LONGEST_PATH_S * fs:
+        return
+    raise ValueError(
+        f"{path} has {n_taps} samples ({n_taps / fs:.3g} s), {noise} {n_samples} ({n_samples / fs:.3g} s): an impulse "
+        f"response must be shorter than the noise, and at most {LONGEST_PATH_S:g} s long; cut the impulse response, or "
+        "are the files swapped?"
+    )
+
+
+def require_same_length(disturbance: str, n_samples: int, noise: str, expected: int) -> None:
+    """Raise ValueError if two recordings that were made together differ in length; they are named by their files."""
+    if n_samples != expected:
+        raise ValueError(
+            f"{disturbance} has {n_samples} samples, {noise} {expected}: they must be recorded together and be equally "
+            f"long; cut both to the same start and the same end"
+        )
+
+
+def require_sound(path: str, taps: np.ndarray) -> None:
+    """Raise ValueError if an impulse response, or a matrix of them, is silent."""
+    if not np.any(taps):
+        raise ValueError(f"{path} is silent, every value is 0: record it again")

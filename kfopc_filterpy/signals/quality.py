@@ -1,0 +1,52 @@
+"""Remarks on recordings that can be used, but tell less than they seem to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+SHORT_S = 5.0
+CLIPPED_SHARE = 1e-4  # of the samples; fewer hardly matter
+
+
+def recording_remarks(samples: Any, fs: float, name: str) -> list[str]:
+    """Return remarks on a recording, (n_samples,) or (n_channels, n_samples): that it is short, or clipped."""
+    channels = np.atleast_2d(samples)
+    remarks = clipping_remarks(channels, name)
+    seconds = channels.shape[-1] / fs
+    if seconds < SHORT_S:
+        remarks.append(
+            f"{name} lasts only {seconds:.3g} s, so a part of the result may be chance: record at least {SHORT_S:g} s."
+        )
+    return remarks
+
+
+def clipping_remarks(samples: Any, name: str) -> list[str]:
+    """Return a remark on each channel of a recording that is clipped."""
+    channels = np.atleast_2d(samples)
+    remarks = []
+    for number, channel in enumerate(channels):
+        share = _clipped_share(channel)
+        if share:
+            which = name if len(channels) == 1 else f"channel {number} of {name}"
+            remarks.append(
+                f"{which} is clipped: {100 * share:.2g} % of its samples stay at the highest or the lowest value. What "
+                "was cut off is missing from every result: record again with less gain."
+            )
+    return remarks
+
+
+def _clipped_share(channel: np.ndarray) -> float:
+    """Return the share of the samples at an extreme value at which the signal stays for three samples and more.
+
+    The peaks of a tone also repeat a value, but only once or twice each.
+    """
+    if channel.size < 3 or np.ptp(channel) == 0:
+        return 0.0
+    count = 0
+    for extreme in (channel.max(), channel.min()):
+        there = channel == extreme
+        if np.mean(there[:-2] & there[1:-1] & there[2:]) > CLIPPED_SHARE:
+            count += int(np.count_nonzero(there))
+    return count / channel.size

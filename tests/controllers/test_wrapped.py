@@ -1,0 +1,146 @@
+"""Wrappers pass on what is assigned to them, and settings that are assigned count like those at the beginning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy import (
+    DiagonalKalman,
+    FastArrayKalman,
+    FxLMS,
+    LimitedController,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
+    kf_pb,
+    simulate,
+)
+from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker
+from kfopc_filterpy.paths import PathTolerance
+
+FS = 16000.0
+PATH = np.array([0.0, 1.0, 0.4, 0.0])
+PATHS = np.array([[PATH, 0.3 * PATH], [0.2 * np.roll(PATH, 1), PATH]])
+KALMAN: dict[str, Any] = {"state_noise": 1e-8, "measurement_noise": 1e-3}
+X = np.random.default_rng(0).standard_normal(2000)
+
+RATED: dict[str, Any] = {
+    "KF-OPC": lambda power: kf_opc(8, PATH, rated_power=power, **KALMAN),
+    "KF-OPC repaired": lambda power: kf_opc_repaired(8, PATH, rated_power=power, **KALMAN),
+    "KF-PB": lambda power: kf_pb(8, PATH, rated_power=power, fs=FS, **KALMAN),
+    "diagonal": lambda power: DiagonalKalman(8, PATH, rated_power=power, **KALMAN),
+    "fast array": lambda power: FastArrayKalman(8, PATH, measurement_noise=1e-3, rated_power=power),
+    "MOV": lambda power: MOVFxLMS(8, PATH, step_size=1e-3, rated_power=power),
+    "optimal leaky": lambda power: OptimalLeakyFxLMS(8, PATH, step_size=1e-3, rated_power=power),
+}
+SEVERAL: dict[str, Any] = {
+    "KF-OPC": lambda power: kf_opc(8, PATHS, rated_power=power, **KALMAN),
+    "direct": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS, form="direct", **KALMAN),
+    "shared gain": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS),
+    "frequency domain": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS, form="frequency domain"),
+    "MOV": lambda power: MOVFxLMS(8, PATHS, step_size=1e-4, rated_power=power),
+}
+WRAPPERS: dict[str, Any] = {
+    "monitor": lambda inner: MonitoredController(inner, fs=FS),
+    "tracker": lambda inner: PathTracker(inner, rng=1, fs=FS),
+    "neutraliser": lambda inner: FeedbackNeutralizer(inner, [0.0, 0.1]),
+    "monitored tracker": lambda inner: MonitoredController(PathTracker(inner, rng=1, fs=FS), fs=FS),
+}
+
+
+class Own:
+    """A user's controller, without any setting."""
+
+    def control_signal(self, reference: float) -> float:
+        return 0.1 * reference
+
+    def update(self, error: float) -> None:
+        pass
+
+
+def control_signal(controller: Any, several: bool = False) -> np.ndarray:
+    path, x = (PATHS, X[np.newaxis]) if several else (PATH, X)
+    d = np.stack([np.roll(X, 3), np.roll(X, 4)]) if several else np.roll(X, 3)
+    return np.asarray(simulate(controller, x, disturbance=d, secondary_path=path).control_signal)
+
+
+@pytest.mark.parametrize("name", RATED)
+def test_a_rated_power_that_is_assigned_counts_like_the_first_one(name: str) -> None:
+    changed, made = RATED[name](1.0), RATED[name](0.05)
+    first = control_signal(RATED[name](1.0))
+    changed.rated_power = 0.05
+    assert changed.rated_power == made.rated_power == 0.05
+    np.testing.assert_array_equal(control_signal(changed), control_signal(made))
+    assert not np.array_equal(control_signal(made), first)
+
+
+@pytest.mark.parametrize("name", SEVERAL)
+def test_rated_powers_of_several_loudspeakers_can_be_assigned(name: str) -> None:
+    changed, made = SEVERAL[name](1.0), SEVERAL[name]([0.05, 0.02])
+    changed.rated_power = [0.05, 0.02]
+    np.testing.assert_array_equal(changed.rated_power, [0.05, 0.02])
+    np.testing.assert_array_equal(control_signal(changed, True), control_signal(made, True))
+    with pytest.raises(ValueError, match="rated_power must be greater than 0"):
+        changed.rated_power = [1.0, -1.0]
+    changed.rated_power = 0.1
+    np.testing.assert_array_equal(changed.rated_power, [0.1, 0.1])
+
+
+def test_a_controller_without_a_rated_power_takes_none() -> None:
+    for controller in (kf_anc(8, PATH, **KALMAN), FxLMS(8, PATH, step_size=1e-3), kf_pb(8, PATHS, rated_power=None)):
+        with pytest.raises(ValueError, match="has no rated power that could be changed: make it with rated_power="):
+            controller.rated_power = 1.0
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+def test_what_is_assigned_to_a_wrapper_reaches_the_controller(name: str) -> None:
+    inner = kf_opc(8, PATH, rated_power=1.0, **KALMAN)
+    wrapper, limiter = WRAPPERS[name](inner), OutputLimiter(1e-3, fs=FS)
+    wrapper.limiter, wrapper.rated_power = limiter, 0.5
+    wrapper.secondary_path, wrapper.secondary_path_uncertainty = 2.0 * PATH, PathTolerance(gain_db=3.0)
+    assert inner.limiter is wrapper.limiter is limiter
+    assert inner.rated_power == wrapper.rated_power == 0.5
+    np.testing.assert_array_equal(inner.secondary_path, 2.0 * PATH)
+    assert inner.secondary_path_uncertainty == PathTolerance(gain_db=3.0)
+
+
+@pytest.mark.parametrize("setting", ["limiter", "rated_power", "secondary_path", "secondary_path_uncertainty"])
+def test_a_setting_that_the_controller_lacks_is_not_taken(setting: str) -> None:
+    wrapper, own = MonitoredController(Own()), Own()
+    with pytest.raises(AttributeError, match=f"Own has no {setting} that could be assigned"):
+        setattr(wrapper, setting, 1.0)
+    assert not hasattr(wrapper, setting)
+    assert not hasattr(own, setting)
+
+
+def test_the_limiter_of_a_users_controller_can_be_replaced() -> None:
+    controller = MonitoredController(LimitedController(Own(), OutputLimiter(1.0)))
+    controller.limiter = limiter = OutputLimiter(0.5)
+    assert controller.controller.limiter is limiter
+    with pytest.raises(TypeError, match="limiter must be an OutputLimiter, got 1"):
+        controller.limiter = 1
+    assert controller.limiter is limiter
+
+
+@pytest.mark.parametrize("name", WRAPPERS)
+@pytest.mark.parametrize(
+    ("references", "errors", "room", "message"),
+    [
+        ((5,), (5,), (4,), r"out must be .* of shape \(5,\)"),
+        ((5,), (2, 5), (5,), r"errors must be \(n_samples,\) for this controller, got shape \(2, 5\)"),
+        ((2, 5), (5,), (5,), r"references must be \(n_samples,\) for this controller, got shape \(2, 5\)"),
+    ],
+)
+def test_a_block_that_does_not_fit_changes_nothing(
+    name: str, references: tuple[int, ...], errors: tuple[int, ...], room: tuple[int, ...], message: str
+) -> None:
+    wrapper, untouched = (WRAPPERS[name](FxLMS(8, PATH, step_size=1e-3)) for _ in range(2))
+    with pytest.raises(ValueError, match=message):
+        wrapper.process(np.ones(references), np.ones(errors), out=np.empty(room))
+    np.testing.assert_array_equal(wrapper.process(X, 0.5 * X), untouched.process(X, 0.5 * X))

@@ -1,0 +1,44 @@
+"""Remarks on recordings: short ones, clipped ones, and those that only look clipped."""
+
+import numpy as np
+import pytest
+
+from kfopc_filterpy.signals import band_limited_noise, tone
+from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
+
+FS = 8000
+NOISE = band_limited_noise((100, 1500), 6.0, fs=FS, rng=1, power=1.0)
+
+
+def test_a_clipped_recording_is_noticed_with_its_share():
+    (remark,) = recording_remarks(np.clip(NOISE, -1.5, np.inf), FS, "noise.wav")
+    assert remark.startswith("noise.wav is clipped: ")
+    share = np.mean(NOISE <= -1.5)
+    assert f"{100 * share:.2g} %" in remark  # hardly a peak of this noise is so short that only one sample is cut off
+    assert "record again with less gain" in remark
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        NOISE,
+        np.round(NOISE * 100) / 100,  # of few bits
+        tone(400.0, 6.0, fs=FS),  # each of its peaks is the same value
+        np.sign(np.arange(6 * FS) % 2 - 0.5),  # a tone at fs/2
+    ],
+    ids=["noise", "few bits", "tone", "fs/2"],
+)
+def test_a_signal_that_repeats_its_peak_is_not_clipped(signal):
+    assert recording_remarks(signal, FS, "noise") == []
+
+
+def test_a_channel_that_is_clipped_is_named():
+    (remark,) = clipping_remarks([NOISE, np.clip(NOISE, -1, 1)], "errors.wav")
+    assert remark.startswith("channel 1 of errors.wav is clipped")
+
+
+def test_a_short_recording_is_noticed():
+    (remark,) = recording_remarks(NOISE[: 3 * FS], FS, "noise")
+    assert remark.startswith("noise lasts only 3 s")
+    assert "record at least 5 s" in remark
+    assert recording_remarks(NOISE[: 5 * FS], FS, "noise") == []
