@@ -42,10 +42,8 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
     except OverflowError as error:  # an integer of Python
         raise ValueError(f"{name} must be finite, but holds a number that is too large for a float") from error
     if real is None:  # numpy would drop the imaginary part with only a warning, and read numbers from text
-        text = type(value).__name__ if isinstance(value, str | bytes) else "text"
-        raise TypeError(
-            f"{name} must be a sequence of real numbers, got {'complex ones' if array.dtype.kind == 'c' else text}"
-        )
+        got = "complex ones" if array.dtype.kind == "c" else type(value).__name__
+        raise TypeError(f"{name} must be a sequence of real numbers, got {got}")
     return real
 
 

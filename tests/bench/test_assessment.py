@@ -60,7 +60,7 @@ def verdict_on(case: str, better: bool):
     if case == "amplifier":
         options["rating"] = 0.6 if better else 0.1
     if case == "adaptation":
-        options |= {"disturbance": heard(primary, 12.0), "want_db": 10.0, "memory_s": 0.25 if better else 0.005}
+        options |= {"disturbance": heard(primary, 12.0), "want_db": 10.0, "memory_s": 0.25 if better else 0.003}
     return assess(x, primary, secondary, fs=FS, **options)
 
 
