@@ -302,7 +302,7 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
         ),
         ("Power for full control", verdict.power(verdict.unlimited_power)),
         (f"Least power for {verdict.want_db:g} dB, best fixed filter", _or_none(verdict, verdict.required_rated_power)),
-        ("Estimate for this controller", _or_none(verdict, verdict.expected_rated_power)),
+        ("Estimate for this controller, peaks included", _or_none(verdict, verdict.expected_rated_power)),
         (
             "Causality",
             "unknown without a primary path"

@@ -25,6 +25,7 @@ LONGEST = 256
 GAIN_THAT_MATTERS_DB = 0.1
 MULTIPLE = 8  # lengths are rounded up to it
 SAMPLES_PER_TAP = 10  # of the record, at least; fewer would fit too much by chance
+SMALLEST_POWER = 1e-60  # of a signal; the settings of softer and of louder ones would not be numbers
 BURST_S = 0.01  # powers over this time show whether a noise is impulsive
 LITTLE = 0.5  # if a larger share of the disturbance's power is left, the reasons say where to look for the cause
 NOTABLY_LONGER = 1.2
@@ -222,6 +223,13 @@ class _Fits:
             self.stretch = full_stretch(x, disturbance, s, _longest(x.size, s.size, n_taps, max_taps, 1.0))
             self.variance_rule = "E[d^2] / (L E[x'^2])"
         self.filtered_power = self.stretch.filtered_power / self.per_tap
+        powers = {"the filtered reference": self.filtered_power, "disturbance": mean_square(self.stretch.d)}
+        for name, power in powers.items():
+            if not SMALLEST_POWER <= power <= 1.0 / SMALLEST_POWER:
+                raise ValueError(
+                    f"{name} must have a mean square from {SMALLEST_POWER:g} to {1.0 / SMALLEST_POWER:g}, got {power:.3g}: "
+                    "scale the signals"
+                )
         correlations: Any = self.stretch.correlations()
         size, shape = correlations.cross.size, (self.per_tap, self.stretch.n_taps)
         # Taps of one delay side by side: then the matrix of a shorter filter is the first part of that of a longer one.
