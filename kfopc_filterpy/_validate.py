@@ -31,11 +31,11 @@ def as_signal(value: Any, name: str, *, min_length: int = 1, length: int | None 
 
 def as_real_array(value: Any, name: str) -> np.ndarray:
     """Return `value` as a float64 array of any shape, NaN and Inf included."""
-    if isinstance(value, np.ma.MaskedArray):
-        value = np.ma.filled(value.astype(np.float64), np.nan)  # a masked value is a missing one
     try:
         array = np.asarray(value)
         real = array.astype(np.float64, copy=False) if array.dtype.kind not in "cSU" else None
+        if real is not None and isinstance(value, np.ma.MaskedArray):
+            real = np.where(np.ma.getmaskarray(value), np.nan, real)  # a masked value is a missing one
     except (TypeError, ValueError) as error:
         ragged = ", whose rows differ in length" if "inhomogeneous" in str(error) else ""
         raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error

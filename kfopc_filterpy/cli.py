@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 ENOUGH, NOT_ENOUGH, WRONG_INPUT = 0, 1, 2
 EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[studies]"'
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
-UNRELATED_DB, POOR_DB = -1.0, -20.0  # of a response that an identified path leaves unexplained
+UNRELATED, CHANCE = 0.02, 3.0  # share of a response that a path must explain, and times what chance explains
+POOR_DB = -20.0  # of the response that is left unexplained: more is too much
 
 EXAMPLES = {
     "": """examples:
@@ -446,7 +447,7 @@ def _identify(options: argparse.Namespace) -> int:
             "identify a shorter impulse response, or record for longer"
         )
     found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs or 0.0)
-    _judge_residual(options, found.residual_db, files.fs or 0.0)
+    _judge_residual(options, found.residual_db, files.fs or 0.0, shortest)
     _write_path(options.output, found.taps, files.fs or 0.0)
     facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
     text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
@@ -454,14 +455,15 @@ def _identify(options: argparse.Namespace) -> int:
     return ENOUGH
 
 
-def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float) -> None:
-    """Raise ValueError if a fit explains next to nothing of a response, warn if it explains little."""
-    explained = f"explains {100 * (1 - 10 ** (residual_db / 10)):.1f} % of {options.response}"
-    if residual_db > UNRELATED_DB:
+def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float, n_samples: int) -> None:
+    """Raise ValueError if a fit explains hardly more of a response than chance would, warn if it explains little."""
+    share = 1.0 - 10 ** (residual_db / 10)
+    explained = f"explains {100 * max(share, 0.0):.1f} % of {options.response}"
+    if share < max(UNRELATED, CHANCE * options.taps / n_samples):
         raise ValueError(
-            f"{options.excitation} {explained}, less than {100 * (1 - 10 ** (UNRELATED_DB / 10)):.0f} %: are the files "
-            "swapped, or of different recordings? Give what was sent to the amplifier first, then what the microphone "
-            "heard at the same time; nothing was written"
+            f"{options.excitation} {explained}, hardly more than chance would: are the files swapped, or of different "
+            "recordings? Give what was sent to the amplifier first, then what the microphone heard at the same time; "
+            "nothing was written"
         )
     if residual_db > POOR_DB:
         warn(
@@ -541,7 +543,7 @@ def _db(power: float) -> float:
 def _convert(options: argparse.Namespace) -> int:
     if (options.to is None) == (options.output is None):
         raise ValueError(f"one file to write is needed, for example {options.path} S.csv or {options.path} -o S.csv")
-    output = options.to or options.output
+    output = options.to if options.to is not None else options.output
     files = Files(options)
     taps = files.path(options.path)
     _write_path(output, taps, files.fs or 0.0)

@@ -62,8 +62,8 @@ OPTIONS = {
     "x_max_mm": "--x-max-mm",
 }
 _NAMES = "|".join(OPTIONS)
-_ALONE = re.compile(rf"^({_NAMES})(?=[\s\[])|(?<![\w./-])(\w+_\w+)(?![\w=]|\.\w)")
-_WITH_A_VALUE = re.compile(rf"(?<![\w./-])({_NAMES})=")
+_ALONE = re.compile(rf"^({_NAMES})(?=\[| must | is )|(?<![\w./\\-])(\w+_\w+)(?![\w=/\\]|\.\w)")
+_WITH_A_VALUE = re.compile(rf"(?<![\w./\\-])({_NAMES})=")
 
 
 def in_options(message: str, options: argparse.Namespace) -> str:

@@ -24,9 +24,9 @@ from .processing import (
     Rows,
     adapt_flags,
     block_signal,
+    output_array,
     require_channels,
     require_one_length,
-    room,
 )
 from .step import Compiled, GuardLine, Lines, estimate_once, listen, process_samples
 
@@ -451,7 +451,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     @rated_power.setter
     def rated_power(self, value: Any) -> None:
         if self.rated_power is None:
-            raise ValueError(f"{self.name} has no rated power that could be changed: make it with rated_power=")
+            raise ValueError(
+                f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
+            )
         self._take_rated_power(self._each_loudspeaker(value, "rated_power"))
 
     def _read_rated_power(self) -> Any:
@@ -572,7 +574,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         require_one_length(x, e)
         flags = adapt_flags(adapt, x.shape[-1])
         shape = (self.n_loudspeakers, x.shape[-1]) if self.multichannel else x.shape
-        y = room(out, shape)
+        y = output_array(out, shape)
         rows = self._rows_of(x, e) if self.multichannel else [x, e, y]
         done = self._process_rows(rows[0], rows[1], rows[2], flags)
         if self.multichannel:

@@ -170,6 +170,8 @@ class MonitoredController(WrappedController):
     def _sample(self, value: Any, name: str, what: str) -> Any:
         """Return a checked sample of the references or of the microphones. While muted, nobody else checks it."""
         several = getattr(self.controller, "multichannel", None)  # None: not known of a user's controller
+        if hasattr(self.controller, "physical"):  # it checks the microphones that exist, and needs no others
+            return value
         if several:
             value = channel_sample(value, getattr(self.controller, f"n_{what}"), name, what)
         elif several is False or np.ndim(value) == 0:
@@ -200,7 +202,7 @@ class MonitoredController(WrappedController):
             self.controller.update(error)
         self._samples += 1
         self._reference_energy += float(np.sum(np.square(self._newest)))
-        self._error_energy += float(np.sum(np.square(error)))
+        self._error_energy += float(np.nansum(np.square(error)))  # NaN: a microphone that does not exist
         self._counted += 1
         if self.muted:
             self._muted_for -= 1
@@ -237,7 +239,7 @@ class MonitoredController(WrappedController):
             self._stop()
         elif np.isfinite(change_db):
             self._note("not louder", change_db)
-            self.margin_db = min(1.5 * self.margin_db, self._widest_margin_db)
+            self.margin_db = max(self.margin_db, min(1.5 * self.margin_db, self._widest_margin_db))
         self._learn(ratio)
 
     def _learn(self, ratio: float) -> None:
@@ -247,10 +249,9 @@ class MonitoredController(WrappedController):
 
     def _stop(self) -> None:
         """Start a pause, after which a fresh controller begins, behind the same limiter: that knows what was played."""
-        limiter = getattr(self.controller, "limiter", None)
-        self.controller = deepcopy(self._fresh)
-        if limiter is not None:
-            self.controller.limiter = limiter  # type: ignore[attr-defined]
+        before, self.controller = self.controller, deepcopy(self._fresh)
+        if hasattr(before, "limiter"):
+            self.controller.limiter = before.limiter  # type: ignore[attr-defined]
         self._muted_for, self._after_silence = self._pause, "retry"
         self._pause = min(2 * self._pause, round(LONGEST_PAUSE * self._first_pause))
         self._references.clear()

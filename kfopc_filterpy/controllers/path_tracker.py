@@ -25,7 +25,7 @@ from .divergence import DivergenceGuard
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer
 SHORT = 1 / 8  # of the memory: this is the memory of the fit that follows fast changes
 FEWEST_FRAMES = 8  # with fewer, no better prediction is significant
-FAINT = 1e-2  # of the energy of a loudspeaker's paths: with less of it left, the loudspeaker counts as faulty
+LOUDEST_PROBE = 100.0  # times the power that it would have with the paths that the tracker was given
 LARGEST_DB = 300.0  # larger settings in dB count as this one; they would overflow
 RIDGE = 1e-9  # relative to the mean power of the regressors, so that a narrow-band reference has a solution
 
@@ -198,11 +198,6 @@ def through(paths: np.ndarray, signals: np.ndarray) -> np.ndarray:
     return oaconvolve(signals[np.newaxis], paths, mode="valid", axes=-1).sum(axis=1)
 
 
-def strengths(paths: np.ndarray) -> np.ndarray:
-    """Return the energy of each loudspeaker's paths (K, J, taps), summed over the microphones, (J,)."""
-    return np.asarray(np.sum(paths**2, axis=(0, 2)))
-
-
 class Evidence:
     """Comparison of two predictions, frame by frame, since the second one began to lead."""
 
@@ -267,9 +262,8 @@ class PathTracker(WrappedController):
     The controller does not hear the probe: what the probe contributes to the error, according to the estimate in use,
     is subtracted.
 
-    If a loudspeaker's paths become more than 20 dB weaker than those that the tracker was given, it is taken for a
-    loudspeaker that is broken or not connected, and its paths stay as they are. Otherwise the probe would become louder
-    and louder in order to be heard.
+    If a loudspeaker's paths become weaker, its probe becomes louder, but at most by 20 dB in comparison with the paths
+    that the tracker was given. Otherwise the probe of a loudspeaker that is not connected would grow without limit.
 
     A sample after which `update` is not called is played, but fits and tests leave out its error, which is not known.
 
@@ -463,9 +457,9 @@ class PathTracker(WrappedController):
         self._reversed = self._paths[..., ::-1].copy().reshape(K, -1)  # oldest sample first, as in the signals
 
     def _begin_with(self, path: np.ndarray) -> None:
-        """Set the paths in use, and how strong the loudspeakers are with them."""
+        """Set the paths in use, which also limit how loud the probe can become."""
         self._know(path)
-        self._strengths = strengths(self._paths)
+        self._given = self._paths
 
     def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
@@ -553,7 +547,8 @@ class PathTracker(WrappedController):
             powers = np.sum(self._e[:, frame] ** 2, axis=1) / count
             rate = np.where(self._residual_power > 0.0, self._frame / self._block, 1.0)
             self._residual_power += rate * (powers - self._residual_power)
-        ratio = common_ratio(self._residual_power, self._paths)
+        ratio, given = (common_ratio(self._residual_power, paths) for paths in (self._paths, self._given))
+        ratio = np.minimum(ratio, np.where(np.isfinite(given), LOUDEST_PROBE * given, np.inf))
         self._level = np.sqrt(self._probe_share / ratio.size * np.where(np.isfinite(ratio), ratio, 0.0))
         self._probe = self._next_probe()
         self._guard.end_frame()
@@ -612,18 +607,10 @@ class PathTracker(WrappedController):
                 self._evidence[k, i, source].add(one, other)
 
     def _take_over(self, better: list[tuple[int, int, str]]) -> None:
-        """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone.
-
-        Those of a loudspeaker that has become faint stay.
-        """
+        """Give models' paths to the controller: for each candidate (microphone, fit, source) those to its microphone."""
         new, old = self._paths.copy(), self._paths
         for k, i, source in better:
             new[k] = self._models[i].secondary[source][k]  # type: ignore[union-attr]  # a better candidate has a model
-        faint = strengths(new) < FAINT * self._strengths
-        new[:, faint] = old[:, faint]
-        better = [one for one in better if np.any(new[one[0]] != old[one[0]])]
-        if not better:
-            return
         self.controller.secondary_path = new if self.controller.multichannel else new[0, 0]
         for k, i, source in better:
             change = np.sum((new[k] - old[k]) ** 2) / max(np.sum(old[k] ** 2), np.finfo(float).tiny)

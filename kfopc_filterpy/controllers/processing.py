@@ -86,14 +86,15 @@ def process_steps(controller: Any, references: Any, errors: Any, *, adapt: Any, 
     require_one_length(x, e)
     flags = adapt_flags(adapt, x.shape[-1])
     y: Any = out
-    if hasattr(controller, "multichannel"):  # otherwise the channels show in the first sample
+    # The channels of others show in the first sample: of a user's controller, and of one with virtual microphones.
+    if hasattr(controller, "multichannel") and not hasattr(controller, "physical"):
         require_channels(x, "references", controller.multichannel, controller.n_references)
         require_channels(e, "errors", controller.multichannel, controller.n_microphones)
-        y = room(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
+        y = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
     for n in range(x.shape[-1]):
         sample = controller.control_signal(x[..., n])
         if n == 0:
-            y = room(y, (*np.shape(sample), x.shape[-1]))
+            y = output_array(y, (*np.shape(sample), x.shape[-1]))
         y[..., n] = sample
         if flags[n]:
             try:
@@ -143,7 +144,7 @@ def require_channels(signal: np.ndarray, name: str, multichannel: bool, n_channe
         raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
 
 
-def room(out: Any, shape: tuple[int, ...]) -> np.ndarray:
+def output_array(out: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return `out`, or a new array if it is None; raise ValueError if control signals of a shape do not fit into it."""
     if out is None:
         return np.empty(shape)

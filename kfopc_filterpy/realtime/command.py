@@ -235,10 +235,10 @@ def _summary(report: RunReport, fs: float, block: int) -> str:
         lines.insert(1, f"round trip {trip} samples, {1e3 * trip / fs:.1f} ms")
     if np.isfinite(report.possible_db):
         reach = f"the best filter without a rated power would reach {report.possible_db:.1f} dB"
-        if report.possible_db < SMALL_BOUND_DB:
+        if report.possible_db < SMALL_BOUND_DB and block > 1:
             reach += (
-                f"; the buffers, two blocks of {block} samples ({2e3 * block / fs:.2g} ms), make the anti-noise late: "
-                "use a smaller --block"
+                f"; if the anti-noise comes too late, use a smaller --block: two blocks of {block} samples are "
+                f"{2e3 * block / fs:.2g} ms"
             )
         lines.insert(2, reach)
     faults = [f"{event.time_s:.2f} s: {event.what} {event.channel}".rstrip() for event in report.health.events]

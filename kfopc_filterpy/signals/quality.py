@@ -8,6 +8,7 @@ import numpy as np
 
 SHORT_S = 5.0
 CLIPPED_SHARE = 1e-4  # of the samples; fewer hardly matter
+STEPS = 2.0  # smallest steps of the numbers: what clips comes from further away
 
 
 def recording_remarks(samples: Any, fs: float, name: str) -> list[str]:
@@ -29,7 +30,7 @@ def clipping_remarks(samples: Any, name: str) -> list[str]:
     for number, channel in enumerate(channels):
         share = _clipped_share(channel)
         if share:
-            which = name if len(channels) == 1 else f"channel {number} of {name}"
+            which = name if len(channels) == 1 else f"{name}, channel {number},"
             remarks.append(
                 f"{which} is clipped: {100 * share:.2g} % of its samples stay at the highest or the lowest value. What "
                 "was cut off is missing from every result: record again with less gain."
@@ -38,15 +39,19 @@ def clipping_remarks(samples: Any, name: str) -> list[str]:
 
 
 def _clipped_share(channel: np.ndarray) -> float:
-    """Return the share of the samples at an extreme value at which the signal stays for three samples and more.
+    """Return the share of the samples at an extreme value that the signal reaches in a step, and at which it stays.
 
-    The peaks of a tone also repeat a value, but only once or twice each.
+    It stays if it is there for three samples and more. So it does at the peaks of a slow tone in whole numbers, too, but
+    there the steps are the smallest that the numbers have.
     """
-    if channel.size < 3 or np.ptp(channel) == 0:
+    values = np.unique(channel)
+    if values.size < 3:
         return 0.0
-    count = 0
-    for extreme in (channel.max(), channel.min()):
+    smallest_step, count = np.diff(values).min(), 0
+    for extreme in (values[-1], values[0]):
         there = channel == extreme
-        if np.mean(there[:-2] & there[1:-1] & there[2:]) > CLIPPED_SHARE:
+        stays = np.mean(there[:-2] & there[1:-1] & there[2:]) > CLIPPED_SHARE
+        steps = np.abs(channel[:-1] - extreme)[there[1:] & ~there[:-1]]
+        if stays and np.median(steps) > STEPS * smallest_step:
             count += int(np.count_nonzero(there))
     return count / channel.size

@@ -240,11 +240,11 @@ def test_the_noise_in_bursts_is_called_so():
         ({"reference": X[:-1]}, ValueError, "disturbance must have 31999 values"),
         ({"reference": np.zeros(X.size)}, ValueError, "must not be silent"),
         ({"disturbance": np.zeros(X.size)}, ValueError, "disturbance must not be silent"),
-        ({"reference": 1e-160 * X}, ValueError, "the filtered reference must have a mean square from 1e-60 to 1e+60"),
+        ({"reference": 1e-160 * X}, ValueError, r"the filtered reference must have a mean square from 1e-60 to 1e\+60"),
         (
             {"disturbance": 1e100 * D},
             ValueError,
-            "disturbance must have a mean square from 1e-60 to 1e+60, got .*: scale",
+            r"disturbance must have a mean square from 1e-60 to 1e\+60, got .*: scale",
         ),
         ({"disturbance": np.where(X > 2, np.nan, D)}, ValueError, "disturbance must be finite"),
         ({"secondary_path": np.zeros((2, 2, 4))}, ValueError, r"\(K microphones, n_samples\) = \(2, 32000\)"),

@@ -478,5 +478,5 @@ def test_the_command_says_if_its_blocks_make_the_anti_noise_late(
     options = ["--rated-power", "0.03", "--taps", "48", "--identify", "1.5", "--listen", "1", "--quiet"]
     assert main(["run", *given, *options, "--block", "40", "--seconds", "1"]) == 0
     out, err = capsys.readouterr()
-    assert "two blocks of 40 samples (10 ms), make the anti-noise late: use a smaller --block" in out
+    assert "if the anti-noise comes too late, use a smaller --block: two blocks of 40 samples are 10 ms" in out
     assert err == ""

@@ -25,8 +25,11 @@ def test_a_clipped_recording_is_noticed_with_its_share():
         np.round(NOISE * 100) / 100,  # of few bits
         tone(400.0, 6.0, fs=FS),  # each of its peaks is the same value
         np.sign(np.arange(6 * FS) % 2 - 0.5),  # a tone at fs/2
+        np.round(327 * tone(50.0, 6.0, fs=FS)),
+        np.round(1000 * tone(20.0, 6.0, fs=FS)),
+        np.sign(tone(100.0, 6.0, fs=FS, phase_rad=0.1)),
     ],
-    ids=["noise", "few bits", "tone", "fs/2"],
+    ids=["noise", "few bits", "tone", "fs/2", "whole numbers", "slow, whole numbers", "square"],
 )
 def test_a_signal_that_repeats_its_peak_is_not_clipped(signal):
     assert recording_remarks(signal, FS, "noise") == []
@@ -34,7 +37,12 @@ def test_a_signal_that_repeats_its_peak_is_not_clipped(signal):
 
 def test_a_channel_that_is_clipped_is_named():
     (remark,) = clipping_remarks([NOISE, np.clip(NOISE, -1, 1)], "errors.wav")
-    assert remark.startswith("channel 1 of errors.wav is clipped")
+    assert remark.startswith("errors.wav, channel 1, is clipped")
+
+
+def test_clipped_whole_numbers_are_noticed():
+    (remark,) = clipping_remarks(np.clip(np.round(3000 * NOISE), -3000, 3000), "noise.wav")
+    assert remark.startswith("noise.wav is clipped")
 
 
 def test_a_short_recording_is_noticed():
