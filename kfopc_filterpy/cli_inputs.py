@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ._validate import as_count, as_positive
-from .paths.fitting import LONG_PATH_S, require_same_length, require_shorter, require_sound
+from .paths.file_checks import LONG_PATH_S, require_same_length, require_shorter, require_sound
 from .signals.quality import clipping_remarks
 from .signals.recordings import as_channel
 

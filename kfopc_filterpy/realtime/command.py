@@ -10,7 +10,7 @@ import numpy as np
 
 from .._validate import as_positive
 from ..controllers.power_budget import kf_pb
-from ..paths.fitting import require_same_length, require_shorter, require_sound
+from ..paths.file_checks import require_same_length, require_shorter, require_sound
 from ..paths.reading import read_path
 from ..power.limiter import OutputLimiter
 from ..signals.recordings import read_recording
