@@ -32,7 +32,7 @@ from kfopc_filterpy.bounds import (
     wiener_solution,
 )
 from kfopc_filterpy.bounds.channels import full_channel_stretch
-from kfopc_filterpy.loop.channels import channel_disturbances
+from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.paths.channels import is_path_matrix, secondary_paths

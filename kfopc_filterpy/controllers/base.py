@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_loudspeaker
+from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..kernels.delay_lines import TAPS, delay_line, latest, newest, refill
+from ..core.running import REFUSED_REFERENCE, Steps, process
 from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.uncertainty import GUARD_TAPS, as_uncertainty, guard_filter
-from ..power.amplifiers import Amplifier, compiled_model
+from ..paths.uncertainty import as_uncertainty, guard_filter
+from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .channels import ChannelGuard, channel_lines, channel_sample, new_channel_guard
 from .processing import (
     BlockProcessing,
     RefusedUpdate,
-    Rows,
     adapt_flags,
     block_signal,
     output_array,
     require_channels,
     require_one_length,
 )
-from .step import Compiled, GuardLine, Lines, estimate_once, listen, process_samples
 
 NO_SOLUTION = (
     "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
@@ -41,6 +39,8 @@ OVERFLOW = (
     "nothing was changed; scale the signals, or use a smaller step"
 )
 
+
+LONGEST_CALL = 1600  # samples between two opportunities to interrupt a block: 0.1 s at 16 kHz
 
 Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
@@ -153,10 +153,22 @@ class WrappedController(BlockProcessing, Checkpointed):
         return {}
 
 
-class FilteredReferenceController(BlockProcessing, Checkpointed):
-    """Delay lines, powers and filtered reference that the built-in controllers share.
+class Looped(NamedTuple):
+    """A controller as the core's loop sees it."""
 
-    A subclass sets `_state`, which begins with `_common()`, and registers the step for its type (see `step`).
+    steps: Steps
+    control_filter: np.ndarray  # (J, I, L) or (L,): the next control signal's
+    recorded: dict[str, np.ndarray]  # constraint_factor and others, (J,) or (1,), as of the last sample
+    after: Callable[[], None]  # call it after each stretch, even if it was interrupted
+    in_use: AbstractContextManager[Any] = nullcontext()
+    owner: Any = None  # what must exist meanwhile
+
+
+class FilteredReferenceController(BlockProcessing, Checkpointed):
+    """Channels, paths, limiter, constraint and blocks: what the built-in controllers share.
+
+    Their signals are in a block of the core (`core_controller.CoreController`) or, until their algorithm has moved there,
+    in arrays of numba's compiled code (`compiled_controller.CompiledController`).
 
     Parameters
     ----------
@@ -178,11 +190,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         channels also a tuple, one for each loudspeaker.
     limiter : OutputLimiter, optional
         Limiter of the control signal, see `limiter`. With several channels a sequence, one for each loudspeaker.
-    filtered_taps : int, optional
-        Number of samples stored of the filtered reference; by default `n_taps`. With several channels, 0 for an
-        algorithm that needs no filtered reference.
-    history : int, optional
-        Number of samples stored of the reference, if the algorithm needs more than the filters.
 
     Attributes
     ----------
@@ -197,9 +204,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     unshared = ""  # the part that prevents sharing, if any
     _uncertainty: Any = None  # as it was assigned
     _refusal = OVERFLOW  # reason of a refused update if no square overflows
-    _state: Any
-    _code: Compiled | None = None
-    _rows: Rows | None = None
 
     def __init__(
         self,
@@ -211,17 +215,44 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         constraint: Constraints | None = None,
         limiter: OutputLimiter | Sequence[OutputLimiter] | None = None,
-        filtered_taps: int | None = None,
-        history: int = 0,
+        **room: Any,
     ) -> None:
         self.n_taps = as_count(n_taps, "n_taps")
         secondary = self._read_paths(secondary_path, n_references, multichannel)
         self._limiter = self._checked_limiter(limiter)
-        filtered_taps = self.n_taps if filtered_taps is None else filtered_taps
-        self._lines: Any = self._new_lines(secondary, amplifier, filtered_taps, max(self.n_taps, history))
         self._constrained = constraint is not None
         self._own_constraint = self._checked_constraint(constraint)
-        self._y: Any = self._lines.control_signal if self.multichannel else 0.0
+        self._begin(secondary, amplifier, **room)
+
+    # What a subclass defines.
+
+    def _begin(self, secondary: np.ndarray, amplifier: Any, **room: Any) -> None:
+        """Make silent signals for checked paths, (n_path,) or (K, J, n_path)."""
+        raise NotImplementedError
+
+    def _estimated_path(self) -> np.ndarray:
+        """Return the estimated secondary path where the steps find it: what is written into it, they use."""
+        raise NotImplementedError
+
+    def _filter_again(self) -> None:
+        """Filter the stored references with the present estimate, and the results with the guard."""
+        raise NotImplementedError
+
+    def _use_guard(self, taps: np.ndarray | None) -> None:
+        """Use a guard W, or none, and filter the stored references with it."""
+        raise NotImplementedError
+
+    def _use_limiter(self, before: Any) -> None:
+        """Use the limiter, or limiters, that were just assigned in place of those `before`."""
+        raise NotImplementedError
+
+    def looped(self) -> Looped | None:
+        """Return what the core's loop needs to run this controller; None if Python must call the steps."""
+        raise NotImplementedError
+
+    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
+        """Follow signals (n_samples, channels), or (n_samples,); return the number of samples before a refusal."""
+        raise NotImplementedError
 
     def _read_paths(self, paths: Any, n_references: int | None, multichannel: bool | None) -> np.ndarray:
         """Set the numbers of channels and return the taps of the secondary path."""
@@ -242,32 +273,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         secondary = path_taps(paths, name="secondary_path")
         self._path_fs = sampling_rate(paths, name="secondary_path") if is_system(paths) else None
         return secondary
-
-    def _new_lines(self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int) -> Any:
-        filtered_taps = max(filtered_taps, GUARD_TAPS) if filtered_taps else 0  # a guard can be assigned later
-        # with another path, and then with a guard
-        to_filter_again = filtered_taps + secondary.shape[-1] + GUARD_TAPS - 2 if filtered_taps else 0
-        if self.multichannel:
-            return channel_lines(
-                secondary,
-                self.n_references,
-                reference_taps=max(reference_taps, to_filter_again),
-                filtered_taps=filtered_taps,
-                amplifier=amplifier,
-                limiter=states_of(self._limiter),
-            )
-        model = compiled_model(amplifier)
-        if model is None:
-            raise TypeError(f"amplifier must be one of kfopc_filterpy's amplifier models or None, got {amplifier!r}")
-        return Lines(
-            secondary_estimate=secondary.copy(),  # a new estimate is written into it
-            reference=delay_line(max(reference_taps, to_filter_again)),
-            filtered=delay_line(filtered_taps),
-            output=delay_line(secondary.size),
-            amplifier=model,
-            limiter=states_of(self._limiter),
-            guard=None,
-        )
 
     def _checked_limiter(self, limiter: Any) -> Any:
         """Return None, a limiter, or a tuple of limiters."""
@@ -305,11 +310,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         """Return a checked number; with several channels (J,), from one number or one for each loudspeaker."""
         return per_loudspeaker(value, self.n_loudspeakers, name, check) if self.multichannel else check(value, name)
 
-    def _common(self) -> tuple[Any, np.ndarray, Any]:
-        """Return the first fields of every state: lines, weights, constraint."""
-        shape = (self.n_loudspeakers, self.n_references, self.n_taps) if self.multichannel else self.n_taps
-        return self._lines, np.zeros(shape), states_of(self._own_constraint)
-
     @property
     def limiter(self) -> Any:
         """Limiter of the control signal, or None; can be assigned, but not shared with another controller.
@@ -321,9 +321,8 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     @limiter.setter
     def limiter(self, value: OutputLimiter | Sequence[OutputLimiter] | None) -> None:
-        self._limiter = self._checked_limiter(value)
-        lines = self._state.lines._replace(limiter=states_of(self._limiter))
-        self._state = self._state._replace(lines=lines)
+        before, self._limiter = self._limiter, self._checked_limiter(value)
+        self._use_limiter(before)
 
     @property
     def secondary_path_uncertainty(self) -> Any:
@@ -346,18 +345,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
                 "kf_pb(..., secondary_path_uncertainty=...), or use KF-ANC, KF-OPC, the diagonal Kalman filter or an LMS "
                 "algorithm"
             )
-        lines = self._state.lines
-        taps = guard_filter(value, lines.secondary_estimate)
-        guard = None if taps is None else self._new_guard(taps)
+        taps = guard_filter(value, self._estimated_path())
         self._uncertainty = as_uncertainty(value)
-        self._state = self._state._replace(lines=lines._replace(guard=guard))
-        self._filter_again()
-
-    def _new_guard(self, taps: np.ndarray) -> GuardLine | ChannelGuard:
-        """Return a guard that has heard nothing yet."""
-        if self.multichannel:
-            return new_channel_guard(taps, (self.n_microphones, self.n_loudspeakers, self.n_references), self.n_taps)
-        return GuardLine(taps, delay_line(self.n_taps))
+        self._use_guard(taps)
 
     def _takes_guard(self) -> bool:
         """Return whether the algorithm's step takes account of an uncertain secondary path."""
@@ -374,13 +364,13 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         one channel, forget the old path within their memory. KF-PB for several channels solves for the new paths at the
         end of the block.
         """
-        return self._lines.secondary_estimate.copy()
+        return self._estimated_path().copy()
 
     @secondary_path.setter
     def secondary_path(self, path: Any) -> None:
         before, after = self.secondary_path, self._checked_estimate(path)
         guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
-        self._lines.secondary_estimate[:] = after
+        self._estimated_path()[:] = after
         if self._uncertainty is None or not self._takes_guard():
             self._filter_again()
         else:  # measured paths, for example, have another distance from the new path
@@ -389,7 +379,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 
     def _checked_estimate(self, path: Any) -> np.ndarray:
         """Return the taps of a new estimate, filled with zeros to the length of the present one."""
-        present = self._lines.secondary_estimate.shape
+        present = self._estimated_path().shape
         if self.multichannel:
             taps, rate = secondary_paths(path, name="secondary_path")
         else:
@@ -409,31 +399,19 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             require_rates(self._path_fs, {"new secondary path": rate})
         return np.pad(taps, [(0, 0)] * (taps.ndim - 1) + [(0, present[-1] - taps.shape[-1])])
 
-    def _filter_again(self) -> None:
-        """Filter the stored references with the present estimate, and the results with the guard."""
-        lines, guard = self._lines, self._state.lines.guard
-        if not self.multichannel:
-            guarded = None if guard is None else guard.filtered
-            _filter_line_again(lines.reference, lines.filtered, lines.secondary_estimate, guard, guarded)
-            return
-        for k, j, i in np.ndindex(lines.filtered.shape[:3]):
-            guarded = None if guard is None else guard.filtered[k, j, i]
-            s = lines.secondary_estimate[k, j]
-            _filter_line_again(lines.reference[i], lines.filtered[k, j, i], s, guard, guarded)
-
     def _after_new_path(self, before: np.ndarray) -> None:
         """Adapt what the algorithm knows to the new estimate; `before` is the last one, of the same shape."""
 
     def _variance_by_new_path(self, before: np.ndarray) -> float:
         """Return the variance of each weight after a new path: they are wrong by the share by which the path changed."""
-        after, w = self._lines.secondary_estimate, self.weights
+        after, w = self._estimated_path(), self.weights
         energy = max(np.sum(before**2), np.sum(after**2))
         return float(np.sum((after - before) ** 2) / energy * np.mean(w**2)) if energy > 0.0 else 0.0
 
     @property
     def weights(self) -> np.ndarray:
         """Control filter w, (L,), or with several channels (J, I, L), newest-sample tap first; a copy."""
-        return self._state.weights.copy()
+        raise NotImplementedError
 
     @property
     def control_filter(self) -> np.ndarray:
@@ -515,118 +493,43 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         }
         return [f"{count} {what}{'s' if count > 1 else ''}" for what, count in counts.items()]
 
-    def control_signal(self, reference: Any) -> Any:
-        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample.
-
-        With several channels, x(n) is (I,) and y(n) is (J,).
-        """
-        if self.multichannel:
-            x = channel_sample(reference, self.n_references, "reference", "references")
-            code = self._compiled()
-            self._lines.heard[:] = x
-            code.emit(code.held.address)
-            return self._y.copy()
-        return self._emit(as_number(reference, "reference"))
-
-    def _emit(self, reference: float) -> float:
-        """Return y(n) for a reference of one channel."""
-        code = self._compiled()
-        self._y = code.emit(code.held.address, reference)
-        return self._y
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes for a copy or a file, which holds a state of its own."""
-        return {name: value for name, value in vars(self).items() if name not in ("_code", "_rows")}
-
-    def _compiled(self) -> Compiled:
-        """Return the state, held for compiled code, and its steps."""
-        if self._code is None or self._code.held.state is not self._state:
-            self._code = Compiled(self._state)
-        return self._code
-
-    def update(self, error: Any) -> None:
-        """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
-        if self.multichannel:
-            error = channel_sample(error, self.n_microphones, "error", "microphones")
-            code = self._compiled()
-            self._lines.error[:] = error
-            adapted = bool(code.adapt(code.held.address, True))
-        else:
-            error = as_number(error, "error")
-            adapted = self._adapt(error)
-        if not adapted:
-            raise ValueError(self._reason(error))
-        if self.multichannel:
-            self.after_compiled(self._state)  # a solution may be due
-
-    def _adapt(self, error: float) -> bool:
-        """Adapt to an error of one channel; return False if that fails."""
-        code = self._compiled()
-        return bool(code.adapt(code.held.address, error, self._y, True))
-
     def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
-        state = self.compiled_state()
-        if state is None:
+        looped = self.looped()
+        if looped is None:
             return super().process(references, errors, adapt=adapt, out=out)
         x = self._block_signal(references, "references", self.n_references)
         e = self._block_signal(errors, "errors", self.n_microphones)
         require_one_length(x, e)
-        flags = adapt_flags(adapt, x.shape[-1])
-        shape = (self.n_loudspeakers, x.shape[-1]) if self.multichannel else x.shape
-        y = output_array(out, shape)
-        rows = self._rows_of(x, e) if self.multichannel else [x, e, y]
-        done = self._process_rows(rows[0], rows[1], rows[2], flags)
-        if self.multichannel:
-            y[:] = rows[2].T
-        else:
-            self._y = float(y[min(done, y.size - 1)])
-        if done < x.shape[-1]:
-            self._raise_refusal(e[..., done], done)
+        n_samples = x.shape[-1]
+        flags = adapt_flags(adapt, n_samples)
+        y = output_array(out, (self.n_loudspeakers, n_samples) if self.multichannel else x.shape)
+        rows = [np.atleast_2d(signal) for signal in (x, e, y)]
+        done = 0
+        while done < n_samples:
+            end = min(done + (self.samples_to_block() or LONGEST_CALL), n_samples)
+            with looped.in_use:
+                status, done = process(looped.steps, *rows, flags, done, end)
+            looped.after()
+            if done < end:
+                self._raise_refusal(x[..., done], e[..., done], done, status)
         return y
 
     def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
         """Return a block of samples, (n_samples,) or (n_channels, n_samples)."""
         signal = block_signal(value, name)
         require_channels(signal, name, self.multichannel, n_channels)
-        return np.require(signal, requirements=("C", "W"))  # one type of array, which is compiled once
+        return np.ascontiguousarray(signal)
 
-    def _rows_of(self, x: np.ndarray, e: np.ndarray) -> list[np.ndarray]:
-        """Return references, errors and room for the control signals, with a sample in each row."""
-        if self._rows is None:
-            self._rows = Rows(self.n_references, self.n_microphones, self.n_loudspeakers)
-        rows = self._rows.of(x.shape[-1])
-        rows[0][:], rows[1][:] = x.T, e.T
-        return rows
-
-    def _process_rows(self, x: np.ndarray, e: np.ndarray, y: np.ndarray, flags: np.ndarray) -> int:
-        """Process samples, and return how many; fewer than all if the controller could not adapt to the next one."""
-        done = 0
-        while done < len(x):
-            end = min(done + (self.samples_to_block() or len(x)), len(x))
-            code = self._compiled()
-            done = process_samples(code.steps, x, e, flags, y, done, end)
-            self.after_compiled(code.held.state)
-            if done < end:
-                break
-        return done
-
-    def _raise_refusal(self, error: Any, sample: int) -> None:
-        """Raise `RefusedUpdate` with the reason that `update` gives."""
+    def _raise_refusal(self, reference: Any, error: Any, sample: int, status: int) -> None:
+        """Raise `RefusedUpdate` with the reason that the step gives when it is called again: it has changed nothing."""
         try:
+            if status == REFUSED_REFERENCE:
+                self.control_signal(reference)
             self.update(error)
         except ValueError as reason:
             raise RefusedUpdate(str(reason), sample) from reason
         raise RefusedUpdate(NO_SOLUTION, sample)
-
-    def _reason(self, error: Any) -> str:
-        """Return why an update was refused."""
-        if self.multichannel:
-            return OVERFLOW
-        lines = self._state.lines
-        values = np.array([estimate_once(lines, error), latest(lines.filtered), latest(lines.reference)])
-        with np.errstate(over="ignore"):
-            return self._refusal if np.isfinite(values**2).all() else OVERFLOW
 
     def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
@@ -645,18 +548,11 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         else:
             x = as_signal(references, "references")
             e = as_signal(errors, "errors", length=x.size)
-            self._require_finite_squares(x, e)
         taken = self._listen(x, e, adapt_flags(adapt, len(x)))
         if taken < len(x):
             refused = ValueError(OVERFLOW if self.multichannel else self._refusal)
             refused.add_note(f"in sample {taken} of those listened to")
             raise refused
-        if self.multichannel:
-            self.after_compiled(self._state)  # a solution may be due
-
-    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
-        """Follow signals whose first axis is time; return the number of samples before a refusal."""
-        return listen(self._compiled().held, references, errors, adapting)
 
     def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return references and errors with a sample in each row."""
@@ -667,17 +563,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
                 f"K = {self.n_microphones}, got {x.shape} and {e.shape}"
             )
         return np.ascontiguousarray(x.T), np.ascontiguousarray(e.T)
-
-    def _require_finite_squares(self, x: np.ndarray, e: np.ndarray) -> None:
-        s, heard = self._lines.secondary_estimate, self._lines.reference
-        before = newest(heard, s.size - 1)[::-1]
-        with np.errstate(over="ignore", invalid="ignore"):
-            filtered = np.convolve(np.concatenate((before, x)), s, mode="valid")
-            fine = np.isfinite(x**2) & np.isfinite(e**2) & np.isfinite(filtered**2)
-        if not fine.all():
-            raise ValueError(
-                f"references and errors must have finite squares: those of sample {int(fine.argmin())} overflow"
-            )
 
     @property
     def _powers_fs(self) -> float:
@@ -697,19 +582,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             | named,
         )
 
-    def compiled_state(self, to_step: bool = True) -> Any:
-        """Return the state for the compiled loop; None if Python must call the steps.
-
-        `to_step` says if the caller will change the state, or only read it.
-        """
-        return self._state if calls_of(type(self)) == calls_of(FilteredReferenceController) else None
-
     def samples_to_block(self) -> int:
         """Return the number of samples until the controller works between blocks; 0 if it never does."""
         return 0
-
-    def after_compiled(self, state: Any) -> None:
-        """Adopt what the compiled loop changed in `state`, however many samples it ran."""
 
 
 def calls_of(kind: type) -> tuple[Any, Any]:
@@ -717,22 +592,8 @@ def calls_of(kind: type) -> tuple[Any, Any]:
     return kind.control_signal, kind.update  # type: ignore[attr-defined]
 
 
-def states_of(value: Any) -> Any:
-    """Return the state of a limiter or a constraint, or of each of a tuple; None stays None."""
-    if isinstance(value, tuple):
-        return tuple(one.state for one in value)
-    return None if value is None else value.state
-
-
 def listed(values: Any, form: str) -> str:
     """Return a number, or several after each other, as text."""
     return ", ".join(format(value, form) for value in np.ravel(values))
 
 
-def _filter_line_again(reference: np.ndarray, filtered: np.ndarray, s: np.ndarray, guard: Any, guarded: Any) -> None:
-    """Fill the delay line `filtered` by a stored reference after the path s, and the line `guarded` by that after W."""
-    n = int(filtered[TAPS])
-    again = np.correlate(newest(reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
-    refill(filtered, again)
-    if guard is not None:
-        refill(guarded, np.correlate(again, guard.taps, mode="valid"))

@@ -16,14 +16,15 @@ from ..kernels.delay_lines import newest
 from ..paths.channels import secondary_paths
 from ..paths.uncertainty import as_uncertainty, guard_filter, path_uncertainty
 from ..power.channels import ChannelBudget
-from .base import FilteredReferenceController, listed
+from .base import listed
+from .compiled_controller import CompiledController
 
 BLOCK_S = 0.032  # time between two solutions
 DEFAULT_MEMORY_S = 0.5
 LOUDEST = 1e100  # references beyond it have been refused, but are still in the delay lines
 
 
-class BlockController(FilteredReferenceController):
+class BlockController(CompiledController):
     """Base class that computes control filters within each loudspeaker's rated power after every block.
 
     A subclass sets `_state` and defines `_end_block`. The state has a record `numbers`, whose field `waiting` counts the

@@ -6,35 +6,29 @@ taps. Secondary paths are (K, J, taps), control filters (J, I, taps), primary pa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
 
 from .._validate import as_real_array
 from ..kernels.compiling import inlined, part
 from ..kernels.delay_lines import delay_line, latest, newest, push
-from ..kernels.holding import ForStates, Held, calling, for_states, state_at
-from ..kernels.records import as_records
-from ..kernels.vectors import at, copy_into, dot
-from ..power.amplifiers import LinearAmplifier, amplify, compiled_model
+from ..kernels.vectors import at, dot
+from ..power.amplifiers import amplifier_models, amplify
 from ..power.constraint import advance_squares, preview_squares
 from ..power.limiter import LimiterState, limit_sample
 from .step import (
     adapt,
-    adapt_step,
+    adapt_sample,
     advance_powers,
-    control_filter,
     emit,
     emit_outputs,
+    emit_sample,
     emit_silence,
-    emit_step,
-    entries_of,
     filter_output,
     loudspeakers,
     output,
-    skip,
     take_reference,
     weights_of,
 )
@@ -66,19 +60,6 @@ class ChannelLines(NamedTuple):
     constraint_factor: np.ndarray  # (J,) the last factors
     heard: np.ndarray  # (I,) room for x, where the entry points find it
     error: np.ndarray  # (K,) room for e, likewise
-
-
-class ChannelSteps(NamedTuple):
-    """A controller of several channels, as compiled loops see it."""
-
-    address: int  # of its state
-    emit: int  # address of the function of `emit_channels_entry`
-    adapt: int  # and of that of `adapt_channels_entry`
-    control_filter: np.ndarray  # (J, I, L)
-    control_signal: np.ndarray  # the last four are those of its lines
-    constraint_factor: np.ndarray
-    heard: np.ndarray
-    error: np.ndarray
 
 
 def channel_lines(
@@ -173,69 +154,22 @@ def emit_channel_outputs(lines, state):
     return 0.0
 
 
-EMIT_CHANNELS = types.float64(types.intp)
-ADAPT_CHANNELS = types.intp(types.intp, types.intp)
-call_emit_channels, call_adapt_channels = calling(EMIT_CHANNELS), calling(ADAPT_CHANNELS)
+@emit_sample.register(ChannelLines)
+def emit_channel_sample(lines, state, reference, control):
+    """Take x(n), (I,), and set y(n), (J,)."""
+    for i in range(lines.heard.size):
+        lines.heard[i] = reference[i]
+    emit(state, lines.heard)
+    for j in range(lines.control_signal.size):
+        control[j] = lines.control_signal[j]
 
 
-@for_states(EMIT_CHANNELS)
-def emit_channels_entry(key):
-    """Compile `emit` for a type of state of several channels."""
-
-    def emit_channels_at(address):
-        state = state_at(address, key)
-        return emit(state, state.lines.heard)
-
-    return emit_channels_at
-
-
-@for_states(ADAPT_CHANNELS)
-def adapt_channels_entry(key):
-    """Compile `adapt`, or `skip` for samples to which it is not to adapt, for a type of state of several channels."""
-
-    def adapt_channels_at(address, adapting):
-        state = state_at(address, key)
-        if adapting:
-            return adapt(state, state.lines.error, state.lines.control_signal)
-        skip(state)
-        return True
-
-    return adapt_channels_at
-
-
-@entries_of.register(ChannelLines)
-def entries_of_channels(lines: ChannelLines) -> tuple[ForStates, ForStates, Callable[[Held, int, int], Any]]:
-    """Return what compiles the two steps, and what makes `ChannelSteps` of their addresses."""
-    return emit_channels_entry, adapt_channels_entry, _steps
-
-
-def _steps(held: Held, emit_address: int, adapt_address: int) -> ChannelSteps:
-    lines, filters = held.state.lines, control_filter(held.state)
-    return ChannelSteps(
-        held.address,
-        emit_address,
-        adapt_address,
-        filters,
-        lines.control_signal,
-        lines.constraint_factor,
-        lines.heard,
-        lines.error,
-    )
-
-
-@emit_step.register(ChannelSteps)
-def emit_channel_step(steps, x):
-    """Return y(n), (J,)."""
-    copy_into(steps.heard, x)
-    call_emit_channels(steps.emit, steps.address)
-    return steps.control_signal
-
-
-@adapt_step.register(ChannelSteps)
-def adapt_channel_step(steps, error, control_signal, adapting):
-    """Adapt to the errors, (K,), or skip the sample; return False if that fails."""
-    copy_into(steps.error, error)
-    return call_adapt_channels(steps.adapt, steps.address, adapting) != 0
+@adapt_sample.register(ChannelLines)
+def adapt_channel_sample(lines, state, error):
+    """Adapt to e(n), (K,)."""
+    for k in range(lines.error.size):
+        lines.error[k] = error[k]
+    return adapt(state, lines.error, lines.control_signal)
 
 
 @emit_silence.register(ChannelLines)
@@ -329,7 +263,7 @@ def least_factor(lines, constraint, d, x):
     """
     heard, unheard = np.inf, np.inf
     for j in range(lines.output.shape[0]):
-        factor, _, gain, _, _, _ = preview_squares(at(constraint, j), d, filtered_square(lines, j), x)
+        factor, _, gain = preview_squares(at(constraint, j), d, filtered_square(lines, j), x)
         if gain == 0.0:
             unheard = min(unheard, factor)
         else:
@@ -360,18 +294,6 @@ def channel_sample(value: Any, size: int, name: str, what: str) -> np.ndarray:
 def delay_lines(n_lines: int, taps: int) -> np.ndarray:
     """Return silent delay lines, one in each row."""
     return np.array([delay_line(taps) for _ in range(n_lines)])
-
-
-def amplifier_models(amplifier: Any, n_loudspeakers: int) -> np.ndarray:
-    """Return the records of the amplifier models of all loudspeakers, (J, 1)."""
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
-    models = [compiled_model(LinearAmplifier() if one is None else one) for one in each]
-    if len(models) != n_loudspeakers or any(model is None for model in models):
-        raise TypeError(
-            "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "
-            f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
-        )
-    return as_records(np.array(models))
 
 
 def amplifier_functions(amplifier: Any, n_loudspeakers: int) -> list[Any] | None:

@@ -3,40 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .._validate import as_positive
-from ..kernels.vectors import at
-from ..power.constraint import ConstraintState
-from .channels import ChannelLines
-from .fxlms import adapt_fxlms
 from .lms import Limiters, LMSController
-from .step import Lines, adapt, filter_output, output
-
-
-class ClippingState(NamedTuple):
-    """State of `ClippingFxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-    amplitude_limit: float | np.ndarray  # (J,)
-
-
-@output.register(ClippingState)
-def output_clipped(state, j):
-    """Return w'x clipped to the limit; pass Inf and NaN, which the loop detects as a divergence."""
-    y, limit = filter_output(state.lines, state.weights, j), at(state.amplitude_limit, j)
-    if not limit < abs(y) < np.inf:
-        return y
-    return limit if y > 0.0 else -limit
-
-
-adapt.register(ClippingState)(adapt_fxlms)
 
 
 class ClippingFxLMS(LMSController):
@@ -76,6 +47,7 @@ class ClippingFxLMS(LMSController):
     """
 
     name = "clipping FxLMS"
+    algorithm = "clipping"
 
     def __init__(
         self,
@@ -87,11 +59,10 @@ class ClippingFxLMS(LMSController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
-        self._state = ClippingState(*self._common(), step, limit)
+        settings = {"step_size": step_size, "amplitude_limit": amplitude_limit}
+        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
 
     @property
     def amplitude_limit(self) -> Any:
         """Amplitude limit A of the control signal; with several channels (J,), a copy."""
-        return copy(self._state.amplitude_limit)
+        return self._of_setting("amplitude_limit")

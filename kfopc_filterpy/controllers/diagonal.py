@@ -13,7 +13,8 @@ from ..kernels.vectors import FAST
 from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import FilteredReferenceController, constraint_or_none
+from .base import constraint_or_none
+from .compiled_controller import CompiledController
 from .step import Lines, adapt, advance_powers
 
 
@@ -61,7 +62,7 @@ def correct_diagonal(variances, w, row, d, state_noise, measurement_noise):
             variances[i] *= max(1.0 - gain * row[i], 0.0)  # rounding of S can make the product exceed 1
 
 
-class DiagonalKalman(FilteredReferenceController):
+class DiagonalKalman(CompiledController):
     r"""Reduced-complexity Kalman filter: eq. 2-9 with P reduced to its diagonal p, an NLMS with a step for each tap.
 
     .. math:: p \leftarrow p + r, \quad S = \sum_i p_i x_i'^2 + q, \quad K_i = p_i x'_i / S, \quad

@@ -28,6 +28,7 @@ from ..power.limiter import OutputLimiter
 from .base import OVERFLOW, FilteredReferenceController, constraint_or_none
 from .blocks import DEFAULT_MEMORY_S, BlockController
 from .channels import ChannelLines, add_squares, least_factor, squares_of_sample
+from .compiled_controller import CompiledController
 from .step import adapt, advance_powers, control_filter, follow
 
 
@@ -165,7 +166,7 @@ def take_back_corrections(correction, w, count):
             T[i, i] -= correction.numbers[0].state_noise
 
 
-class DirectKalman(FilteredReferenceController):
+class DirectKalman(CompiledController):
     r"""KF-ANC or KF-OPC for several channels: the paper's equations with all control filters as one state.
 
     `kf_anc` and `kf_opc` return it if there are several channels. The K measurements of a sample have independent

@@ -22,7 +22,8 @@ from ..kernels.records import new_record
 from ..power.amplifiers import Amplifier
 from ..power.constraint import ConstraintState, OutputPowerConstraint, advance_constraint, squares_are_finite
 from ..power.limiter import OutputLimiter
-from .base import FilteredReferenceController, constraint_or_none
+from .base import constraint_or_none
+from .compiled_controller import CompiledController
 from .step import Lines, adapt, disturbance_estimate, follow, skip
 
 # Of the finite memory, whose arrays can be restarted:
@@ -203,7 +204,7 @@ def restart(own, weights, initial):
         own.weights[i] = weights[i]
 
 
-class FastArrayKalman(FilteredReferenceController):
+class FastArrayKalman(CompiledController):
     r"""Fast-array Kalman filter: eq. 2-9 with r = 0 in O(L), using the shift of the filtered reference.
 
     With `forgetting` = 1 it is `kf_anc` with ``state_noise=0`` (or `kf_opc`, with a rated power), to rounding. Below 1

@@ -2,33 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from .._validate import as_positive
-from ..power.constraint import ConstraintState
-from .channels import ChannelLines
-from .lms import Limiters, LMSController, change_weights
-from .step import Lines, adapt, advance_powers
-
-
-class FxLMSState(NamedTuple):
-    """State of `FxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-
-
-@adapt.register(FxLMSState)
-def adapt_fxlms(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu e(n) x'(n); with several channels, w_ji(n+1) = w_ji(n) + mu sum_k e_k(n) x'_kji(n)."""
-    finite, _, _ = advance_powers(state.lines, state.constraint, error)
-    if finite:
-        change_weights(state.lines, state.weights, 1.0, state.step_size, error, 0.0)
-    return finite
+from .lms import Limiters, LMSController
 
 
 class FxLMS(LMSController):
@@ -96,6 +72,7 @@ class FxLMS(LMSController):
     """
 
     name = "FxLMS"
+    algorithm = "fxlms"
 
     def __init__(
         self,
@@ -106,5 +83,10 @@ class FxLMS(LMSController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
-        self._state = FxLMSState(*self._common(), as_positive(step_size, "step_size"))
+        super().__init__(
+            n_taps,
+            secondary_path,
+            settings={"step_size": step_size},
+            n_references=n_references,
+            limiter=limiter,
+        )

@@ -2,79 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from .._validate import as_positive
-from ..kernels.compiling import by_type, part
-from ..kernels.delay_lines import newest
-from ..kernels.vectors import dot
-from ..power.constraint import ConstraintState
-from .channels import ChannelLines
-from .lms import Limiters, LMSController, change_weights
-from .step import Lines, adapt, advance_powers
-
-
-class FxNLMSState(NamedTuple):
-    """State of `FxNLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-    regularization: float
-
-
-@adapt.register(FxNLMSState)
-def adapt_fxnlms(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)); several channels: see `FxNLMS` for the sums."""
-    finite, _, _ = advance_powers(state.lines, state.constraint, error)
-    if finite:
-        energy = state.regularization + filtered_energy(state.lines, state.weights)
-        change_weights(state.lines, state.weights, 1.0, state.step_size / energy, error, 0.0)
-    return finite
-
-
-@by_type
-def filtered_energy(lines, weights):
-    """Return x'(n)'x'(n), with a guard also that of x'' = W * x'."""
-    row = newest(lines.filtered, weights.size)
-    return dot(row, row) + guarded_energy(lines.guard, weights.size)
-
-
-@part()
-def guarded_energy(guard, taps):
-    """Return x''(n)'x''(n), or 0 without a guard."""
-    if guard is None:
-        return 0.0
-    row = newest(guard.filtered, taps)
-    return dot(row, row)
-
-
-@filtered_energy.register(ChannelLines)
-def channel_energy(lines, weights):
-    """Return the sum of both energies over microphones, loudspeakers and references."""
-    taps = weights.shape[2]
-    return energy_of_lines(lines.filtered, taps) + guarded_channel_energy(lines.guard, taps)
-
-
-@part()
-def guarded_channel_energy(guard, taps):
-    """Return the sum of x''(n)'x''(n), or 0 without a guard."""
-    return 0.0 if guard is None else energy_of_lines(guard.filtered, taps)
-
-
-@part()
-def energy_of_lines(lines, taps):
-    """Return the energy of the newest samples of delay lines (K, J, I, size)."""
-    energy = 0.0
-    for k in range(lines.shape[0]):
-        for j in range(lines.shape[1]):
-            for i in range(lines.shape[2]):
-                row = newest(lines[k, j, i], taps)
-                energy += dot(row, row)
-    return energy
+from .lms import Limiters, LMSController
 
 
 class FxNLMS(LMSController):
@@ -121,6 +51,7 @@ class FxNLMS(LMSController):
     """
 
     name = "FxNLMS"
+    algorithm = "fxnlms"
 
     def __init__(
         self,
@@ -132,11 +63,15 @@ class FxNLMS(LMSController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
-        step, epsilon = as_positive(step_size, "step_size"), as_positive(regularization, "regularization")
-        self._state = FxNLMSState(*self._common(), step, epsilon)
+        super().__init__(
+            n_taps,
+            secondary_path,
+            settings={"step_size": step_size, "regularization": regularization},
+            n_references=n_references,
+            limiter=limiter,
+        )
 
     @property
     def regularization(self) -> float:
         """Regularization epsilon."""
-        return self._state.regularization
+        return self._of_setting("regularization")

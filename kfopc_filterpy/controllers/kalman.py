@@ -26,7 +26,8 @@ from ..power.constraint import (
     squares_are_finite,
 )
 from ..power.limiter import OutputLimiter
-from .base import NO_SOLUTION, FilteredReferenceController, calls_of, constraint_for
+from .base import NO_SOLUTION, calls_of, constraint_for
+from .compiled_controller import CompiledController
 from .direct import DirectKalman
 from .step import Lines, adapt, disturbance_estimate, estimate_once
 
@@ -53,10 +54,10 @@ def correct_constrained(state, error):
     d, h0, x = disturbance_estimate(state.lines, error), latest(state.lines.filtered), latest(state.lines.reference)
     if not squares_are_finite(d, h0, x):
         return False
-    previewed = preview_constraint(state.constraint, d, h0, x)
-    if not correct(state, d, previewed[0] * d):
+    factor, _, _ = preview_constraint(state.constraint, d, h0, x)
+    if not correct(state, d, factor * d):
         return False
-    commit_constraint(state.constraint, previewed, d, h0, x)
+    commit_constraint(state.constraint, d, h0, x)
     return True
 
 
@@ -83,7 +84,7 @@ def observe_guarded(guard, gains, w, noise):
         kalman_step(gains, w, newest(guard.filtered, w.size), 0.0, 0.0, noise, 1.0)
 
 
-class KalmanController(FilteredReferenceController):
+class KalmanController(CompiledController):
     """The modified ANC structure around a Kalman filter: any filterpy `KalmanFilter` of one measurement.
 
     In each sample, the estimator gets the disturbance estimate as z and the filtered reference as H. With a rated

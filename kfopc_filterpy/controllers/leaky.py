@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from .._validate import as_nonnegative, as_positive
-from ..kernels.vectors import at
+from .._validate import as_nonnegative
 from ..power.amplifiers import Amplifier
-from ..power.constraint import REFERENCE, ConstraintState, OutputPowerConstraint
+from ..power.constraint import OutputPowerConstraint
 from .base import constraint_for
-from .channels import ChannelLines
-from .lms import Limiters, LMSController, change_filter, penalty_of_constraint
+from .lms import Limiters, LMSController
 from .mov import penalty_factor
-from .step import Lines, adapt, advance_powers, loudspeakers
 
 
 def leak_factor(
@@ -60,49 +57,6 @@ def leak_factor(
     return as_nonnegative(reference_power, "reference_power") * gamma
 
 
-class LeakyState(NamedTuple):
-    """State of `LeakyFxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-    leak: float | np.ndarray  # (J,)
-
-
-@adapt.register(LeakyState)
-def adapt_leaky(state, error, control_signal):
-    """Set w(n+1) = (1 - mu gamma) w(n) + mu e(n) x'(n)."""
-    finite, _, _ = advance_powers(state.lines, state.constraint, error)
-    if finite:
-        for j in range(loudspeakers(state.lines)):
-            keep = 1.0 - state.step_size * at(state.leak, j)
-            change_filter(state.lines, state.weights, j, keep, state.step_size, error, 0.0)
-    return finite
-
-
-class RatedLeakyState(NamedTuple):
-    """State of `OptimalLeakyFxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-
-
-@adapt.register(RatedLeakyState)
-def adapt_rated_leaky(state, error, control_signal):
-    """Apply the step of leaky FxLMS with gamma(n) = E[x^2] G_s (1/alpha - 1)."""
-    finite, _, factor = advance_powers(state.lines, state.constraint, error)
-    if finite:
-        for j in range(loudspeakers(state.lines)):
-            own = at(state.constraint, j)
-            leak = penalty_of_constraint(own, at(factor, j)) * own.powers[REFERENCE].mean_square
-            keep = 1.0 - state.step_size * leak
-            change_filter(state.lines, state.weights, j, keep, state.step_size, error, 0.0)
-    return finite
-
-
 class LeakyFxLMS(LMSController):
     r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
 
@@ -141,6 +95,8 @@ class LeakyFxLMS(LMSController):
     """
 
     name = "leaky FxLMS"
+    algorithm = "leaky"
+    checks = MappingProxyType({"leak": as_nonnegative})
 
     def __init__(
         self,
@@ -152,19 +108,27 @@ class LeakyFxLMS(LMSController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
-        step, own = as_positive(step_size, "step_size"), self._each_loudspeaker(leak, "leak", as_nonnegative)
-        most = float(np.max(step * own))
+        super().__init__(
+            n_taps,
+            secondary_path,
+            settings={"step_size": step_size, "leak": leak},
+            n_references=n_references,
+            limiter=limiter,
+        )
+
+    def _checked_settings(self, each: Mapping[str, bool]) -> dict[str, Any]:
+        settings = super()._checked_settings(each)
+        most = float(np.max(settings["step_size"] * settings["leak"]))
         if most > 1.0:
             raise ValueError(
                 f"step_size * leak must be 1 at most, got {most:g}: a sample would take more than the weight"
             )
-        self._state = LeakyState(*self._common(), step, own)
+        return settings
 
     @property
     def leak(self) -> Any:
         """Leak gamma; with several channels (J,), a copy."""
-        return copy(self._state.leak)
+        return self._of_setting("leak")
 
 
 class OptimalLeakyFxLMS(LMSController):
@@ -208,6 +172,7 @@ class OptimalLeakyFxLMS(LMSController):
     """
 
     name = "optimal leaky FxLMS"
+    algorithm = "optimal_leaky"
 
     def __init__(
         self,
@@ -225,9 +190,9 @@ class OptimalLeakyFxLMS(LMSController):
         super().__init__(
             n_taps,
             secondary_path,
+            settings={"step_size": step_size},
             n_references=n_references,
             amplifier=amplifier,
             constraint=own,
             limiter=limiter,
         )
-        self._state = RatedLeakyState(*self._common(), as_positive(step_size, "step_size"))

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from .._validate import as_nonnegative, as_positive
-from ..kernels.compiling import by_type
-from ..kernels.delay_lines import newest
-from ..kernels.vectors import at, dot
 from ..power.amplifiers import Amplifier
-from ..power.constraint import ConstraintState, OutputPowerConstraint
+from ..power.constraint import OutputPowerConstraint
 from .base import constraint_for
-from .channels import ChannelLines
-from .lms import Limiters, LMSController, change_filter, heard_output, penalty_of_constraint
-from .step import Lines, adapt, advance_powers, loudspeakers
+from .lms import Limiters, LMSController
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
@@ -62,47 +58,6 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
     gain = as_positive(secondary_path_gain, "secondary_path_gain")
     power = as_nonnegative(disturbance_power, "disturbance_power")
     return max(math.sqrt(gain) * math.sqrt(power / rated_power) - gain, 0.0)
-
-
-class MOVState(NamedTuple):
-    """State of `MOVFxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-    penalty: float | np.ndarray  # or (J,); NaN: computed from the running powers
-    modified: bool
-
-
-@adapt.register(MOVState)
-def adapt_mov(state, error, control_signal):
-    """Set w(n+1) = w(n) + mu [e(n) x'(n) - gamma y(n) x(n)], with gamma = G_s (1/alpha - 1) unless it is fixed."""
-    finite, d, factor = advance_powers(state.lines, state.constraint, error)
-    if finite:
-        w, mu = state.weights, state.step_size
-        if state.modified:
-            error = modified_error(state.lines, w, d)
-        for j in range(loudspeakers(state.lines)):
-            gamma = at(state.penalty, j)
-            if np.isnan(gamma):
-                gamma = penalty_of_constraint(at(state.constraint, j), at(factor, j))
-            change_filter(state.lines, w, j, 1.0, mu, error, mu * gamma * at(control_signal, j))
-    return finite
-
-
-@by_type
-def modified_error(lines, weights, disturbance):
-    """Return d^(n) - w(n)' x'(n)."""
-    return disturbance - dot(weights, newest(lines.filtered, weights.size))
-
-
-@modified_error.register(ChannelLines)
-def modified_channel_errors(lines, weights, disturbance):
-    """Return d^_k(n) - sum_ji w_ji(n)' x'_kji(n) for each microphone, (K,)."""
-    for k in range(disturbance.size):
-        lines.modified_error[k] = disturbance[k] - heard_output(lines.filtered, weights, k)
-    return lines.modified_error
 
 
 class MOVFxLMS(LMSController):
@@ -163,6 +118,8 @@ class MOVFxLMS(LMSController):
     """
 
     name = "MOV-FxLMS"
+    algorithm = "mov"
+    checks = MappingProxyType({"penalty_factor": as_nonnegative, "modified": as_nonnegative})
 
     def __init__(
         self,
@@ -179,24 +136,23 @@ class MOVFxLMS(LMSController):
         modified: bool = False,
     ) -> None:
         own = constraint_for(rated_power, constraint)
+        settings: dict[str, Any] = {"step_size": step_size, "modified": float(bool(modified))}
+        if penalty_factor is not None:
+            self.algorithm = "mov_fixed"
+            settings["penalty_factor"] = penalty_factor
         super().__init__(
             n_taps,
             secondary_path,
+            settings=settings,
             n_references=n_references,
             amplifier=amplifier,
             constraint=own,
             limiter=limiter,
         )
-        penalty = self._each_loudspeaker(
-            0.0 if penalty_factor is None else penalty_factor, "penalty_factor", as_nonnegative
-        )
-        if penalty_factor is None:
-            penalty = penalty * math.nan  # computed from the running powers
-        self._state = MOVState(*self._common(), as_positive(step_size, "step_size"), penalty, bool(modified))
         if modified:
             self.name = "MOV-MFxLMS"
 
     @property
     def modified(self) -> bool:
         """True if the controller adapts to ``d^ - w' x'`` instead of the error."""
-        return self._state.modified
+        return bool(self._of_setting("modified"))

@@ -153,17 +153,3 @@ def output_array(out: Any, shape: tuple[int, ...]) -> np.ndarray:
         got = f"{out.dtype} of shape {out.shape}" if isinstance(out, np.ndarray) else repr(out)
         raise ValueError(f"out must be a writable, C-contiguous array of float64 of shape {shape}, got {got}")
     return np.asarray(out)
-
-
-class Rows:
-    """Arrays in which a block of several channels has a sample in each row; kept from block to block."""
-
-    def __init__(self, *channels: int) -> None:
-        self._channels = channels
-        self._arrays = [np.empty((0, n)) for n in channels]
-
-    def of(self, n_samples: int) -> list[np.ndarray]:
-        """Return an array (n_samples, channels) for each number of channels."""
-        if len(self._arrays[0]) < n_samples:
-            self._arrays = [np.empty((n_samples, n)) for n in self._channels]
-        return [array[:n_samples] for array in self._arrays]

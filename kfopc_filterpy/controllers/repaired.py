@@ -67,10 +67,10 @@ def adapt_repaired(state, error, control_signal):
     if not squares_are_finite(d, h0, x):
         return False
     filtered, reference = gain_samples(state.repair, h0, x, error, d, control_signal)
-    previewed = preview_constraint(state.constraint, d, filtered, reference)
-    if not correct(state, d, measurement_factor(state.repair, previewed[0]) * d):
+    factor, _, _ = preview_constraint(state.constraint, d, filtered, reference)
+    if not correct(state, d, measurement_factor(state.repair, factor) * d):
         return False
-    commit_constraint(state.constraint, previewed, d, filtered, reference)
+    commit_constraint(state.constraint, d, filtered, reference)
     advance_repair(state.repair, state.constraint, control_signal)
     return True
 

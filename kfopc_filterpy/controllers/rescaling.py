@@ -3,43 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .._validate import as_positive
-from ..kernels.vectors import at
-from ..power.constraint import ConstraintState
-from .channels import ChannelLines
-from .fxlms import adapt_fxlms
 from .lms import Limiters, LMSController
-from .step import Lines, adapt, filter_output, output, weights_of
-
-
-class RescalingState(NamedTuple):
-    """State of `RescalingFxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-    amplitude_limit: float | np.ndarray  # (J,)
-
-
-@output.register(RescalingState)
-def output_rescaled(state, j):
-    """Return w'x clipped to the limit, and scale the weights likewise; pass Inf and NaN, which the loop detects."""
-    y, limit = filter_output(state.lines, state.weights, j), at(state.amplitude_limit, j)
-    if not limit < abs(y) < np.inf:
-        return y
-    ratio, w = limit / abs(y), weights_of(state.lines, state.weights, j)
-    for i in range(w.size):
-        w[i] *= ratio
-    return limit if y > 0.0 else -limit
-
-
-adapt.register(RescalingState)(adapt_fxlms)
 
 
 class RescalingFxLMS(LMSController):
@@ -79,6 +47,7 @@ class RescalingFxLMS(LMSController):
     """
 
     name = "re-scaling FxLMS"
+    algorithm = "rescaling"
 
     def __init__(
         self,
@@ -90,11 +59,10 @@ class RescalingFxLMS(LMSController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
-        self._state = RescalingState(*self._common(), step, limit)
+        settings = {"step_size": step_size, "amplitude_limit": amplitude_limit}
+        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
 
     @property
     def amplitude_limit(self) -> Any:
         """Amplitude limit A of the control signal; with several channels (J,), a copy."""
-        return copy(self._state.amplitude_limit)
+        return self._of_setting("amplitude_limit")

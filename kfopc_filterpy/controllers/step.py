@@ -12,17 +12,16 @@ and whatever else its algorithm stores. `adapt` must have a body for the type, r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property, singledispatch
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
 
-from ..kernels.borrowing import borrowed
+from ..core.running import Steps
 from ..kernels.compiling import by_type, compiled, inlined, part
 from ..kernels.delay_lines import latest, newest, push
-from ..kernels.holding import ForStates, Held, calling, for_states, state_at
+from ..kernels.holding import Held, for_states, reals_at, state_at
 from ..kernels.vectors import dot
 from ..power.amplifiers import amplify
 from ..power.constraint import advance_constraint, squares_are_finite
@@ -46,6 +45,7 @@ class Lines(NamedTuple):
     amplifier: np.ndarray  # record of that model; linear: d^ = e + s^ * y as published
     limiter: LimiterState | None
     guard: GuardLine | None
+    control_signal: np.ndarray  # (1,) the last y
 
 
 # Functions chosen by the type of the state.
@@ -131,13 +131,14 @@ def take_reference(lines, x):
 @by_type
 def emit_outputs(lines, state):
     """Return y(n), after any limiter, and add it to its delay line; with several channels, the lines keep it."""
-    return emit_limited(lines, output(state, 0))
+    lines.control_signal[0] = emit_limited(lines, output(state, 0))
+    return lines.control_signal[0]
 
 
 @by_type
 def emit_silence(lines):
     """Add y(n) = 0 to its delay line."""
-    emit_limited(lines, 0.0)
+    lines.control_signal[0] = emit_limited(lines, 0.0)
 
 
 @by_type
@@ -195,37 +196,50 @@ def disturbance_estimate(lines, error):
     return error + dot(s, newest(lines.output, s.size))
 
 
-# Entry points. A loop is given their addresses, and so is compiled once for all algorithms; Python calls them by
-# `ctypes`. They find the state at its address. numba prints an exception that a step raises, and goes on.
+# Entry points: the core's loop is given their addresses, and Python calls them by `ctypes`. They find the state, the
+# samples and the control signals at addresses. numba prints an exception that a step raises, and goes on.
 
 
-EMIT = types.float64(types.intp, types.float64)
-ADAPT = types.intp(types.intp, types.float64, types.float64, types.intp)
-call_emit, call_adapt = calling(EMIT), calling(ADAPT)
+EMIT = types.int32(types.intp, types.intp, types.intp)
+ADAPT = types.int32(types.intp, types.intp)
 
 
 @for_states(EMIT)
 def emit_entry(key):
     """Compile `emit` for a type of state."""
 
-    def emit_at(address, x):
-        return emit(state_at(address, key), x)
+    def emit_at(address, reference, control):
+        state = state_at(address, key)
+        emit_sample(state.lines, state, reals_at(reference), reals_at(control))
+        return 0
 
     return emit_at
 
 
 @for_states(ADAPT)
 def adapt_entry(key):
-    """Compile `adapt`, or `skip` for a sample to which it is not to adapt, for a type of state."""
+    """Compile `adapt`, or `skip` for a sample to which it is not to adapt (no error), for a type of state."""
 
-    def adapt_at(address, error, control_signal, adapting):
+    def adapt_at(address, error):
         state = state_at(address, key)
-        if adapting:  # not a `part` for one and several channels: the compiler would optimise the whole step once more
-            return adapt(state, error, control_signal)
-        skip(state)
-        return True
+        if error == 0:
+            skip(state)
+            return 0
+        return 0 if adapt_sample(state.lines, state, reals_at(error)) else 1
 
     return adapt_at
+
+
+@by_type
+def emit_sample(lines, state, reference, control):
+    """Take x(n) and set y(n), both at addresses."""
+    control[0] = emit(state, reference[0])
+
+
+@by_type
+def adapt_sample(lines, state, error):
+    """Adapt to e(n), which is at an address; return False if that fails."""
+    return adapt(state, error[0], lines.control_signal[0])
 
 
 @for_states(nogil=True)
@@ -250,22 +264,12 @@ def listen(key):
     return listen_at
 
 
-class Steps(NamedTuple):
-    """A controller, as compiled loops see it."""
-
-    address: int  # of its state
-    emit: int  # address of the function of `emit_entry`
-    adapt: int  # and of that of `adapt_entry`
-    control_filter: np.ndarray  # (L,)
-    power_weight: np.ndarray  # (1,) lambda
-    used: np.ndarray  # record of the constraint: factor, power and gain that were used last
-
-
 class Compiled:
     """A controller's state, held, and its compiled steps: `steps` for loops; `emit` and `adapt` for Python.
 
     It must exist for as long as its `steps` are used: they hold the address of the state, and not the state. A step is
-    compiled when it is first asked for: a controller around somebody's own filter never asks for `adapt`.
+    compiled when it is first asked for: a controller around somebody's own filter never asks for `adapt`. Python calls
+    ``emit(*emit_addresses)`` with a sample in `x`, which sets `y`, and ``adapt(*adapt_addresses)`` with one in `e`.
     """
 
     def __init__(self, state: Any) -> None:
@@ -274,65 +278,43 @@ class Compiled:
                 f"no step is registered for this type of state: adapt.register({type(state).__name__})(step)"
             )
         self.held = Held(state)
-        self._emit, self._adapt, self._steps = entries_of(state.lines)
+        path = np.atleast_3d(state.lines.secondary_estimate.T).T
+        self.x, self.y, self.e = np.zeros(counted_references(state.lines)), np.zeros(path.shape[1]), np.zeros(len(path))
+        self.emit_addresses = self.held.address, self.x.ctypes.data, self.y.ctypes.data
+        self.adapt_addresses = self.held.address, self.e.ctypes.data
 
     @cached_property
     def emit(self) -> Any:
-        """Function of the address, and with one channel of x(n), that returns y(n)."""
-        return self._emit.of(self.held).ctypes
+        """Function of `emit_addresses`."""
+        return emit_entry.of(self.held).ctypes
 
     @cached_property
     def adapt(self) -> Any:
-        """Function of the address, with one channel of e(n) and y(n), and of whether to adapt; it returns 0 if that fails."""
-        return self._adapt.of(self.held).ctypes
+        """Function of `adapt_addresses`; it returns 0, or else it could not adapt."""
+        return adapt_entry.of(self.held).ctypes
 
-    @cached_property
-    def steps(self) -> Any:
-        """The controller as loops see it: `Steps`, or `ChannelSteps` for several channels."""
-        return self._steps(self.held, self._emit.of(self.held).address, self._adapt.of(self.held).address)
-
-
-@singledispatch
-def entries_of(lines: Any) -> tuple[ForStates, ForStates, Callable[[Held, int, int], Any]]:
-    """Return what compiles the two steps, and what makes `Steps` of their addresses, by the type of the lines."""
-    return emit_entry, adapt_entry, _steps
+    @property
+    def steps(self) -> Steps:
+        """The controller as the core's loop sees it."""
+        return Steps(self.held.address, emit_entry.of(self.held).address, adapt_entry.of(self.held).address)
 
 
-def _steps(held: Held, emit_address: int, adapt_address: int) -> Steps:
-    state = held.state
-    used = state.constraint.numbers
-    return Steps(held.address, emit_address, adapt_address, control_filter(state), power_weight(state), used)
+def counted_references(lines: Any) -> int:
+    """Return the number of references."""
+    return 1 if lines.reference.ndim == 1 else len(lines.reference)
 
 
-@by_type
-def emit_step(steps, x):
-    """Return y(n) for the newest reference."""
-    return call_emit(steps.emit, steps.address, x)
-
-
-@by_type
-def adapt_step(steps, error, control_signal, adapting):
-    """Adapt to the error that the emitted control signal left, or skip the sample; return False if that fails."""
-    return call_adapt(steps.adapt, steps.address, error, control_signal, adapting) != 0
+def looped_arrays(state: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the control filter, and what can be recorded of a sample: arrays that the steps update."""
+    if state.lines.reference.ndim > 1:
+        return control_filter(state), {"constraint_factor": state.lines.constraint_factor}
+    numbers = state.constraint.numbers
+    recorded = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}
+    views = {name: np.asarray(numbers[field]) for name, field in recorded.items()}
+    return control_filter(state), views | {"power_weight": power_weight(state)}
 
 
 @compiled()
 def estimate_once(lines, error):
     """Call `disturbance_estimate` from Python."""
     return disturbance_estimate(lines, error)
-
-
-@compiled(nogil=True)
-def process_samples(steps, references, errors, adapting, outputs, begin, end):
-    """Process the samples from `begin` to `end` of a block, and set their control signals.
-
-    Return the number of samples processed, or the sample to which the controller could not adapt. The first axis is
-    time; with several channels, each row is a sample.
-    """
-    steps = borrowed(steps)
-    for n in range(begin, end):
-        y = emit_step(steps, references[n])
-        outputs[n] = y
-        if not adapt_step(steps, errors[n], y, adapting[n]):
-            return n
-    return end

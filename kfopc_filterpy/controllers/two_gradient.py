@@ -3,42 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .._validate import as_positive
-from ..kernels.vectors import at
-from ..power.constraint import ConstraintState
-from .channels import ChannelLines
-from .lms import Limiters, LMSController, change_filter
-from .step import Lines, adapt, advance_powers, loudspeakers
-
-
-class TwoGradientState(NamedTuple):
-    """State of `TwoGradientFxLMS`."""
-
-    lines: Lines | ChannelLines
-    weights: np.ndarray
-    constraint: ConstraintState | tuple[ConstraintState, ...]
-    step_size: float
-    amplitude_limit: float | np.ndarray  # (J,)
-    output_step_size: float
-
-
-@adapt.register(TwoGradientState)
-def adapt_two_gradient(state, error, control_signal):
-    """Descend the gradient of the squared error within the limit, that of the control power beyond it."""
-    finite, _, _ = advance_powers(state.lines, state.constraint, error)
-    if finite:
-        for j in range(loudspeakers(state.lines)):
-            y = at(control_signal, j)
-            if abs(y) > at(state.amplitude_limit, j):
-                change_filter(state.lines, state.weights, j, 1.0, 0.0, error, state.output_step_size * y)
-            else:
-                change_filter(state.lines, state.weights, j, 1.0, state.step_size, error, 0.0)
-    return finite
+from .lms import Limiters, LMSController
 
 
 class TwoGradientFxLMS(LMSController):
@@ -84,6 +53,7 @@ class TwoGradientFxLMS(LMSController):
     """
 
     name = "two-gradient FxLMS"
+    algorithm = "two_gradient"
 
     def __init__(
         self,
@@ -96,17 +66,19 @@ class TwoGradientFxLMS(LMSController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(n_taps, secondary_path, n_references=n_references, limiter=limiter)
-        step, limit = as_positive(step_size, "step_size"), self._each_loudspeaker(amplitude_limit, "amplitude_limit")
-        second = step if output_step_size is None else as_positive(output_step_size, "output_step_size")
-        self._state = TwoGradientState(*self._common(), step, limit, second)
+        settings = {
+            "step_size": step_size,
+            "amplitude_limit": amplitude_limit,
+            "output_step_size": step_size if output_step_size is None else output_step_size,
+        }
+        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
 
     @property
     def amplitude_limit(self) -> Any:
         """Amplitude limit A of the control signal; with several channels (J,), a copy."""
-        return copy(self._state.amplitude_limit)
+        return self._of_setting("amplitude_limit")
 
     @property
     def output_step_size(self) -> float:
         """Step size of the second direction."""
-        return self._state.output_step_size
+        return self._of_setting("output_step_size")

@@ -51,8 +51,7 @@ def correct(cov, constraint, weights, z, h, reference, noise, factor):
     if constraint is not None:
         if not squares_are_finite(z, h[0], x):
             return OVERFLOWING_SQUARE, np.nan, np.nan
-        previewed = preview_constraint(constraint, z, h[0], reference)
-        factor = previewed[0]
+        factor, _, _ = preview_constraint(constraint, z, h[0], reference)
     if noise == 0.0 and not np.any(h):
         return SILENT, np.nan, np.nan
     S = project_covariance(cov, h) + noise
@@ -62,7 +61,7 @@ def correct(cov, constraint, weights, z, h, reference, noise, factor):
     if not np.isfinite(y):
         return OVERFLOWING_WEIGHTS, y, S
     if constraint is not None:
-        commit_constraint(constraint, previewed, z, h[0], reference)
+        commit_constraint(constraint, z, h[0], reference)
     return CORRECTED, y, S
 
 

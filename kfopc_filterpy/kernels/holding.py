@@ -12,9 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba import errors, typeof, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from .borrowing import disowned
@@ -75,22 +73,14 @@ def _state_at(typing_context: Any, address: Any, key: Any) -> Any:
 state_at: Any = intrinsic(prefer_literal=True)(_state_at)
 
 
-def calling(signature: Any) -> Any:
-    """Return ``call(function, *arguments)`` for compiled code: it calls the function at an address.
+@intrinsic
+def reals_at(typing_context: Any, address: Any) -> Any:
+    """Return the float64 numbers at an address, to be indexed."""
 
-    numba's own type of functions does this too, but takes 0.1 ms to pass one of them to a loop.
-    """
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
-    def _call(typing_context: Any, function: Any, *arguments: Any) -> Any:
-        def generate(context: Any, builder: Any, own: Any, values: Any) -> Any:
-            kinds = [context.get_value_type(kind) for kind in signature.args]
-            code = ir.FunctionType(context.get_value_type(signature.return_type), kinds).as_pointer()
-            given = zip(cgutils.unpack_tuple(builder, values[1]), arguments, signature.args, strict=True)
-            return builder.call(builder.inttoptr(values[0], code), [context.cast(builder, *one) for one in given])
-
-        return signature.return_type(types.intp, types.StarArgTuple.from_types(arguments)), generate
-
-    return intrinsic(_call)
+    return types.CPointer(types.float64)(types.intp), generate
 
 
 class ForStates:

@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from scipy.signal import fftconvolve
 
-from .._validate import as_generator, as_nonnegative, as_signal
+from .._validate import as_channels, as_generator, as_nonnegative, as_signal
 from ..controllers.base import listening
+from ..paths.channels import primary_paths
 from ..paths.models import path_taps
 
 DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
@@ -21,6 +23,27 @@ def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any
     if disturbance is not None:
         return as_signal(disturbance, "disturbance", length=x.size)
     return np.convolve(x, path_taps(primary_path, fs=fs, name="primary_path"))[: x.size]
+
+
+def channel_disturbances(
+    x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, n_microphones: int
+) -> np.ndarray:
+    """Return the disturbances, (K, n_samples), as given or as the sum of p_ki * x_i."""
+    require_one_source(primary_path, disturbance)
+    if primary_path is not None:
+        primary, _ = primary_paths(primary_path, fs=fs)
+        if primary.shape[:2] != (n_microphones, len(x)):
+            raise ValueError(
+                f"primary_path must be (K microphones, I references, taps) with K = {n_microphones} of secondary_path "
+                f"and I = {len(x)} of reference, got {primary.shape}"
+            )
+        return np.array([fftconvolve(x, p, axes=-1).sum(axis=0)[: x.shape[1]] for p in primary])
+    d = np.atleast_2d(as_channels(disturbance, "disturbance"))
+    if d.shape != (n_microphones, x.shape[1]):
+        raise ValueError(
+            f"disturbance must be (K microphones, n_samples) = {(n_microphones, x.shape[1])}, got {d.shape}"
+        )
+    return d
 
 
 def require_one_source(primary_path: Any, disturbance: Any) -> None:
@@ -44,6 +67,10 @@ class SensorNoise:
     def take(self, *shape: int) -> np.ndarray | float:
         """Return the next samples in an array of a shape, or 0 if there is no noise."""
         return 0.0 if self.rng is None else self.std * self.rng.standard_normal(shape)
+
+    def signal(self, n_channels: int, n_samples: int) -> np.ndarray | None:
+        """Return the next samples, (n_channels, n_samples), or None if there is no noise."""
+        return None if self.rng is None else self.std * self.rng.standard_normal((n_channels, n_samples))
 
 
 def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._validate import as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, FilteredReferenceController
-from ..controllers.step import Compiled, Lines, Steps
+from ..controllers.step import Compiled, Lines, looped_arrays
+from ..core.running import DIVERGED, REFUSED_ERROR, RUNNING, Plant, Record, Signals
 from ..kernels.compiling import compiled
 from ..kernels.covariance import (
     CANCELLATION,
@@ -24,18 +26,16 @@ from ..kernels.covariance import (
     predict_covariance,
     project_covariance,
 )
-from ..kernels.delay_lines import TAPS, delay_line, newest, refill
-from ..kernels.holding import for_states, store
-from ..kernels.stacking import member, stacked, unstack
+from ..kernels.delay_lines import TAPS, newest, refill
 from ..kernels.vectors import copy_into, dot
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
 from .result import SimulationResult
-from .run import DIVERGED, REFUSED, RUNNING, Plant, Stretch, part_of, run
 from .simulation import POWERS, RECORDED
 
+RESULTS = ("error", "control_signal", "amplifier_output", "anti_noise")
 BLOCK = 512  # samples whose gains are stored at a time
 VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
 SAFE = 1e290  # a smaller correction cannot overflow finite weights
@@ -85,28 +85,39 @@ def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
     return m
 
 
-@for_states(nogil=True)
-def run_scenarios(key):
-    """Compile a run of all scenarios for a type of state.
+class _Scenario:
+    """One of the runs: a copy of its controller's state, its plant and its signals."""
 
-    It runs each scenario that has not ended from sample `begin` to `end`. `address` has room for the state of one of
-    them, and `steps` are those of such a state. All other arguments but the gains are stacked.
-    """
+    def __init__(self, state: Any, plant: Plant, signals: Signals, recorded: dict[str, np.ndarray]) -> None:
+        self.state = deepcopy(state)
+        self._plant, self._signals, self._recorded = plant, signals, recorded
+        self._code: Compiled | None = None
+        self.status, self.done = RUNNING, 0
 
-    def run_all(address, steps, states, plants, signals, limits, status, done, begin, end):
-        no_weights = np.empty((0, 0))
-        for i in range(limits.size):
-            if status[i] == RUNNING:
-                states.gains.taken[0] = 0
-                state, plant = member(states, i), member(plants, i)
-                store(state, address, key)
-                used = state.constraint.numbers
-                own = Steps(address, steps.emit, steps.adapt, state.weights, steps.power_weight, used)
-                block = part_of(member(signals, i), begin, end)
-                status[i], taken = run(own, plant, block, no_weights, limits[i], 1, 0)
-                done[i] += taken
+    def run(self, shared: SharedGains, begin: int, end: int) -> None:
+        """Run from sample `begin` to `end` with the gains of the block, if it has not ended."""
+        if self.status != RUNNING:
+            return
+        if self._code is None or self._code.held.state.gains is not shared:
+            self._code = Compiled(self.state._replace(gains=shared))
+        shared.taken[0] = 0
+        _, sources = looped_arrays(self._code.held.state)
+        records = [Record(sources[name], signal) for name, signal in self._recorded.items()]
+        self.status, self.done = self._plant.run(self._code.steps, self._signals, records, begin, end)
 
-    return run_all
+    def give_back(self, state: Any) -> None:
+        """Write the present state into the arrays of the controller's."""
+        for own, theirs in zip(_arrays(self.state), _arrays(state._replace(gains=None)), strict=True):
+            theirs[...] = own
+
+
+def _arrays(value: Any) -> Iterator[np.ndarray]:
+    """Yield the arrays of a state."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from _arrays(item)
 
 
 def simulate_scenarios(
@@ -218,30 +229,30 @@ def simulate_scenarios(
         x, d = x[on:], np.ascontiguousarray(d[:, on:])
 
     limits = DIVERGENCE_LIMIT * np.sqrt([1.0 if p is None else p for p in rated])
-    taps = paths.shape[1]
-    plants = stacked([Plant(s, np.zeros(0), delay_line(taps), model) for s, model in zip(paths, models, strict=True)])
     gains = _GainSequence(states[0], x)
-    own = [state._replace(gains=None) for state in states]
-    scenarios = stacked(own)
     names = RECORDED + POWERS[:2] if record_powers else RECORDED
-    recorded = {name: np.empty((count, x.size)) for name in names}
-    signals = _signals(x, d, noises, recorded)
-    status, done = np.full(count, RUNNING), np.zeros(count, np.int64)
-    code: Compiled | None = None
+    recorded = {name: np.full((count, x.size), np.nan) for name in (*RESULTS, *names)}
+    scenarios = []
+    for i, state in enumerate(states):
+        own = {name: signal[i : i + 1] for name, signal in recorded.items()}
+        signals = Signals(
+            x[None], d[i : i + 1] if len(d) > 1 else d, noises[i].signal(1, x.size), *(own.pop(name) for name in RESULTS)
+        )
+        plant = Plant(paths[i, None, None], np.zeros((1, 1, 0)), models[i].view(np.float64).reshape(1, -1), limits[i : i + 1])
+        scenarios.append(_Scenario(state._replace(gains=None), plant, signals, own))
     for first, shared, solved in gains.blocks():
-        code = code or Compiled(own[0]._replace(gains=shared))
-        together = scenarios._replace(gains=shared)
-        run_scenarios(code.held, code.steps, together, plants, signals, limits, status, done, first, first + solved)
-        _raise_if_refused(status, done, first + solved if solved < shared.variances.size else None)
+        for scenario in scenarios:
+            scenario.run(shared, first, first + solved)
+        _raise_if_refused(scenarios, first + solved if solved < shared.variances.size else None)
         if progress:
             progress(count * solved)
     for signal in recorded.values():
-        for i, end in enumerate(done):
-            signal[i, end:] = np.nan
-    for i, (controller, state) in enumerate(zip(controllers, states, strict=True)):
-        unstack(scenarios, i, own[i])
+        for i, scenario in enumerate(scenarios):
+            signal[i, scenario.done :] = np.nan
+    for controller, state, scenario in zip(controllers, states, scenarios, strict=True):
+        scenario.give_back(state)
         gains.refill(state.lines)  # a scenario that diverged has not heard the end
-        if status[i] == DIVERGED:
+        if scenario.status == DIVERGED:
             refill(state.lines.output, np.zeros(state.lines.output.size))  # its loudspeaker was switched off
         controller.after_compiled(state._replace(gains=gains.covariance), shared=True)
     return [
@@ -252,19 +263,10 @@ def simulate_scenarios(
             reference=x,
             disturbance=d[i if len(d) > 1 else 0],
             **{name: signal[i] for name, signal in recorded.items()},
-            diverged_at_s=done[i] / fs if status[i] == DIVERGED else None,
+            diverged_at_s=scenarios[i].done / fs if scenarios[i].status == DIVERGED else None,
         )
         for i, controller in enumerate(controllers)
     ]
-
-
-def _signals(x: np.ndarray, d: np.ndarray, noises: list[SensorNoise], recorded: dict[str, np.ndarray]) -> Stretch:
-    """Return the stacked signals of the run; one row serves all scenarios, also for what is not recorded."""
-    silent = np.zeros((1, x.size))
-    noisy = any(noise.std for noise in noises)
-    sensed = np.array([np.zeros(x.size) + noise.take(x.size) for noise in noises]) if noisy else silent
-    left = (recorded.get(name, np.empty((1, x.size))) for name in RECORDED + POWERS)
-    return Stretch(x[None], d, sensed, *left)
 
 
 def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
@@ -407,11 +409,12 @@ class _GainSequence:
             yield first, gains, advance_gains(self.covariance, rows, *self._settings, gains)
 
 
-def _raise_if_refused(status: np.ndarray, done: np.ndarray, unsolved: int | None) -> None:
-    for i in np.flatnonzero(status == REFUSED):
-        raise ValueError(
-            f"the weights of controllers[{i}] would overflow in sample {done[i]} of the run: "
-            "its disturbance estimate or residual is too large"
-        )
+def _raise_if_refused(scenarios: list[_Scenario], unsolved: int | None) -> None:
+    for i, scenario in enumerate(scenarios):
+        if scenario.status == REFUSED_ERROR:
+            raise ValueError(
+                f"the weights of controllers[{i}] would overflow in sample {scenario.done} of the run: "
+                "its disturbance estimate or residual is too large"
+            )
     if unsolved is not None:
         raise ValueError(f"{NO_SOLUTION} (sample {unsolved} of the run)")

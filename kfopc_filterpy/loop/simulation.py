@@ -1,34 +1,34 @@
-"""The modified ANC structure of the paper's block diagrams: simulate a controller, an amplifier and the paths."""
+"""The modified ANC structure of the paper's block diagrams: simulate a controller, amplifiers and paths."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .._validate import as_count, as_positive, as_signal
-from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController
-from ..controllers.step import Compiled
-from ..kernels.delay_lines import delay_line
+from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
+from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController, Looped
+from ..core.running import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
+from ..paths.channels import is_path_matrix, path_matrix, secondary_paths
 from ..paths.models import path_taps
-from ..power.amplifiers import Amplifier, LinearAmplifier, compiled_model
+from ..power.amplifiers import Amplifier, amplifier_models, compiled_model
 from ..power.constraint import DEFAULT_FS
-from .channels import is_multichannel, simulate_channels
 from .inputs import (
     DIVERGENCE_LIMIT,
     SensorNoise,
+    channel_disturbances,
     disturbance_at_microphone,
     listen_first,
     naming_sample,
     switch_on_sample,
 )
 from .result import SimulationResult
-from .run import DIVERGED, REFUSED, RUNNING, STEP, Plant, Stretch, anti_noise_once, reference_once, run
 
-RECORDED = ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor")
-POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request
+STRETCH = 1600  # samples between two reports of progress, or two opportunities to interrupt a run: 0.1 s at 16 kHz
+RECORDED = ("constraint_factor",)
+POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorded on request, for one channel
 
 
 def simulate(
@@ -129,143 +129,152 @@ def simulate(
     """
     if isinstance(controller, type) or not isinstance(controller, Controller):
         raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
-    if is_multichannel(controller, reference, secondary_path, disturbance):
-        return simulate_channels(
-            controller,
-            reference,
-            secondary_path=secondary_path,
-            primary_path=primary_path,
-            disturbance=disturbance,
-            fs=fs,
-            amplifier=amplifier,
-            rated_power=rated_power,
-            noise=SensorNoise(sensor_noise_std, rng),
-            switch_on_s=switch_on_s,
-            feedback_path=feedback_path,
-            record_weights_every=record_weights_every,
-            progress=progress,
-            compiled=compiled,
-        )
-    if amplifier is not None and not callable(amplifier):
-        raise TypeError(f"amplifier must be a function of a sample, or None, got {amplifier!r}")
     fs = as_positive(fs, "fs", unit="Hz")
-    x = as_signal(reference, "reference")
-    d = disturbance_at_microphone(x, primary_path, disturbance, fs)
+    several = is_multichannel(controller, reference, secondary_path, disturbance)
+    x, d, secondary = _read_signals(reference, primary_path, disturbance, secondary_path, fs, several)
+    K, J, _ = secondary.shape
+    _require_fit(controller, len(x), J, K, several)
     noise = SensorNoise(sensor_noise_std, rng)
-    if rated_power is None:
-        rated_power = getattr(controller, "rated_power", None)
-    rated_power = None if rated_power is None else as_positive(rated_power, "rated_power")
-    limit = DIVERGENCE_LIMIT * np.sqrt(1.0 if rated_power is None else rated_power)
+    rated = getattr(controller, "rated_power", None) if rated_power is None else rated_power
+    rated = None if rated is None else per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
-    on = switch_on_sample(switch_on_s, fs, x.size)
-    plant = _plant(secondary_path, feedback_path, amplifier, fs)
+    on = switch_on_sample(switch_on_s, fs, x.shape[1])
+    functions, models = _amplifiers(amplifier, J, several)
+    feedback = _feedback(feedback_path, fs, len(x), J, several)
     if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
-    weights = _weight_rows(x.size - on, controller, every)
+    weights = _weight_rows(x.shape[1] - on, controller, every, several)
     if on:
-        listen_first(controller, x[:on], d[:on] + noise.take(on))
-        x, d = x[on:], d[on:]
+        heard = x[:, :on].copy(), d[:, :on] + noise.take(K, on)
+        listen_first(controller, *(heard if several else (signal[0] for signal in heard)))
+        x, d = x[:, on:], d[:, on:]
 
-    run_stretch = partial(_run_steps, controller, plant, amplifier)
-    if compiled and isinstance(controller, FilteredReferenceController) and compiled_model(amplifier) is not None:
-        state = controller.compiled_state()
-        if state is not None:
-            run_stretch = partial(_run_compiled, controller, state, plant)
-    names = RECORDED + POWERS if record_powers else RECORDED
-    recorded = {name: np.empty(x.size) for name in names}
-    status, end = RUNNING, 0
-    for first in range(0, x.size, STEP):
-        stretch = _stretch(x[first : first + STEP], d[first : first + STEP], noise)
-        status, done = run_stretch(stretch, weights, limit, every or 1, first, progress)
-        end = first + done
-        for name, signal in recorded.items():
-            signal[first:end] = getattr(stretch, name)[:done]
-        if status != RUNNING:
-            break
-    for signal in recorded.values():
-        signal[end:] = np.nan
+    plant = Plant(secondary, feedback, models, DIVERGENCE_LIMIT * np.sqrt(np.ones(J) if rated is None else np.broadcast_to(rated, J)))
+    n_samples = x.shape[1]
+    results = [np.full((channels, n_samples), np.nan) for channels in (K, J, J, K)]
+    signals = Signals(np.ascontiguousarray(x), np.ascontiguousarray(d), noise.signal(K, n_samples), *results)
+    recorded = {name: np.full((J if name in RECORDED else 1, n_samples), np.nan) for name in RECORDED + POWERS}
+    run = _Run(controller, plant, signals, recorded, weights, every or 1, functions, several, progress)
+    looped = None
+    if compiled and isinstance(controller, FilteredReferenceController) and not any(functions):
+        looped = controller.looped()
+    diverged, end = run.steps(x) if looped is None else run.loop(looped)
+    for signal in (*results, *recorded.values()):
+        signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
+    wanted = RECORDED + (POWERS if record_powers and not several else ())
+    found = {"error": signals.error, "control_signal": signals.control_signal, "amplifier_output": signals.amplifier_output}
+    found |= {"anti_noise": signals.anti_noise} | {name: recorded[name] for name in wanted}
     if not hasattr(controller, "power_weight"):
-        recorded.pop("power_weight", None)
+        found.pop("power_weight", None)
+    if not several or (np.ndim(reference) == 1 and J == K == 1):  # one channel drops its axis, as it was given
+        x, d, found = x[0], d[0], {name: signal[0] for name, signal in found.items()}
+        rated = None if rated is None else float(np.ravel(rated)[0])
     return SimulationResult(
         algorithm=str(getattr(controller, "name", type(controller).__name__)),
         fs=fs,
-        rated_power=rated_power,
+        rated_power=rated,
         reference=x.copy(),
         disturbance=d.copy(),
-        **recorded,
+        **found,
         weights=weights if every else None,
         weights_time_s=np.arange(len(weights)) * every / fs if every else None,
-        diverged_at_s=end / fs if status == DIVERGED else None,
+        diverged_at_s=end / fs if diverged else None,
     )
 
 
-def _stretch(x: np.ndarray, d: np.ndarray, noise: SensorNoise) -> Stretch:
-    """Return the signals of a stretch: the inputs, and room for the results of the loop."""
-    left = np.full((len(RECORDED + POWERS), x.size), np.nan)
-    return Stretch(x, d, np.zeros(x.size) + noise.take(x.size), *left)
+@dataclass
+class _Run:
+    """A run: the controller, the plant, and what is recorded."""
+
+    controller: Any
+    plant: Plant
+    signals: Signals
+    recorded: dict[str, np.ndarray]  # (J, n_samples) or (1, n_samples)
+    weights: np.ndarray  # (rows, ...)
+    every: int
+    functions: list[Any]  # for each loudspeaker: an amplifier that is not a model, or None
+    several: bool
+    progress: Callable[[int], Any] | None
+
+    def loop(self, looped: Looped) -> tuple[bool, int]:
+        """Run in the core, stretch by stretch: a run can be interrupted between them, and the controller may work."""
+        records = [Record(source, self.recorded[name]) for name, source in looped.recorded.items()]
+        if len(self.weights):
+            rows = self.weights.reshape(len(self.weights), -1)
+            records.append(Record(looped.control_filter.reshape(-1), rows, self.every, in_rows=True))
+        status, begin, n_samples = RUNNING, 0, self.signals.error.shape[1]
+        while begin < n_samples and status == RUNNING:
+            end = min(begin + (self.controller.samples_to_block() or STRETCH), n_samples)
+            try:
+                with looped.in_use:
+                    status, done = self.plant.run(looped.steps, self.signals, records, begin, end)
+            finally:  # even if interrupted, the controller must have the state of its last sample
+                looped.after()
+            if self.progress:
+                self.progress(done - begin)
+            begin = done
+        if status in (REFUSED_REFERENCE, REFUSED_ERROR):
+            with naming_sample(begin):  # the step has changed nothing; called again, it says why
+                if status == REFUSED_REFERENCE:
+                    self.controller.control_signal(self._sample(self.plant.reference))
+                self.controller.update(self._sample(self.plant.error))
+                raise ValueError(NO_SOLUTION)
+        return status == DIVERGED, begin
+
+    def steps(self, x: np.ndarray) -> tuple[bool, int]:
+        """Call the controller for each sample; return whether it diverged, and the first sample not completed."""
+        for n in range(x.shape[1]):
+            with naming_sample(n):
+                y = self._control_signal(self.plant.hear(self.signals, n))
+                if not np.all(np.abs(y) <= self.plant.limit):
+                    return True, n
+                error = self.plant.play(self._amplified(y), self.signals, n)
+                self.signals.control_signal[:, n] = y
+                self.controller.update(self._sample(error))
+            for name, signal in self.recorded.items():
+                signal[:, n] = getattr(self.controller, name, np.nan) if name in RECORDED or not self.several else np.nan
+            if len(self.weights) and n % self.every == 0:
+                self.weights[n // self.every] = np.reshape(filters_of(self.controller), self.weights.shape[1:])
+            if self.progress:
+                self.progress(1)
+        return False, x.shape[1]
+
+    def _sample(self, values: np.ndarray) -> Any:
+        """Return a sample as the controller takes it: a number, or with several channels an array."""
+        return values.copy() if self.several else float(values[0])
+
+    def _control_signal(self, references: np.ndarray) -> np.ndarray:
+        y = self.controller.control_signal(self._sample(references))
+        if not self.several:
+            return np.array([_as_sample(y, "control_signal")])
+        y = np.asarray(y, dtype=np.float64).reshape(-1)
+        if y.size != self.plant.limit.size:
+            raise ValueError(
+                f"control_signal must return a value for each of the {self.plant.limit.size} loudspeakers, got {y.size}"
+            )
+        return y
+
+    def _amplified(self, y: np.ndarray) -> np.ndarray:
+        """Return the amplifiers' outputs, (J,)."""
+        amplified = self.plant.amplified(y)
+        for j, function in enumerate(self.functions):
+            if function is not None:
+                amplified[j] = _as_sample(function(float(y[j])), "amplifier")
+                if not np.isfinite(amplified[j]):
+                    raise ValueError(f"amplifier must return a finite number, got {amplified[j]} for {y[j]}")
+        return amplified
 
 
-def _run_compiled(
-    controller: FilteredReferenceController,
-    state: Any,
-    plant: Plant,
-    stretch: Stretch,
-    weights: np.ndarray,
-    limit: float,
-    every: int,
-    first: int,
-    progress: Callable[[int], Any] | None,
-) -> tuple[int, int]:
-    """Run a stretch by `run.run`."""
-    code = Compiled(state)  # named, so that it outlives the run
-    try:
-        status, done = run(code.steps, plant, stretch, weights, limit, every, first)
-    finally:  # even if interrupted, the controller must have the state of its last sample
-        controller.after_compiled(state)
-    if progress:
-        progress(done)
-    if status == REFUSED:
-        with naming_sample(first + done):
-            controller.update(float(stretch.error[done]))  # raises, with the reason
-            raise ValueError(NO_SOLUTION)
-    return status, done
+def is_multichannel(controller: Any, reference: Any, secondary_path: Any, disturbance: Any) -> bool:
+    """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
+    own = isinstance(controller, FilteredReferenceController) and controller.multichannel
+    return own or np.ndim(reference) == 2 or np.ndim(disturbance) == 2 or is_path_matrix(secondary_path)
 
 
-def _run_steps(
-    controller: Controller,
-    plant: Plant,
-    amplifier: Amplifier | None,
-    stretch: Stretch,
-    weights: np.ndarray,
-    limit: float,
-    every: int,
-    first: int,
-    progress: Callable[[int], Any] | None,
-) -> tuple[int, int]:
-    """Run a stretch like `run.run`, but call the controller for each sample."""
-    for k in range(stretch.reference.size):
-        with naming_sample(first + k):
-            x = reference_once(plant, stretch.reference[k])
-            y = _as_sample(controller.control_signal(x), "control_signal")
-            if not abs(y) <= limit:
-                return DIVERGED, k
-            y_amplified = y if amplifier is None else _as_sample(amplifier(y), "amplifier")
-            if not np.isfinite(y_amplified):
-                raise ValueError(f"amplifier must return a finite number, got {y_amplified} for {y}")
-            a = anti_noise_once(plant, y_amplified)
-            e = float(stretch.disturbance[k] - a + stretch.sensor_noise[k])
-            controller.update(e)
-        stretch.error[k], stretch.control_signal[k] = e, y
-        stretch.amplifier_output[k], stretch.anti_noise[k] = y_amplified, a
-        for name in ("constraint_factor", *POWERS):
-            getattr(stretch, name)[k] = getattr(controller, name, np.nan)
-        if weights.shape[0] > 0 and (first + k) % every == 0:
-            now = getattr(controller, "control_filter", getattr(controller, "weights", None))
-            weights[(first + k) // every] = np.array(now, dtype=np.float64).reshape(-1)
-        if progress:
-            progress(1)
-    return RUNNING, stretch.reference.size
+def filters_of(controller: Any) -> Any:
+    """Return the control filters of a controller."""
+    return getattr(controller, "control_filter", getattr(controller, "weights", None))
 
 
 def _as_sample(value: Any, source: str) -> float:
@@ -276,24 +285,73 @@ def _as_sample(value: Any, source: str) -> float:
         raise TypeError(f"{source} must return one number, got {value!r}") from error
 
 
-def _plant(secondary_path: Any, feedback_path: Any, amplifier: Amplifier | None, fs: float) -> Plant:
-    secondary = path_taps(secondary_path, fs=fs, name="secondary_path")
-    feedback = np.zeros(0)
-    if feedback_path is not None:
-        feedback = path_taps(feedback_path, fs=fs, name="feedback_path")
-        if feedback[0] != 0:
-            raise ValueError(
-                f"feedback_path must have a delay of a sample at least: its first tap is {feedback[0]:g}, not 0"
-            )
-    model = compiled_model(amplifier)
-    if model is None:  # a user's function: `_run_steps` applies it
-        model = LinearAmplifier().model
-    return Plant(secondary, feedback, delay_line(max(secondary.size, feedback.size)), model)
+def _read_signals(
+    reference: Any, primary_path: Any, disturbance: Any, secondary_path: Any, fs: float, several: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return references (I, n), disturbances (K, n) and secondary paths (K, J, taps)."""
+    if several:
+        x = np.atleast_2d(as_channels(reference, "reference"))
+        secondary, _ = secondary_paths(secondary_path, fs=fs)
+        return x, channel_disturbances(x, primary_path, disturbance, fs, len(secondary)), secondary
+    x = as_signal(reference, "reference")
+    d = disturbance_at_microphone(x, primary_path, disturbance, fs)
+    return x[None], d[None], path_taps(secondary_path, fs=fs, name="secondary_path").reshape(1, 1, -1)
 
 
-def _weight_rows(n_samples: int, controller: Controller, every: int | None) -> np.ndarray:
+def _feedback(feedback_path: Any, fs: float, n_references: int, J: int, several: bool) -> np.ndarray:
+    """Return the feedback paths, (I, J, taps); 0 taps without any."""
+    if feedback_path is None:
+        return np.zeros((n_references, J, 0))
+    if several:
+        feedback, _ = path_matrix(feedback_path, fs=fs, name="feedback_path")
+    else:
+        feedback = path_taps(feedback_path, fs=fs, name="feedback_path").reshape(1, 1, -1)
+    if feedback.shape[:2] != (n_references, J):
+        raise ValueError(
+            f"feedback_path must be (I references, J loudspeakers, taps) with I = {n_references}, J = {J}, "
+            f"got {feedback.shape}"
+        )
+    if np.any(feedback[..., 0]):
+        raise ValueError(
+            f"feedback_path must have a delay of a sample at least: its first tap is {feedback[..., 0].flat[0]:g}, not 0"
+            if not several
+            else "feedback_path must have a delay of a sample at least: a first tap is not 0"
+        )
+    return feedback
+
+
+def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.ndarray]:
+    """Return for each loudspeaker an amplifier that is a user's function, or None, and the models, (J, 3)."""
+    each = list(amplifier) if several and isinstance(amplifier, Sequence) else [amplifier] * J
+    if len(each) != J or not all(one is None or callable(one) for one in each):
+        one = "a function of a sample, or one for each of the {J} loudspeakers, or None" if several else "a function of a sample, or None"
+        raise TypeError(f"amplifier must be {one.format(J=J)}, got {amplifier!r}")
+    functions = [one if one is not None and compiled_model(one) is None else None for one in each]
+    models = amplifier_models([None if function else one for one, function in zip(each, functions, strict=True)], J)
+    return functions, models.view(np.float64).reshape(J, -1)
+
+
+def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_microphones: int, several: bool) -> None:
+    """Raise ValueError if a built-in controller is made for other numbers of channels."""
+    if not several or not isinstance(controller, FilteredReferenceController):
+        return
+    if not controller.multichannel:
+        raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
+    counts = {
+        "references": (controller.n_references, n_references),
+        "loudspeakers": (controller.n_loudspeakers, n_loudspeakers),
+        "microphones": (controller.n_microphones, n_microphones),
+    }
+    for name, (own, run) in counts.items():
+        if own != run:
+            raise ValueError(f"the controller is made for {own} {name}, but reference and paths of the run have {run}")
+
+
+def _weight_rows(n_samples: int, controller: Any, every: int | None, several: bool) -> np.ndarray:
+    """Return room for the control filters at every `every`-th sample, (rows, L) or (rows, J, I, L)."""
     if every is None:
         return np.empty((0, 0))
-    if not hasattr(controller, "weights"):
-        raise ValueError("record_weights_every needs a controller with an attribute weights, (L,)")
-    return np.empty((-(-n_samples // every), np.size(controller.weights)))
+    filters = filters_of(controller)
+    if filters is None or (several and np.ndim(filters) != 3):
+        raise ValueError(f"record_weights_every needs a controller with an attribute weights, {'(J, I, L)' if several else '(L,)'}")
+    return np.empty((-(-n_samples // every), *(np.shape(filters) if several else (np.size(filters),))))

@@ -8,37 +8,26 @@ the time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from .._validate import as_positive
-from ..kernels.compiling import compiled, part
-from ..kernels.records import new_record
+from ..core.calls import amplify_all, amplify_compiled
+from ..core.running import HARD_CLIP, LINEAR, SOFT_SATURATION
+from ..kernels.compiling import part
+from ..kernels.records import as_records
 
-LINEAR, HARD_CLIP, SOFT_SATURATION = 0, 1, 2
+# The structure of the core, see anc.h.
+MODEL = np.dtype([(name, np.float64) for name in ("kind", "limit", "sharpness")])
 
 
 @part()
 def amplify(amplifier, y):
     """Return the output for one sample y; `amplifier` is the record of a model."""
-    model = amplifier[0]
-    if model.kind == HARD_CLIP:
-        return min(max(y, -model.limit), model.limit)
-    if model.kind == SOFT_SATURATION:
-        ratio, p = abs(y) / model.limit, model.sharpness
-        if ratio <= 1.0:
-            return y / (1.0 + ratio ** (2.0 * p)) ** (0.5 / p)
-        return math.copysign(model.limit, y) / (1.0 + ratio ** (-2.0 * p)) ** (0.5 / p)  # this form does not overflow
-    return y
-
-
-@compiled()
-def _amplify_all(model, signal, out):
-    for n in range(signal.size):
-        out[n] = amplify(model, signal[n])
+    return amplify_compiled(amplifier.ctypes.data, y)
 
 
 @dataclass(frozen=True)
@@ -51,14 +40,14 @@ class _Amplifier:
     def model(self) -> np.ndarray:
         """Record of kind, limit and sharpness for the compiled loop."""
         limit, sharpness = getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)
-        return new_record(kind=self.kind, limit=limit, sharpness=sharpness)
+        return as_records(np.array([(self.kind, limit, sharpness)], MODEL))
 
     def __call__(self, signal: Any) -> Any:
         """Return the output for `signal`, a number or an array of any shape."""
-        array = np.asarray(signal, dtype=np.float64)
-        out = np.empty(array.size)
-        _amplify_all(self.model, array.reshape(-1), out)
-        return out.reshape(array.shape) if array.ndim else float(out[0])
+        array = np.asarray(signal, dtype=np.float64, order="C")
+        model, out = self.model, np.empty(array.shape)
+        amplify_all(model.ctypes.data, array.ctypes.data, out.ctypes.data, array.size)
+        return out if array.ndim else float(out)
 
 
 @dataclass(frozen=True)
@@ -140,3 +129,15 @@ def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
         )
     models = (LinearAmplifier, HardClipAmplifier, SoftSaturationAmplifier)
     return amplifier.model if isinstance(amplifier, models) and type(amplifier) in models else None
+
+
+def amplifier_models(amplifier: Any, n_loudspeakers: int) -> np.ndarray:
+    """Return the records of the amplifier models of all loudspeakers, (J, 1)."""
+    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
+    models = [compiled_model(LinearAmplifier() if one is None else one) for one in each]
+    if len(models) != n_loudspeakers or any(model is None for model in models):
+        raise TypeError(
+            "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "
+            f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
+        )
+    return as_records(np.array(models))

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_choice, as_nonnegative, as_number, as_positive
-from ..kernels.compiling import compiled, inlined, part
-from ..kernels.records import as_records, new_record
+from ..core.calls import commit, commit_compiled, preview, preview_compiled
+from ..kernels.compiling import inlined, part
+from ..kernels.records import as_records
 
 DEFAULT_FS = 16000.0
 DEFAULT_MEMORY_S = 0.5
@@ -17,104 +18,58 @@ DEFAULT_MEMORY_S = 0.5
 # Below the smallest normal number a ratio of powers has no digits left: such a reference counts as silent.
 SILENCE = float(np.finfo(np.float64).tiny)
 
-# Indices of the running powers; numpy integers, because numba would compile a function again for each Python int.
-DISTURBANCE, FILTERED_REFERENCE, REFERENCE = np.arange(3)
-POWER = np.dtype([("mean_square", np.float64), ("lap", np.float64), ("taken", np.float64)], align=True)
+# Structures of the core, see anc.h.
+_MEANS = ("disturbance", "filtered_reference", "reference")
+POWER = np.dtype([(name, np.float64) for name in ("mean_square", "lap", "taken", "position")])
+SETTINGS = ("rated_power", "rate", "supplied_factor", "supplied_power", "supplied_gain")  # NaN if not supplied
+NUMBERS = np.dtype(
+    [(name, np.float64) for name in (*SETTINGS, "factor", "power", "gain")]
+)
+PREVIEWED = np.dtype(
+    [(name, np.float64) for name in ("factor", "power", "gain")] + [("mean", np.float64, (len(_MEANS),))]
+)
+REFERENCE = _MEANS.index("reference")
 
 
 class ConstraintState(NamedTuple):
     """State that the compiled functions below read and update."""
 
-    powers: (
-        np.ndarray
-    )  # (3,) of POWER: mean square, sum of squares since the sliding window last wrapped, samples taken
+    powers: np.ndarray  # (3,) of POWER: disturbance, filtered reference, reference
     window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from each index on; m = 0: exponential
-    numbers: np.ndarray  # record: settings; values that the caller supplied (NaN: estimated); values last used
-
-
-@part()
-def forgetting_mean(mean, taken, rate, square):
-    """Return an exponentially weighted mean square with one more sample, unbiased from the first sample on."""
-    return mean + max(rate, 1.0 / (taken + 1)) * (square - mean)
-
-
-@part()
-def power_gain(supplied, last, filtered_power, reference_power):
-    """Return the supplied gain, else that of eq. 11, or the last gain while the reference is silent."""
-    if not np.isnan(supplied):
-        return supplied
-    if reference_power > SILENCE:
-        return filtered_power / reference_power
-    return last
-
-
-@part()
-def constraint_factor(supplied, rated_power, disturbance_power, gain):
-    """Return the factor of eq. 13; 1 if there is nothing to constrain (no disturbance, or no gain known yet)."""
-    if not np.isnan(supplied):
-        return supplied
-    if disturbance_power <= SILENCE or np.isnan(gain):
-        return 1.0
-    return min(math.sqrt(rated_power * gain / disturbance_power), 1.0)
+    numbers: np.ndarray  # (1,) of NUMBERS: settings, values last used
+    previewed: np.ndarray  # (1,) of PREVIEWED: room for what the next sample would make of them
 
 
 @inlined
-def _next_mean(state, signal, square):
-    """Return the mean square of a signal with one more sample."""
-    power, m = state.powers[signal], state.window.shape[1]
-    if m == 0:
-        return forgetting_mean(power.mean_square, power.taken, state.numbers[0].rate, square)
-    position = np.int64(power.taken) % m
-    rest = state.window[signal, position + 1] if position + 1 < m else 0.0
-    total = power.lap + square + rest  # sums only, so that rounding never accumulates
-    return total / min(power.taken + 1.0, float(m))
+def preview_squares(state, disturbance, filtered_reference, reference):
+    """Return the constraint factor with a sample's squares included, the power and gain behind it; nothing is changed.
+
+    The squares can be sums over channels. If that of the reference is NaN (none given), the powers of the reference and
+    the filtered reference stay as they are.
+    """
+    preview_compiled(*_addresses(state), disturbance, filtered_reference, reference)
+    previewed = state.previewed[0]
+    return previewed.factor, previewed.power, previewed.gain
 
 
 @inlined
 def preview_constraint(state, disturbance, filtered_reference, reference):
-    """Return the constraint factor with this sample included; nothing is changed.
-
-    Also return the disturbance power and the gain that it was computed from, and the three mean squares. If `reference`
-    is NaN (none given), the powers of the reference and the filtered reference stay as they are.
-    """
+    """Return what `preview_squares` does, for a sample of one channel."""
     return preview_squares(
         state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
     )
 
 
 @inlined
-def preview_squares(state, disturbance, filtered_reference, reference):
-    """Return what `preview_constraint` does, for squares, which can be sums over channels."""
-    numbers = state.numbers[0]
-    mean_d = _next_mean(state, DISTURBANCE, disturbance)
-    mean_xf, mean_x = state.powers[FILTERED_REFERENCE].mean_square, state.powers[REFERENCE].mean_square
-    if not np.isnan(reference):
-        mean_xf = _next_mean(state, FILTERED_REFERENCE, filtered_reference)
-        mean_x = _next_mean(state, REFERENCE, reference)
-    gain = power_gain(numbers.supplied_gain, numbers.gain, mean_xf, mean_x)
-    power = mean_d if np.isnan(numbers.supplied_power) else numbers.supplied_power
-    factor = constraint_factor(numbers.supplied_factor, numbers.rated_power, power, gain)
-    return factor, power, gain, mean_d, mean_xf, mean_x
+def commit_squares(state, disturbance, filtered_reference, reference):
+    """Add the squares that were last previewed to the running powers."""
+    commit_compiled(*_addresses(state), disturbance, filtered_reference, reference)
 
 
 @inlined
-def commit_constraint(state, previewed, disturbance, filtered_reference, reference):
-    """Add the sample to the running powers; `previewed` is what `preview_constraint` returned for it."""
-    commit_squares(
-        state, previewed, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
-    )
-
-
-@inlined
-def commit_squares(state, previewed, disturbance, filtered_reference, reference):
-    """Add squares to the running powers; `previewed` is what `preview_squares` returned for them."""
-    factor, power, gain, mean_d, mean_xf, mean_x = previewed
-    _take(state, DISTURBANCE, disturbance, mean_d)
-    if not np.isnan(reference):
-        _take(state, FILTERED_REFERENCE, filtered_reference, mean_xf)
-        _take(state, REFERENCE, reference, mean_x)
-    numbers = state.numbers[0]
-    numbers.factor, numbers.power, numbers.gain = factor, power, gain
+def commit_constraint(state, disturbance, filtered_reference, reference):
+    """Add the sample that was last previewed to the running powers."""
+    commit_squares(state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference)
 
 
 @inlined
@@ -128,44 +83,22 @@ def advance_constraint(state, disturbance, filtered_reference, reference):
 @inlined
 def advance_squares(state, disturbance, filtered_reference, reference):
     """Add squares, which can be sums over channels, to the running powers and return the constraint factor."""
-    previewed = preview_squares(state, disturbance, filtered_reference, reference)
-    commit_squares(state, previewed, disturbance, filtered_reference, reference)
-    return previewed[0]
+    factor, _, _ = preview_squares(state, disturbance, filtered_reference, reference)
+    commit_squares(state, disturbance, filtered_reference, reference)
+    return factor
+
+
+@inlined
+def _addresses(state):
+    """Return where the core finds the numbers, the powers, the window with its length, and room for a preview."""
+    window, room = state.window, state.previewed.ctypes.data
+    return state.numbers.ctypes.data, state.powers.ctypes.data, window.ctypes.data, window.shape[1], room
 
 
 @part()
 def squares_are_finite(d, filtered, x):
     """Return whether the squares of this sample are finite: an infinite power would never be forgotten."""
     return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
-
-
-@inlined
-def _take(state, signal, square, mean):
-    """Add one square to one running power, whose new mean square is `mean`."""
-    power, m = state.powers[signal], state.window.shape[1]
-    power.mean_square = mean
-    if m > 0:
-        position = np.int64(power.taken) % m
-        power.lap += square
-        state.window[signal, position] = square
-        if position == m - 1:
-            power.lap = 0.0
-            for i in range(m - 2, -1, -1):
-                state.window[signal, i] += state.window[signal, i + 1]
-    power.taken += 1.0
-
-
-@compiled()
-def preview_sample(state, disturbance, filtered_reference, reference):
-    """Return the factor and the gain of `preview_squares`; called from Python."""
-    factor, _, gain, _, _, _ = preview_squares(state, disturbance, filtered_reference, reference)
-    return factor, gain
-
-
-@compiled()
-def advance_sample(state, disturbance, filtered_reference, reference):
-    """Call `advance_squares` from Python."""
-    return advance_squares(state, disturbance, filtered_reference, reference)
 
 
 class OutputPowerConstraint:
@@ -217,17 +150,12 @@ class OutputPowerConstraint:
         self.window = as_choice(window, "window", ("exponential", "sliding"))
         samples = self.memory_s * self.fs
         length = max(round(samples), 1) if window == "sliding" else 0
-        numbers = new_record(
-            rated_power=rated_power,
-            rate=-math.expm1(-1.0 / samples),
-            supplied_factor=math.nan,
-            supplied_power=math.nan,
-            supplied_gain=math.nan,
-            factor=1.0,
-            power=0.0,
-            gain=math.nan,
-        )
-        self._state = ConstraintState(as_records(np.zeros(3, POWER)), np.zeros((3, length)), numbers)
+        numbers = as_records(np.zeros(1, NUMBERS))
+        numbers["rated_power"], numbers["rate"] = rated_power, -math.expm1(-1.0 / samples)
+        for name in ("supplied_factor", "supplied_power", "supplied_gain", "gain"):
+            numbers[name] = math.nan
+        numbers["factor"] = 1.0
+        self._state = ConstraintState(as_records(np.zeros(3, POWER)), np.zeros((3, length)), numbers, as_records(np.zeros(1, PREVIEWED)))
         self._given_gain = secondary_path_gain
         self.secondary_path_gain = secondary_path_gain
 
@@ -322,12 +250,30 @@ class OutputPowerConstraint:
 
         `d_squared`, `xf_squared` and `x_squared` are those of `advance`'s arguments, or their sums over channels.
         """
-        factor, gain = preview_sample(self._state, d_squared, xf_squared, self._known(x_squared))
-        return float(factor), float(gain)
+        previewed = np.zeros(1, PREVIEWED)
+        preview(*self._places(previewed), d_squared, xf_squared, self._known(x_squared))
+        return float(previewed["factor"][0]), float(previewed["gain"][0])
 
     def advance_sums(self, d_squared: float, xf_squared: float, x_squared: float | None) -> float:
         """Add the squares of a sample, `d_squared`, `xf_squared` and `x_squared`, to the powers; return the factor."""
-        return float(advance_sample(self._state, d_squared, xf_squared, self._known(x_squared)))
+        places = self._places(self._state.previewed)
+        squares = d_squared, xf_squared, self._known(x_squared)
+        preview(*places, *squares)
+        commit(*places, *squares)
+        return float(self._state.numbers["factor"][0])
+
+    def _places(self, previewed: np.ndarray) -> tuple[int, int, int, int, int]:
+        """Return what `_addresses` does, with other room for a preview."""
+        powers, window, numbers, _ = (array.ctypes.data for array in self._state)
+        return numbers, powers, window, self._state.window.shape[1], previewed.ctypes.data
+
+    def live_in(self, powers: np.ndarray, window: np.ndarray, numbers: np.ndarray) -> None:
+        """Go on in other arrays: reals of a controller's block, which get the present numbers."""
+        state = self._state
+        places = state._replace(powers=powers.view(POWER).reshape(3), window=window, numbers=numbers.view(NUMBERS).reshape(1))
+        for own, place in zip(state, places, strict=True):
+            place[...] = own
+        self._state = places
 
     def _known(self, x_squared: float | None) -> float:
         """Return the square of the reference, NaN if none is given and none is needed."""

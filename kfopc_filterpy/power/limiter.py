@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_number, as_positive, as_signal
-from ..kernels.compiling import compiled, part
-from ..kernels.records import new_record
+from ..core.calls import limit, limit_all, limit_compiled
+from ..kernels.compiling import part
+from ..kernels.records import as_records
 from .constraint import DEFAULT_FS
 
 DEFAULT_WINDOW_S = 0.1
@@ -23,106 +24,35 @@ LONGEST_WINDOW = 10**7  # samples; the margin for rounding is then 2e-9 of the b
 HORIZONS = 16  # future spans that the gain is planned for, evenly spaced up to N
 RESERVE = 0.02  # of the power; keeps a tone's gain constant even if the window does not hold whole periods
 MEAN_TIME, LOUD_TIME, RELEASE_TIME, MEMORY = 1 / 40, 1 / 5, 1 / 8, 20.0  # time constants in windows
-OVERSHOOT = 1.1  # the gain rises towards this multiple of its aim and stops at the aim, so that it does reach 1
 LOUDEST = 100.0  # times the largest output: louder input is planned for as if it were this loud, to be forgotten soon
 FLOOR = 1e-200  # of the budget: keeps estimates above denormal numbers, which are slow
+
+
+_SETTINGS = ("scale", "peak", "budget", "limit", "planned", "attack", "calm", "fade", "release", "size", "spans")
+_CHANGING = ("position", "spent", "arrived", "average", "loud", "known", "gain", "clipped")
+# The structure of the core, see anc.h. Spans of the window, by horizon: their length, the largest recent input energy in
+# one, and the largest output energy allowed in one.
+NUMBERS = np.dtype(
+    [(name, np.float64) for name in (*_SETTINGS, *_CHANGING)]
+    + [(name, np.float64, (HORIZONS,)) for name in ("horizon", "held", "room")]
+)
 
 
 class LimiterState(NamedTuple):
     """State that `limit_sample` reads and updates.
 
-    A lap is N samples. At position i of a lap, ``laps_out[k]`` is minus this lap's output energy up to k for k < i, the
-    last lap's output energy from k on for k > i, and 0 for k = N. For any m <= N the energy of the last m samples is
-    then one sum. `laps_in` holds the same for the input.
+    A lap is N samples. The rows of `laps`, N + 1 each, are the output energies, the input energies and this lap's output
+    energies one by one; limiter.c says how they are used.
     """
 
-    numbers: np.ndarray  # record: settings, then values that each sample updates; see `_silent_state`
-    horizons: np.ndarray  # (K,) samples, the last one N
-    held: np.ndarray  # (K,) largest recent input energy in a span of each horizon
-    room: np.ndarray  # (K,) largest output energy allowed in such a span
-    laps_out: np.ndarray  # (N + 1,)
-    laps_in: np.ndarray  # (N + 1,)
-    squares: np.ndarray  # (N + 1,) this lap's output energies
-
-
-@part()
-def _aim(state, i, size):
-    """Return the largest constant gain that keeps to the budget over every horizon, for the worst input expected.
-
-    The input energy expected in the next h samples is the least of three: the largest recent energy of h samples; h
-    times the present loudness; and the energy that would make the window as loud as the largest one known, unless the
-    present window is louder already.
-    """
-    numbers, held = state.numbers[0], state.held
-    known = (1.0 + RESERVE) * numbers.known
-    if numbers.arrived + state.laps_in[i + 1] > known:
-        known = np.inf
-    room = 1.0
-    for j in range(held.size):
-        h = state.horizons[j]
-        before = i - h if i >= h else i - h + size + 1
-        held[j] = max(held[j] * numbers.fade, numbers.arrived + state.laps_in[before], FLOOR)
-        kept = i + h if i + h <= size else i + h - size - 1  # index at which the last N - h samples begin
-        coming = min(held[j], h * numbers.loud, known - (numbers.arrived + state.laps_in[kept]))
-        left = min(1.0 - (numbers.spent + state.laps_out[kept]), state.room[j])
-        room = min(room, left / max(coming, FLOOR))
-    return math.sqrt(max(room, 0.0))
+    numbers: np.ndarray  # (1,) of NUMBERS: settings, then values that each sample updates
+    laps: np.ndarray  # (3, N + 1)
 
 
 @part()
 def limit_sample(state, u):
     """Return the output y for the next input u; NaN, with nothing changed, if u is not finite."""
-    if not np.isfinite(u):
-        return np.nan
-    numbers = state.numbers[0]
-    size, i = state.laps_out.size - 1, numbers.position
-    energy = (min(abs(u), numbers.planned) * numbers.scale) ** 2
-    numbers.arrived += energy
-    state.laps_in[i] = -numbers.arrived
-    numbers.average = max(numbers.average + numbers.attack * (energy - numbers.average), FLOOR)
-    numbers.loud = max(numbers.loud * numbers.calm, numbers.average)
-    aim, gain = _aim(state, i, size), numbers.gain
-    numbers.gain = min(aim, gain + numbers.release * max(OVERSHOOT * aim - gain, 0.0))
-    wanted = numbers.gain * u
-    y = min(max(wanted, -numbers.limit), numbers.limit)
-    square = (y * numbers.scale) ** 2
-    left = numbers.budget - (numbers.spent + state.laps_out[i + 1])
-    if square > left:  # the guarantee; the gain above makes this rare
-        y = math.copysign(numbers.peak * math.sqrt(max(left, 0.0)), u)
-        square = (y * numbers.scale) ** 2
-    if y != wanted:
-        numbers.clipped += 1
-    numbers.spent += square
-    state.laps_out[i], state.squares[i] = -numbers.spent, square
-    numbers.position = i + 1
-    if i + 1 == size:
-        _start_lap(state, size)
-    return y
-
-
-@part()
-def _start_lap(state, size):
-    """Start a new lap; the one just completed becomes the last one."""
-    numbers = state.numbers[0]
-    rest = 0.0
-    for k in range(size - 1, 0, -1):
-        rest += state.squares[k]  # summed from scratch, without differences: the guarantee depends on it
-        state.laps_out[k] = rest
-        state.laps_in[k] = numbers.arrived + state.laps_in[k - 1]
-    numbers.position = 0
-    numbers.spent = numbers.arrived = 0.0
-    numbers.known = state.held[-1]
-
-
-@compiled()
-def _limit_one(state, u):
-    return limit_sample(state, u)
-
-
-@compiled(nogil=True)
-def _limit_all(state, signal, out):
-    for n in range(signal.size):
-        out[n] = limit_sample(state, signal[n])
+    return limit_compiled(state.numbers.ctypes.data, state.laps.ctypes.data, u)
 
 
 class OutputLimiter:
@@ -245,30 +175,47 @@ class OutputLimiter:
 
     def __call__(self, u: float) -> float:
         """Return the output for the next input sample `u`."""
-        return float(_limit_one(self._state, as_number(u, "u")))
+        return limit(*self._places(), as_number(u, "u"))
 
     def process(self, signal: Any) -> np.ndarray:
         """Return the output (n,) for a `signal` (n,), or for its next piece; the same bits as sample by sample."""
         signal = as_signal(signal, "signal", min_length=0)
         out = np.empty(signal.size)
-        _limit_all(self._state, signal, out)
+        limit_all(*self._places(), signal.ctypes.data, out.ctypes.data, signal.size)
         return out
+
+    def _places(self) -> tuple[int, int]:
+        """Return where the core finds the arrays."""
+        return self._state.numbers.ctypes.data, self._state.laps.ctypes.data
+
+    def live_in(self, numbers: np.ndarray, laps: np.ndarray) -> None:
+        """Go on in other arrays: reals of a controller's block, which get the present numbers."""
+        places = LimiterState(numbers.view(NUMBERS).reshape(1), laps)
+        for own, place in zip(self._state, places, strict=True):
+            place[...] = own
+        self._state = places
+
+    def move_out(self) -> None:
+        """Go on in arrays of its own."""
+        self._state = LimiterState(*(array.copy() for array in self._state))
 
     def reset(self) -> None:
         """Forget the past, as if only zeros had come in."""
-        fresh = dict(position=0, clipped=0, spent=0.0, arrived=0.0, known=0.0, average=FLOOR, loud=FLOOR, gain=1.0)
-        for name, value in fresh.items():
-            self._state.numbers[name] = value
-        self._state.held[:] = FLOOR
-        for lap in (self._state.laps_out, self._state.laps_in, self._state.squares):
-            lap[:] = 0.0
+        numbers = self._state.numbers
+        for name in _CHANGING:
+            numbers[name] = 0.0
+        numbers["average"] = numbers["loud"] = FLOOR
+        numbers["gain"] = 1.0
+        numbers["held"][0, : int(numbers["spans"][0])] = FLOOR
+        self._state.laps[:] = 0.0
 
 
 def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) -> LimiterState:
     """Return the state of a limiter with windows of `size` samples; `reset` completes it."""
     peak = math.sqrt(size) * math.sqrt(rated_power)  # two roots: their product does not overflow
     limit = 2.0 * peak if amplitude_limit is None else min(amplitude_limit, 2.0 * peak)  # squares stay finite
-    numbers = new_record(
+    spans = min(HORIZONS, size)
+    settings = dict(
         scale=1.0 / peak,
         peak=peak * (1.0 - 2.0**-50),  # so that the rounded square of a clipped sample fits into what is left
         budget=1.0 - (size + 16) * 2.0**-52,
@@ -278,16 +225,12 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
         calm=_kept(LOUD_TIME, size),
         fade=_kept(MEMORY, size),
         release=1.0 - _kept(RELEASE_TIME, size),
-        position=0,
-        spent=0.0,  # output energy of this lap
-        arrived=0.0,  # input energy of this lap
-        average=0.0,  # running mean of the input energies
-        loud=0.0,  # slowly falling maximum of `mean`
-        known=0.0,  # largest recent energy of a window, as of the start of the lap
-        gain=1.0,
-        clipped=0,
+        size=size,
+        spans=spans,
     )
-    spans = min(HORIZONS, size)
+    numbers = as_records(np.zeros(1, NUMBERS))
+    for name, value in settings.items():
+        numbers[name] = value
     horizons = np.arange(1, spans + 1) * size // spans
     room = np.ones(spans)
     if amplitude_limit is not None:
@@ -295,8 +238,8 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
         room = np.clip(sine * (horizons + size / 16), FLOOR, 1.0)
         room[-1] = max(sine * size, FLOOR)
     room[-1] = min(room[-1], 1.0 - RESERVE)
-    laps_out, laps_in, squares = np.zeros((3, size + 1))
-    return LimiterState(numbers, horizons, np.zeros(spans), room, laps_out, laps_in, squares)
+    numbers["horizon"][0, :spans], numbers["room"][0, :spans] = horizons, room
+    return LimiterState(numbers, np.zeros((3, size + 1)))
 
 
 def _kept(windows: float, size: int) -> float:

@@ -256,7 +256,7 @@ def assert_same_controller(one: PowerBudgetController, other: PowerBudgetControl
 def test_pieces_of_the_compiled_loop_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = run(controller())
     for size in (1, 7, 128, 499):
-        monkeypatch.setattr("kfopc_filterpy.loop.simulation.STEP", size)
+        monkeypatch.setattr("kfopc_filterpy.loop.simulation.STRETCH", size)
         assert_same_run(whole, run(controller()))
 
 

@@ -214,7 +214,7 @@ def test_compiled_run_takes_up_what_was_set_on_the_estimator(name, change):
 @pytest.mark.parametrize("name", NAMES)
 def test_pieces_of_the_compiled_loop_do_not_show(name, step, monkeypatch):
     whole = run(controller(name))
-    monkeypatch.setattr("kfopc_filterpy.loop.simulation.STEP", step)
+    monkeypatch.setattr("kfopc_filterpy.loop.simulation.STRETCH", step)
     done = []
     assert_same_run(whole, run(controller(name), progress=done.append))
     assert sum(done) == N

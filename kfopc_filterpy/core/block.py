@@ -1,0 +1,283 @@
+"""A controller of the core: its plan, its block of memory, and the named fields of that block as numpy arrays."""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .library import Library, load
+
+ALIGNMENT = 64  # bytes; wide vectors are fastest there
+_STATE, _SETTING, _SCRATCH = range(3)
+_KINDS = (np.dtype(np.float64), np.dtype(np.int32))
+_VIEW_PLACES = 96
+_step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
+
+# What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
+LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION = range(1, 6)
+REASONS = {
+    LOUD_REFERENCE: "the reference is louder than the largest signal that can be controlled, 1e100 over the path's gain",
+    LOUD_ERROR: "the error is louder than the largest signal that can be controlled, 1e100",
+    LOUD_ESTIMATE: "the disturbance estimate e + s^ * y overflows: it is louder than 1e100",
+    LOUD_STEP: "the step of the weights overflows: step size times error is above 1e50",
+    NO_SOLUTION: "the update has no solution: S = x' P x' + q must be positive and finite",
+}
+
+
+class _Plan(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int32) for name in ("microphones", "loudspeakers", "references", "taps", "path_taps")),
+        *((name, ctypes.c_int32) for name in ("guard_taps", "limited")),
+        *((name, ctypes.c_void_p) for name in ("power_windows", "limiter_windows", "path", "guard", "settings")),
+    ]
+
+
+class _Setting(ctypes.Structure):
+    _fields_ = [
+        ("name", ctypes.c_char_p),
+        ("least", ctypes.c_double),
+        ("most", ctypes.c_double),
+        ("each", ctypes.c_int),
+    ]
+
+
+class _Algorithm(ctypes.Structure):
+    _fields_ = [
+        ("name", ctypes.c_char_p),
+        ("settings", ctypes.POINTER(_Setting)),
+        *((name, ctypes.c_void_p) for name in ("layout", "start", "control_signal", "update")),
+    ]
+
+
+_Visitor = ctypes.PYFUNCTYPE(
+    None,
+    *(ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_size_t),
+    ctypes.POINTER(ctypes.c_int32),
+)
+
+
+class Setting(NamedTuple):
+    """A setting of an algorithm: its name, and whether each loudspeaker has one of its own."""
+
+    name: str
+    each: bool
+
+
+class Algorithm:
+    """An algorithm of the core, or of a library that somebody built from a C file of his own.
+
+    Parameters
+    ----------
+    name : str
+        Name in C, without the prefix ``anc_``.
+    path : str or Path, optional
+        Library that has it, see `build_algorithm`; by default the core's.
+
+    Raises
+    ------
+    ValueError
+        If the library has no algorithm of that name.
+    """
+
+    def __init__(self, name: str, path: str | Path | None = None) -> None:
+        self.name, self.path = name, None if path is None else str(path)
+        self._library: Library = load()
+        library = self._library.held if path is None else ctypes.PyDLL(str(path))
+        try:
+            self._struct = _Algorithm.in_dll(library, f"anc_{name}")
+        except ValueError:
+            raise ValueError(f"{self.path or 'the core'} has no algorithm anc_{name}") from None
+        self.pointer = ctypes.addressof(self._struct)
+        self.settings: list[Setting] = []
+        while (name_of := self._struct.settings[len(self.settings)].name) is not None:
+            self.settings.append(Setting(name_of.decode(), bool(self._struct.settings[len(self.settings)].each)))
+
+    @property
+    def steps(self) -> tuple[int, int]:
+        """Addresses of the functions `control_signal` and `update`."""
+        return self._struct.control_signal, self._struct.update
+
+    def __reduce__(self) -> Any:
+        return Algorithm, (self.name, self.path)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The numbers that decide the size of a block; see `anc_plan` in anc.h."""
+
+    microphones: int
+    loudspeakers: int
+    references: int
+    taps: int
+    path_taps: int
+    guard_taps: int = 0
+    power_windows: tuple[int, ...] = ()
+    limiter_windows: tuple[int, ...] = ()
+
+
+class InUse:
+    """A context that refuses to be entered by a second thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            raise RuntimeError("this controller is in use by another thread: give each thread a controller of its own")
+
+    def __exit__(self, *_: Any) -> None:
+        self._lock.release()
+
+
+class Block:
+    """A controller's memory. A copy of `memory` is a copy of the controller.
+
+    Parameters
+    ----------
+    algorithm : Algorithm
+        Its steps.
+    shape : Shape
+        Its size.
+    path : ndarray, shape (K, J, M)
+        Estimated secondary paths of a fresh block.
+    settings : mapping of str to float or sequence of J
+        Settings of a fresh block, by name.
+    guard : ndarray, shape (G,), optional
+        Filter W of a fresh block with guard_taps.
+    memory : ndarray of uint8, optional
+        Memory of another block of this algorithm and shape, to go on from; a copy is kept.
+
+    Attributes
+    ----------
+    fields : dict of ndarray
+        Views of the memory, by name, four axes each; see `layout_signals` in signals.c.
+    states : list of str
+        Names of those that a step changes and a next one needs.
+    """
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        shape: Shape,
+        *,
+        path: NDArray[np.float64] | None = None,
+        settings: Mapping[str, float | Sequence[float]] | None = None,
+        guard: NDArray[np.float64] | None = None,
+        memory: NDArray[np.uint8] | None = None,
+    ) -> None:
+        self.algorithm, self.shape = algorithm, shape
+        self.in_use = InUse()
+        self._library: Any = load().held
+        keep = self._plan_arrays(path, settings, guard)
+        plan = self._plan_of(shape, keep)
+        of = ctypes.byref
+        self._library.anc_size.restype = ctypes.c_size_t
+        size = self._library.anc_size(ctypes.c_void_p(algorithm.pointer), of(plan))
+        if not size:
+            raise ValueError(f"a controller of this size cannot be made: {shape}")
+        room = np.zeros(size + ALIGNMENT, np.uint8)
+        self.memory = room[-room.ctypes.data % ALIGNMENT :][:size]
+        if memory is not None:
+            if memory.size != size:
+                raise ValueError(f"the memory must have {size} bytes, got {memory.size}")
+            self.memory[:] = memory
+        self._view = (ctypes.c_void_p * _VIEW_PLACES)()
+        self.address = ctypes.addressof(self._view)
+        opened = self._library.anc_open(
+            ctypes.c_void_p(algorithm.pointer),
+            of(plan),
+            self._view,
+            ctypes.c_void_p(self.memory.ctypes.data),
+            ctypes.c_size_t(size),
+            ctypes.c_int(memory is None),
+        )
+        if not opened:
+            raise ValueError(f"a setting or a path of {algorithm.name} is out of its range: {settings}")
+        self.fields: dict[str, NDArray[Any]] = {}
+        self.states: list[str] = []
+        self._library.anc_describe(ctypes.c_void_p(algorithm.pointer), of(plan), _Visitor(self._keep_field), None)
+        self.reference, self.control_signal = np.zeros(shape.references), np.zeros(shape.loudspeakers)
+        self.error = np.zeros(shape.microphones)
+        control, update = algorithm.steps
+        pointers = (ctypes.c_void_p,) * 3
+        self._control = _step(ctypes.c_int, *pointers)(control)
+        self._update = _step(ctypes.c_int, *pointers[:2])(update)
+        self._addresses = [array.ctypes.data for array in (self.reference, self.control_signal, self.error)]
+
+    def _plan_arrays(self, path: Any, settings: Any, guard: Any) -> dict[str, np.ndarray]:
+        """Return the arrays that a plan points to."""
+        shape, numbers = self.shape, dict(settings or {})
+        values = [np.broadcast_to(numbers.pop(name), shape.loudspeakers if each else 1) for name, each in self.algorithm.settings] if numbers else []
+        if numbers:
+            raise TypeError(f"{self.algorithm.name} has no setting {', '.join(numbers)}")
+        return {
+            "power_windows": np.array(shape.power_windows, np.int32),
+            "limiter_windows": np.array(shape.limiter_windows, np.int32),
+            "path": np.array([] if path is None else path, np.float64, order="C"),
+            "guard": np.array([] if guard is None else guard, np.float64),
+            "settings": np.concatenate([*values, np.zeros(1)]),
+        }
+
+    @staticmethod
+    def _plan_of(shape: Shape, arrays: dict[str, np.ndarray]) -> _Plan:
+        counts = {name: value for name, value in asdict(shape).items() if isinstance(value, int)}
+        pointers = {name: array.ctypes.data if array.size else None for name, array in arrays.items()}
+        return _Plan(**counts, limited=bool(shape.limiter_windows), **pointers)
+
+    def _keep_field(self, _: Any, name: bytes, role: int, kind: int, offset: int, shape: Any) -> None:
+        axes, dtype = tuple(shape[i] for i in range(4)), _KINDS[kind]
+        count = int(np.prod(axes))
+        self.fields[name.decode()] = self.memory[offset : offset + count * dtype.itemsize].view(dtype).reshape(axes)
+        if role == _STATE:
+            self.states.append(name.decode())
+
+    def remade(self, shape: Shape, guard: NDArray[np.float64] | None = None) -> Block:
+        """Return a block of another shape that goes on from this one: fields of the same name and shape are copied."""
+        own = {name: self.fields[name].ravel() for name, _ in self.algorithm.settings}
+        settings = {name: own[name] if each else own[name][0] for name, each in self.algorithm.settings}
+        other = Block(self.algorithm, shape, path=self.fields["secondary_path"][0], settings=settings, guard=guard)
+        for name, field in self.fields.items():
+            if other.fields[name].shape == field.shape and name != "guard":
+                other.fields[name][:] = field
+        return other
+
+    def with_guard(self, guard: NDArray[np.float64] | None) -> Block:
+        """Return a block with another guard, or none, that has heard what this one has."""
+        other = self.remade(replace(self.shape, guard_taps=0 if guard is None else guard.size), guard)
+        other.refilter()
+        return other
+
+    def emit(self) -> int:
+        """Take `reference`, set `control_signal`, and return the answer, 0 if all is well."""
+        with self.in_use:
+            return self._control(self.address, self._addresses[0], self._addresses[1])
+
+    def update(self) -> int:
+        """Adapt to `error` and return the answer, 0 if all is well."""
+        with self.in_use:
+            return self._update(self.address, self._addresses[2])
+
+    def listen(self, references: NDArray[np.float64], errors: NDArray[np.float64], adapting: NDArray[np.bool_]) -> int:
+        """Follow (n, I) and (n, K) while the loudspeakers are silent; return the number of samples before a refusal."""
+        arrays = [np.ascontiguousarray(array) for array in (references, errors, adapting)]
+        self._library.anc_listen.restype = ctypes.c_int64
+        with self.in_use:
+            pointers = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
+            return self._library.anc_listen(self._view, *pointers, ctypes.c_int64(len(arrays[0])))
+
+    def refilter(self) -> None:
+        """Filter the stored references again, after the path or the guard has changed."""
+        with self.in_use:
+            self._library.anc_refilter(self._view)
+
+    def newest(self, name: str) -> NDArray[np.float64]:
+        """Return the newest samples of a delay line, newest first: views, with the line's channels as leading axes."""
+        room, at = self.fields[name], int(self.fields[f"{name}_at"].item())
+        return room[..., at : at + (room.shape[-1] - 64) // 4]

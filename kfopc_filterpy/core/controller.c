@@ -1,0 +1,66 @@
+/* What a host calls: measure, open, describe. */
+#include "signals.h"
+#include <string.h>
+
+static int in_range(const anc_setting *setting, real value)
+{
+    return value >= setting->least && (setting->most == 0 ? isfinite(value) : value <= setting->most);
+}
+
+static int all_finite(const real *values, size_t n)
+{
+    for (size_t i = 0; i < n; i++)
+        if (!isfinite(values[i])) return 0;
+    return 1;
+}
+
+/* Return whether all counts that a block needs fit into an int32. */
+static int shape_accepted(const anc_plan *p)
+{
+    const int32_t shape[] = {p->microphones, p->loudspeakers, p->references, p->taps, p->path_taps};
+    const double most = (1 << 28), K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps;
+    for (int i = 0; i < 5; i++)
+        if (shape[i] < 1 || shape[i] > most) return 0;
+    if (p->guard_taps < 0 || p->guard_taps > ANC_GUARD_TAPS || (p->limited && !p->limiter_windows)) return 0;
+    for (int32_t j = 0; j < p->loudspeakers; j++)
+        if ((p->power_windows && (p->power_windows[j] < 0 || ANC_POWERS * J * p->power_windows[j] > most)) ||
+            (p->limited && (p->limiter_windows[j] < 1 || 3 * J * p->limiter_windows[j] > most)))
+            return 0;
+    return K * J * I * (4 * L + 4 * ANC_GUARD_TAPS + 64) <= most && (I + K * J) * (4 * (L + M) + 8 * ANC_GUARD_TAPS + 64) <= most;
+}
+
+static int values_accepted(const anc_algorithm *a, const anc_plan *p)
+{
+    const real *value = p->settings;
+    for (int i = 0; a->settings[i].name; i++)
+        for (int32_t j = 0; j < (a->settings[i].each ? p->loudspeakers : 1); j++)
+            if (!in_range(a->settings + i, *value++)) return 0;
+    return all_finite(p->path, times(p->microphones * p->loudspeakers, p->path_taps)) && (!p->guard_taps || all_finite(p->guard, (size_t)p->guard_taps));
+}
+
+size_t anc_size(const anc_algorithm *a, const anc_plan *plan)
+{
+    anc_view view;
+    anc_layout at = {0};
+    if (!shape_accepted(plan)) return 0;
+    a->layout(&view, plan, a->settings, &at);
+    return at.size == SIZE_MAX ? 0 : at.size;
+}
+
+int anc_open(const anc_algorithm *a, const anc_plan *plan, anc_view *view, void *block, size_t bytes, int fresh)
+{
+    const size_t size = anc_size(a, plan);
+    anc_layout at = {.memory = block};
+    if (!size || bytes < size || (uintptr_t)block % sizeof(real) || (fresh && !values_accepted(a, plan))) return 0;
+    if (fresh) memset(block, 0, size);
+    a->layout(view, plan, a->settings, &at);
+    if (fresh) a->start(view, plan, a->settings);
+    return 1;
+}
+
+void anc_describe(const anc_algorithm *a, const anc_plan *plan, anc_visitor *visit, void *to)
+{
+    anc_view view;
+    anc_layout at = {.visit = visit, .to = to};
+    if (shape_accepted(plan)) a->layout(&view, plan, a->settings, &at);
+}

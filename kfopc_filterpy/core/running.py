@@ -1,0 +1,194 @@
+"""The core's loop: a controller of the core, or functions at two addresses, with a plant or over a block."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .calls import amplify_all
+from .library import load
+
+RUNNING, DIVERGED, REFUSED_REFERENCE, REFUSED_ERROR = range(4)
+LINEAR, HARD_CLIP, SOFT_SATURATION = range(3)
+_library: Any = load().free  # other threads run meanwhile
+
+
+class Steps(NamedTuple):
+    """A controller as the loop sees it: `anc_controller` in anc.h."""
+
+    address: int  # of the controller, which must exist for as long as the loop runs
+    control_signal: int  # addresses of the two functions
+    update: int
+
+
+class _Controller(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("self", "control_signal", "update")]
+
+
+class _Plant(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int32) for name in ("microphones", "loudspeakers", "references", "path_taps", "feedback_taps")),
+        *((name, ctypes.c_int32) for name in ("at", "length")),
+        *((name, ctypes.c_void_p) for name in ("path", "feedback", "amplifiers", "output")),
+        *((name, ctypes.c_void_p) for name in ("reference", "control", "error", "limit")),
+    ]
+
+
+class _Record(ctypes.Structure):
+    _fields_ = [
+        ("source", ctypes.c_void_p),
+        *((name, ctypes.c_int64) for name in ("step", "count", "every", "row", "column")),
+        ("to", ctypes.c_void_p),
+    ]
+
+
+class _Signals(ctypes.Structure):
+    _fields_ = [
+        ("length", ctypes.c_int64),
+        *((name, ctypes.c_void_p) for name in ("reference", "disturbance", "sensor_noise")),
+        *((name, ctypes.c_void_p) for name in ("error", "control_signal", "amplifier_output", "anti_noise")),
+    ]
+
+
+class Signals(NamedTuple):
+    """Signals of a run, C-contiguous, (channels, n_samples): three inputs, then the results of the loop."""
+
+    reference: NDArray[np.float64]  # (I, n)
+    disturbance: NDArray[np.float64]  # (K, n)
+    sensor_noise: NDArray[np.float64] | None  # (K, n)
+    error: NDArray[np.float64]  # (K, n)
+    control_signal: NDArray[np.float64]  # (J, n)
+    amplifier_output: NDArray[np.float64]  # (J, n)
+    anti_noise: NDArray[np.float64]  # (K, n)
+
+
+class Record(NamedTuple):
+    """Numbers of a controller that the loop writes down: at every `every`-th sample, a column, or a row of `to`."""
+
+    source: NDArray[np.float64]  # (count,), with any stride
+    to: NDArray[np.float64]  # (count, n_samples), or (rows, count) if `in_rows`
+    every: int = 1
+    in_rows: bool = False
+
+    def _struct(self) -> _Record:
+        row, column = (self.to.shape[1], 1) if self.in_rows else (1, self.to.shape[1])
+        stride = self.source.strides[0] // 8 if self.source.size > 1 else 1
+        return _Record(
+            self.source.ctypes.data, stride, self.source.size, self.every, row, column, self.to.ctypes.data
+        )
+
+
+class Plant:
+    """The true amplifiers and paths, which start silent.
+
+    Parameters
+    ----------
+    secondary : ndarray, shape (K, J, taps)
+        Secondary paths s.
+    feedback : ndarray, shape (I, J, taps)
+        Paths from the loudspeakers to the reference microphones; 0 taps: none.
+    amplifiers : ndarray, shape (J, 3)
+        Kind, limit and sharpness of each amplifier model.
+    limit : ndarray, shape (J,)
+        A control signal beyond it is a divergence.
+    """
+
+    def __init__(
+        self,
+        secondary: NDArray[np.float64],
+        feedback: NDArray[np.float64],
+        amplifiers: NDArray[np.float64],
+        limit: NDArray[np.float64],
+    ) -> None:
+        K, J, taps = secondary.shape
+        longest = max(taps, feedback.shape[2])
+        length = 4 * longest + 64
+        self.reference, self.control, self.error = np.zeros(len(feedback)), np.zeros(J), np.zeros(K)
+        self.limit, self._models = np.ascontiguousarray(limit, np.float64), np.ascontiguousarray(amplifiers)
+        self._arrays = [
+            *(np.ascontiguousarray(array) for array in (secondary, feedback)),
+            self._models,
+            np.zeros((J, length)),
+            self.reference,
+            self.control,
+            self.error,
+            self.limit,
+        ]
+        counts = (K, J, len(feedback), taps, feedback.shape[2], length - longest, length)
+        self._struct = _Plant(*counts, *(array.ctypes.data for array in self._arrays))
+
+    def run(self, steps: Steps, signals: Signals, records: list[Record], begin: int, end: int) -> tuple[int, int]:
+        """Run a controller from sample `begin` to `end`; return the status and the first sample not completed."""
+        notes = (_Record * max(len(records), 1))(*(record._struct() for record in records))
+        status = ctypes.c_int32()
+        _library.anc_run.restype = ctypes.c_int64
+        done = _library.anc_run(
+            ctypes.byref(_Controller(*steps)),
+            ctypes.byref(self._struct),
+            ctypes.byref(_pointers(signals)),
+            notes,
+            ctypes.c_int32(len(records)),
+            ctypes.c_int64(begin),
+            ctypes.c_int64(end),
+            ctypes.byref(status),
+        )
+        return status.value, done
+
+    def hear(self, signals: Signals, n: int) -> NDArray[np.float64]:
+        """Return the references of sample n, (I,)."""
+        _library.anc_hear(ctypes.byref(self._struct), ctypes.byref(_pointers(signals)), ctypes.c_int64(n))
+        return self.reference
+
+    def amplified(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the outputs of the amplifier models for control signals, (J,)."""
+        y, out = np.ascontiguousarray(y), np.empty(y.size)
+        for j in range(y.size):
+            amplify_all(self._models[j].ctypes.data, y[j:].ctypes.data, out[j:].ctypes.data, 1)
+        return out
+
+    def play(self, amplified: NDArray[np.float64], signals: Signals, n: int) -> NDArray[np.float64]:
+        """Send the amplifiers' outputs, (J,), through the paths; return the errors of sample n, (K,)."""
+        self.control[:] = amplified
+        _library.anc_play(
+            ctypes.byref(self._struct),
+            ctypes.c_void_p(self.control.ctypes.data),
+            ctypes.byref(_pointers(signals)),
+            ctypes.c_int64(n),
+        )
+        return self.error
+
+
+def _pointers(signals: Signals) -> _Signals:
+    pointers = (None if signal is None else signal.ctypes.data for signal in signals)
+    return _Signals(signals.disturbance.shape[1], *pointers)
+
+
+def process(
+    steps: Steps,
+    x: NDArray[np.float64],
+    e: NDArray[np.float64],
+    y: NDArray[np.float64],
+    adapting: NDArray[np.bool_],
+    begin: int,
+    end: int,
+) -> tuple[int, int]:
+    """Process a block, (channels, n_samples), C-contiguous, from sample `begin` to `end`.
+
+    Return the status and the first sample that was refused, or `end`.
+    """
+    scratch, status = np.empty(len(x) + len(y) + len(e)), ctypes.c_int32()
+    _library.anc_process.restype = ctypes.c_int64
+    done = _library.anc_process(
+        ctypes.byref(_Controller(*steps)),
+        *(ctypes.c_int32(len(signal)) for signal in (x, y, e)),
+        *(ctypes.c_void_p(array.ctypes.data) for array in (x, e, y, adapting)),
+        ctypes.c_int64(x.shape[1]),
+        ctypes.c_int64(begin),
+        ctypes.c_int64(end),
+        ctypes.c_void_p(scratch.ctypes.data),
+        ctypes.byref(status),
+    )
+    return status.value, done

@@ -1,0 +1,243 @@
+#include "signals.h"
+#include <string.h>
+
+enum { ALIGN = 64, SLACK = 64 };
+
+/* Layout. */
+
+/* Give the next field its place in the block, and return it; NULL while the block is only measured. */
+static void *field(anc_layout *at, const char *name, anc_role role, anc_type type, const int32_t shape[4])
+{
+    const size_t offset = at->size, most = SIZE_MAX / 4;
+    size_t bytes = type == ANC_IS_REAL ? sizeof(real) : sizeof(int32_t);
+    for (int i = 0; i < 4; i++) bytes = shape[i] && bytes > most / (size_t)shape[i] ? most : bytes * (size_t)shape[i];
+    at->size = offset > most || bytes >= most ? SIZE_MAX : offset + (bytes + ALIGN - 1) / ALIGN * ALIGN;
+    if (at->visit) at->visit(at->to, name, role, type, offset, shape);
+    return at->memory ? at->memory + offset : NULL;
+}
+
+real *reals(anc_layout *at, const char *name, anc_role role, int32_t n0, int32_t n1, int32_t n2, int32_t n3)
+{
+    const int32_t shape[4] = {n0, n1, n2, n3};
+    return field(at, name, role, ANC_IS_REAL, shape);
+}
+
+int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n)
+{
+    const int32_t shape[4] = {1, 1, 1, n};
+    return field(at, name, role, ANC_IS_INT32, shape);
+}
+
+static lines layout_lines(anc_layout *at, const char *name, const char *name_at, int32_t n0, int32_t n1, int32_t n2, int32_t taps)
+{
+    const int32_t length = 4 * taps + SLACK;
+    real *room = reals(at, name, ANC_STATE, n0, n1, n2, length);
+    return (lines){room, int32s(at, name_at, ANC_STATE, 1), n0 * n1 * n2, taps, length};
+}
+
+static int32_t longest(const int32_t *lengths, int32_t n)
+{
+    int32_t most = 0;
+    for (int32_t i = 0; lengths && i < n; i++) most = lengths[i] > most ? lengths[i] : most;
+    return most;
+}
+
+#define COLUMNS(type) (int32_t)(sizeof(type) / sizeof(real))
+
+void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at)
+{
+    const int32_t K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps, G = p->guard_taps;
+    const int32_t filtered = L > ANC_GUARD_TAPS ? L : ANC_GUARD_TAPS; /* a guard can come later, and needs the past */
+    s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
+    s->limited = p->limited;
+    s->power_length = longest(p->power_windows, J), s->limiter_length = longest(p->limiter_windows, J);
+    s->path = reals(at, "secondary_path", ANC_SETTING, 1, K, J, M);
+    s->guard = reals(at, "guard", ANC_SETTING, 1, 1, 1, G);
+    s->loudest = reals(at, "loudest", ANC_SETTING, 1, 1, 1, 1);
+    for (int i = 0; settings[i].name; i++) s->setting[i] = reals(at, settings[i].name, ANC_SETTING, 1, 1, 1, settings[i].each ? J : 1);
+    s->amplifier = (anc_amplifier *)reals(at, "amplifier", ANC_SETTING, 1, 1, J, COLUMNS(anc_amplifier));
+    s->x = layout_lines(at, "reference", "reference_at", 1, 1, I, filtered + M + ANC_GUARD_TAPS - 2);
+    s->filtered = layout_lines(at, "filtered_reference", "filtered_reference_at", K, J, I, filtered);
+    s->guarded = layout_lines(at, "guarded_reference", "guarded_reference_at", G ? K : 0, J, I, L);
+    s->y = layout_lines(at, "output", "output_at", 1, 1, J, M);
+    s->weights = reals(at, "weights", ANC_STATE, 1, J, I, L);
+    s->control = reals(at, "control_signal", ANC_STATE, 1, 1, 1, J);
+    s->constraint = (anc_constraint *)reals(at, "constraint", ANC_STATE, 1, 1, J, COLUMNS(anc_constraint));
+    s->powers = (anc_power *)reals(at, "powers", ANC_STATE, 1, J, ANC_POWERS, COLUMNS(anc_power));
+    s->power_windows = int32s(at, "power_windows", ANC_SETTING, J);
+    s->power_window = reals(at, "power_window", ANC_STATE, 1, J, ANC_POWERS, s->power_length);
+    s->limiter = (anc_limiter *)reals(at, "limiter", ANC_STATE, 1, 1, p->limited ? J : 0, COLUMNS(anc_limiter));
+    s->laps = reals(at, "laps", ANC_STATE, 1, p->limited ? J : 0, 3, s->limiter_length + 1);
+    s->previewed = (anc_previewed *)reals(at, "previewed", ANC_SCRATCH, 1, 1, J, COLUMNS(anc_previewed));
+    s->estimate = reals(at, "disturbance", ANC_SCRATCH, 1, 1, 1, K);
+    s->heard = reals(at, "heard", ANC_SCRATCH, 1, 1, 1, K);
+    s->squares = reals(at, "squares", ANC_SCRATCH, 1, 1, 1, 2 + J);
+    s->step = reals(at, "step", ANC_SCRATCH, 1, 1, J, STEPS);
+}
+
+/* Set the loudest reference, so that nothing that is filtered from it overflows. */
+static void set_loudest(signals *s)
+{
+    real reach = 1, guard = 1;
+    for (int32_t kj = 0; kj < s->K * s->J; kj++) {
+        real sum = 0;
+        for (int32_t m = 0; m < s->M; m++) sum += (real)fabs(s->path[times(kj, s->M) + (size_t)m]);
+        if (sum > reach) reach = sum;
+    }
+    for (int32_t g = 0; g < s->G; g++) guard += (real)fabs(s->guard[g]);
+    *s->loudest = LOUDEST / reach / guard;
+}
+
+void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)
+{
+    const real *from = p->settings;
+    memcpy(s->path, p->path, sizeof(real) * times(s->K * s->J, s->M));
+    if (s->G) memcpy(s->guard, p->guard, sizeof(real) * (size_t)s->G);
+    for (int i = 0; settings[i].name; i++)
+        for (int32_t j = 0; j < (settings[i].each ? s->J : 1); j++) s->setting[i][j] = *from++;
+    for (int32_t j = 0; j < s->J; j++) {
+        s->power_windows[j] = p->power_windows ? p->power_windows[j] : 0;
+        s->amplifier[j] = (anc_amplifier){ANC_LINEAR, 1, 1};
+        s->constraint[j] = (anc_constraint){.rated_power = 1, .rate = 1, .supplied_factor = 1, .supplied_power = (real)NAN,
+                                            .supplied_gain = (real)NAN, .factor = 1, .gain = (real)NAN};
+    }
+    set_loudest(s);
+}
+
+/* A sample. */
+
+/* Make room for one more sample in every row. */
+static void advance(lines *l)
+{
+    if (--*l->at >= 0) return;
+    *l->at = l->length - l->taps;
+    for (int32_t row = 0; row < l->rows; row++)
+        memcpy(newest(l, row) + 1, l->room + times(row, l->length), sizeof(real) * (size_t)(l->taps - 1));
+}
+
+int take_reference(signals *s, const real *reference)
+{
+    for (int32_t i = 0; i < s->I; i++)
+        if (!within(reference[i], *s->loudest)) return ANC_LOUD_REFERENCE;
+    advance(&s->x), advance(&s->filtered);
+    if (s->G) advance(&s->guarded);
+    for (int32_t i = 0; i < s->I; i++) *newest(&s->x, i) = reference[i];
+    for (int32_t kj = 0; kj < s->K * s->J; kj++)
+        for (int32_t i = 0; i < s->I; i++) {
+            const int32_t row = kj * s->I + i;
+            *newest(&s->filtered, row) = dot(s->path + times(kj, s->M), newest(&s->x, i), s->M); /* x' = s^ * x */
+            if (s->G) *newest(&s->guarded, row) = dot(s->guard, newest(&s->filtered, row), s->G); /* x'' = W * x' */
+        }
+    return ANC_DONE;
+}
+
+real filter_output(const signals *s, int32_t j)
+{
+    real y = 0;
+    for (int32_t i = 0; i < s->I; i++) y += dot(s->weights + times(j * s->I + i, s->L), newest(&s->x, i), s->L);
+    return y;
+}
+
+void emit(signals *s, int32_t j, real y)
+{
+    if (j == 0) advance(&s->y);
+    if (s->limited) y = anc_limit(s->limiter + j, s->laps + times(3 * j, s->limiter_length + 1), y);
+    s->control[j] = y;
+    *newest(&s->y, j) = anc_amplify(s->amplifier + j, y);
+}
+
+real heard_output(const signals *s, const lines *rows, int32_t k)
+{
+    real sum = 0;
+    for (int32_t ji = 0; ji < s->J * s->I; ji++) sum += dot(s->weights + times(ji, s->L), newest(rows, k * s->J * s->I + ji), s->L);
+    return sum;
+}
+
+/* Squares: d^ summed over microphones, x over references, x'_j over both. */
+enum { D2, X2, F2 };
+
+int estimate(signals *s, const real *error)
+{
+    s->squares[D2] = s->squares[X2] = 0;
+    for (int32_t k = 0; k < s->K; k++) {
+        if (!within(error[k], LOUDEST)) return ANC_LOUD_ERROR;
+        s->estimate[k] = error[k];
+        for (int32_t j = 0; j < s->J; j++) s->estimate[k] += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, j), s->M);
+        if (!within(s->estimate[k], LOUDEST)) return ANC_LOUD_ESTIMATE;
+        s->squares[D2] += s->estimate[k] * s->estimate[k];
+    }
+    for (int32_t i = 0; i < s->I; i++) s->squares[X2] += *newest(&s->x, i) * *newest(&s->x, i);
+    for (int32_t j = 0; j < s->J; j++) {
+        real f2 = 0;
+        for (int32_t k = 0; k < s->K; k++)
+            for (int32_t i = 0; i < s->I; i++) {
+                const real f = *newest(&s->filtered, (k * s->J + j) * s->I + i);
+                f2 += f * f;
+            }
+        s->squares[F2 + j] = f2;
+        anc_preview(s->constraint + j, s->powers + ANC_POWERS * j, s->power_window + times(ANC_POWERS * j, s->power_length),
+                    s->power_windows[j], s->previewed + j, s->squares[D2], f2, s->squares[X2]);
+    }
+    return ANC_DONE;
+}
+
+void commit(signals *s)
+{
+    for (int32_t j = 0; j < s->J; j++)
+        anc_commit(s->constraint + j, s->powers + ANC_POWERS * j, s->power_window + times(ANC_POWERS * j, s->power_length),
+                   s->power_windows[j], s->previewed + j, s->squares[D2], s->squares[F2 + j], s->squares[X2]);
+}
+
+int descend(signals *s, const real *error)
+{
+    const int32_t rows = s->J * s->I;
+    for (int32_t k = 0; k < s->K; k++) {
+        s->heard[k] = s->G ? heard_output(s, &s->guarded, k) : 0;
+        for (int32_t j = 0; j < s->J; j++) {
+            const real *step = s->step + STEPS * j;
+            if (!within(step[MU] * error[k], LARGEST) || !within(step[MU] * s->heard[k], LARGEST) || !within(step[PENALTY], LARGEST))
+                return ANC_LOUD_STEP;
+        }
+    }
+    commit(s);
+    for (int32_t ji = 0; ji < rows; ji++) {
+        const real *step = s->step + STEPS * (ji / s->I), *x = newest(&s->x, ji % s->I);
+        real *w = s->weights + times(ji, s->L);
+        for (int32_t k = 0; s->G && k < s->K; k++) /* a leak where the paths are uncertain: w -= mu (w'x'') x'' */
+            add_scaled(w, -step[MU] * s->heard[k], newest(&s->guarded, k * rows + ji), s->L);
+        if (step[KEEP] != 1 || step[PENALTY] != 0)
+            for (int32_t l = 0; l < s->L; l++) w[l] = step[KEEP] * w[l] - step[PENALTY] * x[l];
+        for (int32_t k = 0; k < s->K; k++) add_scaled(w, step[MU] * error[k], newest(&s->filtered, k * rows + ji), s->L);
+    }
+    return ANC_DONE;
+}
+
+int64_t anc_listen(anc_view *view, const real *x, const real *e, const uint8_t *adapt, int64_t n)
+{
+    signals *s = (signals *)view;
+    for (int64_t t = 0; t < n; t++) {
+        if (take_reference(s, x + t * s->I)) return t;
+        for (int32_t j = 0; j < s->J; j++) emit(s, j, 0);
+        if (!adapt[t]) continue;
+        if (estimate(s, e + t * s->K)) return t;
+        commit(s);
+    }
+    return n;
+}
+
+void anc_refilter(anc_view *view)
+{
+    signals *s = (signals *)view;
+    for (int32_t kj = 0; kj < s->K * s->J; kj++)
+        for (int32_t i = 0; i < s->I; i++) {
+            real *filtered = newest(&s->filtered, kj * s->I + i);
+            for (int32_t n = 0; n < s->filtered.taps; n++) filtered[n] = dot(s->path + times(kj, s->M), newest(&s->x, i) + n, s->M);
+            /* The guard also needs x' of before its delay line, which is filtered here once more. */
+            for (int32_t n = 0; s->G && n < s->L; n++) {
+                real sum = 0;
+                for (int32_t g = 0; g < s->G; g++) sum += s->guard[g] * dot(s->path + times(kj, s->M), newest(&s->x, i) + n + g, s->M);
+                newest(&s->guarded, kj * s->I + i)[n] = sum;
+            }
+        }
+    set_loudest(s);
+}

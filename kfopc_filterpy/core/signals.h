@@ -1,0 +1,66 @@
+/* The signals of a filtered-reference controller: x, x' = s^ * x, y, d^ = e + s^ * y, and the powers of eq. 10-13. */
+#ifndef SIGNALS_H
+#define SIGNALS_H
+#include "vectors.h"
+
+/* No signal may be louder than LOUDEST, nor a factor of a step larger than LARGEST: so no square overflows, and no weight or
+ * control signal can within 10^40 samples (in float 10^5). What passes these limits is refused before anything changes. */
+#ifdef ANC_FLOAT
+static const real LOUDEST = 1e12f, LARGEST = 1e6f;
+#else
+static const real LOUDEST = 1e100, LARGEST = 1e50;
+#endif
+
+enum { ANC_MOST_SETTINGS = 8, ANC_GUARD_TAPS = 48 };
+
+typedef struct { /* delay lines that advance together */
+    real *room;  /* (rows, length) */
+    int32_t *at; /* where the newest samples stand */
+    int32_t rows, taps, length;
+} lines;
+
+typedef struct {
+    int32_t K, J, I, L, M, G;
+    int32_t limited, power_length, limiter_length; /* the longest windows: rows of `power_window` and `laps` */
+    int32_t *power_windows;                        /* (J) */
+    real *path, *guard;                            /* s^, (K, J, M), and W, (G) */
+    real *loudest;                                 /* |x| beyond it is refused */
+    real *setting[ANC_MOST_SETTINGS];              /* the algorithm's own: one number each, or (J) */
+    lines x, filtered, y, guarded;                 /* rows (I), (K, J, I), (J), (K, J, I); y after limiter and amplifier model */
+    anc_amplifier *amplifier;                      /* (J) known models; linear: d^ = e + s^ * y as published */
+    anc_limiter *limiter;                          /* (J) if limited */
+    real *laps;                                    /* (J, 3, limiter_length + 1) */
+    anc_constraint *constraint;                    /* (J) */
+    anc_power *powers;                             /* (J, ANC_POWERS) */
+    real *power_window;                            /* (J, ANC_POWERS, power_length) */
+    real *weights;                                 /* (J, I, L) */
+    real *control;                                 /* (J) the last y */
+    anc_previewed *previewed;                      /* (J) */
+    real *estimate, *heard;                        /* (K) d^, and sum_ji w_ji' x'_kji */
+    real *squares;                                 /* (2 + J) of d^, x and x'_j, previewed */
+    real *step;                                    /* (J, STEPS) */
+} signals;
+
+enum { KEEP, MU, PENALTY, STEPS }; /* of one loudspeaker's step: w = keep w + mu sum_k e_k x'_k - penalty x */
+
+static inline size_t times(int32_t a, int32_t b) { return (size_t)a * (size_t)b; }
+static inline real *newest(const lines *l, int32_t row) { return l->room + times(row, l->length) + *l->at; }
+static inline int32_t states(const signals *s) { return s->J * s->I * s->L; }
+static inline int within(real value, real most) { return value <= most && value >= -most; } /* not NaN either */
+static inline real *weights_of(const signals *s, int32_t j) { return s->weights + times(j, s->I * s->L); }
+
+/* Layout. */
+real *reals(anc_layout *at, const char *name, anc_role role, int32_t n0, int32_t n1, int32_t n2, int32_t n3);
+int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n);
+void layout_signals(signals *s, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
+void start_signals(signals *s, const anc_plan *plan, const anc_setting *settings);
+
+/* The parts of a sample, in this order. Each returns ANC_DONE, or why it refused, with nothing changed. */
+int take_reference(signals *s, const real *reference);
+real filter_output(const signals *s, int32_t j);                  /* sum_i w_ji' x_i */
+void emit(signals *s, int32_t j, real y);                         /* through limiter and amplifier model, into the delay line of y */
+int estimate(signals *s, const real *error);                      /* d^, with the powers and factors previewed */
+void commit(signals *s);                                          /* take the previewed powers */
+real heard_output(const signals *s, const lines *rows, int32_t k); /* sum_ji w_ji' x'_kji, or with the guarded rows */
+int descend(signals *s, const real *error);                       /* the steps of all loudspeakers; commits */
+#endif
