@@ -153,7 +153,8 @@ def simulate(
     n_samples = x.shape[1]
     results = [np.full((channels, n_samples), np.nan) for channels in (K, J, J, K)]
     signals = Signals(np.ascontiguousarray(x), np.ascontiguousarray(d), noise.signal(K, n_samples), *results)
-    recorded = {name: np.full((J if name in RECORDED else 1, n_samples), np.nan) for name in RECORDED + POWERS}
+    wanted = RECORDED + (POWERS if record_powers and not several else ())
+    recorded = {name: np.full((J, n_samples), np.nan) for name in wanted}
     run = _Run(controller, plant, signals, recorded, weights, every or 1, functions, several, progress)
     looped = None
     if compiled and isinstance(controller, FilteredReferenceController) and not any(functions):
@@ -162,9 +163,8 @@ def simulate(
     for signal in (*results, *recorded.values()):
         signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
-    wanted = RECORDED + (POWERS if record_powers and not several else ())
     found = {"error": signals.error, "control_signal": signals.control_signal, "amplifier_output": signals.amplifier_output}
-    found |= {"anti_noise": signals.anti_noise} | {name: recorded[name] for name in wanted}
+    found |= {"anti_noise": signals.anti_noise} | recorded
     if not hasattr(controller, "power_weight"):
         found.pop("power_weight", None)
     if not several or (np.ndim(reference) == 1 and J == K == 1):  # one channel drops its axis, as it was given
@@ -190,7 +190,7 @@ class _Run:
     controller: Any
     plant: Plant
     signals: Signals
-    recorded: dict[str, np.ndarray]  # (J, n_samples) or (1, n_samples)
+    recorded: dict[str, np.ndarray]  # (J, n_samples)
     weights: np.ndarray  # (rows, ...)
     every: int
     functions: list[Any]  # for each loudspeaker: an amplifier that is not a model, or None
@@ -199,7 +199,8 @@ class _Run:
 
     def loop(self, looped: Looped) -> tuple[bool, int]:
         """Run in the core, stretch by stretch: a run can be interrupted between them, and the controller may work."""
-        records = [Record(source, self.recorded[name]) for name, source in looped.recorded.items()]
+        sources = looped.recorded
+        records = [Record(sources[name], signal) for name, signal in self.recorded.items() if name in sources]
         if len(self.weights):
             rows = self.weights.reshape(len(self.weights), -1)
             records.append(Record(looped.control_filter.reshape(-1), rows, self.every, in_rows=True))
@@ -233,7 +234,7 @@ class _Run:
                 self.signals.control_signal[:, n] = y
                 self.controller.update(self._sample(error))
             for name, signal in self.recorded.items():
-                signal[:, n] = getattr(self.controller, name, np.nan) if name in RECORDED or not self.several else np.nan
+                signal[:, n] = getattr(self.controller, name, np.nan)
             if len(self.weights) and n % self.every == 0:
                 self.weights[n // self.every] = np.reshape(filters_of(self.controller), self.weights.shape[1:])
             if self.progress:

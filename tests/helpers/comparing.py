@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from kfopc_filterpy.controllers.core_controller import CoreController
+
 SIGNALS = (
     "error",
     "control_signal",
@@ -73,12 +75,16 @@ def assert_controller_close(got, want):
 def numbers_of(value):
     """Copies of all arrays in a tuple of tuples, records as plain arrays."""
     if isinstance(value, np.ndarray):
-        return [value.copy() if value.dtype.names is None else np.array(value.tolist(), dtype=float)]
+        names = value.dtype.names
+        return [value.copy()] if names is None else [np.array(value[name], dtype=float) for name in names]
     return [leaf for item in value for leaf in numbers_of(item)] if isinstance(value, tuple) else []
 
 
 def state_of(made):
     """Every number that a controller keeps."""
+    if isinstance(made, CoreController):
+        block = made._opened()
+        return [block.fields[name].copy() for name in block.states]
     kept = (made._state, made.constraint.state)
     if hasattr(made, "estimator"):
         kept += (made.estimator.x, made.estimator.P, made.estimator.K)
