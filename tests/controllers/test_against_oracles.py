@@ -13,11 +13,17 @@ import numpy as np
 import pytest
 from helpers.channels import random_paths, through
 from oracles import lms, signals
+from oracles.diagonal import DiagonalKalman as DiagonalOracle
+from oracles.kalman import Kalman
 from oracles.limiter import Limiter
 from oracles.powers import Constraint
+from oracles.repaired import RepairedKFOPC
+from oracles.rls import FiniteMemoryRLS, FxRLS
 
 from kfopc_filterpy import (
     ClippingFxLMS,
+    DiagonalKalman,
+    FastArrayKalman,
     FxLMS,
     FxNLMS,
     HardClipAmplifier,
@@ -29,6 +35,10 @@ from kfopc_filterpy import (
     RescalingFxLMS,
     SoftSaturationAmplifier,
     TwoGradientFxLMS,
+    fx_rls,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
     simulate,
 )
 from kfopc_filterpy.paths import PathTolerance, guard_filter
@@ -114,12 +124,53 @@ LMS: dict[str, Algorithm] = {
     "clipping": (ClippingFxLMS, lms.ClippingFxLMS, {"step_size": MU / 4, "amplitude_limit": A}, {"mu": MU / 4, "A": A}),
     "re-scaling": (RescalingFxLMS, lms.RescalingFxLMS, {"step_size": MU, "amplitude_limit": A}, {"mu": MU, "A": A}),
 }
-WITH_POWERS = ("optimal leaky", "MOV", "MOV fixed", "MOV modified")
+
+R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2], 0.5, 0.9995
+ours: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+theirs: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
+# filters without state noise: P in units of q
+array: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}
+
+SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
+    "KF-ANC": (kf_anc, Kalman, ours, theirs),
+    "KF-OPC": (kf_opc, Kalman, ours, theirs),
+}
+KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
+    "diagonal KF": (DiagonalKalman, DiagonalOracle, ours, theirs),
+    "diagonal KF-OPC": (DiagonalKalman, DiagonalOracle, ours, theirs),
+    "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
+    "fast array": (FastArrayKalman, FxRLS, array, {"P0": P0 / Q[0]}),
+    "fast array KF-OPC": (FastArrayKalman, FxRLS, array, {"P0": P0 / Q[0]}),
+    "fast array, fading": (
+        FastArrayKalman,
+        FxRLS,
+        array | {"forgetting": LAMBDA},
+        {"P0": P0 / Q[0], "forgetting": LAMBDA, "fast_array": True},
+    ),
+    "fast array, finite": (FastArrayKalman, FiniteMemoryRLS, array | {"memory": 300}, {"P0": P0 / Q[0], "N": 300}),
+    "repaired": (kf_opc_repaired, RepairedKFOPC, ours | {"trim_s": 0.05}, theirs | {"trim_rate": 1 / (0.05 * FS)}),
+    "repaired measurement": (
+        kf_opc_repaired,
+        RepairedKFOPC,
+        ours | {"trim_s": 0.05, "factor_at": "measurement"},
+        theirs | {"trim_rate": 1 / (0.05 * FS), "factor_at_output": False},
+    ),
+    "repaired gain": (
+        kf_opc_repaired,
+        RepairedKFOPC,
+        ours | {"trim_s": None, "gain_of": "reference"},
+        theirs | {"gain_of_control": False},
+    ),
+}
+ALGORITHMS = LMS | KALMAN
+WITH_POWERS = [
+    name for name in ALGORITHMS if name.startswith(("optimal", "MOV", "repaired")) or name.endswith("KF-OPC")
+]
 
 
 def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: str = "exponential") -> tuple[Any, Any]:
     """The package's controller and the oracle; `own` and `known` are further settings of each."""
-    make, oracle, ours, theirs = LMS[name]
+    make, oracle, ours, theirs = ALGORITHMS[name]
     ours = {key: scene.each(value) if isinstance(value, list) else value for key, value in ours.items()} | (own or {})
     theirs = {key: value[: scene.channels] if isinstance(value, list) else value for key, value in theirs.items()}
     if name in WITH_POWERS:
@@ -178,6 +229,41 @@ def test_lms_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> Non
     own, known = saturating(scene) if name in WITH_POWERS else ({}, {})
     both = pair(name, scene, own, known, window="sliding")
     compare(scene, *both, 4000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
+
+
+def kalman_cases(names: Any) -> list[Any]:
+    """Each algorithm with one channel; with two of each if it takes them."""
+    cases = [pytest.param(name, ONE, id=f"{name}, one channel") for name in names]
+    return cases + [pytest.param(name, TWO, id=f"{name}, two of each") for name in names if name in SEVERAL_KALMAN]
+
+
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(KALMAN))
+def test_kalman(name: str, scene: Scene) -> None:
+    compare(scene, *pair(name, scene), 3000)
+
+
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "repaired"]))
+def test_kalman_with_a_guard(name: str, scene: Scene) -> None:
+    W = guard_filter(UNCERTAINTY, scene.s_hat)
+    controller, oracle = pair(name, scene, known={"guard": W})
+    controller.secondary_path_uncertainty = UNCERTAINTY
+    compare(scene, controller, oracle, 2000)
+
+
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-ANC", "KF-OPC", "repaired", "fast array"]))
+def test_kalman_with_limiters(name: str, scene: Scene) -> None:
+    own, theirs = limiters(scene)
+    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 2000)
+    assert all(one.gain < 1.0 for one in theirs)
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "repaired", "fast array KF-OPC"])
+)
+def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
+    own, known = saturating(scene)
+    both = pair(name, scene, own, known, window="sliding")
+    compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
 
 
 @pytest.mark.parametrize("amplitude_limit", [None, 0.5], ids=["", "amplitude limit"])
