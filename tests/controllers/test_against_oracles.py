@@ -46,7 +46,7 @@ from kfopc_filterpy.paths import PathTolerance, guard_filter
 FS = 16000.0
 TOLERANCE = 1e-9  # of the largest value
 UNCERTAINTY = PathTolerance(delay_samples=0.5, gain_db=1.0)
-MEMORY_S = 0.05
+MEMORY_S = 0.01
 POWERS: dict[str, Any] = {"fs": FS, "memory_s": MEMORY_S}
 
 
@@ -60,12 +60,12 @@ class Scene:
         self.primary = random_paths(channels, channels, 20, seed=3, delay=5)
 
     def noises(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Coloured references, twice as loud in the middle, and disturbances that they explain in part."""
+        """Coloured references, soft at first and then loud, and disturbances that they explain in part."""
         rng = np.random.default_rng(4)
         x = through(np.eye(self.channels)[..., None] * [1.0, 0.6, 0.3], rng.standard_normal((self.channels, n)))
-        x[:, n // 3 : 2 * n // 3] *= 2.0
-        x *= 0.5
-        return x, through(self.primary, x) + 0.1 * rng.standard_normal((self.channels, n))
+        x[:, : n // 3] *= 0.05
+        x[:, 3 * n // 4 :] *= 0.6
+        return x, through(self.primary, x) + 0.02 * rng.standard_normal((self.channels, n))
 
     def each(self, values: list[float]) -> Any:
         """The values of the loudspeakers; of one channel, a number."""
@@ -97,7 +97,8 @@ def compare(scene: Scene, controller: Any, oracle: Any, n: int, *, amplifier: An
     assert_close(controller.weights, expected.w, "weights")
     if oracle.constraints:
         assert_close(result.constraint_factor, expected.alphas, "constraint factor")
-        assert np.min(expected.alphas) < 1.0
+        assert np.min(expected.alphas[:, n // 3 - 1]) == 1.0  # the constraint acts, but not always
+        assert np.max(np.min(expected.alphas[:, n // 3 :], axis=1)) < 1.0
     return expected
 
 
@@ -186,8 +187,8 @@ def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: st
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("name", LMS)
 def test_lms(name: str, scene: Scene) -> None:
-    """A second."""
-    compare(scene, *pair(name, scene), 16000)
+    """A second; of several channels a quarter of it."""
+    compare(scene, *pair(name, scene), 16000 // scene.channels**2)
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -196,7 +197,7 @@ def test_lms_with_a_guard(name: str, scene: Scene) -> None:
     W = guard_filter(UNCERTAINTY, scene.s_hat)
     controller, oracle = pair(name, scene, known={"guard": W})
     controller.secondary_path_uncertainty = UNCERTAINTY
-    compare(scene, controller, oracle, 4000)
+    compare(scene, controller, oracle, 3000)
 
 
 def limiters(scene: Scene) -> tuple[Any, list[Limiter]]:
@@ -213,7 +214,7 @@ def limiters(scene: Scene) -> tuple[Any, list[Limiter]]:
 @pytest.mark.parametrize("name", ["FxLMS", "MOV", "two-gradient", "re-scaling"])
 def test_lms_with_limiters(name: str, scene: Scene) -> None:
     own, theirs = limiters(scene)
-    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 4000)
+    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 3000)
     assert all(one.gain < 1.0 for one in theirs)
 
 
@@ -228,7 +229,7 @@ def test_lms_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> Non
     """The true amplifiers clip hard; who estimates the disturbance takes them for soft ones."""
     own, known = saturating(scene) if name in WITH_POWERS else ({}, {})
     both = pair(name, scene, own, known, window="sliding")
-    compare(scene, *both, 4000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
+    compare(scene, *both, 3000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
 
 
 def kalman_cases(names: Any) -> list[Any]:
@@ -295,10 +296,12 @@ def test_powers(window: str, gain: float | None) -> None:
     """The running powers themselves, over several lengths of the window; the reference is silent at first."""
     d, xf, x = np.random.default_rng(6).standard_normal((3, 2000))
     xf[:5] = x[:5] = 0.0
+    d[1000:] *= 0.1
     own = OutputPowerConstraint(0.3, secondary_path_gain=gain, fs=FS, memory_s=0.01, window=window)
     theirs = Constraint(0.3, gain=gain, fs=FS, memory_s=0.01, window=window)
     for n in range(d.size):
         assert own.advance(d[n], xf[n], x[n]) == pytest.approx(theirs.take(d[n] ** 2, xf[n] ** 2, x[n] ** 2), rel=1e-12)
         assert own.disturbance_power == pytest.approx(theirs.disturbance_power, rel=1e-12)
         assert own.secondary_path_gain is None or own.secondary_path_gain == pytest.approx(theirs.gain, rel=1e-12)
-    assert 0.0 < theirs.alpha < 1.0
+        assert n != 900 or 0.0 < theirs.alpha < 1.0
+    assert theirs.alpha == 1.0
