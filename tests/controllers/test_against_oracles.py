@@ -127,40 +127,40 @@ LMS: dict[str, Algorithm] = {
 }
 
 R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2], 0.5, 0.9995
-ours: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
-theirs: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
+OURS: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+THEIRS: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
 # filters without state noise: P in units of q
-array: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}
+ARRAY: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}
 
 SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
-    "KF-ANC": (kf_anc, Kalman, ours, theirs),
-    "KF-OPC": (kf_opc, Kalman, ours, theirs),
+    "KF-ANC": (kf_anc, Kalman, OURS, THEIRS),
+    "KF-OPC": (kf_opc, Kalman, OURS, THEIRS),
 }
 KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
-    "diagonal KF": (DiagonalKalman, DiagonalOracle, ours, theirs),
-    "diagonal KF-OPC": (DiagonalKalman, DiagonalOracle, ours, theirs),
+    "diagonal KF": (DiagonalKalman, DiagonalOracle, OURS, THEIRS),
+    "diagonal KF-OPC": (DiagonalKalman, DiagonalOracle, OURS, THEIRS),
     "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
-    "fast array": (FastArrayKalman, FxRLS, array, {"P0": P0 / Q[0]}),
-    "fast array KF-OPC": (FastArrayKalman, FxRLS, array, {"P0": P0 / Q[0]}),
+    "fast array": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0]}),
+    "fast array KF-OPC": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0]}),
     "fast array, fading": (
         FastArrayKalman,
         FxRLS,
-        array | {"forgetting": LAMBDA},
+        ARRAY | {"forgetting": LAMBDA},
         {"P0": P0 / Q[0], "forgetting": LAMBDA, "fast_array": True},
     ),
-    "fast array, finite": (FastArrayKalman, FiniteMemoryRLS, array | {"memory": 300}, {"P0": P0 / Q[0], "N": 300}),
-    "repaired": (kf_opc_repaired, RepairedKFOPC, ours | {"trim_s": 0.05}, theirs | {"trim_rate": 1 / (0.05 * FS)}),
+    "fast array, finite": (FastArrayKalman, FiniteMemoryRLS, ARRAY | {"memory": 300}, {"P0": P0 / Q[0], "N": 300}),
+    "repaired": (kf_opc_repaired, RepairedKFOPC, OURS | {"trim_s": 0.05}, THEIRS | {"trim_rate": 1 / (0.05 * FS)}),
     "repaired measurement": (
         kf_opc_repaired,
         RepairedKFOPC,
-        ours | {"trim_s": 0.05, "factor_at": "measurement"},
-        theirs | {"trim_rate": 1 / (0.05 * FS), "factor_at_output": False},
+        OURS | {"trim_s": 0.05, "factor_at": "measurement"},
+        THEIRS | {"trim_rate": 1 / (0.05 * FS), "factor_at_output": False},
     ),
     "repaired gain": (
         kf_opc_repaired,
         RepairedKFOPC,
-        ours | {"trim_s": None, "gain_of": "reference"},
-        theirs | {"gain_of_control": False},
+        OURS | {"trim_s": None, "gain_of": "reference"},
+        THEIRS | {"gain_of_control": False},
     ),
 }
 ALGORITHMS = LMS | KALMAN
@@ -265,6 +265,20 @@ def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> 
     own, known = saturating(scene)
     both = pair(name, scene, own, known, window="sliding")
     compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
+
+
+@pytest.mark.parametrize("unheard", [[1], [0, 1]], ids=["one", "both"])
+def test_a_loudspeaker_that_no_microphone_hears(unheard: list[int]) -> None:
+    """Its factor of zero does not count, unless there is no other."""
+    scene = Scene(2)
+    scene.s_hat[:, unheard] = 0.0
+    controller, oracle = pair("KF-OPC", scene)
+    x, d = scene.noises(300)
+    expected = signals.run(oracle, x, d, scene.s)
+    result = simulate(controller, x, disturbance=d, secondary_path=scene.s, fs=FS)
+    np.testing.assert_allclose(result.constraint_factor, expected.alphas, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(controller.weights, expected.w, rtol=0, atol=TOLERANCE)
+    assert np.any(controller.weights != 0.0) == (len(unheard) == 1)
 
 
 @pytest.mark.parametrize("amplitude_limit", [None, 0.5], ids=["", "amplitude limit"])
