@@ -84,22 +84,25 @@ def assert_close(got: Any, expected: Any, what: str) -> None:
     assert worst <= TOLERANCE, f"{what}: {worst:.2g} of the largest value"
 
 
-def compare(scene: Scene, controller: Any, oracle: Any, n: int, *, amplifier: Any = None, played: Any = None) -> Any:
+def compare(
+    scene: Scene, controller: Any, oracle: Any, n: int, *, amplifier: Any = None, played: Any = None, on: int = 0
+) -> None:
     """Run both over the same noise and compare; `played` is what the oracle's loop has for the amplifier."""
     x, d = scene.noises(n)
     paths = scene.s[0, 0] if scene.one else scene.s
     own = (x[0], d[0]) if scene.one else (x, d)
-    result = simulate(controller, own[0], disturbance=own[1], secondary_path=paths, fs=FS, amplifier=amplifier)
-    expected = signals.run(oracle, x, d, scene.s, amplifiers=None if played is None else [played] * scene.channels)
+    options: dict[str, Any] = {"secondary_path": paths, "fs": FS, "amplifier": amplifier, "switch_on_s": on / FS}
+    result = simulate(controller, own[0], disturbance=own[1], **options)
+    amplifiers = None if played is None else [played] * scene.channels
+    expected = signals.run(oracle, x, d, scene.s, amplifiers=amplifiers, on=on)
     assert result.diverged_at_s is None
     assert_close(result.control_signal, expected.y, "control signal")
     assert_close(result.error, expected.e, "error")
     assert_close(controller.weights, expected.w, "weights")
     if oracle.constraints:
         assert_close(result.constraint_factor, expected.alphas, "constraint factor")
-        assert np.min(expected.alphas[:, n // 3 - 1]) == 1.0  # the constraint acts, but not always
-        assert np.max(np.min(expected.alphas[:, n // 3 :], axis=1)) < 1.0
-    return expected
+        assert np.min(expected.alphas[:, n // 3 - 1 - on]) == 1.0  # the constraint acts, but not always
+        assert np.max(np.min(expected.alphas[:, n // 3 - on :], axis=1)) < 1.0
 
 
 # The settings of each algorithm: those of the package, and those of the oracle. Lists have a value of each loudspeaker.
@@ -129,8 +132,7 @@ LMS: dict[str, Algorithm] = {
 R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2], 0.5, 0.9995
 OURS: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
 THEIRS: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
-# filters without state noise: P in units of q
-ARRAY: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}
+ARRAY: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}  # the oracle's P is in units of q
 
 SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
     "KF-ANC": (kf_anc, Kalman, OURS, THEIRS),
@@ -140,8 +142,8 @@ KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
     "diagonal KF": (DiagonalKalman, DiagonalOracle, OURS, THEIRS),
     "diagonal KF-OPC": (DiagonalKalman, DiagonalOracle, OURS, THEIRS),
     "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
-    "fast array": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0]}),
-    "fast array KF-OPC": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0]}),
+    "fast array": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0], "fast_array": True}),
+    "fast array KF-OPC": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0], "fast_array": True}),
     "fast array, fading": (
         FastArrayKalman,
         FxRLS,
@@ -265,6 +267,15 @@ def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> 
     own, known = saturating(scene)
     both = pair(name, scene, own, known, window="sliding")
     compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired"])
+    + [pytest.param("MOV", scene, id=f"MOV, {scene.channels}") for scene in (ONE, TWO)],
+)
+def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
+    compare(scene, *pair(name, scene), 2000, on=400)
 
 
 @pytest.mark.parametrize("unheard", [[1], [0, 1]], ids=["one", "both"])

@@ -35,6 +35,10 @@ class RepairedKFOPC(Kalman):
         if change < 0 or self.alphas[0] < 1:
             self.trim = float(np.clip(self.trim + change, -math.log(10), math.log(10)))
 
+    def follow(self):
+        """Add a sample before the control is switched on to the powers: there is only the gain of the reference yet."""
+        self.constraints[0].take(self.d[0] ** 2, self.x_filtered[0, 0, 0, 0] ** 2, self.x[0, 0] ** 2)
+
     def alpha(self):
         """Return the factor of the measurement."""
         # (s^ * y)(n) = d^(n) - e(n)

@@ -28,7 +28,7 @@ class FxRLS(Controller):
 
     forgetting: float = 1.0  # lambda
     P0: float = 1.0  # variance of each weight at the start, in units of that of the measurement noise
-    fast_array: bool = False  # start with the P that the fast array requires
+    fast_array: bool = False  # start with the P that the fast array requires, and adapt while listening
 
     def __post_init__(self):
         super().__post_init__()
@@ -42,6 +42,13 @@ class FxRLS(Controller):
         for d, x in zip(self.d, self.x_filtered, strict=True):
             w, self.P = correct_rls(w, self.P, x.ravel(), alpha * d, self.forgetting)
         self.w = w.reshape(self.w.shape)
+
+    def follow(self):
+        """Adapt before the control is switched on, too, as the fast array must."""
+        if self.fast_array:
+            self.adapt(self.d)
+        else:
+            self.alpha()
 
 
 class GrowingMemory:
@@ -84,3 +91,7 @@ class FiniteMemoryRLS(Controller):
         if self.elder.heard >= self.N and (self.younger is None or share >= 1):
             self.elder = self.younger or self.elder
             self.younger = GrowingMemory(w, self.P0, known=len(w) - 1)
+
+    def follow(self):
+        """Adapt before the control is switched on, too."""
+        self.adapt(self.d)

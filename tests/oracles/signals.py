@@ -92,6 +92,17 @@ class Controller:
         self.d = e + np.einsum("kjm,jm->k", self.s_hat, self.output_line)
         self.adapt(e)
 
+    def listen(self, x, e):
+        """Take a sample before the control is switched on: the loudspeakers are silent, the powers follow."""
+        self.hear(x)
+        self.play(np.zeros(len(self.y)))
+        self.d = e  # d^ = e, because y = 0
+        self.follow()
+
+    def follow(self):
+        """Add the sample to the powers."""
+        self.alpha()
+
     def alpha(self):
         """Return the constraint factor of all loudspeakers with this sample, eq. 13; 1 without a rated power."""
         if not self.constraints:
@@ -114,11 +125,16 @@ class Run(NamedTuple):
     w: np.ndarray  # (J, I, L) at the end
 
 
-def run(controller, x, d, s, *, amplifiers=None):
-    """Run a controller over references (I, n) and disturbances (K, n), with true secondary paths (K, J, M)."""
+def run(controller, x, d, s, *, amplifiers=None, on=0):
+    """Run a controller over references (I, n) and disturbances (K, n), with true secondary paths (K, J, M).
+
+    The control is switched on at sample `on`; the signals of the run begin there.
+    """
     line = np.zeros(s.shape[1:])
     ys, es, alphas = [], [], []
-    for n in range(x.shape[1]):
+    for n in range(on):
+        controller.listen(x[:, n], d[:, n])
+    for n in range(on, x.shape[1]):
         y = controller.control_signal(x[:, n])
         push(line, amplified(amplifiers, y))
         # e_k(n) = d_k(n) - sum_j (s_kj * y_amp,j)(n)
