@@ -1,7 +1,7 @@
 """The scene that the loop is tested in: paths, noises, amplifiers, and a run of 500 samples."""
 
 import numpy as np
-from oracles import modified_anc as oracle
+from oracles import signals
 
 from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SoftSaturationAmplifier, simulate
 
@@ -13,10 +13,10 @@ R, Q, P0, MU = 1e-5, 1e-2, 0.5, 4e-3
 FS, MEMORY_S = 8000.0, 0.01  # 80 samples: forgetting is at work in a run of 500
 
 AMPLIFIERS = {
-    "none": (None, oracle.linear),
-    "linear": (LinearAmplifier(), oracle.linear),
-    "hard": (HardClipAmplifier(0.7), oracle.hard_clip(0.7)),
-    "soft": (SoftSaturationAmplifier(0.7, 1.5), oracle.rapp(0.7, 1.5)),
+    "none": (None, signals.linear),
+    "linear": (LinearAmplifier(), signals.linear),
+    "hard": (HardClipAmplifier(0.7), signals.hard_clip(0.7)),
+    "soft": (SoftSaturationAmplifier(0.7, 1.5), signals.rapp(0.7, 1.5)),
 }
 
 

@@ -1,7 +1,7 @@
 """The modified ANC loop in plain Python, written from the paper alone: slow, and free of the package.
 
-Each sum over a path is written out from the whole history, the running powers keep every sample, and the Kalman
-filter is filterpy's own. Sign convention: e = d - s * amp(y), d^ = e + s^ * y.
+Each sum over a path is written out from the whole history, and the Kalman filter is filterpy's own. Sign convention:
+e = d - s * amp(y), d^ = e + s^ * y.
 """
 
 from __future__ import annotations
@@ -10,18 +10,8 @@ import math
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
-
-
-def linear(y):
-    return y
-
-
-def hard_clip(limit):
-    return lambda y: math.copysign(limit, y) if abs(y) > limit else y
-
-
-def rapp(limit, sharpness):
-    return lambda y: y / (1 + (abs(y) / limit) ** (2 * sharpness)) ** (1 / (2 * sharpness))
+from oracles.powers import Constraint
+from oracles.signals import linear
 
 
 def at(path, history, n):
@@ -33,42 +23,17 @@ def newest_first(history, n, length):
     return np.array([history[n - k] if n >= k else 0.0 for k in range(length)])
 
 
-class MeanSquare:
-    """Exponential: weights 1 - lambda and lambda, a plain mean until that weight is reached. Sliding: the last m."""
-
-    def __init__(self, memory_s, fs, window):
-        self.new = 1 - math.exp(-1 / (memory_s * fs))
-        self.m = round(memory_s * fs) if window == "sliding" else None
-        self.samples, self.mean = [], 0.0
-
-    def take(self, value):
-        self.samples.append(value * value)
-        if self.m is not None:
-            newest = self.samples[-self.m :]
-            self.mean = math.fsum(newest) / len(newest)
-        else:
-            share = max(self.new, 1 / len(self.samples))
-            self.mean = (1 - share) * self.mean + share * value * value
-        return self.mean
-
-
-class Factor:
-    """Eq. 10-13."""
+class Factor(Constraint):
+    """Eq. 10-13 for one channel; without a rated power the factor is 1."""
 
     def __init__(self, rated_power, gain=None, memory_s=0.5, fs=16000, window="exponential"):
-        self.rated_power, self.fixed_gain = rated_power, gain
-        self.d, self.xf, self.x = (MeanSquare(memory_s, fs, window) for _ in range(3))
-        self.power, self.gain, self.alpha = 0.0, math.nan, 1.0
+        super().__init__(
+            math.inf if rated_power is None else rated_power, gain=gain, memory_s=memory_s, fs=fs, window=window
+        )
 
     def take(self, d, xf, x):
-        self.power, filtered, reference = self.d.take(d), self.xf.take(xf), self.x.take(x)
-        if reference > 0:
-            self.gain = filtered / reference
-        if self.fixed_gain is not None:
-            self.gain = self.fixed_gain
-        self.alpha = 1.0
-        if self.rated_power is not None and self.power > 0 and not math.isnan(self.gain):
-            self.alpha = min(math.sqrt(self.rated_power * self.gain / self.power), 1.0)
+        alpha = super().take(d * d, xf * xf, x * x)
+        self.alpha = 1.0 if self.rated_power == math.inf else alpha
         return self.alpha
 
 
@@ -96,14 +61,8 @@ class LMS:
         self.weights, self.factor, self.mu = np.zeros(n_taps), factor, mu
 
     def adapt(self, e, d, y, xf, x):
-        factor, gamma = self.factor, 0.0
-        factor.take(d, xf[0], x[0])
-        if factor.rated_power is not None and factor.gain > 0:
-            gamma = max(
-                factor.gain * (math.sqrt(factor.power / (factor.rated_power * factor.gain)) - 1),
-                0.0,
-            )
-        self.weights = self.weights + self.mu * (e * xf - gamma * y * x)
+        self.factor.take(d, xf[0], x[0])
+        self.weights = self.weights + self.mu * (e * xf - self.factor.penalty * y * x)
 
 
 def modified_anc(
@@ -132,7 +91,16 @@ def modified_anc(
             continue
         algorithm.adapt(e, d_hat, y, xf_row, x_row)
         factor = algorithm.factor
-        row = (e, y, amplified[n], anti_noise, factor.alpha, factor.power, factor.gain, algorithm.weights.copy())
+        row = (
+            e,
+            y,
+            amplified[n],
+            anti_noise,
+            factor.alpha,
+            factor.disturbance_power,
+            factor.gain,
+            algorithm.weights.copy(),
+        )
         for key, value in zip(rows, row, strict=True):
             rows[key].append(value)
     return {key: np.array(values) for key, values in rows.items()}

@@ -1,0 +1,333 @@
+"""Every algorithm against its oracle in `tests/oracles`: plain numpy, written from the equations alone.
+
+Control signals, errors, factors and final weights agree to 1e-9 of their largest value. They are not the same bits: the
+sums over taps, channels and windows are added up in another order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.channels import random_paths, through
+from oracles import lms, signals
+from oracles.diagonal import DiagonalKalman as DiagonalOracle
+from oracles.kalman import Kalman
+from oracles.limiter import Limiter
+from oracles.powers import Constraint
+from oracles.repaired import RepairedKFOPC
+from oracles.rls import FiniteMemoryRLS, FxRLS
+
+from kfopc_filterpy import (
+    ClippingFxLMS,
+    DiagonalKalman,
+    FastArrayKalman,
+    FxLMS,
+    FxNLMS,
+    HardClipAmplifier,
+    LeakyFxLMS,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    OutputPowerConstraint,
+    RescalingFxLMS,
+    SoftSaturationAmplifier,
+    TwoGradientFxLMS,
+    fx_rls,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
+    simulate,
+)
+from kfopc_filterpy.paths import PathTolerance, guard_filter
+
+FS = 16000.0
+TOLERANCE = 1e-9  # of the largest value
+UNCERTAINTY = PathTolerance(delay_samples=0.5, gain_db=1.0)
+MEMORY_S = 0.01
+POWERS: dict[str, Any] = {"fs": FS, "memory_s": MEMORY_S}
+
+
+class Scene:
+    """Paths and noises for a number of channels."""
+
+    def __init__(self, channels: int) -> None:
+        self.channels, self.one = channels, channels == 1
+        self.s = 0.3 * random_paths(channels, channels, 12, seed=1) + np.eye(channels)[..., None] * np.eye(12)[2]
+        self.s_hat = 0.9 * self.s[..., :9] + random_paths(channels, channels, 9, seed=2) / 20
+        self.primary = random_paths(channels, channels, 20, seed=3, delay=5)
+
+    def noises(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Coloured references, soft at first and then loud, and disturbances that they explain in part."""
+        rng = np.random.default_rng(4)
+        x = through(np.eye(self.channels)[..., None] * [1.0, 0.6, 0.3], rng.standard_normal((self.channels, n)))
+        x[:, : n // 3] *= 0.05
+        x[:, 3 * n // 4 :] *= 0.6
+        return x, through(self.primary, x) + 0.02 * rng.standard_normal((self.channels, n))
+
+    def each(self, values: list[float]) -> Any:
+        """The values of the loudspeakers; of one channel, a number."""
+        return values[0] if self.one else values
+
+
+ONE, TWO = Scene(1), Scene(2)
+SCENES = [pytest.param(ONE, id="one channel"), pytest.param(TWO, id="two of each")]
+
+
+def assert_close(got: Any, expected: Any, what: str) -> None:
+    got, expected = np.reshape(got, expected.shape), np.asarray(expected)
+    largest = np.max(np.abs(expected))
+    assert largest > 0, f"{what} is zero"
+    worst = np.max(np.abs(got - expected)) / largest
+    assert worst <= TOLERANCE, f"{what}: {worst:.2g} of the largest value"
+
+
+def compare(
+    scene: Scene, controller: Any, oracle: Any, n: int, *, amplifier: Any = None, played: Any = None, on: int = 0
+) -> None:
+    """Run both over the same noise and compare; `played` is what the oracle's loop has for the amplifier."""
+    x, d = scene.noises(n)
+    paths = scene.s[0, 0] if scene.one else scene.s
+    own = (x[0], d[0]) if scene.one else (x, d)
+    options: dict[str, Any] = {"secondary_path": paths, "fs": FS, "amplifier": amplifier, "switch_on_s": on / FS}
+    result = simulate(controller, own[0], disturbance=own[1], **options)
+    amplifiers = None if played is None else [played] * scene.channels
+    expected = signals.run(oracle, x, d, scene.s, amplifiers=amplifiers, on=on)
+    assert result.diverged_at_s is None
+    assert_close(result.control_signal, expected.y, "control signal")
+    assert_close(result.error, expected.e, "error")
+    assert_close(controller.weights, expected.w, "weights")
+    if oracle.constraints:
+        assert_close(result.constraint_factor, expected.alphas, "constraint factor")
+        assert np.min(expected.alphas[:, n // 3 - 1 - on]) == 1.0  # the constraint acts, but not always
+        assert np.max(np.min(expected.alphas[:, n // 3 - on :], axis=1)) < 1.0
+
+
+# The settings of each algorithm: those of the package, and those of the oracle. Lists have a value of each loudspeaker.
+
+RATED, A, LEAK, PENALTY = [0.1, 0.15], [0.25, 0.4], [0.3, 0.1], [0.4, 0.2]
+MU = 1e-3
+Algorithm = tuple[Callable[..., Any], Any, dict[str, Any], dict[str, Any]]
+
+LMS: dict[str, Algorithm] = {
+    "FxLMS": (FxLMS, lms.FxLMS, {"step_size": MU}, {"mu": MU}),
+    "FxNLMS": (FxNLMS, lms.FxNLMS, {"step_size": 0.05, "regularization": 0.5}, {"mu": 0.05, "epsilon": 0.5}),
+    "leaky": (LeakyFxLMS, lms.LeakyFxLMS, {"step_size": MU, "leak": LEAK}, {"mu": MU, "gamma": LEAK}),
+    "optimal leaky": (OptimalLeakyFxLMS, lms.OptimalLeakyFxLMS, {"step_size": MU}, {"mu": MU}),
+    "MOV": (MOVFxLMS, lms.MOVFxLMS, {"step_size": MU}, {"mu": MU}),
+    "MOV fixed": (MOVFxLMS, lms.MOVFxLMS, {"step_size": MU, "penalty_factor": PENALTY}, {"mu": MU, "gamma": PENALTY}),
+    "MOV modified": (MOVFxLMS, lms.MOVFxLMS, {"step_size": MU, "modified": True}, {"mu": MU, "modified": True}),
+    "two-gradient": (
+        TwoGradientFxLMS,
+        lms.TwoGradientFxLMS,
+        {"step_size": MU, "amplitude_limit": A, "output_step_size": 2 * MU},
+        {"mu": MU, "A": A, "mu_y": 2 * MU},
+    ),
+    "clipping": (ClippingFxLMS, lms.ClippingFxLMS, {"step_size": MU / 4, "amplitude_limit": A}, {"mu": MU / 4, "A": A}),
+    "re-scaling": (RescalingFxLMS, lms.RescalingFxLMS, {"step_size": MU, "amplitude_limit": A}, {"mu": MU, "A": A}),
+}
+
+R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2], 0.5, 0.9995
+OURS: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+THEIRS: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
+ARRAY: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}  # the oracle's P is in units of q
+
+SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
+    "KF-ANC": (kf_anc, Kalman, OURS, THEIRS),
+    "KF-OPC": (kf_opc, Kalman, OURS, THEIRS),
+}
+KALMAN: dict[str, Algorithm] = SEVERAL_KALMAN | {
+    "diagonal KF": (DiagonalKalman, DiagonalOracle, OURS, THEIRS),
+    "diagonal KF-OPC": (DiagonalKalman, DiagonalOracle, OURS, THEIRS),
+    "FxRLS": (fx_rls, FxRLS, {"forgetting": LAMBDA}, {"forgetting": LAMBDA}),
+    "fast array": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0], "fast_array": True}),
+    "fast array KF-OPC": (FastArrayKalman, FxRLS, ARRAY, {"P0": P0 / Q[0], "fast_array": True}),
+    "fast array, fading": (
+        FastArrayKalman,
+        FxRLS,
+        ARRAY | {"forgetting": LAMBDA},
+        {"P0": P0 / Q[0], "forgetting": LAMBDA, "fast_array": True},
+    ),
+    "fast array, finite": (FastArrayKalman, FiniteMemoryRLS, ARRAY | {"memory": 300}, {"P0": P0 / Q[0], "N": 300}),
+    "repaired": (kf_opc_repaired, RepairedKFOPC, OURS | {"trim_s": 0.05}, THEIRS | {"trim_rate": 1 / (0.05 * FS)}),
+    "repaired measurement": (
+        kf_opc_repaired,
+        RepairedKFOPC,
+        OURS | {"trim_s": 0.05, "factor_at": "measurement"},
+        THEIRS | {"trim_rate": 1 / (0.05 * FS), "factor_at_output": False},
+    ),
+    "repaired gain": (
+        kf_opc_repaired,
+        RepairedKFOPC,
+        OURS | {"trim_s": None, "gain_of": "reference"},
+        THEIRS | {"gain_of_control": False},
+    ),
+}
+ALGORITHMS = LMS | KALMAN
+WITH_POWERS = [
+    name for name in ALGORITHMS if name.startswith(("optimal", "MOV", "repaired")) or name.endswith("KF-OPC")
+]
+
+
+def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: str = "exponential") -> tuple[Any, Any]:
+    """The package's controller and the oracle; `own` and `known` are further settings of each."""
+    make, oracle, ours, theirs = ALGORITHMS[name]
+    ours = {key: scene.each(value) if isinstance(value, list) else value for key, value in ours.items()} | (own or {})
+    theirs = {key: value[: scene.channels] if isinstance(value, list) else value for key, value in theirs.items()}
+    if name in WITH_POWERS:
+        ours["constraint"] = scene.each([OutputPowerConstraint(p, window=window, **POWERS) for p in RATED])
+        theirs["constraints"] = [Constraint(p, window=window, **POWERS) for p in RATED[: scene.channels]]
+    if not scene.one:
+        ours["n_references"] = scene.channels
+    controller = make(16, scene.s_hat[0, 0] if scene.one else scene.s_hat, **ours)
+    channels = {"s_hat": scene.s_hat, "n_taps": 16, "n_references": scene.channels}
+    return controller, oracle(**channels, **theirs, **(known or {}))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", LMS)
+def test_lms(name: str, scene: Scene) -> None:
+    """A second; half of it with running powers, and a quarter of that with several channels: the oracles are slow."""
+    n = 8000 if name in WITH_POWERS else 16000
+    compare(scene, *pair(name, scene), n // scene.channels**2)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", [name for name in LMS if name != "MOV fixed"])
+def test_lms_with_a_guard(name: str, scene: Scene) -> None:
+    W = guard_filter(UNCERTAINTY, scene.s_hat)
+    controller, oracle = pair(name, scene, known={"guard": W})
+    controller.secondary_path_uncertainty = UNCERTAINTY
+    compare(scene, controller, oracle, 2000)
+
+
+def limiters(scene: Scene) -> tuple[Any, list[Limiter]]:
+    """Limiters that act, of the package and of the oracle."""
+    settings: list[tuple[float, Any]] = [
+        (0.01, {"fs": FS, "window_s": 0.01}),
+        (0.02, {"fs": FS, "window_s": 0.013, "amplitude_limit": 0.3}),
+    ]
+    own, theirs = ([make(p, **o) for p, o in settings] for make in (OutputLimiter, Limiter))
+    return scene.each(own), theirs[: scene.channels]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", ["FxLMS", "MOV", "two-gradient", "re-scaling"])
+def test_lms_with_limiters(name: str, scene: Scene) -> None:
+    own, theirs = limiters(scene)
+    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 2000)
+    assert all(one.gain < 1.0 for one in theirs)
+
+
+def saturating(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A soft amplifier model, for the package and for the oracle."""
+    return {"amplifier": SoftSaturationAmplifier(0.2, 1.5)}, {"amplifiers": [signals.rapp(0.2, 1.5)] * scene.channels}
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("name", ["FxLMS", "optimal leaky", "MOV", "MOV modified"])
+def test_lms_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
+    """The true amplifiers clip hard; who estimates the disturbance takes them for soft ones."""
+    own, known = saturating(scene) if name in WITH_POWERS else ({}, {})
+    both = pair(name, scene, own, known, window="sliding")
+    compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
+
+
+def kalman_cases(names: Any) -> list[Any]:
+    """Each algorithm with one channel; with two of each if it takes them."""
+    cases = [pytest.param(name, ONE, id=f"{name}, one channel") for name in names]
+    return cases + [pytest.param(name, TWO, id=f"{name}, two of each") for name in names if name in SEVERAL_KALMAN]
+
+
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(KALMAN))
+def test_kalman(name: str, scene: Scene) -> None:
+    compare(scene, *pair(name, scene), 3000)
+
+
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "repaired"]))
+def test_kalman_with_a_guard(name: str, scene: Scene) -> None:
+    W = guard_filter(UNCERTAINTY, scene.s_hat)
+    controller, oracle = pair(name, scene, known={"guard": W})
+    controller.secondary_path_uncertainty = UNCERTAINTY
+    compare(scene, controller, oracle, 2000)
+
+
+@pytest.mark.parametrize(("name", "scene"), kalman_cases(["KF-ANC", "KF-OPC", "repaired", "fast array"]))
+def test_kalman_with_limiters(name: str, scene: Scene) -> None:
+    own, theirs = limiters(scene)
+    compare(scene, *pair(name, scene, {"limiter": own}, {"limiters": theirs}), 2000)
+    assert all(one.gain < 1.0 for one in theirs)
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"), kalman_cases(["KF-OPC", "diagonal KF-OPC", "repaired", "fast array KF-OPC"])
+)
+def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> None:
+    own, known = saturating(scene)
+    both = pair(name, scene, own, known, window="sliding")
+    compare(scene, *both, 2000, amplifier=HardClipAmplifier(0.15), played=signals.hard_clip(0.15))
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired"])
+    + [pytest.param("MOV", scene, id=f"MOV, {scene.channels}") for scene in (ONE, TWO)],
+)
+def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
+    compare(scene, *pair(name, scene), 2000, on=400)
+
+
+@pytest.mark.parametrize("unheard", [[1], [0, 1]], ids=["one", "both"])
+def test_a_loudspeaker_that_no_microphone_hears(unheard: list[int]) -> None:
+    """Its factor of zero does not count, unless there is no other."""
+    scene = Scene(2)
+    scene.s_hat[:, unheard] = 0.0
+    controller, oracle = pair("KF-OPC", scene)
+    x, d = scene.noises(300)
+    expected = signals.run(oracle, x, d, scene.s)
+    result = simulate(controller, x, disturbance=d, secondary_path=scene.s, fs=FS)
+    np.testing.assert_allclose(result.constraint_factor, expected.alphas, rtol=0, atol=TOLERANCE)
+    np.testing.assert_allclose(controller.weights, expected.w, rtol=0, atol=TOLERANCE)
+    assert np.any(controller.weights != 0.0) == (len(unheard) == 1)
+
+
+@pytest.mark.parametrize("amplitude_limit", [None, 0.5], ids=["", "amplitude limit"])
+@pytest.mark.parametrize("window_s", [0.01, 0.0005], ids=["160 samples", "8 samples"])
+def test_limiter(amplitude_limit: float | None, window_s: float) -> None:
+    """Noise, silence, a burst, a tone: after silence, the first loud samples spend the whole budget.
+
+    A clipped sample is the root of what is left of the budget; when nothing is left, roundings of 1e-16 of the budget are
+    left. So squares are compared, in units of the budget.
+    """
+    rng, n = np.random.default_rng(5), np.arange(3000)
+    u = np.concatenate(
+        [0.2 * rng.standard_normal(3000), np.zeros(500), 20.0 * rng.standard_normal(300), 0.5 * np.sin(0.3 * n)]
+    )
+    limit = {} if amplitude_limit is None else {"amplitude_limit": amplitude_limit}
+    own, theirs = (make(0.04, fs=FS, window_s=window_s, **limit) for make in (OutputLimiter, Limiter))
+    y, expected = own.process(u), np.array([theirs(v) for v in u])
+    budget = 0.04 * round(window_s * FS)
+    assert np.max(np.abs(y * np.abs(y) - expected * np.abs(expected))) < 1e-12 * budget
+    clear = expected**2 > 1e-6 * budget
+    assert_close(y[clear], expected[clear], "output")
+    assert own.clipped > 0
+    assert own.gain == pytest.approx(theirs.gain, rel=TOLERANCE)
+
+
+@pytest.mark.parametrize("window", ["exponential", "sliding"])
+@pytest.mark.parametrize("gain", [None, 0.7])
+def test_powers(window: str, gain: float | None) -> None:
+    """The running powers themselves, over several lengths of the window; the reference is silent at first."""
+    d, xf, x = np.random.default_rng(6).standard_normal((3, 2000))
+    xf[:5] = x[:5] = 0.0
+    d[1000:] *= 0.1
+    own = OutputPowerConstraint(0.3, secondary_path_gain=gain, fs=FS, memory_s=0.01, window=window)
+    theirs = Constraint(0.3, gain=gain, fs=FS, memory_s=0.01, window=window)
+    for n in range(d.size):
+        assert own.advance(d[n], xf[n], x[n]) == pytest.approx(theirs.take(d[n] ** 2, xf[n] ** 2, x[n] ** 2), rel=1e-12)
+        assert own.disturbance_power == pytest.approx(theirs.disturbance_power, rel=1e-12)
+        assert own.secondary_path_gain is None or own.secondary_path_gain == pytest.approx(theirs.gain, rel=1e-12)
+        assert n != 900 or 0.0 < theirs.alpha < 1.0
+    assert theirs.alpha == 1.0
