@@ -69,7 +69,8 @@ KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_var
 LIST = "cases.json"  # what the cases of a version are
 SIGNALS = ("error", "control_signal", "amplifier_output", "anti_noise", "constraint_factor", "weights")
 POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")
-SOFT, HARD = SoftSaturationAmplifier(0.7, 1.5), HardClipAmplifier(0.7)
+SOFT, HARD = SoftSaturationAmplifier(1.0, 1.5), HardClipAmplifier(1.0)
+WIDE = [HardClipAmplifier(2.5), SoftSaturationAmplifier(2.5, 1.5)]  # of two loudspeakers
 
 Result = dict[str, Any]
 Make = Callable[["Scene"], Any]
@@ -87,6 +88,7 @@ class Scene:
     secondary: np.ndarray
     estimate: np.ndarray
     n_taps: int = TAPS
+    pace: float = 1.0  # of what has a step size
     options: dict[str, Any] = field(default_factory=dict)
 
     def having(self, **options: Any) -> Scene:
@@ -110,16 +112,24 @@ def through(paths: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def nearly(secondary: np.ndarray) -> np.ndarray:
-    """Return an estimate that differs from a secondary path a little, and is shorter."""
-    kept = secondary[..., : max(8, round(0.9 * secondary.shape[-1]))]
+    """Return an estimate that differs from a secondary path a little, and is two taps shorter."""
+    kept = secondary[..., :-2]
     return kept * (1.0 + 0.05 * np.random.default_rng(9).standard_normal(kept.shape))
 
 
-def one_channel(x: np.ndarray, primary: Any = None, secondary: Any = None, n_taps: int = TAPS) -> Scene:
-    """Return a scene of one channel with random paths, or those given, scaled to unit energy."""
-    p = decaying(1, 1, 40, 1, 8)[0, 0] if primary is None else primary / np.linalg.norm(primary)
-    s = decaying(1, 1, 20, 2, 2)[0, 0] if secondary is None else secondary / np.linalg.norm(secondary)
-    return Scene(x, np.convolve(x, p)[: x.size], s, nearly(s), n_taps)
+def one_channel(x: np.ndarray) -> Scene:
+    """Return a scene of one channel with random paths."""
+    s = decaying(1, 1, 20, 2, 2)[0, 0]
+    return Scene(x, np.convolve(x, decaying(1, 1, 40, 1, 8)[0, 0])[: x.size], s, nearly(s))
+
+
+def recorded_scene(x: np.ndarray, primary: np.ndarray, secondary: np.ndarray, n_taps: int, pace: float) -> Scene:
+    """Return a scene of measured paths, (K, I or J, taps); filtered reference and disturbance have a power near 1."""
+    d, filtered = through(primary, x), through(secondary[:1, :1], x)
+    d, s = d / np.sqrt(np.mean(d**2)), secondary / np.sqrt(np.mean(filtered**2))
+    if s.shape[:2] == (1, 1):
+        x, d, s = x[0], d[0], s[0, 0]
+    return Scene(x, d, s, nearly(s), n_taps, pace)
 
 
 def channels(n_references: int, delay: int = 2) -> Scene:
@@ -142,8 +152,8 @@ def noises() -> dict[str, np.ndarray]:
 
 
 def unit_power(recording: np.ndarray) -> np.ndarray:
-    """Return the first seconds of a recording with a power of 1."""
-    first = recording[:RECORDED_SAMPLES]
+    """Return the first seconds of a recording with a power of 1, (1, n_samples)."""
+    first = recording[None, :RECORDED_SAMPLES]
     return first / np.sqrt(np.mean(first**2))
 
 
@@ -157,16 +167,16 @@ def recorded_scenes() -> tuple[dict[str, Scene], dict[str, str]]:
         except DataUnavailableError as error:
             skipped[f"{noise}, duct"] = str(error)
             continue
-        scenes[f"{noise}, duct"] = one_channel(unit_power(duct.noise), duct.primary, duct.secondary, RECORDED_TAPS)
+        paths = duct.primary[None, None], duct.secondary[None, None]
+        scenes[f"{noise}, duct"] = recorded_scene(unit_power(duct.noise), *paths, RECORDED_TAPS, pace=0.05)
     try:
         room, recording = load_measured_room(), load_measured_duct(noise="compressor").noise
     except DataUnavailableError as error:
         return scenes, skipped | {"room": str(error)}
-    x = unit_power(recording)[None, : RECORDED_SAMPLES // 2]
+    x = unit_power(recording)[:, : RECORDED_SAMPLES // 2]
     for count in (2, 4):
-        p, s = room.primary[:count], room.secondary[:count, :count]
-        p, s = p / np.linalg.norm(p[0, 0]), s / np.linalg.norm(s[0, 0])
-        scenes[f"room, {count} x {count}"] = Scene(x, through(p, x), s, nearly(s), ROOM_TAPS)
+        paths = room.primary[:count], room.secondary[:count, :count]
+        scenes[f"room, {count} x {count}"] = recorded_scene(x, *paths, ROOM_TAPS, pace=0.02)
     return scenes, skipped
 
 
@@ -182,9 +192,11 @@ def limiter(power: float = 0.05) -> OutputLimiter:
 
 
 def made(make: Any, scene: Scene, **settings: Any) -> Any:
-    """Return a controller for a scene; a `step` stands for a step size over the number of taps."""
+    """Return a controller for a scene; a `step` is a step size times the number of taps."""
     if "step" in settings:
         settings["step_size"] = settings.pop("step") / scene.n_taps
+    for name in settings.keys() & {"step_size", "output_step_size"}:
+        settings[name] *= scene.pace
     if scene.estimate.ndim == 3:
         settings["n_references"] = scene.n_references
     return make(scene.n_taps, scene.estimate, **settings)
@@ -293,7 +305,7 @@ def both(make: Callable[[float], Any]) -> list[Any]:
 SEVERAL: dict[str, Make] = {
     "KF-ANC": lambda s: made(kf_anc, s, **KALMAN),
     "KF-ANC, float32": lambda s: made(kf_anc, s, dtype=np.float32, **KALMAN),
-    "KF-ANC, known amplifiers": lambda s: made(kf_anc, s, amplifier=[HARD, SOFT], **KALMAN),
+    "KF-ANC, known amplifiers": lambda s: made(kf_anc, s, amplifier=WIDE, **KALMAN),
     "KF-ANC, uncertain path": lambda s: with_tolerance(made(kf_anc, s, **KALMAN)),
     "KF-OPC": lambda s: made(kf_opc, s, constraint=both(rated), **KALMAN),
     "KF-OPC, limiter": lambda s: made(kf_opc, s, constraint=both(rated), limiter=both(limiter), **KALMAN),
@@ -310,7 +322,7 @@ SEVERAL: dict[str, Make] = {
     "leaky FxLMS": lambda s: made(LeakyFxLMS, s, leak=[0.3, 0.1], **LMS),
     "optimal leaky FxLMS": lambda s: made(OptimalLeakyFxLMS, s, constraint=both(rated), **LMS),
     "MOV": lambda s: made(MOVFxLMS, s, constraint=both(rated), **LMS),
-    "MOV, modified": lambda s: made(MOVFxLMS, s, constraint=both(rated), modified=True, amplifier=SOFT, **LMS),
+    "MOV, modified": lambda s: made(MOVFxLMS, s, constraint=both(rated), modified=True, amplifier=WIDE, **LMS),
     "MOV, fixed penalty": lambda s: made(MOVFxLMS, s, constraint=both(rated), penalty_factor=[0.5, 0.2], **LMS),
     "two-gradient FxLMS": lambda s: made(TwoGradientFxLMS, s, **PEAK),
     "re-scaling FxLMS": lambda s: made(RescalingFxLMS, s, **LMS, amplitude_limit=[0.3, 0.8]),
@@ -466,7 +478,7 @@ def all_cases() -> tuple[dict[str, Callable[[], Result]], dict[str, str]]:
         around = {"VirtualMicrophones": AROUND_SEVERAL["VirtualMicrophones"]} if count == 1 else AROUND_SEVERAL
         groups[f"2 x 2 x {count}"] = (many, SEVERAL | around)
         groups[f"2 x 2 x {count}, feedback, switched on later"] = (
-            many.having(feedback_path=feedback, switch_on_s=0.05, amplifier=[HARD, SOFT]),
+            many.having(feedback_path=feedback, switch_on_s=0.05, amplifier=WIDE),
             SEVERAL,
         )
     recorded, skipped = recorded_scenes()
@@ -479,12 +491,12 @@ def all_cases() -> tuple[dict[str, Callable[[], Result]], dict[str, str]]:
         for name, make in makers.items()
     }
     late = np.concatenate((np.zeros(max(BLOCKS)), band.secondary))
-    delayed = replace(band, secondary=late, estimate=nearly(late))
+    delayed = replace(band, secondary=late, estimate=nearly(late), pace=0.3)
     for group, (scene, makers) in {
         "sample by sample": (band, SINGLE),
         "sample by sample, 2 x 2 x 2": (channels(2), SEVERAL),
         "blocks": (delayed, SINGLE),
-        "blocks, 2 x 2 x 1": (channels(1, delay=max(BLOCKS)), SEVERAL),
+        "blocks, 2 x 2 x 1": (replace(channels(1, delay=max(BLOCKS)), pace=0.3), SEVERAL),
     }.items():
         blocks = group.startswith("blocks")
         cases |= {f"{group}: {name}": partial(called, make, scene, blocks) for name, make in makers.items()}
