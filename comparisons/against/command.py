@@ -91,7 +91,7 @@ def compared(case: str, old: Result | None, new: Result | None) -> Row:
     failed = [f"{name}: {result['failed']}" for name, result in (("old", old), ("new", new)) if "failed" in result]
     if failed:
         return Row(case, 0, np.inf, "; ".join(failed))
-    samples = max((np.shape(value)[-1] for value in old.values() if np.ndim(value)), default=0)
+    samples = max(size for value in old.values() for size in (0, *np.shape(value)))
     other = sorted(old.keys() ^ new.keys())
     if other:
         return Row(case, samples, np.inf, f"{', '.join(other)} only in one version")
