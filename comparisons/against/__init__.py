@@ -1,0 +1,1 @@
+"""The comparison of the package with an earlier version of itself."""
