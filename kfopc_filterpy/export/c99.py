@@ -1,27 +1,29 @@
-"""A controller as C99: a header and a source file, from C fragments and the controller's present state.
+"""A controller as C99: a header and a source file, with the controller's present state.
 
-The fragments are C themselves, written for float64 and the prefix `anc`. The lines between `#if`, `#else` and `#endif`
-that do not apply are left out, float64 becomes float32 if asked for, and the prefix becomes the name. Only the beginnings
-of the two files have places to fill in, with Python's own `string.Template`: a template language would be a dependency
-for those few.
+A controller of the core brings the core's own files, see `core`. The others, until they have moved to the core, are put
+together from fragments here. The fragments are C themselves, written for float64 and the prefix `anc`. The lines
+between `#if`, `#else` and `#endif` that do not apply are left out, float64 becomes float32 if asked for, and the prefix
+becomes the name. Only the beginnings of the two files have places to fill in, with Python's own `string.Template`: a
+template language would be a dependency for those few.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from string import Template
-from textwrap import fill
 from typing import Any
 
 import numpy as np
 
+from ..controllers.core_controller import CoreController
 from ..filters.random_walk import as_precision
+from .core import core_export
+from .literals import braces, number
 from .parts import Part, Values, parts_of
 
 FRAGMENTS = Path(__file__).parent / "fragments"
-WIDTH = 120
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,9 +43,8 @@ class CExport:
     dtype : str
         float64 (C's double) or float32 (float).
     n_bytes : int
-        Size of the state, ``sizeof(<name>_state)`` with natural alignment. A constant copy, from which it is
-        initialized, takes the same space in read-only memory.
-    operations, most_operations : int
+        Size of the state, ``sizeof(<name>_state)`` with natural alignment, where a pointer has 8 bytes.
+    operations, most_operations : int, or None for a controller of the core
         Floating-point additions, multiplications, divisions and square roots of a usual sample, and of the worst one.
         A fused multiply-add counts as two.
 
@@ -57,7 +58,7 @@ class CExport:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     exported = export_c(controller, Path(folder) / "anc.c", dtype="float32")
     >>> exported
-    <CExport anc.c: FxLMS, 16 taps, float32, state of 332 bytes, 72 operations per sample>
+    <CExport anc.c: FxLMS, 16 taps, float32, state of 5,072 bytes>
     """
 
     path: Path
@@ -67,13 +68,15 @@ class CExport:
     n_taps: int
     dtype: str
     n_bytes: int
-    operations: int
-    most_operations: int
+    operations: int | None
+    most_operations: int | None
 
     def __repr__(self) -> str:
         return f"<CExport {self.path.name}: {self.algorithm}, {self.n_taps} taps, {self.dtype}, {self._cost()}>"
 
     def _cost(self) -> str:
+        if self.operations is None:
+            return f"state of {self.n_bytes:,} bytes"
         most = "" if self.most_operations == self.operations else f", at most {self.most_operations:,}"
         return f"state of {self.n_bytes:,} bytes, {self.operations:,} operations per sample{most}"
 
@@ -81,17 +84,24 @@ class CExport:
 def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any = "float64") -> CExport:
     """Write a controller as a C99 source file and its header, to continue from its present state.
 
-    The files need nothing but `memcpy` and the C standard's `math.h`. They allocate nothing: a struct of fixed size holds
-    the state. Several controllers, each exported under its own name, link into one program. The calls are
+    The files need nothing but ``string.h`` and ``math.h``. They allocate nothing: a struct of fixed size holds the state.
+    Several controllers, each exported under its own name, link into one program. The calls are
 
     - ``void anc_init(anc_state *state)``: set the state to the controller's as it was when exported;
     - ``double anc_control_signal(anc_state *state, double reference)``: return y(n);
-    - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing changed.
+    - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing changed;
+    - ``int anc_self_test(anc_state *state)``, of the FxLMS family: return 0 if known samples give the known results.
+
+    With several channels, the numbers are arrays, and `anc_control_signal` sets its third argument, y(n).
+
+    The files of the FxLMS family contain the package's own core: with the flags that the header states, float64 gives the
+    bits that Python gives. The others are written for the export, and differ from Python by rounding.
 
     Parameters
     ----------
-    controller : FxLMS, MOVFxLMS, DiagonalKalman, or what kf_anc or kf_opc returns
-        Controller of one channel, with a limiter or without. It is not changed.
+    controller : FxLMS and its relatives, DiagonalKalman, or what kf_anc or kf_opc returns
+        Of the FxLMS family any controller: several channels, limiters, amplifier models, an uncertain secondary path,
+        sliding windows. Of the others, one of one channel, with a limiter or without. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Existing files are
         replaced.
@@ -103,15 +113,16 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     Returns
     -------
     CExport
-        The files, the size of the state and the operations per sample. The header states them too.
+        The files, the size of the state and, but for the FxLMS family, the operations per sample. The header states
+        them too.
 
     Raises
     ------
     TypeError, ValueError
-        A controller that has no C code: of several channels, of another algorithm, with an amplifier model, a
-        secondary-path uncertainty, power estimates over a sliding window or a fading memory. A path that does not end
-        in ``.c``, a name that is no C identifier, a value that the precision cannot hold, a limiter's window too long
-        for float32. No file was written.
+        A controller that has no C code: another algorithm, a subclass with calls of its own; a Kalman filter of several
+        channels, with an amplifier model, a secondary-path uncertainty, power estimates over a sliding window or a
+        fading memory. A path that does not end in ``.c``, a name that is no C identifier, a value that the precision
+        cannot hold, a limiter's window too long for float32. No file was written.
 
     Examples
     --------
@@ -130,25 +141,41 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     if path.suffix != ".c":
         raise ValueError(f"path must end in .c, got {str(path)!r}")
     name = _checked_name(path.stem if name is None else name)
-    parts = parts_of(controller, precision)
-    operations = sum(part.operations for part in parts)
-    export = CExport(
-        path,
-        path.with_suffix(".h"),
-        name,
-        controller.name,
-        controller.n_taps,
-        precision.name,
-        _layout(_state(parts), precision.itemsize)[0],
-        operations,
-        operations + sum(part.rare_operations for part in parts),
-    )
-    dialect = _Dialect(name, precision)
-    description = repr(controller)[1:-1].replace("*/", "* /")
-    header, source = _header(export, description, parts, dialect), _source(export, description, parts, dialect)
+    write = _of_core if isinstance(controller, CoreController) else _of_fragments
+    export, header, source = write(controller, path, name, precision)
     export.header_path.write_text(header, encoding="utf-8", newline="\n")
     export.path.write_text(source, encoding="utf-8", newline="\n")
     return export
+
+
+def _of_core(controller: CoreController, path: Path, name: str, precision: np.dtype) -> tuple[CExport, str, str]:
+    """Return the export with the text of its header and of its source."""
+    own, export = core_export(controller), _described(controller, path, name, precision)
+    header, source = own.written(name, export.header_path.name, _description(controller), precision)
+    return replace(export, n_bytes=own.n_bytes(precision)), header, source
+
+
+def _of_fragments(controller: Any, path: Path, name: str, precision: np.dtype) -> tuple[CExport, str, str]:
+    """Return the export with the text of its header and of its source."""
+    parts = parts_of(controller, precision)
+    operations = sum(part.operations for part in parts)
+    export = replace(
+        _described(controller, path, name, precision),
+        n_bytes=_layout(_state(parts), precision.itemsize)[0],
+        operations=operations,
+        most_operations=operations + sum(part.rare_operations for part in parts),
+    )
+    dialect, description = _Dialect(name, precision), _description(controller)
+    return export, _header(export, description, parts, dialect), _source(export, description, parts, dialect)
+
+
+def _described(controller: Any, path: Path, name: str, precision: np.dtype) -> CExport:
+    names = controller.name, controller.n_taps, precision.name
+    return CExport(path, path.with_suffix(".h"), name, *names, n_bytes=0, operations=None, most_operations=None)
+
+
+def _description(controller: Any) -> str:
+    return repr(controller)[1:-1].replace("*/", "* /")
 
 
 def _checked_name(name: Any) -> str:
@@ -191,16 +218,6 @@ class _Dialect:
             code = SINGLE.sub(_in_single_precision, code)
         return re.sub(r"\banc_", f"{self.name}_", re.sub(r"\bANC_", f"{self.name.upper()}_", code))
 
-    def number(self, value: Any, name: str) -> str:
-        """Return a number as C writes it; the precision must be able to hold it."""
-        if isinstance(value, int | np.integer):
-            return str(value)
-        with np.errstate(over="ignore", under="ignore"):
-            rounded = self.precision.type(value)
-        if not np.isfinite(rounded):
-            raise ValueError(f"{name} must be finite in {self.precision}, got {value:g}: scale the signals")
-        return f"{rounded!s}{self.suffix}"
-
     def literal(self, value: Any, name: str, indent: str = "") -> str:
         """Return a value as C writes it: a number, an array in braces, or a struct in braces with named fields."""
         if isinstance(value, dict):
@@ -208,14 +225,9 @@ class _Dialect:
             lines = [f"{inner}.{key} = {self.literal(one.value, key, inner)},\n" for key, one in value.items()]
             return "{\n" + "".join(lines) + indent + "}"
         if np.ndim(value) == 0:
-            return self.number(value, name)
+            return number(value, name, self.precision)
         last = np.max(np.flatnonzero(value), initial=0)  # C sets what follows to zero
-        text = ", ".join(self.number(number, name) for number in value[: last + 1])
-        if len(text) < WIDTH // 2:
-            return f"{{{text}}}"
-        inner = indent + "    "
-        wrapped = fill(text, WIDTH, initial_indent=inner, subsequent_indent=inner, break_on_hyphens=False)
-        return f"{{\n{wrapped}\n{indent}}}"
+        return braces((number(one, name, self.precision) for one in value[: last + 1]), indent)
 
 
 # Comments stay as they are, so they come first.

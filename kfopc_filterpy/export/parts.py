@@ -10,23 +10,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..controllers.base import FilteredReferenceController
+from ..controllers.compiled_controller import CompiledController
 from ..controllers.diagonal import DiagonalState
-from ..controllers.fxlms import FxLMSState
 from ..controllers.kalman import KalmanState
-from ..controllers.mov import MOVState
 from ..controllers.step import Lines
+from ..core.running import LINEAR
 from ..kernels.covariance import CANCELLATION, covariance_matrix
 from ..kernels.delay_lines import newest
-from ..power.amplifiers import LINEAR
-from ..power.constraint import DISTURBANCE, FILTERED_REFERENCE, REFERENCE, ConstraintState
-from ..power.limiter import FLOOR, OVERSHOOT, RESERVE, LimiterState
+from ..power.constraint import ConstraintState
+from ..power.limiter import RESERVE, LimiterState
+from .precision import in_precision
 
 EXPORTED = (
-    "export_c takes FxLMS, MOVFxLMS, DiagonalKalman, kf_anc and kf_opc: one channel, exponential power estimates, with or "
-    "without a limiter; no amplifier model, no secondary_path_uncertainty, no fading memory, no wrapper"
+    "export_c takes the FxLMS family, whatever it has, and DiagonalKalman, kf_anc and kf_opc: one channel, exponential "
+    "power estimates, with or without a limiter; no amplifier model, no secondary_path_uncertainty, no fading memory. "
+    "It takes no wrapper and no subclass with calls of its own"
 )
-LARGEST_MARGIN = 0.01  # of the rated power, which the limiter keeps free for rounding
+OVERSHOOT = 1.1  # of limiter.c
 
 
 class Value(NamedTuple):
@@ -57,7 +57,7 @@ def parts_of(controller: Any, dtype: np.dtype) -> list[Part]:
     """Return the parts of a controller, or raise an error that says why it cannot be exported."""
     state = _exportable_state(controller)
     algorithm = ALGORITHMS[type(state)](state, dtype)
-    parts = [_signals(state.lines, state.weights, "OUTPUT" in algorithm.flags)]
+    parts = [_signals(state.lines, state.weights)]
     if "POWERS" in algorithm.flags:
         parts.append(_powers(state.constraint, dtype))
     if state.lines.limiter is not None:
@@ -65,29 +65,29 @@ def parts_of(controller: Any, dtype: np.dtype) -> list[Part]:
     return [*parts, algorithm]
 
 
+def named(controller: Any) -> str:
+    """Return the name and the class of a controller for a message."""
+    return f"{getattr(controller, 'name', type(controller).__name__)} ({type(controller).__name__})"
+
+
 def _exportable_state(controller: Any) -> Any:
     """Return a copy of a controller's state, or raise an error if it has parts that are not exported."""
-    name = getattr(controller, "name", type(controller).__name__)
-    if not isinstance(controller, FilteredReferenceController):
-        raise TypeError(f"{name} ({type(controller).__name__}) cannot be exported: {EXPORTED}")
+    if not isinstance(controller, CompiledController):
+        raise TypeError(f"{named(controller)} cannot be exported: {EXPORTED}")
     if controller.multichannel:
-        raise ValueError(f"{name} has several channels and cannot be exported: {EXPORTED}")
+        raise ValueError(f"{named(controller)} has several channels and cannot be exported: {EXPORTED}")
     state = deepcopy(controller).compiled_state()
     if type(state) not in ALGORITHMS:
-        raise TypeError(f"{name} ({type(controller).__name__}) cannot be exported: {EXPORTED}")
-    factor_is_fixed = not math.isnan(state.constraint.numbers["supplied_factor"][0])
+        raise TypeError(f"{named(controller)} cannot be exported: {EXPORTED}")
     obstacles = {
         "an amplifier model": state.lines.amplifier["kind"][0] != LINEAR,
         "a secondary_path_uncertainty": state.lines.guard is not None,
         "power estimates over a sliding window": state.constraint.window.shape[1] > 0,
         "a fading memory": isinstance(state, KalmanState) and state.numbers["alpha_sq"][0] != 1.0,
-        "a penalty from a fixed constraint factor": isinstance(state, MOVState)
-        and math.isnan(state.penalty)
-        and factor_is_fixed,
     }
     found = [what for what, there in obstacles.items() if there]
     if found:
-        raise ValueError(f"{name} has {' and '.join(found)} and cannot be exported: {EXPORTED}")
+        raise ValueError(f"{named(controller)} has {' and '.join(found)} and cannot be exported: {EXPORTED}")
     return state
 
 
@@ -96,18 +96,20 @@ def _delay_line(line: np.ndarray, taps: int) -> np.ndarray:
     return np.tile(newest(line, taps), 2)
 
 
-def _signals(lines: Lines, weights: np.ndarray, output: bool) -> Part:
+def _signals(lines: Lines, weights: np.ndarray) -> Part:
     n_taps, n_path = weights.size, lines.secondary_estimate.size
     longest = max(n_taps, n_path)
     fields = {
         "weights": Value(weights, "control filter w, newest-sample tap first", "ANC_TAPS"),
         "reference": Value(_delay_line(lines.reference, longest), "delay line of x", "2 * ANC_REFERENCE_TAPS"),
         "filtered": Value(_delay_line(lines.filtered, n_taps), "delay line of x' = s^ * x", "2 * ANC_TAPS"),
+        "output": Value(_delay_line(lines.output, n_path), "delay line of y", "2 * ANC_PATH_TAPS"),
     }
-    starts = {"reference_start": Value(0, "where the delay lines begin"), "filtered_start": Value(0)}
-    if output:
-        fields["output"] = Value(_delay_line(lines.output, n_path), "delay line of y", "2 * ANC_PATH_TAPS")
-        starts["output_start"] = Value(0)
+    starts = {
+        "reference_start": Value(0, "where the delay lines begin"),
+        "filtered_start": Value(0),
+        "output_start": Value(0),
+    }
     return Part(
         "signals",
         sizes={
@@ -123,13 +125,13 @@ def _signals(lines: Lines, weights: np.ndarray, output: bool) -> Part:
 
 def _powers(constraint: ConstraintState, dtype: np.dtype) -> Part:
     """Return the running powers and the constraint factor."""
-    numbers, means = constraint.numbers, constraint.powers["mean_square"]
+    numbers, (disturbance, filtered, reference) = constraint.numbers, map(float, constraint.powers["mean_square"])
     power, gain = float(numbers["supplied_power"][0]), float(numbers["supplied_gain"][0])
     estimated_power, estimated_gain = math.isnan(power), math.isnan(gain)
     rate, last_gain = float(numbers["rate"][0]), float(numbers["gain"][0])
     memory = math.ceil(1.0 / rate)
     fields = {
-        "disturbance": Value(float(means[DISTURBANCE]) if estimated_power else power, "delta_d^2 = E[d^2], eq. 10"),
+        "disturbance": Value(disturbance if estimated_power else power, "delta_d^2 = E[d^2], eq. 10"),
         "gain": Value((-1.0 if math.isnan(last_gain) else last_gain) if estimated_gain else gain, "G_s of eq. 11"),
         "factor": Value(float(numbers["factor"][0]), "alpha of eq. 13"),
     }
@@ -140,8 +142,8 @@ def _powers(constraint: ConstraintState, dtype: np.dtype) -> Part:
     flags, sizes, operations = set(), {}, 3
     if estimated_gain:
         flags.add("GAIN_ESTIMATED")
-        fields["filtered"] = Value(float(means[FILTERED_REFERENCE]), "E[x'^2]")
-        fields["reference"] = Value(float(means[REFERENCE]), "E[x^2]")
+        fields["filtered"] = Value(filtered, "E[x'^2]")
+        fields["reference"] = Value(reference, "E[x^2]")
         operations += 9
     if estimated_power:
         flags.add("POWER_ESTIMATED")
@@ -158,24 +160,18 @@ def _powers(constraint: ConstraintState, dtype: np.dtype) -> Part:
 
 def _limiter(limiter: LimiterState, dtype: np.dtype) -> Part:
     """Return the limiter; its margin for rounding is that of the precision."""
-    numbers, window, spans = limiter.numbers, limiter.laps_out.size - 1, limiter.horizons.size
-    epsilon = float(np.finfo(dtype).eps)
-    margin = (1.0 - float(numbers["budget"][0])) * epsilon / float(np.finfo(np.float64).eps)
-    if margin > LARGEST_MARGIN:
-        longest = int(window * LARGEST_MARGIN / margin)
-        raise ValueError(
-            f"the limiter's window of {window} samples is too long for {dtype}, whose rounding errors would take "
-            f"{100 * margin:.1f} % of the rated power: at most {longest} samples, or dtype='float64'"
-        )
-    floor = FLOOR if dtype == np.float64 else 1e-30
+    numbers, (laps_out, laps_in, squares) = limiter.numbers.copy(), limiter.laps
+    floor = in_precision(numbers, dtype)
+    window, spans = laps_out.size - 1, int(numbers["spans"][0])
+    horizon, held, room = (numbers[name][0, :spans] for name in ("horizon", "held", "room"))
 
     def number(name: str) -> float:
         return float(numbers[name][0])
 
     settings = {
         "scale": Value(number("scale"), "1 / root of the energy that a window may have"),
-        "peak": Value((1.0 - 4.0 * epsilon) / number("scale"), "that root, less a margin for rounding"),
-        "budget": Value(1.0 - margin, "share of that energy, less a margin for rounding"),
+        "peak": Value(number("peak"), "that root, less a margin for rounding"),
+        "budget": Value(number("budget"), "share of that energy, less a margin for rounding"),
         "limit": Value(number("limit"), "largest amplitude"),
         "planned": Value(number("planned"), "louder inputs are planned for as if they were this loud"),
         "attack": Value(number("attack"), "of the running mean of the input energies"),
@@ -185,20 +181,20 @@ def _limiter(limiter: LimiterState, dtype: np.dtype) -> Part:
         "overshoot": Value(OVERSHOOT, "of the gain over its aim"),
         "reserve": Value(RESERVE, "of the power"),
         "floor": Value(floor, "keeps energies above denormal numbers"),
-        "horizons": Value(limiter.horizons.astype(np.int32), "spans that the gain is planned for", "ANC_HORIZONS"),
-        "room": Value(limiter.room, "largest output energy in such a span", "ANC_HORIZONS"),
+        "horizons": Value(horizon.astype(np.int32), "spans that the gain is planned for", "ANC_HORIZONS"),
+        "room": Value(room, "largest output energy in such a span", "ANC_HORIZONS"),
     }
     fields = {
         "gain": Value(number("gain"), "last used, before any clipping"),
         "spent": Value(number("spent"), "output energy of this lap"),
         "arrived": Value(number("arrived"), "input energy of this lap"),
-        "average": Value(max(number("average"), floor), "running mean of the input energies"),
-        "loud": Value(max(number("loud"), floor), "slowly falling maximum of it"),
+        "average": Value(number("average"), "running mean of the input energies"),
+        "loud": Value(number("loud"), "slowly falling maximum of it"),
         "known": Value(number("known"), "largest recent energy of a window"),
-        "held": Value(np.maximum(limiter.held, floor), "largest recent input energy in such a span", "ANC_HORIZONS"),
-        "laps_out": Value(limiter.laps_out, "output energies of this lap and the last", "ANC_WINDOW + 1"),
-        "laps_in": Value(limiter.laps_in, "input energies", "ANC_WINDOW + 1"),
-        "squares": Value(limiter.squares[:window], "output energies of this lap's samples", "ANC_WINDOW"),
+        "held": Value(held, "largest recent input energy in such a span", "ANC_HORIZONS"),
+        "laps_out": Value(laps_out, "output energies of this lap and the last", "ANC_WINDOW + 1"),
+        "laps_in": Value(laps_in, "input energies", "ANC_WINDOW + 1"),
+        "squares": Value(squares[:window], "output energies of this lap's samples", "ANC_WINDOW"),
         "position": Value(int(numbers["position"][0]), "in the lap"),
         "clipped": Value(min(int(numbers["clipped"][0]), 2**31 - 1), "number of samples clipped"),
     }
@@ -213,32 +209,12 @@ def _limiter(limiter: LimiterState, dtype: np.dtype) -> Part:
     )
 
 
-def _fxlms(state: FxLMSState, dtype: np.dtype) -> Part:
-    n = state.weights.size
-    return Part("fxlms", settings={"step_size": Value(state.step_size, "mu")}, operations=2 * n + 1)
-
-
-def _mov(state: MOVState, dtype: np.dtype) -> Part:
-    n, n_path = state.weights.size, state.lines.secondary_estimate.size
-    settings, flags = {"step_size": Value(state.step_size, "mu")}, {"OUTPUT"}
-    operations = 4 * n + 2 * n_path + 5
-    if math.isnan(state.penalty):
-        flags.add("POWERS")
-        operations += 3
-    else:
-        settings["penalty_factor"] = Value(float(state.penalty), "gamma")
-    if state.modified:
-        flags.add("MODIFIED")
-        operations += 2 * n + 1
-    return Part("mov", settings=settings, flags=flags, operations=operations)
-
-
 def _constrained(state: DiagonalState | KalmanState) -> tuple[Values, set[str]]:
     """Return the settings and flags of a Kalman filter's measurement alpha d^."""
     fixed = float(state.constraint.numbers["supplied_factor"][0])
     if math.isnan(fixed):
-        return {}, {"OUTPUT", "POWERS"}
-    return {"constraint_factor": Value(fixed, "alpha, fixed")}, {"OUTPUT"}
+        return {}, {"POWERS"}
+    return {"constraint_factor": Value(fixed, "alpha, fixed")}, set()
 
 
 def _diagonal(state: DiagonalState, dtype: np.dtype) -> Part:
@@ -289,8 +265,6 @@ def _kalman(state: KalmanState, dtype: np.dtype) -> Part:
 
 
 ALGORITHMS: dict[type, Callable[..., Part]] = {
-    FxLMSState: _fxlms,
-    MOVState: _mov,
     DiagonalState: _diagonal,
     KalmanState: _kalman,
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -13,7 +14,8 @@ import pytest
 from kfopc_filterpy.export import CExport, export_c
 
 FOLDER = Path(__file__).resolve().parents[1] / "export"
-STRICT = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-Wdouble-promotion")
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wconversion", "-Wdouble-promotion")
+STRICT = ("-std=c99", "-O2", *WARNINGS)
 REAL = {"float64": "double", "float32": "float"}
 
 
@@ -64,6 +66,40 @@ class Program:
         size, *_ = out = np.frombuffer(done.stdout)
         samples = out[1 : 1 + 2 * x.size].reshape(-1, 2)
         return Outputs(int(size), samples[:, 0], samples[:, 1].astype(int), out[1 + 2 * x.size :])
+
+
+class CoreOutputs(NamedTuple):
+    """What a stream gave: the size of the state, what the self-tests returned, y (J, n), what the updates returned."""
+
+    n_bytes: int
+    self_tests: list[float]
+    y: np.ndarray
+    status: np.ndarray
+
+
+class CoreProgram:
+    """A controller of the core that was exported and compiled with `core_stream.c` and the flags of its header."""
+
+    def __init__(self, controller: Any, folder: Path, dtype: str = "float64", options: tuple[str, ...] = ()) -> None:
+        self.exported: CExport = export_c(controller, folder / "anc.c", dtype=dtype)
+        self.program, self.loudspeakers = folder / "stream", controller.n_loudspeakers
+        stated = re.search(r"with these flags.*\n \*  +(-std=c99 .*)", self.exported.header_path.read_text())
+        assert stated
+        include = (f"-Dreal={REAL[dtype]}", *(["-DARRAYS"] if controller.multichannel else []), "-I", folder)
+        flags, source = (*stated[1].split(), *WARNINGS, *options), self.exported.path
+        objects = [folder / f"{name}.o" for name in ("anc", "stream")]
+        succeeds(c_compiler(), *flags, "-c", source, "-o", objects[0])
+        succeeds(c_compiler(), *flags, *include, "-c", FOLDER / "core_stream.c", "-o", objects[1])
+        succeeds(c_compiler(), *options, *objects, "-lm", "-o", self.program)
+
+    def run(self, x: np.ndarray, e: np.ndarray) -> CoreOutputs:
+        """Run it on references, (I, n) or (n,), and errors, (K, n) or (n,)."""
+        stream = np.concatenate([np.atleast_2d(x), np.atleast_2d(e)]).T
+        done = subprocess.run([str(self.program)], input=stream.astype(np.float64).tobytes(), capture_output=True)
+        assert done.returncode == 0, done.stderr.decode()
+        out = np.frombuffer(done.stdout)
+        samples = out[3:].reshape(len(stream), -1).T
+        return CoreOutputs(int(out[0]), out[1:3].tolist(), samples[:-1], samples[-1].astype(int))
 
 
 def operations(controller: Any, folder: Path, x: np.ndarray, e: np.ndarray) -> tuple[CExport, np.ndarray]:

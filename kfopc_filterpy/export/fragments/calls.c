@@ -15,9 +15,7 @@ double anc_control_signal(anc_state *state, double reference)
 #if LIMITER
     y = limit(&state->limiter, y);
 #endif
-#if OUTPUT
     state->output_start = push(state->output, state->output_start, ANC_PATH_TAPS, y);
-#endif
     return y;
 }
 

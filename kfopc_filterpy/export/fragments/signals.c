@@ -34,11 +34,9 @@ static void take_reference(anc_state *state, double x)
     state->filtered_start = push(state->filtered, state->filtered_start, ANC_TAPS, filtered);
 }
 
-#if OUTPUT
 /* Return d^(n) = e(n) + (s^ * y)(n). */
 static double disturbance_estimate(const anc_state *state, double error)
 {
     return error + dot(secondary_path, state->output + state->output_start, ANC_PATH_TAPS);
 }
 
-#endif

@@ -1,0 +1,69 @@
+/* $description
+ *
+ * Exported by kfopc_filterpy, to continue from the state that the controller had then:
+ *
+ *     static ${name}_state state;
+ *     ${name}_init(&state);
+ *     for each sample:
+ *         $control    x(n) from the reference microphone$s, y(n) to the amplifier$s
+ *         ${name}_update(&state, e);    e(n) = d(n) - (s * y)(n) from the error microphone$s
+ *
+ * The state has $n_bytes bytes where a pointer has 8. There is no heap, and no state elsewhere.
+ *
+ * Compile with these flags, and the result has the bits of kfopc_filterpy's core$if_compiled:
+ *     $flags
+ * -ffp-contract=off decides the bits, -fno-strict-aliasing is needed, the others are for speed. -ffast-math is refused.
+ * Of the library, memcpy, memset, strcmp and math.h are used.
+ *
+ * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A bad
+ * reference counts as 0, and ${name}_update refuses that sample. A refused update changes nothing. An output is never NaN or
+ * infinite: if the weights have grown that much, it is 0.
+ */
+#ifndef ${NAME}_EXPORTED_H
+#define ${NAME}_EXPORTED_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define ${NAME}_MICROPHONES $K
+#define ${NAME}_LOUDSPEAKERS $J
+#define ${NAME}_REFERENCES $I
+#define ${NAME}_TAPS $L /* of a control filter */
+
+/* What ${name}_update returns. */
+#define ${NAME}_ADAPTED 0
+#define ${NAME}_LOUD_REFERENCE 1
+#define ${NAME}_LOUD_ERROR 2
+#define ${NAME}_LOUD_ESTIMATE 3 /* of the disturbance, e + s^ * y */
+#define ${NAME}_LOUD_STEP 4     /* of the weights: step size times error */
+#define ${NAME}_NO_SOLUTION 5
+
+/* All that changes. A copy of it is a copy of the controller. */
+typedef struct {
+    $real block[$n_reals];
+    void *view[$n_places];  /* where the fields stand in `block` */
+    const void *opened; /* the state that they were found for */
+    int32_t fault;      /* of this sample's reference */
+} ${name}_state;
+
+/* Set the state to that of the export. */
+void ${name}_init(${name}_state *state);
+
+/* $returns the control signal y(n) for the newest reference sample x(n), from the weights of the last sample. */
+$declared_control;
+
+/* Adapt to the error e(n) that this control signal left. Return ${NAME}_ADAPTED, or why the update was refused. */
+$declared_update;
+
+/* Run known samples from the state of the export, and compare with what Python computed for them$tolerated.
+ * Return 0 if they agree. Afterwards the state is that of the export, as after ${name}_init. */
+int ${name}_self_test(${name}_state *state);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

@@ -1,0 +1,102 @@
+/* $description. See $header.
+ *
+ * First the files of kfopc_filterpy's core (MIT licence, sources $stamp), in which only the includes were
+ * resolved and everything made static. Behind them: the plan, the state of the export, the calls. */
+$defined
+#define ANC_PUBLIC static
+#ifdef __GNUC__ /* not every export needs all of the core */
+#pragma GCC diagnostic ignored "-Wunused-function"
+#pragma GCC diagnostic ignored "-Wunused-const-variable"
+#endif
+$core
+/* ---- The exported controller ---- */
+
+#include "$header"
+
+#define ALGORITHM anc_$algorithm
+
+$constants
+static const anc_plan plan = {
+    .microphones = $K, .loudspeakers = $J, .references = $I, .taps = $L, .path_taps = $M, .guard_taps = $G,
+    .limited = $limited, $windows.path = path, $guard.settings = settings,
+};
+
+/* The state of the export: where it differs from a fresh block, `count` elements of a field from `first` on. */
+typedef struct {
+    const char *field;
+    int32_t first, count;
+    const void *values;
+} stretch;
+
+static const stretch initial[] = {
+$stretches    {0},
+};
+
+/* What Python computed for the last samples of the self-test. */
+enum { SELF_TEST = $n_samples, COMPARED = $n_compared };
+static const real expected[COMPARED][$J] = {
+$expected};
+static const real tolerance = $tolerance;
+
+typedef char view_has_room[sizeof(anc_view) == sizeof(((${name}_state *)0)->view) ? 1 : -1];
+
+static void fill(void *to, const char *name, anc_role role, anc_type type, size_t offset, const int32_t shape[4])
+{
+    const size_t size = type == ANC_IS_REAL ? sizeof(real) : sizeof(int32_t);
+    (void)role, (void)shape;
+    for (const stretch *s = initial; s->field; s++)
+        if (!strcmp(s->field, name))
+            memcpy((char *)to + offset + size * (size_t)s->first, s->values, size * (size_t)s->count);
+}
+
+/* Return the view of a state; a copy of a state gets its own when it is first used. */
+static anc_view *view_of(${name}_state *state)
+{
+    if (state->opened != state) anc_open(&ALGORITHM, &plan, (anc_view *)state->view, state->block, sizeof state->block, 0);
+    state->opened = state;
+    return (anc_view *)state->view;
+}
+
+/* Set y for x. Time goes on where x is refused: it counts as silence. */
+static void take(${name}_state *state, const real *x, real *y)
+{
+    static const real silence[$I];
+    anc_view *view = view_of(state);
+    state->fault = ALGORITHM.control_signal(view, x, y);
+    if (state->fault) ALGORITHM.control_signal(view, silence, y);
+    for (int32_t j = 0; j < $J; j++)
+        if (!isfinite(y[j])) y[j] = 0;
+}
+
+static int adapt(${name}_state *state, const real *e)
+{
+    return state->fault ? state->fault : ALGORITHM.update(view_of(state), e);
+}
+
+void ${name}_init(${name}_state *state)
+{
+    anc_open(&ALGORITHM, &plan, (anc_view *)state->view, state->block, sizeof state->block, 1);
+    anc_describe(&ALGORITHM, &plan, fill, state->block);
+    state->opened = state;
+    state->fault = 0;
+}
+
+$calls
+int ${name}_self_test(${name}_state *state)
+{
+    int differ = 0;
+    ${name}_init(state);
+    for (int32_t n = 0; n < SELF_TEST; n++) {
+        real x[$I], e[$K], y[$J];
+        for (int32_t i = 0; i < $I; i++) x[i] = (real)((7 * n + 3 * i) % 17 - 8) / 8;
+        for (int32_t k = 0; k < $K; k++) e[k] = (real)((5 * n + 2 * k) % 13 - 6) / 8;
+        take(state, x, y);
+        adapt(state, e);
+        for (int32_t j = 0; n >= SELF_TEST - COMPARED && j < $J; j++) {
+            const real difference = y[j] - expected[n - (SELF_TEST - COMPARED)][j];
+            if (!(difference <= tolerance && -difference <= tolerance)) differ = 1;
+        }
+    }
+    ${name}_init(state);
+    return differ;
+}
