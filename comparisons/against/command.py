@@ -30,7 +30,12 @@ BEFORE_CORE = "567a38ce53fa4295221c7f51d34fb14b5a5db2a3"  # the last version who
 TOLERANCE = 1e-9  # of a case, relative to the largest value of an array
 ROUNDS = 5
 # Cases that have moved for a known reason: a pattern of their names, how far they may move, and the reason.
-KNOWN: dict[str, tuple[float, str]] = {}
+KNOWN: dict[str, tuple[float, str]] = {
+    "2 x 2 x *: KF-PB, frequency domain": (
+        0.2,
+        "with blocks of 16 samples it amplifies rounding: a reference changed by 1e-13 moves it by 1 % in either version",
+    ),
+}
 
 OK, MOVED, IS_KNOWN = "ok", "MOVED", "known"
 Result = Mapping[str, Any]

@@ -1,4 +1,6 @@
 from .base import Controller as Controller
+from .core_controller import CoreController as CoreController
+from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman
 from .direct import DirectPowerBudget as DirectPowerBudget
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer

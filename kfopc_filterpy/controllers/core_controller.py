@@ -9,6 +9,7 @@ import numpy as np
 
 from .._validate import as_number, as_positive
 from ..core.block import REASONS, Algorithm, Block, Shape
+from ..core.own import load_algorithm as load_algorithm
 from ..core.running import Steps
 from ..power.amplifiers import Amplifier, amplifier_models
 from ..power.constraint import NUMBERS
@@ -25,14 +26,59 @@ Limiters = OutputLimiter | Sequence[OutputLimiter] | None
 class CoreController(FilteredReferenceController):
     """Base class of the controllers whose algorithm is in the core, for one channel and several.
 
-    A subclass names its `algorithm` in C, the `checks` of its settings, and hands these over by their names in C.
+    A subclass names its `algorithm` in C, the `checks` of its settings, and hands these over by their names in C. For an
+    algorithm of your own see `load_algorithm`.
 
     Parameters
     ----------
-    n_taps, secondary_path, n_references, multichannel, amplifier, constraint, limiter
-        See `FilteredReferenceController`.
+    n_taps : int
+        Taps L of the control filter, or of each of them.
+    secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
+        Estimated secondary path, taps or an FIR system; with channel axes, those from loudspeaker j to microphone k.
     settings : mapping
         Settings of the algorithm, as a user gave them: a number each, or also (J,) where each loudspeaker has its own.
+    n_references : int, default 1
+        Number of references I; None: the algorithm takes one channel only.
+    multichannel : bool, optional
+        Whether signals have a channel axis; by default if the secondary path has channel axes or there are several
+        references.
+    amplifier : callable or sequence of J of them, optional
+        Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y.
+    constraint : OutputPowerConstraint or tuple of J of them, optional
+        Constraint that computes the powers and the factor; by default one whose factor is fixed at 1.
+    limiter : OutputLimiter or sequence of J of them, optional
+        Limiter of the control signal, not shared with another controller.
+
+    Attributes
+    ----------
+    algorithm : str or Algorithm
+        Name of an algorithm of the core, or what `load_algorithm` returns. An attribute of the class.
+    checks : mapping of str to callable
+        Functions of a value and its name that return a setting as a float, or raise ValueError; settings without one
+        must be positive. An attribute of the class.
+
+    Raises
+    ------
+    ValueError
+        A setting that its check refuses or that is out of the range that the C file states, fewer than one tap or
+        reference, a path that is not FIR.
+    TypeError
+        A setting that the algorithm does not have, or a limiter that is not an `OutputLimiter`.
+
+    Examples
+    --------
+    >>> from kfopc_filterpy.controllers import CoreController
+    >>> class PlainFxLMS(CoreController):
+    ...     name, algorithm = "plain FxLMS", "fxlms"
+    ...
+    ...     def __init__(self, n_taps, secondary_path, *, step_size):
+    ...         super().__init__(n_taps, secondary_path, settings={"step_size": step_size})
+    >>> controller = PlainFxLMS(4, secondary_path=[1.0], step_size=0.1)
+    >>> controller.control_signal(1.0)
+    0.0
+    >>> controller.update(2.0)  # e = d: nothing is cancelled yet
+    >>> float(controller.weights[0])  # 0.1 * 2 * 1
+    0.2
     """
 
     algorithm: str | Algorithm
@@ -76,6 +122,8 @@ class CoreController(FilteredReferenceController):
 
     def _checked_settings(self, each: Mapping[str, bool]) -> dict[str, Any]:
         """Return the settings, checked; `each` says which of them every loudspeaker has."""
+        if set(self._settings) != set(each):
+            raise TypeError(f"{self.name} has the settings {sorted(each)}, got {sorted(self._settings)}")
         checked = {}
         for name, value in self._settings.items():
             check = self.checks.get(name, as_positive)
@@ -108,10 +156,10 @@ class CoreController(FilteredReferenceController):
         self._memory, self._shape = block.memory, block.shape
         fields = block.fields
         for j, constraint in enumerate(self._each(self._own_constraint)):
-            window = fields["power_window"][0, j, :, : block.shape.power_windows[j]]
+            window = _rows(fields["power_window"][0, j], block.shape.power_windows[j])
             constraint.live_in(fields["powers"][0, j], window, fields["constraint"][0, 0, j])
         for j, limiter in enumerate(self._each(self._limiter)):
-            limiter.live_in(fields["limiter"][0, 0, j], fields["laps"][0, j, :, : block.shape.limiter_windows[j] + 1])
+            limiter.live_in(fields["limiter"][0, 0, j], _rows(fields["laps"][0, j], block.shape.limiter_windows[j] + 1))
         self._block = block
 
     def _opened(self) -> Block:
@@ -193,7 +241,7 @@ class CoreController(FilteredReferenceController):
         else:
             block.reference[0] = as_number(reference, "reference")
         if answer := block.emit():
-            raise ValueError(f"{REASONS[answer]}: nothing was changed")
+            raise ValueError(f"{REASONS[answer]}; nothing was changed")
         return block.control_signal.copy() if self.multichannel else float(block.control_signal[0])
 
     def update(self, error: Any) -> None:
@@ -204,7 +252,7 @@ class CoreController(FilteredReferenceController):
         else:
             block.error[0] = as_number(error, "error")
         if answer := block.update():
-            raise ValueError(f"{REASONS[answer]}: nothing was changed")
+            raise ValueError(f"{REASONS[answer]}; nothing was changed")
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         block = self._opened()
@@ -230,6 +278,11 @@ class CoreController(FilteredReferenceController):
             in_use=block.in_use,
             owner=block,
         )
+
+
+def _rows(room: np.ndarray, length: int) -> np.ndarray:
+    """Return three rows of a length at the start of the room for three of the longest."""
+    return room.reshape(-1)[: 3 * length].reshape(3, length)
 
 
 def _nothing() -> None:

@@ -23,10 +23,10 @@ _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 # What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
 LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION = range(1, 6)
 REASONS = {
-    LOUD_REFERENCE: "the reference is louder than the largest signal that can be controlled, 1e100 over the path's gain",
-    LOUD_ERROR: "the error is louder than the largest signal that can be controlled, 1e100",
-    LOUD_ESTIMATE: "the disturbance estimate e + s^ * y overflows: it is louder than 1e100",
-    LOUD_STEP: "the step of the weights overflows: step size times error is above 1e50",
+    LOUD_REFERENCE: "the reference is too loud, above 1e100 over the gain of the secondary path: scale the signals",
+    LOUD_ERROR: "the error is too loud, above 1e100: scale the signals",
+    LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100: scale the signals",
+    LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
     NO_SOLUTION: "the update has no solution: S = x' P x' + q must be positive and finite",
 }
 
@@ -126,14 +126,19 @@ class InUse:
     """A context that refuses to be entered by a second thread."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        lock = threading.Lock()
+        self._acquire, self.leave = lock.acquire, lock.release
 
-    def __enter__(self) -> None:
-        if not self._lock.acquire(blocking=False):
+    def enter(self) -> None:
+        """Enter, or raise RuntimeError if another thread has."""
+        if not self._acquire(False):
             raise RuntimeError("this controller is in use by another thread: give each thread a controller of its own")
 
+    def __enter__(self) -> None:
+        self.enter()
+
     def __exit__(self, *_: Any) -> None:
-        self._lock.release()
+        self.leave()
 
 
 class Block:
@@ -174,6 +179,7 @@ class Block:
     ) -> None:
         self.algorithm, self.shape = algorithm, shape
         self.in_use = InUse()
+        self._enter, self._leave = self.in_use.enter, self.in_use.leave
         self._library: Any = load().held
         keep = self._plan_arrays(path, settings, guard)
         plan = self._plan_of(shape, keep)
@@ -209,7 +215,8 @@ class Block:
         pointers = (ctypes.c_void_p,) * 3
         self._control = _step(ctypes.c_int, *pointers)(control)
         self._update = _step(ctypes.c_int, *pointers[:2])(update)
-        self._addresses = [array.ctypes.data for array in (self.reference, self.control_signal, self.error)]
+        x, y, e = (array.ctypes.data for array in (self.reference, self.control_signal, self.error))
+        self._emitted, self._updated = (self.address, x, y), (self.address, e)
 
     def _plan_arrays(self, path: Any, settings: Any, guard: Any) -> dict[str, np.ndarray]:
         """Return the arrays that a plan points to."""
@@ -256,13 +263,19 @@ class Block:
 
     def emit(self) -> int:
         """Take `reference`, set `control_signal`, and return the answer, 0 if all is well."""
-        with self.in_use:
-            return self._control(self.address, self._addresses[0], self._addresses[1])
+        self._enter()
+        try:
+            return self._control(*self._emitted)
+        finally:
+            self._leave()
 
     def update(self) -> int:
         """Adapt to `error` and return the answer, 0 if all is well."""
-        with self.in_use:
-            return self._update(self.address, self._addresses[2])
+        self._enter()
+        try:
+            return self._update(*self._updated)
+        finally:
+            self._leave()
 
     def listen(self, references: NDArray[np.float64], errors: NDArray[np.float64], adapting: NDArray[np.bool_]) -> int:
         """Follow (n, I) and (n, K) while the loudspeakers are silent; return the number of samples before a refusal."""

@@ -26,7 +26,7 @@ NUMBERS = np.dtype(
     [(name, np.float64) for name in (*SETTINGS, "factor", "power", "gain")]
 )
 PREVIEWED = np.dtype(
-    [(name, np.float64) for name in ("factor", "power", "gain")] + [("mean", np.float64, (len(_MEANS),))]
+    [(name, np.float64) for name in ("factor", "power", "gain", *(f"mean_{name}" for name in _MEANS))]
 )
 REFERENCE = _MEANS.index("reference")
 

@@ -92,9 +92,9 @@ def test_a_copy_goes_on_alone(name, clone):
 @pytest.mark.parametrize("place", ["progress", "run"])
 @pytest.mark.parametrize("name", MAKERS)
 def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, place, monkeypatch):
-    monkeypatch.setattr(simulation, "STEP", 100)
+    monkeypatch.setattr(simulation, "STRETCH", 100)
     made, reference = MAKERS[name](), MAKERS[name]()
-    run = simulation.run
+    run = simulation.Plant.run
 
     def interrupt(*arguments):
         if place == "run":
@@ -102,10 +102,10 @@ def test_an_interrupted_run_leaves_a_controller_that_goes_on(name, place, monkey
         raise KeyboardInterrupt
 
     if place == "run":  # control-C comes through when the compiled loop returns, before its answer is kept
-        monkeypatch.setattr(simulation, "run", interrupt)
+        monkeypatch.setattr(simulation.Plant, "run", interrupt)
     with pytest.raises(KeyboardInterrupt):
         simulate(made, X, disturbance=D, secondary_path=S, progress=interrupt if place == "progress" else None)
-    monkeypatch.setattr(simulation, "run", run)
+    monkeypatch.setattr(simulation.Plant, "run", run)
     simulate(reference, X[:100], disturbance=D[:100], secondary_path=S)
     np.testing.assert_array_equal(made.weights, reference.weights)
     if isinstance(made, KalmanController):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
+from helpers.comparing import state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -364,15 +365,6 @@ def test_clipping_lets_the_weights_grow() -> None:
     assert np.linalg.norm(clipping.weights) > 5 * np.linalg.norm(scaling.weights)
 
 
-@pytest.mark.parametrize("y", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["re-scaling FxLMS", "clipping FxLMS"])
-def test_a_divergence_is_not_hidden_by_the_limit(name: str, y: float) -> None:
-    controller = EVERY[name][0]()
-    controller._state.weights[0] = y
-    result = simulate(controller, np.ones(10), disturbance=np.ones(10), secondary_path=PATH)
-    assert result.diverged_at_s == 0.0
-
-
 # ---- Refusals
 
 
@@ -461,14 +453,18 @@ def test_a_refused_error_changes_nothing(name: str) -> None:
     controller = EVERY[name][0]()
     options: Any = {"secondary_path": PATH, "fs": controller.constraint.fs}
     simulate(controller, x, disturbance=d, **options)
-    before = pickle.dumps(controller)
+    before = state_of(controller)
     with pytest.raises(ValueError, match="error"):
         controller.update(np.nan)
-    with pytest.raises(ValueError, match="must have finite squares"):
-        controller.update(1e200)
+    for error, reason in ((1e200, "error is too loud"), (0.9e100, "too loud|too large")):
+        with pytest.raises(ValueError, match=reason):
+            controller.update(error)
     with pytest.raises(ValueError, match="reference"):
         controller.control_signal(np.inf)
-    assert pickle.dumps(controller) == before
+    with pytest.raises(ValueError, match="reference is too loud"):
+        controller.control_signal(-1e101)
+    for now, then in zip(state_of(controller), before, strict=True):
+        assert now.tobytes() == then.tobytes()
     controller.update(0.1)  # and it goes on
     assert np.all(np.isfinite(controller.weights))
 

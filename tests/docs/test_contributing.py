@@ -5,14 +5,13 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-import kfopc_filterpy
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "kfopc_filterpy"
@@ -72,33 +71,31 @@ def test_a_folder_imports_only_from_folders_before_it_in_the_list(layer):
 
 
 def test_the_reader_of_imports_finds_relative_and_public_ones():
-    assert set(imported(PACKAGE / "controllers" / "fxlms.py")) == {"_validate", "power", "controllers"}
+    assert set(imported(PACKAGE / "controllers" / "fxlms.py")) == {"controllers"}
     assert set(imported(PACKAGE / "bench" / "registry.py")) == {"bench", "controllers", "power"}
 
 
 # The algorithm.
 
 CHECK = """
-import importlib.util, sys
 import numpy as np
+from helpers.comparing import assert_same_run
 from kfopc_filterpy import OutputLimiter, noise_reduction_db, simulate
 from kfopc_filterpy.bench import Runs, make_controller, make_scene, registry, tune
+from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.plot import curve_style, style
 
-file, registered, styled = sys.argv[1:]
-spec = importlib.util.spec_from_file_location("kfopc_filterpy.controllers.sign", file)
-sign = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(sign)
+{imported}
 
 x, s = np.random.default_rng(1).standard_normal(3000), np.array([0.0, 0.8, -0.3])
-plant = {"primary_path": [0.0, 0.0, 1.0, 0.5], "secondary_path": s, "sensor_noise_std": 0.01, "rng": 2}
-runs = [
-    simulate(sign.SignFxLMS(8, s, step_size=0.002), x, compiled=compiled, record_weights_every=100, **plant)
-    for compiled in (True, False)
-]
-assert sign.SignFxLMS(8, s, step_size=0.002).compiled_state() is not None  # so the first run was compiled
-for name in ("error", "control_signal", "constraint_factor", "weights"):
-    np.testing.assert_allclose(getattr(runs[0], name), getattr(runs[1], name), rtol=1e-12, atol=1e-12, err_msg=name)
+plant = {{"primary_path": [0.0, 0.0, 1.0, 0.5], "secondary_path": s, "sensor_noise_std": 0.01, "rng": 2}}
+controllers = [SignFxLMS(8, s, step_size=0.002) for _ in range(2)]
+assert isinstance(controllers[0], CoreController)
+fast, slow = (
+    simulate(controller, x, compiled=compiled, record_weights_every=100, **plant)
+    for controller, compiled in zip(controllers, (True, False))
+)
+assert_same_run(fast, slow)
 
 # The equation again, with numpy.
 d = np.convolve(x, plant["primary_path"])[: x.size] + 0.01 * np.random.default_rng(2).standard_normal(x.size)
@@ -108,12 +105,23 @@ for n in range(x.size):
     y[n] = w[: n + 1] @ x[latest]
     e[n] = d[n] - sum(s[k] * y[n - k] for k in range(min(n + 1, 3)))
     w[: n + 1] += 0.002 * np.sign(e[n]) * filtered[latest]
-np.testing.assert_allclose(runs[0].error, e, rtol=1e-9, atol=1e-9)
-assert noise_reduction_db(runs[0].error, runs[0].disturbance) > 10
+np.testing.assert_allclose(fast.error, e, rtol=1e-9, atol=1e-9)
+assert noise_reduction_db(fast.error, fast.disturbance) > 10
 
-registry.REGISTRY |= eval("{" + registered + "}", vars(registry) | {"SignFxLMS": sign.SignFxLMS})
+# Two microphones that hear the same, and two loudspeakers of which one is not heard.
+many = SignFxLMS(8, np.array([[s, 0 * s], [s, 0 * s]]), step_size=0.001)
+both = simulate(many, x, secondary_path=np.array([[s, 0 * s], [s, 0 * s]]), disturbance=np.array([d, d]))
+np.testing.assert_allclose(both.error, [e, e], rtol=1e-9, atol=1e-9)
+np.testing.assert_array_equal(many.weights[1], 0.0)
+
+{more}
+print("fine")
+"""
+
+STUDIES = """
+registry.REGISTRY |= eval("{" + REGISTERED + "}", vars(registry) | {"SignFxLMS": SignFxLMS})
 known = dict(style.STYLES)
-style.STYLES |= eval("{" + styled + "}", vars(style))
+style.STYLES |= eval("{" + STYLED + "}", vars(style))
 own = tuple(curve_style("sign FxLMS").values())
 assert own not in [tuple(curve_style(name).values()) for name in known]
 scene = make_scene({1: x}, plant["primary_path"], s, fs=16000.0, rated_power=1.0, power_multiple=2.0, n_taps=8,
@@ -124,21 +132,45 @@ assert controller.name == "sign FxLMS"
 assert noise_reduction_db((run := scene.run(controller)).error, run.disturbance) > 6
 controller.limiter = OutputLimiter(1.0)
 scene.run(controller)
-print("fine")
+assert "sign FxLMS" in registry.algorithms(several_channels=True)
 """
 
+SECTION = TEXT.split("<!-- add-a-controller")[1].split("### Compiled functions")[0]
+SIGN, MEAN = re.findall(r"^```c\n(.*?)^```", SECTION, flags=re.M | re.S)
+CLASS, REGISTERED, STYLED, OUTSIDE = re.findall(r"^```python\n(.*?)^```", SECTION, flags=re.M | re.S)
 
-def test_the_algorithm_that_it_adds_runs_compiled_and_from_python_with_equal_results(tmp_path):
-    """In a process of its own with a cache of its own: compiled code of this module's types would stay in the package's."""
-    section = TEXT.split("<!-- add-a-controller")[1].split("### Compiled functions")[0]
-    module, registered, styled = re.findall(r"^```python\n(.*?)^```", section, flags=re.M | re.S)
-    file = tmp_path / "sign.py"
-    file.write_text(module, encoding="utf-8")
-    (tmp_path / "check.py").write_text(CHECK, encoding="utf-8")
+
+def check(folder: Path, package: Path, *, imported: str, more: str = "") -> None:
+    """Run `CHECK` in a folder, in a process of its own, with caches of its own."""
+    (folder / "check.py").write_text(CHECK.format(imported=imported, more=more), encoding="utf-8")
     environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
-        "PYTHONPATH": str(Path(kfopc_filterpy.__file__).parents[1]),
+        "NUMBA_CACHE_DIR": str(folder / "cache"),
+        "KFOPC_CACHE": str(folder / "cache"),
+        "PYTHONPATH": os.pathsep.join([str(package), str(ROOT / "tests")]),
     }
-    command = [sys.executable, "-W", "error", str(tmp_path / "check.py"), str(file), registered.strip(), styled.strip()]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    command = [sys.executable, "-W", "error", "check.py"]
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
     assert done.stdout.split() == ["fine"], done.stderr
+
+
+def test_the_algorithm_that_it_adds_to_the_package_runs_and_is_tuned(tmp_path):
+    """In a copy of the package, whose core is compiled with the new file."""
+    package = tmp_path / "copy" / "kfopc_filterpy"
+    shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "libanc-*"))
+    (package / "core" / "sign.c").write_text(SIGN, encoding="utf-8")
+    (package / "controllers" / "sign.py").write_text(CLASS, encoding="utf-8")
+    build = "from building import *; build(core_sources(), FOLDER / library_name('double', LEVELS[0]))"
+    subprocess.run([sys.executable, "-c", build], cwd=package / "core", check=True)
+    names = f"REGISTERED, STYLED = {REGISTERED.strip()!r}, {STYLED.strip()!r}\n"
+    imported = "from kfopc_filterpy.controllers.sign import SignFxLMS"
+    check(tmp_path, package.parent, imported=imported, more=names + STUDIES)
+
+
+@pytest.mark.parametrize("state", ["", MEAN], ids=["", "with a state of its own"])
+def test_its_file_runs_outside_the_package(tmp_path, state):
+    layout = next(line for line in SIGN.splitlines() if "layout(" in line)
+    (tmp_path / "sign.c").write_text(SIGN.replace(layout, state or layout), encoding="utf-8")
+    more = "assert many._opened().fields['mean_error'].shape == (1, 1, 1, 2)" if state else ""
+    check(tmp_path, PACKAGE.parent, imported=OUTSIDE, more=more)

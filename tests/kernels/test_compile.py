@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from helpers.loop import S_HAT, noises, run
+from kfopc_filterpy.kernels.stacking import member, stacked, unstack
+from kfopc_filterpy.loop.run import run as compiled_run
 from numba import types
 from numba.core.errors import NumbaError
 
@@ -27,8 +29,6 @@ from kfopc_filterpy.kernels.compiling import CONFIG, by_type, compiled, inlined,
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
 from kfopc_filterpy.kernels.holding import Held, calling, for_states, state_at, store
 from kfopc_filterpy.kernels.records import new_record
-from kfopc_filterpy.kernels.stacking import member, stacked, unstack
-from kfopc_filterpy.loop.run import run as compiled_run
 
 PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
 ANNOUNCED = "kfopc_filterpy: compiling, once; the first runs take some seconds longer\n"

@@ -243,22 +243,21 @@ def test_the_covariance_is_one_until_a_filter_steps():
         np.testing.assert_array_equal(mine, theirs)
 
 
-@pytest.mark.parametrize("place", ["progress", "run_scenarios"])
+@pytest.mark.parametrize("place", ["progress", "run"])
 def test_an_interrupted_run_leaves_the_controllers_as_they_were(place, monkeypatch):
     """All or nothing: a covariance a block ahead of the weights would be neither."""
     x, own = differing(9, 3 * BLOCK)
-    made, alone, calls, compiled = filters(9), filters(9), [], scenarios.run_scenarios
+    made, alone, calls, compiled = filters(9), filters(9), [], scenarios.Plant.run
 
     def interrupt(*arguments):
-        if place == "run_scenarios":
-            compiled(*arguments)
         calls.append(arguments)
-        if len(calls) == 2:
+        if len(calls) == (2 if place == "progress" else 15):  # of nine scenarios: in the second block
             raise KeyboardInterrupt
+        return compiled(*arguments) if place == "run" else None
 
     options = {"fs": FS}
-    if place == "run_scenarios":
-        monkeypatch.setattr(scenarios, "run_scenarios", interrupt)
+    if place == "run":
+        monkeypatch.setattr(scenarios.Plant, "run", interrupt)
     else:
         options["progress"] = interrupt
     with pytest.raises(KeyboardInterrupt):
