@@ -23,7 +23,8 @@ CORE = Path("kfopc_filterpy", "core")
 def _load_building(root: str) -> Any:
     """Return the package's module that compiles, without importing the package."""
     spec = importlib.util.spec_from_file_location("building", Path(root, CORE, "building.py"))
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

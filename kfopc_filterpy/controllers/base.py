@@ -215,18 +215,29 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         constraint: Constraints | None = None,
         limiter: OutputLimiter | Sequence[OutputLimiter] | None = None,
-        **room: Any,
+        filtered_taps: int | None = None,
+        history: int = 0,
     ) -> None:
         self.n_taps = as_count(n_taps, "n_taps")
         secondary = self._read_paths(secondary_path, n_references, multichannel)
         self._limiter = self._checked_limiter(limiter)
         self._constrained = constraint is not None
         self._own_constraint = self._checked_constraint(constraint)
-        self._begin(secondary, amplifier, **room)
+        self._begin(secondary, amplifier, filtered_taps=filtered_taps, history=history)
 
     # What a subclass defines.
 
-    def _begin(self, secondary: np.ndarray, amplifier: Any, **room: Any) -> None:
+    def control_signal(self, reference: Any) -> Any:
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        raise NotImplementedError
+
+    def update(self, error: Any) -> None:
+        """Adapt to the error e(n) that the last control signal left."""
+        raise NotImplementedError
+
+    def _begin(
+        self, secondary: np.ndarray, amplifier: Any, *, filtered_taps: int | None = None, history: int = 0
+    ) -> None:
         """Make silent signals for checked paths, (n_path,) or (K, J, n_path)."""
         raise NotImplementedError
 
@@ -509,7 +520,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         while done < n_samples:
             end = min(done + (self.samples_to_block() or LONGEST_CALL), n_samples)
             with looped.in_use:
-                status, done = process(looped.steps, *rows, flags, done, end)
+                status, done = process(looped.steps, rows[0], rows[1], rows[2], flags, done, end)
             looped.after()
             if done < end:
                 self._raise_refusal(x[..., done], e[..., done], done, status)
@@ -595,5 +606,3 @@ def calls_of(kind: type) -> tuple[Any, Any]:
 def listed(values: Any, form: str) -> str:
     """Return a number, or several after each other, as text."""
     return ", ".join(format(value, form) for value in np.ravel(values))
-
-

@@ -108,7 +108,9 @@ class CoreController(FilteredReferenceController):
             limiter=limiter,
         )
 
-    def _begin(self, secondary: np.ndarray, amplifier: Any) -> None:
+    def _begin(
+        self, secondary: np.ndarray, amplifier: Any, *, filtered_taps: int | None = None, history: int = 0
+    ) -> None:
         models = amplifier_models(amplifier, self.n_loudspeakers)
         algorithm = self._algorithm()
         block = Block(
@@ -192,7 +194,9 @@ class CoreController(FilteredReferenceController):
         for limiter in self._each(before):
             limiter.move_out()
         guard = block.fields["guard"].ravel()
-        self._use_block(block.remade(self._needed_shape(block.shape.path_taps, guard.size), guard if guard.size else None))
+        self._use_block(
+            block.remade(self._needed_shape(block.shape.path_taps, guard.size), guard if guard.size else None)
+        )
 
     # What is used and seen.
 

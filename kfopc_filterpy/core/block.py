@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -173,7 +173,7 @@ class Block:
         shape: Shape,
         *,
         path: NDArray[np.float64] | None = None,
-        settings: Mapping[str, float | Sequence[float]] | None = None,
+        settings: Mapping[str, Any] | None = None,
         guard: NDArray[np.float64] | None = None,
         memory: NDArray[np.uint8] | None = None,
     ) -> None:
@@ -221,7 +221,14 @@ class Block:
     def _plan_arrays(self, path: Any, settings: Any, guard: Any) -> dict[str, np.ndarray]:
         """Return the arrays that a plan points to."""
         shape, numbers = self.shape, dict(settings or {})
-        values = [np.broadcast_to(numbers.pop(name), shape.loudspeakers if each else 1) for name, each in self.algorithm.settings] if numbers else []
+        values = (
+            [
+                np.broadcast_to(numbers.pop(name), shape.loudspeakers if each else 1)
+                for name, each in self.algorithm.settings
+            ]
+            if numbers
+            else []
+        )
         if numbers:
             raise TypeError(f"{self.algorithm.name} has no setting {', '.join(numbers)}")
         return {

@@ -32,7 +32,13 @@ FLAGS = (
 _PACKAGERS = ("CFLAGS", "CPPFLAGS", "LDFLAGS")
 _REFUSED = (
     *("-ffast-math", "-Ofast", "-funsafe-math-optimizations", "-fassociative-math", "-freciprocal-math"),
-    *("-ffinite-math-only", "-fno-signed-zeros", "-fsingle-precision-constant", "-ffp-contract=fast", "-ffp-contract=on"),
+    *(
+        "-ffinite-math-only",
+        "-fno-signed-zeros",
+        "-fsingle-precision-constant",
+        "-ffp-contract=fast",
+        "-ffp-contract=on",
+    ),
     *("-ffp-model=fast", "-ffp-model=aggressive", "-mfpmath=387", "-mfpmath=both", "-mfpmath=sse+387", "-mdaz-ftz"),
 )
 _REFUSED_BEGINNINGS = ("-mrecip", "-fdenormal-fp-math", "-Wp,-ffast-math")

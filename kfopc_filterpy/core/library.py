@@ -51,7 +51,9 @@ def load(real: str = "double") -> Library:
     usable = [level for level in building.LEVELS[:highest] if _path(real, level).exists()]
     level = os.environ.get(LEVEL_VARIABLE) or usable[-1]
     if level not in usable:
-        raise ImportError(f"{LEVEL_VARIABLE}={level}: the levels that are built and that this machine has are {', '.join(usable)}")
+        raise ImportError(
+            f"{LEVEL_VARIABLE}={level}: the levels that are built and that this machine has are {', '.join(usable)}"
+        )
     return lowest if level == lowest.level else _open(real, level)
 
 
@@ -66,7 +68,11 @@ def _open(real: str, level: str) -> Library:
     try:
         free, held = ctypes.CDLL(str(path)), ctypes.PyDLL(str(path))
     except OSError as error:
-        raise ImportError(f"the C core of kfopc_filterpy does not load ({' '.join(str(error).split())}); {_HOW}") from None
+        raise ImportError(
+            f"the C core of kfopc_filterpy does not load ({' '.join(str(error).split())}); {_HOW}"
+        ) from None
     if building.stamp_of(free) != building.stamp():
-        raise ImportError(f"the C core of kfopc_filterpy was built from other sources than those beside it ({path.name}); {_HOW}")
+        raise ImportError(
+            f"the C core of kfopc_filterpy was built from other sources than those beside it ({path.name}); {_HOW}"
+        )
     return Library(path, level, free, held)

@@ -218,7 +218,7 @@ def fault_of(struct: Any) -> str:
         return "its settings must be an array that ends with {0}, also if there is none"
     if missing := [step for step in _STEPS if not getattr(struct, step)]:
         return f"it has no {' and no '.join(missing)}; it must be {{name, settings, {', '.join(_STEPS)}}}"
-    settings = []
+    settings: list[Any] = []
     while (setting := struct.settings[len(settings)]).name is not None:
         settings.append(setting)
         if len(settings) > _MOST_SETTINGS:

@@ -30,7 +30,10 @@ class _Controller(ctypes.Structure):
 
 class _Plant(ctypes.Structure):
     _fields_ = [
-        *((name, ctypes.c_int32) for name in ("microphones", "loudspeakers", "references", "path_taps", "feedback_taps")),
+        *(
+            (name, ctypes.c_int32)
+            for name in ("microphones", "loudspeakers", "references", "path_taps", "feedback_taps")
+        ),
         *((name, ctypes.c_int32) for name in ("at", "length")),
         *((name, ctypes.c_void_p) for name in ("path", "feedback", "amplifiers", "output")),
         *((name, ctypes.c_void_p) for name in ("reference", "control", "error", "limit")),
@@ -76,9 +79,7 @@ class Record(NamedTuple):
     def _struct(self) -> _Record:
         row, column = (self.to.shape[1], 1) if self.in_rows else (1, self.to.shape[1])
         stride = self.source.strides[0] // 8 if self.source.size > 1 else 1
-        return _Record(
-            self.source.ctypes.data, stride, self.source.size, self.every, row, column, self.to.ctypes.data
-        )
+        return _Record(self.source.ctypes.data, stride, self.source.size, self.every, row, column, self.to.ctypes.data)
 
 
 class Plant:

@@ -73,14 +73,16 @@ def _state_at(typing_context: Any, address: Any, key: Any) -> Any:
 state_at: Any = intrinsic(prefer_literal=True)(_state_at)
 
 
-@intrinsic
-def reals_at(typing_context: Any, address: Any) -> Any:
+def _reals_at(typing_context: Any, address: Any) -> Any:
     """Return the float64 numbers at an address, to be indexed."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
     return types.CPointer(types.float64)(types.intp), generate
+
+
+reals_at: Any = intrinsic(_reals_at)
 
 
 class ForStates:

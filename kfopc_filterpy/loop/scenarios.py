@@ -10,6 +10,7 @@ import numpy as np
 
 from .._validate import as_positive, as_signal
 from ..controllers.base import NO_SOLUTION, FilteredReferenceController
+from ..controllers.compiled_controller import CompiledController
 from ..controllers.step import Compiled, Lines, looped_arrays
 from ..core.running import DIVERGED, REFUSED_ERROR, RUNNING, Plant, Record, Signals
 from ..kernels.compiling import compiled
@@ -236,9 +237,14 @@ def simulate_scenarios(
     for i, state in enumerate(states):
         own = {name: signal[i : i + 1] for name, signal in recorded.items()}
         signals = Signals(
-            x[None], d[i : i + 1] if len(d) > 1 else d, noises[i].signal(1, x.size), *(own.pop(name) for name in RESULTS)
+            x[None],
+            d[i : i + 1] if len(d) > 1 else d,
+            noises[i].signal(1, x.size),
+            *(own.pop(name) for name in RESULTS),
         )
-        plant = Plant(paths[i, None, None], np.zeros((1, 1, 0)), models[i].view(np.float64).reshape(1, -1), limits[i : i + 1])
+        plant = Plant(
+            paths[i, None, None], np.zeros((1, 1, 0)), models[i].view(np.float64).reshape(1, -1), limits[i : i + 1]
+        )
         scenarios.append(_Scenario(state._replace(gains=None), plant, signals, own))
     for first, shared, solved in gains.blocks():
         for scenario in scenarios:
@@ -275,7 +281,7 @@ def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
         raise ValueError("controllers must hold one controller at least")
     states = []
     for i, controller in enumerate(controllers):
-        if not isinstance(controller, FilteredReferenceController) or not controller.has_gains:
+        if not isinstance(controller, CompiledController) or not controller.has_gains:
             raise TypeError(f"controllers[{i}] must be a KalmanController, of one channel, got {controller!r}")
         if any(controller is other or _filter(controller) is _filter(other) for other in controllers[:i]):
             raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs its own controller")

@@ -136,7 +136,13 @@ def simulate(
     _require_fit(controller, len(x), J, K, several)
     noise = SensorNoise(sensor_noise_std, rng)
     rated = getattr(controller, "rated_power", None) if rated_power is None else rated_power
-    rated = None if rated is None else per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
+    rated = (
+        None
+        if rated is None
+        else per_loudspeaker(rated, J, "rated_power")
+        if several
+        else as_positive(rated, "rated_power")
+    )
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
     functions, models = _amplifiers(amplifier, J, several)
@@ -149,7 +155,12 @@ def simulate(
         listen_first(controller, *(heard if several else (signal[0] for signal in heard)))
         x, d = x[:, on:], d[:, on:]
 
-    plant = Plant(secondary, feedback, models, DIVERGENCE_LIMIT * np.sqrt(np.ones(J) if rated is None else np.broadcast_to(rated, J)))
+    plant = Plant(
+        secondary,
+        feedback,
+        models,
+        DIVERGENCE_LIMIT * np.sqrt(np.ones(J) if rated is None else np.broadcast_to(rated, J)),
+    )
     n_samples = x.shape[1]
     results = [np.full((channels, n_samples), np.nan) for channels in (K, J, J, K)]
     signals = Signals(np.ascontiguousarray(x), np.ascontiguousarray(d), noise.signal(K, n_samples), *results)
@@ -163,7 +174,11 @@ def simulate(
     for signal in (*results, *recorded.values()):
         signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
-    found = {"error": signals.error, "control_signal": signals.control_signal, "amplifier_output": signals.amplifier_output}
+    found = {
+        "error": signals.error,
+        "control_signal": signals.control_signal,
+        "amplifier_output": signals.amplifier_output,
+    }
     found |= {"anti_noise": signals.anti_noise} | recorded
     if not hasattr(controller, "power_weight"):
         found.pop("power_weight", None)
@@ -325,7 +340,11 @@ def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.nd
     """Return for each loudspeaker an amplifier that is a user's function, or None, and the models, (J, 3)."""
     each = list(amplifier) if several and isinstance(amplifier, Sequence) else [amplifier] * J
     if len(each) != J or not all(one is None or callable(one) for one in each):
-        one = "a function of a sample, or one for each of the {J} loudspeakers, or None" if several else "a function of a sample, or None"
+        one = (
+            "a function of a sample, or one for each of the {J} loudspeakers, or None"
+            if several
+            else "a function of a sample, or None"
+        )
         raise TypeError(f"amplifier must be {one.format(J=J)}, got {amplifier!r}")
     functions = [one if one is not None and compiled_model(one) is None else None for one in each]
     models = amplifier_models([None if function else one for one, function in zip(each, functions, strict=True)], J)
@@ -354,5 +373,7 @@ def _weight_rows(n_samples: int, controller: Any, every: int | None, several: bo
         return np.empty((0, 0))
     filters = filters_of(controller)
     if filters is None or (several and np.ndim(filters) != 3):
-        raise ValueError(f"record_weights_every needs a controller with an attribute weights, {'(J, I, L)' if several else '(L,)'}")
+        raise ValueError(
+            f"record_weights_every needs a controller with an attribute weights, {'(J, I, L)' if several else '(L,)'}"
+        )
     return np.empty((-(-n_samples // every), *(np.shape(filters) if several else (np.size(filters),))))

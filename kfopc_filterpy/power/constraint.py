@@ -22,12 +22,8 @@ SILENCE = float(np.finfo(np.float64).tiny)
 _MEANS = ("disturbance", "filtered_reference", "reference")
 POWER = np.dtype([(name, np.float64) for name in ("mean_square", "lap", "taken", "position")])
 SETTINGS = ("rated_power", "rate", "supplied_factor", "supplied_power", "supplied_gain")  # NaN if not supplied
-NUMBERS = np.dtype(
-    [(name, np.float64) for name in (*SETTINGS, "factor", "power", "gain")]
-)
-PREVIEWED = np.dtype(
-    [(name, np.float64) for name in ("factor", "power", "gain", *(f"mean_{name}" for name in _MEANS))]
-)
+NUMBERS = np.dtype([(name, np.float64) for name in (*SETTINGS, "factor", "power", "gain")])
+PREVIEWED = np.dtype([(name, np.float64) for name in ("factor", "power", "gain", *(f"mean_{name}" for name in _MEANS))])
 REFERENCE = _MEANS.index("reference")
 
 
@@ -155,7 +151,9 @@ class OutputPowerConstraint:
         for name in ("supplied_factor", "supplied_power", "supplied_gain", "gain"):
             numbers[name] = math.nan
         numbers["factor"] = 1.0
-        self._state = ConstraintState(as_records(np.zeros(3, POWER)), np.zeros((3, length)), numbers, as_records(np.zeros(1, PREVIEWED)))
+        self._state = ConstraintState(
+            as_records(np.zeros(3, POWER)), np.zeros((3, length)), numbers, as_records(np.zeros(1, PREVIEWED))
+        )
         self._given_gain = secondary_path_gain
         self.secondary_path_gain = secondary_path_gain
 
@@ -270,7 +268,9 @@ class OutputPowerConstraint:
     def live_in(self, powers: np.ndarray, window: np.ndarray, numbers: np.ndarray) -> None:
         """Go on in other arrays: reals of a controller's block, which get the present numbers."""
         state = self._state
-        places = state._replace(powers=powers.view(POWER).reshape(3), window=window, numbers=numbers.view(NUMBERS).reshape(1))
+        places = state._replace(
+            powers=powers.view(POWER).reshape(3), window=window, numbers=numbers.view(NUMBERS).reshape(1)
+        )
         for own, place in zip(state, places, strict=True):
             place[...] = own
         self._state = places
