@@ -17,12 +17,18 @@ PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
 
 def find_line(module: str, text: str) -> int:
     """Number, from 1, of the only line of a module that contains `text`; ValueError if there is none or more than one."""
-    path = PACKAGE / f"{module.replace('.', '/')}.py"
+    path = source_of(module)
     lines = path.read_text(encoding="utf-8").splitlines()
     found = [number for number, line in enumerate(lines, 1) if text in line]
     if len(found) != 1:
         raise ValueError(f"{len(found)} lines of {path.name} hold {text!r}, expected one")
     return found[0]
+
+
+def source_of(module: str) -> Path:
+    """File of a module, or the C file of the core."""
+    python = PACKAGE / f"{module.replace('.', '/')}.py"
+    return python if python.exists() else python.with_suffix(".c")
 
 
 def page_of(module: str) -> str:
@@ -44,7 +50,7 @@ def line_role(name: str, rawtext: str, text: str, lineno: int, inliner: Any, opt
     up = "../" * environment.docname.count("/")
     link = nodes.reference(rawtext, "", refuri=f"{up}{page_of(module)}.html#L-{number}", internal=True)
     link += nodes.literal(code, code)
-    return [link, nodes.inline("", f" ({module.replace('.', '/')}.py, line {number})")], []
+    return [link, nodes.inline("", f" ({source_of(module).relative_to(PACKAGE).as_posix()}, line {number})")], []
 
 
 def linkcode_resolve(domain: str, info: dict[str, str]) -> str | None:
@@ -65,16 +71,16 @@ def linkcode_resolve(domain: str, info: dict[str, str]) -> str | None:
 
 
 def source_pages(app: Any) -> Iterator[tuple[str, dict[str, Any], str]]:
-    """A page for each module."""
+    """A page for each module and each C file of the core."""
     from pygments import highlight
     from pygments.formatters import HtmlFormatter
-    from pygments.lexers import PythonLexer
+    from pygments.lexers import CLexer, PythonLexer
 
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in sorted([*PACKAGE.rglob("*.py"), *(PACKAGE / "core").glob("*.c")]):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         formatter = HtmlFormatter(linenos="inline", lineanchors="L", anchorlinenos=True, wrapcode=True)
-        title = f"kfopc_filterpy/{'/'.join(parts)}.py"
-        body = f"<h1>{title}</h1>{highlight(path.read_text(encoding='utf-8'), PythonLexer(), formatter)}"
+        title = f"kfopc_filterpy/{'/'.join(parts)}{path.suffix}"
+        body = f"<h1>{title}</h1>{highlight(path.read_text(encoding='utf-8'), (PythonLexer if path.suffix == '.py' else CLexer)(), formatter)}"
         yield page_of(".".join(parts)), {"title": title, "body": body, "parents": []}, "page.html"
 
 

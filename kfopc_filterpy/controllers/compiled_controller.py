@@ -189,7 +189,7 @@ class CompiledController(FilteredReferenceController):
         state = self.compiled_state()
         if state is None:
             return None
-        code = Compiled(state)
+        code = self._compiled() if state is self._state else Compiled(state)
         return Looped(code.steps, *looped_arrays(state), after=lambda: self.after_compiled(state), owner=code)
 
     def compiled_state(self, to_step: bool = True) -> Any:

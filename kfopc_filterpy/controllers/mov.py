@@ -156,3 +156,8 @@ class MOVFxLMS(LMSController):
     def modified(self) -> bool:
         """True if the controller adapts to ``d^ - w' x'`` instead of the error."""
         return bool(self._of_setting("modified"))
+
+    @property
+    def penalty_factor(self) -> Any:
+        """Fixed penalty factor gamma, with several channels (J,); None if it follows the running powers."""
+        return self._of_setting("penalty_factor") if self.algorithm == "mov_fixed" else None

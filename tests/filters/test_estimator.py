@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from kfopc_filterpy import KFOPC, OutputPowerConstraint
 from kfopc_filterpy.filters import guards
+from kfopc_filterpy.power.constraint import ConstraintState
 
 TAPS, STATE_NOISE, NOISE = 5, 1e-4, 0.3
 NAN, INF = math.nan, math.inf
@@ -327,6 +328,8 @@ def deep_equal(a: Any, b: Any) -> bool:
         return isinstance(b, np.ndarray) and a.shape == b.shape and repr(a.tolist()) == repr(b.tolist())
     if isinstance(a, dict):
         return a.keys() == b.keys() and all(deep_equal(a[key], b[key]) for key in a)
+    if isinstance(a, ConstraintState):  # but for the room for a preview
+        a, b = a[:-1], b[:-1]
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(map(deep_equal, a, b))
     if hasattr(a, "__dict__") and not callable(a):
