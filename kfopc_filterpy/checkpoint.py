@@ -47,7 +47,7 @@ import numpy as np
 FORMAT = 1
 PACKAGE = __package__
 MAGIC = b"kfopc checkpoint "
-FOLDERS = ("kernels", "paths", "power", "filters", "controllers", "realtime")  # whose classes a file may name
+FOLDERS = ("core", "kernels", "paths", "power", "filters", "controllers", "realtime")  # whose classes a file may name
 OUTSIDE = (  # what else it may name
     "filterpy.kalman.KalmanFilter",
     "filterpy.common.inv_diagonal",

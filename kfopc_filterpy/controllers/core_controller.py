@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .._validate import as_number, as_positive
-from ..core.block import REASONS, Algorithm, Block, Shape
+from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
 from ..core.running import Steps
 from ..power.amplifiers import Amplifier, amplifier_models
@@ -245,7 +245,7 @@ class CoreController(FilteredReferenceController):
         else:
             block.reference[0] = as_number(reference, "reference")
         if answer := block.emit():
-            raise ValueError(f"{REASONS[answer]}; nothing was changed")
+            raise ValueError(f"{reason_of(answer)}; nothing was changed")
         return block.control_signal.copy() if self.multichannel else float(block.control_signal[0])
 
     def update(self, error: Any) -> None:
@@ -256,7 +256,7 @@ class CoreController(FilteredReferenceController):
         else:
             block.error[0] = as_number(error, "error")
         if answer := block.update():
-            raise ValueError(f"{REASONS[answer]}; nothing was changed")
+            raise ValueError(f"{reason_of(answer)}; nothing was changed")
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         block = self._opened()

@@ -31,6 +31,11 @@ REASONS = {
 }
 
 
+def reason_of(answer: int) -> str:
+    """Return why a step was refused; an algorithm of one's own may have answers of its own."""
+    return REASONS.get(answer, f"the algorithm refused it with the answer {answer}")
+
+
 class _Plan(ctypes.Structure):
     _fields_ = [
         *((name, ctypes.c_int32) for name in ("microphones", "loudspeakers", "references", "taps", "path_taps")),
