@@ -16,18 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from helpers.loop import S_HAT, noises, run
-from kfopc_filterpy.kernels.stacking import member, stacked, unstack
-from kfopc_filterpy.loop.run import run as compiled_run
-from numba import types
 from numba.core.errors import NumbaError
 
 from kfopc_filterpy import FxLMS, OutputLimiter, kf_opc, kf_pb
-from kfopc_filterpy.controllers.channels import ChannelSteps
-from kfopc_filterpy.controllers.step import Steps, adapt_entry, emit_entry, listen, process_samples
+from kfopc_filterpy.controllers.step import adapt_entry, emit_entry, listen
 from kfopc_filterpy.kernels.borrowing import borrowed
 from kfopc_filterpy.kernels.compiling import CONFIG, by_type, compiled, inlined, part
 from kfopc_filterpy.kernels.delay_lines import delay_line, newest
-from kfopc_filterpy.kernels.holding import Held, calling, for_states, state_at, store
+from kfopc_filterpy.kernels.holding import Held, for_states, state_at, store
 from kfopc_filterpy.kernels.records import new_record
 
 PACKAGE = Path(__file__).resolve().parents[2] / "kfopc_filterpy"
@@ -367,7 +363,7 @@ def test_borrowed_arrays_keep_their_references() -> None:
     assert newest(delay_line(3), 2).size == 2  # a view, made in Python
 
 
-@pytest.mark.parametrize("name", ["FxLMS", "KF-OPC", "KF-PB"])
+@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB"])
 def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
     made = made_for_8_khz(name)
     x, d, _ = noises(60)
@@ -428,24 +424,6 @@ def spend_held(key):
     return spend_at
 
 
-SPEND = types.float64(types.intp, types.float64)
-call_spend = calling(SPEND)
-
-
-@for_states(SPEND)
-def spend_by_its_address(key):
-    def spend_at(address, factor):
-        return factor * spend(state_at(address, key))
-
-    return spend_at
-
-
-@compiled(cache=False)
-def call(function, address, factor):
-    """A loop that knows no type of state."""
-    return call_spend(function, address, factor)
-
-
 def test_a_held_state_is_the_state_itself() -> None:
     state = outer()
     assert spend_held(Held(state), 2.0) == 36.0
@@ -453,36 +431,15 @@ def test_a_held_state_is_the_state_itself() -> None:
     np.testing.assert_array_equal(state.values, [0.0, 3.0, 6.0, 9.0])
 
 
-def test_one_compiled_loop_calls_the_functions_of_all_types() -> None:
-    floating, integer = Held(outer()), Held(outer()._replace(factor=2))
-    assert floating.key != integer.key
-    assert call(spend_by_its_address.of(floating).address, floating.address, 2.0) == 36.0
-    assert call(spend_by_its_address.of(integer).address, integer.address, 2.0) == 24.0
-    assert len(call.signatures) == 1
-
-
 def test_each_type_has_a_file_of_its_own_in_the_cache() -> None:
     """In a common one, processes that compile for two types at one time could exchange their code."""
-    held = [Held(made_for_8_khz(name)._state) for name in ("FxLMS", "KF-OPC")]
+    held = [Held(made_for_8_khz(name)._state) for name in ("KF-OPC", "KF-PB")]
     for entry in (emit_entry, adapt_entry, listen):
         names = {entry._make(one.key).__qualname__ for one in held}
         compiled_names = {entry.of(one).__qualname__ for one in held}
         assert len(names) == 1
         assert len(compiled_names) == 2
     assert len({emit_entry.of(one).native_name for one in held}) == 2
-
-
-def test_the_loops_are_compiled_once_for_all_algorithms() -> None:
-    compiled_for = []
-    for name in ("FxLMS", "KF-OPC", "KF-PB"):
-        made = made_for_8_khz(name)
-        run(made, n=60)
-        made.process(np.ones(5), np.ones(5))
-        compiled_for.append((set(compiled_run.signatures), set(process_samples.signatures)))
-    assert compiled_for[0] == compiled_for[1] == compiled_for[2]  # other tests may have used arrays of other types
-    for loop in (compiled_run, process_samples):
-        # Addresses of steps, so that a loop cannot depend on the algorithm. Several channels have steps of their own.
-        assert Steps in {one[0].instance_class for one in loop.signatures} <= {Steps, ChannelSteps}
 
 
 def test_what_holds_a_users_type_is_not_kept_on_disk() -> None:
@@ -541,76 +498,3 @@ def test_a_copied_controller_steps_on_its_own(name: str, copied: Any) -> None:
     np.testing.assert_array_equal(made.weights, weights)
     run(made, n=60, compiled=False)
     np.testing.assert_array_equal(made.weights, copy.weights)
-
-
-# ---- NamedTuples that are stacked
-
-
-class Shared(NamedTuple):
-    """What is one for all."""
-
-    taken: np.ndarray
-
-
-class Item(NamedTuple):
-    """One of many."""
-
-    values: np.ndarray
-    inner: Inner
-    factor: float
-    shared: Shared
-
-
-def items(count: int) -> list[Item]:
-    return [
-        Item(np.arange(3.0) + 10 * i, Inner(new_record(total=float(i), count=i), None), 2.0 + i, Shared(np.zeros(1)))
-        for i in range(count)
-    ]
-
-
-def test_stacked_arrays_and_numbers_get_a_leading_axis() -> None:
-    stack = stacked(items(4))
-    assert type(stack) is Item
-    assert type(stack.inner) is Inner
-    assert stack.values.shape == (4, 3)
-    assert stack.inner.numbers.shape == (4, 1)
-    assert stack.inner.nothing is None
-    np.testing.assert_array_equal(stack.values[2], [20.0, 21.0, 22.0])
-    np.testing.assert_array_equal(stack.inner.numbers["count"][:, 0], range(4))
-    np.testing.assert_array_equal(stack.factor, [2.0, 3.0, 4.0, 5.0])
-
-
-@compiled(cache=False)
-def advance_members(stack, count):
-    """Change each member, and what they share."""
-    total = 0.0
-    for i in range(count):
-        one = member(stack, i)
-        for k in range(one.values.size):
-            one.values[k] *= one.factor
-        one.inner.numbers[0].count += 1
-        one.shared.taken[0] += 1
-        total += one.values[0]
-    return total
-
-
-def test_a_member_is_a_view_of_its_own_part_and_what_is_shared_is_shared() -> None:
-    alone = items(3)
-    stack = stacked(alone)._replace(shared=Shared(np.zeros(1)))
-    assert advance_members(stack, 3) == 0.0 + 10.0 * 3.0 + 20.0 * 4.0
-    assert stack.shared.taken[0] == 3.0
-    np.testing.assert_array_equal(alone[1].values, [10.0, 11.0, 12.0])  # the stack is a copy
-    for i, one in enumerate(alone):
-        own = one._replace(shared=Shared(np.zeros(1)))
-        unstack(stack._replace(shared=Shared(np.full((3, 1), 7.0))), i, own)
-        np.testing.assert_array_equal(own.values, (np.arange(3.0) + 10 * i) * (2.0 + i))
-        assert own.inner.numbers.item() == (float(i), i + 1)
-
-
-def test_a_stack_of_one_and_none() -> None:
-    value = items(1)[0]._replace(shared=None)
-    stack = stacked([value])
-    assert stack.shared is None
-    stack.values[:] = 5.0
-    unstack(stack, 0, value)
-    np.testing.assert_array_equal(value.values, 5.0)
