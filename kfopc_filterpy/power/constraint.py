@@ -266,7 +266,7 @@ class OutputPowerConstraint:
         return numbers, powers, window, self._state.window.shape[1], previewed.ctypes.data
 
     def live_in(self, powers: np.ndarray, window: np.ndarray, numbers: np.ndarray) -> None:
-        """Go on in other arrays: reals of a controller's block, which get the present numbers."""
+        """Go on in the arrays `powers`, `window` and `numbers` of a controller's block, which get the present numbers."""
         state = self._state
         places = state._replace(
             powers=powers.view(POWER).reshape(3), window=window, numbers=numbers.view(NUMBERS).reshape(1)

@@ -189,7 +189,7 @@ class OutputLimiter:
         return self._state.numbers.ctypes.data, self._state.laps.ctypes.data
 
     def live_in(self, numbers: np.ndarray, laps: np.ndarray) -> None:
-        """Go on in other arrays: reals of a controller's block, which get the present numbers."""
+        """Go on in the arrays `numbers` and `laps` of a controller's block, which get the present numbers."""
         places = LimiterState(numbers.view(NUMBERS).reshape(1), laps)
         for own, place in zip(self._state, places, strict=True):
             place[...] = own

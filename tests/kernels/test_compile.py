@@ -446,7 +446,7 @@ def test_what_holds_a_users_type_is_not_kept_on_disk() -> None:
     class Own(NamedTuple):
         values: np.ndarray
 
-    state = made_for_8_khz("FxLMS")._state
+    state = made_for_8_khz("KF-OPC")._state
     assert Held(state).ours
     assert not Held(state._replace(lines=state.lines._replace(guard=Own(np.zeros(3))))).ours
 
