@@ -25,10 +25,20 @@ from kfopc_filterpy.checkpoint import Checkpointed
 from kfopc_filterpy.controllers import MonitoredController, PathTracker, VirtualMicrophones
 from kfopc_filterpy.controllers.base import FilteredReferenceController, WrappedController
 from kfopc_filterpy.controllers.blocks import BlockController
+from kfopc_filterpy.controllers.compiled_controller import CompiledController
+from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.controllers.lms import LMSController
 from kfopc_filterpy.controllers.primary_paths import PrimaryPathController
 
-BASES = {FilteredReferenceController, WrappedController, BlockController, LMSController, PrimaryPathController}
+BASES = {
+    FilteredReferenceController,
+    CompiledController,
+    CoreController,
+    WrappedController,
+    BlockController,
+    LMSController,
+    PrimaryPathController,
+}
 
 
 def again(controller: Any, folder: Path) -> Any:
