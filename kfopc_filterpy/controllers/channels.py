@@ -27,10 +27,8 @@ from .step import (
     emit_sample,
     emit_silence,
     filter_output,
-    loudspeakers,
     output,
     take_reference,
-    weights_of,
 )
 
 
@@ -56,7 +54,6 @@ class ChannelLines(NamedTuple):
     energy: np.ndarray  # (J,) sum of y^2 since the start of the block; without blocks, of all samples
     n_emitted: np.ndarray  # (1,) number of samples in that sum; silence before the control is not counted
     disturbance: np.ndarray  # (K,) the last estimate d^
-    modified_error: np.ndarray  # (K,) room for an algorithm that adapts to another error
     constraint_factor: np.ndarray  # (J,) the last factors
     heard: np.ndarray  # (I,) room for x, where the entry points find it
     error: np.ndarray  # (K,) room for e, likewise
@@ -87,17 +84,10 @@ def channel_lines(
         energy=np.zeros(J),
         n_emitted=np.zeros(1),
         disturbance=np.zeros(K),
-        modified_error=np.zeros(K),
         constraint_factor=np.ones(J),
         heard=np.zeros(n_references),
         error=np.zeros(K),
     )
-
-
-@loudspeakers.register(ChannelLines)
-def channel_loudspeakers(lines):
-    """Return J."""
-    return lines.output.shape[0]
 
 
 @filter_output.register(ChannelLines)
@@ -107,12 +97,6 @@ def channel_output(lines, weights, j):
     for i in range(weights.shape[1]):
         y += dot(weights[j, i], newest(lines.reference[i], weights.shape[2]))
     return y
-
-
-@weights_of.register(ChannelLines)
-def channel_weights(lines, weights, j):
-    """Return the weights for all references, (I L,)."""
-    return weights[j].reshape(-1)
 
 
 @take_reference.register(ChannelLines)

@@ -102,21 +102,9 @@ def power_weight(state: Any) -> np.ndarray:
 
 
 @by_type
-def loudspeakers(lines):
-    """Return the number of loudspeakers."""
-    return 1
-
-
-@by_type
 def filter_output(lines, weights, j):
     """Return w' x of loudspeaker j."""
     return dot(weights, newest(lines.reference, weights.size))
-
-
-@by_type
-def weights_of(lines, weights, j):
-    """Return the weights of loudspeaker j in one row, as a view."""
-    return weights
 
 
 @by_type

@@ -147,7 +147,7 @@ typedef struct { /* numbers that are written down: number c of sample n goes to 
 
 typedef struct { /* (channels, length) each */
     int64_t length;
-    const anc_real *reference, *disturbance, *sensor_noise; /* the last may be NULL */
+    const anc_real *reference, *disturbance, *sensor_noise; /* the last may be NULL, or stand in `error`, which takes its place */
     anc_real *error, *control_signal, *amplifier_output, *anti_noise;
 } anc_signals;
 

@@ -83,7 +83,7 @@ class Algorithm:
     name : str
         Name in C, without the prefix ``anc_``.
     path : str or Path, optional
-        Library that has it, see `build_algorithm`; by default the core's.
+        Library that has it, see `load_algorithm`; by default the core's.
 
     Raises
     ------
@@ -301,8 +301,3 @@ class Block:
         """Filter the stored references again, after the path or the guard has changed."""
         with self.in_use:
             self._library.anc_refilter(self._view)
-
-    def newest(self, name: str) -> NDArray[np.float64]:
-        """Return the newest samples of a delay line, newest first: views, with the line's channels as leading axes."""
-        room, at = self.fields[name], int(self.fields[f"{name}_at"].item())
-        return room[..., at : at + (room.shape[-1] - 64) // 4]

@@ -61,7 +61,7 @@ class Signals(NamedTuple):
 
     reference: NDArray[np.float64]  # (I, n)
     disturbance: NDArray[np.float64]  # (K, n)
-    sensor_noise: NDArray[np.float64] | None  # (K, n)
+    sensor_noise: NDArray[np.float64] | None  # (K, n); may be the array of the error, which takes its place
     error: NDArray[np.float64]  # (K, n)
     control_signal: NDArray[np.float64]  # (J, n)
     amplifier_output: NDArray[np.float64]  # (J, n)

@@ -18,7 +18,7 @@ from ..core.running import LINEAR
 from ..kernels.covariance import CANCELLATION, covariance_matrix
 from ..kernels.delay_lines import newest
 from ..power.constraint import ConstraintState
-from ..power.limiter import RESERVE, LimiterState
+from ..power.limiter import RESERVE, LimiterState, spans_of
 from .precision import in_precision
 
 EXPORTED = (
@@ -163,7 +163,7 @@ def _limiter(limiter: LimiterState, dtype: np.dtype) -> Part:
     numbers, (laps_out, laps_in, squares) = limiter.numbers.copy(), limiter.laps
     floor = in_precision(numbers, dtype)
     window, spans = laps_out.size - 1, int(numbers["spans"][0])
-    horizon, held, room = (numbers[name][0, :spans] for name in ("horizon", "held", "room"))
+    horizon, held, room = spans_of(numbers)[:, :spans]
 
     def number(name: str) -> float:
         return float(numbers[name][0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..power.limiter import FLOOR
+from ..power.limiter import FLOOR, spans_of
 
 LARGEST_MARGIN = 0.01  # of the rated power, which the limiter keeps free for rounding
 SINGLE_FLOOR = 1e-30  # of the budget, as in limiter.c
@@ -31,7 +31,6 @@ def in_precision(numbers: np.ndarray, precision: np.dtype) -> float:
     spans = int(numbers["spans"][0])
     numbers["peak"] = (1.0 - 4.0 * epsilon) / numbers["scale"]
     numbers["budget"] = 1.0 - margin
-    for name in ("average", "loud", "held", "room"):
-        values = numbers[name].reshape(-1)[: spans if name in ("held", "room") else 1]
+    for values in (numbers["average"], numbers["loud"], spans_of(numbers)[1:, :spans]):  # held and room
         np.maximum(values, SINGLE_FLOOR, out=values)
     return SINGLE_FLOOR

@@ -68,9 +68,13 @@ class SensorNoise:
         """Return the next samples in an array of a shape, or 0 if there is no noise."""
         return 0.0 if self.rng is None else self.std * self.rng.standard_normal(shape)
 
-    def signal(self, n_channels: int, n_samples: int) -> np.ndarray | None:
-        """Return the next samples, (n_channels, n_samples), or None if there is no noise."""
-        return None if self.rng is None else self.std * self.rng.standard_normal((n_channels, n_samples))
+    def filled(self, room: np.ndarray) -> np.ndarray | None:
+        """Fill an array with the next samples and return it, or None if there is no noise."""
+        if self.rng is None:
+            return None
+        self.rng.standard_normal(out=room)
+        room *= self.std
+        return room
 
 
 def switch_on_sample(switch_on_s: float, fs: float, n_samples: int) -> int:

@@ -239,7 +239,7 @@ def simulate_scenarios(
         signals = Signals(
             x[None],
             d[i : i + 1] if len(d) > 1 else d,
-            noises[i].signal(1, x.size),
+            noises[i].filled(own["error"]),
             *(own.pop(name) for name in RESULTS),
         )
         plant = Plant(

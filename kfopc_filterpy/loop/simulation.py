@@ -163,7 +163,7 @@ def simulate(
     )
     n_samples = x.shape[1]
     results = [np.full((channels, n_samples), np.nan) for channels in (K, J, J, K)]
-    signals = Signals(np.ascontiguousarray(x), np.ascontiguousarray(d), noise.signal(K, n_samples), *results)
+    signals = Signals(np.ascontiguousarray(x), np.ascontiguousarray(d), noise.filled(results[0]), *results)
     wanted = RECORDED + (POWERS if record_powers and not several else ())
     recorded = {name: np.full((J, n_samples), np.nan) for name in wanted}
     run = _Run(controller, plant, signals, recorded, weights, every or 1, functions, several, progress)

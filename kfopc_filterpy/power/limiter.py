@@ -206,7 +206,7 @@ class OutputLimiter:
             numbers[name] = 0.0
         numbers["average"] = numbers["loud"] = FLOOR
         numbers["gain"] = 1.0
-        _spans(numbers)[1, : int(numbers["spans"][0])] = FLOOR
+        spans_of(numbers)[1, : int(numbers["spans"][0])] = FLOOR
         self._state.laps[:] = 0.0
 
 
@@ -238,11 +238,11 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
         room = np.clip(sine * (horizons + size / 16), FLOOR, 1.0)
         room[-1] = max(sine * size, FLOOR)
     room[-1] = min(room[-1], 1.0 - RESERVE)
-    _spans(numbers)[0, :spans], _spans(numbers)[2, :spans] = horizons, room
+    spans_of(numbers)[0, :spans], spans_of(numbers)[2, :spans] = horizons, room
     return LimiterState(numbers, np.zeros((3, size + 1)))
 
 
-def _spans(numbers: np.ndarray) -> np.ndarray:
+def spans_of(numbers: np.ndarray) -> np.ndarray:
     """Return the lengths of the horizons, the energies held and the energies allowed, (3, HORIZONS), as a view."""
     return numbers.view(np.ndarray).view(np.float64).reshape(-1)[-3 * HORIZONS :].reshape(3, HORIZONS)
 

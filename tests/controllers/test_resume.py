@@ -209,7 +209,7 @@ def test_every_controller_of_the_package_is_saved_by_these_tests() -> None:
 def test_every_function_and_class_of_several_channels_is_among_them() -> None:
     for name in (*kfopc_filterpy.__all__, *controllers.__all__):
         offered = getattr(kfopc_filterpy, name, None) or getattr(controllers, name)
-        if callable(offered) and "n_references" in inspect.signature(offered).parameters:
+        if offered not in BASES and callable(offered) and "n_references" in inspect.signature(offered).parameters:
             kinds = {type(make()).__name__ for make in SEVERAL.values()}
             assert name in kinds or any(key.split(",")[0] == name for key in SEVERAL), name
 
