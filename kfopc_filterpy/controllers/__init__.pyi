@@ -2,7 +2,7 @@ from .base import Controller as Controller
 from .core_controller import CoreController as CoreController
 from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman
-from .direct import DirectPowerBudget as DirectPowerBudget
+from .direct_budget import DirectPowerBudget as DirectPowerBudget
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .frequency_domain import FrequencyDomainKalman as FrequencyDomainKalman
 from .leaky import leak_factor as leak_factor

@@ -192,11 +192,8 @@ class CompiledController(FilteredReferenceController):
         code = self._compiled() if state is self._state else Compiled(state)
         return Looped(code.steps, *looped_arrays(state), after=lambda: self.after_compiled(state), owner=code)
 
-    def compiled_state(self, to_step: bool = True) -> Any:
-        """Return the state for the compiled steps; None if Python must call the steps.
-
-        `to_step` says if the caller will change the state, or only read it.
-        """
+    def compiled_state(self) -> Any:
+        """Return the state for the compiled steps; None if Python must call the steps."""
         return self._state if calls_of(type(self)) == calls_of(CompiledController) else None
 
     def after_compiled(self, state: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from .._validate import as_number, as_positive
+from .._validate import as_number, as_positive, per_channel
 from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
 from ..core.running import Steps
@@ -36,7 +36,8 @@ class CoreController(FilteredReferenceController):
     secondary_path : array_like, shape (taps,) or (K, J, taps), or control system
         Estimated secondary path, taps or an FIR system; with channel axes, those from loudspeaker j to microphone k.
     settings : mapping
-        Settings of the algorithm, as a user gave them: a number each, or also (J,) where each loudspeaker has its own.
+        Settings of the algorithm, as a user gave them: a number each, or also (J,) or (K,) where each
+        loudspeaker or microphone has its own.
     n_references : int, default 1
         Number of references I; None: the algorithm takes one channel only.
     multichannel : bool, optional
@@ -122,14 +123,18 @@ class CoreController(FilteredReferenceController):
         block.fields["amplifier"][0, 0] = models.view(np.float64).reshape(self.n_loudspeakers, -1)
         self._use_block(block)
 
-    def _checked_settings(self, each: Mapping[str, bool]) -> dict[str, Any]:
-        """Return the settings, checked; `each` says which of them every loudspeaker has."""
+    def _checked_settings(self, each: Mapping[str, str]) -> dict[str, Any]:
+        """Return the settings, checked; `each` says which of them every loudspeaker or microphone has."""
         if set(self._settings) != set(each):
             raise TypeError(f"{self.name} has the settings {sorted(each)}, got {sorted(self._settings)}")
-        checked = {}
+        checked: dict[str, Any] = {}
         for name, value in self._settings.items():
             check = self.checks.get(name, as_positive)
-            checked[name] = self._each_loudspeaker(value, name, check) if each[name] else check(value, name)
+            if each[name] and self.multichannel:
+                count = getattr(self, f"n_{each[name]}")
+                checked[name] = per_channel(value, count, each[name], name, check)
+            else:
+                checked[name] = check(value, name)
         return checked
 
     def _algorithm(self) -> Algorithm:
@@ -201,7 +206,7 @@ class CoreController(FilteredReferenceController):
     # What is used and seen.
 
     def _of_setting(self, name: str) -> Any:
-        """Return a setting: a number, or with several channels (J,) where each loudspeaker has its own."""
+        """Return a setting: a number, or with several channels (J,) or (K,) where each has its own."""
         values = self._opened().fields[name].ravel()
         each = any(one.each for one in self._algorithm().settings if one.name == name)
         return values.copy() if each and self.multichannel else float(values[0])

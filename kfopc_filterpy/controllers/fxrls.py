@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from .._validate import as_positive
-from ..filters.kfopc import KFOPC
 from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.limiter import OutputLimiter
-from .kalman import KalmanController
+from .direct import DirectKalman
 
 
 def fx_rls(
@@ -22,8 +19,7 @@ def fx_rls(
     initial_variance: float = 1.0,
     amplifier: Amplifier | None = None,
     limiter: OutputLimiter | None = None,
-    dtype: Any = np.float64,
-) -> KalmanController:
+) -> DirectKalman:
     r"""Return FxRLS, which minimises :math:`\sum_k \lambda^{n-k} (\hat d(k) - w^T x'(k))^2` without a constraint.
 
     .. math:: K = \frac{P x'}{\lambda + x'^T P x'}, \qquad w \leftarrow w + K (\hat d - x'^T w), \qquad
@@ -34,7 +30,7 @@ def fx_rls(
 
     Parameters
     ----------
-    n_taps, secondary_path, amplifier, limiter, dtype
+    n_taps, secondary_path, amplifier, limiter
         As for `kf_anc`.
     forgetting : float, default 0.9999
         Forgetting factor lambda, above 0 and at most 1; the memory is about 1/(1 - lambda) samples.
@@ -43,7 +39,7 @@ def fx_rls(
 
     Returns
     -------
-    KalmanController
+    DirectKalman
         A controller named FxRLS.
 
     Raises
@@ -79,12 +75,14 @@ def fx_rls(
     forgetting = as_positive(forgetting, "forgetting")
     if forgetting > 1.0:
         raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
-    estimator = KFOPC.random_walk(
+    return DirectKalman(
         n_taps,
+        secondary_path,
         state_noise=0.0,
         measurement_noise=1.0,
         initial_variance=as_positive(initial_variance, "initial_variance"),
-        dtype=dtype,
+        fading=1.0 / forgetting,
+        amplifier=amplifier,
+        limiter=limiter,
+        name="FxRLS",
     )
-    estimator.alpha = forgetting**-0.5
-    return KalmanController(estimator, secondary_path, amplifier=amplifier, limiter=limiter, name="FxRLS")

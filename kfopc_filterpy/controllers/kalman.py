@@ -1,100 +1,36 @@
-"""KF-ANC (eq. 2-8) and KF-OPC (eq. 9-13): a Kalman filter as the adaptation of the control filter."""
+"""The Kalman filter as the adaptation of the control filter: KF-ANC and KF-OPC, and any filterpy filter."""
 
 from __future__ import annotations
 
-from copy import deepcopy
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_count, as_number
+from .._validate import as_count
 from ..bounds.settings import SuggestedSettings
 from ..filters.kfopc import KFOPC
 from ..filters.power_budget import PowerBudgetKalmanFilter
-from ..filters.random_walk import RandomWalkKFOPC, new_numbers
-from ..kernels.compiling import inlined, part
-from ..kernels.covariance import Covariance, kalman_step, new_covariance
-from ..kernels.delay_lines import latest, newest
 from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
-from ..power.constraint import (
-    ConstraintState,
-    OutputPowerConstraint,
-    commit_constraint,
-    preview_constraint,
-    squares_are_finite,
-)
+from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import NO_SOLUTION, calls_of, constraint_for
-from .compiled_controller import CompiledController
+from .base import constraint_for
+from .core_controller import CoreController
 from .direct import DirectKalman
-from .step import Lines, adapt, disturbance_estimate, estimate_once
 
 
-class KalmanState(NamedTuple):
-    """State of KF-ANC and KF-OPC."""
-
-    lines: Lines
-    weights: np.ndarray
-    constraint: ConstraintState
-    gains: Covariance  # or another source of gains for which `kalman_step` has a body
-    numbers: np.ndarray  # record: the filter's variances and the results of the last update
-
-
-@adapt.register(KalmanState)
-def adapt_kalman(state, error, control_signal):
-    """Apply eq. 2-13."""
-    return correct_constrained(state, error)
-
-
-@inlined
-def correct_constrained(state, error):
-    """Apply eq. 2-9 with the factor of eq. 10-13; return False, with nothing changed, if that fails."""
-    d, h0, x = disturbance_estimate(state.lines, error), latest(state.lines.filtered), latest(state.lines.reference)
-    if not squares_are_finite(d, h0, x):
-        return False
-    factor, _, _ = preview_constraint(state.constraint, d, h0, x)
-    if not correct(state, d, factor * d):
-        return False
-    commit_constraint(state.constraint, d, h0, x)
-    return True
-
-
-@inlined
-def correct(state, measurement, scaled):
-    """Correct the weights with the scaled measurement (eq. 2-9); return False, with nothing changed, if that fails."""
-    w, numbers = state.weights, state.numbers[0]
-    h = newest(state.lines.filtered, w.size)
-    y, S = kalman_step(state.gains, w, h, scaled, numbers.state_noise, numbers.measurement_noise, numbers.alpha_sq)
-    if not np.isfinite(y):
-        return False
-    numbers.measurement, numbers.residual, numbers.variance = measurement, y, S
-    observe_guarded(state.lines.guard, state.gains, w, numbers.measurement_noise)
-    return True
-
-
-@part()
-def observe_guarded(guard, gains, w, noise):
-    """Correct w as if w'x'' with x'' = W * x' had been measured as zero, if there is a guard.
-
-    A Kalman filter then minimises E[(d - w'x')^2] + E[(w'x'')^2].
-    """
-    if guard is not None:
-        kalman_step(gains, w, newest(guard.filtered, w.size), 0.0, 0.0, noise, 1.0)
-
-
-class KalmanController(CompiledController):
-    """The modified ANC structure around a Kalman filter: any filterpy `KalmanFilter` of one measurement.
+class KalmanController(CoreController):
+    """The modified ANC structure around a filterpy filter: any `KalmanFilter` of one measurement.
 
     In each sample, the estimator gets the disturbance estimate as z and the filtered reference as H. With a rated
-    power this is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` also make the estimator.
+    power this is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` make the same without an estimator in Python, which
+    is much faster.
 
     Parameters
     ----------
     estimator : filterpy.kalman.KalmanFilter
-        Filter whose state is the control filter, ``dim_z = 1``; a `KFOPC`, or filterpy's own. One from
-        `KFOPC.random_walk` runs at compiled speed.
+        Filter whose state is the control filter, ``dim_z = 1``; a `KFOPC`, or filterpy's own.
     secondary_path : array_like or control.TransferFunction
         Estimated secondary path, taps or an FIR system.
     amplifier : callable, optional
@@ -124,8 +60,7 @@ class KalmanController(CompiledController):
     1.3333333333333333
     """
 
-    has_gains = True
-    _filter_type: Any = RandomWalkKFOPC  # type of the filters whose steps are compiled
+    algorithm = "signals_alone"
 
     def __init__(
         self,
@@ -136,14 +71,6 @@ class KalmanController(CompiledController):
         name: str | None = None,
         limiter: OutputLimiter | None = None,
     ) -> None:
-        self._require_filter(estimator)
-        super().__init__(estimator.dim_x, secondary_path, amplifier=amplifier, limiter=limiter)
-        self.estimator = estimator
-        self._state = self._new_state(new_covariance(np.zeros((1, 1))), new_numbers())
-        self._calls_are_ours = calls_of(type(self)) == calls_of(self._family())
-        self.name = name or self._usual_name()
-
-    def _require_filter(self, estimator: Any) -> None:
         if not isinstance(estimator, KalmanFilter):
             raise TypeError(f"estimator must be a filterpy KalmanFilter, got {type(estimator).__name__}")
         if estimator.dim_z != 1:
@@ -153,19 +80,14 @@ class KalmanController(CompiledController):
             )
         if isinstance(estimator, PowerBudgetKalmanFilter):
             raise TypeError("estimator has a power budget: use PowerBudgetController, or kf_pb")
-
-    def _new_state(self, gains: Covariance, numbers: np.ndarray) -> Any:
-        return KalmanState(*self._common(), gains, numbers)
-
-    def _family(self) -> type[KalmanController]:
-        """Return the class whose `control_signal` and `update` the compiled step implements."""
-        return KalmanController
+        self.estimator = estimator
+        super().__init__(
+            estimator.dim_x, secondary_path, settings={}, n_references=None, amplifier=amplifier, limiter=limiter
+        )
+        self.name = name or ("KF-ANC" if self.rated_power is None else "KF-OPC")
 
     def _takes_guard(self) -> bool:
-        return type(self.estimator) is self._filter_type  # their steps are compiled
-
-    def _usual_name(self) -> str:
-        return "KF-ANC" if self.rated_power is None else "KF-OPC"
+        return False  # the estimator gets one measurement in a sample
 
     def _read_rated_power(self) -> float | None:
         return getattr(self.estimator, "rated_power", None)
@@ -177,11 +99,6 @@ class KalmanController(CompiledController):
     def weights(self) -> np.ndarray:
         """Estimator's state w, (L,); a copy."""
         return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
-
-    @property
-    def control_filter(self) -> np.ndarray:
-        """Control filter that generates y, (L,); a copy."""
-        return self.weights
 
     @property
     def constraint(self) -> OutputPowerConstraint:
@@ -204,101 +121,38 @@ class KalmanController(CompiledController):
         if variance > 0.0:
             self.estimator.P = self.estimator.P + variance * np.eye(self.n_taps)
 
-    # Two calls per sample. A random-walk filter uses the compiled step; any other filter uses its own `update`.
-
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        reference = as_number(reference, "reference")
-        self._see_weights()
-        return self._emit(reference)
-
-    def _see_weights(self) -> None:
-        """Copy the estimator's weights into the state."""
-        x = self.estimator.x
-        self._state.weights[:] = x.reshape(-1) if isinstance(x, np.ndarray) else np.reshape(x, -1)
+        self._weights()[:] = np.reshape(self.estimator.x, -1)
+        return super().control_signal(reference)
 
     def update(self, error: float) -> None:
-        """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
-        error = as_number(error, "error")
-        state = self._steppable_state()
-        if state is None:
-            if self._state.lines.guard is not None:
-                raise ValueError(
-                    "secondary_path_uncertainty needs the estimator's own step, and its F, Q, P or inv was replaced by "
-                    "something else than that of a random walk: assign None to secondary_path_uncertainty, or make a new "
-                    "controller"
-                )
-            self._update_through_estimator(error)
-        elif self._adapt(error):
-            self.estimator.after_compiled(state.weights.copy())
-        else:
-            # This raises, with the reason. On a copy, because its prediction would stay.
-            deepcopy(self)._update_through_estimator(error)
-            raise ValueError(NO_SOLUTION)
-
-    def _update_through_estimator(self, error: float) -> None:
-        """Call the estimator's `predict` and `update`."""
-        d = estimate_once(self._state.lines, error)
-        h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
-        x, powers = latest(self._state.lines.reference), self.constraint
+        """Let the estimator predict and update (eq. 2-9) with the error e(n) that the last control signal left."""
+        super().update(error)
+        block, estimator = self._opened(), self.estimator
+        d, x = float(block.fields["disturbance"].item()), float(block.latest("reference").flat[0])
+        h, powers = block.latest("filtered_reference").reshape(1, -1)[:, : self.n_taps].copy(), self.constraint
         powers.preview(d, h[0, 0], x)  # raises if a square overflows, before anything changes
-        self.estimator.predict()
-        if isinstance(self.estimator, KFOPC):
-            self._update_estimator(d, h, x)
+        estimator.predict()
+        if isinstance(estimator, KFOPC):
+            estimator.update(d, H=h, reference=x)
         else:
-            self.estimator.update(np.full((1,) * np.ndim(self.estimator.x), d), H=h)
+            estimator.update(np.full((1,) * np.ndim(estimator.x), d), H=h)
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
 
-    def _update_estimator(self, d: float, h: np.ndarray, x: float) -> None:
-        self.estimator.update(d, H=h, reference=x)
-
-    def _state_with_estimator(self) -> Any:
-        """Return the state with the estimator's present weights and power arrays."""
-        self._see_weights()
-        constraint = self.constraint.state
-        if constraint is not self._state.constraint:
-            self._state = self._state._replace(constraint=constraint)
-        return self._state
-
-    def _steppable_state(self, to_step: bool = True) -> Any:
-        """Return the state with the estimator's covariance; None if the estimator's step is not compiled.
-
-        `to_step` says if the caller will change the state, or only read it.
-        """
-        estimator: Any = self.estimator
-        if type(estimator) is not self._filter_type or not estimator.steps_compiled():
-            return None
-        arrays, numbers = estimator.compiled_arrays(to_step)
-        state = self._state_with_estimator()
-        if arrays is not state.gains or numbers is not state.numbers:
-            self._state = state = state._replace(gains=arrays, numbers=numbers)
-        return state
-
-    # A whole signal at compiled speed.
-
-    def compiled_state(self, to_step: bool = True) -> Any:
-        """Return the state for the compiled loop; None if Python must call the steps.
-
-        `to_step` says if the caller will change the state, or only read it.
-        """
-        state = self._steppable_state(to_step) if self._calls_are_ours else None
-        if state is not None:
-            state.numbers["variance"] = np.nan  # NaN until the first update
-        return state
-
-    def after_compiled(self, state: Any, shared: bool = False) -> None:
-        """Give the estimator the results in `state`; `shared` if other filters continue from its covariance too."""
-        arrays = state.gains if shared else None
-        if not np.isnan(state.numbers["variance"][0]):
-            self.estimator.after_compiled(state.weights.copy(), arrays)
-        elif arrays is not None:  # it diverged before its first update
-            self.estimator.go_on_from(arrays)
-
-    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
-        """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
-        self._state_with_estimator()
-        super().listen(references, errors, adapt=adapt)
+    def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
+        if self.constraint is self._own_constraint:
+            return super()._listen(references, errors, adapting)
+        block = self._opened()
+        for n, (x, e) in enumerate(zip(references, errors, strict=True)):
+            taken = super()._listen(references[n : n + 1], errors[n : n + 1], adapting[n : n + 1])
+            if not taken:
+                return n
+            if adapting[n]:
+                filtered = float(block.latest("filtered_reference").flat[0])
+                self.constraint.advance(float(e), filtered, float(x))  # silent: d^ = e
+        return len(references)
 
 
 def kf_anc(
@@ -311,8 +165,7 @@ def kf_anc(
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
-    dtype: Any = np.float64,
-) -> KalmanController | DirectKalman:
+) -> DirectKalman:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
 
     Parameters
@@ -332,15 +185,12 @@ def kf_anc(
     n_references : int, default 1
         Number of references I.
     amplifier, limiter : optional
-        See `KalmanController`; with several loudspeakers, a sequence with one for each.
-    dtype : {numpy.float64, numpy.float32}, default numpy.float64
-        See `KFOPC.random_walk`.
+        See `DirectKalman`.
 
     Returns
     -------
-    KalmanController or DirectKalman
-        A controller named KF-ANC. With several channels it is a `DirectKalman`, whose signals and weights have channel
-        axes.
+    DirectKalman
+        A controller named KF-ANC. With several channels, its signals and weights have channel axes.
 
     Raises
     ------
@@ -371,7 +221,6 @@ def kf_anc(
         state_noise=state_noise,
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
-        dtype=dtype,
     )
 
 
@@ -387,13 +236,12 @@ def kf_opc(
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
-    dtype: Any = np.float64,
-) -> KalmanController | DirectKalman:
+) -> DirectKalman:
     """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter, dtype
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter
         As for `kf_anc`.
     rated_power : float or array_like, shape (J,), optional
         Rated output power rho_o of all loudspeakers, or of each.
@@ -403,9 +251,8 @@ def kf_opc(
 
     Returns
     -------
-    KalmanController or DirectKalman
-        A controller named KF-OPC. With several channels it is a `DirectKalman`, which scales all measurements by the
-        smallest of the loudspeakers' factors.
+    DirectKalman
+        A controller named KF-OPC. With several loudspeakers it scales all measurements by the smallest of their factors.
 
     Raises
     ------
@@ -435,7 +282,6 @@ def kf_opc(
         state_noise=state_noise,
         measurement_noise=measurement_noise,
         initial_variance=initial_variance,
-        dtype=dtype,
     )
 
 
@@ -446,14 +292,11 @@ def _kalman(
     amplifier: Any,
     limiter: Any,
     **settings: Any,
-) -> KalmanController | DirectKalman:
-    """Return the controller for one channel or for several."""
+) -> DirectKalman:
+    """Return the controller, with suggested settings where none are given."""
     taps, settings = with_suggested(n_taps, settings)
-    outside = {"amplifier": amplifier, "limiter": limiter}
-    controller = (
-        DirectKalman(taps, secondary_path, n_references=n_references, **outside, **settings)
-        if is_multichannel(secondary_path, n_references)
-        else KalmanController(KFOPC.random_walk(taps, **settings), secondary_path, **outside)
+    controller = DirectKalman(
+        taps, secondary_path, n_references=n_references, amplifier=amplifier, limiter=limiter, **settings
     )
     return at_suggested_rate(controller, n_taps)
 

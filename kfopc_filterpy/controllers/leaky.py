@@ -116,7 +116,7 @@ class LeakyFxLMS(LMSController):
             limiter=limiter,
         )
 
-    def _checked_settings(self, each: Mapping[str, bool]) -> dict[str, Any]:
+    def _checked_settings(self, each: Mapping[str, str]) -> dict[str, Any]:
         settings = super()._checked_settings(each)
         most = float(np.max(settings["step_size"] * settings["leak"]))
         if most > 1.0:

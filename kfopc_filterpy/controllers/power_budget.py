@@ -2,27 +2,47 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
-from .._validate import as_choice
+from .._validate import as_choice, as_number
 from ..bounds.settings import SuggestedSettings
 from ..filters.power_budget import PowerBudgetKalmanFilter
-from ..kernels.covariance import Covariance
-from ..kernels.delay_lines import latest
+from ..filters.random_walk import new_numbers
+from ..kernels.covariance import Covariance, kalman_step, new_covariance
+from ..kernels.delay_lines import latest, newest
 from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifier
 from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
-from ..power.constraint import ConstraintState, advance_constraint
+from ..power.constraint import (
+    ConstraintState,
+    advance_constraint,
+    commit_constraint,
+    preview_constraint,
+    squares_are_finite,
+)
 from ..power.limiter import OutputLimiter
-from .direct import DirectPowerBudget
+from .base import NO_SOLUTION, calls_of
+from .compiled_controller import CompiledController
+from .direct_budget import DirectPowerBudget
 from .frequency_domain import FrequencyDomainKalman
-from .kalman import KalmanController, at_suggested_rate, correct_constrained, is_multichannel, with_suggested
+from .kalman import at_suggested_rate, is_multichannel, with_suggested
 from .primary_paths import PrimaryPathController
 from .shared_gain import SharedGainKalman
-from .step import Lines, adapt, control_filter, disturbance_estimate, emitted, follow, power_weight, skip, unheard
+from .step import (
+    Lines,
+    adapt,
+    control_filter,
+    disturbance_estimate,
+    emitted,
+    estimate_once,
+    follow,
+    power_weight,
+    skip,
+    unheard,
+)
 
 
 class PowerBudgetState(NamedTuple):
@@ -32,16 +52,28 @@ class PowerBudgetState(NamedTuple):
     weights: np.ndarray
     constraint: ConstraintState  # computes the powers; its factor is fixed at 1
     gains: Covariance
-    numbers: np.ndarray  # as of `KalmanState`
+    numbers: np.ndarray  # record: the filter's variances and the results of the last update
     budget: BudgetState
 
 
 @adapt.register(PowerBudgetState)
 def adapt_power_budget(state, error, control_signal):
     """Apply eq. 2-8, then let the budget find the control filter for the estimate."""
-    if not correct_constrained(state, error):
+    d, filtered, x = (
+        disturbance_estimate(state.lines, error),
+        latest(state.lines.filtered),
+        latest(state.lines.reference),
+    )
+    if not squares_are_finite(d, filtered, x):
         return False
-    x, filtered = latest(state.lines.reference), latest(state.lines.filtered)
+    preview_constraint(state.constraint, d, filtered, x)
+    w, numbers = state.weights, state.numbers[0]
+    h = newest(state.lines.filtered, w.size)
+    y, S = kalman_step(state.gains, w, h, d, numbers.state_noise, numbers.measurement_noise, numbers.alpha_sq)
+    if not np.isfinite(y):
+        return False
+    numbers.measurement, numbers.residual, numbers.variance = d, y, S
+    commit_constraint(state.constraint, d, filtered, x)
     advance_budget(state.budget, state.weights, x, filtered, control_signal)
     return True
 
@@ -90,7 +122,7 @@ def weight_of_power_budget(state: PowerBudgetState) -> np.ndarray:
     return weight
 
 
-class PowerBudgetController(KalmanController):
+class PowerBudgetController(CompiledController):
     """The modified ANC structure around a filter with a power budget; `kf_pb` also makes the filter.
 
     Parameters
@@ -120,10 +152,6 @@ class PowerBudgetController(KalmanController):
     ('KF-PB', 0.5, 0.0)
     """
 
-    estimator: PowerBudgetKalmanFilter
-    unshared = "power budget"
-    _filter_type = PowerBudgetKalmanFilter
-
     def __init__(
         self,
         estimator: PowerBudgetKalmanFilter,
@@ -134,7 +162,13 @@ class PowerBudgetController(KalmanController):
         limiter: OutputLimiter | None = None,
         secondary_path_uncertainty: Any = None,
     ) -> None:
-        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
+        if not isinstance(estimator, PowerBudgetKalmanFilter):
+            raise TypeError(f"estimator must be a PowerBudgetKalmanFilter, got {type(estimator).__name__}")
+        super().__init__(estimator.dim_x, secondary_path, amplifier=amplifier, limiter=limiter)
+        self.estimator = estimator
+        gains = new_covariance(np.zeros((1, 1)))
+        self._state = PowerBudgetState(*self._common(), gains, new_numbers(), estimator.budget.state)
+        self.name = name or "KF-PB"
         present = estimator.budget.state.guard.size
         if guard_filter(secondary_path_uncertainty, self.secondary_path) is not None and present != GUARD_TAPS:
             raise ValueError(
@@ -143,27 +177,16 @@ class PowerBudgetController(KalmanController):
             )
         self._uncertainty = as_uncertainty(secondary_path_uncertainty)
 
-    def _require_filter(self, estimator: KalmanFilter) -> None:
-        if not isinstance(estimator, PowerBudgetKalmanFilter):
-            raise TypeError(f"estimator must be a PowerBudgetKalmanFilter, got {type(estimator).__name__}")
+    def _read_rated_power(self) -> float | None:
+        return self.estimator.rated_power
 
-    def _new_state(self, gains: Covariance, numbers: np.ndarray) -> Any:
-        return PowerBudgetState(*self._common(), gains, numbers, self.estimator.budget.state)
+    def _take_rated_power(self, value: float) -> None:
+        self.estimator.rated_power = value
 
-    def _family(self) -> type[KalmanController]:
-        return PowerBudgetController
-
-    def _takes_guard(self) -> bool:
-        return False  # the budget's control filter takes account of it
-
-    def _after_new_path(self, before: np.ndarray) -> None:
-        """Let P grow; measured paths, for example, have another distance from the new path, and so another guard."""
-        super()._after_new_path(before)
-        if self._uncertainty is not None:
-            self.estimator.budget.use_guard(guard_filter(self._uncertainty, self.secondary_path))
-
-    def _usual_name(self) -> str:
-        return "KF-PB"
+    @property
+    def weights(self) -> np.ndarray:
+        """Estimate of the unconstrained control filter w, (L,); a copy."""
+        return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
 
     @property
     def control_filter(self) -> np.ndarray:
@@ -179,8 +202,74 @@ class PowerBudgetController(KalmanController):
     def _powers_fs(self) -> float:
         return self.estimator.budget.fs
 
-    def _update_estimator(self, d: float, h: np.ndarray, x: float) -> None:
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Let P grow; measured paths, for example, have another distance from the new path, and so another guard."""
+        variance = self._variance_by_new_path(before)
+        if variance > 0.0:
+            self.estimator.P = self.estimator.P + variance * np.eye(self.n_taps)
+        if self._uncertainty is not None:
+            self.estimator.budget.use_guard(guard_filter(self._uncertainty, self.secondary_path))
+
+    def control_signal(self, reference: float) -> float:
+        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
+        reference = as_number(reference, "reference")
+        self._see_weights()
+        return float(self._emit(reference))
+
+    def _see_weights(self) -> None:
+        """Copy the estimator's weights into the state."""
+        self._state.weights[:] = np.reshape(self.estimator.x, -1)
+
+    def update(self, error: float) -> None:
+        """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
+        error = as_number(error, "error")
+        state = self._steppable_state()
+        if state is None:
+            self._update_through_estimator(error)
+        elif self._adapt(error):
+            self.estimator.after_compiled(state.weights.copy())
+        else:
+            # This raises, with the reason. On a copy, because its prediction would stay.
+            deepcopy(self)._update_through_estimator(error)
+            raise ValueError(NO_SOLUTION)
+
+    def _update_through_estimator(self, error: float) -> None:
+        """Call the estimator's `predict` and `update`."""
+        d = estimate_once(self._state.lines, error)
+        h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
+        x, powers = latest(self._state.lines.reference), self.constraint
+        powers.preview(d, h[0, 0], x)  # raises if a square overflows, before anything changes
+        self.estimator.predict()
         self.estimator.update(d, H=h, reference=x, control_signal=self._y)
+        powers.advance(d, h[0, 0], x)
+
+    def _steppable_state(self) -> Any:
+        """Return the state with the estimator's covariance; None if the estimator's step is not compiled."""
+        estimator = self.estimator
+        if type(estimator) is not PowerBudgetKalmanFilter or not estimator.steps_compiled():
+            return None
+        arrays, numbers = estimator.compiled_arrays()
+        self._see_weights()
+        if arrays is not self._state.gains or numbers is not self._state.numbers:
+            self._state = self._state._replace(gains=arrays, numbers=numbers)
+        return self._state
+
+    def compiled_state(self) -> Any:
+        """Return the state for the compiled steps; None if Python must call the steps."""
+        state = self._steppable_state() if calls_of(type(self)) == calls_of(PowerBudgetController) else None
+        if state is not None:
+            state.numbers["variance"] = np.nan  # NaN until the first update
+        return state
+
+    def after_compiled(self, state: Any) -> None:
+        """Give the estimator the results in `state`."""
+        if not np.isnan(state.numbers["variance"][0]):
+            self.estimator.after_compiled(state.weights.copy())
+
+    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
+        """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
+        self._see_weights()
+        super().listen(references, errors, adapt=adapt)
 
 
 FORMS = ("direct", "shared gain", "frequency domain")
@@ -198,7 +287,6 @@ def kf_pb(
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
-    dtype: Any = None,
     secondary_path_uncertainty: Any = ONE_SAMPLE,
     form: str | None = None,
     **settings: Any,
@@ -214,7 +302,7 @@ def kf_pb(
         Estimated secondary path, or those from J loudspeakers to K microphones.
     rated_power : float or array_like, shape (J,)
         Rated output power, of all loudspeakers or of each.
-    state_noise, measurement_noise, initial_variance, dtype
+    state_noise, measurement_noise, initial_variance
         As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
         As for `kf_anc`. Behind its limiter, the direct form for one channel asks for more power only if that lowers the
@@ -265,7 +353,6 @@ def kf_pb(
         "state_noise": state_noise,
         "measurement_noise": measurement_noise,
         "initial_variance": initial_variance,
-        "dtype": dtype,
     }
     if isinstance(n_taps, SuggestedSettings):
         settings = {"fs": n_taps.fs} | settings

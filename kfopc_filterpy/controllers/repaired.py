@@ -11,126 +11,37 @@ completely. On other paths the control signal and the reference have different s
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-
-from .._validate import as_choice, as_positive
+from .._validate import as_choice, as_nonnegative, as_positive
 from ..bounds.settings import SuggestedSettings
-from ..filters.kfopc import KFOPC
-from ..filters.random_walk import RandomWalkKFOPC
-from ..kernels.compiling import compiled, inlined
-from ..kernels.covariance import Covariance
-from ..kernels.delay_lines import latest, newest
-from ..kernels.records import new_record
-from ..kernels.vectors import dot
 from ..power.amplifiers import Amplifier
-from ..power.constraint import (
-    ConstraintState,
-    OutputPowerConstraint,
-    commit_constraint,
-    preview_constraint,
-    squares_are_finite,
-)
+from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import constraint_for
-from .kalman import KalmanController, at_suggested_rate, correct, suggested_constraint, with_suggested
-from .step import Lines, adapt, disturbance_estimate, estimate_once, output
+from .direct import DirectKalman
+from .kalman import at_suggested_rate, suggested_constraint, with_suggested
 
-LARGEST_TRIM = math.log(10.0)
 DEFAULT_TRIM_S = 1.0
 
 
-class RepairedState(NamedTuple):
-    """State of the repaired KF-OPC."""
-
-    lines: Lines
-    weights: np.ndarray
-    constraint: ConstraintState
-    gains: Covariance
-    numbers: np.ndarray  # as of `KalmanState`
-    repair: np.ndarray  # record: of_control, trim_rate (0: none), at_output; log of the trim, factor at the output
-
-
-@output.register(RepairedState)
-def output_repaired(state, j):
-    """Return w'x times the factor at the output."""
-    w = state.weights
-    return state.repair[0].output_gain * dot(w, newest(state.lines.reference, w.size))
-
-
-@adapt.register(RepairedState)
-def adapt_repaired(state, error, control_signal):
-    """Apply eq. 2-9 with the repaired factor."""
-    d, h0, x = disturbance_estimate(state.lines, error), latest(state.lines.filtered), latest(state.lines.reference)
-    if not squares_are_finite(d, h0, x):
-        return False
-    filtered, reference = gain_samples(state.repair, h0, x, error, d, control_signal)
-    factor, _, _ = preview_constraint(state.constraint, d, filtered, reference)
-    if not correct(state, d, measurement_factor(state.repair, factor) * d):
-        return False
-    commit_constraint(state.constraint, d, filtered, reference)
-    advance_repair(state.repair, state.constraint, control_signal)
-    return True
-
-
-@compiled()
-def gain_samples(repair, filtered, x, error, d, y):
-    """Return the samples whose powers give G_s: x' and x (eq. 11), or s^ * y = d^ - e and y."""
-    if repair[0].of_control == 0:
-        return filtered, x
-    return d - error, y
-
-
-@compiled()
-def measurement_factor(repair, factor):
-    """Return the factor of the measurement (eq. 9)."""
-    return 1.0 if repair[0].at_output != 0 else trimmed(repair, factor)
-
-
-@inlined
-def trimmed(repair, factor):
-    """Return the factor with the trim, at most 1."""
-    return min(factor * math.exp(repair[0].trim), 1.0)
-
-
-@compiled()
-def advance_repair(repair, constraint, y):
-    """Record the factor used, and trim the next one by the power of y: up if it is below the rated power, else down.
-
-    At a factor of 1 the trim does not rise, so that it does not wind up.
-    """
-    own, numbers = repair[0], constraint.numbers[0]
-    numbers.factor = trimmed(repair, numbers.factor)
-    change = own.trim_rate * (1.0 - y * y / numbers.rated_power)
-    if change < 0.0 or numbers.factor < 1.0:
-        own.trim = min(max(own.trim + change, -LARGEST_TRIM), LARGEST_TRIM)
-    if own.at_output != 0:
-        own.output_gain = numbers.factor
-
-
-class RepairedKFOPC(KalmanController):
+class RepairedKFOPC(DirectKalman):
     """KF-OPC whose constraint factor keeps the rated power on more paths than the published one.
 
-    Made by `kf_opc_repaired`. The estimator has no constraint: the controller sets its factor.
+    Made by `kf_opc_repaired`.
 
     Parameters
     ----------
-    estimator : RandomWalkKFOPC
-        Filter without a rated power.
-    secondary_path, amplifier, name, limiter
-        As for `KalmanController`.
-    constraint : OutputPowerConstraint
-        Constraint that computes the powers and the factor. A copy is kept.
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter
+        As for `DirectKalman`.
+    constraint : OutputPowerConstraint or sequence of J of them
+        Constraint that computes the powers and the factor, or that of each loudspeaker. Copies are kept.
     gain_of, trim_s, factor_at
         As for `kf_opc_repaired`.
 
     Raises
     ------
     ValueError
-        An estimator of another type or with a rated power; an unknown `gain_of` or `factor_at`; a `trim_s` that is not
-        positive.
+        An unknown `gain_of` or `factor_at`; a `trim_s` that is not positive; what `DirectKalman` refuses.
 
     Examples
     --------
@@ -140,89 +51,34 @@ class RepairedKFOPC(KalmanController):
     ('RepairedKFOPC', 0.5)
     """
 
-    estimator: RandomWalkKFOPC
-    unshared = "repaired gain"
+    algorithm = "repaired"
+    checks = dict.fromkeys((*DirectKalman.checks, "of_control", "trim_rate", "at_output"), as_nonnegative)
 
     def __init__(
         self,
-        estimator: RandomWalkKFOPC,
+        n_taps: int,
         secondary_path: Any,
-        constraint: OutputPowerConstraint,
         *,
+        constraint: Any,
         gain_of: str = "control",
         trim_s: float | None = DEFAULT_TRIM_S,
         factor_at: str = "output",
-        amplifier: Amplifier | None = None,
-        name: str | None = None,
-        limiter: OutputLimiter | None = None,
+        **settings: Any,
     ) -> None:
         self.gain_of = as_choice(gain_of, "gain_of", ("reference", "control"))
         self.trim_s = None if trim_s is None else as_positive(trim_s, "trim_s", unit="s")
         self.factor_at = as_choice(factor_at, "factor_at", ("measurement", "output"))
-        own = constraint_for(None, constraint)
-        rate = 0.0 if self.trim_s is None else 1.0 / (self.trim_s * constraint.fs)
-        self._repair = new_record(
-            of_control=int(gain_of == "control"),
-            trim_rate=rate,
-            at_output=int(factor_at == "output"),
-            trim=0.0,
-            output_gain=1.0,
+        fs = (constraint if isinstance(constraint, OutputPowerConstraint) else constraint[0]).fs
+        super().__init__(
+            n_taps,
+            secondary_path,
+            constraint=constraint,
+            name="KF-OPC repaired",
+            of_control=float(gain_of == "control"),
+            trim_rate=0.0 if self.trim_s is None else 1.0 / (self.trim_s * fs),
+            at_output=float(factor_at == "output"),
+            **settings,
         )
-        super().__init__(estimator, secondary_path, amplifier=amplifier, name=name, limiter=limiter)
-        self._own_constraint = own
-
-    def _require_filter(self, estimator: Any) -> None:
-        if not isinstance(estimator, RandomWalkKFOPC) or estimator.rated_power is not None:
-            raise ValueError("estimator must be a filter of KFOPC.random_walk without a rated power of its own")
-
-    def _new_state(self, gains: Covariance, numbers: np.ndarray) -> Any:
-        return RepairedState(*self._common(), gains, numbers, self._repair)
-
-    def _usual_name(self) -> str:
-        return "KF-OPC repaired"
-
-    def _family(self) -> type[KalmanController]:
-        return RepairedKFOPC
-
-    def _read_rated_power(self) -> float:
-        return self.constraint.rated_power
-
-    def _take_rated_power(self, value: float) -> None:
-        self.constraint.rated_power = value
-
-    @property
-    def constraint(self) -> OutputPowerConstraint:
-        """Constraint that computes the powers and the factor."""
-        return self._own_constraint
-
-    @property
-    def constraint_factor(self) -> float:
-        """Constraint factor of the last sample, trimmed."""
-        return self.constraint.factor
-
-    def _update_through_estimator(self, error: float) -> None:
-        d = estimate_once(self._state.lines, error)
-        h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
-        seen = gain_samples(self._repair, h[0, 0], latest(self._state.lines.reference), error, d, self._y)
-        factor = self.constraint.preview(d, *seen)  # raises if a square overflows, before anything changes
-        self.estimator.constraint_factor = measurement_factor(self._repair, factor)
-        self.estimator.predict()
-        self.estimator.update(d, H=h)
-        self.constraint.advance(d, *seen)
-        advance_repair(self._repair, self.constraint.state, self._y)
-
-    def after_compiled(self, state: Any, shared: bool = False) -> None:
-        """Give the estimator the results in `state` and the last factor; see `KalmanController` for `shared`."""
-        super().after_compiled(state, shared)
-        self._hold_factor()
-
-    def update(self, error: float) -> None:
-        """Adapt to the error e(n) that the last control signal left."""
-        super().update(error)
-        self._hold_factor()
-
-    def _hold_factor(self) -> None:
-        self.estimator.constraint_factor = 1.0 if self.factor_at == "output" else self.constraint_factor
 
 
 def kf_opc_repaired(
@@ -285,13 +141,14 @@ def kf_opc_repaired(
     noises = {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance}
     taps, settings = with_suggested(n_taps, noises)
     controller = RepairedKFOPC(
-        KFOPC.random_walk(taps, **settings),
+        taps,
         secondary_path,
-        own,
+        constraint=own,
         gain_of=gain_of,
         trim_s=trim_s,
         factor_at=factor_at,
         amplifier=amplifier,
         limiter=limiter,
+        **settings,
     )
     return at_suggested_rate(controller, n_taps)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..kernels.compiling import inlined
-from ..kernels.covariance import Covariance, correct_weights, kalman_step, new_covariance
+from ..kernels.covariance import DIRECTION, Covariance, correct_weights, kalman_step, new_covariance
 from ..kernels.delay_lines import newest
 from ..kernels.records import new_record
 from ..kernels.vectors import copy_into, dot
@@ -51,8 +51,9 @@ def adapt_shared_gain(state, error, control_signal):
     innovation, S = kalman_step(state.gains, paths[0], h, d[0], numbers.state_noise, 1.0, 1.0)
     if not np.isfinite(innovation):
         return False
+    direction, root = state.gains.memory[DIRECTION : DIRECTION + h.size], np.sqrt(S)
     for k in range(1, paths.shape[0]):
-        correct_weights(paths[k], state.gains.gain_direction, (d[k] - dot(h, paths[k])) / S)
+        correct_weights(paths[k], direction, (d[k] - dot(h, paths[k])) / root)
     numbers.waiting += 1
     return True
 
@@ -185,7 +186,8 @@ class SharedGainKalman(PrimaryPathController):
         if not power > 0.0:
             return
         if numbers["state_noise"][0] == 0.0:
-            triangle = self._state.gains.triangle
-            triangle.flat[:: triangle.shape[1] + 1] = self._first_variance(PRIOR, power)
+            size = self._state.row.size
+            first = new_covariance(self._first_variance(PRIOR, power) * np.eye(size))
+            self._state.gains.memory[:] = first.memory
         numbers["state_noise"] = self._state_noise(numbers["state_noise"][0], power)
         self._solve()

@@ -3,9 +3,9 @@
  * A controller is a plan (its shape and settings), a block of memory (all that changes) and a view (where its fields stand
  * in the block). A copy of the block, opened again, is a copy of the controller: written to a file, it goes on to the bit.
  *
- * K microphones, J loudspeakers, I references, L taps of a control filter, M taps of a secondary path, G taps of a guard.
- * Arrays are row-major in that order, with channels first; delay lines hold the newest sample first. Signs:
- * e = d - s*y_amp, d^ = e + s^*y. */
+ * S scenarios, K microphones, J loudspeakers, I references, L taps of a control filter, M taps of a secondary path, G taps of a
+ * guard. Arrays are row-major in that order, with channels first; delay lines hold the newest sample first. Scenarios have the
+ * same references, estimated paths and gains, and each its own weights, powers and plant. Signs: e = d - s*y_amp, d^ = e + s^*y. */
 #ifndef ANC_H
 #define ANC_H
 #include <stddef.h>
@@ -33,20 +33,21 @@ typedef double anc_real;
 /* Controllers. */
 
 typedef struct {
-    int32_t microphones, loudspeakers, references, taps, path_taps; /* K, J, I, L, M */
+    int32_t scenarios, microphones, loudspeakers, references, taps, path_taps; /* S, K, J, I, L, M */
     int32_t guard_taps;             /* G; 0: the secondary paths are exact */
     int32_t limited;                /* 1: each control signal passes a limiter */
-    const int32_t *power_windows;   /* (J) samples of the window of the powers; 0: exponential. NULL: all 0 */
-    const int32_t *limiter_windows; /* (J) samples of each limiter's window; NULL without limiters */
+    const int32_t *power_windows;   /* (S, J) samples of the window of the powers; 0: exponential. NULL: all 0 */
+    const int32_t *limiter_windows; /* (S, J) samples of each limiter's window; NULL without limiters */
     const anc_real *path;           /* (K, J, M) estimated secondary paths */
     const anc_real *guard;          /* (G) filter W; NULL without */
-    const anc_real *settings;       /* the algorithm's own in its order: one number each, or J where `each` */
+    const anc_real *settings;       /* the algorithm's own in its order: one number each, or as many as `each` says */
 } anc_plan;
 
+typedef enum { ANC_ONE, ANC_EACH_LOUDSPEAKER, ANC_EACH_MICROPHONE } anc_each;
 typedef struct {
     const char *name;
     anc_real least, most; /* inclusive; most 0: any finite value from least on */
-    int each;             /* 1: one number for each loudspeaker */
+    anc_each each;
 } anc_setting;
 
 typedef struct { void *place[96]; } anc_view; /* room for any algorithm's */
@@ -71,12 +72,12 @@ typedef struct {
     const anc_setting *settings; /* ends with a NULL name */
     void (*layout)(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
     void (*start)(anc_view *view, const anc_plan *plan, const anc_setting *settings);    /* before the first sample, on zeros */
-    int (*control_signal)(anc_view *view, const anc_real *reference, anc_real *control); /* (I) -> (J) */
-    int (*update)(anc_view *view, const anc_real *error); /* (K); NULL: a sample that is not adapted to */
+    int (*control_signal)(anc_view *view, const anc_real *reference, anc_real *control); /* (I) -> (S, J) */
+    int (*update)(anc_view *view, const anc_real *error); /* (S, K); NULL: a sample that is not adapted to */
 } anc_algorithm;
 
 extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_optimal_leaky, anc_mov, anc_mov_fixed, anc_two_gradient,
-    anc_clipping, anc_rescaling;
+    anc_clipping, anc_rescaling, anc_kalman, anc_repaired, anc_signals_alone;
 
 /* Bytes of a block; 0 if the plan is refused: a shape below 1, a setting out of its range, a path that is not finite, too large. */
 ANC_PUBLIC size_t anc_size(const anc_algorithm *algorithm, const anc_plan *plan);
@@ -85,7 +86,7 @@ ANC_PUBLIC int anc_open(const anc_algorithm *algorithm, const anc_plan *plan, an
 ANC_PUBLIC void anc_describe(const anc_algorithm *algorithm, const anc_plan *plan, anc_visitor *visit, void *to);
 /* Filter the stored references again, after the paths or the guard in the block have changed. */
 ANC_PUBLIC void anc_refilter(anc_view *view);
-/* Follow x, (n, I), and e, (n, K), while the loudspeakers are silent: delay lines advance, and powers where `adapt` is 1; the weights
+/* Follow x, (n, I), and e, (n, S, K), while the loudspeakers are silent: delay lines advance, and powers where `adapt` is 1; the weights
  * stay. Return the number of samples before a refused one. */
 ANC_PUBLIC int64_t anc_listen(anc_view *view, const anc_real *x, const anc_real *e, const uint8_t *adapt, int64_t n);
 
@@ -121,6 +122,17 @@ typedef struct {
 ANC_PUBLIC anc_real anc_limit(anc_limiter *limiter, anc_real *laps, anc_real u);
 ANC_PUBLIC void anc_limit_all(anc_limiter *limiter, anc_real *laps, const anc_real *input, anc_real *output, int64_t n);
 
+/* The covariance of n weights that walk at random, in memory of the host that is zero but for its variances (see covariance.h). */
+typedef struct {
+    anc_real scale, diagonal, pending, largest, bound, floored; /* largest at the start; none is above `bound` now */
+} anc_owed;
+ANC_PUBLIC size_t anc_covariance_size(int32_t n);
+ANC_PUBLIC void anc_covariance_describe(int32_t n, anc_visitor *visit, void *to);
+/* Eq. 5-9 for a row h: correct w by the measurement z with noise q. `result` gets the innovation and S. */
+ANC_PUBLIC int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real q, anc_real result[2]);
+/* Eq. 4 before that: P = fading P + r I. A row that tells nothing, S = 0, corrects nothing. */
+ANC_PUBLIC int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real r, anc_real q, anc_real fading, anc_real result[2]);
+
 /* The loop. */
 
 typedef struct { /* a controller as the loop sees it: of the core, or anybody's */
@@ -130,13 +142,13 @@ typedef struct { /* a controller as the loop sees it: of the core, or anybody's 
 } anc_controller;
 
 typedef struct {
-    int32_t microphones, loudspeakers, references, path_taps, feedback_taps;
+    int32_t scenarios, microphones, loudspeakers, references, path_taps, feedback_taps; /* with feedback, one scenario */
     int32_t at, length;              /* of the delay lines of y_amp, at least as long as both paths */
-    const anc_real *path, *feedback; /* (K, J, path_taps) true s; (I, J, feedback_taps) to the reference microphones */
-    const anc_amplifier *amplifiers; /* (J) */
-    anc_real *output;                /* (J, length) */
-    anc_real *reference, *control, *error; /* (I), (J), (K): the present sample */
-    const anc_real *limit;           /* (J) a control signal beyond it is a divergence */
+    const anc_real *path, *feedback; /* (S, K, J, path_taps) true s; (I, J, feedback_taps) to the reference microphones */
+    const anc_amplifier *amplifiers; /* (S, J) */
+    anc_real *output;                /* (S, J, length) */
+    anc_real *reference, *control, *error; /* (I), (S, J), (S, K): the present sample */
+    const anc_real *limit;           /* (S, J) a control signal beyond it is a divergence */
 } anc_plant;
 
 typedef struct { /* numbers that are written down: number c of sample n goes to to[n / every * row + c * column] */
@@ -145,7 +157,7 @@ typedef struct { /* numbers that are written down: number c of sample n goes to 
     anc_real *to;
 } anc_record;
 
-typedef struct { /* (channels, length) each */
+typedef struct { /* (channels, length) each; those of scenarios one after the other */
     int64_t length;
     const anc_real *reference, *disturbance, *sensor_noise; /* the last may be NULL, or stand in `error`, which takes its place */
     anc_real *error, *control_signal, *amplifier_output, *anti_noise;
@@ -153,7 +165,8 @@ typedef struct { /* (channels, length) each */
 
 typedef enum { ANC_RUNNING, ANC_DIVERGED, ANC_REFUSED_REFERENCE, ANC_REFUSED_ERROR } anc_status;
 
-/* Run a controller and a plant from sample `begin` to `end`; return the first sample that was not completed. */
+/* Run a controller and a plant from sample `begin` to `end`; return the first sample that was not completed. With a status of
+ * ANC_DIVERGED, go on from the divergence at `begin`: the control signals of that sample are those in `plant`. */
 ANC_PUBLIC int64_t anc_run(const anc_controller *controller, anc_plant *plant, const anc_signals *signals, const anc_record *records, int32_t n_records, int64_t begin, int64_t end, int32_t *status);
 /* The plant's two halves of a sample, for a controller that the host calls. */
 ANC_PUBLIC void anc_hear(anc_plant *plant, const anc_signals *signals, int64_t n);

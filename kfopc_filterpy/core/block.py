@@ -18,6 +18,8 @@ ALIGNMENT = 64  # bytes; wide vectors are fastest there
 _STATE, _SETTING, _SCRATCH = range(3)
 _KINDS = (np.dtype(np.float64), np.dtype(np.int32))
 _VIEW_PLACES = 96
+SLACK = 64  # of delay lines, see signals.c
+_EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 
 # What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
@@ -27,7 +29,7 @@ REASONS = {
     LOUD_ERROR: "the error is too loud, above 1e100: scale the signals",
     LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100: scale the signals",
     LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
-    NO_SOLUTION: "the update has no solution: S = x' P x' + q must be positive and finite",
+    NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
 }
 
 
@@ -38,7 +40,8 @@ def reason_of(answer: int) -> str:
 
 class _Plan(ctypes.Structure):
     _fields_ = [
-        *((name, ctypes.c_int32) for name in ("microphones", "loudspeakers", "references", "taps", "path_taps")),
+        *((name, ctypes.c_int32) for name in ("scenarios", "microphones", "loudspeakers", "references")),
+        *((name, ctypes.c_int32) for name in ("taps", "path_taps")),
         *((name, ctypes.c_int32) for name in ("guard_taps", "limited")),
         *((name, ctypes.c_void_p) for name in ("power_windows", "limiter_windows", "path", "guard", "settings")),
     ]
@@ -61,7 +64,7 @@ class _Algorithm(ctypes.Structure):
     ]
 
 
-_Visitor = ctypes.PYFUNCTYPE(
+VISITOR = ctypes.PYFUNCTYPE(
     None,
     *(ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_size_t),
     ctypes.POINTER(ctypes.c_int32),
@@ -69,10 +72,10 @@ _Visitor = ctypes.PYFUNCTYPE(
 
 
 class Setting(NamedTuple):
-    """A setting of an algorithm: its name, and whether each loudspeaker has one of its own."""
+    """A setting of an algorithm: its name, and who has one of its own."""
 
     name: str
-    each: bool
+    each: str  # "" (one for all), "loudspeakers" or "microphones"
 
 
 class Algorithm:
@@ -102,12 +105,25 @@ class Algorithm:
         self.pointer = ctypes.addressof(self._struct)
         self.settings: list[Setting] = []
         while (name_of := self._struct.settings[len(self.settings)].name) is not None:
-            self.settings.append(Setting(name_of.decode(), bool(self._struct.settings[len(self.settings)].each)))
+            self.settings.append(Setting(name_of.decode(), _EACH[self._struct.settings[len(self.settings)].each]))
 
     @property
     def steps(self) -> tuple[int, int]:
         """Addresses of the functions `control_signal` and `update`."""
         return self._struct.control_signal, self._struct.update
+
+    def shapes(self, shape: Shape) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of the fields of a block, by name."""
+        found: dict[str, tuple[int, ...]] = {}
+
+        def keep(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
+            found[name.decode()] = tuple(axes[i] for i in range(4))
+
+        arrays = {name: np.array(getattr(shape, name), np.int32) for name in ("power_windows", "limiter_windows")}
+        plan = _plan_of(shape, arrays)
+        pointer = ctypes.c_void_p(self.pointer)
+        self._library.held.anc_describe(pointer, ctypes.byref(plan), VISITOR(keep), None)
+        return found
 
     def __reduce__(self) -> Any:
         return Algorithm, (self.name, self.path)
@@ -123,8 +139,15 @@ class Shape:
     taps: int
     path_taps: int
     guard_taps: int = 0
-    power_windows: tuple[int, ...] = ()
+    power_windows: tuple[int, ...] = ()  # of every loudspeaker of every scenario
     limiter_windows: tuple[int, ...] = ()
+    scenarios: int = 1
+
+
+def _plan_of(shape: Shape, arrays: dict[str, np.ndarray]) -> _Plan:
+    counts = {name: value for name, value in asdict(shape).items() if isinstance(value, int)}
+    pointers = {name: array.ctypes.data if array.size else None for name, array in arrays.items()}
+    return _Plan(**counts, limited=bool(shape.limiter_windows), **pointers)
 
 
 class InUse:
@@ -157,7 +180,7 @@ class Block:
         Its size.
     path : ndarray, shape (K, J, M)
         Estimated secondary paths of a fresh block.
-    settings : mapping of str to float or sequence of J
+    settings : mapping of str to float or sequence of J or K
         Settings of a fresh block, by name.
     guard : ndarray, shape (G,), optional
         Filter W of a fresh block with guard_taps.
@@ -170,6 +193,8 @@ class Block:
         Views of the memory, by name, four axes each; see `layout_signals` in signals.c.
     states : list of str
         Names of those that a step changes and a next one needs.
+    scratch : list of str
+        Names of those that no next step needs.
     """
 
     def __init__(
@@ -187,7 +212,7 @@ class Block:
         self._enter, self._leave = self.in_use.enter, self.in_use.leave
         self._library: Any = load().held
         keep = self._plan_arrays(path, settings, guard)
-        plan = self._plan_of(shape, keep)
+        plan = _plan_of(shape, keep)
         of = ctypes.byref
         self._library.anc_size.restype = ctypes.c_size_t
         size = self._library.anc_size(ctypes.c_void_p(algorithm.pointer), of(plan))
@@ -213,9 +238,10 @@ class Block:
             raise ValueError(f"a setting or a path of {algorithm.name} is out of its range: {settings}")
         self.fields: dict[str, NDArray[Any]] = {}
         self.states: list[str] = []
-        self._library.anc_describe(ctypes.c_void_p(algorithm.pointer), of(plan), _Visitor(self._keep_field), None)
-        self.reference, self.control_signal = np.zeros(shape.references), np.zeros(shape.loudspeakers)
-        self.error = np.zeros(shape.microphones)
+        self.scratch: list[str] = []
+        self._library.anc_describe(ctypes.c_void_p(algorithm.pointer), of(plan), VISITOR(self._keep_field), None)
+        self.reference, self.control_signal = np.zeros(shape.references), np.zeros(shape.scenarios * shape.loudspeakers)
+        self.error = np.zeros(shape.scenarios * shape.microphones)
         control, update = algorithm.steps
         pointers = (ctypes.c_void_p,) * 3
         self._control = _step(ctypes.c_int, *pointers)(control)
@@ -228,7 +254,7 @@ class Block:
         shape, numbers = self.shape, dict(settings or {})
         values = (
             [
-                np.broadcast_to(numbers.pop(name), shape.loudspeakers if each else 1)
+                np.broadcast_to(numbers.pop(name), getattr(shape, each) if each else 1)
                 for name, each in self.algorithm.settings
             ]
             if numbers
@@ -244,18 +270,22 @@ class Block:
             "settings": np.concatenate([*values, np.zeros(1)]),
         }
 
-    @staticmethod
-    def _plan_of(shape: Shape, arrays: dict[str, np.ndarray]) -> _Plan:
-        counts = {name: value for name, value in asdict(shape).items() if isinstance(value, int)}
-        pointers = {name: array.ctypes.data if array.size else None for name, array in arrays.items()}
-        return _Plan(**counts, limited=bool(shape.limiter_windows), **pointers)
-
     def _keep_field(self, _: Any, name: bytes, role: int, kind: int, offset: int, shape: Any) -> None:
         axes, dtype = tuple(shape[i] for i in range(4)), _KINDS[kind]
         count = int(np.prod(axes))
         self.fields[name.decode()] = self.memory[offset : offset + count * dtype.itemsize].view(dtype).reshape(axes)
         if role == _STATE:
             self.states.append(name.decode())
+        elif role == _SCRATCH:
+            self.scratch.append(name.decode())
+
+    def latest(self, name: str) -> NDArray[np.float64]:
+        """Return a field, or of delay lines the samples that they keep, newest first; a view."""
+        field = self.fields[name]
+        if f"{name}_at" not in self.fields:
+            return field
+        at, taps = self.fields[f"{name}_at"].item(), (field.shape[-1] - SLACK) // 4  # as `layout_lines` makes them
+        return field[..., at : at + taps]
 
     def remade(self, shape: Shape, guard: NDArray[np.float64] | None = None) -> Block:
         """Return a block of another shape that goes on from this one: fields of the same name and shape are copied."""

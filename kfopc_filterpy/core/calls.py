@@ -1,4 +1,4 @@
-"""Functions of the core that numba's compiled code and Python call: limiter, powers, amplifiers."""
+"""Functions of the core that numba's compiled code and Python call: limiter, powers, amplifiers, covariance."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import llvmlite.binding
 from numba import types
 
+from .block import VISITOR
 from .library import load
 
 _library = load()
@@ -38,3 +39,23 @@ commit = _held("commit", None, *_SQUARES)
 limit_all = _held("limit_all", None, *(ctypes.c_void_p,) * 4, ctypes.c_int64)
 limit = _held("limit", ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double)
 amplify_all = _held("amplify_all", None, *(ctypes.c_void_p,) * 3, ctypes.c_int64)
+
+_PLACES = (types.intp, types.int32, types.intp, types.intp)
+covariance_step_compiled = _compiled("covariance_step", types.int32, *_PLACES, *(types.float64,) * 4, types.intp)
+covariance_update = _held(
+    "covariance_update",
+    *(ctypes.c_int, ctypes.c_void_p, ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p),
+    *(ctypes.c_double, ctypes.c_double, ctypes.c_void_p),
+)
+
+
+def covariance_fields(n: int) -> tuple[int, dict[str, slice]]:
+    """Return the size of the memory of a covariance, and where its fields are, in numbers."""
+    fields: dict[str, slice] = {}
+
+    def keep(_: Any, name: bytes, role: int, kind: int, offset: int, shape: Any) -> None:
+        begin = offset // 8
+        fields[name.decode()] = slice(begin, begin + shape[0] * shape[1] * shape[2] * shape[3])
+
+    _held("covariance_describe", None, ctypes.c_int32, VISITOR, ctypes.c_void_p)(n, VISITOR(keep), None)
+    return _held("covariance_size", ctypes.c_size_t, ctypes.c_int32)(n) // 8, fields

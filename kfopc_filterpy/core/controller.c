@@ -17,14 +17,16 @@ static int all_finite(const real *values, size_t n)
 /* Return whether all counts that a block needs fit into an int32. */
 static int shape_accepted(const anc_plan *p)
 {
-    const int32_t shape[] = {p->microphones, p->loudspeakers, p->references, p->taps, p->path_taps};
+    const int32_t shape[] = {p->scenarios, p->microphones, p->loudspeakers, p->references, p->taps, p->path_taps};
     const double most = (1 << 28), K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps;
-    for (int i = 0; i < 5; i++)
+    const double S = p->scenarios;
+    for (int i = 0; i < 6; i++)
         if (shape[i] < 1 || shape[i] > most) return 0;
     if (p->guard_taps < 0 || p->guard_taps > ANC_GUARD_TAPS || (p->limited && !p->limiter_windows)) return 0;
-    for (int32_t j = 0; j < p->loudspeakers; j++)
-        if ((p->power_windows && (p->power_windows[j] < 0 || ANC_POWERS * J * p->power_windows[j] > most)) ||
-            (p->limited && (p->limiter_windows[j] < 1 || 3 * J * p->limiter_windows[j] > most)))
+    if (S * J * I * L > most || S * K > most || S * J * (4 * M + 64) > most) return 0;
+    for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++)
+        if ((p->power_windows && (p->power_windows[sj] < 0 || ANC_POWERS * S * J * p->power_windows[sj] > most)) ||
+            (p->limited && (p->limiter_windows[sj] < 1 || 3 * S * J * p->limiter_windows[sj] > most)))
             return 0;
     return K * J * I * (4 * L + 4 * ANC_GUARD_TAPS + 64) <= most && (I + K * J) * (4 * (L + M) + 8 * ANC_GUARD_TAPS + 64) <= most;
 }
@@ -33,7 +35,7 @@ static int values_accepted(const anc_algorithm *a, const anc_plan *p)
 {
     const real *value = p->settings;
     for (int i = 0; a->settings[i].name; i++)
-        for (int32_t j = 0; j < (a->settings[i].each ? p->loudspeakers : 1); j++)
+        for (int32_t n = 0; n < numbers_of(a->settings + i, p); n++)
             if (!in_range(a->settings + i, *value++)) return 0;
     return all_finite(p->path, times(p->microphones * p->loudspeakers, p->path_taps)) && (!p->guard_taps || all_finite(p->guard, (size_t)p->guard_taps));
 }

@@ -18,17 +18,18 @@ void anc_play(anc_plant *p, const real *amplified, const anc_signals *s, int64_t
     const int32_t taps = p->path_taps > p->feedback_taps ? p->path_taps : p->feedback_taps;
     const int32_t before = p->at;
     if (--p->at < 0) p->at = p->length - taps;
-    for (int32_t j = 0; j < p->loudspeakers; j++) {
-        real *row = p->output + times(j, p->length);
+    for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {
+        real *row = p->output + times(sj, p->length);
         if (!before) memcpy(row + p->at + 1, row, sizeof(real) * (size_t)(taps - 1));
-        row[p->at] = s->amplifier_output[j * s->length + n] = amplified[j];
+        row[p->at] = s->amplifier_output[sj * s->length + n] = amplified[sj];
     }
-    for (int32_t k = 0; k < p->microphones; k++) {
+    for (int32_t sk = 0; sk < p->scenarios * p->microphones; sk++) {
+        const int64_t at = sk * s->length + n;
         real a = 0;
-        for (int32_t j = 0; j < p->loudspeakers; j++) a += dot(p->path + times(k * p->loudspeakers + j, p->path_taps), p->output + times(j, p->length) + p->at, p->path_taps);
-        s->anti_noise[k * s->length + n] = a;
-        p->error[k] = s->disturbance[k * s->length + n] - a + (s->sensor_noise ? s->sensor_noise[k * s->length + n] : 0);
-        s->error[k * s->length + n] = p->error[k];
+        for (int32_t j = 0; j < p->loudspeakers; j++)
+            a += dot(p->path + times(sk * p->loudspeakers + j, p->path_taps), p->output + times(sk / p->microphones * p->loudspeakers + j, p->length) + p->at, p->path_taps);
+        s->anti_noise[at] = a;
+        s->error[at] = p->error[sk] = s->disturbance[at] - a + (s->sensor_noise ? s->sensor_noise[at] : 0);
     }
 }
 
@@ -40,16 +41,20 @@ static void write_down(const anc_record *r, int64_t n)
 
 int64_t anc_run(const anc_controller *c, anc_plant *p, const anc_signals *s, const anc_record *records, int32_t n_records, int64_t begin, int64_t end, int32_t *status)
 {
-    for (int64_t n = begin; n < end; n++) {
-        anc_hear(p, s, n);
-        *status = ANC_REFUSED_REFERENCE;
-        if (c->control_signal(c->self, p->reference, p->control)) return n;
+    const int32_t loudspeakers = p->scenarios * p->loudspeakers;
+    int emitted = *status == ANC_DIVERGED;
+    for (int64_t n = begin; n < end; n++, emitted = 0) {
+        if (!emitted) {
+            anc_hear(p, s, n);
+            *status = ANC_REFUSED_REFERENCE;
+            if (c->control_signal(c->self, p->reference, p->control)) return n;
+        }
         *status = ANC_DIVERGED;
-        for (int32_t j = 0; j < p->loudspeakers; j++)
-            if (!within(p->control[j], p->limit[j])) return n;
-        for (int32_t j = 0; j < p->loudspeakers; j++) {
-            s->control_signal[j * s->length + n] = p->control[j];
-            p->control[j] = anc_amplify(p->amplifiers + j, p->control[j]);
+        for (int32_t sj = 0; sj < loudspeakers; sj++)
+            if (!within(p->control[sj], p->limit[sj])) return n;
+        for (int32_t sj = 0; sj < loudspeakers; sj++) {
+            s->control_signal[sj * s->length + n] = p->control[sj];
+            p->control[sj] = anc_amplify(p->amplifiers + sj, p->control[sj]);
         }
         anc_play(p, p->control, s, n);
         *status = ANC_REFUSED_ERROR;

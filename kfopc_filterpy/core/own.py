@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from . import building
-from .block import Algorithm, _Algorithm, _Plan, _Visitor
+from .block import Algorithm, _Algorithm, _Plan, VISITOR
 from .library import load
 
 CACHE_VARIABLE = "KFOPC_CACHE"
@@ -248,5 +248,5 @@ def _fields_of(struct: Any) -> Counter[str]:
     def take(_: Any, name: bytes, *rest: Any) -> None:
         names[name.decode()] += 1
 
-    load().held.anc_describe(ctypes.byref(struct), ctypes.byref(plan), _Visitor(take), None)
+    load().held.anc_describe(ctypes.byref(struct), ctypes.byref(plan), VISITOR(take), None)
     return names

@@ -32,7 +32,7 @@ class _Plant(ctypes.Structure):
     _fields_ = [
         *(
             (name, ctypes.c_int32)
-            for name in ("microphones", "loudspeakers", "references", "path_taps", "feedback_taps")
+            for name in ("scenarios", "microphones", "loudspeakers", "references", "path_taps", "feedback_taps")
         ),
         *((name, ctypes.c_int32) for name in ("at", "length")),
         *((name, ctypes.c_void_p) for name in ("path", "feedback", "amplifiers", "output")),
@@ -57,7 +57,10 @@ class _Signals(ctypes.Structure):
 
 
 class Signals(NamedTuple):
-    """Signals of a run, C-contiguous, (channels, n_samples): three inputs, then the results of the loop."""
+    """Signals of a run, C-contiguous, (channels, n_samples): three inputs, then the results of the loop.
+
+    The channels of scenarios come one after the other.
+    """
 
     reference: NDArray[np.float64]  # (I, n)
     disturbance: NDArray[np.float64]  # (K, n)
@@ -87,14 +90,19 @@ class Plant:
 
     Parameters
     ----------
-    secondary : ndarray, shape (K, J, taps)
-        Secondary paths s.
+    secondary : ndarray, shape (S, K, J, taps)
+        Secondary paths s of each scenario.
     feedback : ndarray, shape (I, J, taps)
-        Paths from the loudspeakers to the reference microphones; 0 taps: none.
-    amplifiers : ndarray, shape (J, 3)
+        Paths from the loudspeakers to the reference microphones; 0 taps: none. With several scenarios there is none.
+    amplifiers : ndarray, shape (S J, 3)
         Kind, limit and sharpness of each amplifier model.
-    limit : ndarray, shape (J,)
+    limit : ndarray, shape (S J,)
         A control signal beyond it is a divergence.
+
+    Attributes
+    ----------
+    control : ndarray, shape (S J,)
+        Control signals of the present sample; after a divergence they can be mended before the run goes on.
     """
 
     def __init__(
@@ -104,27 +112,32 @@ class Plant:
         amplifiers: NDArray[np.float64],
         limit: NDArray[np.float64],
     ) -> None:
-        K, J, taps = secondary.shape
+        S, K, J, taps = secondary.shape
         longest = max(taps, feedback.shape[2])
         length = 4 * longest + 64
-        self.reference, self.control, self.error = np.zeros(len(feedback)), np.zeros(J), np.zeros(K)
+        self.reference, self.control, self.error = np.zeros(len(feedback)), np.zeros(S * J), np.zeros(S * K)
         self.limit, self._models = np.ascontiguousarray(limit, np.float64), np.ascontiguousarray(amplifiers)
         self._arrays = [
-            *(np.ascontiguousarray(array) for array in (secondary, feedback)),
+            *(np.array(array, order="C") for array in (secondary, feedback)),
             self._models,
-            np.zeros((J, length)),
+            np.zeros((S * J, length)),
             self.reference,
             self.control,
             self.error,
             self.limit,
         ]
-        counts = (K, J, len(feedback), taps, feedback.shape[2], length - longest, length)
+        counts = (S, K, J, len(feedback), taps, feedback.shape[2], length - longest, length)
         self._struct = _Plant(*counts, *(array.ctypes.data for array in self._arrays))
 
-    def run(self, steps: Steps, signals: Signals, records: list[Record], begin: int, end: int) -> tuple[int, int]:
-        """Run a controller from sample `begin` to `end`; return the status and the first sample not completed."""
+    def run(
+        self, steps: Steps, signals: Signals, records: list[Record], begin: int, end: int, status: int = RUNNING
+    ) -> tuple[int, int]:
+        """Run a controller from sample `begin` to `end`; return the status and the first sample not completed.
+
+        With the status DIVERGED, go on from a divergence at `begin` with the control signals in `control`.
+        """
         notes = (_Record * max(len(records), 1))(*(record._struct() for record in records))
-        status = ctypes.c_int32()
+        answer = ctypes.c_int32(status)
         _library.anc_run.restype = ctypes.c_int64
         done = _library.anc_run(
             ctypes.byref(_Controller(*steps)),
@@ -134,9 +147,15 @@ class Plant:
             ctypes.c_int32(len(records)),
             ctypes.c_int64(begin),
             ctypes.c_int64(end),
-            ctypes.byref(status),
+            ctypes.byref(answer),
         )
-        return status.value, done
+        return answer.value, done
+
+    def silence(self, scenario: int) -> None:
+        """Cut off the loudspeakers of a scenario."""
+        loudspeakers = self._arrays[0].shape[2]
+        rows = slice(scenario * loudspeakers, (scenario + 1) * loudspeakers)
+        self._arrays[0][scenario] = self._arrays[3][rows] = self.control[rows] = 0.0
 
     def hear(self, signals: Signals, n: int) -> NDArray[np.float64]:
         """Return the references of sample n, (I,)."""

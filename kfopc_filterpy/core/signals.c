@@ -35,6 +35,11 @@ static lines layout_lines(anc_layout *at, const char *name, const char *name_at,
     return (lines){room, int32s(at, name_at, ANC_STATE, 1), n0 * n1 * n2, taps, length};
 }
 
+int32_t numbers_of(const anc_setting *setting, const anc_plan *p)
+{
+    return setting->each == ANC_EACH_LOUDSPEAKER ? p->loudspeakers : setting->each == ANC_EACH_MICROPHONE ? p->microphones : 1;
+}
+
 static int32_t longest(const int32_t *lengths, int32_t n)
 {
     int32_t most = 0;
@@ -46,33 +51,34 @@ static int32_t longest(const int32_t *lengths, int32_t n)
 
 void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at)
 {
-    const int32_t K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps, G = p->guard_taps;
+    const int32_t S = p->scenarios, K = p->microphones, J = p->loudspeakers, I = p->references;
+    const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
     const int32_t filtered = L > ANC_GUARD_TAPS ? L : ANC_GUARD_TAPS; /* a guard can come later, and needs the past */
-    s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
+    s->S = S, s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
     s->limited = p->limited;
-    s->power_length = longest(p->power_windows, J), s->limiter_length = longest(p->limiter_windows, J);
+    s->power_length = longest(p->power_windows, S * J), s->limiter_length = longest(p->limiter_windows, S * J);
     s->path = reals(at, "secondary_path", ANC_SETTING, 1, K, J, M);
     s->guard = reals(at, "guard", ANC_SETTING, 1, 1, 1, G);
     s->loudest = reals(at, "loudest", ANC_SETTING, 1, 1, 1, 1);
-    for (int i = 0; settings[i].name; i++) s->setting[i] = reals(at, settings[i].name, ANC_SETTING, 1, 1, 1, settings[i].each ? J : 1);
-    s->amplifier = (anc_amplifier *)reals(at, "amplifier", ANC_SETTING, 1, 1, J, COLUMNS(anc_amplifier));
+    for (int i = 0; settings[i].name; i++) s->setting[i] = reals(at, settings[i].name, ANC_SETTING, 1, 1, 1, numbers_of(settings + i, p));
+    s->amplifier = (anc_amplifier *)reals(at, "amplifier", ANC_SETTING, 1, S, J, COLUMNS(anc_amplifier));
     s->x = layout_lines(at, "reference", "reference_at", 1, 1, I, filtered + M + ANC_GUARD_TAPS - 2);
     s->filtered = layout_lines(at, "filtered_reference", "filtered_reference_at", K, J, I, filtered);
     s->guarded = layout_lines(at, "guarded_reference", "guarded_reference_at", G ? K : 0, J, I, L);
-    s->y = layout_lines(at, "output", "output_at", 1, 1, J, M);
-    s->weights = reals(at, "weights", ANC_STATE, 1, J, I, L);
-    s->control = reals(at, "control_signal", ANC_STATE, 1, 1, 1, J);
-    s->constraint = (anc_constraint *)reals(at, "constraint", ANC_STATE, 1, 1, J, COLUMNS(anc_constraint));
-    s->powers = (anc_power *)reals(at, "powers", ANC_STATE, 1, J, ANC_POWERS, COLUMNS(anc_power));
-    s->power_windows = int32s(at, "power_windows", ANC_SETTING, J);
-    s->power_window = reals(at, "power_window", ANC_STATE, 1, J, ANC_POWERS, s->power_length);
-    s->limiter = (anc_limiter *)reals(at, "limiter", ANC_STATE, 1, 1, p->limited ? J : 0, COLUMNS(anc_limiter));
-    s->laps = reals(at, "laps", ANC_STATE, 1, p->limited ? J : 0, 3, s->limiter_length + 1);
-    s->previewed = (anc_previewed *)reals(at, "previewed", ANC_SCRATCH, 1, 1, J, COLUMNS(anc_previewed));
-    s->estimate = reals(at, "disturbance", ANC_SCRATCH, 1, 1, 1, K);
-    s->heard = reals(at, "heard", ANC_SCRATCH, 1, 1, 1, K);
-    s->squares = reals(at, "squares", ANC_SCRATCH, 1, 1, 1, 2 + J);
-    s->step = reals(at, "step", ANC_SCRATCH, 1, 1, J, STEPS);
+    s->y = layout_lines(at, "output", "output_at", 1, S, J, M);
+    s->weights = reals(at, "weights", ANC_STATE, S, J, I, L);
+    s->control = reals(at, "control_signal", ANC_STATE, 1, 1, S, J);
+    s->constraint = (anc_constraint *)reals(at, "constraint", ANC_STATE, 1, S, J, COLUMNS(anc_constraint));
+    s->powers = (anc_power *)reals(at, "powers", ANC_STATE, S, J, ANC_POWERS, COLUMNS(anc_power));
+    s->power_windows = int32s(at, "power_windows", ANC_SETTING, S * J);
+    s->power_window = reals(at, "power_window", ANC_STATE, S, J, ANC_POWERS, s->power_length);
+    s->limiter = (anc_limiter *)reals(at, "limiter", ANC_STATE, 1, S, p->limited ? J : 0, COLUMNS(anc_limiter));
+    s->laps = reals(at, "laps", ANC_STATE, S, p->limited ? J : 0, 3, s->limiter_length + 1);
+    s->previewed = (anc_previewed *)reals(at, "previewed", ANC_SCRATCH, 1, S, J, COLUMNS(anc_previewed));
+    s->estimate = reals(at, "disturbance", ANC_SCRATCH, 1, 1, S, K);
+    s->heard = reals(at, "heard", ANC_SCRATCH, 1, 1, S, K);
+    s->squares = reals(at, "squares", ANC_SCRATCH, 1, S, J, ANC_POWERS);
+    s->step = reals(at, "step", ANC_SCRATCH, 1, S, J, STEPS);
 }
 
 /* Set the loudest reference, so that nothing that is filtered from it overflows. */
@@ -94,15 +100,18 @@ void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)
     memcpy(s->path, p->path, sizeof(real) * times(s->K * s->J, s->M));
     if (s->G) memcpy(s->guard, p->guard, sizeof(real) * (size_t)s->G);
     for (int i = 0; settings[i].name; i++)
-        for (int32_t j = 0; j < (settings[i].each ? s->J : 1); j++) s->setting[i][j] = *from++;
-    for (int32_t j = 0; j < s->J; j++) {
-        s->power_windows[j] = p->power_windows ? p->power_windows[j] : 0;
-        s->amplifier[j] = (anc_amplifier){ANC_LINEAR, 1, 1};
-        s->constraint[j] = (anc_constraint){.rated_power = 1, .rate = 1, .supplied_factor = 1, .supplied_power = (real)NAN,
+        for (int32_t n = 0; n < numbers_of(settings + i, p); n++) s->setting[i][n] = *from++;
+    for (int32_t sj = 0; sj < s->S * s->J; sj++) {
+        s->power_windows[sj] = p->power_windows ? p->power_windows[sj] : 0;
+        s->amplifier[sj] = (anc_amplifier){ANC_LINEAR, 1, 1};
+        s->constraint[sj] = (anc_constraint){.rated_power = 1, .rate = 1, .supplied_factor = 1, .supplied_power = (real)NAN,
                                             .supplied_gain = (real)NAN, .factor = 1, .gain = (real)NAN};
     }
     set_loudest(s);
 }
+
+void layout_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at) { layout_signals((signals *)view, plan, settings, at); }
+void start_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings) { start_signals((signals *)view, plan, settings); }
 
 /* A sample. */
 
@@ -131,83 +140,133 @@ int take_reference(signals *s, const real *reference)
     return ANC_DONE;
 }
 
-real filter_output(const signals *s, int32_t j)
+real filter_output(const signals *s, int32_t sj)
 {
     real y = 0;
-    for (int32_t i = 0; i < s->I; i++) y += dot(s->weights + times(j * s->I + i, s->L), newest(&s->x, i), s->L);
+    for (int32_t i = 0; i < s->I; i++) y += dot(weights_of(s, sj) + times(i, s->L), newest(&s->x, i), s->L);
     return y;
 }
 
-void emit(signals *s, int32_t j, real y)
+void emit(signals *s, int32_t sj, real y)
 {
-    if (j == 0) advance(&s->y);
-    if (s->limited) y = anc_limit(s->limiter + j, s->laps + times(3 * j, s->limiter_length + 1), y);
-    s->control[j] = y;
-    *newest(&s->y, j) = anc_amplify(s->amplifier + j, y);
+    if (sj == 0) advance(&s->y);
+    if (s->limited) y = anc_limit(s->limiter + sj, s->laps + times(3 * sj, s->limiter_length + 1), y);
+    s->control[sj] = y;
+    *newest(&s->y, sj) = anc_amplify(s->amplifier + sj, y);
 }
 
-real heard_output(const signals *s, const lines *rows, int32_t k)
+int control_signal_plain(anc_view *view, const real *reference, real *control)
 {
+    signals *s = (signals *)view;
+    const int refused = take_reference(s, reference);
+    for (int32_t sj = 0; !refused && sj < s->S * s->J; sj++) emit(s, sj, filter_output(s, sj)), control[sj] = s->control[sj];
+    return refused;
+}
+
+real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t k)
+{
+    const real *w = weights_of(s, scenario * s->J);
     real sum = 0;
-    for (int32_t ji = 0; ji < s->J * s->I; ji++) sum += dot(s->weights + times(ji, s->L), newest(rows, k * s->J * s->I + ji), s->L);
+    for (int32_t ji = 0; ji < s->J * s->I; ji++) sum += dot(w + times(ji, s->L), newest(rows, k * s->J * s->I + ji), s->L);
     return sum;
 }
 
-/* Squares: d^ summed over microphones, x over references, x'_j over both. */
-enum { D2, X2, F2 };
-
-int estimate(signals *s, const real *error)
+int estimate_disturbance(signals *s, const real *error)
 {
-    s->squares[D2] = s->squares[X2] = 0;
-    for (int32_t k = 0; k < s->K; k++) {
-        if (!within(error[k], LOUDEST)) return ANC_LOUD_ERROR;
-        s->estimate[k] = error[k];
-        for (int32_t j = 0; j < s->J; j++) s->estimate[k] += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, j), s->M);
-        if (!within(s->estimate[k], LOUDEST)) return ANC_LOUD_ESTIMATE;
-        s->squares[D2] += s->estimate[k] * s->estimate[k];
+    real x2 = 0;
+    for (int32_t sk = 0; sk < s->S * s->K; sk++) {
+        const int32_t scenario = sk / s->K, k = sk % s->K;
+        real d = error[sk];
+        if (!within(d, LOUDEST)) return ANC_LOUD_ERROR;
+        for (int32_t j = 0; j < s->J; j++) d += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, scenario * s->J + j), s->M);
+        if (!within(d, LOUDEST)) return ANC_LOUD_ESTIMATE;
+        s->estimate[sk] = d;
     }
-    for (int32_t i = 0; i < s->I; i++) s->squares[X2] += *newest(&s->x, i) * *newest(&s->x, i);
-    for (int32_t j = 0; j < s->J; j++) {
-        real f2 = 0;
-        for (int32_t k = 0; k < s->K; k++)
+    for (int32_t i = 0; i < s->I; i++) x2 += *newest(&s->x, i) * *newest(&s->x, i);
+    /* Squares of d^ are summed over microphones, of x over references, of x'_j over both. */
+    for (int32_t sj = 0; sj < s->S * s->J; sj++) {
+        const int32_t scenario = sj / s->J, j = sj % s->J;
+        real d2 = 0, f2 = 0;
+        for (int32_t k = 0; k < s->K; k++) {
+            d2 += s->estimate[scenario * s->K + k] * s->estimate[scenario * s->K + k];
             for (int32_t i = 0; i < s->I; i++) {
                 const real f = *newest(&s->filtered, (k * s->J + j) * s->I + i);
                 f2 += f * f;
             }
-        s->squares[F2 + j] = f2;
-        anc_preview(s->constraint + j, s->powers + ANC_POWERS * j, s->power_window + times(ANC_POWERS * j, s->power_length),
-                    s->power_windows[j], s->previewed + j, s->squares[D2], f2, s->squares[X2]);
+        }
+        real *squares = s->squares + ANC_POWERS * sj;
+        squares[ANC_DISTURBANCE] = d2, squares[ANC_FILTERED] = f2, squares[ANC_REFERENCE] = x2;
     }
     return ANC_DONE;
 }
 
+static real *window_of(const signals *s, int32_t sj) { return s->power_window + times(ANC_POWERS * sj, s->power_length); }
+
+void preview(signals *s)
+{
+    for (int32_t sj = 0; sj < s->S * s->J; sj++) {
+        const real *squares = s->squares + ANC_POWERS * sj;
+        anc_preview(s->constraint + sj, s->powers + ANC_POWERS * sj, window_of(s, sj), s->power_windows[sj], s->previewed + sj,
+                    squares[ANC_DISTURBANCE], squares[ANC_FILTERED], squares[ANC_REFERENCE]);
+    }
+}
+
+int estimate(signals *s, const real *error)
+{
+    const int refused = estimate_disturbance(s, error);
+    if (!refused) preview(s);
+    return refused;
+}
+
+real least_factor(const signals *s, int32_t scenario)
+{
+    real heard = 2, unheard = 2; /* a loudspeaker whose gain is zero keeps silent: its factor counts only if there is no other */
+    for (int32_t j = 0; j < s->J; j++) {
+        const anc_previewed *p = s->previewed + scenario * s->J + j;
+        real *least = p->gain == 0 ? &unheard : &heard;
+        if (p->factor < *least) *least = p->factor;
+    }
+    return heard < 2 ? heard : unheard;
+}
+
 void commit(signals *s)
 {
-    for (int32_t j = 0; j < s->J; j++)
-        anc_commit(s->constraint + j, s->powers + ANC_POWERS * j, s->power_window + times(ANC_POWERS * j, s->power_length),
-                   s->power_windows[j], s->previewed + j, s->squares[D2], s->squares[F2 + j], s->squares[X2]);
+    for (int32_t sj = 0; sj < s->S * s->J; sj++) {
+        const real *squares = s->squares + ANC_POWERS * sj;
+        anc_commit(s->constraint + sj, s->powers + ANC_POWERS * sj, window_of(s, sj), s->power_windows[sj], s->previewed + sj,
+                   squares[ANC_DISTURBANCE], squares[ANC_FILTERED], squares[ANC_REFERENCE]);
+    }
+}
+
+void set_step(signals *s, int32_t sj, real keep, real mu, real penalty)
+{
+    real *step = s->step + STEPS * sj;
+    step[KEEP] = keep, step[MU] = mu, step[PENALTY] = penalty;
 }
 
 int descend(signals *s, const real *error)
 {
     const int32_t rows = s->J * s->I;
-    for (int32_t k = 0; k < s->K; k++) {
-        s->heard[k] = s->G ? heard_output(s, &s->guarded, k) : 0;
+    for (int32_t sk = 0; sk < s->S * s->K; sk++) {
+        const int32_t scenario = sk / s->K;
+        s->heard[sk] = s->G ? heard_output(s, &s->guarded, scenario, sk % s->K) : 0;
         for (int32_t j = 0; j < s->J; j++) {
-            const real *step = s->step + STEPS * j;
-            if (!within(step[MU] * error[k], LARGEST) || !within(step[MU] * s->heard[k], LARGEST) || !within(step[PENALTY], LARGEST))
+            const real *step = s->step + STEPS * (scenario * s->J + j);
+            if (!within(step[MU] * error[sk], LARGEST) || !within(step[MU] * s->heard[sk], LARGEST) || !within(step[PENALTY], LARGEST))
                 return ANC_LOUD_STEP;
         }
     }
     commit(s);
-    for (int32_t ji = 0; ji < rows; ji++) {
-        const real *step = s->step + STEPS * (ji / s->I), *x = newest(&s->x, ji % s->I);
-        real *w = s->weights + times(ji, s->L);
+    for (int32_t sji = 0; sji < s->S * rows; sji++) {
+        const int32_t scenario = sji / rows, ji = sji % rows;
+        const real *step = s->step + STEPS * (sji / s->I), *x = newest(&s->x, sji % s->I);
+        const real *heard = s->heard + scenario * s->K, *e = error + scenario * s->K;
+        real *w = s->weights + times(sji, s->L);
         for (int32_t k = 0; s->G && k < s->K; k++) /* a leak where the paths are uncertain: w -= mu (w'x'') x'' */
-            add_scaled(w, -step[MU] * s->heard[k], newest(&s->guarded, k * rows + ji), s->L);
+            add_scaled(w, -step[MU] * heard[k], newest(&s->guarded, k * rows + ji), s->L);
         if (step[KEEP] != 1 || step[PENALTY] != 0)
             for (int32_t l = 0; l < s->L; l++) w[l] = step[KEEP] * w[l] - step[PENALTY] * x[l];
-        for (int32_t k = 0; k < s->K; k++) add_scaled(w, step[MU] * error[k], newest(&s->filtered, k * rows + ji), s->L);
+        for (int32_t k = 0; k < s->K; k++) add_scaled(w, step[MU] * e[k], newest(&s->filtered, k * rows + ji), s->L);
     }
     return ANC_DONE;
 }
@@ -217,9 +276,9 @@ int64_t anc_listen(anc_view *view, const real *x, const real *e, const uint8_t *
     signals *s = (signals *)view;
     for (int64_t t = 0; t < n; t++) {
         if (take_reference(s, x + t * s->I)) return t;
-        for (int32_t j = 0; j < s->J; j++) emit(s, j, 0);
+        for (int32_t sj = 0; sj < s->S * s->J; sj++) emit(s, sj, 0);
         if (!adapt[t]) continue;
-        if (estimate(s, e + t * s->K)) return t;
+        if (estimate(s, e + t * s->S * s->K)) return t;
         commit(s);
     }
     return n;
@@ -241,3 +300,11 @@ void anc_refilter(anc_view *view)
         }
     set_loudest(s);
 }
+
+/* The signals alone, for an estimator of the host: d^ is previewed, and what the estimator makes of it are the weights. */
+
+static const anc_setting none[] = {{0}};
+
+static int update_estimate(anc_view *view, const real *error) { return error ? estimate((signals *)view, error) : ANC_DONE; }
+
+const anc_algorithm anc_signals_alone = {"signals alone", none, layout_plain, start_plain, control_signal_plain, update_estimate};

@@ -20,25 +20,25 @@ typedef struct { /* delay lines that advance together */
 } lines;
 
 typedef struct {
-    int32_t K, J, I, L, M, G;
+    int32_t S, K, J, I, L, M, G;
     int32_t limited, power_length, limiter_length; /* the longest windows: rows of `power_window` and `laps` */
-    int32_t *power_windows;                        /* (J) */
+    int32_t *power_windows;                        /* (S, J) */
     real *path, *guard;                            /* s^, (K, J, M), and W, (G) */
     real *loudest;                                 /* |x| beyond it is refused */
-    real *setting[ANC_MOST_SETTINGS];              /* the algorithm's own: one number each, or (J) */
-    lines x, filtered, y, guarded;                 /* rows (I), (K, J, I), (J), (K, J, I); y after limiter and amplifier model */
-    anc_amplifier *amplifier;                      /* (J) known models; linear: d^ = e + s^ * y as published */
-    anc_limiter *limiter;                          /* (J) if limited */
-    real *laps;                                    /* (J, 3, limiter_length + 1) */
-    anc_constraint *constraint;                    /* (J) */
-    anc_power *powers;                             /* (J, ANC_POWERS) */
-    real *power_window;                            /* (J, ANC_POWERS, power_length) */
-    real *weights;                                 /* (J, I, L) */
-    real *control;                                 /* (J) the last y */
-    anc_previewed *previewed;                      /* (J) */
-    real *estimate, *heard;                        /* (K) d^, and sum_ji w_ji' x'_kji */
-    real *squares;                                 /* (2 + J) of d^, x and x'_j, previewed */
-    real *step;                                    /* (J, STEPS) */
+    real *setting[ANC_MOST_SETTINGS];              /* the algorithm's own: one number each, (J) or (K) */
+    lines x, filtered, y, guarded;                 /* rows (I), (K, J, I), (S, J), (K, J, I); y after limiter and amplifier model */
+    anc_amplifier *amplifier;                      /* (S, J) known models; linear: d^ = e + s^ * y as published */
+    anc_limiter *limiter;                          /* (S, J) if limited */
+    real *laps;                                    /* (S, J, 3, limiter_length + 1) */
+    anc_constraint *constraint;                    /* (S, J) */
+    anc_power *powers;                             /* (S, J, ANC_POWERS) */
+    real *power_window;                            /* (S, J, ANC_POWERS, power_length) */
+    real *weights;                                 /* (S, J, I, L) */
+    real *control;                                 /* (S, J) the last y */
+    anc_previewed *previewed;                      /* (S, J) */
+    real *estimate, *heard;                        /* (S, K) d^, and sum_ji w_ji' x'_kji */
+    real *squares;                                 /* (S, J, ANC_POWERS) of d^, x'_j and x, previewed */
+    real *step;                                    /* (S, J, STEPS) */
 } signals;
 
 enum { KEEP, MU, PENALTY, STEPS }; /* of one loudspeaker's step: w = keep w + mu sum_k e_k x'_k - penalty x */
@@ -47,20 +47,31 @@ static inline size_t times(int32_t a, int32_t b) { return (size_t)a * (size_t)b;
 static inline real *newest(const lines *l, int32_t row) { return l->room + times(row, l->length) + *l->at; }
 static inline int32_t states(const signals *s) { return s->J * s->I * s->L; }
 static inline int within(real value, real most) { return value <= most && value >= -most; } /* not NaN either */
-static inline real *weights_of(const signals *s, int32_t j) { return s->weights + times(j, s->I * s->L); }
+static inline real *weights_of(const signals *s, int32_t sj) { return s->weights + times(sj, s->I * s->L); }
 
 /* Layout. */
 real *reals(anc_layout *at, const char *name, anc_role role, int32_t n0, int32_t n1, int32_t n2, int32_t n3);
 int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n);
+int32_t numbers_of(const anc_setting *setting, const anc_plan *plan); /* how many a setting has */
 void layout_signals(signals *s, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
 void start_signals(signals *s, const anc_plan *plan, const anc_setting *settings);
 
-/* The parts of a sample, in this order. Each returns ANC_DONE, or why it refused, with nothing changed. */
+/* The same as functions of an algorithm, and the usual control signal: the weights' output. */
+void layout_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
+void start_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings);
+int control_signal_plain(anc_view *view, const real *reference, real *control);
+
+/* The parts of a sample, in this order; `sj` is a loudspeaker of a scenario. Those that return int return ANC_DONE, or why they
+ * refused, with nothing changed. */
 int take_reference(signals *s, const real *reference);
-real filter_output(const signals *s, int32_t j);                  /* sum_i w_ji' x_i */
-void emit(signals *s, int32_t j, real y);                         /* through limiter and amplifier model, into the delay line of y */
-int estimate(signals *s, const real *error);                      /* d^, with the powers and factors previewed */
-void commit(signals *s);                                          /* take the previewed powers */
-real heard_output(const signals *s, const lines *rows, int32_t k); /* sum_ji w_ji' x'_kji, or with the guarded rows */
-int descend(signals *s, const real *error);                       /* the steps of all loudspeakers; commits */
+real filter_output(const signals *s, int32_t sj);  /* sum_i w_ji' x_i */
+void emit(signals *s, int32_t sj, real y);         /* through limiter and amplifier model, into the delay line of y */
+int estimate(signals *s, const real *error);       /* d^, with the powers and factors previewed */
+int estimate_disturbance(signals *s, const real *error); /* d^ and the squares alone, */
+void preview(signals *s);                          /* and the powers and factors of these squares */
+real least_factor(const signals *s, int32_t scenario); /* of its loudspeakers that a microphone hears, previewed */
+void commit(signals *s);                           /* take the previewed powers */
+real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t k); /* sum_ji w_ji' x'_kji, or with the guarded rows */
+void set_step(signals *s, int32_t sj, real keep, real mu, real penalty);
+int descend(signals *s, const real *error);        /* the steps of all loudspeakers; commits */
 #endif

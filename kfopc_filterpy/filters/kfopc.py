@@ -194,7 +194,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         initial_variance: float = 1.0,
         rated_power: float | None = None,
         constraint: OutputPowerConstraint | None = None,
-        dtype: Any = np.float64,
     ) -> RandomWalkKFOPC:
         """Return the filter of eq. 1-8 for a random-walk control filter: F = I, Q = r I, R = q, in O(L^2) per sample.
 
@@ -212,10 +211,6 @@ class KFOPC(KalmanFilter, Checkpointed):
             Rated output power; None: the unconstrained filter, KF-ANC.
         constraint : OutputPowerConstraint, optional
             Given instead of `rated_power`, as for `KFOPC`.
-        dtype : {numpy.float64, numpy.float32}, default numpy.float64
-            Precision in which P is stored and updated; the weights stay float64. float32 halves the memory and, at many
-            taps, the time. Rounding limits what it can know: a state noise below 2.4e-7 of the largest variance in P
-            counts as that, so that P stays positive semidefinite.
 
         Returns
         -------
@@ -225,7 +220,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         Raises
         ------
         ValueError
-            A negative variance, fewer than one tap, another dtype, or a constraint argument out of range.
+            A negative variance, fewer than one tap, or a constraint argument out of range.
 
         Examples
         --------
@@ -246,7 +241,6 @@ class KFOPC(KalmanFilter, Checkpointed):
             initial_variance=initial_variance,
             rated_power=rated_power,
             constraint=constraint,
-            dtype=dtype,
         )
 
     # The constraint: its values can be read, or supplied by the caller.

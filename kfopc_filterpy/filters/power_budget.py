@@ -23,8 +23,8 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
     ----------
     n_taps : int
         Taps L of the control filter, the state.
-    state_noise, measurement_noise, initial_variance, dtype
-        r, q, P(0|0) = initial_variance I and the precision of P, see `KFOPC.random_walk`.
+    state_noise, measurement_noise, initial_variance
+        r, q and P(0|0) = initial_variance I, see `KFOPC.random_walk`.
     rated_power : float
         Rated output power (mean square of the control signal).
     fs, memory_s, averaging_s, guard
@@ -75,7 +75,6 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
         measurement_noise: float,
         rated_power: float,
         initial_variance: float = 1.0,
-        dtype: Any = np.float64,
         fs: float = DEFAULT_FS,
         memory_s: float = DEFAULT_CORRELATION_MEMORY_S,
         averaging_s: float = DEFAULT_AVERAGING_S,
@@ -87,7 +86,6 @@ class PowerBudgetKalmanFilter(RandomWalkKFOPC):
             state_noise=state_noise,
             measurement_noise=measurement_noise,
             initial_variance=initial_variance,
-            dtype=dtype,
         )
         self._budget = PowerBudget(
             n_taps,

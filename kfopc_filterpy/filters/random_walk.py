@@ -4,65 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from math import isfinite, log, pi
+from math import isfinite, log, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_number, require_finite
-from ..kernels.compiling import part
-from ..kernels.covariance import Covariance, project_covariance, update_weights
-from ..kernels.holding import for_states, state_at
+from ..core.block import LOUD_STEP, NO_SOLUTION
+from ..kernels.covariance import Covariance, covariance_update, direction_of
 from ..kernels.records import new_record
-from ..power.constraint import OutputPowerConstraint, commit_constraint, preview_constraint, squares_are_finite
+from ..power.constraint import OutputPowerConstraint
 from .covariance import RandomWalkCovariance, require_covariance
 from .guards import SILENT_REFERENCE, State, checked_measurement, require_observation
 from .kfopc import KFOPC
-
-# Outcomes of `correct`.
-CORRECTED, NO_VARIANCE, OVERFLOWING_WEIGHTS, NOT_FINITE, OVERFLOWING_SQUARE, SILENT = range(6)
-UNTOUCHED = (NOT_FINITE, OVERFLOWING_SQUARE, SILENT)  # refused before the pass over the covariance
-
-
-@for_states()
-def correct_once(key):
-    """Compile `correct` for a type of `FilterArrays`."""
-
-    def correct_at(address, weights, z, h, reference, noise, factor):
-        state = state_at(address, key)
-        return correct(state.covariance, state.constraint, weights, z, h, reference, noise, factor)
-
-    return correct_at
-
-
-@part()
-def correct(cov, constraint, weights, z, h, reference, noise, factor):
-    """Apply eq. 5-9 to `weights` and `cov`; return the outcome, the residual and S.
-
-    `constraint` is None in a filter without a rated power; the measurement is then scaled by `factor`. A refused update
-    changes nothing, except that pending changes of P may be applied, which does not change its value.
-    """
-    nothing = 0.0 * z
-    for i in range(h.size):
-        nothing += 0.0 * h[i] + 0.0 * weights[i]
-    if nothing != 0.0:  # NaN
-        return NOT_FINITE, np.nan, np.nan
-    x = 0.0 if np.isnan(reference) else reference
-    if constraint is not None:
-        if not squares_are_finite(z, h[0], x):
-            return OVERFLOWING_SQUARE, np.nan, np.nan
-        factor, _, _ = preview_constraint(constraint, z, h[0], reference)
-    if noise == 0.0 and not np.any(h):
-        return SILENT, np.nan, np.nan
-    S = project_covariance(cov, h) + noise
-    if not 0.0 < S < np.inf:
-        return NO_VARIANCE, np.nan, S
-    y = update_weights(cov, weights, h, factor * z, S, noise)
-    if not np.isfinite(y):
-        return OVERFLOWING_WEIGHTS, y, S
-    if constraint is not None:
-        commit_constraint(constraint, z, h[0], reference)
-    return CORRECTED, y, S
 
 
 def new_numbers() -> np.ndarray:
@@ -107,11 +61,10 @@ class RandomWalkKFOPC(KFOPC):
     - If another F or a full Q is assigned or passed, or with `B` and `u`, or an H of several rows, the step uses
       filterpy's own equations, in O(L^3).
     - filterpy's fading memory ``alpha`` stays fast.
-    - `dtype` is the precision in which P is stored: float64, or float32 if requested.
 
     Parameters
     ----------
-    n_taps, state_noise, measurement_noise, initial_variance, rated_power, constraint, dtype
+    n_taps, state_noise, measurement_noise, initial_variance, rated_power, constraint
         As for `KFOPC.random_walk`.
 
     Examples
@@ -156,10 +109,8 @@ class RandomWalkKFOPC(KFOPC):
         initial_variance: float = 1.0,
         rated_power: float | None = None,
         constraint: OutputPowerConstraint | None = None,
-        dtype: Any = np.float64,
     ) -> None:
         n_taps = as_count(n_taps, "n_taps")
-        precision = as_precision(dtype)
         self._F: np.ndarray | None = None  # None: the identity
         self._Q: np.ndarray | None = None  # None: state_noise I
         self._views: dict[str, np.ndarray] = {}  # read-only F, Q, R, made when read
@@ -172,7 +123,7 @@ class RandomWalkKFOPC(KFOPC):
         self.state_noise = state_noise
         self.measurement_noise = measurement_noise
         variance = as_nonnegative(initial_variance, "initial_variance")
-        self._covariance = RandomWalkCovariance(variance * np.eye(n_taps), precision)
+        self._covariance = RandomWalkCovariance(variance * np.eye(n_taps))
 
     def __getstate__(self) -> State:
         """Return the state for a deep copy or a file, without views (copied views would be writeable)."""
@@ -263,11 +214,6 @@ class RandomWalkKFOPC(KFOPC):
     # P and the values that follow from it, computed when read.
 
     @property
-    def dtype(self) -> np.dtype:
-        """Precision that P is kept in."""
-        return self._covariance.arrays.triangle.dtype
-
-    @property
     def P(self) -> np.ndarray:
         """State covariance, a full symmetric array; values written into it take effect at the next step."""
         return self._covariance.show()
@@ -277,7 +223,7 @@ class RandomWalkKFOPC(KFOPC):
         # as in filterpy's equations, a number is the variance of every state
         P = self._matrix(value * np.eye(self.dim_x) if np.ndim(value) == 0 else value, "P")
         if not self._delegating:  # the rounding of filterpy's own equations need not be small beside P
-            require_covariance(P, self.dtype)
+            require_covariance(P)
         self._replace_covariance(P)
 
     def _replace_covariance(self, P: np.ndarray) -> None:
@@ -306,7 +252,8 @@ class RandomWalkKFOPC(KFOPC):
     def K(self) -> np.ndarray:
         """Kalman gain of the last update, (n, 1)."""
         if self._K is None:  # eq. 6, K = P x' / S
-            self._K = (self._covariance.arrays.gain_direction / self._numbers["variance"][0]).reshape(-1, 1)
+            u = direction_of(self._covariance.arrays, self.dim_x)
+            self._K = (u / sqrt(self._numbers["variance"][0])).reshape(-1, 1)
         return self._K
 
     @K.setter
@@ -400,42 +347,33 @@ class RandomWalkKFOPC(KFOPC):
         return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
-        """Apply eq. 5-9 to the arrays; return the new weights. A refused update raises before anything changes."""
-        constraint = self._constraint
-        if constraint is None:
-            state, factor = None, self._unconstrained_factor
-        else:
-            if reference is None and constraint.needs_reference:
-                constraint.preview(z, h[0], reference)  # raises, with the reason
-            state, factor = constraint.state, 1.0
-        weights = np.array(self.x, dtype=np.float64)
-        if weights.size != self.dim_x:
-            self._weights()  # raises, with the reason
-        held, before, prior = self._covariance.before_update(state)
-        x = np.nan if reference is None else reference
-        outcome, y, S = correct_once(held, weights.reshape(-1), z, h, x, noise, factor)
-        if outcome not in UNTOUCHED:
-            self._covariance.projected(before, prior)
-        if outcome != CORRECTED:
-            self._refuse(outcome, z, S, h, reference)
-        self._covariance.updated()
+        """Apply eq. 5-9; return the new weights. A refused update raises before anything changes."""
+        constraint, weights = self._constraint, self._weights()
+        if not isfinite(z + float(h @ h)):
+            checked_measurement(self, z, None, h)  # raises if one of them is not finite
+        factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
+        if noise == 0.0 and not h.any():
+            raise ValueError(SILENT_REFERENCE)
+        covariance = self._covariance
+        (memory, result), (before, prior) = covariance.arrays, covariance.before_update()
+        result[1] = nan
+        places = (array.ctypes.data for array in (memory, weights, h))
+        memory_at, weights_at, h_at = places
+        answer = covariance_update(memory_at, h.size, weights_at, h_at, factor * z, noise, result.ctypes.data)
+        y, S = result.tolist()
+        if S == S:  # the pass over P has begun
+            covariance.projected(before, prior)
+        if answer == LOUD_STEP:
+            raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
+        if answer == NO_SOLUTION:
+            cause = "P is not positive definite on H" if S <= 0 else "it overflows"
+            raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
+        if constraint is not None:
+            constraint.advance(z, h[0], reference)
+        covariance.updated()
         self._K, self._made = None, {name: value for name, value in self._made.items() if name == "x_prior"}
         self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
         return weights
-
-    def _refuse(self, outcome: int, z: float, S: float, h: np.ndarray, reference: float | None) -> None:
-        """Raise ValueError for an update that `correct` refused."""
-        if outcome == NOT_FINITE:
-            self._weights()
-            checked_measurement(self, z, None, h)
-        if outcome == OVERFLOWING_SQUARE and self._constraint is not None:
-            self._constraint.preview(z, h[0], reference)
-        if outcome == SILENT:
-            raise ValueError(SILENT_REFERENCE)
-        if outcome == NO_VARIANCE:
-            cause = "P is not positive definite on H" if S <= 0 else f"it overflows {self.dtype.name}"
-            raise ValueError(f"S = H P H' + R must be positive, got {S:g}: {cause}. Nothing was changed")
-        raise ValueError(f"the weights would overflow: x = {self.x!r}, z = {z:g}, S = {S:g}. Nothing was changed")
 
     def _own_constraint(self, value: Any) -> OutputPowerConstraint:
         """Return a copy of a constraint; there is one loudspeaker."""
@@ -462,43 +400,20 @@ class RandomWalkKFOPC(KFOPC):
         self._log_likelihood = self._likelihood = self._mahalanobis = None
         self.x, self.x_post = x, x.copy()
 
-    # Compiled steps, of one sample or of a whole signal: the arrays are handed out, updated and taken back.
+    # Steps of KF-PB that numba compiles: the arrays are handed out, updated and taken back.
 
     def steps_compiled(self) -> bool:
-        """Return whether this filter uses the compiled random-walk equations, and not filterpy's own."""
+        """Return whether this filter uses the random-walk equations, and not filterpy's own."""
         return self._F is None and self._Q is None and self.inv is np.linalg.inv
 
-    def compiled_arrays(self, to_step: bool = True) -> tuple[Covariance, np.ndarray]:
-        """Return the covariance arrays and the variances; `to_step` says if the caller will change the arrays."""
+    def compiled_arrays(self) -> tuple[Covariance, np.ndarray]:
+        """Return the covariance arrays and the variances."""
         self._take_in_edits()
         self._numbers["alpha_sq"] = self._alpha_sq
-        return self._covariance.own() if to_step else self._covariance.arrays, self._numbers
+        return self._covariance.arrays, self._numbers
 
-    def go_on_from(self, shared: Covariance) -> None:
-        """Continue from the covariance `shared` with other filters, without an update of this filter's own."""
-        self._K, prior = self.K, self.P_prior
-        self._covariance.share(shared)
-        self._covariance.prior = prior
-        self._covariance.missed()
-
-    def after_compiled(self, weights: np.ndarray, shared: Covariance | None = None) -> None:
-        """Adopt the results of one or more compiled samples; the filter keeps the array `weights`, (n,).
-
-        `shared` is the covariance arrays if other filters continue from them too.
-        """
-        if shared is not None:
-            self._covariance.share(shared)
+    def after_compiled(self, weights: np.ndarray) -> None:
+        """Adopt the results of one or more compiled samples; the filter keeps the array `weights`, (n,)."""
         self._covariance.after_compiled()
         self._K, self._made = None, {}
         self._record(weights.reshape(np.shape(self.x)))
-
-
-def as_precision(dtype: Any) -> np.dtype:
-    """Return the precision of a covariance, float64 or float32, or raise a clear error."""
-    try:
-        precision = np.dtype(dtype)
-    except TypeError as error:
-        raise TypeError(f"dtype must be numpy.float64 or numpy.float32, got {dtype!r}") from error
-    if precision not in (np.float64, np.float32):
-        raise ValueError(f"dtype must be numpy.float64 or numpy.float32, got {precision}")
-    return precision

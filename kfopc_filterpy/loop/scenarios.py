@@ -2,123 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from copy import deepcopy
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from .._validate import as_positive, as_signal
-from ..controllers.base import NO_SOLUTION, FilteredReferenceController
-from ..controllers.compiled_controller import CompiledController
-from ..controllers.step import Compiled, Lines, looped_arrays
-from ..core.running import DIVERGED, REFUSED_ERROR, RUNNING, Plant, Record, Signals
-from ..kernels.compiling import compiled
-from ..kernels.covariance import (
-    CANCELLATION,
-    Covariance,
-    aligned_zeros,
-    copy_covariance,
-    correct_weights,
-    covariance_matrix,
-    downdate_carefully,
-    downdate_covariance,
-    kalman_step,
-    predict_covariance,
-    project_covariance,
-)
-from ..kernels.delay_lines import TAPS, newest, refill
-from ..kernels.vectors import copy_into, dot
+from ..controllers.base import FilteredReferenceController
+from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
+from ..controllers.core_controller import CoreController
+from ..core.block import Block, Shape, reason_of
+from ..core.running import DIVERGED, RUNNING, Plant, Record, Signals, Steps
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
-from ..power.constraint import DEFAULT_FS
+from ..power.constraint import DEFAULT_FS, NUMBERS
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
 from .result import SimulationResult
-from .simulation import POWERS, RECORDED
+from .simulation import POWERS, RECORDED, STRETCH
 
 RESULTS = ("error", "control_signal", "amplifier_output", "anti_noise")
-BLOCK = 512  # samples whose gains are stored at a time
-VARIANCES = ("state_noise", "measurement_noise", "alpha_sq")
-SAFE = 1e290  # a smaller correction cannot overflow finite weights
-
-
-class SharedGains(NamedTuple):
-    """The gains of a block of m samples, used instead of a covariance."""
-
-    directions: np.ndarray  # (m, n or more) g_k = S_k K_k
-    norms: np.ndarray  # (m,) of g_k, a bound on its elements
-    variances: np.ndarray  # (m,) S_k
-    taken: np.ndarray  # (1,) samples of the block that a scenario has processed
-
-
-@kalman_step.register(SharedGains)
-def shared_step(gains, w, h, scaled_measurement, state_noise, noise, alpha_sq):
-    """Correct the weights with the gain of the sample (eq. 5, 9); return NaN as innovation if they would overflow."""
-    k = gains.taken[0]
-    S = gains.variances[k]
-    y = scaled_measurement - dot(h, w)
-    if not abs(y / S) * gains.norms[k] < SAFE:
-        return np.nan, S
-    correct_weights(w, gains.directions[k], y / S)
-    gains.taken[0] = k + 1
-    return y, S
-
-
-@compiled(nogil=True)
-def advance_gains(cov, filtered, state_noise, noise, alpha_sq, gains):
-    """Set the gains of the samples of a block; return the number of samples before the first without a solution.
-
-    `filtered` holds n - 1 + m samples of the filtered reference, newest first.
-    """
-    n, m = cov.product.size, gains.variances.size
-    for k in range(m):
-        h = filtered[m - 1 - k : m - 1 - k + n]
-        predict_covariance(cov, alpha_sq, state_noise)
-        S = project_covariance(cov, h) + noise
-        if not 0.0 < S < np.inf:
-            return k
-        if S / noise > CANCELLATION and downdate_carefully(cov, h, noise):
-            S = 1.0 / cov.owed[0].last_inverse_S
-        else:
-            downdate_covariance(cov, S)
-        copy_into(gains.directions[k], cov.gain_direction)
-        gains.variances[k], gains.norms[k] = S, np.sqrt(dot(cov.gain_direction, cov.gain_direction))
-    return m
-
-
-class _Scenario:
-    """One of the runs: a copy of its controller's state, its plant and its signals."""
-
-    def __init__(self, state: Any, plant: Plant, signals: Signals, recorded: dict[str, np.ndarray]) -> None:
-        self.state = deepcopy(state)
-        self._plant, self._signals, self._recorded = plant, signals, recorded
-        self._code: Compiled | None = None
-        self.status, self.done = RUNNING, 0
-
-    def run(self, shared: SharedGains, begin: int, end: int) -> None:
-        """Run from sample `begin` to `end` with the gains of the block, if it has not ended."""
-        if self.status != RUNNING:
-            return
-        if self._code is None or self._code.held.state.gains is not shared:
-            self._code = Compiled(self.state._replace(gains=shared))
-        shared.taken[0] = 0
-        _, sources = looped_arrays(self._code.held.state)
-        records = [Record(sources[name], signal) for name, signal in self._recorded.items()]
-        self.status, self.done = self._plant.run(self._code.steps, self._signals, records, begin, end)
-
-    def give_back(self, state: Any) -> None:
-        """Write the present state into the arrays of the controller's."""
-        for own, theirs in zip(_arrays(self.state), _arrays(state._replace(gains=None)), strict=True):
-            theirs[...] = own
-
-
-def _arrays(value: Any) -> Iterator[np.ndarray]:
-    """Yield the arrays of a state."""
-    if isinstance(value, np.ndarray):
-        yield value
-    elif isinstance(value, tuple):
-        for item in value:
-            yield from _arrays(item)
+# What scenarios that share gains must agree in, in words, by the names of fields.
+IN_WORDS = {
+    "secondary_path": "their estimated secondary path",
+    "guard": "their secondary-path uncertainty",
+    "reference": "the reference heard so far",
+    "filtered_reference": "the reference heard so far",
+    **dict.fromkeys(("owed", "triangle", "gain_direction"), "their covariance P"),
+}
 
 
 def simulate_scenarios(
@@ -137,21 +48,20 @@ def simulate_scenarios(
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,
 ) -> list[SimulationResult]:
-    """Run Kalman controllers that share one gain sequence; to rounding, the results are those of `simulate` for each.
+    """Run controllers of one kind side by side; the results are those of `simulate` for each.
 
-    The gain (eq. 6) depends on the reference and the filter's r, q and P(0|0), not on the measurements. Scenarios that
-    differ in rated power, amplifier, disturbance, true secondary path or sensor noise therefore need the filter's
-    O(L^2) only once, and O(L) each. The scenarios run side by side, and only the gains of one block are stored.
+    The gain of a Kalman filter (eq. 6) depends on the reference and the filter's r, q and P(0|0), not on the
+    measurements. Scenarios that differ in rated power, amplifier, disturbance, true secondary path or sensor noise
+    therefore need the filter's O(L^2) only once, and O(L) each.
 
     Scenarios cannot share gains if they differ in the reference, the estimated secondary path, r, q or P(0|0). Acoustic
-    feedback would give each scenario its own reference, so there is no `feedback_path` here. A second observation that
-    depends on the control signal would give each scenario its own row, so it is not supported either.
+    feedback would give each scenario its own reference, so there is no `feedback_path` here.
 
     Parameters
     ----------
-    controllers : sequence of KalmanController
-        Separate objects with `kf_anc` or `kf_opc` filters. They must agree in taps, estimated secondary path, state and
-        measurement noise, fading memory, covariance and the signals heard so far.
+    controllers : sequence of CoreController
+        Separate controllers of one channel, of `kf_anc` or `kf_opc` for example. They must agree in the algorithm and its
+        settings, taps, estimated secondary path, covariance and the signals heard so far.
     reference : array_like
         (n_samples,) reference x, the same for all.
     secondary_path : array_like, control.TransferFunction or list of them
@@ -189,11 +99,10 @@ def simulate_scenarios(
     ------
     ValueError
         Controllers that cannot share gains (the message says which and why), lists of another length, or arguments that
-        `simulate` refuses. During a run: weights that would overflow, or an update without a solution. The controllers
-        are then unchanged, except for what they heard before they were switched on. The same holds after an
-        interruption.
+        `simulate` refuses. During a run: a signal that becomes too loud. The controllers are then unchanged, except for
+        what they heard before they were switched on. The same holds after an interruption.
     TypeError
-        An object that is not a `KalmanController`, or an amplifier that is not one of the package's models.
+        A controller whose algorithm is not in the core, or an amplifier that is not one of the package's models.
 
     Examples
     --------
@@ -213,7 +122,7 @@ def simulate_scenarios(
     if isinstance(controllers, FilteredReferenceController):
         raise TypeError("controllers must be a sequence of controllers: [controller] for one")
     controllers = list(controllers)
-    states = _states_that_share(controllers, fs)
+    blocks = _blocks_that_share(controllers, fs)
     count = len(controllers)
     d = _disturbances(x, primary_path, disturbance, fs, count)
     noises = [
@@ -222,7 +131,7 @@ def simulate_scenarios(
     ]
     rated = [c.rated_power if rated_power is None else as_positive(rated_power, "rated_power") for c in controllers]
     paths = _stacked_paths(secondary_path, fs, count)
-    models = [_model(own) for own in _each(amplifier, count, "amplifier")]
+    models = np.concatenate([_model(own) for own in _each(amplifier, count, "amplifier")])
     on = switch_on_sample(switch_on_s, fs, x.size)
     if on:
         for i, (controller, noise) in enumerate(zip(controllers, noises, strict=True)):
@@ -230,37 +139,21 @@ def simulate_scenarios(
         x, d = x[on:], np.ascontiguousarray(d[:, on:])
 
     limits = DIVERGENCE_LIMIT * np.sqrt([1.0 if p is None else p for p in rated])
-    gains = _GainSequence(states[0], x)
-    names = RECORDED + POWERS[:2] if record_powers else RECORDED
-    recorded = {name: np.full((count, x.size), np.nan) for name in (*RESULTS, *names)}
-    scenarios = []
-    for i, state in enumerate(states):
-        own = {name: signal[i : i + 1] for name, signal in recorded.items()}
-        signals = Signals(
-            x[None],
-            d[i : i + 1] if len(d) > 1 else d,
-            noises[i].filled(own["error"]),
-            *(own.pop(name) for name in RESULTS),
-        )
-        plant = Plant(
-            paths[i, None, None], np.zeros((1, 1, 0)), models[i].view(np.float64).reshape(1, -1), limits[i : i + 1]
-        )
-        scenarios.append(_Scenario(state._replace(gains=None), plant, signals, own))
-    for first, shared, solved in gains.blocks():
-        for scenario in scenarios:
-            scenario.run(shared, first, first + solved)
-        _raise_if_refused(scenarios, first + solved if solved < shared.variances.size else None)
-        if progress:
-            progress(count * solved)
-    for signal in recorded.values():
-        for i, scenario in enumerate(scenarios):
-            signal[i, scenario.done :] = np.nan
-    for controller, state, scenario in zip(controllers, states, scenarios, strict=True):
-        scenario.give_back(state)
-        gains.refill(state.lines)  # a scenario that diverged has not heard the end
-        if scenario.status == DIVERGED:
-            refill(state.lines.output, np.zeros(state.lines.output.size))  # its loudspeaker was switched off
-        controller.after_compiled(state._replace(gains=gains.covariance), shared=True)
+    plant = Plant(paths[:, None, None], np.zeros((1, 1, 0)), models.view(np.float64).reshape(count, -1), limits)
+    results = {name: np.full((count, x.size), np.nan) for name in RESULTS}
+    noisy = [noise.filled(row) is not None for noise, row in zip(noises, results["error"], strict=True)]
+    results["error"][np.logical_not(noisy)] = 0.0
+    present = np.array(np.broadcast_to(d, (count, x.size)), order="C")  # a copy: that of a diverged scenario is silenced
+    signals = Signals(x[None], present, results["error"] if any(noisy) else None, *results.values())
+    recorded = {
+        name: np.full((count, x.size), np.nan) for name in (RECORDED + POWERS[:2] if record_powers else RECORDED)
+    }
+    side_by_side = _SideBySide(blocks)
+    side_by_side.run(plant, signals, recorded, progress)
+    side_by_side.give_back()
+    for i, end in side_by_side.diverged_at.items():
+        for signal in (*results.values(), *recorded.values()):
+            signal[i, end:] = np.nan
     return [
         SimulationResult(
             algorithm=controller.name,
@@ -268,68 +161,157 @@ def simulate_scenarios(
             rated_power=rated[i],
             reference=x,
             disturbance=d[i if len(d) > 1 else 0],
-            **{name: signal[i] for name, signal in recorded.items()},
-            diverged_at_s=scenarios[i].done / fs if scenarios[i].status == DIVERGED else None,
+            **{name: signal[i] for name, signal in (results | recorded).items()},
+            diverged_at_s=side_by_side.diverged_at[i] / fs if i in side_by_side.diverged_at else None,
         )
         for i, controller in enumerate(controllers)
     ]
 
 
-def _states_that_share(controllers: list[Any], fs: float) -> list[Any]:
-    """Return the controllers' states for the compiled loop, or raise an error that names a difference."""
+def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
+    """Return the controllers' blocks, or raise an error that names a difference."""
     if not controllers:
         raise ValueError("controllers must hold one controller at least")
-    states = []
+    blocks: list[Block] = []
     for i, controller in enumerate(controllers):
-        if not isinstance(controller, CompiledController) or not controller.has_gains:
-            raise TypeError(f"controllers[{i}] must be a KalmanController, of one channel, got {controller!r}")
-        if any(controller is other or _filter(controller) is _filter(other) for other in controllers[:i]):
+        if not isinstance(controller, CoreController) or controller.multichannel:
+            raise TypeError(f"controllers[{i}] must be a controller of the core, of one channel, got {controller!r}")
+        if any(controller is other for other in controllers[:i]):
             raise ValueError(f"controllers[{i}] is in the list twice: each scenario needs its own controller")
         controller.require_sample_rate(fs)
-        state = controller.compiled_state(to_step=False)
-        if state is None:
+        looped = controller.looped()
+        if looped is None:
             raise ValueError(
-                f"controllers[{i}] takes filterpy's own equations or steps of its own; scenarios share the gains of "
-                "KalmanControllers of filters from KFOPC.random_walk"
+                f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and others "
+                "whose steps are in the core"
             )
-        parts = {"limiter": state.lines.limiter, "secondary-path uncertainty": state.lines.guard}
-        for what in (controller.unshared, *(name for name, part in parts.items() if part is not None)):
-            if what:
-                raise ValueError(f"controllers[{i}] has a {what}, which scenarios do not run: use simulate for it")
-        states.append(state)
-    for i, state in enumerate(states[1:], 1):
-        difference = _difference(states[0], state)
+        blocks.append(looped.owner)
+    for i, block in enumerate(blocks[1:], 1):
+        difference = _difference(blocks[0], block)
         if difference:
             raise ValueError(f"controllers[0] and controllers[{i}] must agree in {difference} to share gains")
-    return states
+    return blocks
 
 
-def _filter(controller: Any) -> Any:
-    return controller.estimator
+def _difference(one: Block, other: Block) -> str | None:
+    """Return what prevents two blocks from sharing gains, in words; None if nothing does."""
+    if (one.algorithm.name, one.algorithm.path) != (other.algorithm.name, other.algorithm.path):
+        return "the algorithm"
+    if one.shape != other.shape:
+        return "n_taps" if one.shape.taps != other.shape.taps else f"their shape, {one.shape} and {other.shape}"
+    own = own_fields(one)
+    for name in one.fields:
+        if name in own or name in one.scratch or name.endswith("_at"):
+            continue
+        if not np.array_equal(one.latest(name), other.latest(name), equal_nan=True):
+            return IN_WORDS.get(name, name)
+    return None
 
 
-def _difference(one: Any, other: Any) -> str | None:
-    """Return what prevents two states from sharing gains, in words; None if nothing does."""
-    if one.weights.size != other.weights.size:
-        return "n_taps"
-    if one.gains.triangle.dtype != other.gains.triangle.dtype:
-        return "dtype"
-    if not np.array_equal(one.lines.secondary_estimate, other.lines.secondary_estimate):
-        return "their estimated secondary path"
-    if any(one.numbers[name][0] != other.numbers[name][0] for name in VARIANCES):
-        return "state noise, measurement noise and fading memory"
-    if one.constraint.window.shape != other.constraint.window.shape:
-        return "the length of the sliding windows of their powers"
-    for mine, theirs in ((one.lines.reference, other.lines.reference), (one.lines.filtered, other.lines.filtered)):
-        if not np.array_equal(newest(mine, int(mine[TAPS])), newest(theirs, int(theirs[TAPS]))):
-            return "the reference heard so far"
-    a, b = one.gains, other.gains
-    if a.triangle is b.triangle:  # they ran together
-        return None
-    same = np.array_equal(a.triangle, b.triangle) and np.array_equal(a.owed, b.owed) and not a.owed["inverse_S"][0]
-    if not same:
-        same = np.array_equal(covariance_matrix(a), covariance_matrix(b))
-    return None if same else "their covariance P"
+class _SideBySide:
+    """Controllers in one block that has their scenarios.
+
+    Attributes
+    ----------
+    diverged_at : dict of int to int
+        The sample in which a scenario diverged, by its number.
+    """
+
+    def __init__(self, blocks: list[Block]) -> None:
+        self._blocks, first = blocks, blocks[0]
+        self._own = own_fields(first)
+        self._block = first.remade(_shape_for(first, len(blocks)), first.fields["guard"].ravel())
+        self.diverged_at: dict[int, int] = {}
+        self._at_divergence: dict[int, dict[str, np.ndarray]] = {}
+        at, length = self._block.fields["output_at"].item(), self._block.fields["output"].shape[-1]
+        for scenario, block in enumerate(blocks):
+            rows = self._rows(scenario)
+            for name in rows.keys() - {"output"}:
+                rows[name][:] = block.fields[name].ravel()
+            latest = block.latest("output").reshape(-1, block.shape.path_taps)
+            rows["output"].reshape(-1, length)[:, at : at + block.shape.path_taps] = latest
+
+    def _rows(self, scenario: int) -> dict[str, np.ndarray]:
+        """Return a scenario's own fields, flat, as views."""
+        fields = {name: self._block.fields[name] for name in self._own}
+        return {name: field.reshape(len(self._blocks), -1)[scenario] for name, field in fields.items()}
+
+    def run(
+        self,
+        plant: Plant,
+        signals: Signals,
+        recorded: dict[str, np.ndarray],
+        progress: Callable[[int], Any] | None,
+    ) -> None:
+        """Run all scenarios; one that diverges is silenced, and the others go on."""
+        block, count = self._block, len(self._blocks)
+        steps = Steps(block.address, *block.algorithm.steps)
+        constraint = block.fields["constraint"].view(NUMBERS).reshape(count)
+        records = [Record(constraint[IN_CONSTRAINT[name]], signal) for name, signal in recorded.items()]
+        status, done, n_samples = RUNNING, 0, signals.error.shape[1]
+        while done < n_samples and len(self.diverged_at) < count:
+            begin, end = done, min(done + STRETCH, n_samples)
+            with block.in_use:
+                status, done = plant.run(steps, signals, records, begin, end, status)
+            if status == DIVERGED:
+                for scenario in np.flatnonzero(~(np.abs(plant.control) <= plant.limit)):
+                    self._silence(int(scenario), done, plant, signals)
+            elif status != RUNNING:
+                self._raise_refusal(plant, done)
+            if progress:
+                progress(count * (done - begin))
+
+    def _silence(self, scenario: int, sample: int, plant: Plant, signals: Signals) -> None:
+        """Switch a scenario off: nothing of it is heard any more, and its weights stay zero."""
+        rows = self._rows(scenario)
+        rows["output"][:] = 0.0
+        if scenario not in self.diverged_at:
+            self.diverged_at[scenario] = sample
+            self._at_divergence[scenario] = {name: field.copy() for name, field in rows.items()}
+        rows["weights"][:] = 0.0
+        plant.silence(scenario)
+        for signal in (signals.disturbance, signals.sensor_noise):
+            if signal is not None:
+                signal[scenario, sample:] = 0.0
+
+    def _raise_refusal(self, plant: Plant, sample: int) -> None:
+        """Raise ValueError with the reason for which the core refused a sample."""
+        self._block.error[:] = plant.error
+        answer = self._block.update()
+        loudest = int(np.argmax(np.abs(plant.error)))
+        raise ValueError(
+            f"{reason_of(answer)} (sample {sample} of the run, the loudest error is controllers[{loudest}]'s)"
+        )
+
+    def give_back(self) -> None:
+        """Write the present state into the blocks of the controllers."""
+        for scenario, block in enumerate(self._blocks):
+            rows = self._rows(scenario) | self._at_divergence.get(scenario, {})
+            for name, field in block.fields.items():
+                if name in rows:
+                    field[...] = rows[name].reshape(field.shape)
+                elif name not in self._own:
+                    field[...] = self._block.fields[name]
+
+
+def own_fields(block: Block) -> list[str]:
+    """Return the names of the fields that each scenario has for itself."""
+    return [
+        name
+        for name, shape in block.algorithm.shapes(_shape_for(block, 2)).items()
+        if shape != block.fields[name].shape
+    ]
+
+
+def _shape_for(block: Block, scenarios: int) -> Shape:
+    """Return the shape of a block with so many scenarios that are like this one."""
+    shape = block.shape
+    return replace(
+        shape,
+        scenarios=scenarios,
+        power_windows=shape.power_windows * scenarios,
+        limiter_windows=shape.limiter_windows * scenarios,
+    )
 
 
 def _each(value: Any, count: int, name: str) -> list[Any]:
@@ -382,45 +364,3 @@ def _model(amplifier: Amplifier | None) -> np.ndarray:
             f"amplifier must be one of the package's models or None, got {amplifier!r}; use simulate for it"
         )
     return model
-
-
-class _GainSequence:
-    """The gains of a run, computed block by block in the same arrays, from a copy of the covariance."""
-
-    def __init__(self, state: Any, x: np.ndarray) -> None:
-        self.covariance: Covariance = copy_covariance(state.gains)
-        self._settings = [float(state.numbers[name][0]) for name in VARIANCES]
-        n, lines = state.weights.size, state.lines
-        heard = newest(lines.reference, int(lines.reference[TAPS]))[::-1]
-        self._reference = np.concatenate((heard, x))
-        filtered = np.convolve(self._reference, lines.secondary_estimate)[heard.size : heard.size + x.size]
-        self.n_taps, self.n_samples = n, x.size
-        older = newest(lines.filtered, int(lines.filtered[TAPS]))[::-1]
-        self._all_filtered = np.concatenate((older, filtered))
-        self._filtered = self._all_filtered[older.size - (n - 1) :]  # from n - 1 samples before the first on
-
-    def refill(self, lines: Lines) -> None:
-        """Fill the delay lines with the end of the run."""
-        refill(lines.reference, self._reference[::-1])
-        refill(lines.filtered, self._all_filtered[::-1])
-
-    def blocks(self) -> Iterator[tuple[int, SharedGains, int]]:
-        """Yield the first sample of each block, its gains, and how many of them were computed before a failure."""
-        n = self.n_taps
-        for first in range(0, self.n_samples, BLOCK):
-            m = min(BLOCK, self.n_samples - first)
-            if m < BLOCK or first == 0:
-                gains = SharedGains(aligned_zeros(m, n), np.zeros(m), np.full(m, np.nan), np.zeros(1, np.int64))
-            rows = self._filtered[first : first + n - 1 + m][::-1].copy()
-            yield first, gains, advance_gains(self.covariance, rows, *self._settings, gains)
-
-
-def _raise_if_refused(scenarios: list[_Scenario], unsolved: int | None) -> None:
-    for i, scenario in enumerate(scenarios):
-        if scenario.status == REFUSED_ERROR:
-            raise ValueError(
-                f"the weights of controllers[{i}] would overflow in sample {scenario.done} of the run: "
-                "its disturbance estimate or residual is too large"
-            )
-    if unsolved is not None:
-        raise ValueError(f"{NO_SOLUTION} (sample {unsolved} of the run)")

@@ -156,7 +156,7 @@ def simulate(
         x, d = x[:, on:], d[:, on:]
 
     plant = Plant(
-        secondary,
+        secondary[None],
         feedback,
         models,
         DIVERGENCE_LIMIT * np.sqrt(np.ones(J) if rated is None else np.broadcast_to(rated, J)),

@@ -1,0 +1,291 @@
+#include "covariance.h"
+#include <string.h>
+
+/* Above this ratio of S to q the downdate cancels so many digits of P that it is computed in twice the precision. This happens in
+ * the first samples after a large initial variance. */
+static const real CANCELLATION = 1000;
+/* In roundings of the largest variance: an h'P h below the first is nothing but rounding (of a unit h); the second is the least
+ * state noise from then on, in float always. See `blurred`. */
+static const real BLUR = 16, FLOOR = 2;
+#ifdef ANC_FLOAT
+static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1 cuts a float into two halves whose products are exact */
+#else
+static const real ROUNDING = DBL_EPSILON, MOST = 1e300, CAREFULLY = 1e100, SPLIT = 134217729; /* 2^27 + 1 */
+#endif
+enum { DIRECTION, DIRECTION_LOW, GAIN, GAIN_LOW, CAREFUL };
+
+static size_t triangle(int32_t n) { return times(padded(n) / PARTS, padded(n) / PARTS + 1) * (PARTS * PARTS / 2); }
+
+void layout_covariance(covariance *c, int32_t n, anc_layout *at)
+{
+    c->n = n, c->padded = padded(n);
+    c->owed = (anc_owed *)reals(at, "owed", ANC_STATE, 1, 1, 1, sizeof(anc_owed) / sizeof(real));
+    c->u = reals(at, "gain_direction", ANC_STATE, 1, 1, 1, c->padded);
+    c->T = reals(at, "triangle", ANC_STATE, 1, 1, 1, (int32_t)triangle(n));
+    c->h = reals(at, "row", ANC_SCRATCH, 1, 1, 1, c->padded);
+    c->Ph = reals(at, "P_row", ANC_SCRATCH, 1, 1, 1, c->padded);
+    c->careful = reals(at, "careful", ANC_SCRATCH, 1, 1, CAREFUL, c->padded);
+}
+
+void start_covariance(covariance *c, real initial_variance)
+{
+    for (int32_t i = 0; i < c->n; i++) row_of(c, i)[i] = initial_variance;
+    *c->owed = (anc_owed){.scale = 1, .largest = initial_variance, .bound = initial_variance, .floored = sizeof(real) < sizeof(double)};
+}
+
+static real largest_variance(const covariance *c)
+{
+    real most = c->T[0];
+    for (int32_t i = 1; i < c->n; i++) {
+        const real variance = row_of(c, i)[i];
+        if (variance > most) most = variance;
+    }
+    return most;
+}
+
+int predictable(const covariance *c, real fading, real state_noise, real energy)
+{
+    const real scale = fading * c->owed->scale, diagonal = fading * c->owed->diagonal + state_noise;
+    const real bound[] = {c->owed->bound, largest_variance(c)}; /* the first is not exact, the second takes time */
+    for (int i = 0; i < 2; i++) {
+        const real variance = scale * bound[i] + diagonal; /* h'P h <= trace(P) h'h */
+        if (variance <= MOST && (real)c->n * variance * energy <= MOST) return 1;
+    }
+    return 0;
+}
+
+void predict(covariance *c, real fading, real state_noise)
+{
+    c->owed->scale *= fading;
+    c->owed->diagonal = fading * c->owed->diagonal + state_noise;
+}
+
+/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. */
+static real pass(covariance *c, real pending, real diagonal)
+{
+    const real *restrict u = c->u, *restrict h = c->h;
+    real *restrict Ph = c->Ph, *row = c->T;
+    for (int32_t i = 0; i < c->padded; i += 2) {
+        const int32_t group = i / PARTS * PARTS, length = group + PARTS;
+        real *restrict a = row, *restrict b = row + length;
+        const real ua = pending * u[i], ub = pending * u[i + 1], ha = h[i], hb = h[i + 1];
+        vector sum_a[VECTORS], sum_b[VECTORS];
+        real part_a[PARTS], part_b[PARTS];
+        for (int v = 0; v < VECTORS; v++) sum_a[v] = sum_b[v] = zero;
+        for (int32_t j = 0; j < length; j += PARTS)
+            for (int v = 0; v < VECTORS; v++) {
+                const vector pa = vectors(a + j)[v] - ua * vectors(u + j)[v], pb = vectors(b + j)[v] - ub * vectors(u + j)[v];
+                vectors_of(a + j)[v] = pa, vectors_of(b + j)[v] = pb;
+                sum_a[v] += pa * vectors(h + j)[v], sum_b[v] += pb * vectors(h + j)[v];
+                if (j < group) vectors_of(Ph + j)[v] += pa * ha + pb * hb; /* the upper triangle's */
+            }
+        for (int v = 0; v < VECTORS; v++) vectors_of(part_a)[v] = sum_a[v], vectors_of(part_b)[v] = sum_b[v];
+        Ph[i] = total(part_a), Ph[i + 1] = total(part_b);
+        if (i < c->n) a[i] += diagonal, Ph[i] += diagonal * ha;
+        if (i + 1 < c->n) b[i + 1] += diagonal, Ph[i + 1] += diagonal * hb;
+        row += 2 * length;
+    }
+    return dot(h, Ph, c->padded);
+}
+
+/* Raise a variance that is rounded below zero, h'P h < 0, with all of the diagonal; return the new h'P h. */
+static real lift(covariance *c, real variance)
+{
+    const real amount = -2 * variance / dot(c->h, c->h, c->n) + ROUNDING * largest_variance(c);
+    for (int32_t i = 0; i < c->n; i++) row_of(c, i)[i] += amount, c->Ph[i] += amount * c->h[i];
+    return dot(c->h, c->Ph, c->n);
+}
+
+/* Return an h'P h that seems to be lost in the rounding of P, raised if it is negative; see to it that P recovers.
+ *
+ * If P is large along some directions and the reference shows others only, what P should be there falls below the last digit of
+ * its elements, and rounding may make it negative. Left alone, each sample would shrink 1/P there as if that were true, until S
+ * turns negative. So from then on P gets as much state noise as its largest element is rounded by. */
+static real blurred(covariance *c, real variance, real blur)
+{
+    c->owed->bound = largest_variance(c);
+    if (variance < blur * c->owed->bound) c->owed->floored = 1;
+    return variance < 0 ? lift(c, variance) : variance;
+}
+
+real project(covariance *c)
+{
+    anc_owed *owed = c->owed;
+    if (owed->floored != 0) {
+        const real most = largest_variance(c), least = FLOOR * ROUNDING * (most < owed->largest ? most : owed->largest);
+        if (owed->diagonal < least) owed->diagonal = least;
+    }
+    owed->bound = owed->scale * owed->bound + owed->diagonal;
+    if (owed->scale != 1) { /* only with a fading memory */
+        for (size_t i = 0; i < triangle(c->n); i++) c->T[i] *= owed->scale;
+    }
+    const real variance = pass(c, owed->scale * owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
+    owed->scale = 1, owed->diagonal = owed->pending = 0;
+    return variance < blur * owed->bound ? blurred(c, variance, blur) : variance;
+}
+
+/* Numbers in twice the precision, as a rounded value and the rest. */
+
+/* Return a + b; the rounding error goes to `rest` (Knuth). */
+static vector two_sum(vector a, vector b, vector *rest)
+{
+    const vector sum = a + b, b_in_sum = sum - a;
+    *rest = (a - (sum - b_in_sum)) + (b - b_in_sum);
+    return sum;
+}
+
+/* Return a b; the rounding error goes to `rest` (Dekker). */
+static vector two_product(vector a, vector b, vector *rest)
+{
+    const vector product = a * b, cut_a = SPLIT * a, cut_b = SPLIT * b;
+    const vector a_high = cut_a - (cut_a - a), b_high = cut_b - (cut_b - b), a_low = a - a_high, b_low = b - b_high;
+    *rest = ((a_high * b_high - product) + a_high * b_low + a_low * b_high) + a_low * b_low;
+    return product;
+}
+
+/* Add a b to (sum, low) (Dot2 of Ogita, Rump and Oishi). */
+static void add_product(vector *sum, vector *low, vector a, vector b)
+{
+    vector product_rest, sum_rest;
+    const vector product = two_product(a, b, &product_rest);
+    *sum = two_sum(*sum, product, &sum_rest);
+    *low += product_rest + sum_rest;
+}
+
+/* Return the sum of partial sums; what is below its last digit goes to `rest`. */
+static real total_with_rest(const vector sum[VECTORS], const vector low[VECTORS], real *rest)
+{
+    real part[PARTS], part_low[PARTS], result[PARTS], result_low[PARTS];
+    for (int v = 0; v < VECTORS; v++) vectors_of(part)[v] = sum[v], vectors_of(part_low)[v] = low[v];
+    vector all = zero + part[0], all_low = zero + part_low[0], error;
+    for (int p = 1; p < PARTS; p++) all = two_sum(all, zero + part[p], &error), all_low += error + part_low[p];
+    all = two_sum(all, all_low, &error);
+    *vectors_of(result) = all, *vectors_of(result_low) = error;
+    *rest = result_low[0];
+    return result[0];
+}
+
+/* Set g + g_low to T h. */
+static void multiply_carefully(const covariance *c, real *g, real *g_low)
+{
+    const real *a = c->T, *h = c->h;
+    memset(g, 0, sizeof(real) * (size_t)c->padded), memset(g_low, 0, sizeof(real) * (size_t)c->padded);
+    for (int32_t i = 0; i < c->padded; i++) {
+        const int32_t group = i / PARTS * PARTS, length = group + PARTS;
+        vector sum[VECTORS], low[VECTORS];
+        for (int v = 0; v < VECTORS; v++) sum[v] = low[v] = zero;
+        for (int32_t j = 0; j < length; j += PARTS)
+            for (int v = 0; v < VECTORS; v++) {
+                add_product(sum + v, low + v, vectors(a + j)[v], vectors(h + j)[v]);
+                if (j < group) add_product(vectors_of(g + j) + v, vectors_of(g_low + j) + v, vectors(a + j)[v], zero + h[i]);
+            }
+        g[i] = total_with_rest(sum, low, g_low + i);
+        a += length;
+    }
+}
+
+/* Return 1 / sqrt(S) after eq. 8 in twice the precision; 0, with nothing changed, if a number would be too large for that. */
+static real downdate_carefully(covariance *c, real q)
+{
+    real *g = c->careful + times(DIRECTION, c->padded), *g_low = c->careful + times(DIRECTION_LOW, c->padded);
+    real *k = c->careful + times(GAIN, c->padded), *k_low = c->careful + times(GAIN_LOW, c->padded), *a = c->T;
+    const real noise[PARTS] = {q};
+    vector sum[VECTORS], low[VECTORS], rest;
+    multiply_carefully(c, g, g_low);
+    for (int v = 0; v < VECTORS; v++) sum[v] = vectors(noise)[v], low[v] = zero;
+    for (int32_t j = 0; j < c->padded; j += PARTS)
+        for (int v = 0; v < VECTORS; v++) {
+            add_product(sum + v, low + v, vectors(c->h + j)[v], vectors(g + j)[v]);
+            low[v] += vectors(c->h + j)[v] * vectors(g_low + j)[v];
+        }
+    real S_low;
+    const real S = total_with_rest(sum, low, &S_low);
+    for (int32_t j = 0; j < c->padded; j += WIDE) { /* K = g / S */
+        const vector gain = *vectors(g + j) / S, product = two_product(gain, zero + S, &rest);
+        *vectors_of(k + j) = gain;
+        *vectors_of(k_low + j) = (((*vectors(g + j) - product) - rest) + *vectors(g_low + j) - gain * S_low) / S;
+    }
+    for (int32_t i = 0; i < c->n; i++)
+        if (!(S > 0 && S < CAREFULLY && within(g[i], CAREFULLY) && within(k[i], CAREFULLY) && within(k_low[i], CAREFULLY))) return 0;
+    for (int32_t i = 0; i < c->padded; i++) {
+        const int32_t group = i / PARTS * PARTS, length = group + PARTS;
+        for (int32_t j = 0; j < length; j += WIDE) {
+            const vector product = two_product(zero + g[i], *vectors(k + j), &rest);
+            *vectors_of(a + j) = (*vectors(a + j) - product) - (rest + (g[i] * *vectors(k_low + j) + g_low[i] * *vectors(k + j)));
+        }
+        for (int32_t j = group; j < i; j++) row_of(c, j)[i] = a[j]; /* both halves of a group stay equal */
+        a += length;
+    }
+    const real inverse_root = 1 / root(S);
+    for (int32_t j = 0; j < c->padded; j++) c->u[j] = g[j] * inverse_root;
+    return inverse_root;
+}
+
+real downdate(covariance *c, real S, real q)
+{
+    real inverse_root = S > CANCELLATION * q ? downdate_carefully(c, q) : 0;
+    if (inverse_root > 0) return inverse_root;
+    inverse_root = 1 / root(S);
+    for (int32_t j = 0; j < c->padded; j++) c->u[j] = c->Ph[j] * inverse_root;
+    c->owed->pending = 1;
+    return inverse_root;
+}
+
+int correct(const covariance *c, real *w, real innovation, real inverse_root, real most)
+{
+    const real step = innovation * inverse_root; /* K y = u step, and no element of u is larger than the root of the largest variance */
+    if (!within(root(c->owed->bound) * step, most)) return 0;
+    add_scaled(w, step, c->u, c->n);
+    return 1;
+}
+
+/* A covariance alone, in memory of the host. */
+
+static covariance in_memory(void *memory, int32_t n)
+{
+    covariance c;
+    anc_layout at = {.memory = memory};
+    layout_covariance(&c, n, &at);
+    return c;
+}
+
+size_t anc_covariance_size(int32_t n)
+{
+    covariance c;
+    anc_layout at = {0};
+    layout_covariance(&c, n, &at);
+    return at.size;
+}
+
+void anc_covariance_describe(int32_t n, anc_visitor *visit, void *to)
+{
+    covariance c;
+    anc_layout at = {.visit = visit, .to = to};
+    layout_covariance(&c, n, &at);
+}
+
+int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real q, anc_real result[2])
+{
+    covariance c = in_memory(memory, n);
+    if (!predictable(&c, 1, 0, dot(h, h, n))) return ANC_NO_SOLUTION;
+    memcpy(c.h, h, sizeof(real) * (size_t)n);
+    const real S = project(&c) + q, y = z - dot(h, w, n);
+    result[0] = y, result[1] = S;
+    if (!(S > 0)) return ANC_NO_SOLUTION;
+    if (!within(root(c.owed->bound) * (y / root(S)), MOST)) return ANC_LOUD_STEP;
+    const real inverse_root = downdate(&c, S, q);
+    correct(&c, w, y, inverse_root, MOST);
+    return ANC_DONE;
+}
+
+int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real r, anc_real q, anc_real fading, anc_real result[2])
+{
+    covariance c = in_memory(memory, n);
+    if (!predictable(&c, fading, r, dot(h, h, n))) return ANC_NO_SOLUTION;
+    predict(&c, fading, r);
+    memcpy(c.h, h, sizeof(real) * (size_t)n);
+    const real S = project(&c) + q, y = z - dot(h, w, n);
+    if (S > 0) correct(&c, w, y, downdate(&c, S, q), LARGEST);
+    result[0] = y, result[1] = S;
+    return ANC_DONE;
+}

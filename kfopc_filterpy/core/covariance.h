@@ -1,0 +1,38 @@
+/* The covariance of n weights that walk at random (eq. 4-8). */
+#ifndef COVARIANCE_H
+#define COVARIANCE_H
+#include "signals.h"
+
+/* P = scale (T - pending u u') + diagonal I, with u = P x' / sqrt(S) of the last update. What is pending is applied in the pass
+ * that computes the next P x', so each element is read and written once a sample. T is the lower triangle in rows that end with
+ * their group of PARTS, one after the other: row i has the elements 0 to PARTS (i / PARTS + 1) - 1. Within a group both halves
+ * are stored, and stay equal, so that a pass needs no rest of a row. What stands beyond n is zero. */
+typedef struct {
+    int32_t n, padded; /* n in whole groups */
+    anc_owed *owed;
+    real *T, *u;
+    real *h, *Ph;      /* (padded) the row x' of the present pass, and P x' */
+    real *careful;     /* (CAREFUL, padded) room for numbers in twice the precision */
+} covariance;
+
+static inline int32_t padded(int32_t n) { return (n + PARTS - 1) / PARTS * PARTS; }
+static inline real *row_of(const covariance *c, int32_t i) /* T's */
+{
+    const int32_t group = i / PARTS;
+    return c->T + times(group, group + 1) * (PARTS * PARTS / 2) + times(i % PARTS, group + 1) * PARTS;
+}
+
+void layout_covariance(covariance *c, int32_t n, anc_layout *at);
+void start_covariance(covariance *c, real initial_variance);
+/* Return whether P = fading P + r I and P x' are sure to be finite for rows x' of this energy; if not, nothing was changed. */
+int predictable(const covariance *c, real fading, real state_noise, real energy);
+/* Eq. 4, still pending: P = fading P + r I. */
+void predict(covariance *c, real fading, real state_noise);
+/* Apply what is pending, set c->Ph to P c->h, and return h' P h. */
+real project(covariance *c);
+/* Eq. 8, P -= g g' / S with g = P h, after `project`; in twice the precision where S is far above the measurement noise q.
+ * Return 1 / sqrt(S). */
+real downdate(covariance *c, real S, real q);
+/* Eq. 5, w += K y with K = u / sqrt(S) (eq. 6); return 0, with nothing changed, if a weight could move further than `most`. */
+int correct(const covariance *c, real *w, real innovation, real inverse_root, real most);
+#endif

@@ -1,0 +1,77 @@
+/* KF-ANC and KF-OPC: eq. 2-9 of Ji et al. with the factor of eq. 10-13, and FxRLS, which is the same with a fading memory. */
+#include "kalman.h"
+#include <string.h>
+
+static const anc_setting kalman_settings[] = {KALMAN_SETTINGS_LISTED, {0}};
+
+void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+{
+    kalman *f = (kalman *)view;
+    layout_signals(&f->s, plan, settings, at);
+    layout_covariance(&f->c, states(&f->s), at);
+    f->scaled = reals(at, "measurement", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
+}
+
+void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+{
+    kalman *f = (kalman *)view;
+    start_signals(&f->s, plan, settings);
+    start_covariance(&f->c, *f->s.setting[INITIAL_VARIANCE]);
+}
+
+/* Set h to the filtered references of microphone k, those of all control filters one after the other. */
+static void observe(kalman *f, const lines *rows, int32_t k)
+{
+    const int32_t n = f->s.J * f->s.I;
+    for (int32_t ji = 0; ji < n; ji++) memcpy(f->c.h + times(ji, f->s.L), newest(rows, k * n + ji), sizeof(real) * (size_t)f->s.L);
+}
+
+static real energy(const signals *s, const lines *rows, int32_t k)
+{
+    const int32_t n = s->J * s->I;
+    real sum = 0;
+    for (int32_t ji = 0; ji < n; ji++) sum += dot(newest(rows, k * n + ji), newest(rows, k * n + ji), s->L);
+    return sum;
+}
+
+/* Measure at microphone k: eq. 5-9 for every scenario, with one gain. */
+static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
+{
+    const int32_t n = f->c.n;
+    const real q = f->s.setting[MEASUREMENT_NOISE][k];
+    observe(f, rows, k);
+    const real S = project(&f->c) + q; /* eq. 7 */
+    if (!(S > 0)) return;              /* no noise, and nothing that P leaves open: nothing is told */
+    const real inverse_root = downdate(&f->c, S, q);
+    for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
+        real *w = weights_of(&f->s, scenario * f->s.J);
+        correct(&f->c, w, (z ? z[scenario * f->s.K + k] : 0) - dot(f->c.h, w, n), inverse_root, LARGEST);
+    }
+}
+
+int correct_weights(kalman *f)
+{
+    signals *s = &f->s;
+    const real fading = *s->setting[FADING], state_noise = *s->setting[STATE_NOISE];
+    for (int32_t k = 0; k < s->K; k++)
+        if (!predictable(&f->c, fading, state_noise, energy(s, &s->filtered, k)) ||
+            (s->G && !predictable(&f->c, fading, state_noise, energy(s, &s->guarded, k))))
+            return ANC_NO_SOLUTION;
+    predict(&f->c, fading, state_noise); /* eq. 4, once a sample */
+    for (int32_t k = 0; k < s->K; k++) measure(f, &s->filtered, k, f->scaled);
+    for (int32_t k = 0; s->G && k < s->K; k++) measure(f, &s->guarded, k, NULL); /* as if w'x'' had been measured as zero */
+    commit(s);
+    return ANC_DONE;
+}
+
+static int update(anc_view *view, const real *error)
+{
+    kalman *f = (kalman *)view;
+    if (!error) return ANC_DONE;
+    const int refused = estimate(&f->s, error);
+    if (refused) return refused;
+    for (int32_t sk = 0; sk < f->s.S * f->s.K; sk++) f->scaled[sk] = least_factor(&f->s, sk / f->s.K) * f->s.estimate[sk]; /* eq. 9 */
+    return correct_weights(f);
+}
+
+const anc_algorithm anc_kalman = {"Kalman filter", kalman_settings, layout_kalman, start_kalman, control_signal_plain, update};
