@@ -50,8 +50,16 @@ static void observe_control(signals *s)
     }
 }
 
-/* Return exp(c), to c^3 / 6 and without exp, which differs between machines. */
-static real growth(real c) { return c > 0 ? 1 + c + c * c / 2 : 1 / (1 - c + c * c / 2); }
+/* Return exp(c), of sums and products only: those of the math library differ between machines. Below c = -5 any trim is at its
+ * bound afterwards. */
+static real growth(real c)
+{
+    const real part = (c > -5 ? c : -5) / 16;
+    real power = 1;
+    for (int n = 10; n > 0; n--) power = 1 + part * power / (real)n;
+    for (int n = 0; n < 4; n++) power *= power;
+    return power;
+}
 
 /* Trim the next factor by the power of y: up if it is below the rated power, else down. At a factor of 1 it does not rise, so
  * that it does not wind up. */
