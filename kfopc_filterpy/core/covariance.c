@@ -6,7 +6,7 @@
 static const real CANCELLATION = 1000;
 /* In roundings of the largest variance: an h'P h below the first is nothing but rounding (of a unit h); the second is the least
  * state noise from then on, in float always. See `blurred`. */
-static const real BLUR = 16, FLOOR = 2;
+static const real BLUR = 16, LEAST_NOISE = 2;
 #ifdef ANC_FLOAT
 static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1 cuts a float into two halves whose products are exact */
 #else
@@ -112,7 +112,7 @@ real project(covariance *c)
 {
     anc_owed *owed = c->owed;
     if (owed->floored != 0) {
-        const real most = largest_variance(c), least = FLOOR * ROUNDING * (most < owed->largest ? most : owed->largest);
+        const real most = largest_variance(c), least = LEAST_NOISE * ROUNDING * (most < owed->largest ? most : owed->largest);
         if (owed->diagonal < least) owed->diagonal = least;
     }
     owed->bound = owed->scale * owed->bound + owed->diagonal;

@@ -64,7 +64,7 @@ int correct_weights(kalman *f)
     return ANC_DONE;
 }
 
-static int update(anc_view *view, const real *error)
+static int update_kalman(anc_view *view, const real *error)
 {
     kalman *f = (kalman *)view;
     if (!error) return ANC_DONE;
@@ -74,4 +74,4 @@ static int update(anc_view *view, const real *error)
     return correct_weights(f);
 }
 
-const anc_algorithm anc_kalman = {"Kalman filter", kalman_settings, layout_kalman, start_kalman, control_signal_plain, update};
+const anc_algorithm anc_kalman = {"Kalman filter", kalman_settings, layout_kalman, start_kalman, control_signal_plain, update_kalman};

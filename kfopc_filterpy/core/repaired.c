@@ -10,21 +10,21 @@ static const anc_setting repaired_settings[] = {
     KALMAN_SETTINGS_LISTED, {"of_control", 0, 1, ANC_ONE}, {"trim_rate", 0, 1, ANC_ONE}, {"at_output", 0, 1, ANC_ONE}, {0}};
 static const real MOST_TRIM = 10;
 
-static void layout(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+static void layout_repaired(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
 {
     kalman *f = (kalman *)view;
     layout_kalman(view, plan, settings, at);
     f->trim = reals(at, "trim", ANC_STATE, 1, f->s.S, f->s.J, TRIMS);
 }
 
-static void start(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+static void start_repaired(anc_view *view, const anc_plan *plan, const anc_setting *settings)
 {
     kalman *f = (kalman *)view;
     start_kalman(view, plan, settings);
     for (int32_t n = 0; n < f->s.S * f->s.J * TRIMS; n++) f->trim[n] = 1;
 }
 
-static int control_signal(anc_view *view, const real *reference, real *control)
+static int control_signal_repaired(anc_view *view, const real *reference, real *control)
 {
     kalman *f = (kalman *)view;
     signals *s = &f->s;
@@ -77,7 +77,7 @@ static void advance_trim(kalman *f, int32_t sj)
     if (*s->setting[AT_OUTPUT]) trim[OUTPUT_GAIN] = factor;
 }
 
-static int update(anc_view *view, const real *error)
+static int update_repaired(anc_view *view, const real *error)
 {
     kalman *f = (kalman *)view;
     signals *s = &f->s;
@@ -97,4 +97,4 @@ static int update(anc_view *view, const real *error)
     return refused;
 }
 
-const anc_algorithm anc_repaired = {"KF-OPC repaired", repaired_settings, layout, start, control_signal, update};
+const anc_algorithm anc_repaired = {"KF-OPC repaired", repaired_settings, layout_repaired, start_repaired, control_signal_repaired, update_repaired};

@@ -1,29 +1,23 @@
-"""A controller as C99: a header and a source file, with the controller's present state.
-
-A controller of the core brings the core's own files, see `core`. The others, until they have moved to the core, are put
-together from fragments here. The fragments are C themselves, written for float64 and the prefix `anc`. The lines
-between `#if`, `#else` and `#endif` that do not apply are left out, float64 becomes float32 if asked for, and the prefix
-becomes the name. Only the beginnings of the two files have places to fill in, with Python's own `string.Template`: a
-template language would be a dependency for those few.
-"""
+"""A controller as C99: a header and a source file, with the controller's present state."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 
+from ..controllers.base import calls_of
 from ..controllers.core_controller import CoreController
-from ..filters.random_walk import as_precision
-from .core import core_export
-from .literals import braces, number
-from .parts import Part, Values, parts_of
+from ..core.block import Block
+from .source import Exported
 
-FRAGMENTS = Path(__file__).parent / "fragments"
+EXPORTED = (
+    "export_c takes the controllers whose algorithm is in the package's core. It takes no wrapper (export the inner "
+    "controller), no algorithm of one's own and no subclass with calls of its own"
+)
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,9 +38,6 @@ class CExport:
         float64 (C's double) or float32 (float).
     n_bytes : int
         Size of the state, ``sizeof(<name>_state)`` with natural alignment, where a pointer has 8 bytes.
-    operations, most_operations : int, or None for a controller of the core
-        Floating-point additions, multiplications, divisions and square roots of a usual sample, and of the worst one.
-        A fused multiply-add counts as two.
 
     Examples
     --------
@@ -68,17 +59,12 @@ class CExport:
     n_taps: int
     dtype: str
     n_bytes: int
-    operations: int | None
-    most_operations: int | None
 
     def __repr__(self) -> str:
-        return f"<CExport {self.path.name}: {self.algorithm}, {self.n_taps} taps, {self.dtype}, {self._cost()}>"
-
-    def _cost(self) -> str:
-        if self.operations is None:
-            return f"state of {self.n_bytes:,} bytes"
-        most = "" if self.most_operations == self.operations else f", at most {self.most_operations:,}"
-        return f"state of {self.n_bytes:,} bytes, {self.operations:,} operations per sample{most}"
+        return (
+            f"<CExport {self.path.name}: {self.algorithm}, {self.n_taps} taps, {self.dtype}, "
+            f"state of {self.n_bytes:,} bytes>"
+        )
 
 
 def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any = "float64") -> CExport:
@@ -90,18 +76,18 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     - ``void anc_init(anc_state *state)``: set the state to the controller's as it was when exported;
     - ``double anc_control_signal(anc_state *state, double reference)``: return y(n);
     - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing changed;
-    - ``int anc_self_test(anc_state *state)``, of the FxLMS family: return 0 if known samples give the known results.
+    - ``int anc_self_test(anc_state *state)``: return 0 if known samples give the known results.
 
     With several channels, the numbers are arrays, and `anc_control_signal` sets its third argument, y(n).
 
-    The files of the FxLMS family contain the package's own core: with the flags that the header states, float64 gives the
-    bits that Python gives. The others are written for the export, and differ from Python by rounding.
+    The source contains the files of the package's own core: with the flags that the header states, float64 gives the bits
+    that Python gives.
 
     Parameters
     ----------
-    controller : FxLMS and its relatives, DiagonalKalman, or what kf_anc or kf_opc returns
-        Of the FxLMS family any controller: several channels, limiters, amplifier models, an uncertain secondary path,
-        sliding windows. Of the others, one of one channel, with a limiter or without. It is not changed.
+    controller : CoreController
+        The FxLMS family, `kf_anc`, `kf_opc`, `fx_rls`, `kf_opc_repaired`: whatever they have, such as several channels,
+        limiters, amplifier models, an uncertain secondary path or sliding windows. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Existing files are
         replaced.
@@ -113,16 +99,15 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     Returns
     -------
     CExport
-        The files, the size of the state and, but for the FxLMS family, the operations per sample. The header states
-        them too.
+        The files and the size of the state. The header states it too.
 
     Raises
     ------
-    TypeError, ValueError
-        A controller that has no C code: another algorithm, a subclass with calls of its own; a Kalman filter of several
-        channels, with an amplifier model, a secondary-path uncertainty, power estimates over a sliding window or a
-        fading memory. A path that does not end in ``.c``, a name that is no C identifier, a value that the precision
-        cannot hold, a limiter's window too long for float32. No file was written.
+    TypeError
+        A controller whose algorithm is not in the core, or a subclass with calls of its own. No file was written.
+    ValueError
+        A path that does not end in ``.c``, a name that is no C identifier, a value that the precision cannot hold, a
+        limiter's window too long for float32. No file was written.
 
     Examples
     --------
@@ -137,169 +122,48 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     >>> "double left_control_signal(left_state *state, double reference);" in header
     True
     """
-    path, precision = Path(path), as_precision(dtype)
+    path, precision = Path(path), _precision(dtype)
     if path.suffix != ".c":
         raise ValueError(f"path must end in .c, got {str(path)!r}")
     name = _checked_name(path.stem if name is None else name)
-    write = _of_core if isinstance(controller, CoreController) else _of_fragments
-    export, header, source = write(controller, path, name, precision)
+    block = _exportable(controller)
+    exported = Exported(block, controller.multichannel, name, precision)
+    description = repr(controller)[1:-1].replace("*/", "* /")
+    export = CExport(
+        path, path.with_suffix(".h"), name, controller.name, controller.n_taps, precision.name, exported.n_bytes
+    )
+    header, source = exported.texts(export.header_path.name, description)
     export.header_path.write_text(header, encoding="utf-8", newline="\n")
     export.path.write_text(source, encoding="utf-8", newline="\n")
     return export
 
 
-def _of_core(controller: CoreController, path: Path, name: str, precision: np.dtype) -> tuple[CExport, str, str]:
-    """Return the export with the text of its header and of its source."""
-    own, export = core_export(controller), _described(controller, path, name, precision)
-    header, source = own.written(name, export.header_path.name, _description(controller), precision)
-    return replace(export, n_bytes=own.n_bytes(precision)), header, source
+def _exportable(controller: Any) -> Block:
+    """Return a controller's block, or raise a TypeError that says why it cannot be exported."""
+    kind = type(controller)
+    if not isinstance(controller, CoreController):
+        obstacle = "is not in the core"
+    elif calls_of(kind) != calls_of(CoreController):
+        obstacle = "has calls of its own"
+    elif controller._opened().algorithm.path is not None:
+        obstacle = "has an algorithm of its own"
+    else:
+        return controller._opened()
+    named = f"{getattr(controller, 'name', kind.__name__)} ({kind.__name__})"
+    raise TypeError(f"{named} {obstacle} and cannot be exported: {EXPORTED}")
 
 
-def _of_fragments(controller: Any, path: Path, name: str, precision: np.dtype) -> tuple[CExport, str, str]:
-    """Return the export with the text of its header and of its source."""
-    parts = parts_of(controller, precision)
-    operations = sum(part.operations for part in parts)
-    export = replace(
-        _described(controller, path, name, precision),
-        n_bytes=_layout(_state(parts), precision.itemsize)[0],
-        operations=operations,
-        most_operations=operations + sum(part.rare_operations for part in parts),
-    )
-    dialect, description = _Dialect(name, precision), _description(controller)
-    return export, _header(export, description, parts, dialect), _source(export, description, parts, dialect)
-
-
-def _described(controller: Any, path: Path, name: str, precision: np.dtype) -> CExport:
-    names = controller.name, controller.n_taps, precision.name
-    return CExport(path, path.with_suffix(".h"), name, *names, n_bytes=0, operations=None, most_operations=None)
-
-
-def _description(controller: Any) -> str:
-    return repr(controller)[1:-1].replace("*/", "* /")
+def _precision(dtype: Any) -> np.dtype:
+    try:
+        precision = np.dtype(dtype)
+    except TypeError as error:
+        raise TypeError(f"dtype must be 'float64' or 'float32', got {dtype!r}") from error
+    if precision not in (np.float64, np.float32):
+        raise ValueError(f"dtype must be 'float64' or 'float32', got {precision}")
+    return precision
 
 
 def _checked_name(name: Any) -> str:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier that begins with a letter, such as name='anc', got {name!r}")
     return name
-
-
-def _state(parts: list[Part]) -> Values:
-    """Return the fields of the state: numbers and arrays of reals, structs, integers."""
-    fields = {name: value for part in parts for name, value in part.fields.items()}
-    order = sorted(fields, key=lambda name: (type(fields[name].value) is int, type(fields[name].value) is dict))
-    return {name: fields[name] for name in order}
-
-
-def _layout(values: Values, real: int) -> tuple[int, int]:
-    """Return the size and the alignment in bytes of a struct of these fields, each aligned to its own size."""
-    size, alignment = 0, 1
-    for value in (entry.value for entry in values.values()):
-        if isinstance(value, dict):
-            bytes_of, own = _layout(value, real)
-        else:
-            own = 4 if isinstance(value, int) else real
-            bytes_of = own * np.size(value)
-        size = -(-size // own) * own + bytes_of
-        alignment = max(alignment, own)
-    return -(-size // alignment) * alignment, alignment
-
-
-class _Dialect:
-    """The name and the precision that the C code is written in."""
-
-    def __init__(self, name: str, precision: np.dtype) -> None:
-        self.name, self.precision = name, precision
-        self.suffix = "" if precision == np.float64 else "f"
-
-    def translated(self, code: str) -> str:
-        """Return code for float64 and the prefix `anc` in this precision, with this name."""
-        if self.suffix:
-            code = SINGLE.sub(_in_single_precision, code)
-        return re.sub(r"\banc_", f"{self.name}_", re.sub(r"\bANC_", f"{self.name.upper()}_", code))
-
-    def literal(self, value: Any, name: str, indent: str = "") -> str:
-        """Return a value as C writes it: a number, an array in braces, or a struct in braces with named fields."""
-        if isinstance(value, dict):
-            inner = indent + "    "
-            lines = [f"{inner}.{key} = {self.literal(one.value, key, inner)},\n" for key, one in value.items()]
-            return "{\n" + "".join(lines) + indent + "}"
-        if np.ndim(value) == 0:
-            return number(value, name, self.precision)
-        last = np.max(np.flatnonzero(value), initial=0)  # C sets what follows to zero
-        return braces((number(one, name, self.precision) for one in value[: last + 1]), indent)
-
-
-# Comments stay as they are, so they come first.
-SINGLE = re.compile(r"/\*.*?\*/|\bdouble\b|\b(?:sqrt|fabs|copysign|fma)(?=\()|\b\d+\.\d+(?:e-?\d+)?", re.S)
-
-
-def _in_single_precision(found: re.Match[str]) -> str:
-    text = found[0]
-    return text if text.startswith("/*") else "float" if text == "double" else f"{text}f"
-
-
-def _chosen(code: str, flags: set[str]) -> str:
-    """Return code with the lines that apply between `#if FLAG`, `#else` and `#endif`."""
-    lines, taken = [], [True]
-    for line in code.splitlines(keepends=True):
-        word, *rest = line.split() or [""]
-        if word == "#if":
-            taken.append(rest[0] in flags)
-        elif word == "#else":
-            taken[-1] = not taken[-1]
-        elif word == "#endif":
-            taken.pop()
-        elif all(taken):
-            lines.append(line)
-    return "".join(lines)
-
-
-def _fragment(name: str) -> str:
-    return (FRAGMENTS / name).read_text(encoding="utf-8")
-
-
-def _declared(values: Values, indent: str = "    ") -> str:
-    """Return the fields of a struct."""
-    lines = []
-    for name, (value, comment, size) in values.items():
-        kind = f"anc_{name}" if isinstance(value, dict) else "int32_t" if isinstance(value, int) else "double"
-        note = f" /* {comment} */" if comment else ""
-        lines.append(f"{indent}{kind} {name}{f'[{size}]' if size else ''};{note}\n")
-    return "".join(lines)
-
-
-def _header(export: CExport, description: str, parts: list[Part], dialect: _Dialect) -> str:
-    state = _state(parts)
-    sizes = [
-        f"#define ANC_{name} {one.value} /* {one.comment} */\n" for part in parts for name, one in part.sizes.items()
-    ]
-    structs = [
-        f"/* {one.comment[0].upper()}{one.comment[1:]}. */\ntypedef struct {{\n{_declared(one.value)}}} anc_{name};\n\n"
-        for name, one in state.items()
-        if isinstance(one.value, dict)
-    ]
-    return Template(dialect.translated(_fragment("header.h"))).substitute(
-        description=description,
-        cost=export._cost(),
-        sizes=dialect.translated("".join(sizes)),
-        structs=dialect.translated("".join(structs)),
-        fields=dialect.translated(_declared(state)),
-    )
-
-
-def _source(export: CExport, description: str, parts: list[Part], dialect: _Dialect) -> str:
-    settings = []
-    for name, (value, comment, size) in ((name, one) for part in parts for name, one in part.settings.items()):
-        kind = "int32_t" if np.asarray(value).dtype.kind == "i" else "double"
-        declared = dialect.translated(f"static const {kind} {name}{f'[{size}]' if size else ''}")
-        settings.append(f"{declared} = {dialect.literal(value, name)}; /* {comment} */\n")
-    beginning = Template(dialect.translated(_fragment("source.c"))).substitute(
-        description=description,
-        header=export.header_path.name,
-        settings="".join(settings),
-        initial=dialect.literal(_state(parts), "state"),
-    )
-    flags = set().union(*(part.flags for part in parts))
-    code = "".join(_chosen(_fragment(f"{name}.c"), flags) for name in [*(part.fragment for part in parts), "calls"])
-    return beginning + dialect.translated(code)

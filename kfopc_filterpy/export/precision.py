@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..power.limiter import FLOOR, spans_of
+from ..power.limiter import spans_of
 
 LARGEST_MARGIN = 0.01  # of the rated power, which the limiter keeps free for rounding
 SINGLE_FLOOR = 1e-30  # of the budget, as in limiter.c
 
 
-def in_precision(numbers: np.ndarray, precision: np.dtype) -> float:
-    """Change a limiter's record of numbers to those of a precision, and return its floor.
+def in_precision(numbers: np.ndarray, precision: np.dtype) -> None:
+    """Change a limiter's record of numbers to those of a precision.
 
     Raises
     ------
@@ -19,7 +19,7 @@ def in_precision(numbers: np.ndarray, precision: np.dtype) -> float:
         If the margin for rounding would take too much of the rated power.
     """
     if precision == np.float64:
-        return FLOOR
+        return
     epsilon, window = float(np.finfo(precision).eps), int(numbers["size"][0])
     margin = (1.0 - float(numbers["budget"][0])) * epsilon / float(np.finfo(np.float64).eps)
     if margin > LARGEST_MARGIN:
@@ -33,4 +33,3 @@ def in_precision(numbers: np.ndarray, precision: np.dtype) -> float:
     numbers["budget"] = 1.0 - margin
     for values in (numbers["average"], numbers["loud"], spans_of(numbers)[1:, :spans]):  # held and room
         np.maximum(values, SINGLE_FLOOR, out=values)
-    return SINGLE_FLOOR

@@ -16,8 +16,10 @@
  * Of the library, memcpy, memset, strcmp and math.h are used.
  *
  * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A bad
- * reference counts as 0, and ${name}_update refuses that sample. A refused update changes nothing. An output is never NaN or
- * infinite: if the weights have grown that much, it is 0.
+ * reference counts as 0, and ${name}_update refuses that sample. It also refuses a disturbance estimate e + s^ * y that is too
+ * loud, a step of the weights that is too large, and a covariance so large that the next one could overflow
+ * (${NAME}_NO_SOLUTION). A refused update changes nothing. An output is never NaN or infinite: if the weights have grown that
+ * much, it is 0.
  */
 #ifndef ${NAME}_EXPORTED_H
 #define ${NAME}_EXPORTED_H
@@ -34,13 +36,7 @@ extern "C" {
 #define ${NAME}_TAPS $L /* of a control filter */
 
 /* What ${name}_update returns. */
-#define ${NAME}_ADAPTED 0
-#define ${NAME}_LOUD_REFERENCE 1
-#define ${NAME}_LOUD_ERROR 2
-#define ${NAME}_LOUD_ESTIMATE 3 /* of the disturbance, e + s^ * y */
-#define ${NAME}_LOUD_STEP 4     /* of the weights: step size times error */
-#define ${NAME}_NO_SOLUTION 5
-
+$answers
 /* All that changes. A copy of it is a copy of the controller. */
 typedef struct {
     $real block[$n_reals];
