@@ -17,7 +17,7 @@ $core
 
 $constants
 static const anc_plan plan = {
-    .microphones = $K, .loudspeakers = $J, .references = $I, .taps = $L, .path_taps = $M, .guard_taps = $G,
+    .scenarios = 1, .microphones = $K, .loudspeakers = $J, .references = $I, .taps = $L, .path_taps = $M, .guard_taps = $G,
     .limited = $limited, $windows.path = path, $guard.settings = settings,
 };
 

@@ -1,51 +1,45 @@
 /* Runs an exported controller on a stream of binary float64.
  *
- * Input: the number of taps of the true secondary path, the taps, then x(n) and d(n) of each sample. The error is
- * e(n) = d(n) - (s * y)(n); without taps it is d(n). Output: the size of the state, then y(n) and what the update returned
- * for each sample, and at the end the weights.
+ * Input: x(n) and e(n) of each sample, of all channels. Output: the size of the state, what two self-tests returned, before
+ * and after the samples, then y(n) and what the update returned for each sample. Half way, a copy of the state goes on in its
+ * place. With FIRST=1, the controller was exported between the two calls of a sample, and that of sample 0 is the second.
  */
 #include "anc.h"
 
 #include <stdio.h>
+#include <string.h>
 
-#define LONGEST 4096
+enum { K = ANC_MICROPHONES, J = ANC_LOUDSPEAKERS, I = ANC_REFERENCES, SWITCHED = 2500 };
 
-static anc_state state;
+static anc_state states[2];
 
-static int get(double *value)
-{
-    return fread(value, sizeof *value, 1, stdin) == 1;
-}
-
-static void put(double value)
-{
-    fwrite(&value, sizeof value, 1, stdout);
-}
+static void put(double value) { fwrite(&value, sizeof value, 1, stdout); }
 
 int main(void)
 {
-    static double path[LONGEST], played[LONGEST];
-    double size, x, d;
-    int taps;
-    if (!get(&size) || !(size >= 0.0 && size <= LONGEST))
-        return 1;
-    taps = (int)size;
-    for (int k = 0; k < taps; k++)
-        if (!get(&path[k]))
-            return 1;
-    anc_init(&state);
-    put((double)sizeof state);
-    while (get(&x) && get(&d)) {
-        const double y = (double)anc_control_signal(&state, (real)x);
-        for (int k = taps - 1; k > 0; k--)
-            played[k] = played[k - 1];
-        played[0] = y;
-        for (int k = 0; k < taps; k++)
-            d -= path[k] * played[k];
-        put(y);
-        put((double)anc_update(&state, (real)d));
+    anc_state *state = states;
+    double in[I + K];
+    put((double)sizeof *state);
+    put(anc_self_test(state));
+    put(anc_self_test(state)); /* the state is that of the export again */
+    for (long n = 0; fread(in, sizeof in, 1, stdin) == 1; n++) {
+        NUMBER x[I], e[K], y[J] = {0};
+        for (int i = 0; i < I; i++) x[i] = (NUMBER)in[i];
+        for (int k = 0; k < K; k++) e[k] = (NUMBER)in[I + k];
+        if (n == SWITCHED) {
+            states[1] = states[0];
+            memset(states, 0xff, sizeof *states);
+            state = states + 1;
+        }
+#ifdef ARRAYS
+        if (n >= FIRST) anc_control_signal(state, x, y);
+        const int answer = anc_update(state, e);
+#else
+        if (n >= FIRST) y[0] = anc_control_signal(state, x[0]);
+        const int answer = anc_update(state, e[0]);
+#endif
+        for (int j = 0; j < J; j++) put((double)y[j]);
+        put(answer);
     }
-    for (int k = 0; k < ANC_TAPS; k++)
-        put((double)state.weights[k]);
     return 0;
 }

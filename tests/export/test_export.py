@@ -1,0 +1,531 @@
+"""Controllers of the core exported as C: the bits of Python in float64, and close to it in float32."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from copy import deepcopy
+from functools import cache
+
+import numpy as np
+import pytest
+from helpers.c99 import FAST, WARNINGS, Program, c_compiler, compiler, succeeds
+from helpers.channels import random_paths, through
+
+from kfopc_filterpy import (
+    KFOPC,
+    ClippingFxLMS,
+    FxLMS,
+    FxNLMS,
+    HardClipAmplifier,
+    KalmanController,
+    LeakyFxLMS,
+    MOVFxLMS,
+    OptimalLeakyFxLMS,
+    OutputLimiter,
+    OutputPowerConstraint,
+    RescalingFxLMS,
+    SoftSaturationAmplifier,
+    TwoGradientFxLMS,
+    fx_rls,
+    kf_anc,
+    kf_opc,
+    kf_opc_repaired,
+    kf_pb,
+    simulate,
+)
+from kfopc_filterpy.controllers import CoreController, MonitoredController, load_algorithm
+from kfopc_filterpy.core.building import FOLDER, core_sources
+from kfopc_filterpy.export import export_c
+from kfopc_filterpy.export.joined import sources_of
+
+L, RATED, WINDOW = 16, 0.5, 800
+TRAINING, SAMPLES = 3_000, 5_000
+S_HAT = np.array([0.0, 0.85, -0.35, 0.25, 0.1])
+S = np.array([0.0, 0.9, -0.4, 0.2, 0.1, 0.05])
+S_TWO = random_paths(2, 2, 6, seed=1)
+S_TWO_HAT = S_TWO[..., :5] + 0.02 * random_paths(2, 2, 5, seed=2)
+P_TWO = random_paths(2, 2, 30, seed=3, delay=8)
+
+NOISES = {"state_noise": 1e-7, "measurement_noise": 1e-2}
+ALGORITHMS = {
+    "FxLMS": (FxLMS, {"step_size": 2e-4}),
+    "FxNLMS": (FxNLMS, {"step_size": 0.005}),
+    "leaky": (LeakyFxLMS, {"step_size": 2e-4, "leak": 0.3}),
+    "optimal leaky": (OptimalLeakyFxLMS, {"step_size": 2e-4, "rated_power": RATED}),
+    "MOV": (MOVFxLMS, {"step_size": 2e-4, "rated_power": RATED}),
+    "MOV modified": (MOVFxLMS, {"step_size": 2e-4, "rated_power": RATED, "modified": True}),
+    "MOV fixed": (MOVFxLMS, {"step_size": 2e-4, "rated_power": RATED, "penalty_factor": 0.3}),
+    "two-gradient": (TwoGradientFxLMS, {"step_size": 2e-4, "amplitude_limit": 0.8, "output_step_size": 1e-4}),
+    "clipping": (ClippingFxLMS, {"step_size": 2e-4, "amplitude_limit": 0.8}),
+    "rescaling": (RescalingFxLMS, {"step_size": 2e-4, "amplitude_limit": 0.8}),
+    "KF-ANC": (kf_anc, NOISES),
+    "KF-OPC": (kf_opc, {"rated_power": RATED, **NOISES}),
+    "FxRLS": (fx_rls, {"forgetting": 0.999}),
+    "repaired": (kf_opc_repaired, {"rated_power": RATED, **NOISES}),
+}
+ONE_CHANNEL, ONE_REFERENCE = {"FxRLS"}, {"FxRLS", "repaired"}
+
+
+def limiter(rated_power=RATED, window=WINDOW):
+    return OutputLimiter(rated_power, window_s=window / 16000)
+
+
+def constraint(rated_power=RATED):
+    return OutputPowerConstraint(rated_power, window="sliding", memory_s=0.01)
+
+
+def made(name, **more):
+    kind, settings = ALGORITHMS[name]
+    return kind(L, S_HAT, **settings, **more)
+
+
+def with_everything(name):
+    """Return a controller with two of each channel, where it can have them, and with all else that it takes."""
+    kind, settings = ALGORITHMS[name]
+    settings, two = dict(settings), name not in ONE_CHANNEL
+    if settings.pop("rated_power", None):
+        settings["constraint"] = [constraint(), constraint(0.3)]
+        settings["amplifier"] = [HardClipAmplifier(1.2), SoftSaturationAmplifier(1.5, sharpness=1.7)]
+    for each in ("leak", "amplitude_limit", "penalty_factor", "measurement_noise"):
+        if two and each in settings:
+            settings[each] = [settings[each], 1.5 * settings[each]]
+    if name not in ONE_REFERENCE:
+        settings["n_references"] = 2
+    limiters = [limiter(), limiter(0.3)] if two else limiter()
+    controller = kind(L, S_TWO_HAT if two else S_HAT, limiter=limiters, **settings)
+    controller.secondary_path_uncertainty = 0.2
+    return controller
+
+
+CONTROLLERS = {f"{name}, everything": lambda name=name: with_everything(name) for name in ALGORITHMS} | {
+    "FxLMS": lambda: made("FxLMS"),
+    "FxLMS, limited": lambda: made("FxLMS", limiter=limiter()),
+    "MOV": lambda: made("MOV"),
+    "KF-OPC": lambda: made("KF-OPC"),
+    "KF-OPC, limited": lambda: made("KF-OPC", limiter=limiter()),
+    "KF-OPC, one tap": lambda: kf_opc(1, [0.9], rated_power=RATED, **NOISES),
+    "KF-OPC, twice the precision": lambda: kf_opc(
+        L, S_HAT, rated_power=RATED, state_noise=1e-6, measurement_noise=1e-6, initial_variance=100.0
+    ),
+    "repaired": lambda: made("repaired"),
+}
+
+
+@cache
+def noises(n=TRAINING + SAMPLES):
+    """References, a tone in noise that gets louder, and disturbances, with two channels each."""
+    rng = np.random.default_rng(1)
+    x = np.where(np.arange(n) % 7000 < 5000, 1.0, 2.5) * (
+        0.5 * rng.standard_normal((2, n)) + np.sin(0.2 * np.arange(n))
+    )
+    return x, through(P_TWO, x) + 0.05 * rng.standard_normal((2, n))
+
+
+def ran(controller, part, n=TRAINING + SAMPLES):
+    x, d = (signal[:, part] for signal in noises(n))
+    path = S_TWO
+    if not controller.multichannel:
+        x, d, path = x[0], d[0], S
+    result = simulate(controller, x[: controller.n_references] if x.ndim > 1 else x, disturbance=d, secondary_path=path)
+    assert result.diverged_at_s is None
+    return result
+
+
+@cache
+def trained_and_run(name):
+    """Return a controller as it was after training, and its run from there on."""
+    controller = CONTROLLERS[name]()
+    ran(controller, slice(TRAINING))
+    trained = deepcopy(controller)
+    return trained, ran(controller, slice(TRAINING, None))
+
+
+def sample(controller, signal):
+    """Return a sample of all channels as a controller takes it."""
+    return signal if controller.multichannel else signal[0]
+
+
+def stepped(controller, x, e):
+    """Return y (J, n) of the two calls per sample."""
+    y = np.empty((controller.n_loudspeakers, x.shape[1]))
+    for n in range(x.shape[1]):
+        y[:, n] = controller.control_signal(sample(controller, x[:, n]))
+        controller.update(sample(controller, e[:, n]))
+    return y
+
+
+# The result, sample by sample.
+
+
+def test_every_algorithm_of_the_core_is_tested_here():
+    defined = {
+        name
+        for path in core_sources()
+        for name in re.findall(r"^const anc_algorithm anc_(\w+)", path.read_text(), re.M)
+    }
+    tested = {make()._opened().algorithm.name for make in CONTROLLERS.values()}
+    assert tested == defined - {"signals_alone"}  # this one has no exported controller
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_float64_gives_the_bits_of_python(name, tmp_path):
+    trained, result = trained_and_run(name)
+    program = Program(trained, tmp_path)
+    out = program.run(result.reference, result.error)
+    np.testing.assert_array_equal(out.y, np.atleast_2d(result.control_signal))
+    assert np.abs(out.y).max() > 0.1
+    assert out.self_tests == [0, 0]
+    assert not out.status.any()
+    assert out.n_bytes == program.exported.n_bytes
+    assert f"block[{trained._opened().memory.size // 8}]" in program.exported.header_path.read_text()
+
+
+@pytest.mark.parametrize(
+    "name", ["FxLMS, limited", "MOV", "MOV fixed, everything", "KF-OPC", "KF-OPC, everything", "repaired"]
+)
+def test_float32_follows_python(name, tmp_path):
+    trained, result = trained_and_run(name)
+    program = Program(trained, tmp_path, "float32")
+    out = program.run(result.reference, result.error)
+    difference = np.abs(out.y - result.control_signal) / np.sqrt(np.mean(result.control_signal**2))
+    print(f"{name}: largest {difference.max():.1e}, rms {np.sqrt(np.mean(difference**2)):.1e}")
+    assert np.sqrt(np.mean(difference**2)) <= (1e-3 if trained.limiter is None else 1e-2)
+    assert trained.limiter is not None or difference.max() <= 1e-2
+    assert out.self_tests == [0, 0]
+    assert not out.status.any()
+    assert out.n_bytes == program.exported.n_bytes
+
+
+@pytest.mark.parametrize("options", [(), ("-O1", "-DLANES_OF_ONE=1"), ("-O1", "-march=native")], ids=" ".join)
+def test_the_bits_do_not_depend_on_the_processor(options, tmp_path):
+    trained, result = trained_and_run("repaired, everything")
+    out = Program(trained, tmp_path, options=options).run(result.reference, result.error)
+    np.testing.assert_array_equal(out.y, result.control_signal)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_in_a_long_run_no_window_of_the_limiters_output_exceeds_the_rated_power(dtype, tmp_path):
+    controller, n = CONTROLLERS["KF-OPC, limited"](), 200_000
+    program = Program(controller, tmp_path, dtype, options=("-O1",))
+    result = ran(controller, slice(None), n)
+    out = program.run(result.reference, result.error)
+    if dtype == "float64":
+        np.testing.assert_array_equal(out.y[0], result.control_signal)
+    energy = np.cumsum(np.concatenate([np.zeros(1), out.y[0]]).astype(np.longdouble) ** 2)
+    windows = (energy[WINDOW:] - energy[:-WINDOW]) / WINDOW
+    assert windows.max() <= RATED
+    assert np.mean(windows) > 0.3 * RATED
+    assert not out.status.any()
+
+
+def test_the_self_test_finds_a_difference(tmp_path):
+    program = Program(trained_and_run("KF-OPC")[0], tmp_path)
+    source = program.exported.path.read_text()
+    digit = source.index(".", source.index("expected[COMPARED]")) + 12  # one digit of the first output
+    program.exported.path.write_text(source[:digit] + str(9 - int(source[digit])) + source[digit + 1 :])
+    program.compile()
+    assert program.run(np.zeros(1), np.zeros(1)).self_tests == [1, 1]
+
+
+# The state that it starts from.
+
+
+@pytest.mark.parametrize("name", ["FxLMS, limited", "KF-OPC, everything"])
+def test_an_export_between_the_two_calls_of_a_sample_continues_with_the_update(name, tmp_path):
+    controller = CONTROLLERS[name]()
+    x, e = (signal[: controller.n_references, :100] for signal in noises())
+    stepped(controller, x[:, :50], e[:, :50])
+    controller.control_signal(sample(controller, x[:, 50]))
+    out = Program(controller, tmp_path, first=1).run(x[:, 50:], e[:, 50:])
+    controller.update(sample(controller, e[:, 50]))
+    np.testing.assert_array_equal(out.y[:, 1:], stepped(controller, x[:, 51:], e[:, 51:]))
+
+
+def test_what_was_assigned_before_the_export_is_exported(tmp_path):
+    controller = CONTROLLERS["KF-OPC"]()
+    x, e = (signal[:1, :300] for signal in noises())
+    stepped(controller, x, e)
+    controller.measurement_noise, controller.state_noise, controller.secondary_path = (
+        0.3,
+        1e-6,
+        [0.0, 0.7, 0.1, 0.0, 0.2],
+    )
+    out = Program(controller, tmp_path).run(x, e)
+    np.testing.assert_array_equal(out.y, stepped(controller, x, e))
+
+
+@pytest.mark.parametrize("name", ["FxLMS, limited", "KF-OPC, everything"])
+def test_an_export_changes_nothing_in_the_controller(name, tmp_path):
+    controller, untouched = CONTROLLERS[name](), CONTROLLERS[name]()
+    for one in (controller, untouched):
+        ran(one, slice(200))
+    first = export_c(controller, tmp_path / "first.c", name="anc")
+    second = export_c(controller, tmp_path / "second.c", name="anc")
+    assert first.path.read_text().replace("first.h", "second.h") == second.path.read_text()
+    results = [ran(one, slice(200, 400)).control_signal for one in (controller, untouched)]
+    np.testing.assert_array_equal(*results)
+
+
+# What a precision cannot hold.
+
+
+def test_what_float32_cannot_hold_is_refused(tmp_path):
+    long = FxLMS(2, [1.0], step_size=0.1, limiter=limiter(window=100_000))
+    with pytest.raises(ValueError, match=r"window of 100000 samples is too long for float32.*at most"):
+        export_c(long, tmp_path / "anc.c", dtype="float32")
+    with pytest.raises(ValueError, match="path must be finite in float32"):
+        export_c(FxLMS(2, [1e39], step_size=0.1), tmp_path / "anc.c", dtype="float32")
+    with pytest.raises(ValueError, match="settings must be finite in float32"):
+        export_c(kf_anc(2, [1.0], initial_variance=1e39, **NOISES), tmp_path / "anc.c", dtype="float32")
+    assert list(tmp_path.iterdir()) == []
+    assert export_c(long, tmp_path / "anc.c").n_bytes > 3 * 8 * 100_000
+
+
+@pytest.mark.parametrize(("ratio", "tolerance"), [(1e6, 0.1), (1e9, 0.1)])
+def test_a_large_initial_variance_is_no_harm_in_float32(ratio, tolerance, tmp_path):
+    """The rounding of P(0|0) alone is 6e-8 of 10^6 or 10^9 measurement noises."""
+    controller = kf_opc(
+        L, S_HAT, rated_power=RATED, state_noise=0.0, measurement_noise=1e-3, initial_variance=1e-3 * ratio
+    )
+    program = Program(controller, tmp_path, "float32")
+    result = ran(controller, slice(None))
+    out = program.run(result.reference, result.error)
+    difference = np.abs(out.y[0] - result.control_signal)
+    print(f"{ratio:g}: largest {difference.max():.1e}, of the last half {difference[difference.size // 2 :].max():.1e}")
+    assert difference.max() <= tolerance
+    assert not out.status.any()
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "large"),
+    [
+        ("FxLMS", "float64", 1e200),
+        ("MOV, everything", "float32", 1e30),
+        ("KF-OPC", "float32", 1e30),
+        ("KF-OPC, everything", "float64", 1e200),
+    ],
+)
+def test_a_bad_error_is_refused_and_a_bad_reference_counts_as_zero(name, dtype, large, tmp_path):
+    """Python's controller, which is told nothing of the bad errors and zero for the bad references, goes on alike."""
+    controller = CONTROLLERS[name]()
+    x, e = (signal[: controller.n_references, :900].copy() for signal in noises())
+    e[-1, [300, 301, 450, 550, 650]] = [np.nan, np.inf, -np.inf, large, np.nan]
+    x[-1, [400, 401, 500, 600, 650]] = [np.nan, np.inf, -np.inf, large, np.nan]
+    out = Program(controller, tmp_path, dtype).run(x, e)
+    expected, refused = np.empty((controller.n_loudspeakers, 900)), np.zeros(900, int)
+    for n in range(900):
+        bad_reference, bad_error = not abs(x[-1, n]) < large, not abs(e[-1, n]) < large
+        expected[:, n] = controller.control_signal(sample(controller, 0.0 * x[:, 0] if bad_reference else x[:, n]))
+        if bad_reference or bad_error:
+            refused[n] = 1 if bad_reference else 2
+        else:
+            controller.update(sample(controller, e[:, n]))
+    assert np.count_nonzero(refused) == 9
+    np.testing.assert_array_equal(out.status, refused)
+    np.testing.assert_allclose(out.y, expected, rtol=0, atol=0 if dtype == "float64" else 2e-2)
+
+
+@pytest.mark.parametrize(("dtype", "variance", "loud"), [("float64", 1e150, 1e80), ("float32", 1e20, 1e9)])
+def test_a_covariance_that_is_too_large_for_a_reference_is_refused(dtype, variance, loud, tmp_path):
+    controller = kf_anc(2, [1.0], state_noise=0.0, measurement_noise=1.0, initial_variance=variance)
+    x, e = (signal[:1, :200].copy() for signal in noises())
+    x[:, :100], e[:, :102] = 0.0, 0.0
+    x[:, 100] = loud  # its square is finite, but not as many times as the variance says
+    out = Program(controller, tmp_path, dtype).run(x, e)
+    np.testing.assert_array_equal(np.flatnonzero(out.status), [100, 101])
+    assert set(out.status) == {0, 5}
+    assert np.isfinite(out.y).all()
+
+
+def test_without_measurement_noise_silence_teaches_nothing(tmp_path):
+    controller = kf_anc(4, [1.0, 0.5], state_noise=1e-6, measurement_noise=0.0)
+    x, e = (signal[:1, :300].copy() for signal in noises())
+    x[:, 100:120] = 0.0
+    out = Program(controller, tmp_path).run(x, e)
+    np.testing.assert_array_equal(out.y, stepped(controller, x, e))
+    assert not out.status.any()
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_a_controller_that_diverges_stays_finite_and_says_so(dtype, tmp_path):
+    rng = np.random.default_rng(1)
+    x, sign = rng.standard_normal((2, 20_000))
+    e = sign * np.logspace(0, 30 if dtype == "float32" else 200, x.size)
+    out = Program(FxLMS(L, S_HAT, step_size=1.0), tmp_path, dtype).run(x, e)
+    assert np.isfinite(out.y).all()
+    assert np.abs(out.y).max() > 1e5
+    assert {0, 2} < set(out.status)
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        ("rescaling, everything", "float32"),
+        ("repaired, everything", "float64"),
+        ("KF-OPC, twice the precision", "float32"),
+    ],
+)
+def test_sanitizers_find_nothing(name, dtype, tmp_path):
+    options = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    probe = tmp_path / "probe.c"
+    probe.write_text("int main(void) { return 0; }\n")
+    built = subprocess.run([c_compiler(), *options, str(probe), "-o", str(tmp_path / "probe")], capture_output=True)
+    if built.returncode != 0 or subprocess.run([str(tmp_path / "probe")], capture_output=True).returncode != 0:
+        pytest.skip("the compiler has no address and undefined-behaviour sanitizers")
+    controller = CONTROLLERS[name]()
+    x, e = (
+        signal[:count, :4000].copy()
+        for signal, count in zip(noises(), (controller.n_references, controller.n_microphones), strict=True)
+    )
+    x[0, 1000], x[0, 2000], e[0, 3000], e[0, 3100] = np.nan, np.inf, np.nan, -np.inf
+    out = Program(controller, tmp_path, dtype, (*FAST, *options)).run(x, e)
+    np.testing.assert_array_equal(np.flatnonzero(out.status), [1000, 2000, 3000, 3100])
+
+
+# The files.
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "others"),
+    [
+        ("FxLMS", ["lms"], ["kalman", "covariance", "loop"]),
+        ("KF-OPC", ["kalman", "covariance"], ["lms", "repaired", "loop"]),
+        ("repaired", ["repaired", "kalman", "covariance"], ["lms", "loop"]),
+    ],
+)
+def test_the_files_of_the_core_that_are_needed_stand_in_the_source_as_they_are(name, own, others, tmp_path):
+    text = export_c(CONTROLLERS[name](), tmp_path / "anc.c").path.read_text()
+    files = [f"{one}.c" for one in (*own, "signals", "limiter", "constraint", "amplifier", "controller")]
+    for path in (FOLDER / file for file in ("vectors.h", "signals.h", *files)):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            assert line.startswith(("#include", "const anc_algorithm")) or line in text
+    assert not [file for file in others if f"/* ---- {file}.c ---- */" in text]
+
+
+def test_a_file_needs_what_it_names_but_not_what_it_defines_itself():
+    assert sources_of("int anc_size_of(int);") == []
+    assert [path.name for path in sources_of("anc_amplify(&amplifier, y)")] == ["amplifier.c"]
+
+
+def test_only_the_calls_are_visible_and_only_the_mathematics_library_is_needed(tmp_path):
+    if shutil.which("nm") is None:
+        pytest.skip("needs nm, which lists a file's symbols")
+    for name in ("MOV, everything", "repaired, everything"):
+        path = export_c(CONTROLLERS[name](), tmp_path / "anc.c").path
+        succeeds(c_compiler(), "-std=c99", "-O1", *WARNINGS, "-c", path, "-o", tmp_path / "anc.o")
+        symbols = subprocess.run(["nm", str(tmp_path / "anc.o")], capture_output=True, text=True, check=True).stdout
+        needed = {line.split()[-1] for line in symbols.splitlines() if " U " in line}
+        assert needed <= {"sqrt", "memcpy", "memset", "strcmp"}
+        public = {line.split()[-1] for line in symbols.splitlines() if line.split()[-2] in "TDBRC"}
+        assert public == {"anc_init", "anc_control_signal", "anc_update", "anc_self_test"}
+
+
+def test_two_controllers_of_other_names_link_into_one_program_also_of_cpp(tmp_path):
+    export_c(CONTROLLERS["KF-OPC, limited"](), tmp_path / "left.c")
+    export_c(CONTROLLERS["MOV, everything"](), tmp_path / "other.c", name="right_2", dtype="float32")
+    main = tmp_path / "main.cpp"
+    main.write_text(
+        '#include "left.h"\n#include "other.h"\nstatic left_state a;\nstatic right_2_state b;\n'
+        "int main() { return left_self_test(&a) || right_2_self_test(&b) || LEFT_ADAPTED || LEFT_TAPS != RIGHT_2_TAPS; }\n"
+    )
+    objects = [tmp_path / "left.o", tmp_path / "other.o"]
+    for path in objects:
+        succeeds(c_compiler(), "-std=c99", *FAST, *WARNINGS, "-c", path.with_suffix(".c"), "-o", path)
+    options = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-I", tmp_path)
+    succeeds(compiler("c++", "g++"), *options, main, *objects, "-lm", "-o", tmp_path / "main")
+    succeeds(tmp_path / "main")
+
+
+def test_fast_math_is_refused_by_the_file_itself(tmp_path):
+    path = export_c(made("KF-OPC"), tmp_path / "anc.c").path
+    command = [c_compiler(), "-std=c99", "-ffast-math", "-c", str(path), "-o", str(tmp_path / "anc.o")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "compile it without -ffast-math" in done.stderr
+
+
+def test_the_header_and_the_repr_state_the_size(tmp_path):
+    exported = export_c(made("KF-OPC"), tmp_path / "anc.c", dtype="float32")
+    header = exported.header_path.read_text()
+    assert f"{exported.n_bytes:,} bytes" in header
+    assert f"state of {exported.n_bytes:,} bytes>" in repr(exported)
+    assert f"KF-OPC: {L} taps, rated power 0.5" in header
+    assert "#define ANC_ADAPTED 0\n#define ANC_LOUD_REFERENCE 1\n" in header
+
+
+def test_a_name_cannot_end_the_comment_that_it_stands_in(tmp_path):
+    controller = made("FxLMS")
+    controller.name = "mine */ int broken;"
+    succeeds(c_compiler(), "-std=c99", *WARNINGS, "-fsyntax-only", export_c(controller, tmp_path / "anc.c").path)
+
+
+# What is refused.
+
+
+class Own(FxLMS):
+    """An FxLMS with calls of its own."""
+
+    def update(self, error):
+        super().update(0.5 * error)
+
+
+def of_a_file(folder):
+    folder.mkdir()
+    source = folder / "mine.c"
+    source.write_text(
+        '#include "signals.h"\nstatic const anc_setting none[] = {{0}};\n'
+        "static int update_mine(anc_view *view, const real *error) { return error ? estimate((signals *)view, error) : 0; }\n"
+        'const anc_algorithm anc_mine = {"mine", none, layout_plain, start_plain, control_signal_plain, update_mine};\n'
+    )
+
+    class Mine(CoreController):
+        name, algorithm = "mine", load_algorithm(source)
+
+    return Mine(4, S_HAT, settings={})
+
+
+NOT_EXPORTED = {
+    "a number": (lambda folder: 3.0, "float .* is not in the core"),
+    "KF-PB": (lambda folder: kf_pb(4, S_HAT, rated_power=RATED, **NOISES), "KF-PB .* is not in the core"),
+    "monitor": (lambda folder: MonitoredController(made("KF-OPC")), r"MonitoredController\) is not in the core"),
+    "own calls": (lambda folder: Own(4, S_HAT, step_size=0.1), r"FxLMS \(Own\) has calls of its own"),
+    "estimator": (
+        lambda folder: KalmanController(KFOPC.random_walk(4, rated_power=RATED, **NOISES), S_HAT),
+        r"KF-OPC \(KalmanController\) has calls of its own",
+    ),
+    "own file": (lambda folder: of_a_file(folder / "own"), r"mine \(Mine\) has an algorithm of its own"),
+}
+
+
+@pytest.mark.parametrize("case", NOT_EXPORTED)
+def test_a_controller_that_is_not_exported_is_refused_by_name(case, tmp_path):
+    make, reason = NOT_EXPORTED[case]
+    controller = make(tmp_path)
+    with pytest.raises(TypeError, match=rf"{reason} and cannot be exported: export_c takes the controllers whose"):
+        export_c(controller, tmp_path / "anc.c")
+    assert not list(tmp_path.glob("anc*"))
+
+
+BAD_ARGUMENTS = {
+    "path": ({"path": "anc.txt"}, ValueError, "must end in .c"),
+    "stem": ({"path": "my anc.c"}, ValueError, "C identifier"),
+    "name": ({"name": "2nd"}, ValueError, "C identifier"),
+    "underscore": ({"name": "_anc"}, ValueError, "C identifier"),
+    "empty name": ({"name": ""}, ValueError, "C identifier"),
+    "dtype": ({"dtype": "float16"}, ValueError, "'float64' or 'float32', got float16"),
+    "no dtype": ({"dtype": "double precision"}, TypeError, "'float64' or 'float32', got 'double precision'"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARGUMENTS)
+def test_bad_arguments_are_refused_before_a_file_is_written(case, tmp_path):
+    arguments, error, reason = BAD_ARGUMENTS[case]
+    arguments = {"path": "anc.c"} | arguments
+    with pytest.raises(error, match=reason):
+        export_c(made("KF-OPC"), tmp_path / arguments.pop("path"), **arguments)
+    assert list(tmp_path.iterdir()) == []
