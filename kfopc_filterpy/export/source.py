@@ -58,7 +58,13 @@ class Exported:
         expected, scale = self._expected()
         s = self.block.shape
         common: dict[str, Any] = {
-            **dict(zip("KJILMG", (s.microphones, s.loudspeakers, s.references, s.taps, s.path_taps, s.guard_taps), strict=True)),
+            **dict(
+                zip(
+                    "KJILMG",
+                    (s.microphones, s.loudspeakers, s.references, s.taps, s.path_taps, s.guard_taps),
+                    strict=True,
+                )
+            ),
             "description": description,
             "header": header,
             "name": self.name,

@@ -50,12 +50,21 @@ class Program:
     """A controller that was exported and compiled with `stream.c`, the flags of its header and these options."""
 
     def __init__(
-        self, controller: Any, folder: Path, dtype: str = "float64", options: tuple[str, ...] = FAST, first: int = 0
+        self,
+        controller: Any,
+        folder: Path,
+        dtype: str = "float64",
+        options: tuple[str, ...] = FAST,
+        *,
+        first: int = 0,
+        path: Any = (0.0,),
     ) -> None:
         self.exported: CExport = export_c(controller, folder / "anc.c", dtype=dtype)
         self.program = folder / "stream"
         number = "double" if dtype == "float64" else "float"
-        self.defined = (f"-DNUMBER={number}", f"-DFIRST={first}", *(["-DARRAYS"] if controller.multichannel else []))
+        values = {"NUMBER": number, "FIRST": first, "PATH": ", ".join(map(repr, map(float, path)))}
+        self.defined = [f"-D{name}={value}" for name, value in values.items()]
+        self.defined += ["-DARRAYS"] if controller.multichannel else []
         self.compile(options)
 
     def compile(self, options: tuple[str, ...] = FAST) -> None:
