@@ -97,7 +97,7 @@ static int descend_mov(signals *s, const real *error, const real *fixed)
         const real gamma = fixed ? fixed[sj % s->J] : penalty_of_constraint(s->previewed + sj);
         set_step(s, sj, 1, mu, mu * gamma * s->control[sj]);
     }
-    if (!*s->setting[MODIFIED]) return descend(s, error);
+    if (*s->setting[MODIFIED] == 0) return descend(s, error);
     for (int32_t sk = 0; sk < s->S * s->K; sk++) s->estimate[sk] -= heard_output(s, &s->filtered, sk / s->K, sk % s->K);
     return descend(s, s->estimate);
 }

@@ -74,7 +74,7 @@ static void advance_trim(kalman *f, int32_t sj)
         if (trim[TRIM] > MOST_TRIM) trim[TRIM] = MOST_TRIM;
         if (!(trim[TRIM] >= 1 / MOST_TRIM)) trim[TRIM] = 1 / MOST_TRIM;
     }
-    if (*s->setting[AT_OUTPUT]) trim[OUTPUT_GAIN] = factor;
+    if (*s->setting[AT_OUTPUT] != 0) trim[OUTPUT_GAIN] = factor;
 }
 
 static int update_repaired(anc_view *view, const real *error)
@@ -84,14 +84,14 @@ static int update_repaired(anc_view *view, const real *error)
     if (!error) return ANC_DONE;
     int refused = estimate_disturbance(s, error);
     if (refused) return refused;
-    if (*s->setting[OF_CONTROL]) observe_control(s);
+    if (*s->setting[OF_CONTROL] != 0) observe_control(s);
     preview(s);
     for (int32_t sj = 0; sj < s->S * s->J; sj++) {
         const real factor = s->previewed[sj].factor * f->trim[TRIMS * sj + TRIM];
         s->previewed[sj].factor = factor < 1 ? factor : 1;
     }
     for (int32_t sk = 0; sk < s->S * s->K; sk++)
-        f->scaled[sk] = (*s->setting[AT_OUTPUT] ? 1 : least_factor(s, sk / s->K)) * s->estimate[sk];
+        f->scaled[sk] = (*s->setting[AT_OUTPUT] != 0 ? 1 : least_factor(s, sk / s->K)) * s->estimate[sk];
     refused = correct_weights(f);
     for (int32_t sj = 0; !refused && sj < s->S * s->J; sj++) advance_trim(f, sj);
     return refused;
