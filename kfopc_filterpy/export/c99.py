@@ -86,8 +86,9 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     Parameters
     ----------
     controller : CoreController
-        The FxLMS family, `kf_anc`, `kf_opc`, `fx_rls`, `kf_opc_repaired`: whatever they have, such as several channels,
-        limiters, amplifier models, an uncertain secondary path or sliding windows. It is not changed.
+        One whose algorithm is in the core, such as the FxLMS family or what `kf_anc`, `kf_opc`, `fx_rls` and
+        `kf_opc_repaired` return, with whatever it has: several channels, limiters, amplifier models, an uncertain
+        secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Existing files are
         replaced.

@@ -72,7 +72,7 @@ class Exported:
             "real": self.real,
         }
         algorithm = self.block.algorithm.name
-        source = self._filled(
+        source = _filled(
             "template.c",
             common,
             **self._constants(),
@@ -87,10 +87,7 @@ class Exported:
             tolerance=number(tolerance * scale, "tolerance", self.precision),
             calls=self._calls(),
         )
-        return self._filled("template.h", common, **self._header(tolerance)), source
-
-    def _filled(self, template: str, common: dict[str, Any], **values: Any) -> str:
-        return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(common, **values)
+        return _filled("template.h", common, **self._header(tolerance)), source
 
     def _header(self, tolerance: float) -> dict[str, Any]:
         arrays, name = self.multichannel, self.name
@@ -230,3 +227,7 @@ def _tidy_lines(state: dict[str, NDArray[Any]]) -> None:
 
 def _bits(values: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(values).ravel().view(np.int64 if values.dtype == np.float64 else np.int32)
+
+
+def _filled(template: str, common: dict[str, Any], **values: Any) -> str:
+    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(common, **values)
