@@ -242,7 +242,7 @@ def _fault_of_fields(struct: Any) -> str:
 
 def _fields_of(struct: Any) -> Counter[str]:
     """Return how often `layout` makes each field of the smallest controller."""
-    plan = _Plan(microphones=1, loudspeakers=1, references=1, taps=1, path_taps=1)
+    plan = _Plan(scenarios=1, microphones=1, loudspeakers=1, references=1, taps=1, path_taps=1)
     names: Counter[str] = Counter()
 
     def take(_: Any, name: bytes, *rest: Any) -> None:
