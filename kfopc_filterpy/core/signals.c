@@ -42,12 +42,10 @@ static int32_t longest(const int32_t *lengths, int32_t n)
     return most;
 }
 
-#define COLUMNS(type) (int32_t)(sizeof(type) / sizeof(real))
-
 void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at)
 {
     const int32_t K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps, G = p->guard_taps;
-    const int32_t filtered = L > ANC_GUARD_TAPS ? L : ANC_GUARD_TAPS; /* a guard can come later, and needs the past */
+    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* a guard can come later, a fast array needs L + 1 samples */
     s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
     s->limited = p->limited;
     s->power_length = longest(p->power_windows, J), s->limiter_length = longest(p->limiter_windows, J);
@@ -146,11 +144,29 @@ void emit(signals *s, int32_t j, real y)
     *newest(&s->y, j) = anc_amplify(s->amplifier + j, y);
 }
 
+int filtered_signal(anc_view *view, const real *reference, real *control)
+{
+    signals *s = (signals *)view;
+    const int refused = take_reference(s, reference);
+    for (int32_t j = 0; !refused && j < s->J; j++) emit(s, j, filter_output(s, j)), control[j] = s->control[j];
+    return refused;
+}
+
 real heard_output(const signals *s, const lines *rows, int32_t k)
 {
     real sum = 0;
     for (int32_t ji = 0; ji < s->J * s->I; ji++) sum += dot(s->weights + times(ji, s->L), newest(rows, k * s->J * s->I + ji), s->L);
     return sum;
+}
+
+real least_factor(const signals *s)
+{
+    real heard = (real)INFINITY, unheard = (real)INFINITY;
+    for (int32_t j = 0; j < s->J; j++) {
+        real *least = s->previewed[j].gain == 0 ? &unheard : &heard;
+        if (s->previewed[j].factor < *least) *least = s->previewed[j].factor;
+    }
+    return heard < (real)INFINITY ? heard : unheard;
 }
 
 /* Squares: d^ summed over microphones, x over references, x'_j over both. */
@@ -212,15 +228,21 @@ int descend(signals *s, const real *error)
     return ANC_DONE;
 }
 
-int64_t anc_listen(anc_view *view, const real *x, const real *e, const uint8_t *adapt, int64_t n)
+static int follow(signals *s, const real *error)
+{
+    const int refused = estimate(s, error);
+    if (!refused) commit(s);
+    return refused;
+}
+
+int64_t anc_listen(const anc_algorithm *a, anc_view *view, const real *x, const real *e, const uint8_t *adapt, int64_t n, int32_t *answer)
 {
     signals *s = (signals *)view;
     for (int64_t t = 0; t < n; t++) {
-        if (take_reference(s, x + t * s->I)) return t;
+        const real *error = adapt[t] ? e + t * s->K : NULL;
+        if ((*answer = take_reference(s, x + t * s->I))) return t;
         for (int32_t j = 0; j < s->J; j++) emit(s, j, 0);
-        if (!adapt[t]) continue;
-        if (estimate(s, e + t * s->K)) return t;
-        commit(s);
+        if ((*answer = a->listen ? a->listen(view, error) : error ? follow(s, error) : ANC_DONE)) return t;
     }
     return n;
 }

@@ -11,6 +11,13 @@ static const real LOUDEST = 1e12f, LARGEST = 1e6f;
 static const real LOUDEST = 1e100, LARGEST = 1e50;
 #endif
 
+/* The most that a setting which is a variance may be: neither it nor its sum over all samples overflows. */
+#ifdef ANC_FLOAT
+#define MOST_VARIANCE 1e25f
+#else
+#define MOST_VARIANCE 1e50
+#endif
+
 enum { ANC_MOST_SETTINGS = 8, ANC_GUARD_TAPS = 48 };
 
 typedef struct { /* delay lines that advance together */
@@ -50,6 +57,7 @@ static inline int within(real value, real most) { return value <= most && value 
 static inline real *weights_of(const signals *s, int32_t j) { return s->weights + times(j, s->I * s->L); }
 
 /* Layout. */
+#define COLUMNS(type) (int32_t)(sizeof(type) / sizeof(real))
 real *reals(anc_layout *at, const char *name, anc_role role, int32_t n0, int32_t n1, int32_t n2, int32_t n3);
 int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n);
 void layout_signals(signals *s, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
@@ -59,7 +67,9 @@ void start_signals(signals *s, const anc_plan *plan, const anc_setting *settings
 int take_reference(signals *s, const real *reference);
 real filter_output(const signals *s, int32_t j);                  /* sum_i w_ji' x_i */
 void emit(signals *s, int32_t j, real y);                         /* through limiter and amplifier model, into the delay line of y */
+int filtered_signal(anc_view *view, const real *reference, real *control); /* these three: the control_signal of most algorithms */
 int estimate(signals *s, const real *error);                      /* d^, with the powers and factors previewed */
+real least_factor(const signals *s);                              /* previewed, of the loudspeakers that a microphone hears; of none: of all */
 void commit(signals *s);                                          /* take the previewed powers */
 real heard_output(const signals *s, const lines *rows, int32_t k); /* sum_ji w_ji' x'_kji, or with the guarded rows */
 int descend(signals *s, const real *error);                       /* the steps of all loudspeakers; commits */
