@@ -32,12 +32,16 @@ static void start(anc_view *view, const anc_plan *plan, const anc_setting *setti
 static real look(diagonal *f, const lines *rows, int32_t k, real r)
 {
     const signals *s = &f->s;
+    const int32_t n = s->J * s->I, L = s->L;
     real S = *s->setting[MEASUREMENT_NOISE];
-    for (int32_t ji = 0; ji < s->J * s->I; ji++) {
-        const real *x = newest(rows, k * s->J * s->I + ji);
-        real *restrict p = f->variances + times(ji, s->L), *restrict g = f->direction + times(ji, s->L);
-        for (int32_t l = 0; l < s->L; l++) p[l] += r, g[l] = p[l] * x[l];
-        S += dot(g, x, s->L);
+    for (int32_t ji = 0; ji < n; ji++) {
+        const real *x = newest(rows, k * n + ji);
+        real *restrict p = f->variances + times(ji, L), *restrict g = f->direction + times(ji, L);
+        for (int32_t l = 0; l < L; l++) {
+            p[l] += r;
+            g[l] = p[l] * x[l];
+        }
+        S += dot(g, x, L);
     }
     return 1 / S;
 }
@@ -45,16 +49,16 @@ static real look(diagonal *f, const lines *rows, int32_t k, real r)
 /* Measure d = w'x' + e_o at microphone k: with K = p x' / S, w += K (d - w'x') and p -= K x' p. */
 static void measure(diagonal *f, const lines *rows, int32_t k, real d, real r)
 {
-    signals *s = &f->s;
+    const signals *s = &f->s;
+    const int32_t n = s->J * s->I, L = s->L;
     const real inverse = look(f, rows, k, r), step = inverse * (d - heard_output(s, rows, k));
     /* Without measurement noise, a reference that is silent, or nearly, tells nothing. */
-    if (!isfinite(inverse) || !within(step * root(dot(f->direction, f->direction, states(s))), LARGEST)) return;
-    add_scaled(s->weights, step, f->direction, states(s));
-    for (int32_t ji = 0; ji < s->J * s->I; ji++) {
-        const real *x = newest(rows, k * s->J * s->I + ji);
-        real *restrict p = f->variances + times(ji, s->L);
-        const real *restrict g = f->direction + times(ji, s->L);
-        for (int32_t l = 0; l < s->L; l++) {
+    if (!isfinite(inverse) || !within(step * root(dot(f->direction, f->direction, n * L)), LARGEST)) return;
+    add_scaled(s->weights, step, f->direction, n * L);
+    for (int32_t ji = 0; ji < n; ji++) {
+        const real *x = newest(rows, k * n + ji), *g = f->direction + times(ji, L);
+        real *restrict p = f->variances + times(ji, L);
+        for (int32_t l = 0; l < L; l++) {
             const real left = 1 - inverse * g[l] * x[l];
             p[l] *= left > 0 ? left : 0; /* rounding of S can make it negative */
         }

@@ -198,9 +198,10 @@ static int advanced(arrays *f, int32_t i)
 static void correct_pair(arrays *f, real d)
 {
     turns *turn = f->turns;
-    const int32_t elder = (int32_t)turn->elder, younger = 1 - elder;
+    const int32_t elder = (int32_t)turn->elder, younger = 1 - elder, L = f->s.L;
     const real memory = *f->s.setting[MEMORY], largest = initial_variance(&f->s);
-    const real *w_elder = f->weights + times(elder, f->s.L), *w_younger = f->weights + times(younger, f->s.L);
+    const real *w_elder = f->weights + times(elder, L), *w_younger = f->weights + times(younger, L);
+    real *restrict mixed = f->s.weights;
     if (turn->elder_lost == 0) {
         if (advanced(f, elder)) correct(f, elder, d);
         else if (turn->lost += 1, turn->paired != 0) turn->elder_lost = 1;
@@ -212,14 +213,14 @@ static void correct_pair(arrays *f, real d)
     }
     real share = turn->paired != 0 ? f->numbers[younger].heard / memory : 0;
     if (share > 1) share = 1; /* samples that were not adapted to are heard, too */
-    for (int32_t l = 0; l < f->s.L; l++) f->s.weights[l] = w_elder[l] + share * (w_younger[l] - w_elder[l]);
+    for (int32_t l = 0; l < L; l++) mixed[l] = w_elder[l] + share * (w_younger[l] - w_elder[l]);
     if (share == 1) {
         turn->elder = (real)younger, turn->elder_lost = 0;
         turn->initial = MORE * turn->initial < largest ? MORE * turn->initial : largest;
-        restart(f, elder, f->s.weights);
+        restart(f, elder, mixed);
     } else if (turn->paired == 0 && f->numbers[elder].heard >= memory) {
         turn->paired = 1;
-        restart(f, younger, f->s.weights);
+        restart(f, younger, mixed);
     }
 }
 

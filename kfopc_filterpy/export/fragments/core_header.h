@@ -40,6 +40,7 @@ extern "C" {
 #define ${NAME}_LOUD_ESTIMATE 3 /* of the disturbance, e + s^ * y */
 #define ${NAME}_LOUD_STEP 4     /* of the weights: step size times error */
 #define ${NAME}_NO_SOLUTION 5
+#define ${NAME}_LOST_ARRAY 6
 
 /* All that changes. A copy of it is a copy of the controller. */
 typedef struct {
