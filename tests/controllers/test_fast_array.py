@@ -177,11 +177,6 @@ def test_a_loud_error_is_refused_and_nothing_changed(memory: int | None) -> None
     np.testing.assert_equal(state_of(controller), before)
 
 
-def test_it_takes_one_channel() -> None:
-    with pytest.raises(ValueError, match="FastArrayKalman takes one channel"):
-        FastArrayKalman(L, PATH[None, None], measurement_noise=0.01)
-
-
 def test_a_copy_goes_on_alone() -> None:
     x, d = signals()
     controller = FastArrayKalman(L, [0.9], measurement_noise=0.01)

@@ -144,8 +144,9 @@ def test_float64_gives_the_bits_of_python(name, tmp_path):
     assert not out.status.any()
 
 
-@pytest.mark.parametrize("name", CONTROLLERS)
+@pytest.mark.parametrize("name", [name for name in CONTROLLERS if name != "finite memory"])
 def test_float32_follows_python(name, tmp_path):
+    """But for the finite memory, whose arrays are lost sooner and then restarted."""
     trained, result = trained_and_run(name)
     program = CoreProgram(trained, tmp_path, "float32")
     out = program.run(result.reference, result.error)
