@@ -21,9 +21,9 @@ from ..power.limiter import RESERVE, LimiterState, spans_of
 from .precision import in_precision
 
 EXPORTED = (
-    "export_c takes the FxLMS family, DiagonalKalman and FastArrayKalman, whatever they have, and kf_anc and kf_opc: one "
-    "channel, exponential power estimates, with or without a limiter; no amplifier model, no secondary_path_uncertainty, no fading memory. "
-    "It takes no wrapper and no subclass with calls of its own"
+    "export_c takes the FxLMS family, DiagonalKalman and FastArrayKalman, whatever they have, and kf_anc and "
+    "kf_opc: one channel, exponential power estimates, with or without a limiter; no amplifier model, no "
+    "secondary_path_uncertainty, no fading memory. It takes no wrapper and no subclass with calls of its own"
 )
 OVERSHOOT = 1.1  # of limiter.c
 
