@@ -73,9 +73,7 @@ class DiagonalKalman(CoreController):
 
     name = "diagonal KF"
     algorithm = "diagonal"
-    checks = MappingProxyType(
-        dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative)
-    )
+    checks = MappingProxyType(dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative))
 
     def __init__(
         self,
