@@ -44,9 +44,9 @@ typedef struct {
 typedef struct { real root, c, s, t, h; } rotations; /* next gamma^-1/2; orthogonal: cosine, sine; hyperbolic: tangent, cosine */
 
 enum { MEASUREMENT_NOISE, INITIAL_VARIANCE, FORGETTING, MEMORY = FORGETTING };
-static const anc_setting growing[] = {
+static const anc_setting growing_settings[] = {
     {"measurement_noise", FLT_MIN, MOST_VARIANCE, 0}, {"initial_variance", FLT_MIN, MOST_VARIANCE, 0}, {"forgetting", FLT_MIN, 1, 0}, {0}};
-static const anc_setting finite[] = { /* float counts to 2^24, twice the memory */
+static const anc_setting finite_settings[] = { /* float counts to 2^24, twice the memory */
     {"measurement_noise", FLT_MIN, MOST_VARIANCE, 0}, {"initial_variance", FLT_MIN, MOST_VARIANCE, 0}, {"memory", 2, 1 << 23, 0}, {0}};
 
 /* The last entry of the gain relative to the column beyond which an array is lost; and one of a pair, which can be restarted. */
@@ -151,7 +151,7 @@ static int adapt_growing(anc_view *view, const real *error)
     return ANC_DONE;
 }
 
-const anc_algorithm anc_fast_array = {"fast-array KF", growing, layout_growing, start_growing, filtered_signal, adapt_growing, adapt_growing};
+const anc_algorithm anc_fast_array = {"fast-array KF", growing_settings, layout_growing, start_growing, filtered_signal, adapt_growing, adapt_growing};
 
 /* A finite memory of N samples: two growing ones without forgetting that take turns.
  *
@@ -238,4 +238,4 @@ static int adapt_finite(anc_view *view, const real *error)
     return ANC_DONE;
 }
 
-const anc_algorithm anc_finite_memory = {"finite-memory fast-array KF", finite, layout_finite, start_finite, filtered_signal, adapt_finite, adapt_finite};
+const anc_algorithm anc_finite_memory = {"finite-memory fast-array KF", finite_settings, layout_finite, start_finite, filtered_signal, adapt_finite, adapt_finite};

@@ -293,7 +293,13 @@ def test_a_controller_that_diverges_stays_finite_and_says_so(dtype, tmp_path):
     assert {0, 2} < set(out.status)
 
 
-@pytest.mark.parametrize("name", ["FxLMS", "MOV, everything", "rescaling, 2x2x2", "two-gradient, 2x2x2"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("FxLMS", "MOV, everything", "rescaling, 2x2x2", "two-gradient, 2x2x2", "diagonal KF-OPC, 2x2x2"),
+        *("fast array", "finite memory"),
+    ],
+)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_sanitizers_find_nothing(name, dtype, tmp_path):
     options = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
