@@ -97,4 +97,4 @@ static int update(anc_view *view, const real *error)
     return refused;
 }
 
-const anc_algorithm anc_repaired = {"KF-OPC repaired", repaired_settings, layout, start, control_signal, update};
+const anc_algorithm anc_repaired = {"KF-OPC repaired", repaired_settings, layout, start, control_signal, update, NULL};

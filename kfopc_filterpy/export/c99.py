@@ -90,17 +90,17 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     - ``void anc_init(anc_state *state)``: set the state to the controller's as it was when exported;
     - ``double anc_control_signal(anc_state *state, double reference)``: return y(n);
     - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing changed;
-    - ``int anc_self_test(anc_state *state)``, of the FxLMS family: return 0 if known samples give the known results.
+    - ``int anc_self_test(anc_state *state)``, of a controller of the core: return 0 if known samples give the known results.
 
     With several channels, the numbers are arrays, and `anc_control_signal` sets its third argument, y(n).
 
-    The files of the FxLMS family contain the package's own core: with the flags that the header states, float64 gives the
-    bits that Python gives. The others are written for the export, and differ from Python by rounding.
+    The files of a controller of the core contain the core itself: with the flags that the header states, float64 gives
+    the bits that Python gives. The others are written for the export, and differ from Python by rounding.
 
     Parameters
     ----------
-    controller : FxLMS and its relatives, DiagonalKalman, or what kf_anc or kf_opc returns
-        Of the FxLMS family any controller: several channels, limiters, amplifier models, an uncertain secondary path,
+    controller : FxLMS and its relatives, DiagonalKalman, FastArrayKalman, or what kf_anc or kf_opc returns
+        Of the core any controller: several channels, limiters, amplifier models, an uncertain secondary path,
         sliding windows. Of the others, one of one channel, with a limiter or without. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Existing files are
@@ -113,7 +113,7 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     Returns
     -------
     CExport
-        The files, the size of the state and, but for the FxLMS family, the operations per sample. The header states
+        The files, the size of the state and, but for the core, the operations per sample. The header states
         them too.
 
     Raises

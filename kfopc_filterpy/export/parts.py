@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..controllers.compiled_controller import CompiledController
-from ..controllers.diagonal import DiagonalState
 from ..controllers.kalman import KalmanState
 from ..controllers.step import Lines
 from ..core.running import LINEAR
@@ -22,9 +21,9 @@ from ..power.limiter import RESERVE, LimiterState, spans_of
 from .precision import in_precision
 
 EXPORTED = (
-    "export_c takes the FxLMS family, whatever it has, and DiagonalKalman, kf_anc and kf_opc: one channel, exponential "
-    "power estimates, with or without a limiter; no amplifier model, no secondary_path_uncertainty, no fading memory. "
-    "It takes no wrapper and no subclass with calls of its own"
+    "export_c takes the FxLMS family, DiagonalKalman and FastArrayKalman, whatever they have, and kf_anc and "
+    "kf_opc: one channel, exponential power estimates, with or without a limiter; no amplifier model, no "
+    "secondary_path_uncertainty, no fading memory. It takes no wrapper and no subclass with calls of its own"
 )
 OVERSHOOT = 1.1  # of limiter.c
 
@@ -209,28 +208,12 @@ def _limiter(limiter: LimiterState, dtype: np.dtype) -> Part:
     )
 
 
-def _constrained(state: DiagonalState | KalmanState) -> tuple[Values, set[str]]:
+def _constrained(state: KalmanState) -> tuple[Values, set[str]]:
     """Return the settings and flags of a Kalman filter's measurement alpha d^."""
     fixed = float(state.constraint.numbers["supplied_factor"][0])
     if math.isnan(fixed):
         return {}, {"POWERS"}
     return {"constraint_factor": Value(fixed, "alpha, fixed")}, set()
-
-
-def _diagonal(state: DiagonalState, dtype: np.dtype) -> Part:
-    n, n_path = state.weights.size, state.lines.secondary_estimate.size
-    settings, flags = _constrained(state)
-    noises = {
-        "state_noise": Value(state.state_noise, "r"),
-        "measurement_noise": Value(state.measurement_noise, "q"),
-    }
-    return Part(
-        "diagonal",
-        settings=settings | noises,
-        fields={"variances": Value(state.variances, "p, the diagonal of P", "ANC_TAPS")},
-        flags=flags,
-        operations=14 * n + 2 * n_path + 3,
-    )
 
 
 def _kalman(state: KalmanState, dtype: np.dtype) -> Part:
@@ -265,6 +248,5 @@ def _kalman(state: KalmanState, dtype: np.dtype) -> Part:
 
 
 ALGORITHMS: dict[type, Callable[..., Part]] = {
-    DiagonalState: _diagonal,
     KalmanState: _kalman,
 }

@@ -16,7 +16,7 @@
  * Of the library, memcpy, memset, strcmp and math.h are used.
  *
  * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A bad
- * reference counts as 0, and ${name}_update refuses that sample. A refused update changes nothing. An output is never NaN or
+ * reference counts as 0, and ${name}_update refuses that sample. A refused update learns nothing. An output is never NaN or
  * infinite: if the weights have grown that much, it is 0.
  */
 #ifndef ${NAME}_EXPORTED_H
@@ -40,6 +40,7 @@ extern "C" {
 #define ${NAME}_LOUD_ESTIMATE 3 /* of the disturbance, e + s^ * y */
 #define ${NAME}_LOUD_STEP 4     /* of the weights: step size times error */
 #define ${NAME}_NO_SOLUTION 5
+#define ${NAME}_LOST_ARRAY 6
 
 /* All that changes. A copy of it is a copy of the controller. */
 typedef struct {
