@@ -203,7 +203,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     has_gains = False  # True if it has Kalman gains, which scenarios can share
     unshared = ""  # the part that prevents sharing, if any
     _uncertainty: Any = None  # as it was assigned
-    _refusal = OVERFLOW  # reason of a refused update if no square overflows
 
     def __init__(
         self,
@@ -561,9 +560,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             e = as_signal(errors, "errors", length=x.size)
         taken = self._listen(x, e, adapt_flags(adapt, len(x)))
         if taken < len(x):
-            refused = ValueError(OVERFLOW if self.multichannel else self._refusal)
-            refused.add_note(f"in sample {taken} of those listened to")
-            raise refused
+            raise refused_while_listening(OVERFLOW, taken)
 
     def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return references and errors with a sample in each row."""
@@ -601,6 +598,13 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
 def calls_of(kind: type) -> tuple[Any, Any]:
     """Return a class's two methods per sample; if a subclass overrides one, Python must call it."""
     return kind.control_signal, kind.update  # type: ignore[attr-defined]
+
+
+def refused_while_listening(reason: str, sample: int) -> ValueError:
+    """Return the error of a sample that was refused before the control was switched on."""
+    refused = ValueError(reason)
+    refused.add_note(f"in sample {sample} of those listened to")
+    return refused
 
 
 def listed(values: Any, form: str) -> str:

@@ -14,7 +14,7 @@ from ..core.running import Steps
 from ..power.amplifiers import Amplifier, amplifier_models
 from ..power.constraint import NUMBERS
 from ..power.limiter import OutputLimiter
-from .base import LONGEST_CALL, FilteredReferenceController, Looped, calls_of
+from .base import LONGEST_CALL, FilteredReferenceController, Looped, calls_of, refused_while_listening
 from .channels import channel_sample
 
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
@@ -268,9 +268,9 @@ class CoreController(FilteredReferenceController):
         x, e = (signal.reshape(len(signal), -1) for signal in (references, errors))
         for begin in range(0, len(x), LONGEST_CALL):
             part = slice(begin, begin + LONGEST_CALL)
-            done = block.listen(x[part], e[part], adapting[part])
-            if done < len(x[part]):
-                return begin + done
+            done, answer = block.listen(x[part], e[part], adapting[part])
+            if answer:
+                raise refused_while_listening(reason_of(answer), begin + done)
         return len(x)
 
     def looped(self) -> Looped | None:

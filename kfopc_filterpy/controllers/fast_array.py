@@ -1,210 +1,23 @@
-"""The Kalman filter in O(L) per sample, by the fast array of `kernels.fast_array`: growing or finite memory."""
+"""The Kalman filter in O(L) per sample, by a fast array: growing or finite memory."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from .._validate import as_count, as_positive
-from ..kernels.compiling import inlined, part
-from ..kernels.delay_lines import latest, newest
-from ..kernels.fast_array import (
-    FastArray,
-    array_holds,
-    correct_by_rotations,
-    new_fast_array,
-    restart_array,
-    rotate_array,
-    stray,
-)
-from ..kernels.records import new_record
 from ..power.amplifiers import Amplifier
-from ..power.constraint import ConstraintState, OutputPowerConstraint, advance_constraint, squares_are_finite
+from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import constraint_or_none
-from .compiled_controller import CompiledController
-from .step import Lines, adapt, disturbance_estimate, follow, skip
+from .core_controller import CoreController
 
-# Of the finite memory, whose arrays can be restarted:
-LARGEST_STRAY = 1e-4  # beyond it an array is lost
-LESS, MORE = 0.01, 2.0  # factors of P at the next start, after an array was lost and after one lasted
+ENERGY, LOST = 1, 4  # places in the records `array_numbers` and `turns` of fast_array.c
 LEAST_MEMORY = 2  # in filter lengths
 
 
-class FastArrayState(NamedTuple):
-    """State of `FastArrayKalman` without a finite memory."""
-
-    lines: Lines
-    weights: np.ndarray
-    constraint: ConstraintState
-    array: FastArray
-
-
-class GrowingFilter(NamedTuple):
-    """One of the two filters of a finite memory, which remembers all since its start."""
-
-    array: FastArray
-    weights: np.ndarray
-
-
-class FiniteMemoryState(NamedTuple):
-    """State of `FastArrayKalman` with a finite memory."""
-
-    lines: Lines
-    weights: np.ndarray  # the two filters' weights, mixed
-    constraint: ConstraintState
-    one: GrowingFilter
-    other: GrowingFilter
-    numbers: np.ndarray  # record, see `new_pair`
-
-
-def new_pair(n_taps: int, initial: float, memory: int) -> tuple[GrowingFilter, GrowingFilter, np.ndarray]:
-    """Return two growing-memory filters, the first at its start, and the record of their turns."""
-    one, other = (
-        GrowingFilter(new_fast_array(n_taps, initial, largest_stray=LARGEST_STRAY), np.zeros(n_taps)) for _ in range(2)
-    )
-    turns = new_record(
-        memory=memory,  # N
-        elder_is_other=0,
-        paired=0,  # whether the younger filter runs
-        elder_lost=0,  # whether the elder stands still until the younger has taken over
-        initial=initial,  # P at the next start
-        largest_initial=initial,
-        lost=0,  # arrays lost to rounding so far
-    )
-    return one, other, turns
-
-
-@adapt.register(FastArrayState)
-def adapt_fast_array(state, error, control_signal):
-    """Apply eq. 2-9 by the two rotations."""
-    return rotate(state, error)
-
-
-@follow.register(FastArrayState)
-def follow_fast_array(state, error):
-    """Adapt while listening: the gains must follow the filtered reference from the first sample on."""
-    return rotate(state, error)
-
-
-@adapt.register(FiniteMemoryState)
-def adapt_finite_memory(state, error, control_signal):
-    """Apply eq. 2-9 to both filters, and mix them."""
-    return rotate_both(state, error)
-
-
-@follow.register(FiniteMemoryState)
-def follow_finite_memory(state, error):
-    """Adapt while listening, like the single array."""
-    return rotate_both(state, error)
-
-
-@skip.register(FastArrayState)
-def skip_fast_array(state):
-    """Advance the array, which must follow each sample of the filtered reference, as if the weights had been right."""
-    advance_if_held(state.array, newest(state.lines.filtered, state.weights.size + 1))
-
-
-@skip.register(FiniteMemoryState)
-def skip_finite_memory(state):
-    """Advance both arrays."""
-    row = newest(state.lines.filtered, state.weights.size + 1)
-    advance_if_held(state.one.array, row)
-    advance_if_held(state.other.array, row)
-
-
-@part()
-def advance_if_held(array, row):
-    """Advance an array without correcting weights; one that rounding has corrupted is left for the next update."""
-    if array_holds(array, row):
-        rotate_array(array)
-
-
-@inlined
-def rotate(state, error):
-    """Apply eq. 2-9 by the two rotations; return False, with nothing changed, if rounding has corrupted the array."""
-    row = newest(state.lines.filtered, state.weights.size + 1)
-    if not array_holds(state.array, row):
-        return False
-    d, x = disturbance_estimate(state.lines, error), latest(state.lines.reference)
-    if not squares_are_finite(d, row[0], x):
-        return False
-    factor = advance_constraint(state.constraint, d, row[0], x)
-    correct_by_rotations(state.array, state.weights, row, factor * d)
-    return True
-
-
-@inlined
-def rotate_both(state, error):
-    """Apply eq. 2-9 to both filters, and mix them; return False, with nothing changed, if a square overflows."""
-    row = newest(state.lines.filtered, state.weights.size + 1)
-    d, x = disturbance_estimate(state.lines, error), latest(state.lines.reference)
-    if not squares_are_finite(d, row[0], x):
-        return False
-    scaled = advance_constraint(state.constraint, d, row[0], x) * d
-    if state.numbers[0].elder_is_other == 0:
-        correct_pair(state.one, state.other, state.numbers, state.weights, row, scaled)
-    else:
-        correct_pair(state.other, state.one, state.numbers, state.weights, row, scaled)
-    return True
-
-
-@part()
-def correct_pair(elder, younger, numbers, mixed, row, d):
-    """Correct the two filters, mix them, and let them take turns.
-
-    The younger filter starts when the elder one has heard N samples, and takes over after N more, when the elder one is
-    restarted. Its share of the mixed weights grows in proportion to what it has heard, a/N. If the reference's statistics
-    are steady, the variance of the mixed weights is then that of least squares over N samples, at every sample: with
-    shares s = a/N and 1 - s of filters that average over a and a + N samples, it is in proportion to
-    a (s/a + (1 - s)/(a + N))^2 + N ((1 - s)/(a + N))^2 = 1/N.
-    """
-    turns = numbers[0]
-    if turns.elder_lost == 0 and not corrected(elder, row, d):
-        turns.lost += 1
-        if turns.paired != 0:
-            turns.elder_lost = 1
-        else:
-            turns.initial *= LESS
-            restart_array(elder.array, turns.initial)
-    if turns.paired != 0 and not corrected(younger, row, d):
-        turns.lost += 1
-        turns.initial *= LESS
-        restart(younger, elder.weights, turns.initial)
-    share = 0.0
-    if turns.paired != 0:
-        share = min(younger.array.numbers[0].heard / turns.memory, 1.0)  # skipped samples are heard without turns
-    for i in range(mixed.size):
-        mixed[i] = elder.weights[i] + share * (younger.weights[i] - elder.weights[i])
-    if share >= 1.0:
-        turns.elder_is_other = 1 - turns.elder_is_other
-        turns.elder_lost = 0
-        turns.initial = min(MORE * turns.initial, turns.largest_initial)
-        restart(elder, mixed, turns.initial)
-    elif turns.paired == 0 and elder.array.numbers[0].heard >= turns.memory:
-        turns.paired = 1
-        restart(younger, mixed, turns.initial)
-
-
-@part()
-def corrected(own, row, d):
-    """Correct a filter; return False, with its weights as they were, if rounding has corrupted its array."""
-    if not array_holds(own.array, row):
-        return False
-    correct_by_rotations(own.array, own.weights, row, d)
-    return True
-
-
-@part()
-def restart(own, weights, initial):
-    """Begin a filter again at `weights`."""
-    restart_array(own.array, initial)
-    for i in range(weights.size):
-        own.weights[i] = weights[i]
-
-
-class FastArrayKalman(CompiledController):
+class FastArrayKalman(CoreController):
     r"""Fast-array Kalman filter: eq. 2-9 with r = 0 in O(L), using the shift of the filtered reference.
 
     With `forgetting` = 1 it is `kf_anc` with ``state_noise=0`` (or `kf_opc`, with a rated power), to rounding. Below 1
@@ -237,7 +50,7 @@ class FastArrayKalman(CompiledController):
     forgetting : float, default 1
         Forgetting factor lambda, above 0 and at most 1.
     memory : int, optional
-        Memory N in samples, at least 2 L. The excess error is L/N of the measurement noise. Not with `forgetting` below
+        Memory N in samples, at least 2 L and at most 2^23. The excess error is L/N of the measurement noise. Not with `forgetting` below
         1. By default only `forgetting` limits the memory.
     rated_power : float, optional
         Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default there is no
@@ -263,15 +76,39 @@ class FastArrayKalman(CompiledController):
     The gains must follow the filtered reference from the first sample on. The filter therefore also adapts while it
     listens, before the control is switched on: it starts with weights learnt from the noise so far.
 
+    It uses the shift of the row by one sample at a time. Let P be in units of the measurement noise, u(n) = x'(n)^T the
+    row and :math:`\gamma^{-1}(n) = 1 + \lambda^{-1} u(n) P(n-1) u(n)^T`. Successive rows share all but one sample, so
+
+    .. math:: \lambda^{-1} \left( \begin{bmatrix} P(n) & 0 \\ 0 & 0 \end{bmatrix} -
+       \begin{bmatrix} 0 & 0 \\ 0 & P(n-1) \end{bmatrix} \right) = B(n)\, \mathrm{diag}(1, -1)\, B(n)^T
+
+    keeps its rank of two, which it has at the start if P(-1) = eta diag(lambda^2, ..., lambda^{L+1}). One orthogonal and
+    one hyperbolic rotation, which zero the second and third entry of the first row below, then update gain g, gamma and
+    B together:
+
+    .. math:: \begin{bmatrix} \gamma^{-1/2}(n) & \bar u(n+1) B(n) \\
+       \begin{bmatrix} 0 \\ g(n) \gamma^{-1/2}(n) \end{bmatrix} & B(n) \end{bmatrix} \Theta =
+       \begin{bmatrix} \gamma^{-1/2}(n+1) & 0 \\
+       \begin{bmatrix} g(n+1) \gamma^{-1/2}(n+1) \\ 0 \end{bmatrix} & \lambda^{1/2} B(n+1) \end{bmatrix}
+
+    with :math:`\bar u(n+1)` the L + 1 newest samples. With forgetting, rounding errors grow by the factor 1/lambda per
+    sample, since the errors of P are not forgotten. Without it they grow slowly, but if P(-1) is large, the rotations
+    cancel its digits. The last entry of the rotated gain column is zero in exact arithmetic, so it shows how far an
+    array has gone astray (`stray`).
+
+    An array can also begin in the middle of a signal if it takes the samples before as zeros: :math:`\bar u` then has
+    fewer entries than L + 1 at first, and the structure holds.
+
     References
     ----------
     R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control",
-    Int. J. Adapt. Control Signal Process. 19, 2005. The docstring of the module `kernels.fast_array` has the derivation.
+    Int. J. Adapt. Control Signal Process. 19, 2005; A. H. Sayed, Fundamentals of Adaptive Filtering, Wiley 2003, ch. 14
+    (fast array RLS), from which these equations follow.
 
     S. van Ophem, A. P. Berkhoff, "A numerically stable, finite memory, fast array recursive least squares filter for
     broadband active noise control", Int. J. Adapt. Control Signal Process. 30, 2016: two growing memories, mixed so that
     the information used is always the same, and restarted in turn. Of this paper we had only the abstract; the mixture,
-    the restart and what is done about a lost array are derived here (`correct_pair`, `restart_array`).
+    the restart and what is done about a lost array are derived here (``core/fast_array.c``).
 
     Examples
     --------
@@ -285,10 +122,7 @@ class FastArrayKalman(CompiledController):
     """
 
     name = "fast-array KF"
-    _refusal = (
-        "the fast array is lost to rounding: nothing was changed, and this filter cannot go on. Use memory= instead of "
-        "a forgetting factor, or kf_anc, whose O(L^2) form does not lose its covariance"
-    )
+    algorithm = "fast_array"
 
     def __init__(
         self,
@@ -304,8 +138,7 @@ class FastArrayKalman(CompiledController):
         amplifier: Amplifier | None = None,
         limiter: OutputLimiter | None = None,
     ) -> None:
-        q = as_positive(measurement_noise, "measurement_noise")
-        variance = as_positive(initial_variance, "initial_variance")
+        settings: dict[str, float] = {"measurement_noise": measurement_noise, "initial_variance": initial_variance}
         forgetting = as_positive(forgetting, "forgetting")
         if forgetting > 1.0:
             raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
@@ -316,44 +149,52 @@ class FastArrayKalman(CompiledController):
                 raise ValueError(f"memory must be {LEAST_MEMORY} n_taps = {least} samples at least, got {memory}")
             if forgetting < 1.0:
                 raise ValueError(f"give either memory or a forgetting factor below 1, got {memory} and {forgetting:g}")
+            self.algorithm = "finite_memory"
+            settings["memory"] = memory
+        else:
+            settings["forgetting"] = forgetting
         own = constraint_or_none(rated_power, constraint)
         super().__init__(
-            n_taps, secondary_path, amplifier=amplifier, constraint=own, limiter=limiter, filtered_taps=n_taps + 1
+            n_taps,
+            secondary_path,
+            settings=settings,
+            n_references=None,
+            amplifier=amplifier,
+            constraint=own,
+            limiter=limiter,
         )
         self.name = ("" if memory is None else "finite-memory ") + (
             "fast-array KF" if own is None else "fast-array KF-OPC"
         )
-        initial = variance / (q * forgetting)
-        self._state: FastArrayState | FiniteMemoryState
-        if memory is None:
-            self._state = FastArrayState(*self._common(), new_fast_array(self.n_taps, initial, forgetting))
-        else:
-            self._state = FiniteMemoryState(*self._common(), *new_pair(self.n_taps, initial, memory))
 
     @property
     def forgetting(self) -> float:
         """Forgetting factor lambda."""
-        return float(self._arrays[0].numbers["forgetting"][0])
+        return self._of_setting("forgetting") if self.algorithm == "fast_array" else 1.0
 
     @property
     def memory(self) -> int | None:
         """Memory N in samples; None without a finite memory."""
-        return int(self._state.numbers["memory"][0]) if isinstance(self._state, FiniteMemoryState) else None
+        return int(self._of_setting("memory")) if self.algorithm == "finite_memory" else None
 
     @property
     def stray(self) -> float:
         """Relative size of what rounding adds to the array, 0 in exact arithmetic; with a finite memory, the larger."""
-        return max(stray(array) for array in self._arrays)
+        fields = self._opened().fields
+        last, energy = fields["gain"][0, 0, :, -1], fields["arrays"][0, 0, :, ENERGY]
+        return float(np.max(np.abs(last) / np.sqrt(np.where(energy > 0.0, energy, np.inf))))
 
     @property
     def arrays_lost(self) -> int:
         """Number of arrays that a finite memory has restarted before their time, because rounding had spoilt them."""
-        return int(self._state.numbers["lost"][0]) if isinstance(self._state, FiniteMemoryState) else 0
+        return int(self._opened().fields["turns"].flat[LOST]) if self.algorithm == "finite_memory" else 0
 
-    @property
-    def _arrays(self) -> tuple[FastArray, ...]:
-        state = self._state
-        return (state.one.array, state.other.array) if isinstance(state, FiniteMemoryState) else (state.array,)
+    def _takes_guard(self) -> bool:
+        return False
 
     def _filter_again(self) -> None:
         """Keep the filtered reference: the array needs each row to be the last one, shifted by a sample."""
+        filtered = self._opened().fields["filtered_reference"]
+        before = filtered.copy()
+        super()._filter_again()
+        filtered[:] = before

@@ -65,7 +65,7 @@ typedef struct {
 } anc_layout;
 
 /* What a step returns. A step that is refused changed no state. */
-typedef enum { ANC_DONE, ANC_LOUD_REFERENCE, ANC_LOUD_ERROR, ANC_LOUD_ESTIMATE, ANC_LOUD_STEP, ANC_NO_SOLUTION } anc_answer;
+typedef enum { ANC_DONE, ANC_LOUD_REFERENCE, ANC_LOUD_ERROR, ANC_LOUD_ESTIMATE, ANC_LOUD_STEP, ANC_NO_SOLUTION, ANC_LOST_ARRAY } anc_answer;
 
 typedef struct {
     const char *name;
@@ -74,10 +74,12 @@ typedef struct {
     void (*start)(anc_view *view, const anc_plan *plan, const anc_setting *settings);    /* before the first sample, on zeros */
     int (*control_signal)(anc_view *view, const anc_real *reference, anc_real *control); /* (I) -> (S, J) */
     int (*update)(anc_view *view, const anc_real *error); /* (S, K); NULL: a sample that is not adapted to */
+    int (*listen)(anc_view *view, const anc_real *error); /* the same while the loudspeakers are silent; NULL: follow the powers */
 } anc_algorithm;
 
 extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_optimal_leaky, anc_mov, anc_mov_fixed, anc_two_gradient,
-    anc_clipping, anc_rescaling, anc_kalman, anc_repaired, anc_signals_alone;
+    anc_clipping, anc_rescaling, anc_kalman, anc_diagonal, anc_fast_array, anc_finite_memory, anc_repaired,
+    anc_signals_alone;
 
 /* Bytes of a block; 0 if the plan is refused: a shape below 1, a setting out of its range, a path that is not finite, too large. */
 ANC_PUBLIC size_t anc_size(const anc_algorithm *algorithm, const anc_plan *plan);
@@ -87,8 +89,8 @@ ANC_PUBLIC void anc_describe(const anc_algorithm *algorithm, const anc_plan *pla
 /* Filter the stored references again, after the paths or the guard in the block have changed. */
 ANC_PUBLIC void anc_refilter(anc_view *view);
 /* Follow x, (n, I), and e, (n, S, K), while the loudspeakers are silent: delay lines advance, and powers where `adapt` is 1; the weights
- * stay. Return the number of samples before a refused one. */
-ANC_PUBLIC int64_t anc_listen(anc_view *view, const anc_real *x, const anc_real *e, const uint8_t *adapt, int64_t n);
+ * stay, unless the algorithm listens in its own way. Return the number of samples before a refused one, whose answer is set. */
+ANC_PUBLIC int64_t anc_listen(const anc_algorithm *algorithm, anc_view *view, const anc_real *x, const anc_real *e, const uint8_t *adapt, int64_t n, int32_t *answer);
 
 /* Parts that also work alone. */
 

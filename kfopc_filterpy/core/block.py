@@ -23,13 +23,15 @@ _EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 
 # What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
-LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION = range(1, 6)
+LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION, LOST_ARRAY = range(1, 7)
 REASONS = {
     LOUD_REFERENCE: "the reference is too loud, above 1e100 over the gain of the secondary path: scale the signals",
     LOUD_ERROR: "the error is too loud, above 1e100: scale the signals",
     LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100: scale the signals",
     LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
     NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
+    LOST_ARRAY: "the fast array is lost to rounding: this filter cannot go on. Use memory= instead of a forgetting factor, "
+    "or kf_anc, whose O(L^2) form does not lose its covariance",
 }
 
 
@@ -60,7 +62,7 @@ class _Algorithm(ctypes.Structure):
     _fields_ = [
         ("name", ctypes.c_char_p),
         ("settings", ctypes.POINTER(_Setting)),
-        *((name, ctypes.c_void_p) for name in ("layout", "start", "control_signal", "update")),
+        *((name, ctypes.c_void_p) for name in ("layout", "start", "control_signal", "update", "listen")),
     ]
 
 
@@ -319,13 +321,24 @@ class Block:
         finally:
             self._leave()
 
-    def listen(self, references: NDArray[np.float64], errors: NDArray[np.float64], adapting: NDArray[np.bool_]) -> int:
-        """Follow (n, I) and (n, K) while the loudspeakers are silent; return the number of samples before a refusal."""
-        arrays = [np.ascontiguousarray(array) for array in (references, errors, adapting)]
+    def listen(
+        self, references: NDArray[np.float64], errors: NDArray[np.float64], adapting: NDArray[np.bool_]
+    ) -> tuple[int, int]:
+        """Follow (n, I) and (n, K) while the loudspeakers are silent.
+
+        Return the number of samples before a refusal, and the answer, 0 if all is well.
+        """
+        arrays, answer = [np.ascontiguousarray(array) for array in (references, errors, adapting)], ctypes.c_int32()
         self._library.anc_listen.restype = ctypes.c_int64
         with self.in_use:
-            pointers = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
-            return self._library.anc_listen(self._view, *pointers, ctypes.c_int64(len(arrays[0])))
+            done = self._library.anc_listen(
+                ctypes.c_void_p(self.algorithm.pointer),
+                self._view,
+                *(ctypes.c_void_p(array.ctypes.data) for array in arrays),
+                ctypes.c_int64(len(arrays[0])),
+                ctypes.byref(answer),
+            )
+        return done, answer.value
 
     def refilter(self) -> None:
         """Filter the stored references again, after the path or the guard has changed."""

@@ -225,8 +225,11 @@ real downdate(covariance *c, real S, real q)
 {
     real inverse_root = S > CANCELLATION * q ? downdate_carefully(c, q) : 0;
     if (inverse_root > 0) return inverse_root;
+    real *restrict u = c->u;
+    const real *restrict Ph = c->Ph;
+    const int32_t n = c->padded;
     inverse_root = 1 / root(S);
-    for (int32_t j = 0; j < c->padded; j++) c->u[j] = c->Ph[j] * inverse_root;
+    for (int32_t j = 0; j < n; j++) u[j] = Ph[j] * inverse_root;
     c->owed->pending = 1;
     return inverse_root;
 }

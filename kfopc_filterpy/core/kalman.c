@@ -74,4 +74,4 @@ static int update_kalman(anc_view *view, const real *error)
     return correct_weights(f);
 }
 
-const anc_algorithm anc_kalman = {"Kalman filter", kalman_settings, layout_kalman, start_kalman, control_signal_plain, update_kalman};
+const anc_algorithm anc_kalman = {"Kalman filter", kalman_settings, layout_kalman, start_kalman, filtered_signal, update_kalman, NULL};

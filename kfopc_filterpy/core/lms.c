@@ -17,7 +17,7 @@ static int update_fxlms(anc_view *view, const real *error)
     return refused ? refused : descend(s, error);
 }
 
-const anc_algorithm anc_fxlms = {"FxLMS", fxlms, layout_plain, start_plain, control_signal_plain, update_fxlms};
+const anc_algorithm anc_fxlms = {"FxLMS", fxlms, layout_plain, start_plain, filtered_signal, update_fxlms, NULL};
 
 /* FxNLMS: w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)), with the energy of all filtered references. */
 
@@ -41,7 +41,7 @@ static int update_fxnlms(anc_view *view, const real *error)
     return refused ? refused : descend(s, error);
 }
 
-const anc_algorithm anc_fxnlms = {"FxNLMS", fxnlms, layout_plain, start_plain, control_signal_plain, update_fxnlms};
+const anc_algorithm anc_fxnlms = {"FxNLMS", fxnlms, layout_plain, start_plain, filtered_signal, update_fxnlms, NULL};
 
 /* Leaky FxLMS: w(n+1) = (1 - mu gamma) w(n) + mu e(n) x'(n). */
 
@@ -58,7 +58,7 @@ static int update_leaky(anc_view *view, const real *error)
     return refused ? refused : descend(s, error);
 }
 
-const anc_algorithm anc_leaky = {"leaky FxLMS", leaky, layout_plain, start_plain, control_signal_plain, update_leaky};
+const anc_algorithm anc_leaky = {"leaky FxLMS", leaky, layout_plain, start_plain, filtered_signal, update_leaky, NULL};
 
 /* Optimal leaky FxLMS: the same with gamma(n) = E[x^2] G_s (1 / alpha - 1). */
 
@@ -79,7 +79,7 @@ static int update_optimal_leaky(anc_view *view, const real *error)
     return refused ? refused : descend(s, error);
 }
 
-const anc_algorithm anc_optimal_leaky = {"optimal leaky FxLMS", fxlms, layout_plain, start_plain, control_signal_plain, update_optimal_leaky};
+const anc_algorithm anc_optimal_leaky = {"optimal leaky FxLMS", fxlms, layout_plain, start_plain, filtered_signal, update_optimal_leaky, NULL};
 
 /* MOV-FxLMS: w(n+1) = w(n) + mu [e(n) x'(n) - gamma y(n) x(n)], with gamma = G_s (1 / alpha - 1), or a fixed one.
  * Modified, it adapts to d^ - w'x' in place of the error. */
@@ -110,8 +110,8 @@ static int update_mov_fixed(anc_view *view, const real *error)
     return error ? descend_mov(s, error, s->setting[PENALTY_FACTOR]) : ANC_DONE;
 }
 
-const anc_algorithm anc_mov = {"MOV-FxLMS", mov, layout_plain, start_plain, control_signal_plain, update_mov};
-const anc_algorithm anc_mov_fixed = {"MOV-FxLMS fixed", mov_fixed, layout_plain, start_plain, control_signal_plain, update_mov_fixed};
+const anc_algorithm anc_mov = {"MOV-FxLMS", mov, layout_plain, start_plain, filtered_signal, update_mov, NULL};
+const anc_algorithm anc_mov_fixed = {"MOV-FxLMS fixed", mov_fixed, layout_plain, start_plain, filtered_signal, update_mov_fixed, NULL};
 
 /* Two-gradient FxLMS (Shi et al. 2019): FxLMS while |y(n)| <= A, else w(n+1) = w(n) - mu_y y(n) x(n). */
 
@@ -131,7 +131,7 @@ static int update_two_gradient(anc_view *view, const real *error)
     return refused ? refused : descend(s, error);
 }
 
-const anc_algorithm anc_two_gradient = {"two-gradient FxLMS", two_gradient, layout_plain, start_plain, control_signal_plain, update_two_gradient};
+const anc_algorithm anc_two_gradient = {"two-gradient FxLMS", two_gradient, layout_plain, start_plain, filtered_signal, update_two_gradient, NULL};
 
 /* Clipping FxLMS (Qiu and Hansen 2001): y(n) is clipped to A; re-scaling FxLMS: and w scaled by A / |y(n)|. Then FxLMS. */
 
@@ -157,5 +157,5 @@ static int limited_signal(anc_view *view, const real *reference, real *control, 
 static int control_signal_clipping(anc_view *view, const real *reference, real *control) { return limited_signal(view, reference, control, 0); }
 static int control_signal_rescaling(anc_view *view, const real *reference, real *control) { return limited_signal(view, reference, control, 1); }
 
-const anc_algorithm anc_clipping = {"clipping FxLMS", limited, layout_plain, start_plain, control_signal_clipping, update_fxlms};
-const anc_algorithm anc_rescaling = {"re-scaling FxLMS", limited, layout_plain, start_plain, control_signal_rescaling, update_fxlms};
+const anc_algorithm anc_clipping = {"clipping FxLMS", limited, layout_plain, start_plain, control_signal_clipping, update_fxlms, NULL};
+const anc_algorithm anc_rescaling = {"re-scaling FxLMS", limited, layout_plain, start_plain, control_signal_rescaling, update_fxlms, NULL};

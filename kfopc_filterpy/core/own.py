@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from . import building
-from .block import Algorithm, _Algorithm, _Plan, VISITOR
+from .block import VISITOR, Algorithm, _Algorithm, _Plan
 from .library import load
 
 CACHE_VARIABLE = "KFOPC_CACHE"
@@ -89,13 +89,6 @@ def load_algorithm(path: str | os.PathLike[str], name: str | None = None) -> Own
     ... {
     ...     start_signals((signals *)view, plan, settings);
     ... }
-    ... static int control_signal(anc_view *view, const real *reference, real *control)
-    ... {
-    ...     signals *s = (signals *)view;
-    ...     const int refused = take_reference(s, reference);
-    ...     for (int32_t j = 0; !refused && j < s->J; j++) emit(s, j, filter_output(s, j)), control[j] = s->control[j];
-    ...     return refused;
-    ... }
     ... static int update(anc_view *view, const real *error) // the delayless LMS, which takes the path for 1
     ... {
     ...     signals *s = (signals *)view;
@@ -105,7 +98,7 @@ def load_algorithm(path: str | os.PathLike[str], name: str | None = None) -> Own
     ...     for (int32_t i = 0; i < s->L; i++) s->weights[i] += *s->setting[0] * *error * newest(&s->x, 0)[i];
     ...     return ANC_DONE;
     ... }
-    ... const anc_algorithm anc_plain = {"plain LMS", settings, layout, start, control_signal, update};
+    ... const anc_algorithm anc_plain = {"plain LMS", settings, layout, start, filtered_signal, update};
     ... '''
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = Path(folder, "plain.c")
@@ -242,7 +235,7 @@ def _fault_of_fields(struct: Any) -> str:
 
 def _fields_of(struct: Any) -> Counter[str]:
     """Return how often `layout` makes each field of the smallest controller."""
-    plan = _Plan(microphones=1, loudspeakers=1, references=1, taps=1, path_taps=1)
+    plan = _Plan(scenarios=1, microphones=1, loudspeakers=1, references=1, taps=1, path_taps=1)
     names: Counter[str] = Counter()
 
     def take(_: Any, name: bytes, *rest: Any) -> None:

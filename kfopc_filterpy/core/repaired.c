@@ -97,4 +97,4 @@ static int update_repaired(anc_view *view, const real *error)
     return refused;
 }
 
-const anc_algorithm anc_repaired = {"KF-OPC repaired", repaired_settings, layout_repaired, start_repaired, control_signal_repaired, update_repaired};
+const anc_algorithm anc_repaired = {"KF-OPC repaired", repaired_settings, layout_repaired, start_repaired, control_signal_repaired, update_repaired, NULL};

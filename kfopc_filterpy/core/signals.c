@@ -47,13 +47,11 @@ static int32_t longest(const int32_t *lengths, int32_t n)
     return most;
 }
 
-#define COLUMNS(type) (int32_t)(sizeof(type) / sizeof(real))
-
 void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at)
 {
     const int32_t S = p->scenarios, K = p->microphones, J = p->loudspeakers, I = p->references;
     const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
-    const int32_t filtered = L > ANC_GUARD_TAPS ? L : ANC_GUARD_TAPS; /* a guard can come later, and needs the past */
+    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* a guard can come later, a fast array needs L + 1 samples */
     s->S = S, s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
     s->limited = p->limited;
     s->power_length = longest(p->power_windows, S * J), s->limiter_length = longest(p->limiter_windows, S * J);
@@ -155,7 +153,7 @@ void emit(signals *s, int32_t sj, real y)
     *newest(&s->y, sj) = anc_amplify(s->amplifier + sj, y);
 }
 
-int control_signal_plain(anc_view *view, const real *reference, real *control)
+int filtered_signal(anc_view *view, const real *reference, real *control)
 {
     signals *s = (signals *)view;
     const int refused = take_reference(s, reference);
@@ -271,15 +269,21 @@ int descend(signals *s, const real *error)
     return ANC_DONE;
 }
 
-int64_t anc_listen(anc_view *view, const real *x, const real *e, const uint8_t *adapt, int64_t n)
+static int follow(signals *s, const real *error)
+{
+    const int refused = estimate(s, error);
+    if (!refused) commit(s);
+    return refused;
+}
+
+int64_t anc_listen(const anc_algorithm *a, anc_view *view, const real *x, const real *e, const uint8_t *adapt, int64_t n, int32_t *answer)
 {
     signals *s = (signals *)view;
     for (int64_t t = 0; t < n; t++) {
-        if (take_reference(s, x + t * s->I)) return t;
+        const real *error = adapt[t] ? e + t * s->S * s->K : NULL;
+        if ((*answer = take_reference(s, x + t * s->I))) return t;
         for (int32_t sj = 0; sj < s->S * s->J; sj++) emit(s, sj, 0);
-        if (!adapt[t]) continue;
-        if (estimate(s, e + t * s->S * s->K)) return t;
-        commit(s);
+        if ((*answer = a->listen ? a->listen(view, error) : error ? follow(s, error) : ANC_DONE)) return t;
     }
     return n;
 }
@@ -307,4 +311,4 @@ static const anc_setting none[] = {{0}};
 
 static int update_estimate(anc_view *view, const real *error) { return error ? estimate((signals *)view, error) : ANC_DONE; }
 
-const anc_algorithm anc_signals_alone = {"signals alone", none, layout_plain, start_plain, control_signal_plain, update_estimate};
+const anc_algorithm anc_signals_alone = {"signals alone", none, layout_plain, start_plain, filtered_signal, update_estimate, NULL};

@@ -11,6 +11,13 @@ static const real LOUDEST = 1e12f, LARGEST = 1e6f;
 static const real LOUDEST = 1e100, LARGEST = 1e50;
 #endif
 
+/* The most that a setting which is a variance may be: neither it nor its sum over all samples overflows. */
+#ifdef ANC_FLOAT
+#define MOST_VARIANCE 1e25f
+#else
+#define MOST_VARIANCE 1e50
+#endif
+
 enum { ANC_MOST_SETTINGS = 8, ANC_GUARD_TAPS = 48 };
 
 typedef struct { /* delay lines that advance together */
@@ -50,6 +57,7 @@ static inline int within(real value, real most) { return value <= most && value 
 static inline real *weights_of(const signals *s, int32_t sj) { return s->weights + times(sj, s->I * s->L); }
 
 /* Layout. */
+#define COLUMNS(type) (int32_t)(sizeof(type) / sizeof(real))
 real *reals(anc_layout *at, const char *name, anc_role role, int32_t n0, int32_t n1, int32_t n2, int32_t n3);
 int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n);
 int32_t numbers_of(const anc_setting *setting, const anc_plan *plan); /* how many a setting has */
@@ -59,7 +67,7 @@ void start_signals(signals *s, const anc_plan *plan, const anc_setting *settings
 /* The same as functions of an algorithm, and the usual control signal: the weights' output. */
 void layout_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
 void start_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings);
-int control_signal_plain(anc_view *view, const real *reference, real *control);
+int filtered_signal(anc_view *view, const real *reference, real *control);
 
 /* The parts of a sample, in this order; `sj` is a loudspeaker of a scenario. Those that return int return ANC_DONE, or why they
  * refused, with nothing changed. */

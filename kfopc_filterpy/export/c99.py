@@ -75,7 +75,7 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
 
     - ``void anc_init(anc_state *state)``: set the state to the controller's as it was when exported;
     - ``double anc_control_signal(anc_state *state, double reference)``: return y(n);
-    - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing changed;
+    - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing learned;
     - ``int anc_self_test(anc_state *state)``: return 0 if known samples give the known results.
 
     With several channels, the numbers are arrays, and `anc_control_signal` sets its third argument, y(n).
@@ -86,9 +86,9 @@ def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any 
     Parameters
     ----------
     controller : CoreController
-        One whose algorithm is in the core, such as the FxLMS family or what `kf_anc`, `kf_opc`, `fx_rls` and
-        `kf_opc_repaired` return, with whatever it has: several channels, limiters, amplifier models, an uncertain
-        secondary path, sliding windows. It is not changed.
+        One whose algorithm is in the core, such as the FxLMS family, `DiagonalKalman`, `FastArrayKalman`, or what
+        `kf_anc`, `kf_opc`, `fx_rls` and `kf_opc_repaired` return, with whatever it has: several channels, limiters,
+        amplifier models, an uncertain secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Existing files are
         replaced.

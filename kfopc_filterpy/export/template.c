@@ -68,9 +68,13 @@ static void take(${name}_state *state, const real *x, real *y)
         if (!isfinite(y[j])) y[j] = 0;
 }
 
+/* Time goes on after a refused sample, too: it is one that is not adapted to. */
 static int adapt(${name}_state *state, const real *e)
 {
-    return state->fault ? state->fault : ALGORITHM.update(view_of(state), e);
+    anc_view *view = view_of(state);
+    const int refused = state->fault ? state->fault : ALGORITHM.update(view, e);
+    if (refused) ALGORITHM.update(view, NULL);
+    return refused;
 }
 
 void ${name}_init(${name}_state *state)

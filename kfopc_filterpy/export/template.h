@@ -17,9 +17,9 @@
  *
  * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A bad
  * reference counts as 0, and ${name}_update refuses that sample. It also refuses a disturbance estimate e + s^ * y that is too
- * loud, a step of the weights that is too large, and a covariance so large that the next one could overflow
- * (${NAME}_NO_SOLUTION). A refused update changes nothing. An output is never NaN or infinite: if the weights have grown that
- * much, it is 0.
+ * loud, a step of the weights that is too large, a covariance so large that the next one could overflow (${NAME}_NO_SOLUTION),
+ * and a fast array that is lost to rounding. A refused update learns nothing. An output is never NaN or infinite: if the
+ * weights have grown that much, it is 0.
  */
 #ifndef ${NAME}_EXPORTED_H
 #define ${NAME}_EXPORTED_H

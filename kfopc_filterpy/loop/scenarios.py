@@ -22,8 +22,15 @@ from .result import SimulationResult
 from .simulation import POWERS, RECORDED, STRETCH
 
 RESULTS = ("error", "control_signal", "amplifier_output", "anti_noise")
-# What scenarios that share gains must agree in, in words, by the names of fields.
-IN_WORDS = {
+# What scenarios that share gains must agree in, in words.
+SHAPE_IN_WORDS = {
+    "taps": "n_taps",
+    "path_taps": "their estimated secondary path",
+    "guard_taps": "their secondary-path uncertainty",
+    "power_windows": "the length of the sliding windows of their powers",
+    "limiter_windows": "the windows of their limiters",
+}
+IN_WORDS = {  # by the names of fields
     "secondary_path": "their estimated secondary path",
     "guard": "their secondary-path uncertainty",
     "reference": "the reference heard so far",
@@ -143,7 +150,9 @@ def simulate_scenarios(
     results = {name: np.full((count, x.size), np.nan) for name in RESULTS}
     noisy = [noise.filled(row) is not None for noise, row in zip(noises, results["error"], strict=True)]
     results["error"][np.logical_not(noisy)] = 0.0
-    present = np.array(np.broadcast_to(d, (count, x.size)), order="C")  # a copy: that of a diverged scenario is silenced
+    present = np.array(
+        np.broadcast_to(d, (count, x.size)), order="C"
+    )  # a copy: that of a diverged scenario is silenced
     signals = Signals(x[None], present, results["error"] if any(noisy) else None, *results.values())
     recorded = {
         name: np.full((count, x.size), np.nan) for name in (RECORDED + POWERS[:2] if record_powers else RECORDED)
@@ -185,6 +194,8 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
                 f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and others "
                 "whose steps are in the core"
             )
+        if looped.owner.algorithm.path is not None:
+            raise ValueError(f"controllers[{i}] has an algorithm of your own, which may know one scenario only: use simulate")
         blocks.append(looped.owner)
     for i, block in enumerate(blocks[1:], 1):
         difference = _difference(blocks[0], block)
@@ -197,8 +208,9 @@ def _difference(one: Block, other: Block) -> str | None:
     """Return what prevents two blocks from sharing gains, in words; None if nothing does."""
     if (one.algorithm.name, one.algorithm.path) != (other.algorithm.name, other.algorithm.path):
         return "the algorithm"
-    if one.shape != other.shape:
-        return "n_taps" if one.shape.taps != other.shape.taps else f"their shape, {one.shape} and {other.shape}"
+    for name, words in SHAPE_IN_WORDS.items():
+        if getattr(one.shape, name) != getattr(other.shape, name):
+            return words
     own = own_fields(one)
     for name in one.fields:
         if name in own or name in one.scratch or name.endswith("_at"):

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
+from helpers.channels import random_paths
+from helpers.comparing import state_of
 
 from kfopc_filterpy import DiagonalKalman, HardClipAmplifier, OutputPowerConstraint, kf_anc, kf_opc, simulate
 
@@ -93,16 +95,59 @@ def test_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:
     assert np.all(np.isfinite(controller.weights))
 
 
-def test_an_error_whose_square_overflows_is_refused_and_nothing_changed() -> None:
+def test_of_several_channels_it_is_its_equations() -> None:
+    """Two microphones measure the weights of two loudspeakers one after the other; the smaller factor scales them."""
+    rng, rated = np.random.default_rng(3), (0.05, 0.3)
+    paths = random_paths(2, 2, 4, seed=1)
+    x, e = rng.standard_normal(300), rng.standard_normal((2, 300))
+    constraints = [OutputPowerConstraint(power, memory_s=0.01) for power in rated]
+    controller = DiagonalKalman(L, paths, constraint=constraints, **NOISES)
+    w, p, y = np.zeros(2 * L), np.full(2 * L, 0.7), np.zeros((2, 300))
+    xf = np.array([[np.convolve(x, path)[:300] for path in of_microphone] for of_microphone in paths])
+    padded = np.pad(xf, ((0, 0), (0, 0), (L - 1, 0)))
+    for n in range(300):
+        y[:, n] = controller.control_signal([x[n]])
+        row_of_x = np.pad(x, (L - 1, 0))[n : n + L][::-1]
+        np.testing.assert_allclose(y[:, n], w.reshape(2, L) @ row_of_x, rtol=0, atol=1e-11)
+        controller.update(e[:, n])
+        factor = np.min(controller.constraint_factor)
+        p = p + 1e-5
+        for k in range(2):
+            d = e[k, n] + sum(np.convolve(y[j, : n + 1], paths[k, j])[n] for j in range(2))
+            h = padded[k, :, n : n + L][:, ::-1].ravel()
+            K = p * h / (p @ h**2 + 0.02)
+            w, p = w + K * (factor * d - h @ w), (1.0 - K * h) * p
+    assert factor < 0.8
+    np.testing.assert_allclose(controller.weights.ravel(), w, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(controller.variances.ravel(), p, rtol=1e-9)
+    assert controller.variances.shape == controller.weights.shape == (2, 1, L)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_loud_error_is_refused_and_nothing_changed(several: bool) -> None:
     x, d = signals()
-    controller = DiagonalKalman(L, PATH, rated_power=0.3, **NOISES)
-    simulate(controller, x, disturbance=d, secondary_path=PATH)
-    controller.control_signal(0.3)
-    before = pickle.dumps(controller)
-    with pytest.raises(ValueError, match="must have finite squares"):
-        controller.update(1e200)
-    assert pickle.dumps(controller) == before
+    paths = random_paths(2, 2, 4, seed=1) if several else PATH
+    controller = DiagonalKalman(L, paths, rated_power=0.3, **NOISES)
+    e = np.tile(d, (2, 1)) if several else d
+    controller.process(x[None] if several else x, e)
+    controller.control_signal([0.3] if several else 0.3)
+    before = state_of(controller)
+    with pytest.raises(ValueError, match="error is too loud"):
+        controller.update([0.1, 1e200] if several else 1e200)
+    assert [field.tobytes() for field in state_of(controller)] == [field.tobytes() for field in before]
     assert (controller.state_noise, controller.measurement_noise) == (1e-5, 0.02)
+
+
+def test_a_step_that_would_be_too_large_is_left_out() -> None:
+    """Without measurement noise, K = 1/x' for one tap: a reference next to nothing asks for too much."""
+    controller = DiagonalKalman(1, [1.0], state_noise=0.0, measurement_noise=0.0)
+    for x in (1e-60, 1e-160):  # of the second, even S underflows
+        controller.control_signal(x)
+        controller.update(1.0)
+        assert (controller.weights[0], controller.variances[0]) == (0.0, 1.0)
+    controller.control_signal(1e-40)
+    controller.update(1.0)
+    assert controller.weights[0] == pytest.approx(1e40)
 
 
 def test_a_copy_goes_on_alone() -> None:
@@ -118,7 +163,7 @@ def test_a_copy_goes_on_alone() -> None:
 
 
 @pytest.mark.parametrize("name", ["state_noise", "measurement_noise", "initial_variance"])
-@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, 1e51])
 def test_bad_variances_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         DiagonalKalman(L, PATH, **(NOISES | {name: value}))

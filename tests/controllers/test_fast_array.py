@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.comparing import state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfilt
@@ -17,6 +18,11 @@ from kfopc_filterpy.signals import band_limited_noise
 
 L = 6
 PATH = np.array([0.0, 0.8, -0.3])
+
+
+def root_of(controller: FastArrayKalman) -> float:
+    """gamma^(-1/2)."""
+    return float(controller._opened().fields["arrays"].flat[0])
 
 
 def signals(n: int = 400, seed: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -114,15 +120,13 @@ def test_an_array_that_rounding_has_spoilt_is_refused_and_nothing_changed(compil
     again = FastArrayKalman(L, PATH, measurement_noise=1e-6, forgetting=0.95)
     simulate(again, x[:lost_at], disturbance=d[:lost_at], secondary_path=PATH, compiled=compiled)
     # the refused sample changed neither weights, array nor powers
-    np.testing.assert_array_equal(controller.weights, again.weights)
-    assert pickle.dumps(controller.constraint) == pickle.dumps(again.constraint)
-    for part in ("gain", "first", "second"):
-        arrays = (getattr(made._state.array, part) for made in (controller, again))
-        np.testing.assert_array_equal(*arrays, err_msg=part)
-    before = pickle.dumps(controller)
+    for name in ("weights", "powers", "constraint", "gain", "first_column", "second_column", "arrays"):
+        fields = (made._opened().fields[name] for made in (controller, again))
+        np.testing.assert_array_equal(*fields, err_msg=name)
+    before = state_of(controller)
     with pytest.raises(ValueError, match="lost to rounding"):
         controller.update(1.0)
-    assert pickle.dumps(controller) == before
+    np.testing.assert_equal(state_of(controller), before)
     assert np.all(np.isfinite(controller.weights))
 
 
@@ -131,13 +135,12 @@ def test_a_spoilt_array_is_told_from_a_good_one() -> None:
     controller = FastArrayKalman(L, PATH, measurement_noise=1.0)
     x, d = signals(50)
     simulate(controller, x, disturbance=d, secondary_path=PATH)
-    assert controller._state.array.numbers["root"][0] >= 1.0
+    assert root_of(controller) >= 1.0
     broken = copy.deepcopy(controller)
-    broken._state.array.second[:] = 10.0
+    broken._opened().fields["second_column"][:] = 10.0
     broken.control_signal(1.0)
     with pytest.raises(ValueError, match="lost to rounding"):
         broken.update(1.0)
-    assert abs(broken._state.array.numbers["behind"][0]) > 1.0
 
 
 def test_while_it_listens_it_learns() -> None:
@@ -162,18 +165,16 @@ def test_an_array_that_is_lost_while_listening_is_refused() -> None:
     assert controller.forgetting == 0.95
 
 
-def test_an_error_whose_square_overflows_is_refused_and_nothing_changed() -> None:
+@pytest.mark.parametrize("memory", [None, 50])
+def test_a_loud_error_is_refused_and_nothing_changed(memory: int | None) -> None:
     x, d = signals()
-    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, rated_power=0.3)
+    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, rated_power=0.3, memory=memory)
     simulate(controller, x, disturbance=d, secondary_path=PATH)
     controller.control_signal(0.3)
-    twin = pickle.loads(pickle.dumps(controller))
-    with pytest.raises(ValueError, match="must have finite squares"):
+    before = state_of(controller)
+    with pytest.raises(ValueError, match="error is too loud"):
         controller.update(1e200)
-    for made in (controller, twin):  # as if nothing had been
-        made.update(0.1)
-    np.testing.assert_array_equal(controller.weights, twin.weights)
-    assert controller.constraint_factor == twin.constraint_factor
+    np.testing.assert_equal(state_of(controller), before)
 
 
 def test_a_copy_goes_on_alone() -> None:
@@ -293,7 +294,7 @@ def test_a_narrow_band_spoils_a_growing_memory_and_it_says_so() -> None:
     controller = FastArrayKalman(32, PATH, measurement_noise=1e-4, initial_variance=1.0)
     with pytest.raises(ValueError, match="lost to rounding"):
         simulate(controller, x, disturbance=d, secondary_path=PATH)
-    assert controller.stray > 0.1 or controller._state.array.numbers["root"][0] < 1.1
+    assert controller.stray > 0.1 or root_of(controller) < 1.1
 
 
 @pytest.mark.parametrize(("memory", "spoilt"), [(100, False), (3200, True)])
@@ -328,25 +329,13 @@ def test_a_finite_memory_keeps_a_rated_power() -> None:
     assert np.mean(result.control_signal[10_000:] ** 2) == pytest.approx(0.3, rel=0.1)
 
 
-def test_a_finite_memory_refuses_what_overflows_and_nothing_changed() -> None:
-    x, d = signals()
-    controller = FastArrayKalman(L, PATH, measurement_noise=0.01, memory=50)
-    simulate(controller, x, disturbance=d, secondary_path=PATH)
-    controller.control_signal(0.3)
-    twin = pickle.loads(pickle.dumps(controller))
-    with pytest.raises(ValueError, match="must have finite squares"):
-        controller.update(1e200)
-    for made in (controller, twin):
-        made.update(0.1)
-    np.testing.assert_array_equal(controller.weights, twin.weights)
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"memory": 2 * L - 1}, "memory must be 2 n_taps = 12 samples at least, got 11"),
         ({"memory": 100, "forgetting": 0.99}, "give either memory or a forgetting factor below 1"),
         ({"memory": 0}, "memory"),
+        ({"memory": 2**23 + 1}, "out of its range"),
     ],
 )
 def test_a_bad_memory_is_refused(settings: dict[str, Any], message: str) -> None:

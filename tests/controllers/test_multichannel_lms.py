@@ -16,7 +16,7 @@ from helpers.comparing import assert_same_run
 from kfopc_filterpy import (
     KFOPC,
     ClippingFxLMS,
-    DiagonalKalman,
+    FastArrayKalman,
     FxLMS,
     FxNLMS,
     HardClipAmplifier,
@@ -468,7 +468,7 @@ def test_several_references_need_no_channel_axes() -> None:
         (lambda: FxNLMS(L, PATHS, step_size=MU, regularization=0.0), ValueError, "regularization must be greater than 0"),
         (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use controllers.SharedGainKalman, .* FxNLMS"),
         (lambda: KalmanController(KFOPC(L), PATHS), ValueError, "KalmanController takes one channel"),
-        (lambda: DiagonalKalman(L, PATHS, state_noise=0.0, measurement_noise=1.0), ValueError, "DiagonalKalman takes one channel: .* with the setting n_references take several"),
+        (lambda: FastArrayKalman(L, PATHS, measurement_noise=1.0), ValueError, "FastArrayKalman takes one channel: .* with the setting n_references take several"),
     ],
     ids=range(19),
 )  # fmt: skip

@@ -239,6 +239,7 @@ BUDGET: dict[str, Any] = {"rated_power": [0.1, 0.2], "fs": FS, "memory_s": 0.5, 
 OF_SEVERAL: dict[str, Any] = {
     "FxLMS": lambda s: FxLMS(N_TAPS, s, step_size=0.1 * MU, **MANY),
     "KF-ANC": lambda s: kf_anc(N_TAPS, s, **KALMAN, **MANY),
+    "diagonal KF": lambda s: DiagonalKalman(N_TAPS, s, **KALMAN, **MANY),
 }
 OF_BLOCKS: dict[str, Any] = {
     "direct": lambda s, **more: kf_pb(N_TAPS, s, form="direct", **KALMAN, **BUDGET, **more),

@@ -118,6 +118,7 @@ SEVERAL: dict[str, Any] = {
     "kf_pb, frequency domain": lambda: kf_pb(
         L, PATHS, rated_power=0.05, form="frequency domain", fs=FS, block=16, limiter=limiters(), **MANY
     ),
+    "DiagonalKalman": lambda: DiagonalKalman(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
     "FxLMS": lambda: FxLMS(L, PATHS, step_size=MU, limiter=limiters(), **MANY),
     "FxNLMS": lambda: FxNLMS(L, PATHS, step_size=0.1, **MANY),
     "LeakyFxLMS": lambda: LeakyFxLMS(L, PATHS, step_size=MU, leak=[0.3, 0.1], **MANY),
