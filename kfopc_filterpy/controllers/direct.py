@@ -146,6 +146,20 @@ class DirectKalman(CoreController):
         self._opened().fields["measurement_noise"][:] = noise
 
     @property
+    def innovation(self) -> Any:
+        """Innovation alpha d^ - w'x' of the last sample; with several channels (K,)."""
+        return self._of_microphones("innovation")
+
+    @property
+    def innovation_variance(self) -> Any:
+        """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
+        return self._of_microphones("innovation_variance")
+
+    def _of_microphones(self, name: str) -> Any:
+        values = self._opened().fields[name].ravel()
+        return values.copy() if self.multichannel else float(values[0])
+
+    @property
     def covariance(self) -> np.ndarray:
         """State covariance P, (J I L, J I L), in the order of ``weights.ravel()``; a new array."""
         fields = {name: self._opened().fields[name].ravel() for name in ("owed", "triangle", "gain_direction")}

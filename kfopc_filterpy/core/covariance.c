@@ -88,6 +88,21 @@ static real pass(covariance *c, real pending, real diagonal)
     return dot(h, Ph, c->padded);
 }
 
+/* Set T to scale (T - pending u u'), with a fading memory only: in `pass`, (scale u_i) u_j would not be (scale u_j) u_i to the bit,
+ * and fading makes such a difference grow. */
+static void fade(covariance *c)
+{
+    const real *restrict u = c->u;
+    real *restrict row = c->T;
+    for (int32_t i = 0; i < c->padded; i++) {
+        const int32_t length = i / PARTS * PARTS + PARTS;
+        const real ui = c->owed->pending * u[i], scale = c->owed->scale;
+        for (int32_t j = 0; j < length; j++) row[j] = scale * (row[j] - ui * u[j]);
+        row += length;
+    }
+    c->owed->pending = 0;
+}
+
 /* Raise a variance that is rounded below zero, h'P h < 0, with all of the diagonal; return the new h'P h. */
 static real lift(covariance *c, real variance)
 {
@@ -116,10 +131,8 @@ real project(covariance *c)
         if (owed->diagonal < least) owed->diagonal = least;
     }
     owed->bound = owed->scale * owed->bound + owed->diagonal;
-    if (owed->scale != 1) { /* only with a fading memory */
-        for (size_t i = 0; i < triangle(c->n); i++) c->T[i] *= owed->scale;
-    }
-    const real variance = pass(c, owed->scale * owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
+    if (owed->scale != 1) fade(c);
+    const real variance = pass(c, owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
     owed->scale = 1, owed->diagonal = owed->pending = 0;
     return variance < blur * owed->bound ? blurred(c, variance, blur) : variance;
 }

@@ -10,6 +10,8 @@ void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *sett
     layout_signals(&f->s, plan, settings, at);
     layout_covariance(&f->c, states(&f->s), at);
     f->scaled = reals(at, "measurement", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
+    f->innovation = reals(at, "innovation", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
+    f->variance = reals(at, "innovation_variance", ANC_SCRATCH, 1, 1, 1, f->s.K);
 }
 
 void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)
@@ -37,15 +39,16 @@ static real energy(const signals *s, const lines *rows, int32_t k)
 /* Measure at microphone k: eq. 5-9 for every scenario, with one gain. */
 static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
 {
-    const int32_t n = f->c.n;
+    const int32_t K = f->s.K;
     const real q = f->s.setting[MEASUREMENT_NOISE][k];
     observe(f, rows, k);
-    const real S = project(&f->c) + q; /* eq. 7 */
-    if (!(S > 0)) return;              /* no noise, and nothing that P leaves open: nothing is told */
-    const real inverse_root = downdate(&f->c, S, q);
+    const real S = project(&f->c) + q;                           /* eq. 7 */
+    const real inverse_root = S > 0 ? downdate(&f->c, S, q) : 0; /* S = 0: P leaves nothing open, and the row tells nothing */
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         real *w = weights_of(&f->s, scenario * f->s.J);
-        correct(&f->c, w, (z ? z[scenario * f->s.K + k] : 0) - dot(f->c.h, w, n), inverse_root, LARGEST);
+        const real y = (z ? z[scenario * K + k] : 0) - dot(f->c.h, w, f->c.n);
+        if (z) f->innovation[scenario * K + k] = y, f->variance[k] = S;
+        if (S > 0) correct(&f->c, w, y, inverse_root, LARGEST);
     }
 }
 

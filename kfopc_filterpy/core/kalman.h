@@ -6,7 +6,8 @@
 typedef struct {
     signals s;
     covariance c;
-    real *scaled; /* (S, K) alpha d^, the measurements */
+    real *scaled;                /* (S, K) alpha d^, the measurements */
+    real *innovation, *variance; /* (S, K) and (K), S of eq. 7, of the last sample */
     real *trim;   /* (S, J, TRIMS) of repaired.c only */
 } kalman;
 

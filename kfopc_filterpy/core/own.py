@@ -80,15 +80,7 @@ def load_algorithm(path: str | os.PathLike[str], name: str | None = None) -> Own
     >>> from kfopc_filterpy.controllers import CoreController, load_algorithm
     >>> code = '''
     ... #include "signals.h"
-    ... static const anc_setting settings[] = {{"step_size", 0, 0, 0}, {0}}; // any value from 0 on, one for all
-    ... static void layout(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
-    ... {
-    ...     layout_signals((signals *)view, plan, settings, at);
-    ... }
-    ... static void start(anc_view *view, const anc_plan *plan, const anc_setting *settings)
-    ... {
-    ...     start_signals((signals *)view, plan, settings);
-    ... }
+    ... static const anc_setting settings[] = {{"step_size", 0, 0, ANC_ONE}, {0}}; // any value from 0 on, one for all
     ... static int update(anc_view *view, const real *error) // the delayless LMS, which takes the path for 1
     ... {
     ...     signals *s = (signals *)view;
@@ -98,7 +90,7 @@ def load_algorithm(path: str | os.PathLike[str], name: str | None = None) -> Own
     ...     for (int32_t i = 0; i < s->L; i++) s->weights[i] += *s->setting[0] * *error * newest(&s->x, 0)[i];
     ...     return ANC_DONE;
     ... }
-    ... const anc_algorithm anc_plain = {"plain LMS", settings, layout, start, filtered_signal, update};
+    ... const anc_algorithm anc_plain = {"plain LMS", settings, layout_plain, start_plain, filtered_signal, update};
     ... '''
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = Path(folder, "plain.c")

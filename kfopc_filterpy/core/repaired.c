@@ -7,7 +7,7 @@
 
 enum { OF_CONTROL = KALMAN_SETTINGS, TRIM_RATE, AT_OUTPUT };
 static const anc_setting repaired_settings[] = {
-    KALMAN_SETTINGS_LISTED, {"of_control", 0, 1, ANC_ONE}, {"trim_rate", 0, 1, ANC_ONE}, {"at_output", 0, 1, ANC_ONE}, {0}};
+    KALMAN_SETTINGS_LISTED, {"of_control", 0, 1, ANC_ONE}, {"trim_rate", 0, 0, ANC_ONE}, {"at_output", 0, 1, ANC_ONE}, {0}};
 static const real MOST_TRIM = 10;
 
 static void layout_repaired(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
@@ -50,11 +50,10 @@ static void observe_control(signals *s)
     }
 }
 
-/* Return exp(c), of sums and products only: those of the math library differ between machines. Below c = -5 any trim is at its
- * bound afterwards. */
+/* Return exp(c), of sums and products only: those of math libraries differ. Beyond |c| = 5 any trim is at its bound afterwards. */
 static real growth(real c)
 {
-    const real part = (c > -5 ? c : -5) / 16;
+    const real part = (c > 5 ? 5 : c > -5 ? c : -5) / 16;
     real power = 1;
     for (int n = 10; n > 0; n--) power = 1 + part * power / (real)n;
     for (int n = 0; n < 4; n++) power *= power;

@@ -568,10 +568,13 @@ def _remembered(controller: Any) -> int:
 
 
 def _surprise(controller: Any) -> float:
-    """Return the squared innovation over its predicted variance of a Kalman filter's last update; NaN without one."""
+    """Return the squared innovation over its predicted variance of a Kalman filter's last update; NaN without one.
+
+    With several microphones it is their mean.
+    """
     estimator = getattr(controller, "estimator", None)
-    innovation, variance = (getattr(estimator, name, None) for name in ("y", "S"))
-    if innovation is None or variance is None or np.size(innovation) != 1 or np.size(variance) != 1:
+    innovation = getattr(controller, "innovation", getattr(estimator, "y", None))
+    variance = getattr(controller, "innovation_variance", getattr(estimator, "S", None))
+    if innovation is None or variance is None or np.size(innovation) != np.size(variance) or not np.all(variance):
         return np.nan
-    y, S = float(np.ravel(innovation)[0]), float(np.ravel(variance)[0])
-    return y * y / S if S > 0.0 else np.nan
+    return float(np.mean(np.ravel(innovation) ** 2 / np.ravel(variance)))

@@ -226,7 +226,7 @@ def test_channels_of_one_are_the_single_channel_bit_for_bit(name: str) -> None:
     for signal in ("error", "control_signal", "anti_noise", "constraint_factor"):
         np.testing.assert_array_equal(getattr(got, signal), getattr(want, signal), err_msg=signal)
     np.testing.assert_array_equal(got.weights[:, 0, 0], want.weights)
-    np.testing.assert_array_equal(many.covariance, single.estimator.P)
+    np.testing.assert_array_equal(many.covariance, single.covariance)
     for attribute in ("weights", "disturbance_power", "secondary_path_gain", "constraint_factor", "rated_power"):
         np.testing.assert_array_equal(np.ravel(getattr(many, attribute)), getattr(single, attribute), err_msg=attribute)
     assert got.algorithm == want.algorithm
@@ -311,47 +311,25 @@ def test_a_dead_microphone_is_refused_by_name_with_nothing_changed(name: str) ->
         one.control_signal([0.1, 0.2])
     with pytest.raises(ValueError, match="that of microphone 1 is nan"):
         refusing.update([0.1, np.nan, 0.2])
-    with pytest.raises(ValueError, match="must have finite squares, and one overflows"):
+    with pytest.raises(ValueError, match=r"finite squares, and one overflows|too loud"):
         refusing.update([0.1, 0.2, 1e200])
     assert_same_run(run(refusing, noise(20)), run(twin, noise(20)))
 
 
-def test_an_update_without_a_solution_names_the_microphone_and_changes_nothing() -> None:
-    """Sound reaches microphone 2 later than the others: until then, without measurement noise, it tells nothing.
-
-    The corrections of the other microphones are taken back: P to rounding, all else exactly.
-    """
+def test_a_microphone_that_is_not_reached_tells_nothing_without_measurement_noise() -> None:
+    """Sound reaches microphone 2 later than the others: until then S is zero, and the weights are those without it."""
     paths = ESTIMATE.copy()
     paths[2] = np.roll(ESTIMATE[2], 2, axis=-1) * [0.0, 0.0, 0.0, 1.0]
-    settings = {"measurement_noise": [0.01, 0.01, 0.0], "initial_variance": 100.0, "state_noise": 1e-3}
-    refusing, twin = MAKE["KF-OPC"](paths, **settings), MAKE["KF-OPC"](paths, **settings)
-    start = refusing.covariance
-    heard = 0
+    settings = {"initial_variance": 100.0, "state_noise": 1e-3}
+    three = MAKE["KF-ANC"](paths, measurement_noise=[0.01, 0.01, 0.0], **settings)
+    two = MAKE["KF-ANC"](paths[:2], measurement_noise=0.01, **settings)
     for n, x in enumerate(noise(40).T):
-        for one in (refusing, twin):
-            one.control_signal(x)
-        if n < 3:
-            if np.any(refusing._state.lines.filtered[:2]):
-                heard += 1
-            with pytest.raises(ValueError, match=r"no solution for microphone 2: .* give measurement_noise > 0"):
-                refusing.update([1.0, 2.0, 3.0])
-            np.testing.assert_array_equal(refusing.weights, 0.0)
-            np.testing.assert_array_equal(refusing.disturbance_power, 0.0)
-            np.testing.assert_allclose(refusing.covariance, start, rtol=0, atol=1e-10)
-        else:
-            for one in (refusing, twin):
-                one.update([1.0, 2.0, 3.0])
-    assert heard > 0  # corrections were taken back
-    np.testing.assert_allclose(refusing.weights, twin.weights, rtol=0, atol=1e-9 * np.abs(twin.weights).max())
-    assert np.any(twin.weights)
-
-
-def test_the_loop_names_the_sample_of_an_update_without_a_solution() -> None:
-    paths = ESTIMATE.copy()
-    paths[1] = 0.0
-    with pytest.raises(ValueError, match="no solution for microphone 1") as refused:
-        run(MAKE["KF-ANC"](paths, measurement_noise=[0.1, 0.0, 0.1]), noise(20))
-    assert any("sample 0" in note for note in refused.value.__notes__)
+        np.testing.assert_array_equal(three.control_signal(x), two.control_signal(x)) if n < 4 else None
+        three.update([1.0, 2.0, 3.0])
+        two.update([1.0, 2.0])
+        assert np.array_equal(three.weights, two.weights) == (n < 3), n
+    assert np.any(three.weights)
+    assert np.all(np.isfinite(three.weights))
 
 
 @pytest.mark.parametrize(
@@ -362,11 +340,10 @@ def test_the_loop_names_the_sample_of_an_update_without_a_solution() -> None:
         (lambda: MAKE["KF-PB"](measurement_noise=[0.1, 0.0, 0.1]), ValueError, "measurement_noise must be greater than 0"),
         (lambda: MAKE["KF-ANC"](state_noise=-1.0), ValueError, "state_noise must not be negative"),
         (lambda: MAKE["KF-ANC"](initial_variance=np.nan), ValueError, "initial_variance must be finite"),
-        (lambda: MAKE["KF-ANC"](dtype=int), ValueError, "dtype must be numpy.float64 or numpy.float32"),
         (lambda: MAKE["KF-ANC"](n_references=0), ValueError, "n_references must be at least 1"),
         (lambda: MAKE["KF-OPC"](ESTIMATE[:, :1]), ValueError, "one for each of the 1 loudspeakers, got 2"),
         (lambda: kf_opc(L, ESTIMATE, **SETTINGS), ValueError, "give either rated_power= or constraint="),
-        (lambda: kf_opc(L, ONE_PATH, rated_power=[1.0, 2.0], state_noise=0.0, measurement_noise=0.1), TypeError, "this filter has one loudspeaker"),
+        (lambda: kf_opc(L, ONE_PATH, rated_power=[1.0, 2.0], state_noise=0.0, measurement_noise=0.1), ValueError, "must be one for one loudspeaker, got 2"),
         (lambda: kf_pb(L, ESTIMATE, rated_power=[1.0] * 3, form="direct", **SETTINGS), ValueError, "each of the 2 loudspeakers"),
         (lambda: kf_pb(L, ESTIMATE, rated_power=1.0, form="direct"), TypeError, "give state_noise and measurement_noise"),
         (lambda: MAKE["KF-ANC"](np.ones((2, 4))), ValueError, r"\(K microphones, J loudspeakers, taps\), got \(2, 4\)"),
@@ -375,7 +352,7 @@ def test_the_loop_names_the_sample_of_an_update_without_a_solution() -> None:
         (lambda: run(MAKE["KF-ANC"](), noise(9, 1)), ValueError, "I = 1 of reference"),
         (lambda: simulate_scenarios([MAKE["KF-ANC"]()], noise(9)[0], primary_path=ONE_PATH, secondary_path=ONE_PATH), (TypeError, ValueError), "channel"),
     ],
-    ids=range(17),
+    ids=range(16),
 )  # fmt: skip
 def test_settings_that_do_not_fit_are_refused(make: Callable[[], Any], error: Any, message: str) -> None:
     with pytest.raises(error, match=message):

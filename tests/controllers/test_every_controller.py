@@ -81,11 +81,10 @@ def test_repr_names_the_algorithm_and_its_settings(name: str) -> None:
 
 def test_repr_of_kf_opc() -> None:
     controller = kf_opc(128, S_HAT, rated_power=1.0, **KALMAN)
-    controller.estimator.constraint_factor = 0.70711
+    controller.constraint.factor = 0.70711
     assert repr(controller) == "<KF-OPC: 128 taps, rated power 1, constraint factor 0.707>"
     controller.limiter = OutputLimiter(2.5)
-    controller.estimator.rated_power = None
-    assert repr(controller) == "<KF-OPC: 128 taps, constraint factor 1, limiter of rated power 2.5>"
+    assert repr(controller) == "<KF-OPC: 128 taps, rated power 1, constraint factor 0.707, limiter of rated power 2.5>"
 
 
 def test_no_controller_is_left_out() -> None:

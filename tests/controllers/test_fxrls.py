@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import HardClipAmplifier, fx_rls, simulate
+from kfopc_filterpy import HardClipAmplifier, OutputLimiter, fx_rls, simulate
 
 L = 6
 PATH = np.array([0.0, 0.8, -0.3])
@@ -66,9 +66,15 @@ def test_it_forgets() -> None:
 
 
 def test_a_known_amplifier_and_a_limiter_are_passed_on() -> None:
-    controller = fx_rls(L, PATH, amplifier=HardClipAmplifier(0.5), dtype=np.float32)
-    assert controller.estimator.dtype == np.float32
-    assert controller._state.lines.amplifier == HardClipAmplifier(0.5).model
+    x, d = signals()
+    options = {"disturbance": 3.0 * d, "secondary_path": PATH, "amplifier": HardClipAmplifier(0.5)}
+    known = fx_rls(L, PATH, amplifier=HardClipAmplifier(0.5), limiter=OutputLimiter(4.0, window_s=0.001))
+    result = simulate(known, x, **options)
+    assert known.limiter.gain < 1.0
+    assert np.max(np.abs(result.control_signal)) > 0.5
+    exact = fx_rls(L, PATH)  # which hears d itself: the amplifier model makes the estimate exact
+    simulate(exact, x, disturbance=3.0 * d, secondary_path=PATH)
+    np.testing.assert_allclose(known.weights, exact.weights, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("value", [0.0, -0.5, 1.1, np.nan, np.inf])

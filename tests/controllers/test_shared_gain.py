@@ -92,7 +92,7 @@ def test_one_loudspeaker_in_the_shared_gain_form_agrees_with_the_direct_one() ->
     [
         ({"form": "direct"}, TypeError, "give state_noise and measurement_noise"),
         ({"state_noise": 1e-6}, TypeError, "shared gain form takes path_memory_s instead of state_noise"),
-        ({"initial_variance": 1.0, "dtype": np.float64}, TypeError, "instead of initial_variance, dtype"),
+        ({"initial_variance": 1.0}, TypeError, "instead of initial_variance"),
         ({"form": "other"}, ValueError, "form must be one of"),
     ],
     ids=["direct", "state noise", "variance", "other"],
