@@ -120,6 +120,7 @@ CONTROLLERS = {f"{name}, everything": lambda name=name: with_everything(name) fo
         L, S_HAT, rated_power=RATED, state_noise=1e-6, measurement_noise=1e-6, initial_variance=100.0
     ),
     "repaired": lambda: made("repaired"),
+    "fast array": lambda: made("fast array"),
 }
 
 
@@ -193,7 +194,17 @@ def test_float64_gives_the_bits_of_python(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["FxLMS, limited", "MOV", "MOV fixed, everything", "KF-OPC", "KF-OPC, everything", "repaired"]
+    "name",
+    [
+        "FxLMS, limited",
+        "MOV",
+        "MOV fixed, everything",
+        "KF-OPC",
+        "KF-OPC, everything",
+        "repaired",
+        "diagonal, everything",
+        "fast array",
+    ],
 )
 def test_float32_follows_python(name, tmp_path):
     trained, result = trained_and_run(name)
@@ -384,6 +395,7 @@ def test_a_control_signal_that_overflows_is_silent_and_its_update_is_refused(dty
         ("rescaling, everything", "float32"),
         ("repaired, everything", "float64"),
         ("KF-OPC, twice the precision", "float32"),
+        ("finite memory, everything", "float64"),
     ],
 )
 def test_sanitizers_find_nothing(name, dtype, tmp_path):
