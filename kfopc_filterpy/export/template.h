@@ -13,7 +13,7 @@
  * Compile with these flags, and the result has the bits of kfopc_filterpy's core$if_compiled:
  *     $flags
  * -ffp-contract=off decides the bits, -fno-strict-aliasing is needed, the others are for speed. -ffast-math is refused.
- * Of the library, memcpy, memset, strcmp and math.h are used.
+ * Of the library, memcpy, memmove, memset, strcmp and math.h are used.
  *
  * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A bad
  * reference counts as 0, and ${name}_update refuses that sample. It also refuses a disturbance estimate e + s^ * y that is too
