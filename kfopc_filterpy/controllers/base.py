@@ -200,8 +200,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
     """
 
     name = "controller"
-    has_gains = False  # True if it has Kalman gains, which scenarios can share
-    unshared = ""  # the part that prevents sharing, if any
     _uncertainty: Any = None  # as it was assigned
 
     def __init__(

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_real_array
-from ..kernels.compiling import inlined, part
+from ..kernels.compiling import inlined
 from ..kernels.delay_lines import delay_line, latest, newest, push
 from ..kernels.vectors import at, dot
 from ..power.amplifiers import amplifier_models, amplify
-from ..power.constraint import advance_squares, preview_squares
+from ..power.constraint import advance_squares
 from ..power.limiter import LimiterState, limit_sample
 from .step import (
     adapt,
@@ -32,14 +32,6 @@ from .step import (
 )
 
 
-class ChannelGuard(NamedTuple):
-    """The guard against uncertain secondary paths, see `paths.uncertainty`."""
-
-    taps: np.ndarray  # of W
-    filtered: np.ndarray  # (K, J, I, size) delay lines of x''_kji = W * x'_kji
-    output: np.ndarray  # (K,) room for the sums of w_ji' x''_kji
-
-
 class ChannelLines(NamedTuple):
     """Signals that a controller of several channels uses, and its models."""
 
@@ -49,7 +41,6 @@ class ChannelLines(NamedTuple):
     output: np.ndarray  # (J, size) delay lines of y, after limiters and amplifier models
     amplifier: np.ndarray  # (J, 1) records of those models
     limiter: tuple[LimiterState, ...] | None
-    guard: ChannelGuard | None
     control_signal: np.ndarray  # (J,) the last y
     energy: np.ndarray  # (J,) sum of y^2 since the start of the block; without blocks, of all samples
     n_emitted: np.ndarray  # (1,) number of samples in that sum; silence before the control is not counted
@@ -79,7 +70,6 @@ def channel_lines(
         output=delay_lines(J, taps),
         amplifier=amplifier_models(amplifier, J),
         limiter=limiter,
-        guard=None,
         control_signal=np.zeros(J),
         energy=np.zeros(J),
         n_emitted=np.zeros(1),
@@ -109,24 +99,6 @@ def take_references(lines, x):
         for j in range(filtered.shape[1]):
             for i in range(filtered.shape[2]):
                 push(filtered[k, j, i], dot(s[k, j], newest(lines.reference[i], s.shape[2])))
-    take_channels_guarded(lines.guard, filtered)
-
-
-@part()
-def take_channels_guarded(guard, filtered):
-    """Add (W * x'_kji)(n) to their delay lines, if there is a guard."""
-    if guard is not None:
-        for k in range(filtered.shape[0]):
-            for j in range(filtered.shape[1]):
-                for i in range(filtered.shape[2]):
-                    push(guard.filtered[k, j, i], dot(guard.taps, newest(filtered[k, j, i], guard.taps.size)))
-
-
-def new_channel_guard(taps: np.ndarray, shape: tuple[int, int, int], n_taps: int) -> ChannelGuard:
-    """Return a guard with silent delay lines of `n_taps` samples; `shape` is (K, J, I)."""
-    K, J, n_references = shape
-    filtered = delay_lines(K * J * n_references, n_taps)
-    return ChannelGuard(taps, filtered.reshape(*shape, -1), np.zeros(K))
 
 
 @emit_outputs.register(ChannelLines)
@@ -236,23 +208,6 @@ def add_squares(lines, constraint, d, x):
     """Add the sums of squares to the powers of each loudspeaker, and set their constraint factors."""
     for j in range(lines.output.shape[0]):
         lines.constraint_factor[j] = advance_squares(at(constraint, j), d, filtered_square(lines, j), x)
-
-
-@inlined
-def least_factor(lines, constraint, d, x):
-    """Return the least constraint factor with this sample included; nothing is changed.
-
-    A loudspeaker whose gain is zero, which no microphone hears, is left out: its control filters stay zero. If there is
-    no other, its factor is returned.
-    """
-    heard, unheard = np.inf, np.inf
-    for j in range(lines.output.shape[0]):
-        factor, _, gain = preview_squares(at(constraint, j), d, filtered_square(lines, j), x)
-        if gain == 0.0:
-            unheard = min(unheard, factor)
-        else:
-            heard = min(heard, factor)
-    return heard if heard < np.inf else unheard
 
 
 @inlined

@@ -8,11 +8,10 @@ import numpy as np
 
 from .._validate import as_number
 from ..kernels.delay_lines import TAPS, delay_line, newest, refill
-from ..paths.uncertainty import GUARD_TAPS
 from ..power.amplifiers import compiled_model
 from .base import OVERFLOW, FilteredReferenceController, Looped, calls_of
-from .channels import ChannelGuard, channel_lines, channel_sample, new_channel_guard
-from .step import Compiled, GuardLine, Lines, listen, looped_arrays
+from .channels import channel_lines, channel_sample
+from .step import Compiled, Lines, listen, looped_arrays
 
 
 class CompiledController(FilteredReferenceController):
@@ -41,9 +40,7 @@ class CompiledController(FilteredReferenceController):
         self._lines: Any = self._new_lines(secondary, amplifier, filtered_taps, max(self.n_taps, history))
 
     def _new_lines(self, secondary: np.ndarray, amplifier: Any, filtered_taps: int, reference_taps: int) -> Any:
-        filtered_taps = max(filtered_taps, GUARD_TAPS) if filtered_taps else 0  # a guard can be assigned later
-        # with another path, and then with a guard
-        to_filter_again = filtered_taps + secondary.shape[-1] + GUARD_TAPS - 2 if filtered_taps else 0
+        to_filter_again = filtered_taps + secondary.shape[-1] - 1 if filtered_taps else 0  # with another path
         if self.multichannel:
             return channel_lines(
                 secondary,
@@ -63,7 +60,6 @@ class CompiledController(FilteredReferenceController):
             output=delay_line(secondary.size),
             amplifier=model,
             limiter=states_of(self._limiter),
-            guard=None,
             control_signal=np.zeros(1),
         )
 
@@ -79,28 +75,14 @@ class CompiledController(FilteredReferenceController):
     def _estimated_path(self) -> np.ndarray:
         return self._lines.secondary_estimate
 
-    def _use_guard(self, taps: np.ndarray | None) -> None:
-        guard = None if taps is None else self._new_guard(taps)
-        self._state = self._state._replace(lines=self._state.lines._replace(guard=guard))
-        self._filter_again()
-
-    def _new_guard(self, taps: np.ndarray) -> GuardLine | ChannelGuard:
-        """Return a guard that has heard nothing yet."""
-        if self.multichannel:
-            return new_channel_guard(taps, (self.n_microphones, self.n_loudspeakers, self.n_references), self.n_taps)
-        return GuardLine(taps, delay_line(self.n_taps))
-
     def _filter_again(self) -> None:
-        """Filter the stored references with the present estimate, and the results with the guard."""
-        lines, guard = self._lines, self._state.lines.guard
+        """Filter the stored references with the present estimate."""
+        lines = self._lines
         if not self.multichannel:
-            guarded = None if guard is None else guard.filtered
-            _filter_line_again(lines.reference, lines.filtered, lines.secondary_estimate, guard, guarded)
+            _filter_line_again(lines.reference, lines.filtered, lines.secondary_estimate)
             return
         for k, j, i in np.ndindex(lines.filtered.shape[:3]):
-            guarded = None if guard is None else guard.filtered[k, j, i]
-            s = lines.secondary_estimate[k, j]
-            _filter_line_again(lines.reference[i], lines.filtered[k, j, i], s, guard, guarded)
+            _filter_line_again(lines.reference[i], lines.filtered[k, j, i], lines.secondary_estimate[k, j])
 
     @property
     def weights(self) -> np.ndarray:
@@ -202,10 +184,6 @@ def states_of(value: Any) -> Any:
     return None if value is None else value.state
 
 
-def _filter_line_again(reference: np.ndarray, filtered: np.ndarray, s: np.ndarray, guard: Any, guarded: Any) -> None:
-    """Fill the delay line `filtered` by a stored reference after the path s, and the line `guarded` by that after W."""
-    n = int(filtered[TAPS])
-    again = np.correlate(newest(reference, n + s.size + GUARD_TAPS - 2), s, mode="valid")
-    refill(filtered, again)
-    if guard is not None:
-        refill(guarded, np.correlate(again, guard.taps, mode="valid"))
+def _filter_line_again(reference: np.ndarray, filtered: np.ndarray, s: np.ndarray) -> None:
+    """Fill the delay line `filtered` by a stored reference after the path s."""
+    refill(filtered, np.correlate(newest(reference, int(filtered[TAPS]) + s.size - 1), s, mode="valid"))

@@ -28,13 +28,6 @@ from ..power.constraint import advance_constraint, squares_are_finite
 from ..power.limiter import LimiterState, limit_sample
 
 
-class GuardLine(NamedTuple):
-    """The guard against an uncertain secondary path, see `paths.uncertainty`."""
-
-    taps: np.ndarray  # of W
-    filtered: np.ndarray  # delay line of W * x'
-
-
 class Lines(NamedTuple):
     """Signals that a controller uses, and its models."""
 
@@ -44,7 +37,6 @@ class Lines(NamedTuple):
     output: np.ndarray  # delay line of y, after the limiter and the amplifier model
     amplifier: np.ndarray  # record of that model; linear: d^ = e + s^ * y as published
     limiter: LimiterState | None
-    guard: GuardLine | None
     control_signal: np.ndarray  # (1,) the last y
 
 
@@ -113,7 +105,6 @@ def take_reference(lines, x):
     push(lines.reference, x)
     s = lines.secondary_estimate
     push(lines.filtered, dot(s, newest(lines.reference, s.size)))
-    take_guarded(lines.guard, lines.filtered)
 
 
 @by_type
@@ -168,13 +159,6 @@ def limited(limiter, y):
     if limiter is None:
         return y
     return limit_sample(limiter, y)
-
-
-@part()
-def take_guarded(guard, filtered):
-    """Add (W * x')(n) to its delay line, if there is a guard."""
-    if guard is not None:
-        push(guard.filtered, dot(guard.taps, newest(filtered, guard.taps.size)))
 
 
 @inlined

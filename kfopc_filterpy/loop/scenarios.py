@@ -195,7 +195,9 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
                 "whose steps are in the core"
             )
         if looped.owner.algorithm.path is not None:
-            raise ValueError(f"controllers[{i}] has an algorithm of your own, which may know one scenario only: use simulate")
+            raise ValueError(
+                f"controllers[{i}] has an algorithm of your own, which may know one scenario only: use simulate"
+            )
         blocks.append(looped.owner)
     for i, block in enumerate(blocks[1:], 1):
         difference = _difference(blocks[0], block)
