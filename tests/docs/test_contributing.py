@@ -170,7 +170,7 @@ def test_the_algorithm_that_it_adds_to_the_package_runs_and_is_tuned(tmp_path):
 
 @pytest.mark.parametrize("state", ["", MEAN], ids=["", "with a state of its own"])
 def test_its_file_runs_outside_the_package(tmp_path, state):
-    layout = next(line for line in SIGN.splitlines() if "layout(" in line)
-    (tmp_path / "sign.c").write_text(SIGN.replace(layout, state or layout), encoding="utf-8")
+    own = SIGN.replace("static int update(", f"{state}\nstatic int update(").replace("layout_plain", "layout")
+    (tmp_path / "sign.c").write_text(own if state else SIGN, encoding="utf-8")
     more = "assert many._opened().fields['mean_error'].shape == (1, 1, 1, 2)" if state else ""
     check(tmp_path, PACKAGE.parent, imported=OUTSIDE, more=more)
