@@ -2,6 +2,12 @@
 #include "signals.h"
 #include <string.h>
 
+#ifdef ANC_FLOAT
+enum { LONGEST = 1 << 24 }; /* of the windows: positions in them are reals, and a float counts no further */
+#else
+enum { LONGEST = 1 << 28 };
+#endif
+
 static int in_range(const anc_setting *setting, real value)
 {
     return value >= setting->least && (setting->most == 0 ? isfinite(value) : value <= setting->most);
@@ -23,8 +29,8 @@ static int shape_accepted(const anc_plan *p)
         if (shape[i] < 1 || shape[i] > most) return 0;
     if (p->guard_taps < 0 || p->guard_taps > ANC_GUARD_TAPS || (p->limited && !p->limiter_windows)) return 0;
     for (int32_t j = 0; j < p->loudspeakers; j++)
-        if ((p->power_windows && (p->power_windows[j] < 0 || ANC_POWERS * J * p->power_windows[j] > most)) ||
-            (p->limited && (p->limiter_windows[j] < 1 || 3 * J * p->limiter_windows[j] > most)))
+        if ((p->power_windows && (p->power_windows[j] < 0 || p->power_windows[j] > LONGEST || ANC_POWERS * J * p->power_windows[j] > most)) ||
+            (p->limited && (p->limiter_windows[j] < 1 || p->limiter_windows[j] > LONGEST || 3 * J * p->limiter_windows[j] > most)))
             return 0;
     return K * J * I * (4 * L + 4 * ANC_GUARD_TAPS + 64) <= most && (I + K * J) * (4 * (L + M) + 8 * ANC_GUARD_TAPS + 64) <= most;
 }
@@ -32,10 +38,11 @@ static int shape_accepted(const anc_plan *p)
 static int values_accepted(const anc_algorithm *a, const anc_plan *p)
 {
     const real *value = p->settings;
+    if (!p->path || (a->settings->name && !value) || (p->guard_taps && !p->guard)) return 0;
     for (int i = 0; a->settings[i].name; i++)
         for (int32_t j = 0; j < (a->settings[i].each ? p->loudspeakers : 1); j++)
             if (!in_range(a->settings + i, *value++)) return 0;
-    return all_finite(p->path, times(p->microphones * p->loudspeakers, p->path_taps)) && (!p->guard_taps || all_finite(p->guard, (size_t)p->guard_taps));
+    return all_finite(p->path, times(p->microphones * p->loudspeakers, p->path_taps)) && all_finite(p->guard, (size_t)p->guard_taps);
 }
 
 size_t anc_size(const anc_algorithm *a, const anc_plan *plan)
