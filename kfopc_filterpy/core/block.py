@@ -187,6 +187,7 @@ class Block:
         self._enter, self._leave = self.in_use.enter, self.in_use.leave
         self._library: Any = load().held
         keep = self._plan_arrays(path, settings, guard)
+        self._require_sizes(keep, memory is None)
         plan = self._plan_of(shape, keep)
         of = ctypes.byref
         self._library.anc_size.restype = ctypes.c_size_t
@@ -243,6 +244,20 @@ class Block:
             "guard": np.array([] if guard is None else guard, np.float64),
             "settings": np.concatenate([*values, np.zeros(1)]),
         }
+
+    def _require_sizes(self, arrays: Mapping[str, np.ndarray], fresh: bool) -> None:
+        """Raise ValueError if the core would see another shape, or read beyond an array."""
+        shape = self.shape
+        if any(value >= 2**31 for value in asdict(shape).values() if isinstance(value, int)):
+            raise ValueError(f"a controller of this size cannot be made: {shape}")
+        sizes = {name: (0, shape.loudspeakers) for name in ("power_windows", "limiter_windows")}
+        if fresh:
+            if self.algorithm.settings and arrays["settings"].size == 1:
+                raise ValueError(f"{self.algorithm.name} needs its settings {[one.name for one in self.algorithm.settings]}")
+            sizes |= {"path": (shape.microphones * shape.loudspeakers * shape.path_taps,), "guard": (shape.guard_taps,)}
+        for name, expected in sizes.items():
+            if arrays[name].size not in expected:
+                raise ValueError(f"{name} of {arrays[name].size} numbers does not fit {shape}")
 
     @staticmethod
     def _plan_of(shape: Shape, arrays: dict[str, np.ndarray]) -> _Plan:
