@@ -34,6 +34,9 @@ _REFUSED = (
     *("-ffast-math", "-Ofast", "-funsafe-math-optimizations", "-fassociative-math", "-freciprocal-math"),
     *(
         "-ffinite-math-only",
+        "-fno-honor-nans",
+        "-fno-honor-infinities",
+        "-fapprox-func",
         "-fno-signed-zeros",
         "-fsingle-precision-constant",
         "-ffp-contract=fast",
@@ -189,7 +192,7 @@ def build_core(folder: Path, target: str = "") -> list[Path]:
 
 
 def _system(target: str) -> str:
-    return target.split("-")[1] if target else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
+    return target.split("-")[1].split(".")[0] if target else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
 
 
 def _is_zig(command: list[str]) -> bool:
