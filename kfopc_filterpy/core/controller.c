@@ -29,7 +29,7 @@ static int shape_accepted(const anc_plan *p)
         if (shape[i] < 1 || shape[i] > most) return 0;
     if (p->guard_taps < 0 || p->guard_taps > ANC_GUARD_TAPS || (p->limited && !p->limiter_windows)) return 0;
     for (int32_t j = 0; j < p->loudspeakers; j++)
-        if ((p->power_windows && (p->power_windows[j] < 0 || p->power_windows[j] > LONGEST || ANC_POWERS * J * p->power_windows[j] > most)) ||
+        if ((p->power_windows && (p->power_windows[j] < 0 || p->power_windows[j] > LONGEST || (double)ANC_POWERS * J * p->power_windows[j] > most)) ||
             (p->limited && (p->limiter_windows[j] < 1 || p->limiter_windows[j] > LONGEST || 3 * J * p->limiter_windows[j] > most)))
             return 0;
     return K * J * I * (4 * L + 4 * ANC_GUARD_TAPS + 64) <= most && (I + K * J) * (4 * (L + M) + 8 * ANC_GUARD_TAPS + 64) <= most;

@@ -114,7 +114,7 @@ static int descend_mov(signals *s, const real *error, const real *fixed)
         const real gamma = fixed ? fixed[j] : penalty_of_constraint(s->previewed + j);
         set_step(s, j, 1, mu, mu * gamma * s->control[j]);
     }
-    if (!*s->setting[MODIFIED]) return descend(s, error);
+    if (*s->setting[MODIFIED] == 0) return descend(s, error);
     for (int32_t k = 0; k < s->K; k++) s->estimate[k] -= heard_output(s, &s->filtered, k);
     return descend(s, s->estimate);
 }
