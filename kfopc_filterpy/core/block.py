@@ -253,7 +253,9 @@ class Block:
         sizes = {name: (0, shape.loudspeakers) for name in ("power_windows", "limiter_windows")}
         if fresh:
             if self.algorithm.settings and arrays["settings"].size == 1:
-                raise ValueError(f"{self.algorithm.name} needs its settings {[one.name for one in self.algorithm.settings]}")
+                raise ValueError(
+                    f"{self.algorithm.name} needs its settings {[one.name for one in self.algorithm.settings]}"
+                )
             sizes |= {"path": (shape.microphones * shape.loudspeakers * shape.path_taps,), "guard": (shape.guard_taps,)}
         for name, expected in sizes.items():
             if arrays[name].size not in expected:

@@ -192,7 +192,11 @@ def build_core(folder: Path, target: str = "") -> list[Path]:
 
 
 def _system(target: str) -> str:
-    return target.split("-")[1].split(".")[0] if target else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
+    return (
+        target.split("-")[1].split(".")[0]
+        if target
+        else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
+    )
 
 
 def _is_zig(command: list[str]) -> bool:

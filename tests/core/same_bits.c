@@ -111,7 +111,7 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
     }
     memset(signal, 0, sizeof signal), memset(output, 0, sizeof output), memset(present, 0, sizeof present);
 
-    printf("%s %s %d %d %d ", algorithms[number].name, equipped ? "equipped" : "plain", (int)K, (int)J, (int)I);
+    printf("%s %s %d %d %d ", algorithms[number].name + 4, equipped ? "equipped" : "plain", (int)K, (int)J, (int)I);
     const size_t bytes = anc_size(c.algorithm, &plan);
     void *room = malloc(bytes + 64), *block = (char *)room + (64 - (uintptr_t)room % 64) % 64;
     if (!bytes || !room || !anc_open(c.algorithm, &plan, &c.view, block, bytes, 1)) {
@@ -129,8 +129,14 @@ static void run(int32_t number, int32_t K, int32_t J, int32_t I, int equipped)
     free(room);
 }
 
-int main(void)
+int main(int argc, char **argv)
 {
+#ifdef LOADED
+    library = argc > 1 ? argv[1] : "";
+    find(&size_of, "anc_size"), find(&open_block, "anc_open"), find(&describe, "anc_describe"), find(&run_loop, "anc_run");
+    for (int32_t number = 0; algorithms[number].name; number++) find(&algorithms[number].algorithm, algorithms[number].name);
+#endif
+    (void)argc, (void)argv;
     for (int32_t number = 0; algorithms[number].name; number++)
         for (int equipped = 0; equipped < 2; equipped++) {
             run(number, 1, 1, 1, equipped);

@@ -236,7 +236,15 @@ def test_headers_stand_alone(header: str, tmp_path: Path) -> None:
     unit = tmp_path / "unit.c"
     unit.write_text(f'#include "{header}"\n#include "{header}"\nextern int something;\n')
     command = c_compiler()
-    ran(*command, *program_flags(command), *WARNINGS, "-Wno-unused-function", "-Wno-unused-const-variable", "-fsyntax-only", unit)
+    ran(
+        *command,
+        *program_flags(command),
+        *WARNINGS,
+        "-Wno-unused-function",
+        "-Wno-unused-const-variable",
+        "-fsyntax-only",
+        unit,
+    )
 
 
 # What a library shows.

@@ -106,7 +106,9 @@ def test_roles_are_known() -> None:
 # Plans of any kind.
 
 ANY_NUMBER = st.one_of(
-    st.sampled_from([0.0, -0.0, 1.0, -1.0, 1e-310, 1e-30, 1e30, 1e100, 1e155, 1.7e308, -1.7e308, np.nan, np.inf, -np.inf]),
+    st.sampled_from(
+        [0.0, -0.0, 1.0, -1.0, 1e-310, 1e-30, 1e30, 1e100, 1e155, 1.7e308, -1.7e308, np.nan, np.inf, -np.inf]
+    ),
     st.floats(),
 )
 ANY_SAMPLE = st.one_of(st.floats(-1.0, 1.0), ANY_NUMBER)
@@ -121,7 +123,11 @@ def plans(draw: st.DrawFn, odd: bool) -> tuple[str, Shape, dict[str, Any]]:
     count = ODD_COUNT if odd and draw(st.integers(0, 4)) == 0 else COUNT
     name = draw(st.sampled_from(known()))
     K, J, I = draw(COUNT), draw(COUNT), draw(count)
-    taps, path_taps, guard_taps = draw(TAPS if count is COUNT else count), draw(TAPS), draw(st.sampled_from([0, 1, 5, 48]))
+    taps, path_taps, guard_taps = (
+        draw(TAPS if count is COUNT else count),
+        draw(TAPS),
+        draw(st.sampled_from([0, 1, 5, 48])),
+    )
     windows = [
         tuple(draw(st.lists(st.integers(least, 40), min_size=J, max_size=J))) if draw(st.booleans()) else ()
         for least in (0, 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.core import FOLDER, c_compiler, known, program, ran, tool, zig
+from helpers.core import FOLDER, c_compiler, highest_level, known, program, ran, tool, zig
 
 from kfopc_filterpy.core import building, library
 
@@ -43,15 +43,8 @@ def test_libraries_of_all_levels(real: str, level: str, tmp_path: Path) -> None:
         pytest.skip(f"{file.name} is not built on this machine")
     if building.LEVELS.index(level) > building.LEVELS.index(highest_level()):
         pytest.skip(f"this processor has no {level}")
-    made = program(
-        "same_bits", tmp_path, c_compiler(), "-O1", f"-Wl,-rpath,{file.parent}", sources=[file], real=real
-    )
+    made = program("same_bits", tmp_path, c_compiler(), "-O1", f"-Wl,-rpath,{file.parent}", sources=[file], real=real)
     assert_same(ran(made), real, tmp_path)
-
-
-def highest_level() -> str:
-    """Return the highest level of this processor, whether a library was built for it or not."""
-    return {3: "x86-64-v3", 4: "x86-64-v4"}.get(library.load().free.anc_processor_level(), "baseline")
 
 
 @pytest.mark.parametrize("real", building.REALS)
@@ -68,7 +61,9 @@ def test_every_case_runs(real: str) -> None:
 
 
 @pytest.mark.parametrize("real", building.REALS)
-@pytest.mark.parametrize("other", [pytest.param(name, marks=[] if name == "one lane" else pytest.mark.slow) for name in OTHERS])
+@pytest.mark.parametrize(
+    "other", [pytest.param(name, marks=[] if name == "one lane" else pytest.mark.slow) for name in OTHERS]
+)
 def test_other_ways_to_compile(real: str, other: str, tmp_path: Path) -> None:
     assert_same(ran(program("same_bits", tmp_path, c_compiler(), *OTHERS[other], real=real)), real, tmp_path)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from kfopc_filterpy.core import building
+from kfopc_filterpy.core import building, library
 
 FOLDER = Path(__file__).resolve().parents[1] / "core"
 # The settings of every algorithm, in the order of its C file, such that it adapts to noise of power 1/3. A float holds each.
@@ -61,6 +61,11 @@ def zig() -> list[str]:
     return [sys.executable, "-m", "ziglang", "cc"]
 
 
+def highest_level() -> str:
+    """Return the highest level of this processor, whether a library was built for it or not."""
+    return {3: "x86-64-v3", 4: "x86-64-v4"}.get(library.load().free.anc_processor_level(), "baseline")
+
+
 def tool(name: str, package: str) -> str:
     """Return the path of a program of the machine, or skip the test."""
     found = shutil.which(name)
@@ -87,13 +92,23 @@ def program(
 ) -> Path:
     """Compile a program of tests/core with the sources of the core, or against a library, and return its path."""
     rows = ", ".join(
-        f'{{"{algorithm}", &anc_{algorithm}, {{{", ".join(f"(anc_real){value!r}" for value in settings.values())}}}}}'
+        f"{{ALGORITHM({algorithm}), {{{', '.join(f'(anc_real){value!r}' for value in settings.values())}}}}}"
         for algorithm, settings in ALGORITHMS.items()
     )
-    table = "static const struct { const char *name; const anc_algorithm *algorithm; anc_real settings[8]; } algorithms[]"
+    table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[8]; } algorithms[]"
     (folder / "algorithms.h").write_text(f"{table} = {{{rows}, {{0}}}};\n")
     made = folder / name
     files = building.core_sources() if sources is None else sources
     include = (f"-I{folder}", f"-I{FOLDER}")
-    ran(*command, *program_flags(command, **of_flags), *options, *include, FOLDER / f"{name}.c", *files, "-o", made, "-lm")
+    ran(
+        *command,
+        *program_flags(command, **of_flags),
+        *options,
+        *include,
+        FOLDER / f"{name}.c",
+        *files,
+        "-o",
+        made,
+        "-lm",
+    )
     return made
