@@ -250,7 +250,7 @@ class Block:
         shape = self.shape
         if any(value >= 2**31 for value in asdict(shape).values() if isinstance(value, int)):
             raise ValueError(f"a controller of this size cannot be made: {shape}")
-        sizes = {name: (0, shape.loudspeakers) for name in ("power_windows", "limiter_windows")}
+        sizes: dict[str, tuple[int, ...]] = dict.fromkeys(("power_windows", "limiter_windows"), (0, shape.loudspeakers))
         if fresh:
             if self.algorithm.settings and arrays["settings"].size == 1:
                 raise ValueError(

@@ -122,7 +122,7 @@ def plans(draw: st.DrawFn, odd: bool) -> tuple[str, Shape, dict[str, Any]]:
     """Return an algorithm, a shape and the arguments of a block."""
     count = ODD_COUNT if odd and draw(st.integers(0, 4)) == 0 else COUNT
     name = draw(st.sampled_from(known()))
-    K, J, I = draw(COUNT), draw(COUNT), draw(count)
+    K, J, references = draw(COUNT), draw(COUNT), draw(count)
     taps, path_taps, guard_taps = (
         draw(TAPS if count is COUNT else count),
         draw(TAPS),
@@ -134,7 +134,9 @@ def plans(draw: st.DrawFn, odd: bool) -> tuple[str, Shape, dict[str, Any]]:
     ]
     if odd and draw(st.integers(0, 4)) == 0:
         windows[draw(st.integers(0, 1))] = draw(st.tuples(st.sampled_from([-1, 0, 1, 2**28, 2**31 - 1])))
-    shape = Shape(K, J, I, taps, path_taps, guard_taps + (50 if odd and draw(st.integers(0, 9)) == 0 else 0), *windows)
+    shape = Shape(
+        K, J, references, taps, path_taps, guard_taps + (50 if odd and draw(st.integers(0, 9)) == 0 else 0), *windows
+    )
     rng = np.random.default_rng(draw(st.integers(0, 9)))
     path, guard = rng.standard_normal((K, J, path_taps)), rng.standard_normal(shape.guard_taps)
     values: dict[str, Any] = dict(ALGORITHMS[name])
