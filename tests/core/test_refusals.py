@@ -78,8 +78,8 @@ def test_a_refused_step_changes_nothing(name: str, shape: str) -> None:
         for half, channels in (("control_signal", disturbed.reference.size), ("update", disturbed.error.size)):
             if n > 5 and rng.random() < 0.5:
                 bad, channel = rng.uniform(-1.0, 1.0, channels), rng.integers(channels)
-                usable = n < 100 or rng.random() < 0.5  # a loud sample may be taken, and after it others are refused
-                bad[channel] = rng.choice(UNUSABLE if usable else LOUD)
+                unusable = n < 100 or rng.random() < 0.5  # a loud sample may be taken, and after it others are refused
+                bad[channel] = rng.choice(UNUSABLE if unusable else LOUD)
                 before = disturbed.kept()
                 answer = disturbed.step(half, bad)
                 refusals.add((half, answer))
@@ -94,7 +94,7 @@ def test_a_refused_step_changes_nothing(name: str, shape: str) -> None:
             assert disturbed.kept() == undisturbed.kept(), (n, half)
             assert disturbed.control_signal.tobytes() == undisturbed.control_signal.tobytes()
     assert {half for half, answer in refusals if answer} == {"control_signal", "update"}
-    assert np.any(disturbed.fields["weights"] != 0)  # they did adapt
+    assert disturbed.kept() != made(name, SHAPES[shape]).kept()
 
 
 def test_roles_are_known() -> None:

@@ -11,8 +11,8 @@ from kfopc_filterpy.core import building, library
 
 RECORDED = FOLDER / "same_bits.txt"
 SAMPLES = 700
-# Other ways to the same sums: one number at a time, and less optimization.
-OTHERS = {"one lane": ("-DLANES_OF_ONE=1",), "-O1": ("-O1",), "-O0": ("-O0",)}
+# Other ways to the same sums: one number at a time, other optimization, all files at once.
+OTHERS = {"one lane": ("-DLANES_OF_ONE=1",), **{flag: (flag,) for flag in ("-O0", "-O1", "-Os", "-flto")}}
 
 
 def recorded(real: str) -> list[str]:
