@@ -170,6 +170,8 @@ def build(
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".building-") as folder:
         library = Path(folder, output.name)
         line = [*command, *flags(command, real, level, target), "-o", str(library), *map(str, sources), "-lm"]
+        if _system(target) == "macos":  # where a library has a name in it, by default the path at which it is made
+            line.append(f"-Wl,-install_name,@rpath/{output.name}")
         try:
             run = subprocess.run(line, capture_output=True, text=True, errors="replace")
         except OSError as error:
