@@ -21,8 +21,8 @@ static real power(real base, real exponent)
 real anc_amplify(const anc_amplifier *a, real y)
 {
     const real size = y < 0 ? -y : y;
-    if (a->kind == ANC_HARD_CLIP && size > a->limit) return y < 0 ? -a->limit : a->limit;
-    if (a->kind == ANC_SOFT_SATURATION) { /* y / (1 + |y / a|^2p)^(1 / 2p) */
+    if (a->kind == (real)ANC_HARD_CLIP && size > a->limit) return y < 0 ? -a->limit : a->limit;
+    if (a->kind == (real)ANC_SOFT_SATURATION) { /* y / (1 + |y / a|^2p)^(1 / 2p) */
         const real ratio = size / a->limit, p = a->sharpness;
         if (ratio <= 1) return y / power(1 + power(ratio, 2 * p), (real)0.5 / p);
         return (y < 0 ? -a->limit : a->limit) / power(1 + power(1 / ratio, 2 * p), (real)0.5 / p); /* which does not overflow */

@@ -35,7 +35,7 @@ typedef double anc_real;
 typedef struct {
     int32_t scenarios, microphones, loudspeakers, references, taps, path_taps; /* S, K, J, I, L, M */
     int32_t guard_taps;             /* G; 0: the secondary paths are exact */
-    int32_t limited;                /* 1: each control signal passes a limiter */
+    int32_t limited;                /* 1: each control signal passes a limiter, silent until the host sets its numbers */
     const int32_t *power_windows;   /* (S, J) samples of the window of the powers; 0: exponential. NULL: all 0 */
     const int32_t *limiter_windows; /* (S, J) samples of each limiter's window; NULL without limiters */
     const anc_real *path;           /* (K, J, M) estimated secondary paths */
@@ -81,9 +81,10 @@ extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_opti
     anc_clipping, anc_rescaling, anc_kalman, anc_diagonal, anc_fast_array, anc_finite_memory, anc_repaired,
     anc_signals_alone;
 
-/* Bytes of a block; 0 if the plan is refused: a shape below 1, a setting out of its range, a path that is not finite, too large. */
+/* Bytes of a block; 0 if its shape is refused: a count below 1, or too large. */
 ANC_PUBLIC size_t anc_size(const anc_algorithm *algorithm, const anc_plan *plan);
-/* Find the fields in a block, aligned as anc_real is; a fresh one is started. Return 0 if the plan is refused or the block too small. */
+/* Find the fields in a block, aligned as anc_real is; a fresh one is started. Return 0 if the block is too small or the plan refused:
+ * its shape, and for a fresh block a setting out of its range, a path or guard that is not finite, or one of them missing. */
 ANC_PUBLIC int anc_open(const anc_algorithm *algorithm, const anc_plan *plan, anc_view *view, void *block, size_t bytes, int fresh);
 ANC_PUBLIC void anc_describe(const anc_algorithm *algorithm, const anc_plan *plan, anc_visitor *visit, void *to);
 /* Filter the stored references again, after the paths or the guard in the block have changed. */

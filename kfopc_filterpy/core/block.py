@@ -214,6 +214,7 @@ class Block:
         self._enter, self._leave = self.in_use.enter, self.in_use.leave
         self._library: Any = load().held
         keep = self._plan_arrays(path, settings, guard)
+        self._require_sizes(keep, memory is None)
         plan = _plan_of(shape, keep)
         of = ctypes.byref
         self._library.anc_size.restype = ctypes.c_size_t
@@ -271,6 +272,22 @@ class Block:
             "guard": np.array([] if guard is None else guard, np.float64),
             "settings": np.concatenate([*values, np.zeros(1)]),
         }
+
+    def _require_sizes(self, arrays: Mapping[str, np.ndarray], fresh: bool) -> None:
+        """Raise ValueError if the core would see another shape, or read beyond an array."""
+        shape, loudspeakers = self.shape, self.shape.scenarios * self.shape.loudspeakers
+        if any(value >= 2**31 for value in asdict(shape).values() if isinstance(value, int)):
+            raise ValueError(f"a controller of this size cannot be made: {shape}")
+        sizes: dict[str, tuple[int, ...]] = dict.fromkeys(("power_windows", "limiter_windows"), (0, loudspeakers))
+        if fresh:
+            if self.algorithm.settings and arrays["settings"].size == 1:
+                raise ValueError(
+                    f"{self.algorithm.name} needs its settings {[one.name for one in self.algorithm.settings]}"
+                )
+            sizes |= {"path": (shape.microphones * shape.loudspeakers * shape.path_taps,), "guard": (shape.guard_taps,)}
+        for name, expected in sizes.items():
+            if arrays[name].size not in expected:
+                raise ValueError(f"{name} of {arrays[name].size} numbers does not fit {shape}")
 
     def _keep_field(self, _: Any, name: bytes, role: int, kind: int, offset: int, shape: Any) -> None:
         axes, dtype = tuple(shape[i] for i in range(4)), _KINDS[kind]

@@ -34,6 +34,9 @@ _REFUSED = (
     *("-ffast-math", "-Ofast", "-funsafe-math-optimizations", "-fassociative-math", "-freciprocal-math"),
     *(
         "-ffinite-math-only",
+        "-fno-honor-nans",
+        "-fno-honor-infinities",
+        "-fapprox-func",
         "-fno-signed-zeros",
         "-fsingle-precision-constant",
         "-ffp-contract=fast",
@@ -167,6 +170,8 @@ def build(
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".building-") as folder:
         library = Path(folder, output.name)
         line = [*command, *flags(command, real, level, target), "-o", str(library), *map(str, sources), "-lm"]
+        if _system(target) == "macos":  # where a library has a name in it, by default the path at which it is made
+            line.append(f"-Wl,-install_name,@rpath/{output.name}")
         try:
             run = subprocess.run(line, capture_output=True, text=True, errors="replace")
         except OSError as error:
@@ -189,7 +194,11 @@ def build_core(folder: Path, target: str = "") -> list[Path]:
 
 
 def _system(target: str) -> str:
-    return target.split("-")[1] if target else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
+    return (
+        target.split("-")[1].split(".")[0]
+        if target
+        else {"Windows": "windows", "Darwin": "macos"}.get(platform.system(), "other")
+    )
 
 
 def _is_zig(command: list[str]) -> bool:

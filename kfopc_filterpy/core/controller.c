@@ -2,6 +2,12 @@
 #include "signals.h"
 #include <string.h>
 
+#ifdef ANC_FLOAT
+enum { LONGEST = 1 << 24 }; /* of the windows: positions in them are reals, and a float counts no further */
+#else
+enum { LONGEST = 1 << 28 };
+#endif
+
 static int in_range(const anc_setting *setting, real value)
 {
     return value >= setting->least && (setting->most == 0 ? isfinite(value) : value <= setting->most);
@@ -24,20 +30,22 @@ static int shape_accepted(const anc_plan *p)
         if (shape[i] < 1 || shape[i] > most) return 0;
     if (p->guard_taps < 0 || p->guard_taps > ANC_GUARD_TAPS || (p->limited && !p->limiter_windows)) return 0;
     if (S * J * I * L > most || S * K > most || S * J * (4 * M + 64) > most) return 0;
-    for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++)
-        if ((p->power_windows && (p->power_windows[sj] < 0 || ANC_POWERS * S * J * p->power_windows[sj] > most)) ||
-            (p->limited && (p->limiter_windows[sj] < 1 || 3 * S * J * p->limiter_windows[sj] > most)))
-            return 0;
+    for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {
+        const double power = p->power_windows ? p->power_windows[sj] : 0, limiter = p->limited ? p->limiter_windows[sj] : 1;
+        if (power < 0 || power > LONGEST || S * J * power * ANC_POWERS > most) return 0;
+        if (limiter < 1 || limiter > LONGEST || S * J * limiter * 3 > most) return 0;
+    }
     return K * J * I * (4 * L + 4 * ANC_GUARD_TAPS + 64) <= most && (I + K * J) * (4 * (L + M) + 8 * ANC_GUARD_TAPS + 64) <= most;
 }
 
 static int values_accepted(const anc_algorithm *a, const anc_plan *p)
 {
     const real *value = p->settings;
+    if (!p->path || (a->settings->name && !value) || (p->guard_taps && !p->guard)) return 0;
     for (int i = 0; a->settings[i].name; i++)
         for (int32_t n = 0; n < numbers_of(a->settings + i, p); n++)
             if (!in_range(a->settings + i, *value++)) return 0;
-    return all_finite(p->path, times(p->microphones * p->loudspeakers, p->path_taps)) && (!p->guard_taps || all_finite(p->guard, (size_t)p->guard_taps));
+    return all_finite(p->path, times(p->microphones * p->loudspeakers, p->path_taps)) && all_finite(p->guard, (size_t)p->guard_taps);
 }
 
 size_t anc_size(const anc_algorithm *a, const anc_plan *plan)

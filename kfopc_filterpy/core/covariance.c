@@ -14,14 +14,12 @@ static const real ROUNDING = DBL_EPSILON, MOST = 1e300, CAREFULLY = 1e100, SPLIT
 #endif
 enum { DIRECTION, DIRECTION_LOW, GAIN, GAIN_LOW, CAREFUL };
 
-static size_t triangle(int32_t n) { return times(padded(n) / PARTS, padded(n) / PARTS + 1) * (PARTS * PARTS / 2); }
-
 void layout_covariance(covariance *c, int32_t n, anc_layout *at)
 {
     c->n = n, c->padded = padded(n);
     c->owed = (anc_owed *)reals(at, "owed", ANC_STATE, 1, 1, 1, sizeof(anc_owed) / sizeof(real));
     c->u = reals(at, "gain_direction", ANC_STATE, 1, 1, 1, c->padded);
-    c->T = reals(at, "triangle", ANC_STATE, 1, 1, 1, (int32_t)triangle(n));
+    c->T = reals(at, "triangle", ANC_STATE, 1, c->padded / PARTS, c->padded / PARTS + 1, PARTS * PARTS / 2);
     c->h = reals(at, "row", ANC_SCRATCH, 1, 1, 1, c->padded);
     c->Ph = reals(at, "P_row", ANC_SCRATCH, 1, 1, 1, c->padded);
     c->careful = reals(at, "careful", ANC_SCRATCH, 1, 1, CAREFUL, c->padded);

@@ -104,6 +104,8 @@ void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)
         s->amplifier[sj] = (anc_amplifier){ANC_LINEAR, 1, 1};
         s->constraint[sj] = (anc_constraint){.rated_power = 1, .rate = 1, .supplied_factor = 1, .supplied_power = (real)NAN,
                                             .supplied_gain = (real)NAN, .factor = 1, .gain = (real)NAN};
+        if (s->limited) /* silent, and within its laps, until the host sets its numbers */
+            s->limiter[sj] = (anc_limiter){.size = (real)p->limiter_windows[sj], .spans = 1, .horizon = {(real)p->limiter_windows[sj]}};
     }
     set_loudest(s);
 }

@@ -8,7 +8,8 @@
 
 typedef anc_real real;
 
-#if defined __FAST_MATH__ || (defined FLT_EVAL_METHOD && FLT_EVAL_METHOD != 0)
+#if defined __FAST_MATH__ || (defined __FINITE_MATH_ONLY__ && __FINITE_MATH_ONLY__) || defined __ASSOCIATIVE_MATH__ || \
+    defined __RECIPROCAL_MATH__ || (defined FLT_EVAL_METHOD && FLT_EVAL_METHOD != 0)
 #error "the core promises equal bits: compile it without -ffast-math, and not for the x87"
 #endif
 

@@ -1,0 +1,271 @@
+"""How the core is compiled and loaded: flags, levels, stamps, and what is said where something is missing."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from helpers.core import c_compiler, exported, program_flags, ran, tool, zig
+
+from kfopc_filterpy.core import building, library
+
+WARNINGS = ("-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
+HOW = "python -m pip install -e ."
+
+
+@pytest.fixture
+def no_flags(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Clear the variables that choose the compiler and its flags."""
+    for name in ("CC", "CFLAGS", "CPPFLAGS", "LDFLAGS"):
+        monkeypatch.delenv(name, raising=False)
+    return monkeypatch
+
+
+@pytest.fixture
+def copied(tmp_path: Path) -> Path:
+    """Return the folder `core` of a copy, in a package that has nothing else."""
+    folder = tmp_path / "kfopc_filterpy" / "core"
+    shutil.copytree(building.FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__", ".building-*"))
+    (folder.parent / "__init__.py").touch()
+    return folder
+
+
+def loaded(core: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Load the library of a copy in a process of its own."""
+    code = "from kfopc_filterpy.core.library import load; print(load().level)"
+    command, environment = [sys.executable, "-c", code], {"PATH": "", **variables}
+    return subprocess.run(command, capture_output=True, text=True, env=environment, cwd=core.parents[1])
+
+
+def only_line(failed: subprocess.CompletedProcess[str]) -> str:
+    """Return the message of an ImportError, which is one line."""
+    assert failed.returncode == 1
+    last = failed.stderr.splitlines()[-1]
+    assert last.startswith("ImportError: "), failed.stderr
+    return last
+
+
+def in_use() -> Path:
+    """Return the library that this process has loaded."""
+    return library.load().path
+
+
+# Loading.
+
+
+def test_a_library_of_other_sources_is_refused(copied: Path) -> None:
+    assert loaded(copied).returncode == 0
+    with (copied / "lms.c").open("a") as file:
+        file.write("/* edited */\n")
+    message = only_line(loaded(copied))
+    assert "was built from other sources" in message
+    assert HOW in message
+
+
+def test_a_missing_library_is_reported(copied: Path) -> None:
+    for path in copied.glob("libanc-*"):
+        path.unlink()
+    message = only_line(loaded(copied))
+    assert "is not built" in message
+    assert HOW in message
+
+
+def test_a_library_for_another_machine_is_reported(copied: Path) -> None:
+    (copied / building.library_name("double", "baseline")).write_bytes(b"not a library")
+    message = only_line(loaded(copied))
+    assert "does not load" in message
+    assert HOW in message
+
+
+def test_only_the_library_that_is_loaded_need_be_current(copied: Path) -> None:
+    """An old one of another level is refused where it is asked for."""
+    higher = sorted(copied.glob("libanc-double-x86-64-*"))
+    if not higher or library.load().level == "baseline":
+        pytest.skip("only the baseline is built, or this processor has no more")
+    for path in higher:
+        shutil.copy(in_use(), path)
+        path.write_bytes(path.read_bytes().replace(building.stamp().encode(), b"0" * 16))
+    assert "was built from other sources" in only_line(loaded(copied))
+    assert loaded(copied, KFOPC_CORE_LEVEL="baseline").stdout.strip() == "baseline"
+
+
+@pytest.mark.parametrize("level", building.levels())
+def test_forced_level(level: str) -> None:
+    if not (building.FOLDER / building.library_name("double", level)).exists():
+        pytest.skip(f"the level {level} is not built")
+    run = loaded(building.FOLDER, KFOPC_CORE_LEVEL=level)
+    if run.returncode:
+        assert f"KFOPC_CORE_LEVEL={level}: the levels that are built and that this machine has are" in only_line(run)
+        assert building.LEVELS.index(level) > building.LEVELS.index(library.load().level)
+    else:
+        assert run.stdout.strip() == level
+
+
+def test_unknown_level_is_refused() -> None:
+    message = only_line(loaded(building.FOLDER, KFOPC_CORE_LEVEL="x86-64-v9"))
+    assert "KFOPC_CORE_LEVEL=x86-64-v9" in message
+    assert "baseline" in message
+
+
+def test_unknown_real_is_refused() -> None:
+    with pytest.raises(ValueError, match="real must be one of"):
+        library.load("half")
+
+
+def test_libraries_of_this_machine_are_current() -> None:
+    """One that is left over from an earlier build would not be noticed before somebody asks for its level."""
+    for path in building.FOLDER.glob("libanc-*"):
+        assert building.stamp_of(ctypes.CDLL(str(path))) == building.stamp(), path
+
+
+# Flags.
+
+
+@pytest.mark.parametrize("name", ["CFLAGS", "CPPFLAGS", "LDFLAGS", "CC"])
+@pytest.mark.parametrize("flag", [*building._REFUSED, *(f"{flag}=all" for flag in building._REFUSED_BEGINNINGS)])
+def test_flags_that_break_equal_bits_are_refused(name: str, flag: str, no_flags: pytest.MonkeyPatch) -> None:
+    no_flags.setenv(name, f"gcc -O2 {flag} -g" if name == "CC" else f"-O2 {flag} -g")
+    with pytest.raises(building.BuildError, match=re.escape(f"{flag} breaks this, remove it")):
+        building.flags(building.compiler())
+
+
+def test_flags_of_packagers_are_honoured(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    """Debug information, hardening and a path in the library appear; the level and the contraction stay ours."""
+    command = c_compiler()
+    no_flags.setenv("CC", command[0])
+    no_flags.setenv("CFLAGS", "-O2 -g -fstack-protector-strong -Wformat -Werror=format-security -ffp-contract=off")
+    no_flags.setenv("CPPFLAGS", "-D_FORTIFY_SOURCE=2")
+    no_flags.setenv("LDFLAGS", "-Wl,-rpath,/of/a/packager")
+    made = tmp_path / building.library_name("double", "baseline")
+    building.build(building.core_sources(), made)
+    content = made.read_bytes()
+    assert b".debug_info" in content
+    assert b"/of/a/packager" in content
+    given = building.flags(command)
+    assert given.index("-O2") < given.index("-O3")  # ours decide
+    assert building.stamp_of(ctypes.CDLL(str(made))) == building.stamp()
+
+
+@pytest.mark.parametrize("flag", ["-ffast-math", "-Ofast", "-ffinite-math-only", "-funsafe-math-optimizations"])
+def test_headers_refuse_fast_mathematics(flag: str, tmp_path: Path) -> None:
+    """Whoever compiles the C files with his own tools is told too."""
+    unit = tmp_path / "unit.c"
+    unit.write_text('#include "signals.h"\n')
+    command = [*c_compiler(), *building.FLAGS, f"-I{building.FOLDER}", flag, "-fsyntax-only", str(unit)]
+    run = subprocess.run(command, capture_output=True, text=True)
+    assert run.returncode
+    assert "the core promises equal bits" in run.stderr
+
+
+def test_a_failing_compiler_is_quoted(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    no_flags.setenv("CC", c_compiler()[0])
+    unit = tmp_path / "unit.c"
+    unit.write_text("#error of this kind\n")
+    with pytest.raises(building.BuildError, match="of this kind"):
+        building.build([unit], tmp_path / "lib.so")
+    assert [path.name for path in tmp_path.iterdir()] == ["unit.c"]  # nothing half made
+
+
+# Compilers.
+
+
+def test_no_compiler_says_what_to_install(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    no_flags.setenv("PATH", str(tmp_path))
+    no_flags.setattr(building.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(building.BuildError) as caught:
+        building.build(building.core_sources(), tmp_path / "lib.so")
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in ("gcc", "clang", "CC", "-m pip install ziglang"):
+        assert word in message
+
+
+def test_a_named_compiler_that_is_missing_is_reported(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    no_flags.setenv("CC", "no-such-compiler")
+    with pytest.raises(building.BuildError, match="the C compiler no-such-compiler does not start"):
+        building.build(building.core_sources(), tmp_path / "lib.so")
+    with pytest.raises(building.BuildError, match="no-such-compiler does not start"):
+        building.build_core(tmp_path)
+
+
+def test_zig_is_taken_where_the_machine_has_no_compiler(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    no_flags.setenv("PATH", str(tmp_path))
+    no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
+    assert building.compiler() == [sys.executable, "-m", "ziglang", "cc"]
+
+
+def test_only_zig_builds_for_other_machines(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    no_flags.setenv("CC", "gcc")
+    with pytest.raises(building.BuildError, match="only zig builds for other machines"):
+        building.build(building.core_sources(), tmp_path / "lib.so", target="aarch64-linux-musl")
+
+
+@pytest.mark.parametrize(
+    ("target", "name"),
+    [
+        ("x86_64-linux-gnu.2.17", "libanc-float-baseline.so"),
+        ("aarch64-macos.11.0", "libanc-float-baseline.dylib"),
+        ("x86_64-windows-gnu", "libanc-float-baseline.dll"),
+    ],
+)
+def test_names_of_libraries_for_other_systems(target: str, name: str) -> None:
+    assert building.library_name("float", "baseline", target) == name
+
+
+@pytest.mark.parametrize("real", building.REALS)
+@pytest.mark.parametrize("compiler", ["gcc", "clang", "zig"])
+def test_no_warnings(real: str, compiler: str, tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
+    command = zig() if compiler == "zig" else [tool(compiler, compiler)]
+    options = (*building.flags(command, real), *WARNINGS)
+    ran(*command, *options, *building.core_sources(), "-o", tmp_path / "libanc.so", "-lm")
+
+
+def test_headers_are_c_plus_plus_too(tmp_path: Path) -> None:
+    unit = tmp_path / "unit.cpp"
+    unit.write_text('#include "anc.h"\nconst anc_algorithm *used = &anc_fxlms;\n')
+    ran(tool("g++", "g++"), "-std=c++11", *WARNINGS, f"-I{building.FOLDER}", "-fsyntax-only", unit)
+
+
+@pytest.mark.parametrize("header", ["anc.h", "vectors.h", "signals.h"])
+def test_headers_stand_alone(header: str, tmp_path: Path) -> None:
+    unit = tmp_path / "unit.c"
+    unit.write_text(f'#include "{header}"\n#include "{header}"\nextern int something;\n')
+    command = c_compiler()
+    ran(
+        *command,
+        *program_flags(command),
+        *WARNINGS,
+        "-Wno-unused-function",
+        "-Wno-unused-const-variable",
+        "-fsyntax-only",
+        unit,
+    )
+
+
+# What a library shows.
+
+
+@pytest.mark.parametrize("path", sorted(building.FOLDER.glob("libanc-*")), ids=lambda path: path.name)
+def test_every_public_symbol_begins_with_anc(path: Path) -> None:
+    listing = ran(tool("nm", "binutils"), "-D", "--defined-only", path)
+    kinds = {name: kind for kind, name in (line.split()[-2:] for line in listing.splitlines())}
+    assert [name for name in kinds if not name.startswith("anc_")] == []
+    data = {name for name, kind in kinds.items() if kind in "DRBV"} - {"anc_stamp"}
+    assert data == {f"anc_{name}" for name in exported()}
+    header = (building.FOLDER / "anc.h").read_text(encoding="utf-8")
+    functions = set(re.findall(r"^ANC_PUBLIC [^;(]*?(anc_\w+)\(", header, re.M)) | {"anc_processor_level"}
+    assert {name for name, kind in kinds.items() if kind == "T"} == functions
+
+
+@pytest.mark.parametrize("path", sorted(building.FOLDER.glob("libanc-*")), ids=lambda path: path.name)
+def test_a_library_needs_no_memory_and_no_files(path: Path) -> None:
+    """No allocation, no input or output: of the C library it takes copying, sqrt and the like."""
+    listing = ran(tool("nm", "binutils"), "-D", "--undefined-only", path)
+    names = {line.split()[-1].split("@")[0] for line in listing.splitlines()}
+    allowed = {"memcpy", "memset", "memmove", "sqrt", "sqrtf", "__stack_chk_fail"}
+    assert {name for name in names if not name.startswith(("_ITM_", "__cxa_finalize", "__gmon_start__"))} <= allowed

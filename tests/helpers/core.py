@@ -1,0 +1,121 @@
+"""The algorithms that the core exports, with settings for tests, and the C programs of tests/core that run them."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from kfopc_filterpy.core import building, library
+
+KALMAN = {"state_noise": 2.0**-20, "measurement_noise": 2.0**-7, "initial_variance": 2.0**-7, "fading": 1.0}
+FOLDER = Path(__file__).resolve().parents[1] / "core"
+# The settings of every algorithm, in the order of its C file, such that it adapts to noise of power 1/3. A float holds each.
+ALGORITHMS: dict[str, Mapping[str, float]] = {
+    "fxlms": {"step_size": 2.0**-7},
+    "fxnlms": {"step_size": 2.0**-4, "regularization": 2.0**-5},
+    "leaky": {"step_size": 2.0**-7, "leak": 2.0**-4},
+    "optimal_leaky": {"step_size": 2.0**-7},
+    "mov": {"step_size": 2.0**-7, "modified": 1.0},
+    "mov_fixed": {"step_size": 2.0**-7, "modified": 0.0, "penalty_factor": 2.0**-3},
+    "two_gradient": {"step_size": 2.0**-7, "amplitude_limit": 2.0**-4, "output_step_size": 2.0**-8},
+    "clipping": {"step_size": 2.0**-7, "amplitude_limit": 2.0**-4},
+    "rescaling": {"step_size": 2.0**-7, "amplitude_limit": 2.0**-4},
+    "kalman": KALMAN,
+    "repaired": KALMAN | {"of_control": 1.0, "trim_rate": 2.0**-7, "at_output": 1.0},
+    "diagonal": {"state_noise": 2.0**-20, "measurement_noise": 2.0**-7, "initial_variance": 2.0**-7},
+    "fast_array": {"measurement_noise": 2.0**-4, "initial_variance": 2.0**-4, "forgetting": 1.0},
+    "finite_memory": {"measurement_noise": 2.0**-4, "initial_variance": 2.0**-4, "memory": 64.0},
+    "signals_alone": {},
+}
+
+
+def exported() -> list[str]:
+    """Return the names of the algorithms that anc.h declares, without ``anc_``."""
+    text = (building.FOLDER / "anc.h").read_text(encoding="utf-8")
+    (names,) = re.findall(r"^extern ANC_PUBLIC const anc_algorithm ([^;]+);", text, re.M)
+    return [name.strip().removeprefix("anc_") for name in names.split(",")]
+
+
+def known() -> list[str]:
+    """Return the algorithms of the table; a test fails if the core has another."""
+    assert set(exported()) == set(ALGORITHMS), (
+        f"ALGORITHMS of tests/helpers/core.py and anc.h differ in {sorted(set(exported()) ^ set(ALGORITHMS))}: "
+        "enter a new algorithm with its settings"
+    )
+    return list(ALGORITHMS)
+
+
+def c_compiler() -> list[str]:
+    """Return the machine's C compiler, or skip the test."""
+    found = next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))), None)
+    if found is None:
+        pytest.skip("needs a C compiler: cc, gcc or clang")
+    return [found]
+
+
+def zig() -> list[str]:
+    """Return the command of zig's C compiler, or skip the test."""
+    if importlib.util.find_spec("ziglang") is None:
+        pytest.skip("needs zig: python -m pip install ziglang")
+    return [sys.executable, "-m", "ziglang", "cc"]
+
+
+def highest_level() -> str:
+    """Return the highest level of this processor, whether a library was built for it or not."""
+    return {3: "x86-64-v3", 4: "x86-64-v4"}.get(library.load().free.anc_processor_level(), "baseline")
+
+
+def tool(name: str, package: str) -> str:
+    """Return the path of a program of the machine, or skip the test."""
+    found = shutil.which(name)
+    if found is None:
+        pytest.skip(f"needs {name}, which comes with {package}")
+    return found
+
+
+def ran(*command: object, cwd: Path | None = None, **variables: str) -> str:
+    """Run a command and return what it printed; if it fails, so does the test."""
+    line = [str(part) for part in command]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=cwd, env={**os.environ, **variables})
+    assert done.returncode == 0, f"{' '.join(line)}\n{done.stdout[-3000:]}{done.stderr[-3000:]}"
+    return done.stdout
+
+
+def program_flags(command: list[str], real: str = "double", level: str = "baseline", target: str = "") -> list[str]:
+    """Return the flags that the library is built with, for a program."""
+    return [flag for flag in building.flags(command, real, level, target) if flag not in ("-shared", "-fPIC")]
+
+
+def program(
+    name: str, folder: Path, command: list[str], *options: str, sources: list[Path] | None = None, **of_flags: str
+) -> Path:
+    """Compile a program of tests/core with the sources of the core, or against a library, and return its path."""
+    rows = ", ".join(
+        f"{{ALGORITHM({algorithm}), {{{', '.join(f'(anc_real){value!r}' for value in settings.values())}}}}}"
+        for algorithm, settings in ALGORITHMS.items()
+    )
+    table = "static struct { const char *name; const anc_algorithm *algorithm; anc_real settings[8]; } algorithms[]"
+    (folder / "algorithms.h").write_text(f"{table} = {{{rows}, {{0}}}};\n")
+    made = folder / name
+    files = building.core_sources() if sources is None else sources
+    include = (f"-I{folder}", f"-I{FOLDER}")
+    ran(
+        *command,
+        *program_flags(command, **of_flags),
+        *options,
+        *include,
+        FOLDER / f"{name}.c",
+        *files,
+        "-o",
+        made,
+        "-lm",
+    )
+    return made
