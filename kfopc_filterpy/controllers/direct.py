@@ -153,6 +153,15 @@ class DirectKalman(CoreController):
         direction = fields["gain_direction"][: self._weights().size]
         return full_covariance(fields["triangle"], direction, scale, diagonal, -scale * pending)
 
+    @property
+    def innovation(self) -> Any:
+        """Innovation of the last update over its standard deviation; with several channels that of each microphone, (K,).
+
+        The microphones are measured one after the other, so each of them is predicted with those before it known.
+        """
+        innovation = self._opened().fields["innovation"].ravel()
+        return innovation.copy() if self.multichannel else float(innovation[0])
+
     def _after_new_path(self, before: np.ndarray) -> None:
         """Let P grow by the variance that the new paths give to the weights."""
         self._opened().fields["owed"].ravel().view(OWED)["diagonal"] += self._variance_by_new_path(before)

@@ -9,7 +9,7 @@ void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *sett
     kalman *f = (kalman *)view;
     layout_signals(&f->s, plan, settings, at);
     layout_covariance(&f->c, states(&f->s), at);
-    f->scaled = reals(at, "measurement", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
+    f->scaled = reals(at, "innovation", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
 }
 
 void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)
@@ -34,18 +34,19 @@ static real energy(const signals *s, const lines *rows, int32_t k)
     return sum;
 }
 
-/* Measure at microphone k: eq. 5-9 for every scenario, with one gain. */
-static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
+/* Measure z at microphone k: eq. 5-9 for every scenario, with one gain. The innovations over sqrt(S) take the place of z. */
+static void measure(kalman *f, const lines *rows, int32_t k, real *z)
 {
     const int32_t n = f->c.n;
     const real q = f->s.setting[MEASUREMENT_NOISE][k];
     observe(f, rows, k);
     const real S = project(&f->c) + q; /* eq. 7 */
-    if (!(S > 0)) return;              /* no noise, and nothing that P leaves open: nothing is told */
-    const real inverse_root = downdate(&f->c, S, q);
+    const real inverse_root = S > 0 ? downdate(&f->c, S, q) : 0; /* 0: no noise, and nothing that P leaves open */
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         real *w = weights_of(&f->s, scenario * f->s.J);
-        correct(&f->c, w, (z ? z[scenario * f->s.K + k] : 0) - dot(f->c.h, w, n), inverse_root, LARGEST);
+        const real innovation = (z ? z[scenario * f->s.K + k] : 0) - dot(f->c.h, w, n);
+        if (inverse_root > 0) correct(&f->c, w, innovation, inverse_root, LARGEST);
+        if (z) z[scenario * f->s.K + k] = innovation * inverse_root;
     }
 }
 

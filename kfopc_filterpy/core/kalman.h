@@ -6,7 +6,7 @@
 typedef struct {
     signals s;
     covariance c;
-    real *scaled; /* (S, K) alpha d^, the measurements */
+    real *scaled; /* (S, K) alpha d^, the measurements; after the update the innovations, over sqrt(S) */
     real *trim;   /* (S, J, TRIMS) of repaired.c only */
 } kalman;
 

@@ -569,6 +569,9 @@ def _remembered(controller: Any) -> int:
 
 def _surprise(controller: Any) -> float:
     """Return the squared innovation over its predicted variance of a Kalman filter's last update; NaN without one."""
+    normalized = getattr(controller, "innovation", None)
+    if normalized is not None:
+        return float(normalized) ** 2 if np.ndim(normalized) == 0 else np.nan
     estimator = getattr(controller, "estimator", None)
     innovation, variance = (getattr(estimator, name, None) for name in ("y", "S"))
     if innovation is None or variance is None or np.size(innovation) != 1 or np.size(variance) != 1:

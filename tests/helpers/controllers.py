@@ -51,7 +51,6 @@ def constraint(**settings: Any) -> OutputPowerConstraint:
 
 MAKERS: dict[str, Any] = {
     "KF-ANC": lambda **o: kf_anc(N_TAPS, S_HAT, **KALMAN, **o),
-    "KF-ANC, float32": lambda **o: kf_anc(N_TAPS, S_HAT, dtype=np.float32, **KALMAN, **o),
     "KF-OPC": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
     "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
     "KF-OPC repaired": lambda **o: kf_opc_repaired(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
@@ -111,7 +110,6 @@ def limiters() -> list[OutputLimiter]:
 
 SEVERAL: dict[str, Any] = {
     "kf_anc": lambda: kf_anc(L, PATHS, **KALMAN, **MANY),
-    "kf_anc, float32": lambda: kf_anc(L, PATHS, dtype=np.float32, **KALMAN, **MANY),
     "kf_opc": lambda: kf_opc(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
     "kf_pb, direct": lambda: kf_pb(L, PATHS, rated_power=[0.02, 0.05], form="direct", fs=FS, **KALMAN, **MANY),
     "kf_pb": lambda: kf_pb(L, PATHS, rated_power=[0.02, 0.05], fs=FS, **MANY),
@@ -248,6 +246,5 @@ FILTERS: dict[str, Any] = {
     "KFOPC, loudspeakers": lambda: _full(constraint=constraints()),
     "random walk": lambda: KFOPC.random_walk(N_TAPS, **KALMAN),
     "random walk, KF-OPC": lambda: KFOPC.random_walk(N_TAPS, constraint=constraint(), **KALMAN),
-    "random walk, float32": lambda: KFOPC.random_walk(N_TAPS, dtype=np.float32, **KALMAN),
     "power budget": lambda: PowerBudgetKalmanFilter(N_TAPS, rated_power=0.3, fs=FS, memory_s=0.05, **KALMAN),
 }
