@@ -60,10 +60,11 @@ void predict(covariance *c, real fading, real state_noise)
     c->owed->diagonal = fading * c->owed->diagonal + state_noise;
 }
 
-/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. */
-static real pass(covariance *c, real pending, real diagonal)
+/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. Only with a `pending` of 0
+ * or 1 are the elements (i, j) and (j, i) of a group rounded alike. */
+static real pass(covariance *c, const real *restrict u, real pending, real diagonal)
 {
-    const real *restrict u = c->u, *restrict h = c->h;
+    const real *restrict h = c->h;
     real *restrict Ph = c->Ph, *row = c->T;
     for (int32_t i = 0; i < c->padded; i += 2) {
         const int32_t group = i / PARTS * PARTS, length = group + PARTS;
@@ -116,10 +117,13 @@ real project(covariance *c)
         if (owed->diagonal < least) owed->diagonal = least;
     }
     owed->bound = owed->scale * owed->bound + owed->diagonal;
+    const real *u = c->u;
     if (owed->scale != 1) { /* only with a fading memory */
         for (size_t i = 0; i < triangle(c->n); i++) c->T[i] *= owed->scale;
+        for (int32_t j = 0; j < c->padded; j++) c->careful[j] = root(owed->scale) * c->u[j];
+        u = c->careful;
     }
-    const real variance = pass(c, owed->scale * owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
+    const real variance = pass(c, u, owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
     owed->scale = 1, owed->diagonal = owed->pending = 0;
     return variance < blur * owed->bound ? blurred(c, variance, blur) : variance;
 }

@@ -349,7 +349,7 @@ class RandomWalkKFOPC(KFOPC):
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
         """Apply eq. 5-9; return the new weights. A refused update raises before anything changes."""
         constraint, weights = self._constraint, self._weights()
-        if not isfinite(z + float(h @ h)):
+        if not isfinite(z + np.vdot(h, h)):
             checked_measurement(self, z, None, h)  # raises if one of them is not finite
         factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
         if noise == 0.0 and not h.any():
