@@ -290,6 +290,7 @@ int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h,
     memcpy(c.h, h, sizeof(real) * (size_t)n);
     const real S = project(&c) + q, y = z - dot(h, w, n);
     if (S > 0) correct(&c, w, y, downdate(&c, S, q), LARGEST);
+    else memset(c.u, 0, sizeof(real) * (size_t)c.padded); /* P is what it was predicted to be */
     result[0] = y, result[1] = S;
     return ANC_DONE;
 }

@@ -252,8 +252,8 @@ class RandomWalkKFOPC(KFOPC):
     def K(self) -> np.ndarray:
         """Kalman gain of the last update, (n, 1)."""
         if self._K is None:  # eq. 6, K = P x' / S
-            u = direction_of(self._covariance.arrays, self.dim_x)
-            self._K = (u / sqrt(self._numbers["variance"][0])).reshape(-1, 1)
+            u, S = direction_of(self._covariance.arrays, self.dim_x), self._numbers["variance"][0]
+            self._K = (u / sqrt(S) if S > 0 else np.zeros_like(u)).reshape(-1, 1)
         return self._K
 
     @K.setter

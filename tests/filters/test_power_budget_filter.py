@@ -420,7 +420,7 @@ def test_an_amplifier_that_clips_drives_kf_anc_apart_and_not_kf_pb(kind: str) ->
 
 def test_scenarios_and_another_sample_rate_are_refused() -> None:
     options = {"disturbance": np.ones(10), "secondary_path": S_HAT}
-    with pytest.raises(ValueError, match=r"controllers\[0\] has a power budget.*use simulate"):
+    with pytest.raises(TypeError, match=r"controllers\[0\] must be a controller of the core"):
         simulate_scenarios([controller()], np.ones(10), fs=FS, **options)
     with pytest.raises(ValueError, match=r"fs is 16000 Hz but the controller's .* is for 8000 Hz"):
         simulate(controller(), np.ones(10), fs=16000.0, **options)
