@@ -58,6 +58,8 @@ class DirectKalman(CoreController):
         Limiter of the control signal, or one for each loudspeaker, not shared with another controller.
     name : str, optional
         Name in results and legends; by default KF-OPC with a rated power, else KF-ANC.
+    **settings
+        Settings that the `algorithm` of a subclass adds to these.
 
     Raises
     ------

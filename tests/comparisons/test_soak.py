@@ -173,7 +173,7 @@ def test_a_violation_fails_the_command(
     monkeypatch.setattr(study, "all_cases", lambda: [case])
     assert main(["soak", "--quiet", "--samples", "2000", "--output", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
-    assert "VIOLATION: breaking, float64, white, by sample 1,100: the smallest eigenvalue" in printed
+    assert "VIOLATION: breaking, white, by sample 1,100: the smallest eigenvalue" in printed
     assert "2 of 2 runs violated a promise" in printed
 
 
