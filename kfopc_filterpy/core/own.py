@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from . import building
-from .block import Algorithm, _Algorithm, _Plan, VISITOR
+from .block import VISITOR, Algorithm, _Algorithm, _Plan
 from .library import load
 
 CACHE_VARIABLE = "KFOPC_CACHE"

@@ -143,7 +143,9 @@ def simulate_scenarios(
     results = {name: np.full((count, x.size), np.nan) for name in RESULTS}
     noisy = [noise.filled(row) is not None for noise, row in zip(noises, results["error"], strict=True)]
     results["error"][np.logical_not(noisy)] = 0.0
-    present = np.array(np.broadcast_to(d, (count, x.size)), order="C")  # a copy: that of a diverged scenario is silenced
+    present = np.array(
+        np.broadcast_to(d, (count, x.size)), order="C"
+    )  # a copy: that of a diverged scenario is silenced
     signals = Signals(x[None], present, results["error"] if any(noisy) else None, *results.values())
     recorded = {
         name: np.full((count, x.size), np.nan) for name in (RECORDED + POWERS[:2] if record_powers else RECORDED)

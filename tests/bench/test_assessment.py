@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from kfopc_filterpy import kf_pb, noise_reduction_db
+from kfopc_filterpy import noise_reduction_db
 from kfopc_filterpy.bench import algorithms, assess, assessed_runs, compare_recordings
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.metrics import convergence_time_s, overshoot
