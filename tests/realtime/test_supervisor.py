@@ -12,7 +12,7 @@ from helpers.channels import random_paths
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import FxLMS, OutputPowerConstraint, kf_anc, kf_opc
+from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
 from kfopc_filterpy.controllers import MonitoredController
 from kfopc_filterpy.realtime import SimulatedInterface, Supervisor
 
@@ -267,6 +267,20 @@ def test_louder_noise_is_no_divergence(name: str, up_db: int) -> None:
     supervisor = supervised(controller, amplitude_limit=1e3, full_scale=1e3)
     loop(supervisor, noise)
     assert not supervisor.health.counts
+
+
+def test_the_innovation_of_a_core_controller_is_that_of_the_filter() -> None:
+    """Over its standard deviation: y / S^0.5, after a start in twice the precision, too."""
+    noises = {"state_noise": 1e-4, "measurement_noise": 1e-4, "initial_variance": 1e3}
+    core, filterpys = kf_anc(8, PATH, **noises), KalmanController(KFOPC.random_walk(8, **noises), PATH)
+    for x, e in np.random.default_rng(0).standard_normal((60, 2)):
+        for controller in (core, filterpys):
+            controller.control_signal(x)
+            controller.update(e)
+        kf = filterpys.estimator
+        assert core.innovation == pytest.approx(kf.y.item() / np.sqrt(kf.S.item()), rel=1e-6)
+    several = kf_anc(8, PATHS, **noises)
+    assert several.innovation.shape == (2,)
 
 
 def test_surprising_innovations_are_a_divergence() -> None:
