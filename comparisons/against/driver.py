@@ -240,7 +240,6 @@ PEAK: dict[str, Any] = LMS | {"amplitude_limit": 0.8}
 # One channel: each is called with a scene and further options. Constraints keep a state, so each run has its own.
 SINGLE: dict[str, Any] = {
     "KF-ANC": lambda s, **o: made(kf_anc, s, **KALMAN, **o),
-    "KF-ANC, float32": lambda s, **o: made(kf_anc, s, dtype=np.float32, **KALMAN, **o),
     "KF-OPC": lambda s, **o: made(kf_opc, s, constraint=rated(), **KALMAN, **o),
     "KF-OPC, sliding": lambda s, **o: made(kf_opc, s, constraint=rated(window="sliding"), **KALMAN, **o),
     "KF-OPC repaired": lambda s, **o: made(kf_opc_repaired, s, constraint=rated(), **KALMAN, **o),
@@ -304,7 +303,6 @@ def both(make: Callable[[float], Any]) -> list[Any]:
 
 SEVERAL: dict[str, Make] = {
     "KF-ANC": lambda s: made(kf_anc, s, **KALMAN),
-    "KF-ANC, float32": lambda s: made(kf_anc, s, dtype=np.float32, **KALMAN),
     "KF-ANC, known amplifiers": lambda s: made(kf_anc, s, amplifier=WIDE, **KALMAN),
     "KF-ANC, uncertain path": lambda s: with_tolerance(made(kf_anc, s, **KALMAN)),
     "KF-OPC": lambda s: made(kf_opc, s, constraint=both(rated), **KALMAN),
@@ -337,7 +335,7 @@ AROUND_SEVERAL: dict[str, Make] = {
         made(FxLMS, replace(s, estimate=s.estimate[1:]), **LMS), s.estimate, decaying(1, 1, 6, 5, 0), physical=[0]
     ),
 }
-ROOM_2 = [*(name for name in SEVERAL if "float32" not in name), *AROUND_SEVERAL]
+ROOM_2 = [*SEVERAL, *AROUND_SEVERAL]
 ROOM_4: dict[str, Make] = {
     "KF-ANC": SEVERAL["KF-ANC"],
     "KF-OPC": lambda s: made(kf_opc, s, rated_power=0.1, **KALMAN),

@@ -224,11 +224,10 @@ def _without_forgetting(runs: Runs, scene: Scene) -> dict[str, dict[str, float]]
 def _by_filterpy(scene: Scene, setting: Setting) -> SimulationResult:
     """Run the first part of the study with filterpy's own KalmanFilter as the estimator of KF-ANC."""
     fast = make_controller(scene, "KF-ANC", setting)
-    assert isinstance(fast, KalmanController)
     estimator = KalmanFilter(dim_x=scene.n_taps, dim_z=1)
     estimator.P *= scene.initial_variance
-    estimator.Q *= fast.estimator.state_noise
-    estimator.R *= fast.estimator.measurement_noise
+    estimator.Q *= fast.state_noise
+    estimator.R *= fast.measurement_noise
     start = slice(0, int(scene.switch_on_s * scene.fs) + FILTERPY_SAMPLES)
     short = dataclasses.replace(
         scene, references=[scene.references[0][start]], disturbances=[scene.disturbances[0][start]]

@@ -20,8 +20,6 @@ from .tuning import AllDivergedError, tune
 ALGORITHMS = ("KF-PB", "KF-OPC", "FxLMS")
 NSE_WINDOW_S = 0.1  # of the figures that are drawn beside the time of convergence
 TUNED_ON_S = 5.0  # of the record, for FxLMS's step size
-MANY_TAPS = 192  # from which float32 pays
-LEAST_STATE_NOISE = 3e-7  # over the initial variance, for float32, which rounds that by 6e-8
 
 
 @dataclass
@@ -83,7 +81,7 @@ class Plan:
         outside: dict[str, Any] = {"limiter": limiter}
         if several:
             outside["n_references"] = len(self.x)
-        noises: dict[str, Any] = {**self.settings.settings, "dtype": self.precision}
+        noises: dict[str, Any] = self.settings.settings
         if name == "FxLMS":
             return FxLMS(n_taps, self.s, step_size=self.step_size, **outside)
         if name == "KF-OPC":
@@ -99,13 +97,6 @@ class Plan:
             **outside,
             **own,
         )
-
-    @property
-    def precision(self) -> type:
-        """float32 for long filters, which halves the time, if the state noise is well above its rounding of P."""
-        settings = self.settings
-        is_safe = settings.state_noise > LEAST_STATE_NOISE * settings.initial_variance
-        return np.float32 if is_safe and settings.n_taps >= MANY_TAPS else np.float64
 
     @property
     def tuning_samples(self) -> int:

@@ -15,7 +15,6 @@ from scipy.signal import fftconvolve
 
 from kfopc_filterpy import (
     HardClipAmplifier,
-    KalmanController,
     SimulationResult,
     clipped_fraction,
     convergence_time_s,
@@ -32,6 +31,7 @@ from kfopc_filterpy.bounds import (
     wiener_solution,
 )
 from kfopc_filterpy.bounds.channels import full_channel_stretch
+from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
@@ -218,7 +218,7 @@ class Scene:
         )
 
     def run_together(
-        self, controllers: Sequence[KalmanController], seed_index: int = 0, **options: Any
+        self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
     ) -> list[SimulationResult]:
         """Run `controllers` that share their gains on the noise of one seed, of index `seed_index`.
 

@@ -28,10 +28,7 @@ from .processing import (
     require_one_length,
 )
 
-NO_SOLUTION = (
-    "the update has no solution: S = x' P x' + q must be positive and finite; a silent reference with "
-    "measurement_noise = 0 tells nothing: give measurement_noise > 0"
-)
+NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
 
 
 OVERFLOW = (

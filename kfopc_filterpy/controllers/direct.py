@@ -58,6 +58,8 @@ class DirectKalman(CoreController):
         Limiter of the control signal, or one for each loudspeaker, not shared with another controller.
     name : str, optional
         Name in results and legends; by default KF-OPC with a rated power, else KF-ANC.
+    **settings
+        Settings that the `algorithm` of a subclass adds to these.
 
     Raises
     ------
@@ -147,7 +149,10 @@ class DirectKalman(CoreController):
 
     @property
     def innovation(self) -> Any:
-        """Innovation alpha d^ - w'x' of the last sample; with several channels (K,)."""
+        """Innovation alpha d^ - w'x' of the last update; with several channels that of each microphone, (K,).
+
+        The microphones are measured one after the other, so each of them is predicted with those before it known.
+        """
         return self._of_microphones("innovation")
 
     @property

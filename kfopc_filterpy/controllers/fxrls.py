@@ -46,10 +46,13 @@ def fx_rls(
     ------
     ValueError
         A forgetting factor outside (0, 1], secondary paths of several channels, or arguments that `kf_anc` refuses. In
-        a run: a P that is no longer positive
-        definite. Band-limited noise and tones do not excite all directions of the control filter. In the others P grows
-        by 1/lambda per sample until rounding corrupts it, after some 23 time constants of the memory. State noise
-        instead of forgetting (`kf_anc`) causes no such growth.
+        a run: a P that is too large.
+
+    Notes
+    -----
+    Band-limited noise and tones do not excite all directions of the control filter. In the others P grows by 1/lambda
+    per sample until rounding corrupts it, after some 23 time constants of the memory, and the control diverges. State
+    noise instead of forgetting (`kf_anc`) causes no such growth.
 
     References
     ----------

@@ -58,7 +58,8 @@ void predict(covariance *c, real fading, real state_noise)
     c->owed->diagonal = fading * c->owed->diagonal + state_noise;
 }
 
-/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. */
+/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. `pending` is 0 or 1, so that
+ * the elements (i, j) and (j, i) of a group are rounded alike. */
 static real pass(covariance *c, real pending, real diagonal)
 {
     const real *restrict u = c->u, *restrict h = c->h;
@@ -300,6 +301,7 @@ int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h,
     memcpy(c.h, h, sizeof(real) * (size_t)n);
     const real S = project(&c) + q, y = z - dot(h, w, n);
     if (S > 0) correct(&c, w, y, downdate(&c, S, q), LARGEST);
+    else memset(c.u, 0, sizeof(real) * (size_t)c.padded); /* P is what it was predicted to be */
     result[0] = y, result[1] = S;
     return ANC_DONE;
 }

@@ -36,7 +36,7 @@ static real energy(const signals *s, const lines *rows, int32_t k)
     return sum;
 }
 
-/* Measure at microphone k: eq. 5-9 for every scenario, with one gain. */
+/* Measure z at microphone k: eq. 5-9 for every scenario, with one gain. */
 static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
 {
     const int32_t K = f->s.K;

@@ -252,8 +252,8 @@ class RandomWalkKFOPC(KFOPC):
     def K(self) -> np.ndarray:
         """Kalman gain of the last update, (n, 1)."""
         if self._K is None:  # eq. 6, K = P x' / S
-            u = direction_of(self._covariance.arrays, self.dim_x)
-            self._K = (u / sqrt(self._numbers["variance"][0])).reshape(-1, 1)
+            u, S = direction_of(self._covariance.arrays, self.dim_x), self._numbers["variance"][0]
+            self._K = (u / sqrt(S) if S > 0 else np.zeros_like(u)).reshape(-1, 1)
         return self._K
 
     @K.setter
@@ -349,7 +349,7 @@ class RandomWalkKFOPC(KFOPC):
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
         """Apply eq. 5-9; return the new weights. A refused update raises before anything changes."""
         constraint, weights = self._constraint, self._weights()
-        if not isfinite(z + float(h @ h)):
+        if not isfinite(z + np.vdot(h, h)):
             checked_measurement(self, z, None, h)  # raises if one of them is not finite
         factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
         if noise == 0.0 and not h.any():

@@ -113,7 +113,7 @@ def simulate(
     ValueError
         Signals that are empty, not finite or of different lengths; sample rates that differ; both or neither of
         `primary_path` and `disturbance`; a feedback path without delay. Nothing was changed. During a run: an amplifier
-        that returns NaN, or an update without a solution (a silent reference with q = 0).
+        that returns NaN, or an update without a solution (a covariance that is too large).
     TypeError
         A controller without `control_signal` and `update`, or an amplifier that is not a function.
 

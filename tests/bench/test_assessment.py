@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import soundfile
 
-from kfopc_filterpy import kf_pb, noise_reduction_db
+from kfopc_filterpy import noise_reduction_db
 from kfopc_filterpy.bench import algorithms, assess, assessed_runs, compare_recordings
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.metrics import convergence_time_s, overshoot
@@ -289,39 +289,6 @@ def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
     free, _ = on(50.0)
     assert free.limits.decided_by == "amplifier"
     assert free.limits.rated_power == pytest.approx(0.8)
-
-
-def test_long_filters_run_in_float32_with_the_same_verdict_unless_it_cannot_hold_the_state_noise(monkeypatch):
-    used = []
-
-    def spy(*arguments, **options):
-        used.append(options["dtype"])
-        return kf_pb(*arguments, **options)
-
-    def on(memory_s: float = 0.25):
-        return assess(
-            noise(),
-            None,
-            arriving(6, length=16),
-            disturbance=heard(arriving(20, 100), 10.0),
-            rating=0.3,
-            fs=FS,
-            n_taps=assessed_runs.MANY_TAPS,
-            beside=(),
-            secondary_path_uncertainty=None,
-            memory_s=memory_s,
-        )
-
-    monkeypatch.setattr(assessed_runs, "kf_pb", spy)
-    short, slow = on(), on(memory_s=1000.0)  # the state noise goes with the inverse square of the memory
-    monkeypatch.setattr(assessed_runs.Plan, "precision", np.float64)
-    exact = on()
-    assert used == [np.float32, np.float64, np.float64]
-    assert slow.settings.state_noise < 1e-6 * short.settings.state_noise
-    assert short.noise_reduction_db != exact.noise_reduction_db
-    assert short.noise_reduction_db == pytest.approx(exact.noise_reduction_db, abs=0.01)
-    assert (short.enough, short.limited_by) == (exact.enough, exact.limited_by) == (False, "amplifier")
-    assert short.figures["KF-PB"]["worst_window"] <= 1 + 1e-6
 
 
 # What it writes.

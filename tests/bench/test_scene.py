@@ -53,17 +53,19 @@ def test_initial_variance_makes_weights_that_need_the_wiener_power(n_taps):
 @pytest.mark.parametrize("name", KALMAN)
 def test_kalman_filters_start_with_the_variances_of_the_scene(name):
     scene = scene_of(16)
-    estimator = make_controller(scene, name, 1e-6).estimator
-    np.testing.assert_array_equal(np.diag(estimator.P), np.full(16, scene.initial_variance))
-    assert estimator.measurement_noise == scene.measurement_noise
-    assert estimator.state_noise == pytest.approx(1e-6 * scene.measurement_noise / scene.filtered_power, rel=1e-12)
+    controller = make_controller(scene, name, 1e-6)
+    kf = controller.estimator if name == "KF-PB" else controller
+    P = kf.P if name == "KF-PB" else kf.covariance
+    np.testing.assert_array_equal(np.diag(P), np.full(16, scene.initial_variance))
+    assert kf.measurement_noise == scene.measurement_noise
+    assert kf.state_noise == pytest.approx(1e-6 * scene.measurement_noise / scene.filtered_power, rel=1e-12)
 
 
 def test_recursive_least_squares_start_with_the_same_variance_over_q():
     scene = scene_of(16)
-    estimator = make_controller(scene, "FxRLS", 1e-3).estimator
+    controller = make_controller(scene, "FxRLS", 1e-3)
     ratio = scene.initial_variance / scene.measurement_noise
-    np.testing.assert_allclose(np.diag(estimator.P), ratio * estimator.measurement_noise, rtol=1e-12)
+    np.testing.assert_allclose(np.diag(controller.covariance), ratio * controller.measurement_noise, rtol=1e-12)
 
 
 def test_each_seed_has_its_own_sensor_noise_apart_from_the_noises():

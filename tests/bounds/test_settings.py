@@ -344,11 +344,14 @@ def test_a_controller_takes_suggested_settings_where_none_is_given(make: Any) ->
     suggested = suggest_settings(X, D, S, n_taps=8)
     ours = make(suggested, S, **rated)
     by_hand = make(8, S, **rated, **suggested.settings)
-    for name in ("x", "P", "Q", "R"):
-        np.testing.assert_array_equal(getattr(ours.estimator, name), getattr(by_hand.estimator, name), err_msg=name)
     own = make(suggested, S, measurement_noise=0.25, **rated)
-    assert own.estimator.R == 0.25
-    np.testing.assert_array_equal(own.estimator.P, by_hand.estimator.P)
+    kf, same, other = (one.estimator if make is kf_pb else one for one in (ours, by_hand, own))
+    covariance = "P" if make is kf_pb else "covariance"
+    assert ours.n_taps == 8
+    for name in (covariance, "state_noise", "measurement_noise"):
+        np.testing.assert_array_equal(getattr(kf, name), getattr(same, name), err_msg=name)
+    assert other.measurement_noise == 0.25
+    np.testing.assert_array_equal(getattr(other, covariance), getattr(same, covariance))
 
 
 def test_several_channels_take_suggested_settings() -> None:
@@ -363,11 +366,11 @@ def test_several_channels_take_suggested_settings() -> None:
 
 def test_the_sample_rate_is_that_of_the_suggested_settings() -> None:
     suggested = suggest_settings(X, D, S, n_taps=8, fs=8000.0)
-    assert kf_opc(suggested, S, rated_power=0.5).estimator.constraint.fs == 8000.0
+    assert kf_opc(suggested, S, rated_power=0.5).constraint.fs == 8000.0
     assert kf_pb(suggested, S, rated_power=0.5).estimator.budget.fs == 8000.0
     assert kf_pb(suggested, S, rated_power=0.5, fs=8000).estimator.budget.fs == 8000.0
     own = OutputPowerConstraint(0.5, fs=8000.0, memory_s=0.1)
-    assert kf_opc(suggested, S, constraint=own).estimator.constraint.memory_s == 0.1
+    assert kf_opc(suggested, S, constraint=own).constraint.memory_s == 0.1
     with pytest.raises(ValueError, match="settings, fs is 8000 Hz but the controller's power memory is for 16000 Hz"):
         kf_opc(suggested, S, constraint=OutputPowerConstraint(0.5))
     for form in ("direct", "shared gain", "frequency domain"):

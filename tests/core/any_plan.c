@@ -48,13 +48,14 @@ static int run(const anc_algorithm *a, const anc_plan *plan, size_t bytes)
 {
     anc_view view;
     char *block = malloc(bytes), *copy = malloc(bytes);
-    anc_real *x = malloc(sizeof *x * (size_t)plan->references), *y = malloc(sizeof *y * (size_t)plan->loudspeakers);
-    anc_real *e = malloc(sizeof *e * (size_t)plan->microphones); /* each of just its bytes */
+    anc_real *x = malloc(sizeof *x * (size_t)plan->references), *y = malloc(sizeof *y * (size_t)(plan->scenarios * plan->loudspeakers));
+    const int32_t errors = plan->scenarios * plan->microphones;
+    anc_real *e = malloc(sizeof *e * (size_t)errors); /* each of just its bytes */
     if (!block || !copy || !x || !y || !e) exit(2);
     const int opened = anc_open(a, plan, &view, block, bytes, 1);
     for (int n = 0; opened && n < SAMPLES; n++) {
         for (int32_t i = 0; i < plan->references; i++) x[i] = mostly_noise();
-        for (int32_t k = 0; k < plan->microphones; k++) e[k] = mostly_noise();
+        for (int32_t k = 0; k < errors; k++) e[k] = mostly_noise();
         for (int half = 0; half < 2; half++) {
             memcpy(copy, block, bytes);
             const int answer = half ? a->update(&view, below(10) ? e : NULL) : a->control_signal(&view, x, y);
@@ -83,19 +84,19 @@ int main(int argc, char **argv)
     for (long i = 0; i < plans; i++) {
         const int32_t number = below(known);
         const anc_algorithm *a = algorithms[number].algorithm;
-        anc_plan plan = {.scenarios = any_count(3), .microphones = any_count(MOST), .loudspeakers = any_count(MOST), .references = any_count(MOST),
+        anc_plan plan = {.scenarios = any_count(MOST), .microphones = any_count(MOST), .loudspeakers = any_count(MOST), .references = any_count(MOST),
                          .taps = any_count(LONGEST), .path_taps = any_count(LONGEST), .guard_taps = below(2) ? any_count(48) : 0, .limited = below(2)};
         const int tidy = below(2); /* so that many plans are not refused */
-        int32_t windows[2][MOST + 1];
-        for (int32_t j = 0; j <= MOST; j++) windows[0][j] = below(3) ? any_count(LONGEST) : 0, windows[1][j] = any_count(LONGEST);
+        int32_t windows[2][MOST * MOST];
+        for (int32_t j = 0; j < MOST * MOST; j++) windows[0][j] = below(3) ? any_count(LONGEST) : 0, windows[1][j] = any_count(LONGEST);
         plan.power_windows = below(2) ? windows[0] : NULL;
         plan.limiter_windows = plan.limited ? windows[1] : NULL;
-        if (plan.loudspeakers > MOST && plan.loudspeakers < 1 << 28) plan.power_windows = plan.limiter_windows = NULL, plan.limited = 0;
+        if (plan.loudspeakers > MOST || plan.scenarios > MOST) plan.power_windows = plan.limiter_windows = NULL, plan.limited = 0;
         const size_t bytes = anc_size(a, &plan);
         if (!bytes || bytes > 1 << 22) continue; /* refused, or as large as a test should be */
         const int32_t taps = plan.microphones * plan.loudspeakers * plan.path_taps;
         anc_real settings[8 * (MOST + 1)], *value = settings;
-        if (plan.loudspeakers > MOST || plan.microphones > MOST) continue;
+        if (plan.scenarios > MOST || plan.loudspeakers > MOST || plan.microphones > MOST) continue;
         for (int s = 0; a->settings[s].name; s++)
             for (int32_t n = 0; n < numbers(a->settings + s, &plan); n++) *value++ = tidy ? algorithms[number].settings[s] : any();
         anc_real *path = malloc(sizeof *path * (size_t)taps), *guard = malloc(sizeof *guard * (size_t)(plan.guard_taps + 1));

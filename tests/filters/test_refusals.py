@@ -139,14 +139,6 @@ def test_a_step_of_its_own_is_not_checked(monkeypatch: pytest.MonkeyPatch) -> No
             f.update(2.0, H=ROW)
 
 
-def test_float32_is_given_the_rounding_of_float32() -> None:
-    """A P that a float32 filter has rounded can be assigned to it again; in float64 it is indefinite."""
-    kf = KFOPC.random_walk(N, dtype=np.float32, **NOISES)
-    kf.P = rotated(1.0, 0.5, -1e-6)
-    with pytest.raises(ValueError, match="P must be positive semidefinite"):
-        KFOPC.random_walk(N, **NOISES).P = rotated(1.0, 0.5, -1e-6)
-
-
 # F and H as nested lists
 
 

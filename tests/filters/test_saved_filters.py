@@ -90,8 +90,8 @@ def test_read_only_arrays_stay_read_only(tmp_path: Path) -> None:
     assert loaded.x.flags.writeable
 
 
-def test_the_rows_of_a_loaded_covariance_begin_at_cache_lines_again(tmp_path: Path) -> None:
+def test_a_loaded_covariance_begins_at_a_cache_line_again(tmp_path: Path) -> None:
     kf = KFOPC.random_walk(128, state_noise=1e-6, measurement_noise=0.1)
     kf.save(tmp_path / "filter.kfopc")
-    triangle = KFOPC.load(tmp_path / "filter.kfopc")._covariance.arrays.triangle
-    assert triangle.ctypes.data % 64 == 0
+    memory = KFOPC.load(tmp_path / "filter.kfopc")._covariance.arrays.memory
+    assert memory.ctypes.data % 64 == 0

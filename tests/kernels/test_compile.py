@@ -363,7 +363,7 @@ def test_borrowed_arrays_keep_their_references() -> None:
     assert newest(delay_line(3), 2).size == 2  # a view, made in Python
 
 
-@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB"])
+@pytest.mark.parametrize("name", ["KF-PB", "KF-PB, no limiter"])
 def test_runs_keep_the_references_of_a_controllers_arrays(name: str) -> None:
     made = made_for_8_khz(name)
     x, d, _ = noises(60)
@@ -399,16 +399,17 @@ def test_an_array_with_gaps_is_not_read_as_one_without() -> None:
 
 
 def made_for_8_khz(name: str) -> Any:
-    """A controller with a limiter, for the runs of `helpers.loop`."""
-    limiter = OutputLimiter(0.1, fs=8000.0, window_s=0.01)
+    """A controller with a limiter unless the name says otherwise, for the runs of `helpers.loop`."""
+    kind, free, _ = name.partition(", no limiter")
+    limiter = None if free else OutputLimiter(0.1, fs=8000.0, window_s=0.01)
     kalman: dict[str, Any] = {"state_noise": 1e-5, "measurement_noise": 1e-2, "rated_power": 0.2, "limiter": limiter}
     made: Any = (
         FxLMS(4, S_HAT, step_size=0.01, limiter=limiter)
-        if name == "FxLMS"
-        else {"KF-OPC": kf_opc, "KF-PB": kf_pb}[name](4, S_HAT, **kalman)
+        if kind == "FxLMS"
+        else {"KF-OPC": kf_opc, "KF-PB": kf_pb}[kind](4, S_HAT, **kalman)
     )
     made.constraint.fs = 8000.0
-    if name == "KF-PB":
+    if kind == "KF-PB":
         made.estimator.budget.fs = 8000.0
     return made
 
@@ -433,7 +434,7 @@ def test_a_held_state_is_the_state_itself() -> None:
 
 def test_each_type_has_a_file_of_its_own_in_the_cache() -> None:
     """In a common one, processes that compile for two types at one time could exchange their code."""
-    held = [Held(made_for_8_khz(name)._state) for name in ("KF-OPC", "KF-PB")]
+    held = [Held(made_for_8_khz(name)._state) for name in ("KF-PB", "KF-PB, no limiter")]
     for entry in (emit_entry, adapt_entry, listen):
         names = {entry._make(one.key).__qualname__ for one in held}
         compiled_names = {entry.of(one).__qualname__ for one in held}
@@ -446,7 +447,7 @@ def test_what_holds_a_users_type_is_not_kept_on_disk() -> None:
     class Own(NamedTuple):
         values: np.ndarray
 
-    state = made_for_8_khz("KF-OPC")._state
+    state = made_for_8_khz("KF-PB")._state
     assert Held(state).ours
     assert not Held(state._replace(lines=state.lines._replace(guard=Own(np.zeros(3))))).ours
 

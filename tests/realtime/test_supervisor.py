@@ -12,7 +12,7 @@ from helpers.channels import random_paths
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import FxLMS, OutputPowerConstraint, kf_opc
+from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
 from kfopc_filterpy.controllers import MonitoredController
 from kfopc_filterpy.realtime import SimulatedInterface, Supervisor
 
@@ -269,15 +269,29 @@ def test_louder_noise_is_no_divergence(name: str, up_db: int) -> None:
     assert not supervisor.health.counts
 
 
+def test_the_innovation_of_a_core_controller_is_that_of_the_filter() -> None:
+    """Over its standard deviation: y / S^0.5, after a start in twice the precision, too."""
+    noises = {"state_noise": 1e-4, "measurement_noise": 1e-4, "initial_variance": 1e3}
+    core, filterpys = kf_anc(8, PATH, **noises), KalmanController(KFOPC.random_walk(8, **noises), PATH)
+    for x, e in np.random.default_rng(0).standard_normal((60, 2)):
+        for controller in (core, filterpys):
+            controller.control_signal(x)
+            controller.update(e)
+        kf = filterpys.estimator
+        assert core.innovation == pytest.approx(kf.y.item(), rel=1e-6)
+        assert core.innovation_variance == pytest.approx(kf.S.item(), rel=1e-6)
+    several = kf_anc(8, PATHS, **noises)
+    assert several.innovation.shape == (2,)
+
+
 def test_surprising_innovations_are_a_divergence() -> None:
     """The error suddenly is 60 dB up, and the reference is not."""
 
     def spoil(x: np.ndarray, e: np.ndarray, first: int) -> tuple[Any, Any]:
         return x, (1e3 * e if first >= 20000 else e)
 
-    controller = MAKERS["KF-OPC"]()
-    controller.rated_power = 1e12  # no power can be exceeded
-    supervisor = supervised(controller, amplitude_limit=1e9, full_scale=None)
+    free = kf_anc(24, PATH, state_noise=1e-7, measurement_noise=1e-2, initial_variance=1e-2)  # no power can be exceeded
+    supervisor = supervised(free, amplitude_limit=1e9, full_scale=None)
     loop(supervisor, plant(seconds=4.0), spoil)
     assert supervisor.health.counts["diverged: innovation"] >= 1
 
