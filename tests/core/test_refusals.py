@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from kfopc_filterpy import OutputLimiter
 from kfopc_filterpy.core import building
-from kfopc_filterpy.core.block import Algorithm, Block, Shape
+from kfopc_filterpy.core.block import Algorithm, Block, Shape, _plan_of
 
 SETTING, SCRATCH = 1, 2  # anc_role
 SHAPES = {
@@ -180,7 +180,7 @@ class Guarded:
         block = Block.__new__(Block)
         block.algorithm, block.shape = self.algorithm, shape
         self.arrays = block._plan_arrays(path, settings, guard)
-        plan = Block._plan_of(shape, self.arrays)
+        plan = _plan_of(shape, self.arrays)
         library.anc_size.restype = ctypes.c_size_t
         self.opened = False
         self.size = library.anc_size(ctypes.c_void_p(self.algorithm.pointer), ctypes.byref(plan))
