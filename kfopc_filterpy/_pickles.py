@@ -4,8 +4,8 @@ A pickle is a program for a small machine, and Python's machine calls whatever t
 the instructions that hold data. It fills lists, deques, dicts, Counters and tuples, and makes objects without their
 ``__new__``, ``__init__``, ``__setstate__`` and setters. A pickle can name classes in the `FOLDERS`, what is in
 `OUTSIDE`, and what the reader trusts; functions among them are kept, but not called. A class that says itself how it
-is copied is refused: an algorithm, which loads a library, is one. Keys are numbers, strings or tuples of them, whose
-hash runs no code. Arrays are views of memory beside the pickle.
+is copied is refused: an algorithm, which loads a library, is one. Keys are numbers, strings or tuples of them, and arguments have
+plain types, whose methods run no code of a file's objects. Arrays are views of memory beside the pickle.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from contextlib import suppress
 from importlib import import_module
 from inspect import getattr_static
 from types import MemberDescriptorType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy.linalg
@@ -56,7 +56,7 @@ def pickled(value: Any) -> tuple[bytes, bytes]:
         pickler = _Pickler()
         pickler.dump(value)
         program, memory = pickler.file.getvalue(), b"".join(pickler.arrays)
-        unpickled(program, memory, pickler.named)
+        unpickled(program, memoryview(memory), pickler.named)
     except Exception as error:  # a class can raise anything when it is pickled
         raise TypeError(f"{_culprit(value)} cannot be saved, because not all of it is data: {error}") from error
     return program, memory
@@ -72,14 +72,14 @@ class _Pickler(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:
         """Return how a value is made, if it is not for Python to say."""
         if type(value) is np.ndarray and value.dtype == object:  # filterpy's z, before the first measurement
-            return np.ndarray, (value.ravel().tolist(), value.shape)
+            return np.ndarray, (value.shape, value.ravel().tolist())
         if type(value) in (np.ndarray, np.recarray) or isinstance(value, np.generic):
             kind, order, at = value.dtype, "F" if value.flags.fnc else "C", sum(map(len, self.arrays))
-            fields = kind.str if kind.names is None else [(name, kind[name].str) for name in kind.names]
+            fields = tuple(text for name in kind.names or () for text in (name, kind[name].str)) or (kind.str,)
             if _dtype(fields, kind.isalignedstruct) != kind:
                 raise TypeError(f"an array of {kind}; make it one of numbers")
             self.arrays.append(value.tobytes(order) + bytes(-value.nbytes % LINE))
-            return np.ndarray, (fields, kind.isalignedstruct, value.shape, order, at, isinstance(value, np.generic))
+            return np.ndarray, (value.shape, fields, kind.isalignedstruct, order, at, isinstance(value, np.generic))
         if type(value) is np.random.Generator:
             return np.random.Generator, (value.bit_generator.state,)
         if hasattr(value, "__qualname__"):  # a class or a function
@@ -101,7 +101,7 @@ def _culprit(value: Any) -> str:
     return type(value).__name__
 
 
-def unpickled(program: bytes, memory: Any, named: Iterable[Any]) -> Any:
+def unpickled(program: bytes, memory: memoryview, named: Iterable[Any]) -> Any:
     """Return what was pickled; `named` are classes and functions that the pickle may name.
 
     Raises
@@ -111,8 +111,8 @@ def unpickled(program: bytes, memory: Any, named: Iterable[Any]) -> Any:
     """
     names = {f"{thing.__module__}.{thing.__qualname__}": thing for thing in (*OUTSIDE, *MADE, *named)}
     stack, marks, memo, fresh = list[Any](), list[int](), list[Any](), dict[int, Any]()
-    for instruction, value, _ in pickletools.genops(program):
-        name = instruction.name
+    for instruction, argument, _ in pickletools.genops(program):
+        name, value = instruction.name, cast(Any, argument)
         if name == "MARK":
             marks.append(len(stack))
         elif name == "MEMOIZE":
@@ -133,7 +133,7 @@ def unpickled(program: bytes, memory: Any, named: Iterable[Any]) -> Any:
             elif name == "BUILD":
                 _fill(fresh.pop(id(stack[-1])), items[0])  # once
             else:
-                stack.append(_made(*items, memory))
+                stack.append(_made(items[0], items[1], memory))
                 fresh[id(stack[-1])] = stack[-1]
         elif name in NUMBERS or name in STRINGS:
             stack.append(value)
@@ -165,39 +165,61 @@ def _named(name: str, names: dict[str, Any]) -> Any:
     return names[name]
 
 
-def _made(kind: Any, arguments: tuple[Any, ...], memory: Any) -> Any:
+def _made(kind: Any, arguments: Any, memory: memoryview) -> Any:
     """Return an object of a class, without attributes, or what one of `MADE` is with these arguments."""
-    if kind is np.ndarray and len(arguments) == 2:
-        return np.fromiter(arguments[0], object).reshape(arguments[1])
-    if kind is np.ndarray:
-        fields, aligned, shape, order, at, scalar = arguments
-        array = np.ndarray(shape, _dtype(fields, aligned), memory, at, order=order)
-        return array[()] if scalar else array if array.dtype.names is None else as_records(array)
-    if kind is np.random.Generator and arguments[0]["bit_generator"] in GENERATORS:
-        made = np.random.Generator(getattr(np.random, arguments[0]["bit_generator"])(0))
-        made.bit_generator.state = arguments[0]
-        return made
-    if kind is deque or kind is Counter:
+    types = [type(argument) for argument in arguments] if type(arguments) is tuple else None
+    if kind is np.ndarray and types in ([tuple, list], [tuple, tuple, bool, str, int, bool]):
+        return _array(memory, *arguments)
+    if kind is np.random.Generator and types == [dict]:
+        return _generator(arguments[0])
+    if (kind is deque and types in ([], [tuple, int])) or (kind is Counter and types == [dict]):
         return kind(*arguments)
-    if not isinstance(kind, type) or len(arguments) != len(getattr(kind, "_fields", ())):
-        raise ValueError(f"{kind} is no class, or has other fields")
+    if types is None or not issubclass(type(kind), type) or kind in MADE:
+        raise ValueError("something is made of other parts")
     if any(getattr(kind, name, None) is not getattr(object, name, None) for name in COPYING):
         raise ValueError(f"{kind.__name__} says itself how it is copied")
-    return tuple.__new__(kind, arguments) if issubclass(kind, tuple) else object.__new__(kind)
+    items = arguments[0] if types == [tuple] and not hasattr(kind, "_fields") else arguments
+    if len(items) != len(getattr(kind, "_fields", items if types == [tuple] else ())):
+        raise ValueError(f"{kind.__name__} has other fields")
+    return tuple.__new__(kind, items) if issubclass(kind, tuple) else object.__new__(kind)
 
 
-def _dtype(fields: Any, aligned: bool) -> np.dtype:
+def _array(memory: memoryview, shape: tuple[int, ...], fields: Any, aligned: bool = False, *how: Any) -> Any:
+    """Return an array, or a scalar: of a list of objects, or in the memory at a place."""
+    if any(type(size) is not int for size in shape):
+        raise ValueError("a shape of other things than numbers")
+    if type(fields) is list:
+        return np.fromiter(fields, object).reshape(shape)
+    order, at, scalar = how
+    array = np.ndarray(shape, _dtype(fields, aligned), memory[at:], order=order)  # numpy takes a negative offset
+    return array[()] if scalar else array if array.dtype.names is None else as_records(array)
+
+
+def _dtype(fields: tuple[str, ...], aligned: bool) -> np.dtype:
     """Return a type of numbers or strings, or of records with fields of these names and types."""
-    dtype = np.dtype(fields if type(fields) is str else [(name, str(one)) for name, one in fields], align=aligned)
+    if any(type(text) is not str for text in fields):
+        raise ValueError("a type of other things than words")
+    pairs = list(zip(fields[::2], fields[1::2], strict=False))
+    dtype = np.dtype(pairs or fields[0], align=aligned)
     if dtype.hasobject:
         raise ValueError(f"an array of {dtype}; make it one of numbers, or a list")
     return dtype
 
 
+def _generator(state: dict[str, Any]) -> np.random.Generator:
+    """Return a generator of random numbers."""
+    parts = [*state.values(), *state["state"].values()]
+    if state["bit_generator"] not in GENERATORS or any(type(part) not in (*PLAIN, dict, np.ndarray) for part in parts):
+        raise ValueError("a generator that is not numpy's")
+    made = np.random.Generator(getattr(np.random, state["bit_generator"])(0))
+    made.bit_generator.state = state
+    return made
+
+
 def _fill(made: Any, state: Any) -> None:
     """Set the attributes of an object, those in slots too, without its setters."""
     for part in state if type(state) is tuple else (state,):
-        for name, value in (part or {}).items():
+        for name, value in dict.items({} if part is None else part):
             if type(slot := getattr_static(type(made), name, None)) is MemberDescriptorType:
                 slot.__set__(made, value)
             else:

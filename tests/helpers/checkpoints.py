@@ -70,9 +70,9 @@ def contents(value: Any) -> list[Any]:
         if value is None or kind in (bool, int, str, float):
             found.append((kind, repr(value)))
             return
-        index, _ = known.setdefault(id(value), (len(known), value))
-        found.append((kind.__qualname__, index))
-        if index < len(known) - 1 or len(found) > 10**6:
+        new = id(value) not in known
+        found.append((kind.__qualname__, known.setdefault(id(value), (len(known), value))[0]))
+        if not new:
             return
         if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
             found.append((value.dtype.descr, value.shape, value.tobytes()))
