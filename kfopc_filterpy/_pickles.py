@@ -37,8 +37,7 @@ COPYING = ("__reduce__", "__reduce_ex__", "__setstate__")  # methods of a class 
 LINE = 64  # bytes in a cache line
 
 # Instructions that bring a value, that begin one, and that take the last ones, by their number or, for 0, back to a mark.
-NUMBERS = ("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT")
-STRINGS = ("SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8")
+BRING = ("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8")
 BEGIN = {"NONE": type(None), "NEWFALSE": bool, "EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_TUPLE": tuple}
 TAKE = {"TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "APPENDS": 0, "SETITEM": 2, "SETITEMS": 0}
 TAKE |= {"STACK_GLOBAL": 2, "NEWOBJ": 2, "REDUCE": 2, "BUILD": 1}
@@ -135,7 +134,7 @@ def unpickled(program: bytes, memory: memoryview, named: Iterable[Any]) -> Any:
             else:
                 stack.append(_made(items[0], items[1], memory))
                 fresh[id(stack[-1])] = stack[-1]
-        elif name in NUMBERS or name in STRINGS:
+        elif name in BRING:
             stack.append(value)
         elif name in BEGIN:
             stack.append(BEGIN[name]())
@@ -223,4 +222,4 @@ def _fill(made: Any, state: Any) -> None:
             if type(slot := getattr_static(type(made), name, None)) is MemberDescriptorType:
                 slot.__set__(made, value)
             else:
-                vars(made)[name] = value
+                object.__getattribute__(made, "__dict__")[name] = value

@@ -416,8 +416,7 @@ class Watched(KFOPC):
         return super().__new__(cls)
 
     def __getattribute__(self, name: str) -> Any:
-        if name not in ("__dict__", "__class__"):
-            CALLS.append(name)
+        CALLS.append(name)
         return super().__getattribute__(name)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -490,7 +489,7 @@ def test_attributes_are_set_without_setters(saved: Path) -> None:
     state = b"}" + text("rated_power") + b"K\x01s" + b"}" + text("_constraint") + b"K\x02s" + b"\x86"
     loaded = Watched.load(forge(saved, me + state + b"b."))
     assert not CALLS
-    assert vars(loaded) == {"rated_power": 1}
+    assert object.__getattribute__(loaded, "__dict__") == {"rated_power": 1}
     assert KFOPC._constraint.__get__(loaded) == 2  # type: ignore[attr-defined]
 
 
