@@ -4,8 +4,9 @@ A pickle is a program for a small machine, and Python's machine calls whatever t
 the instructions that hold data. It fills lists, deques, dicts, Counters and tuples, and makes objects without their
 ``__new__``, ``__init__``, ``__setstate__`` and setters. A pickle can name classes in the `FOLDERS`, what is in
 `OUTSIDE`, and what the reader trusts; functions among them are kept, but not called. A class that says itself how it
-is copied is refused: an algorithm, which loads a library, is one. Keys are numbers, strings or tuples of them, and arguments have
-plain types, whose methods run no code of a file's objects. Arrays are views of memory beside the pickle.
+is copied is refused: an algorithm, which loads a library, is one. Keys are numbers, strings or tuples of them, and what
+an array or a generator is made of has plain types, so that no method of an object in the pickle is called either.
+Arrays are views of memory beside the pickle.
 """
 
 from __future__ import annotations
@@ -25,8 +26,6 @@ import numpy as np
 import scipy.linalg
 from filterpy.common import inv_diagonal
 from filterpy.kalman import KalmanFilter
-
-from .kernels.records import as_records
 
 FOLDERS = ("core", "kernels", "paths", "power", "filters", "controllers", "realtime")  # whose classes can be named
 OUTSIDE = (KalmanFilter, inv_diagonal, np.linalg.inv, np.linalg.pinv, scipy.linalg.inv, scipy.linalg.pinv)  # and these
@@ -191,7 +190,11 @@ def _array(memory: memoryview, shape: tuple[int, ...], fields: Any, aligned: boo
         return np.fromiter(fields, object).reshape(shape)
     order, at, scalar = how
     array = np.ndarray(shape, _dtype(fields, aligned), memory[at:], order=order)  # numpy takes a negative offset
-    return array[()] if scalar else array if array.dtype.names is None else as_records(array)
+    if array.dtype.names is not None:
+        from .kernels.records import as_records  # it loads numba, which who has records has loaded
+
+        array = as_records(array)
+    return array[()] if scalar else array
 
 
 def _dtype(fields: tuple[str, ...], aligned: bool) -> np.dtype:
@@ -207,8 +210,12 @@ def _dtype(fields: tuple[str, ...], aligned: bool) -> np.dtype:
 
 def _generator(state: dict[str, Any]) -> np.random.Generator:
     """Return a generator of random numbers."""
-    parts = [*state.values(), *state["state"].values()]
-    if state["bit_generator"] not in GENERATORS or any(type(part) not in (*PLAIN, dict, np.ndarray) for part in parts):
+    parts = [*state.values(), *dict.values(state["state"])]
+    if any(type(part) not in (*PLAIN, dict, np.ndarray) for part in parts):
+        raise ValueError("a generator with a state that is not numpy's")
+    if state["bit_generator"] not in GENERATORS or any(
+        type(part) is np.ndarray and part.dtype.hasobject for part in parts
+    ):
         raise ValueError("a generator that is not numpy's")
     made = np.random.Generator(getattr(np.random, state["bit_generator"])(0))
     made.bit_generator.state = state

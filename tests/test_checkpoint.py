@@ -468,6 +468,25 @@ class Watched(KFOPC):
         called("collections:Counter", b"%b"),
         called("collections:Counter", b"]%ba"),
         called("numpy.random._generator:Generator", b"%b"),
+        called("numpy.random._generator:Generator", b"}" + text("bit_generator") + b"%bs" + text("state") + b"}s"),
+        called(
+            "numpy.random._generator:Generator",
+            b"}" + text("bit_generator") + text("PCG64") + b"s" + text("state") + b"%bs",
+        ),
+        called(
+            "numpy.random._generator:Generator",
+            b"}"
+            + text("bit_generator")
+            + text("MT19937")
+            + b"s"
+            + text("state")
+            + b"}"
+            + text("pos")
+            + b"K\x01s"
+            + text("key")
+            + called(ARRAY, b"M\x70\x02\x85", b"](" + b"%b" * 624 + b"e")
+            + b"ss",
+        ),
         named(f"{CLASS}:LimiterState") + b"%b\x81",
         named("kfopc_filterpy.power.shared_constraint:SharedConstraint") + b"%b\x85\x81",
         b"%b%bb",
