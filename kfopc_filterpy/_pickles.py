@@ -42,6 +42,10 @@ TAKE = {"TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "APPENDS
 TAKE |= {"STACK_GLOBAL": 2, "NEWOBJ": 2, "REDUCE": 2, "BUILD": 1}
 
 
+class NotTrusted(ValueError):
+    """A pickle names what it must not."""
+
+
 def pickled(value: Any) -> tuple[bytes, bytes]:
     """Return the pickle of an object and the memory of its arrays, once they have been read.
 
@@ -159,7 +163,7 @@ def _named(name: str, names: dict[str, Any]) -> Any:
             return found
     if name not in names:
         hint = f"if it is yours and you trust the file, pass it, load(path, trusted=[{name.rpartition('.')[2]}])"
-        raise ValueError(f"it names {name}, which is none of {__package__}'s own classes: {hint}")
+        raise NotTrusted(f"names {name}, which is none of {__package__}'s own classes: {hint}")
     return names[name]
 
 
@@ -211,11 +215,10 @@ def _dtype(fields: tuple[str, ...], aligned: bool) -> np.dtype:
 def _generator(state: dict[str, Any]) -> np.random.Generator:
     """Return a generator of random numbers."""
     parts = [*state.values(), *dict.values(state["state"])]
-    if any(type(part) not in (*PLAIN, dict, np.ndarray) for part in parts):
-        raise ValueError("a generator with a state that is not numpy's")
-    if state["bit_generator"] not in GENERATORS or any(
-        type(part) is np.ndarray and part.dtype.hasobject for part in parts
-    ):
+    for part in parts:
+        if type(part) not in (*PLAIN, dict, np.ndarray) or (type(part) is np.ndarray and part.dtype.hasobject):
+            raise ValueError("a generator with a state that is not numpy's")
+    if state["bit_generator"] not in GENERATORS:
         raise ValueError("a generator that is not numpy's")
     made = np.random.Generator(getattr(np.random, state["bit_generator"])(0))
     made.bit_generator.state = state

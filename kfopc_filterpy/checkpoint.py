@@ -176,13 +176,15 @@ def _load(kind: type[Any], path: Path, trusted: Iterable[Any]) -> Any:
     begins, _, size = first.decode(errors="replace").rpartition(" ")
     if f"{begins} " != _kind():
         raise CheckpointError(
-            f"{path} is a {begins.rstrip(':')!r}, and this version reads {_kind()[:-2]!r}, as it may continue in another "
-            "way: load the file with the version that wrote it, or begin anew"
+            f"{path} is a {begins.rstrip(':')!r}, and this version reads {_kind()[:-2]!r} only: load the file with the "
+            "version that wrote it, or begin anew"
         )
     try:
         end = len(first) + 1 + int(size)
         pickled, arrays = bytes(memory[len(first) + 1 : end]), memory[end + -end % LINE : -DIGEST]
         made = _pickles.unpickled(pickled, arrays, (kind, *trusted))
+    except _pickles.NotTrusted as error:
+        raise CheckpointError(f"{path} {error}") from None
     except Exception as error:  # a file with the right checksum can hold anything
         raise CheckpointError(
             f"{path} has a correct checksum, but `save` of this version does not write such a file "

@@ -248,7 +248,7 @@ def test_another_format_is_refused_and_another_version_if_its_series_differs(sav
     series = ".".join(kfopc_filterpy.__version__.split(".")[:2])
     _, _, rest = content.partition(b": ")
     reads = (
-        rf"and this version reads 'kfopc checkpoint 2 of kfopc_filterpy {series}', .* load the file with the version"
+        rf"and this version reads 'kfopc checkpoint 2 of kfopc_filterpy {series}' only: load the file with the version"
     )
     with pytest.raises(ValueError, match=rf"old.kfopc is a 'kfopc checkpoint 1', {reads}"):
         KFOPC.load(sealed(old, b'kfopc checkpoint 1 17\n{"package":"1.0"}\n'))
@@ -284,16 +284,16 @@ FILTER = named("kfopc_filterpy.filters.kfopc:KFOPC") + b")\x81"
 CLASS = "kfopc_filterpy.power.limiter"
 HUGE = b"\x8a\x06" + (10**12).to_bytes(6, "little")
 FORGED: dict[str, tuple[bytes, str]] = {
-    "a process": (called("os:system", text("touch {trace}")), "it names os.system, which is none of"),
+    "a process": (called("os:system", text("touch {trace}")), "names os.system, which is none of"),
     "a process, protocol 0": (b"cos\nsystem\n(S'touch {trace}'\ntR.", "the instruction GLOBAL"),
     "a process, inst": (b"(S'touch {trace}'\nios\nsystem\n.", "the instruction STRING"),
-    "a process, obj": (b"(" + named("os:system") + text("touch {trace}") + b"o.", "it names os.system"),
-    "code": (called("builtins:eval", text("open('{trace}', 'w')")), "it names builtins.eval"),
-    "an import": (called("builtins:__import__", text("antigravity")), "it names builtins.__import__"),
+    "a process, obj": (b"(" + named("os:system") + text("touch {trace}") + b"o.", "names os.system"),
+    "code": (called("builtins:eval", text("open('{trace}', 'w')")), "names builtins.eval"),
+    "an import": (called("builtins:__import__", text("antigravity")), "names builtins.__import__"),
     "a dotted name": (called("kfopc_filterpy.checkpoint:os.system", text("touch {trace}")), "os.system, which is none"),
     "a dotted name in a folder": (
         called("kfopc_filterpy.core.block:ctypes.PyDLL", text("{trace}")),
-        "it names kfopc_filterpy.core.block.ctypes.PyDLL",
+        "names kfopc_filterpy.core.block.ctypes.PyDLL",
     ),
     "a library": (
         called("kfopc_filterpy.core.block:Algorithm", text("fxlms"), text("{trace}")),
@@ -305,16 +305,16 @@ FORGED: dict[str, tuple[bytes, str]] = {
     ),
     "an import of a module": (
         called("kfopc_filterpy.core.library:Path", text("{trace}")),
-        "it names kfopc_filterpy.core.library.Path",
+        "names kfopc_filterpy.core.library.Path",
     ),
     "a function of the package": (called("kfopc_filterpy.core.own:load_algorithm", text("a.c")), "none of"),
-    "the command line": (called("kfopc_filterpy.cli:main"), "it names kfopc_filterpy.cli.main"),
+    "the command line": (called("kfopc_filterpy.cli:main"), "names kfopc_filterpy.cli.main"),
     "a module that is not there": (called("kfopc_filterpy.power.nothing:A"), "ModuleNotFoundError"),
-    "a folder above": (called("kfopc_filterpy.power.:os"), "it names"),
+    "a folder above": (called("kfopc_filterpy.power.:os"), "names "),
     "a constructor": (called(f"{CLASS}:OutputLimiter", text("1")), "OutputLimiter has other fields"),
     "a call of a function that can be named": (called("numpy.linalg:inv", b"]"), "something is made of other parts"),
     "a call of an object": (FILTER + b")R", "something is made of other parts"),
-    "a class with a metaclass": (called("builtins:type", text("A"), b")", b"}"), "it names builtins.type"),
+    "a class with a metaclass": (called("builtins:type", text("A"), b")", b"}"), "names builtins.type"),
     "attributes of a class": (named(f"{CLASS}:OutputLimiter") + b"}" + text("a") + b"K\x01sb", "correct checksum"),
     "attributes of a function": (named("numpy.linalg:inv") + b"}" + text("a") + b"K\x01sb", "correct checksum"),
     "attributes, twice": (FILTER + b"}b}b", "correct checksum"),
@@ -378,13 +378,13 @@ def test_a_file_that_save_did_not_write_is_refused_and_runs_nothing(name: str, s
     before = set(sys.modules)
     for whole in (program + b".", FILTER + b"}" + text("own") + program.removesuffix(b".") + b"sb."):
         tracemalloc.start()
-        with pytest.raises(ValueError, match="has a correct checksum, but") as refused:
+        with pytest.raises(ValueError, match=r"has a correct checksum, but|kfopc names ") as refused:
             KFOPC.load(forge(saved, b"\x80\x05" + whole))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert message in str(refused.value) or whole is not program + b"."
         assert peak < 50_000_000
-    with pytest.raises(ValueError, match="has a correct checksum, but") as refused:
+    with pytest.raises(ValueError, match=r"has a correct checksum, but|kfopc names ") as refused:
         KFOPC.load(forge(saved, b"\x80\x05" + program + b"."))
     assert message in str(refused.value)
     assert not os.path.exists(trace)
@@ -497,7 +497,7 @@ def test_nothing_of_a_class_or_function_that_is_trusted_is_called(program: bytes
     me = __name__
     CALLS.clear()
     program = program.replace(b"%b", named(f"{me}:Watched") + b")\x81").replace(b"%f", named(f"{me}:watched"))
-    with pytest.raises(ValueError, match="correct checksum"):
+    with pytest.raises(ValueError, match=r"correct checksum|kfopc names "):
         Watched.load(forge(saved, program + b"."), trusted=[watched])
     assert not CALLS
 
