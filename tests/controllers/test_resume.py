@@ -256,7 +256,7 @@ def test_an_amplifier_without_a_name_is_refused_before_anything_is_written(tmp_p
     path = tmp_path / "run.kfopc"
     path.write_bytes(b"before")
     anonymous = PathTracker(FxLMS(4, S_HAT, step_size=0.01), rng=1, amplifier=lambda y: y)
-    with pytest.raises(TypeError, match=r"PathTracker\._amplifiers\[0\] cannot be saved: .*<lambda>"):
+    with pytest.raises(TypeError, match=r"PathTracker\._amplifiers cannot be saved.*<lambda>"):
         anonymous.save(path)
     assert path.read_bytes() == b"before"
     named = PathTracker(kf_anc(4, S_HAT, state_noise=0.0, measurement_noise=1.0), rng=1, amplifier=own_amplifier)
