@@ -44,9 +44,9 @@ static real largest_variance(const covariance *c)
 int predictable(const covariance *c, real fading, real state_noise, real energy)
 {
     const real scale = fading * c->owed->scale, diagonal = fading * c->owed->diagonal + state_noise;
-    const real bound[] = {c->owed->bound, largest_variance(c)}; /* the first is not exact, the second takes time */
-    for (int i = 0; i < 2; i++) {
-        const real variance = scale * bound[i] + diagonal; /* h'P h <= trace(P) h'h */
+    real bound = c->owed->bound; /* not exact, but at hand */
+    for (int i = 0; i < 2; i++, bound = largest_variance(c)) {
+        const real variance = scale * bound + diagonal; /* h'P h <= trace(P) h'h */
         if (variance <= MOST && (real)c->n * variance * energy <= MOST) return 1;
     }
     return 0;
