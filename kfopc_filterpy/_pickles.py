@@ -85,6 +85,8 @@ class _Pickler(pickle.Pickler):
         if type(value) is np.random.Generator:
             return np.random.Generator, (value.bit_generator.state,)
         if hasattr(value, "__qualname__"):  # a class or a function
+            if not isinstance(value.__module__, str):  # pickle would search all modules for it
+                raise TypeError(f"it holds {value!r}")
             self.named.append(value)
             return value.__qualname__
         return NotImplemented

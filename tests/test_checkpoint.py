@@ -668,12 +668,13 @@ def test_a_process_that_is_killed_at_any_point_leaves_a_whole_file(kind: str, tm
 def test_a_second_process_continues_to_the_bit(tmp_path: Path) -> None:
     script = """
 import sys, numpy as np
-from kfopc_filterpy import KalmanController, kf_opc
+from kfopc_filterpy import kf_opc
+from kfopc_filterpy.controllers import DirectKalman
 path, begin, end = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 if begin == 0:
     controller = kf_opc(8, [0.0, 1.0], rated_power=0.1, state_noise=1e-6, measurement_noise=0.1)
 else:
-    controller = KalmanController.load(path)
+    controller = DirectKalman.load(path)
 x, d = np.random.default_rng(0).standard_normal((2, 300))
 for n in range(begin, end):
     y = controller.control_signal(x[n])

@@ -233,6 +233,8 @@ static real downdate_carefully(covariance *c, real q)
     return inverse_root;
 }
 
+int tells(const covariance *c, real S) { return S > 0 && root(c->owed->bound) <= LARGEST * root(S); }
+
 real downdate(covariance *c, real S, real q)
 {
     real inverse_root = S > CANCELLATION * q ? downdate_carefully(c, q) : 0;
@@ -300,7 +302,7 @@ int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h,
     predict(&c, fading, r);
     memcpy(c.h, h, sizeof(real) * (size_t)n);
     const real S = project(&c) + q, y = z - dot(h, w, n);
-    if (S > 0) correct(&c, w, y, downdate(&c, S, q), LARGEST);
+    if (tells(&c, S)) correct(&c, w, y, downdate(&c, S, q), LARGEST);
     else memset(c.u, 0, sizeof(real) * (size_t)c.padded); /* P is what it was predicted to be */
     result[0] = y, result[1] = S;
     return ANC_DONE;

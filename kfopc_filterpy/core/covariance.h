@@ -30,6 +30,9 @@ int predictable(const covariance *c, real fading, real state_noise, real energy)
 void predict(covariance *c, real fading, real state_noise);
 /* Apply what is pending, set c->Ph to P c->h, and return h' P h. */
 real project(covariance *c);
+/* Return whether S of eq. 7 is large enough for a gain: with less, K could exceed LARGEST. Such a row has next to no energy, or P leaves
+ * nothing open about it, and without measurement noise it tells nothing. */
+int tells(const covariance *c, real S);
 /* Eq. 8, P -= g g' / S with g = P h, after `project`; in twice the precision where S is far above the measurement noise q.
  * Return 1 / sqrt(S). */
 real downdate(covariance *c, real S, real q);

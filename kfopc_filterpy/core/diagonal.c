@@ -53,7 +53,7 @@ static void measure(diagonal *f, const lines *rows, int32_t k, const real *d, re
     const int32_t n = s->J * s->I, L = s->L;
     const real inverse = look(f, rows, k, r), size = root(dot(f->direction, f->direction, n * L));
     /* Without measurement noise, a reference that is silent, or nearly, tells nothing. */
-    if (!isfinite(inverse)) return;
+    if (!within(inverse * size, LARGEST)) return;
     for (int32_t scenario = 0; scenario < s->S; scenario++) {
         const real step = inverse * ((d ? d[scenario * s->K + k] : 0) - heard_output(s, rows, scenario, k));
         if (within(step * size, LARGEST)) add_scaled(weights_of(s, scenario * s->J), step, f->direction, n * L);

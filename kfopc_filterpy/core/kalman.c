@@ -42,13 +42,14 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
     const int32_t K = f->s.K;
     const real q = f->s.setting[MEASUREMENT_NOISE][k];
     observe(f, rows, k);
-    const real S = project(&f->c) + q;                           /* eq. 7 */
-    const real inverse_root = S > 0 ? downdate(&f->c, S, q) : 0; /* S = 0: P leaves nothing open, and the row tells nothing */
+    const real S = project(&f->c) + q; /* eq. 7 */
+    const int tell = tells(&f->c, S);
+    const real inverse_root = tell ? downdate(&f->c, S, q) : 0;
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         real *w = weights_of(&f->s, scenario * f->s.J);
         const real y = (z ? z[scenario * K + k] : 0) - dot(f->c.h, w, f->c.n);
         if (z) f->innovation[scenario * K + k] = y, f->variance[k] = S;
-        if (S > 0) correct(&f->c, w, y, inverse_root, LARGEST);
+        if (tell) correct(&f->c, w, y, inverse_root, LARGEST);
     }
 }
 

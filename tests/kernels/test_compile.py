@@ -449,7 +449,7 @@ def test_what_holds_a_users_type_is_not_kept_on_disk() -> None:
 
     state = made_for_8_khz("KF-PB")._state
     assert Held(state).ours
-    assert not Held(state._replace(lines=state.lines._replace(guard=Own(np.zeros(3))))).ours
+    assert not Held(state._replace(lines=state.lines._replace(limiter=Own(np.zeros(3))))).ours
 
 
 def test_a_state_is_not_written_where_another_type_is_held() -> None:

@@ -307,7 +307,7 @@ def test_a_scenario_that_diverges_leaves_the_others_alone(cause):
 
 def test_when_all_have_diverged_the_run_ends():
     x, own = differing(3, 3000)
-    own |= {"secondary_path": [np.append(-S_HAT, 0.0)] * 3, "amplifier": [None] * 3}
+    own |= {"secondary_path": [-scale * np.append(S_HAT, 0.0) for scale in (1.0, 2.0, 4.0)], "amplifier": [None] * 3}
     noises, counts = {"state_noise": 1e-2, "measurement_noise": 0.1}, []
     made, alone = ([kf_anc(7, S_HAT, **noises) for _ in range(3)] for _ in range(2))
     results = run_scenarios(made, x, fs=FS, rated_power=1e-4, progress=counts.append, **own)
