@@ -12,8 +12,8 @@ static const real SILENCE = DBL_MIN;
 static real next_mean(const anc_power *p, const real *window, int32_t length, real rate, real square)
 {
     if (!length) {
-        const real share = 1 / (p->taken + 1);
-        return p->mean_square + (share > rate ? share : rate) * (square - p->mean_square);
+        const real share = rate * (p->taken + 1) < 1 ? 1 / (p->taken + 1) : rate;
+        return p->mean_square + share * (square - p->mean_square);
     }
     const int32_t i = (int32_t)p->position;
     const real rest = i + 1 < length ? window[i + 1] : 0; /* of the last lap; sums only, so that no rounding accumulates */

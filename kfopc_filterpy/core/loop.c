@@ -23,20 +23,23 @@ void anc_play(anc_plant *p, const real *amplified, const anc_signals *s, int64_t
         if (!before) memcpy(row + p->at + 1, row, sizeof(real) * (size_t)(taps - 1));
         row[p->at] = s->amplifier_output[sj * s->length + n] = amplified[sj];
     }
-    for (int32_t sk = 0; sk < p->scenarios * p->microphones; sk++) {
-        const int64_t at = sk * s->length + n;
-        real a = 0;
-        for (int32_t j = 0; j < p->loudspeakers; j++)
-            a += dot(p->path + times(sk * p->loudspeakers + j, p->path_taps), p->output + times(sk / p->microphones * p->loudspeakers + j, p->length) + p->at, p->path_taps);
-        s->anti_noise[at] = a;
-        s->error[at] = p->error[sk] = s->disturbance[at] - a + (s->sensor_noise ? s->sensor_noise[at] : 0);
-    }
+    for (int32_t scenario = 0; scenario < p->scenarios; scenario++)
+        for (int32_t k = 0; k < p->microphones; k++) {
+            const int32_t sk = scenario * p->microphones + k;
+            const int64_t at = sk * s->length + n;
+            real a = 0;
+            for (int32_t j = 0; j < p->loudspeakers; j++)
+                a += dot(p->path + times(sk * p->loudspeakers + j, p->path_taps), p->output + times(scenario * p->loudspeakers + j, p->length) + p->at, p->path_taps);
+            s->anti_noise[at] = a;
+            s->error[at] = p->error[sk] = s->disturbance[at] - a + (s->sensor_noise ? s->sensor_noise[at] : 0);
+        }
 }
 
 static void write_down(const anc_record *r, int64_t n)
 {
-    if (n % r->every) return;
-    for (int64_t c = 0; c < r->count; c++) r->to[n / r->every * r->row + c * r->column] = r->from[c * r->step];
+    const int64_t row = r->every == 1 ? n : n / r->every;
+    if (row * r->every != n) return;
+    for (int64_t c = 0; c < r->count; c++) r->to[row * r->row + c * r->column] = r->from[c * r->step];
 }
 
 int64_t anc_run(const anc_controller *c, anc_plant *p, const anc_signals *s, const anc_record *records, int32_t n_records, int64_t begin, int64_t end, int32_t *status)

@@ -174,28 +174,27 @@ real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t
 int estimate_disturbance(signals *s, const real *error)
 {
     real x2 = 0;
-    for (int32_t sk = 0; sk < s->S * s->K; sk++) {
-        const int32_t scenario = sk / s->K, k = sk % s->K;
-        real d = error[sk];
-        if (!within(d, LOUDEST)) return ANC_LOUD_ERROR;
-        for (int32_t j = 0; j < s->J; j++) d += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, scenario * s->J + j), s->M);
-        if (!within(d, LOUDEST)) return ANC_LOUD_ESTIMATE;
-        s->estimate[sk] = d;
-    }
     for (int32_t i = 0; i < s->I; i++) x2 += *newest(&s->x, i) * *newest(&s->x, i);
-    /* Squares of d^ are summed over microphones, of x over references, of x'_j over both. */
-    for (int32_t sj = 0; sj < s->S * s->J; sj++) {
-        const int32_t scenario = sj / s->J, j = sj % s->J;
-        real d2 = 0, f2 = 0;
+    for (int32_t scenario = 0; scenario < s->S; scenario++) {
+        const real *e = error + scenario * s->K;
+        real *estimates = s->estimate + scenario * s->K, d2 = 0;
         for (int32_t k = 0; k < s->K; k++) {
-            d2 += s->estimate[scenario * s->K + k] * s->estimate[scenario * s->K + k];
-            for (int32_t i = 0; i < s->I; i++) {
-                const real f = *newest(&s->filtered, (k * s->J + j) * s->I + i);
-                f2 += f * f;
-            }
+            real d = e[k];
+            if (!within(d, LOUDEST)) return ANC_LOUD_ERROR;
+            for (int32_t j = 0; j < s->J; j++) d += dot(s->path + times(k * s->J + j, s->M), newest(&s->y, scenario * s->J + j), s->M);
+            if (!within(d, LOUDEST)) return ANC_LOUD_ESTIMATE;
+            estimates[k] = d, d2 += d * d;
         }
-        real *squares = s->squares + ANC_POWERS * sj;
-        squares[ANC_DISTURBANCE] = d2, squares[ANC_FILTERED] = f2, squares[ANC_REFERENCE] = x2;
+        /* Squares of d^ are summed over microphones, of x over references, of x'_j over both. */
+        for (int32_t j = 0; j < s->J; j++) {
+            real *squares = s->squares + ANC_POWERS * (scenario * s->J + j), f2 = 0;
+            for (int32_t k = 0; k < s->K; k++)
+                for (int32_t i = 0; i < s->I; i++) {
+                    const real f = *newest(&s->filtered, (k * s->J + j) * s->I + i);
+                    f2 += f * f;
+                }
+            squares[ANC_DISTURBANCE] = d2, squares[ANC_FILTERED] = f2, squares[ANC_REFERENCE] = x2;
+        }
     }
     return ANC_DONE;
 }
@@ -246,28 +245,27 @@ void set_step(signals *s, int32_t sj, real keep, real mu, real penalty)
 
 int descend(signals *s, const real *error)
 {
-    const int32_t rows = s->J * s->I;
-    for (int32_t sk = 0; sk < s->S * s->K; sk++) {
-        const int32_t scenario = sk / s->K;
-        s->heard[sk] = s->G ? heard_output(s, &s->guarded, scenario, sk % s->K) : 0;
-        for (int32_t j = 0; j < s->J; j++) {
-            const real *step = s->step + STEPS * (scenario * s->J + j);
-            if (!within(step[MU] * error[sk], LARGEST) || !within(step[MU] * s->heard[sk], LARGEST) || !within(step[PENALTY], LARGEST))
-                return ANC_LOUD_STEP;
+    for (int32_t scenario = 0; scenario < s->S; scenario++)
+        for (int32_t k = 0; k < s->K; k++) {
+            const real e = error[scenario * s->K + k], heard = s->G ? heard_output(s, &s->guarded, scenario, k) : 0;
+            s->heard[scenario * s->K + k] = heard;
+            for (int32_t j = 0; j < s->J; j++) {
+                const real *step = s->step + STEPS * (scenario * s->J + j);
+                if (!within(step[MU] * e, LARGEST) || !within(step[MU] * heard, LARGEST) || !within(step[PENALTY], LARGEST)) return ANC_LOUD_STEP;
+            }
         }
-    }
     commit(s);
-    for (int32_t sji = 0; sji < s->S * rows; sji++) {
-        const int32_t scenario = sji / rows, ji = sji % rows;
-        const real *step = s->step + STEPS * (sji / s->I), *x = newest(&s->x, sji % s->I);
-        const real *heard = s->heard + scenario * s->K, *e = error + scenario * s->K;
-        real *w = s->weights + times(sji, s->L);
-        for (int32_t k = 0; s->G && k < s->K; k++) /* a leak where the paths are uncertain: w -= mu (w'x'') x'' */
-            add_scaled(w, -step[MU] * heard[k], newest(&s->guarded, k * rows + ji), s->L);
-        if (step[KEEP] != 1 || step[PENALTY] != 0)
-            for (int32_t l = 0; l < s->L; l++) w[l] = step[KEEP] * w[l] - step[PENALTY] * x[l];
-        for (int32_t k = 0; k < s->K; k++) add_scaled(w, step[MU] * e[k], newest(&s->filtered, k * rows + ji), s->L);
-    }
+    for (int32_t scenario = 0; scenario < s->S; scenario++)
+        for (int32_t j = 0; j < s->J; j++)
+            for (int32_t i = 0; i < s->I; i++) {
+                const int32_t ji = j * s->I + i, rows = s->J * s->I;
+                const real *step = s->step + STEPS * (scenario * s->J + j), *e = error + scenario * s->K, *heard = s->heard + scenario * s->K;
+                real *w = s->weights + times(scenario * rows + ji, s->L);
+                for (int32_t k = 0; s->G && k < s->K; k++) /* a leak where the paths are uncertain: w -= mu (w'x'') x'' */
+                    add_scaled(w, -step[MU] * heard[k], newest(&s->guarded, k * rows + ji), s->L);
+                if (step[KEEP] != 1 || step[PENALTY] != 0) shrink(w, step[KEEP], step[PENALTY], newest(&s->x, i), s->L);
+                for (int32_t k = 0; k < s->K; k++) add_scaled(w, step[MU] * e[k], newest(&s->filtered, k * rows + ji), s->L);
+            }
     return ANC_DONE;
 }
 

@@ -52,11 +52,9 @@ static inline real root(real square)
 }
 
 /* Add up the partial sums. */
-static inline real total(real part[PARTS])
+static inline real total(const real p[PARTS])
 {
-    for (int half = PARTS / 2; half; half /= 2)
-        for (int p = 0; p < half; p++) part[p] += part[p + half];
-    return part[0];
+    return ((p[0] + p[4]) + (p[2] + p[6])) + ((p[1] + p[5]) + (p[3] + p[7]));
 }
 
 /* Return a'b. */
@@ -77,5 +75,11 @@ static inline real dot(const real *restrict a, const real *restrict b, int32_t n
 static inline void add_scaled(real *restrict to, real a, const real *restrict from, int32_t n)
 {
     for (int32_t i = 0; i < n; i++) to[i] += a * from[i];
+}
+
+/* Set w = keep w - a x. */
+static inline void shrink(real *restrict w, real keep, real a, const real *restrict x, int32_t n)
+{
+    for (int32_t i = 0; i < n; i++) w[i] = keep * w[i] - a * x[i];
 }
 #endif
