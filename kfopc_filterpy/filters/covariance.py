@@ -26,6 +26,8 @@ class RandomWalkCovariance:
     if that is no longer possible.
     """
 
+    _seen: tuple[np.ndarray, int, int] | None = None  # what `seen` has found
+
     def __init__(self, P: np.ndarray) -> None:
         self.n = len(P)
         self.arrays: Covariance = new_covariance(0.5 * (P + P.T))
@@ -35,9 +37,17 @@ class RandomWalkCovariance:
         self._shown: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
+    def seen(self) -> tuple[np.ndarray, int, int]:
+        """Record of what is pending, and the addresses of the memory and of the last result."""
+        if self._seen is None:
+            memory, result = self.arrays
+            self._seen = owed_of(self.arrays), memory.ctypes.data, result.ctypes.data
+        return self._seen
+
+    @property
     def now(self) -> Moment:
         """P at present."""
-        scale, diagonal, pending, *_ = owed_of(self.arrays).item()
+        scale, diagonal, pending, *_ = self.seen[0].item()
         return scale, diagonal, -scale * pending
 
     def full(self, moment: Moment | np.ndarray) -> np.ndarray:
@@ -59,9 +69,13 @@ class RandomWalkCovariance:
                 return P
         return None
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the attributes for a copy or a file, which holds arrays of its own."""
+        return {name: value for name, value in vars(self).items() if name != "_seen"}
+
     def __deepcopy__(self, memo: dict[int, Any]) -> RandomWalkCovariance:
         other = memo[id(self)] = object.__new__(type(self))
-        other.__dict__.update(deepcopy(vars(self) | {"arrays": None}, memo))
+        other.__dict__.update(deepcopy(self.__getstate__() | {"arrays": None}, memo))
         other.arrays = copy_covariance(self.arrays, self.n)
         return other
 
@@ -73,7 +87,7 @@ class RandomWalkCovariance:
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Record eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, as pending for the next pass over the triangle."""
-        owed = owed_of(self.arrays)
+        owed = self.seen[0]
         scale, diagonal, pending, *_ = owed.item()
         if not alpha_sq * max(scale, diagonal) + state_noise < LARGEST:
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
@@ -101,7 +115,7 @@ class RandomWalkCovariance:
 
     def updated(self) -> None:
         """Record an update: P is P_post, and P_prior, if it was the triangle, is P + u u'."""
-        scale, diagonal, pending, *_ = owed_of(self.arrays).item()
+        scale, diagonal, pending, *_ = self.seen[0].item()
         if isinstance(self.prior, tuple):
             self.prior = 1.0, 0.0, 1.0 - pending
         self.posterior = scale, diagonal, -scale * pending

@@ -355,11 +355,11 @@ class RandomWalkKFOPC(KFOPC):
         if noise == 0.0 and not h.any():
             raise ValueError(SILENT_REFERENCE)
         covariance = self._covariance
-        (memory, result), (before, prior) = covariance.arrays, covariance.before_update()
+        before, prior = covariance.before_update()
+        result, (_, memory_at, result_at) = covariance.arrays.result, covariance.seen
         result[1] = nan
-        places = (array.ctypes.data for array in (memory, weights, h))
-        memory_at, weights_at, h_at = places
-        answer = covariance_update(memory_at, h.size, weights_at, h_at, factor * z, noise, result.ctypes.data)
+        places = memory_at, h.size, weights.ctypes.data, h.ctypes.data
+        answer = covariance_update(*places, factor * z, noise, result_at)
         y, S = result.tolist()
         if S == S:  # the pass over P has begun
             covariance.projected(before, prior)
