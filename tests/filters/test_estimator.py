@@ -333,8 +333,8 @@ def deep_equal(a: Any, b: Any) -> bool:
     if isinstance(a, list | tuple):
         return len(a) == len(b) and all(map(deep_equal, a, b))
     if hasattr(a, "__dict__") and not callable(a):
-        held = [{key: value for key, value in vars(o).items() if key not in ("_shown", "_held")} for o in (a, b)]
-        return deep_equal(*held)  # _shown: P as last read; _held: the arrays again
+        held = [{key: value for key, value in vars(o).items() if key not in ("_shown", "_seen")} for o in (a, b)]
+        return deep_equal(*held)  # _shown: P as last read; _seen: addresses of the arrays
     return a is b or a == b or repr(a) == repr(b) == "nan"
 
 
