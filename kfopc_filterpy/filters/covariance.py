@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,16 @@ Moment = tuple[float, float, float]
 TRIANGLE: Moment = (1.0, 0.0, 0.0)  # P is T itself
 
 
+class Seen(NamedTuple):
+    """What an update of the core needs of a covariance."""
+
+    owed: np.ndarray  # record of what is pending
+    weights: np.ndarray  # (n,) room for the weights
+    row: np.ndarray  # (n,) room for H
+    places: tuple[int, int, int, int]  # the first arguments of `covariance_update`
+    result: int  # its last one
+
+
 class RandomWalkCovariance:
     """P, P_prior and P_post of a random-walk filter, each expanded to a full array when read.
 
@@ -26,7 +36,7 @@ class RandomWalkCovariance:
     if that is no longer possible.
     """
 
-    _seen: tuple[np.ndarray, int, int] | None = None  # what `seen` has found
+    _seen: Seen | None = None  # what `seen` has found
 
     def __init__(self, P: np.ndarray) -> None:
         self.n = len(P)
@@ -37,17 +47,19 @@ class RandomWalkCovariance:
         self._shown: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
-    def seen(self) -> tuple[np.ndarray, int, int]:
-        """Record of what is pending, and the addresses of the memory and of the last result."""
+    def seen(self) -> Seen:
+        """Views and addresses, which are looked up once: that takes as long as a sample of a short filter."""
         if self._seen is None:
-            memory, result = self.arrays
-            self._seen = owed_of(self.arrays), memory.ctypes.data, result.ctypes.data
+            weights, row = np.zeros((2, self.n))
+            memory, result = (array.ctypes.data for array in self.arrays)
+            places = memory, self.n, weights.ctypes.data, row.ctypes.data
+            self._seen = Seen(owed_of(self.arrays), weights, row, places, result)
         return self._seen
 
     @property
     def now(self) -> Moment:
         """P at present."""
-        scale, diagonal, pending, *_ = self.seen[0].item()
+        scale, diagonal, pending, *_ = self.seen.owed.item()
         return scale, diagonal, -scale * pending
 
     def full(self, moment: Moment | np.ndarray) -> np.ndarray:
@@ -87,7 +99,7 @@ class RandomWalkCovariance:
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Record eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, as pending for the next pass over the triangle."""
-        owed = self.seen[0]
+        owed = self.seen.owed
         scale, diagonal, pending, *_ = owed.item()
         if not alpha_sq * max(scale, diagonal) + state_noise < LARGEST:
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
@@ -115,7 +127,7 @@ class RandomWalkCovariance:
 
     def updated(self) -> None:
         """Record an update: P is P_post, and P_prior, if it was the triangle, is P + u u'."""
-        scale, diagonal, pending, *_ = self.seen[0].item()
+        scale, diagonal, pending, *_ = self.seen.owed.item()
         if isinstance(self.prior, tuple):
             self.prior = 1.0, 0.0, 1.0 - pending
         self.posterior = scale, diagonal, -scale * pending

@@ -348,18 +348,22 @@ class RandomWalkKFOPC(KFOPC):
 
     def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
         """Apply eq. 5-9; return the new weights. A refused update raises before anything changes."""
-        constraint, weights = self._constraint, self._weights()
-        if not isfinite(z + np.vdot(h, h)):
-            checked_measurement(self, z, None, h)  # raises if one of them is not finite
+        constraint, covariance = self._constraint, self._covariance
+        seen = covariance.seen
+        x = np.asarray(self.x)
+        if x.size != self.dim_x:
+            self._weights()  # raises
+        seen.weights[:], seen.row[:] = x.reshape(-1), h
+        if not isfinite(z + h.dot(h) + seen.weights.dot(seen.weights)):
+            self._weights()  # raises if one of them is not finite
+            checked_measurement(self, z, None, h)
         factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
         if noise == 0.0 and not h.any():
             raise ValueError(SILENT_REFERENCE)
-        covariance = self._covariance
         before, prior = covariance.before_update()
-        result, (_, memory_at, result_at) = covariance.arrays.result, covariance.seen
+        result = covariance.arrays.result
         result[1] = nan
-        places = memory_at, h.size, weights.ctypes.data, h.ctypes.data
-        answer = covariance_update(*places, factor * z, noise, result_at)
+        answer = covariance_update(*seen.places, factor * z, noise, seen.result)
         y, S = result.tolist()
         if S == S:  # the pass over P has begun
             covariance.projected(before, prior)
@@ -373,7 +377,7 @@ class RandomWalkKFOPC(KFOPC):
         covariance.updated()
         self._K, self._made = None, {name: value for name, value in self._made.items() if name == "x_prior"}
         self._numbers["measurement"], self._numbers["residual"], self._numbers["variance"] = z, y, S
-        return weights
+        return seen.weights.reshape(x.shape).copy()
 
     def _own_constraint(self, value: Any) -> OutputPowerConstraint:
         """Return a copy of a constraint; there is one loudspeaker."""
