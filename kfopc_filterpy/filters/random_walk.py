@@ -354,7 +354,7 @@ class RandomWalkKFOPC(KFOPC):
         if x.size != self.dim_x:
             self._weights()  # raises
         seen.weights[:], seen.row[:] = x.reshape(-1), h
-        if not isfinite(z + h.dot(h) + seen.weights.dot(seen.weights)):
+        if not isfinite(z + np.vdot(h, h) + np.vdot(seen.weights, seen.weights)):
             self._weights()  # raises if one of them is not finite
             checked_measurement(self, z, None, h)
         factor = self._unconstrained_factor if constraint is None else constraint.preview(z, h[0], reference)
