@@ -295,7 +295,7 @@ void anc_refilter(anc_view *view)
         for (int32_t i = 0; i < s->I; i++) {
             real *filtered = newest(&s->filtered, kj * s->I + i);
             for (int32_t n = 0; n < s->filtered.taps; n++) filtered[n] = dot(s->path + times(kj, s->M), newest(&s->x, i) + n, s->M);
-            /* The guard also needs x' of before its delay line, which is filtered here once more. */
+            /* The guard also needs x' from before its delay line, which is computed here again. */
             for (int32_t n = 0; s->G && n < s->L; n++) {
                 real sum = 0;
                 for (int32_t g = 0; g < s->G; g++) sum += s->guard[g] * dot(s->path + times(kj, s->M), newest(&s->x, i) + n + g, s->M);
@@ -305,7 +305,7 @@ void anc_refilter(anc_view *view)
     set_loudest(s);
 }
 
-/* The signals alone, for an estimator of the host: d^ is previewed, and what the estimator makes of it are the weights. */
+/* The signals alone, for an estimator of the host, which takes d^ and sets the weights. */
 
 static const anc_setting none[] = {{0}};
 
