@@ -37,7 +37,7 @@ typedef double anc_real;
 typedef struct {
     int32_t scenarios, microphones, loudspeakers, references, taps, path_taps; /* S, K, J, I, L, M */
     int32_t guard_taps;             /* G; 0: the secondary paths are exact */
-    int32_t limited;                /* 1: each control signal passes a limiter, silent until the host sets its numbers */
+    int32_t limited;                /* 1: with limiters, which are silent until the host sets their numbers */
     const int32_t *power_windows;   /* (S, J) samples of the window of the powers; 0: exponential. NULL: all 0 */
     const int32_t *limiter_windows; /* (S, J) samples of each limiter's window; NULL without limiters */
     const anc_real *path;           /* (K, J, M) estimated secondary paths */
@@ -150,9 +150,9 @@ typedef struct { /* a controller as the loop sees it: of the core or of the host
 } anc_controller;
 
 typedef struct {
-    int32_t scenarios, microphones, loudspeakers, references, path_taps, feedback_taps; /* with feedback, one scenario */
+    int32_t scenarios, microphones, loudspeakers, references, path_taps, feedback_taps; /* one scenario if feedback */
     int32_t at, length;              /* of the delay lines of y_amp, at least as long as both paths */
-    const anc_real *path, *feedback; /* (S, K, J, path_taps) true s; (I, J, feedback_taps) to the reference microphones */
+    const anc_real *path, *feedback; /* (S, K, J, path_taps) true s; (I, J, feedback_taps) to references */
     const anc_amplifier *amplifiers; /* (S, J) */
     anc_real *output;                /* (S, J, length) */
     anc_real *reference, *control, *error; /* (I), (S, J), (S, K): the present sample */

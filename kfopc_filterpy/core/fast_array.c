@@ -55,7 +55,7 @@ static const anc_setting finite_settings[] = { /* float counts to 2^24, twice th
 /* An array is lost if the last entry of its gain column exceeds UNUSABLE of the column's norm. One of a pair, which can
  * be restarted, is given up beyond ASTRAY. */
 static const real UNUSABLE = (real)0.1, ASTRAY = (real)1e-4;
-static const real LESS = (real)0.01, MORE = 2; /* factors of P at the next start, after an array was lost and after one lasted */
+static const real LESS = (real)0.01, MORE = 2; /* of P at the next start: after an array was lost, and after one lasted */
 
 static void layout_arrays(arrays *f, const anc_plan *plan, const anc_setting *settings, anc_layout *at, int32_t n)
 {
@@ -86,7 +86,7 @@ static int find_rotations(const arrays *f, int32_t i, real largest_stray, rotati
 {
     const int32_t n = f->s.L + 1;
     const array_numbers *a = f->numbers + i;
-    const int32_t known = a->heard + 1 < (real)n ? (int32_t)a->heard + 1 : n; /* what was before its start counts as zero */
+    const int32_t known = a->heard + 1 < (real)n ? (int32_t)a->heard + 1 : n; /* before its start: zeros */
     const real *row = newest(&f->s.filtered, 0), last = f->gain[times(i, n) + (size_t)f->s.L];
     const real ahead = dot(row, f->first + times(i, n), known), behind = dot(row, f->second + times(i, n), known);
     const real next = root(a->root * a->root + ahead * ahead), t = behind / next, cosine = root(1 - t * t);

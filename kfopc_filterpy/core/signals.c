@@ -51,7 +51,7 @@ void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, 
 {
     const int32_t S = p->scenarios, K = p->microphones, J = p->loudspeakers, I = p->references;
     const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
-    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* a guard can come later, a fast array needs L + 1 samples */
+    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* for a later guard; for a fast array */
     s->S = S, s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
     s->limited = p->limited;
     s->power_length = longest(p->power_windows, S * J), s->limiter_length = longest(p->limiter_windows, S * J);
@@ -219,7 +219,7 @@ int estimate(signals *s, const real *error)
 
 real least_factor(const signals *s, int32_t scenario)
 {
-    real heard = 2, unheard = 2; /* a loudspeaker whose gain is zero keeps silent: its factor counts only if there is no other */
+    real heard = 2, unheard = 2; /* a loudspeaker of zero gain is silent: it counts only if all are */
     for (int32_t j = 0; j < s->J; j++) {
         const anc_previewed *p = s->previewed + scenario * s->J + j;
         real *least = p->gain == 0 ? &unheard : &heard;

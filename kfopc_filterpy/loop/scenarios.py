@@ -191,8 +191,8 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
         looped = controller.looped()
         if looped is None:
             raise ValueError(
-                f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and others "
-                "whose steps are in the core"
+                f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and "
+                "others whose steps are in the core"
             )
         if looped.owner.algorithm.path is not None:
             raise ValueError(
