@@ -1,10 +1,10 @@
 """Pickles that only hold data: reading one calls nothing that it names.
 
-A pickle is a program for a small machine, and Python's machine calls whatever the program names. The one here knows only
-the instructions that hold data. It fills lists, deques, dicts, Counters and tuples, and makes objects without their
-``__new__``, ``__init__``, ``__setstate__`` and setters. A pickle can name classes in the `FOLDERS`, what is in
-`OUTSIDE`, and what the reader trusts; functions among them are kept, but not called. A class that says itself how it
-is copied is refused: an algorithm, which loads a library, is one. Keys are numbers, strings or tuples of them, and what
+A pickle is a program for a small machine, and Python's machine calls whatever the program names. The one here knows
+only the instructions that hold data. It fills lists, deques, dicts, Counters and tuples, and makes objects without
+their ``__new__``, ``__init__``, ``__setstate__`` and setters. A pickle can name classes in the `FOLDERS`, what is in
+`OUTSIDE`, and what the reader trusts; functions among them are kept, but not called. A class with methods for its own
+copying is refused: an algorithm, which loads a library, is one. Keys are numbers, strings or tuples of them, and what
 an array or a generator is made of has plain types, so that no method of an object in the pickle is called either.
 Arrays are views of memory beside the pickle.
 """
@@ -32,10 +32,10 @@ OUTSIDE = (KalmanFilter, inv_diagonal, np.linalg.inv, np.linalg.pinv, scipy.lina
 MADE = (np.ndarray, np.random.Generator, deque, Counter)  # and these, which `_made` knows
 GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")  # numpy's bit generators
 PLAIN = (type(None), bool, int, float, str)
-COPYING = ("__reduce__", "__reduce_ex__", "__setstate__")  # methods of a class that says itself how it is copied
+COPYING = ("__reduce__", "__reduce_ex__", "__setstate__")  # methods of a class for its own copying
 LINE = 64  # bytes in a cache line
 
-# Instructions that bring a value, that begin one, and that take the last ones, by their number or, for 0, back to a mark.
+# Instructions that push a value, that push an empty one, and that take the last ones: so many, or for 0 back to a mark.
 BRING = ("BININT", "BININT1", "BININT2", "LONG1", "LONG4", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8")
 BEGIN = {"NONE": type(None), "NEWFALSE": bool, "EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_TUPLE": tuple}
 TAKE = {"TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "APPENDS": 0, "SETITEM": 2, "SETITEMS": 0}
@@ -72,7 +72,7 @@ class _Pickler(pickle.Pickler):
         super().__init__(self.file, 5)
 
     def reducer_override(self, value: Any) -> Any:
-        """Return how a value is made, if it is not for Python to say."""
+        """Return how a value is made, or NotImplemented if Python decides."""
         if type(value) is np.ndarray and value.dtype == object:  # filterpy's z, before the first measurement
             return np.ndarray, (value.shape, value.ravel().tolist())
         if type(value) in (np.ndarray, np.recarray) or isinstance(value, np.generic):
@@ -197,7 +197,7 @@ def _array(memory: memoryview, shape: tuple[int, ...], fields: Any, aligned: boo
     order, at, scalar = how
     array = np.ndarray(shape, _dtype(fields, aligned), memory[at:], order=order)  # numpy takes a negative offset
     if array.dtype.names is not None:
-        from .kernels.records import as_records  # it loads numba, which who has records has loaded
+        from .kernels.records import as_records  # imported here, because it loads numba
 
         array = as_records(array)
     return array[()] if scalar else array

@@ -2,13 +2,13 @@
 
 A file has four parts::
 
-    kfopc checkpoint 2 of kfopc_filterpy 2.0: 4711\n    the format, the series that wrote it, the bytes of the pickle
+    kfopc checkpoint 2 of kfopc_filterpy 2.0: 4711\n    the format, the version that wrote it, the pickle's size
     a pickle                                            the object without the memory of its arrays, see `_pickles`
     memory of the arrays                                each begins at a multiple of 64 bytes, a cache line
     64 hexadecimal digits                               SHA-256 of everything before them
 
-What an object is, its ``__getstate__`` says, as for a copy. What it holds twice, it holds twice again, but views of one
-memory become arrays of their own, as in a deep copy.
+As for a copy, ``__getstate__`` decides what is stored of an object. What an object holds twice is still one thing, but
+views of one memory become arrays of their own, as in a deep copy.
 
 Loading calls nothing that a file names, and arrays are views of the bytes that were read, so a file cannot claim more
 memory than it has. But the numbers in a state are not checked, and compiled code trusts them when the object is used.
@@ -120,7 +120,7 @@ class Checkpointed:
         Notes
         -----
         Loading calls nothing that the file names, and takes no more memory for arrays than the file has. The checksum
-        finds damage, not intent: compiled code trusts the numbers of a state, so do not load files that you do not trust.
+        finds damage, not intent. Compiled code trusts the numbers of a state: do not load files that you do not trust.
 
         See Also
         --------

@@ -77,8 +77,7 @@ class DirectKalman(CoreController):
     If the secondary path has channel axes, or if there are several references, `weights` is (J, I, L) and
     `constraint_factor` is (J,), each loudspeaker's own factor; the smallest one is applied.
 
-    With ``measurement_noise=0``, a row that P leaves nothing open about, such as a silent one, tells nothing: such a
-    sample corrects nothing.
+    With ``measurement_noise=0``, a sample that carries no information, such as a silent one, corrects nothing.
 
     Examples
     --------
@@ -151,7 +150,7 @@ class DirectKalman(CoreController):
     def innovation(self) -> Any:
         """Innovation alpha d^ - w'x' of the last update; with several channels that of each microphone, (K,).
 
-        The microphones are measured one after the other, so each of them is predicted with those before it known.
+        The microphones are measured one after the other, each with the weights that those before it have corrected.
         """
         return self._of_microphones("innovation")
 

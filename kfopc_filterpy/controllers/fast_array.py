@@ -27,11 +27,11 @@ class FastArrayKalman(CoreController):
 
     Rounding: without forgetting, the weights agree with those of the O(L^2) filter to about 1e-10 over a million
     samples, on white, coloured and band-limited noise. With forgetting, errors grow by 1/lambda per sample until the
-    array is lost, after 10 to 20 memories of 1/(1 - lambda) samples: some ten seconds for lambda = 0.9999 at 16 kHz.
+    array is lost, after 10 to 20 memories of 1/(1 - lambda) samples: about ten seconds for lambda = 0.9999 at 16 kHz.
     `update` then raises ValueError, and the weights stay as they were. A narrow band with an `initial_variance` far
     above `measurement_noise` can spoil the array without forgetting, too.
 
-    With `memory` = N the filter forgets and still runs for ever, at less than twice the cost. Two filters without
+    With `memory` = N the filter forgets and still runs forever, at less than twice the cost. Two filters without
     forgetting take turns: every N samples one of them is restarted from the weights in use, with
     P = `initial_variance`. The weights are a mixture of both that is as accurate as least squares over the last N
     samples, or as `fx_rls` with lambda = 1 - 2/N. A sample counts for 2 N samples. After that it is known only through
@@ -50,8 +50,8 @@ class FastArrayKalman(CoreController):
     forgetting : float, default 1
         Forgetting factor lambda, above 0 and at most 1.
     memory : int, optional
-        Memory N in samples, at least 2 L and at most 2^23. The excess error is L/N of the measurement noise. Not with `forgetting` below
-        1. By default only `forgetting` limits the memory.
+        Memory N in samples, at least 2 L and at most 2^23. The excess error is L/N of the measurement noise. Not with
+        `forgetting` below 1. By default only `forgetting` limits the memory.
     rated_power : float, optional
         Rated output power rho_o: the measurement is scaled by the constraint factor of eq. 13. By default there is no
         constraint.
@@ -96,7 +96,7 @@ class FastArrayKalman(CoreController):
     cancel its digits. The last entry of the rotated gain column is zero in exact arithmetic, so it shows how far an
     array has gone astray (`stray`).
 
-    An array can also begin in the middle of a signal if it takes the samples before as zeros: :math:`\bar u` then has
+    An array can also begin in the middle of a signal if it takes the earlier samples for zeros: :math:`\bar u` then has
     fewer entries than L + 1 at first, and the structure holds.
 
     References

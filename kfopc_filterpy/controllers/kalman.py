@@ -24,8 +24,7 @@ class KalmanController(CoreController):
     """The modified ANC structure around a filterpy filter: any `KalmanFilter` of one measurement.
 
     In each sample, the estimator gets the disturbance estimate as z and the filtered reference as H. With a rated
-    power this is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` make the same without an estimator in Python, which
-    is much faster.
+    power this is KF-OPC, without one KF-ANC. `kf_anc` and `kf_opc` return the same in C, which is much faster.
 
     Parameters
     ----------
@@ -252,7 +251,7 @@ def kf_opc(
     Returns
     -------
     DirectKalman
-        A controller named KF-OPC. With several loudspeakers it scales all measurements by the smallest of their factors.
+        A controller named KF-OPC. With several loudspeakers it scales all measurements by their smallest factor.
 
     Raises
     ------

@@ -128,7 +128,7 @@ def kf_opc_repaired(
     Raises
     ------
     ValueError, TypeError
-        Arguments that `KFOPC.random_walk` or `OutputPowerConstraint` refuses; neither suggested settings nor state noise
+        Arguments that `DirectKalman` or `OutputPowerConstraint` refuses; neither suggested settings nor state noise
         and measurement noise; an unknown `gain_of` or `factor_at`; a `trim_s` that is not positive.
 
     Examples

@@ -1,11 +1,13 @@
 /* Active noise control in C99: no allocation, no input or output, no global state, the same bits on every machine.
  *
- * A controller is a plan (its shape and settings), a block of memory (all that changes) and a view (where its fields stand
- * in the block). A copy of the block, opened again, is a copy of the controller: written to a file, it goes on to the bit.
+ * A controller is a plan (its shape and settings), a block of memory (all that changes) and a view (where its fields
+ * are in the block). A copy of the block, opened again, is a copy of the controller: written to a file, it goes on to
+ * the bit.
  *
- * S scenarios, K microphones, J loudspeakers, I references, L taps of a control filter, M taps of a secondary path, G taps of a
- * guard. Arrays are row-major in that order, with channels first; delay lines hold the newest sample first. Scenarios have the
- * same references, estimated paths and gains, and each its own weights, powers and plant. Signs: e = d - s*y_amp, d^ = e + s^*y. */
+ * S scenarios, K microphones, J loudspeakers, I references, L taps of a control filter, M taps of a secondary path, G
+ * taps of a guard. Arrays are row-major in that order, with channels first; delay lines hold the newest sample first.
+ * Scenarios have the same references, estimated paths and gains, and each its own weights, powers and plant.
+ * Signs: e = d - s*y_amp, d^ = e + s^*y. */
 #ifndef ANC_H
 #define ANC_H
 #include <stddef.h>
@@ -35,7 +37,7 @@ typedef double anc_real;
 typedef struct {
     int32_t scenarios, microphones, loudspeakers, references, taps, path_taps; /* S, K, J, I, L, M */
     int32_t guard_taps;             /* G; 0: the secondary paths are exact */
-    int32_t limited;                /* 1: each control signal passes a limiter, silent until the host sets its numbers */
+    int32_t limited;                /* 1: with limiters, which are silent until the host sets their numbers */
     const int32_t *power_windows;   /* (S, J) samples of the window of the powers; 0: exponential. NULL: all 0 */
     const int32_t *limiter_windows; /* (S, J) samples of each limiter's window; NULL without limiters */
     const anc_real *path;           /* (K, J, M) estimated secondary paths */
@@ -74,7 +76,7 @@ typedef struct {
     void (*start)(anc_view *view, const anc_plan *plan, const anc_setting *settings);    /* before the first sample, on zeros */
     int (*control_signal)(anc_view *view, const anc_real *reference, anc_real *control); /* (I) -> (S, J) */
     int (*update)(anc_view *view, const anc_real *error); /* (S, K); NULL: a sample that is not adapted to */
-    int (*listen)(anc_view *view, const anc_real *error); /* the same while the loudspeakers are silent; NULL: follow the powers */
+    int (*listen)(anc_view *view, const anc_real *error); /* before control is on; NULL: follow the powers */
 } anc_algorithm;
 
 extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_optimal_leaky, anc_mov, anc_mov_fixed, anc_two_gradient,
@@ -83,14 +85,16 @@ extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_opti
 
 /* Bytes of a block; 0 if its shape is refused: a count below 1, or too large. */
 ANC_PUBLIC size_t anc_size(const anc_algorithm *algorithm, const anc_plan *plan);
-/* Find the fields in a block, aligned as anc_real is; a fresh one is started. Return 0 if the block is too small or the plan refused:
- * its shape, and for a fresh block a setting out of its range, a path or guard that is not finite, or one of them missing. */
+/* Find the fields in a block, which is aligned as anc_real is; start it if it is fresh. Return 0 if the block is too
+ * small or the plan is refused: for its shape, or if the block is fresh, for a setting out of its range or a path or
+ * guard that is missing or not finite. */
 ANC_PUBLIC int anc_open(const anc_algorithm *algorithm, const anc_plan *plan, anc_view *view, void *block, size_t bytes, int fresh);
 ANC_PUBLIC void anc_describe(const anc_algorithm *algorithm, const anc_plan *plan, anc_visitor *visit, void *to);
 /* Filter the stored references again, after the paths or the guard in the block have changed. */
 ANC_PUBLIC void anc_refilter(anc_view *view);
-/* Follow x, (n, I), and e, (n, S, K), while the loudspeakers are silent: delay lines advance, and powers where `adapt` is 1; the weights
- * stay, unless the algorithm listens in its own way. Return the number of samples before a refused one, whose answer is set. */
+/* Follow x, (n, I), and e, (n, S, K), while the loudspeakers are silent: the delay lines advance, and so do the powers
+ * where `adapt` is 1; the weights stay, unless the algorithm has a `listen` of its own. Return the number of samples
+ * before a refused one, and set `answer` to its answer. */
 ANC_PUBLIC int64_t anc_listen(const anc_algorithm *algorithm, anc_view *view, const anc_real *x, const anc_real *e, const uint8_t *adapt, int64_t n, int32_t *answer);
 
 /* Parts that also work alone. */
@@ -125,36 +129,37 @@ typedef struct {
 ANC_PUBLIC anc_real anc_limit(anc_limiter *limiter, anc_real *laps, anc_real u);
 ANC_PUBLIC void anc_limit_all(anc_limiter *limiter, anc_real *laps, const anc_real *input, anc_real *output, int64_t n);
 
-/* The covariance of n weights that walk at random, in memory of the host that is zero but for its variances (see covariance.h). */
+/* The covariance of n weights in a random walk, in memory of the host, which sets T and the numbers owed (see
+ * covariance.h). */
 typedef struct {
-    anc_real scale, diagonal, pending, largest, bound, floored; /* largest at the start; none is above `bound` now */
+    anc_real scale, diagonal, pending, largest, bound, floored; /* largest: at the start; bound: of all now */
 } anc_owed;
 ANC_PUBLIC size_t anc_covariance_size(int32_t n);
 ANC_PUBLIC void anc_covariance_describe(int32_t n, anc_visitor *visit, void *to);
 /* Eq. 5-9 for a row h: correct w by the measurement z with noise q. `result` gets the innovation and S. */
 ANC_PUBLIC int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real q, anc_real result[2]);
-/* Eq. 4 before that: P = fading P + r I. A row that tells nothing, S = 0, corrects nothing. */
+/* Eq. 4 before that: P = fading P + r I. A row that carries no information, S = 0, corrects nothing. */
 ANC_PUBLIC int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real r, anc_real q, anc_real fading, anc_real result[2]);
 
 /* The loop. */
 
-typedef struct { /* a controller as the loop sees it: of the core, or anybody's */
+typedef struct { /* a controller as the loop sees it: of the core or of the host */
     void *self;
     int (*control_signal)(void *self, const anc_real *reference, anc_real *control);
     int (*update)(void *self, const anc_real *error);
 } anc_controller;
 
 typedef struct {
-    int32_t scenarios, microphones, loudspeakers, references, path_taps, feedback_taps; /* with feedback, one scenario */
+    int32_t scenarios, microphones, loudspeakers, references, path_taps, feedback_taps; /* one scenario if feedback */
     int32_t at, length;              /* of the delay lines of y_amp, at least as long as both paths */
-    const anc_real *path, *feedback; /* (S, K, J, path_taps) true s; (I, J, feedback_taps) to the reference microphones */
+    const anc_real *path, *feedback; /* (S, K, J, path_taps) true s; (I, J, feedback_taps) to references */
     const anc_amplifier *amplifiers; /* (S, J) */
     anc_real *output;                /* (S, J, length) */
     anc_real *reference, *control, *error; /* (I), (S, J), (S, K): the present sample */
     const anc_real *limit;           /* (S, J) a control signal beyond it is a divergence */
 } anc_plant;
 
-typedef struct { /* numbers that are written down: number c of sample n goes to to[n / every * row + c * column] */
+typedef struct { /* numbers to record: number c of sample n goes to to[n / every * row + c * column] */
     const anc_real *from;
     int64_t step, count, every, row, column;
     anc_real *to;
@@ -162,19 +167,21 @@ typedef struct { /* numbers that are written down: number c of sample n goes to 
 
 typedef struct { /* (channels, length) each; those of scenarios one after the other */
     int64_t length;
-    const anc_real *reference, *disturbance, *sensor_noise; /* the last may be NULL, or stand in `error`, which takes its place */
+    const anc_real *reference, *disturbance, *sensor_noise; /* the last may be NULL, or `error`, which overwrites it */
     anc_real *error, *control_signal, *amplifier_output, *anti_noise;
 } anc_signals;
 
 typedef enum { ANC_RUNNING, ANC_DIVERGED, ANC_REFUSED_REFERENCE, ANC_REFUSED_ERROR } anc_status;
 
-/* Run a controller and a plant from sample `begin` to `end`; return the first sample that was not completed. With a status of
- * ANC_DIVERGED, go on from the divergence at `begin`: the control signals of that sample are those in `plant`. */
+/* Run a controller and a plant from sample `begin` to `end`; return the first sample that was not completed. With a
+ * status of ANC_DIVERGED, go on from the divergence at `begin`: the control signals of that sample are those in
+ * `plant`. */
 ANC_PUBLIC int64_t anc_run(const anc_controller *controller, anc_plant *plant, const anc_signals *signals, const anc_record *records, int32_t n_records, int64_t begin, int64_t end, int32_t *status);
 /* The plant's two halves of a sample, for a controller that the host calls. */
 ANC_PUBLIC void anc_hear(anc_plant *plant, const anc_signals *signals, int64_t n);
 ANC_PUBLIC void anc_play(anc_plant *plant, const anc_real *amplified, const anc_signals *signals, int64_t n);
-/* Process a block, (channels, length) each, from sample `begin` to `end`; return the first sample that was refused, or `end`. */
+/* Process a block, (channels, length) each, from sample `begin` to `end`; return the first sample that was refused, or
+ * `end`. */
 ANC_PUBLIC int64_t anc_process(const anc_controller *controller, int32_t references, int32_t loudspeakers, int32_t microphones, const anc_real *x, const anc_real *e, anc_real *y, const uint8_t *adapt, int64_t length, int64_t begin, int64_t end, anc_real *scratch, int32_t *status);
 
 #ifdef __cplusplus

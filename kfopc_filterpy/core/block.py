@@ -30,8 +30,8 @@ REASONS = {
     LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100: scale the signals",
     LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
     NO_SOLUTION: "the covariance P is too large: S = x' P x' + q could overflow",
-    LOST_ARRAY: "the fast array is lost to rounding: this filter cannot go on. Use memory= instead of a forgetting factor, "
-    "or kf_anc, whose O(L^2) form does not lose its covariance",
+    LOST_ARRAY: "the fast array is lost to rounding: this filter cannot go on. Use memory= instead of a forgetting "
+    "factor, or kf_anc, whose O(L^2) form does not lose its covariance",
 }
 
 

@@ -1,14 +1,14 @@
 #include "covariance.h"
 #include <string.h>
 
-/* Above this ratio of S to q the downdate cancels so many digits of P that it is computed in twice the precision. This happens in
- * the first samples after a large initial variance. */
+/* Above this ratio of S to q, the downdate cancels so many digits of P that it is computed in twice the precision. This
+ * happens in the first samples after a large initial variance. */
 static const real CANCELLATION = 1000;
-/* In roundings of the largest variance: an h'P h below the first is nothing but rounding (of a unit h); the second is the least
- * state noise from then on, in float always. See `blurred`. */
+/* Both in rounding errors of the largest variance. For an h of energy 1, an h'P h below BLUR is nothing but rounding.
+ * From then on, and in float always, the state noise is at least LEAST_NOISE. See `blurred`. */
 static const real BLUR = 16, LEAST_NOISE = 2;
 #ifdef ANC_FLOAT
-static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1 cuts a float into two halves whose products are exact */
+static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1, see two_product */
 #else
 static const real ROUNDING = DBL_EPSILON, MOST = 1e300, CAREFULLY = 1e100, SPLIT = 134217729; /* 2^27 + 1 */
 #endif
@@ -44,7 +44,7 @@ static real largest_variance(const covariance *c)
 int predictable(const covariance *c, real fading, real state_noise, real energy)
 {
     const real scale = fading * c->owed->scale, diagonal = fading * c->owed->diagonal + state_noise;
-    real bound = c->owed->bound; /* not exact, but at hand */
+    real bound = c->owed->bound; /* often too large, but at hand */
     for (int i = 0; i < 2; i++, bound = largest_variance(c)) {
         const real variance = scale * bound + diagonal; /* h'P h <= trace(P) h'h */
         if (variance <= MOST && (real)c->n * variance * energy <= MOST) return 1;
@@ -58,8 +58,8 @@ void predict(covariance *c, real fading, real state_noise)
     c->owed->diagonal = fading * c->owed->diagonal + state_noise;
 }
 
-/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. `pending` is 0 or 1, so that
- * the elements (i, j) and (j, i) of a group are rounded alike. */
+/* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. `pending` is 0
+ * or 1, so that the elements (i, j) and (j, i) of a group are rounded alike. */
 static real pass(covariance *c, real pending, real diagonal)
 {
     const real *restrict u = c->u, *restrict h = c->h;
@@ -87,8 +87,8 @@ static real pass(covariance *c, real pending, real diagonal)
     return dot(h, Ph, c->padded);
 }
 
-/* Set T to scale (T - pending u u'), with a fading memory only: in `pass`, (scale u_i) u_j would not be (scale u_j) u_i to the bit,
- * and fading makes such a difference grow. */
+/* Set T to scale (T - pending u u'). This is needed for a fading memory only: in `pass`, (scale u_i) u_j would not
+ * equal (scale u_j) u_i to the bit, and fading makes such a difference grow. */
 static void fade(covariance *c)
 {
     const real *restrict u = c->u;
@@ -102,7 +102,7 @@ static void fade(covariance *c)
     c->owed->pending = 0;
 }
 
-/* Raise a variance that is rounded below zero, h'P h < 0, with all of the diagonal; return the new h'P h. */
+/* Raise the whole diagonal, because rounding has made h'P h negative; return the new h'P h. */
 static real lift(covariance *c, real variance)
 {
     const real amount = -2 * variance / dot(c->h, c->h, c->n) + ROUNDING * largest_variance(c);
@@ -110,10 +110,10 @@ static real lift(covariance *c, real variance)
     return dot(c->h, c->Ph, c->n);
 }
 
-/* Return an h'P h that seems to be lost in the rounding of P, raised if it is negative; see to it that P recovers.
+/* Return an h'P h that may be lost in the rounding of P, raised if it is negative, and make sure that P recovers.
  *
- * If P is large along some directions and the reference shows others only, what P should be there falls below the last digit of
- * its elements, and rounding may make it negative. Left alone, each sample would shrink 1/P there as if that were true, until S
+ * If P is large along some directions and the reference excites only others, the variances along these fall below the
+ * last digit of P's elements, and rounding may make them negative. Each sample would then reduce 1/P further, until S
  * turns negative. So from then on P gets as much state noise as its largest element is rounded by. */
 static real blurred(covariance *c, real variance, real blur)
 {
@@ -196,7 +196,7 @@ static void multiply_carefully(const covariance *c, real *g, real *g_low)
     }
 }
 
-/* Return 1 / sqrt(S) after eq. 8 in twice the precision; 0, with nothing changed, if a number would be too large for that. */
+/* Apply eq. 8 in twice the precision and return 1 / sqrt(S), or 0, with nothing changed, if a number is too large. */
 static real downdate_carefully(covariance *c, real q)
 {
     real *g = c->careful + times(DIRECTION, c->padded), *g_low = c->careful + times(DIRECTION_LOW, c->padded);
@@ -250,7 +250,8 @@ real downdate(covariance *c, real S, real q)
 
 int correct(const covariance *c, real *w, real innovation, real inverse_root, real most)
 {
-    const real step = innovation * inverse_root; /* K y = u step, and no element of u is larger than the root of the largest variance */
+    /* K y = u step, and no element of u is above the root of the largest variance. */
+    const real step = innovation * inverse_root;
     if (!within(root(c->owed->bound) * step, most)) return 0;
     add_scaled(w, step, c->u, c->n);
     return 1;

@@ -1,5 +1,5 @@
-/* The Kalman filter with only the diagonal p of its covariance, in O(L) per sample: eq. 2-9 for the weights of all loudspeakers,
- * which the microphones measure one after the other. */
+/* The Kalman filter with only the diagonal p of its covariance, in O(L) per sample: eq. 2-9 for the weights of all
+ * loudspeakers, which the microphones measure one after the other. */
 #include "signals.h"
 
 typedef struct {
@@ -52,7 +52,7 @@ static void measure(diagonal *f, const lines *rows, int32_t k, const real *d, re
     const signals *s = &f->s;
     const int32_t n = s->J * s->I, L = s->L;
     const real inverse = look(f, rows, k, r), size = root(dot(f->direction, f->direction, n * L));
-    /* Without measurement noise, a reference that is silent, or nearly, tells nothing. */
+    /* Without measurement noise, a reference that is silent, or nearly so, carries no information. */
     if (!within(inverse * size, LARGEST)) return;
     for (int32_t scenario = 0; scenario < s->S; scenario++) {
         const real step = inverse * ((d ? d[scenario * s->K + k] : 0) - heard_output(s, rows, scenario, k));

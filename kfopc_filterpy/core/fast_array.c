@@ -1,19 +1,21 @@
-/* The fast array: the gains of a Kalman filter without state noise, or with forgetting, in O(L) per sample, for one channel.
+/* The fast array: the gains of a Kalman filter without state noise, with or without forgetting, in O(L) per
+ * sample, for one channel.
  *
  * P, in units of the measurement noise, changes by a matrix of rank two when the row x' shifts by a sample:
  *
  *     ([P(n), 0; 0, 0] - [0, 0; 0, P(n-1)]) / lambda = B(n) diag(1, -1) B(n)^T
  *
- * An orthogonal and a hyperbolic rotation Theta, which zero the second and third entry of the first row below, update the gain g,
- * gamma^-1(n) = 1 + x'^T(n) P(n-1) x'(n) / lambda and B together, with x+ the L + 1 newest samples:
+ * One orthogonal and one hyperbolic rotation, together Theta, zero the second and third entry of the first row below.
+ * They update the gain g, gamma^-1(n) = 1 + x'^T(n) P(n-1) x'(n) / lambda and B. x+ has the L + 1 newest samples.
  *
  *     [gamma^-1/2(n),             x+^T(n+1) B(n)]         [gamma^-1/2(n+1),                 0              ]
  *     [[0; g(n) gamma^-1/2(n)],   B(n)          ] Theta = [[g(n+1) gamma^-1/2(n+1); 0],  lambda^1/2 B(n+1)]
  *
- * FastArrayKalman has the derivation, and what rounding does.
+ * The docstring of FastArrayKalman derives this, and says what rounding does.
  *
- * R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control", Int. J. Adapt.
- * Control Signal Process. 19, 2005; A. H. Sayed, Fundamentals of Adaptive Filtering, Wiley 2003, ch. 14. */
+ * R. Fraanje, A. H. Sayed, M. Verhaegen, N. J. Doelman, "A fast-array Kalman filter solution to active noise control",
+ * Int. J. Adapt. Control Signal Process. 19, 2005; A. H. Sayed, Fundamentals of Adaptive Filtering, Wiley 2003,
+ * ch. 14. */
 #include "signals.h"
 #include <string.h>
 
@@ -50,9 +52,10 @@ static const anc_setting growing_settings[] = {
 static const anc_setting finite_settings[] = { /* float counts to 2^24, twice the memory */
     {"measurement_noise", FLT_MIN, MOST_VARIANCE, ANC_ONE}, {"initial_variance", FLT_MIN, MOST_VARIANCE, ANC_ONE}, {"memory", 2, 1 << 23, ANC_ONE}, {0}};
 
-/* The last entry of the gain relative to the column beyond which an array is lost; and one of a pair, which can be restarted. */
+/* An array is lost if the last entry of its gain column exceeds UNUSABLE of the column's norm. One of a pair, which can
+ * be restarted, is given up beyond ASTRAY. */
 static const real UNUSABLE = (real)0.1, ASTRAY = (real)1e-4;
-static const real LESS = (real)0.01, MORE = 2; /* factors of P at the next start, after an array was lost and after one lasted */
+static const real LESS = (real)0.01, MORE = 2; /* of P at the next start: after an array was lost, and after one lasted */
 
 static void layout_arrays(arrays *f, const anc_plan *plan, const anc_setting *settings, anc_layout *at, int32_t n)
 {
@@ -83,7 +86,7 @@ static int find_rotations(const arrays *f, int32_t i, real largest_stray, rotati
 {
     const int32_t n = f->s.L + 1;
     const array_numbers *a = f->numbers + i;
-    const int32_t known = a->heard + 1 < (real)n ? (int32_t)a->heard + 1 : n; /* what was before its start counts as zero */
+    const int32_t known = a->heard + 1 < (real)n ? (int32_t)a->heard + 1 : n; /* before its start: zeros */
     const real *row = newest(&f->s.filtered, 0), last = f->gain[times(i, n) + (size_t)f->s.L];
     const real ahead = dot(row, f->first + times(i, n), known), behind = dot(row, f->second + times(i, n), known);
     const real next = root(a->root * a->root + ahead * ahead), t = behind / next, cosine = root(1 - t * t);
@@ -124,7 +127,8 @@ static void correct_array(arrays *f, int32_t i)
     }
 }
 
-/* A growing memory, with forgetting. The gains must follow the row from the first sample on, so that it also adapts while it listens. */
+/* A growing memory, with forgetting. The gains must follow the row from the first sample on, so it also adapts while it
+ * listens. */
 
 static void layout_growing(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
 {
@@ -150,7 +154,7 @@ static int adapt_growing(anc_view *view, const real *error)
     rotations r;
     const int refused = error ? estimate(s, error) : ANC_DONE, held = find_rotations(f, 0, UNUSABLE, &r);
     if (refused) return refused;
-    if (!held) return error ? ANC_LOST_ARRAY : ANC_DONE; /* a sample that is not adapted to leaves it to the next one that is */
+    if (!held) return error ? ANC_LOST_ARRAY : ANC_DONE; /* reported with the next error */
     rotate(f, 0, r, *s->setting[FORGETTING]);
     if (!error) return ANC_DONE;
     correct_array(f, 0);
@@ -162,10 +166,11 @@ const anc_algorithm anc_fast_array = {"fast-array KF", growing_settings, layout_
 
 /* A finite memory of N samples: two growing ones without forgetting that take turns.
  *
- * The younger one starts when the elder one has heard N samples, and takes over after N more, when the elder one is restarted. Its
- * share of the mixed weights grows in proportion to what it has heard, a/N. If the reference's statistics are steady, the variance of
- * the mixed weights is then that of least squares over N samples, at every sample: with shares s = a/N and 1 - s of filters that
- * average over a and a + N samples, it is in proportion to a (s/a + (1 - s)/(a + N))^2 + N ((1 - s)/(a + N))^2 = 1/N. */
+ * The younger one starts when the elder one has heard N samples, and takes over after N more, when the elder one is
+ * restarted. Its share of the mixed weights grows with the number a of samples that it has heard, a/N. If the
+ * reference's statistics are steady, the variance of the mixed weights is then that of least squares over N samples, at
+ * every sample: with shares s = a/N and 1 - s of filters that average over a and a + N samples, it is proportional to
+ * a (s/a + (1 - s)/(a + N))^2 + N ((1 - s)/(a + N))^2 = 1/N. */
 
 static void layout_finite(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
 {
@@ -183,8 +188,9 @@ static void start_finite(anc_view *view, const anc_plan *plan, const anc_setting
     for (int32_t i = 0; i < 2; i++) begin(f, i, f->turns->initial, 0);
 }
 
-/* Begin array i at weights that are known: those of the other array, or the mixed ones. The first L - 1 rows are incomplete, and what is measured does not belong to them. They
- * count as measurements that the weights explain, so that P is complete when the first full row is due. */
+/* Begin array i at known weights: those of the elder array, or the mixed ones. The first L - 1 rows are incomplete, so
+ * the measurements do not fit them. They count as measurements that the weights explain, so that P is complete when the
+ * first full row is due. */
 static void restart(arrays *f, int32_t i, int mixed)
 {
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
@@ -220,7 +226,7 @@ static void correct_pair(arrays *f)
         else turn->lost += 1, turn->initial *= LESS, restart(f, younger, 0);
     }
     real share = turn->paired != 0 ? f->numbers[younger].heard / memory : 0;
-    if (share > 1) share = 1; /* samples that were not adapted to are heard, too */
+    if (share > 1) share = 1; /* samples without adaptation are heard too */
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {
         const real *w_elder = weights_in(f, scenario, elder), *w_younger = weights_in(f, scenario, younger);
         real *restrict mixed = weights_of(&f->s, scenario);

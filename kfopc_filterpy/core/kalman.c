@@ -1,4 +1,5 @@
-/* KF-ANC and KF-OPC: eq. 2-9 of Ji et al. with the factor of eq. 10-13, and FxRLS, which is the same with a fading memory. */
+/* KF-ANC and KF-OPC: eq. 2-9 of Ji et al. with the factor of eq. 10-13, and FxRLS, which is the same with a fading
+ * memory. */
 #include "kalman.h"
 #include <string.h>
 

@@ -1,8 +1,9 @@
 /* KF-OPC with its gain repaired: three changes of eq. 11-13, alone or together.
  *
- * Eq. 13 keeps the rated power if the secondary path is flat over the noise and the disturbance can be cancelled completely. On
- * other paths control signal and reference have different spectra. Therefore G_s is that of the control signal,
- * E[(s^ * y)^2] / E[y^2]; the measured output power trims the factor; and the factor acts on the output, at once. */
+ * Eq. 13 keeps the rated power if the secondary path is flat over the noise and the disturbance can be cancelled
+ * completely. On other paths, control signal and reference have different spectra. Therefore G_s is that of the control
+ * signal, E[(s^ * y)^2] / E[y^2]; the measured output power trims the factor; and the factor acts on the output,
+ * at once. */
 #include "kalman.h"
 
 enum { OF_CONTROL = KALMAN_SETTINGS, TRIM_RATE, AT_OUTPUT };
@@ -36,7 +37,7 @@ static int control_signal_repaired(anc_view *view, const real *reference, real *
     return refused;
 }
 
-/* Put the squares of s^ * y and y where those of x' and x stand (eq. 11). */
+/* Put the squares of s^ * y and y in place of those of x' and x (eq. 11). */
 static void observe_control(signals *s)
 {
     for (int32_t sj = 0; sj < s->S * s->J; sj++) {
@@ -50,7 +51,8 @@ static void observe_control(signals *s)
     }
 }
 
-/* Return exp(c), of sums and products only: those of math libraries differ. Beyond |c| = 5 any trim is at its bound afterwards. */
+/* Return exp(c), by sums and products only, since the exp of math libraries differs. Any |c| above 5 takes a trim
+ * to its bound. */
 static real growth(real c)
 {
     const real part = (c > 5 ? 5 : c > -5 ? c : -5) / 16;
@@ -60,8 +62,8 @@ static real growth(real c)
     return power;
 }
 
-/* Trim the next factor by the power of y: up if it is below the rated power, else down. At a factor of 1 it does not rise, so
- * that it does not wind up. */
+/* Trim the next factor by the power of y: up if it is below the rated power, else down. At a factor of 1 the trim does
+ * not rise, so that it does not wind up. */
 static void advance_trim(kalman *f, int32_t sj)
 {
     const signals *s = &f->s;

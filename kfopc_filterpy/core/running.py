@@ -93,7 +93,7 @@ class Plant:
     secondary : ndarray, shape (S, K, J, taps)
         Secondary paths s of each scenario.
     feedback : ndarray, shape (I, J, taps)
-        Paths from the loudspeakers to the reference microphones; 0 taps: none. With several scenarios there is none.
+        Paths from the loudspeakers to the reference microphones; 0 taps: none, as it must be with several scenarios.
     amplifiers : ndarray, shape (S J, 3)
         Kind, limit and sharpness of each amplifier model.
     limit : ndarray, shape (S J,)

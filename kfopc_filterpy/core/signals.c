@@ -51,7 +51,7 @@ void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, 
 {
     const int32_t S = p->scenarios, K = p->microphones, J = p->loudspeakers, I = p->references;
     const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
-    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* a guard can come later, a fast array needs L + 1 samples */
+    const int32_t filtered = L < ANC_GUARD_TAPS ? ANC_GUARD_TAPS : L + 1; /* for a later guard; for a fast array */
     s->S = S, s->K = K, s->J = J, s->I = I, s->L = L, s->M = M, s->G = G;
     s->limited = p->limited;
     s->power_length = longest(p->power_windows, S * J), s->limiter_length = longest(p->limiter_windows, S * J);
@@ -219,7 +219,7 @@ int estimate(signals *s, const real *error)
 
 real least_factor(const signals *s, int32_t scenario)
 {
-    real heard = 2, unheard = 2; /* a loudspeaker whose gain is zero keeps silent: its factor counts only if there is no other */
+    real heard = 2, unheard = 2; /* a loudspeaker of zero gain is silent: it counts only if all are */
     for (int32_t j = 0; j < s->J; j++) {
         const anc_previewed *p = s->previewed + scenario * s->J + j;
         real *least = p->gain == 0 ? &unheard : &heard;
@@ -295,7 +295,7 @@ void anc_refilter(anc_view *view)
         for (int32_t i = 0; i < s->I; i++) {
             real *filtered = newest(&s->filtered, kj * s->I + i);
             for (int32_t n = 0; n < s->filtered.taps; n++) filtered[n] = dot(s->path + times(kj, s->M), newest(&s->x, i) + n, s->M);
-            /* The guard also needs x' of before its delay line, which is filtered here once more. */
+            /* The guard also needs x' from before its delay line, which is computed here again. */
             for (int32_t n = 0; s->G && n < s->L; n++) {
                 real sum = 0;
                 for (int32_t g = 0; g < s->G; g++) sum += s->guard[g] * dot(s->path + times(kj, s->M), newest(&s->x, i) + n + g, s->M);
@@ -305,7 +305,7 @@ void anc_refilter(anc_view *view)
     set_loudest(s);
 }
 
-/* The signals alone, for an estimator of the host: d^ is previewed, and what the estimator makes of it are the weights. */
+/* The signals alone, for an estimator of the host, which takes d^ and sets the weights. */
 
 static const anc_setting none[] = {{0}};
 

@@ -3,15 +3,16 @@
 #define SIGNALS_H
 #include "vectors.h"
 
-/* No signal may be louder than LOUDEST, nor a factor of a step larger than LARGEST: so no square overflows, and no weight or
- * control signal can within 10^40 samples (in float 10^5). What passes these limits is refused before anything changes. */
+/* No signal may be louder than LOUDEST, and no factor of a step larger than LARGEST. So no square overflows, and no
+ * weight or control signal can within 10^40 samples (10^5 in float). What exceeds these limits is refused before
+ * anything changes. */
 #ifdef ANC_FLOAT
 static const real LOUDEST = 1e12f, LARGEST = 1e6f;
 #else
 static const real LOUDEST = 1e100, LARGEST = 1e50;
 #endif
 
-/* The most that a setting which is a variance may be: neither it nor its sum over all samples overflows. */
+/* The largest variance that a setting may have: neither it nor its sum over all samples overflows. */
 #ifdef ANC_FLOAT
 #define MOST_VARIANCE 1e25f
 #else
@@ -22,7 +23,7 @@ enum { ANC_MOST_SETTINGS = 8, ANC_GUARD_TAPS = 48 };
 
 typedef struct { /* delay lines that advance together */
     real *room;  /* (rows, length) */
-    int32_t *at; /* where the newest samples stand */
+    int32_t *at; /* where the newest samples are */
     int32_t rows, taps, length;
 } lines;
 
@@ -69,14 +70,14 @@ void layout_plain(anc_view *view, const anc_plan *plan, const anc_setting *setti
 void start_plain(anc_view *view, const anc_plan *plan, const anc_setting *settings);
 int filtered_signal(anc_view *view, const real *reference, real *control);
 
-/* The parts of a sample, in this order; `sj` is a loudspeaker of a scenario. Those that return int return ANC_DONE, or why they
- * refused, with nothing changed. */
+/* The parts of a sample, in this order; `sj` is a loudspeaker of a scenario. Those that return int return ANC_DONE, or
+ * why they refused, with nothing changed. */
 int take_reference(signals *s, const real *reference);
 real filter_output(const signals *s, int32_t sj);  /* sum_i w_ji' x_i */
 void emit(signals *s, int32_t sj, real y);         /* through limiter and amplifier model, into the delay line of y */
 int estimate(signals *s, const real *error);       /* d^, with the powers and factors previewed */
-int estimate_disturbance(signals *s, const real *error); /* d^ and the squares alone, */
-void preview(signals *s);                          /* and the powers and factors of these squares */
+int estimate_disturbance(signals *s, const real *error); /* the first half of `estimate`: d^ and the squares */
+void preview(signals *s);                          /* the second half: the powers and factors of these squares */
 real least_factor(const signals *s, int32_t scenario); /* of its loudspeakers that a microphone hears, previewed */
 void commit(signals *s);                           /* take the previewed powers */
 real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t k); /* sum_ji w_ji' x'_kji, or with the guarded rows */

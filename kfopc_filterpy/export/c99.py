@@ -70,18 +70,18 @@ class CExport:
 def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any = "float64") -> CExport:
     """Write a controller as a C99 source file and its header, to continue from its present state.
 
-    The files need nothing but ``string.h`` and ``math.h``. They allocate nothing: a struct of fixed size holds the state.
+    The files need only ``string.h`` and ``math.h``. They allocate nothing: a struct of fixed size holds the state.
     Several controllers, each exported under its own name, link into one program. The calls are
 
     - ``void anc_init(anc_state *state)``: set the state to the controller's as it was when exported;
     - ``double anc_control_signal(anc_state *state, double reference)``: return y(n);
-    - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with nothing learned;
+    - ``int anc_update(anc_state *state, double error)``: adapt to e(n); nonzero if refused, with the weights unchanged;
     - ``int anc_self_test(anc_state *state)``: return 0 if known samples give the known results.
 
     With several channels, the numbers are arrays, and `anc_control_signal` sets its third argument, y(n).
 
-    The source contains the files of the package's own core: with the flags that the header states, float64 gives the bits
-    that Python gives.
+    The source contains the files of the package's own core: with the flags that the header states, float64 gives the
+    bits of Python.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ COMMENT = re.compile(r"/\*.*?\*/", re.S)
 
 
 def sources_of(code: str) -> list[Path]:
-    """Return the files that define what C code names, those that define what these name, and so on, as a linker does."""
+    """Return the files that define what C code names, what these files name, and so on, as a linker finds them."""
     codes = {path: COMMENT.sub("", path.read_text(encoding="utf-8")) for path in core_sources()}
     defined = {path: DEFINED.findall(text) for path, text in codes.items()}
     public = {name: path for path, names in defined.items() for static, name in names if not static}

@@ -1,7 +1,7 @@
 /* $description. See $header.
  *
  * First the files of kfopc_filterpy's core (MIT licence, sources $stamp), in which only the includes were
- * resolved and everything made static. Behind them: the plan, the state of the export, the calls. */
+ * resolved and everything made static. After them: the plan, the state of the export, the calls. */
 $defined
 #define ANC_PUBLIC static
 #ifdef __GNUC__ /* not every export needs all of the core */

@@ -8,18 +8,18 @@
  *         $control    x(n) from the reference microphone$s, y(n) to the amplifier$s
  *         ${name}_update(&state, e);    e(n) = d(n) - (s * y)(n) from the error microphone$s
  *
- * The state has $n_bytes bytes where a pointer has 8. There is no heap, and no state elsewhere.
+ * The state has $n_bytes bytes where a pointer has 8. No heap is used, and there is no state elsewhere.
  *
  * Compile with these flags, and the result has the bits of kfopc_filterpy's core$if_compiled:
  *     $flags
  * -ffp-contract=off decides the bits, -fno-strict-aliasing is needed, the others are for speed. -ffast-math is refused.
- * Of the library, memcpy, memmove, memset, strcmp and math.h are used.
+ * Of the C library it uses memcpy, memmove, memset, strcmp and math.h.
  *
- * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A bad
- * reference counts as 0, and ${name}_update refuses that sample. It also refuses a disturbance estimate e + s^ * y that is too
- * loud, a step of the weights that is too large, a covariance so large that the next one could overflow (${NAME}_NO_SOLUTION),
- * and a fast array that is lost to rounding. A refused update learns nothing. An output is never NaN or infinite: if the
- * weights have grown that much, it is 0.
+ * Bad input: a reference or an error that is NaN, infinite or too loud to be squared and filtered without overflow. A
+ * bad reference counts as 0, and ${name}_update refuses that sample. It also refuses a disturbance estimate e + s^ * y
+ * that is too loud, a step of the weights that is too large, a covariance so large that the next one could overflow
+ * (${NAME}_NO_SOLUTION), and a fast array that is lost to rounding. A refused update changes no weight. An output is
+ * never NaN or infinite: if the weights have grown that much, it is 0.
  */
 #ifndef ${NAME}_EXPORTED_H
 #define ${NAME}_EXPORTED_H

@@ -67,8 +67,8 @@ def simulate_scenarios(
     Parameters
     ----------
     controllers : sequence of CoreController
-        Separate controllers of one channel, of `kf_anc` or `kf_opc` for example. They must agree in the algorithm and its
-        settings, taps, estimated secondary path, covariance and the signals heard so far.
+        Separate controllers of one channel, of `kf_anc` or `kf_opc` for example. They must agree in the algorithm and
+        its settings, taps, estimated secondary path, covariance and the signals heard so far.
     reference : array_like
         (n_samples,) reference x, the same for all.
     secondary_path : array_like, control.TransferFunction or list of them
@@ -152,7 +152,7 @@ def simulate_scenarios(
     results["error"][np.logical_not(noisy)] = 0.0
     present = np.array(
         np.broadcast_to(d, (count, x.size)), order="C"
-    )  # a copy: that of a diverged scenario is silenced
+    )  # a copy, in which the disturbance of a diverged scenario is set to zero
     signals = Signals(x[None], present, results["error"] if any(noisy) else None, *results.values())
     recorded = {
         name: np.full((count, x.size), np.nan) for name in (RECORDED + POWERS[:2] if record_powers else RECORDED)
@@ -191,8 +191,8 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
         looped = controller.looped()
         if looped is None:
             raise ValueError(
-                f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and others "
-                "whose steps are in the core"
+                f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and "
+                "others whose steps are in the core"
             )
         if looped.owner.algorithm.path is not None:
             raise ValueError(
@@ -276,7 +276,7 @@ class _SideBySide:
                 progress(count * (done - begin))
 
     def _silence(self, scenario: int, sample: int, plant: Plant, signals: Signals) -> None:
-        """Switch a scenario off: nothing of it is heard any more, and its weights stay zero."""
+        """Switch a scenario off: its signals are zero from now on, and so are its weights."""
         rows = self._rows(scenario)
         rows["output"][:] = 0.0
         if scenario not in self.diverged_at:
