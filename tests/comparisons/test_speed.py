@@ -39,6 +39,7 @@ def small(monkeypatch):
     monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
     assert main(["speed", "--quiet", "--output", str(tmp_path)]) == 0
     result = json.loads((tmp_path / "speed.json").read_text())

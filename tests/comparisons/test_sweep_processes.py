@@ -103,6 +103,7 @@ GRID = {"a": list(range(1, 11))}
 SWEEP = ["comparisons", "sweep", "--scenario", "own_slow_module:slow", "--axis", "a=1:10:10", "--seeds", "4"]
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.parametrize(("ending", "jobs"), [("SIGKILL", 2), ("SIGINT", 1), ("SIGINT", 2)])
 def test_sweep_goes_on_from_what_is_done(own, tmp_path, ending, jobs):
@@ -128,6 +129,7 @@ def test_sweep_goes_on_from_what_is_done(own, tmp_path, ending, jobs):
     assert [run["product"] for run in sweep.runs] == [run["product"] for run in fresh.runs]
 
 
+@pytest.mark.slow
 @posix
 def test_worker_killed_on_this_machine_is_an_error_that_keeps_what_is_done(own, tmp_path):
     with pytest.raises(OSError, match="a worker process was killed"):
@@ -165,6 +167,7 @@ def _wait_for_workers(address, count):
         client.wait_for_workers(count, timeout=PATIENCE_S)
 
 
+@pytest.mark.slow
 @posix
 @dask
 def test_cluster_loses_a_worker_and_no_cell(own, cluster, tmp_path):
@@ -202,6 +205,7 @@ def test_cluster_loses_a_worker_and_no_cell(own, cluster, tmp_path):
         run_sweep({"a": [3]}, tmp_path / "broken", seeds=1, scenario=own.broken, scheduler=address, quiet=True)
 
 
+@pytest.mark.slow
 @posix
 @dask
 def test_command_sends_a_module_that_the_workers_lack(cluster, tmp_path, monkeypatch, capsys):
@@ -216,6 +220,7 @@ def test_command_sends_a_module_that_the_workers_lack(cluster, tmp_path, monkeyp
     assert "4 runs, 2 cells" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @posix
 @dask
 def test_job_that_no_worker_survives_ends_the_sweep(own, cluster, tmp_path):

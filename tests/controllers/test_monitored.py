@@ -69,6 +69,7 @@ def test_a_right_path_is_left_alone() -> None:
     np.testing.assert_array_equal(with_switch.control_signal, listened.control_signal)
 
 
+@pytest.mark.slow
 def test_a_noise_that_swells_or_fluctuates_is_not_blamed_on_the_control() -> None:
     """The reference tells how loud the noise is; what it does not tell, a test does, and the control goes on."""
     x = compressor_noise(10.0, fs=FS, rng=1) * np.repeat([1.0, 10.0], int(5 * FS))
@@ -123,6 +124,7 @@ def test_a_bad_sample_is_refused_while_muted_too_and_the_monitor_goes_on(bad: An
     assert "louder" in [event.what for event in monitored.health]
 
 
+@pytest.mark.slow
 def test_a_noise_that_comes_and_goes_is_no_reason_to_doubt_the_control() -> None:
     """Silent windows tell nothing: the margin stays, and so does the control."""
     x = white(10.0)
@@ -135,6 +137,7 @@ def test_a_noise_that_comes_and_goes_is_no_reason_to_doubt_the_control() -> None
     assert noise_reduction_db(result.error, result.disturbance) > 3.0
 
 
+@pytest.mark.slow
 def test_the_margin_has_a_limit() -> None:
     rng = np.random.default_rng(3)
     d = rng.standard_normal(int(40 * FS)) * np.repeat(10.0 ** rng.uniform(0.0, 2.0, 80), int(0.5 * FS))

@@ -68,6 +68,7 @@ def test_after_a_jump_it_is_as_good_as_one_that_was_identified_anew(name: str) -
     assert np.abs(emitted).max() < 60.0
 
 
+@pytest.mark.slow
 def test_a_drift_over_ten_seconds_is_followed() -> None:
     x, d = noises(22.0)
     paths = [resonant_path(5 + 3 * a, 600 + 300 * a, 0.8 + 0.05 * a, 1 - 0.3 * a) for a in np.linspace(0, 1, 201)]
@@ -87,6 +88,7 @@ def test_a_drift_over_ten_seconds_is_followed() -> None:
     assert reduction_db(error, d, 21.0, 22.0) > reduction_db(fresh.error, d[round(12 * FS) :], 9.0, 10.0) - 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["FxLMS", "KF-ANC"])
 def test_a_path_that_stays_is_kept_and_costs_little(name: str) -> None:
     x, d = noises(16.0)
@@ -257,6 +259,7 @@ def test_a_pause_of_the_adaptation_has_a_probe_and_is_forgotten_by_the_guard() -
     assert np.std(pause) > 0.9 * np.sqrt(np.mean(pause**2)) > 0.0  # noise, not one sample again and again
 
 
+@pytest.mark.slow
 def test_the_probe_does_not_grow_if_a_loudspeaker_is_unplugged() -> None:
     """Otherwise it would be a thousand million times too loud after half a minute."""
     x, d = noises(16.0)
@@ -272,6 +275,7 @@ def test_the_probe_does_not_grow_if_a_loudspeaker_is_unplugged() -> None:
     assert reduction_db(error, d, 15.0, 16.0) > 6.0
 
 
+@pytest.mark.slow
 def test_an_estimate_that_is_far_too_loud_is_corrected() -> None:
     x, d = noises(16.0)
     tracker = tracked("FxLMS", 20.0 * BEFORE)
@@ -372,6 +376,7 @@ def test_only_the_probe_may_be_asked() -> None:
     assert {change.source for change in tracker.changes} == {"probe"}
 
 
+@pytest.mark.slow
 def test_a_known_amplifier_is_not_taken_for_a_change() -> None:
     """The fits know what the amplifier delivers, and the controller what the probe adds to it."""
     x, d = noises(6.0)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from helpers.pages import Page
 
 
+@pytest.mark.slow
 def test_the_figures_say_what_the_page_says() -> None:
     page = Page("changing_path")
     v = page.run(until="The drift")

@@ -7,10 +7,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 import soundfile
 from helpers.pages import Page
 
 
+@pytest.mark.slow
 def test_the_commands_say_what_the_page_says(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", "/usr/bin:/bin")  # the page changes it, and the folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
+import pytest
 import soundfile
 from helpers.pages import Page
 
@@ -15,6 +16,7 @@ from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 from kfopc_filterpy.signals import band_limited_noise, write_wav
 
 
+@pytest.mark.slow
 def test_the_figures_say_what_the_page_says():
     page = Page("your_recording")
 
