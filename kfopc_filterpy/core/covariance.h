@@ -28,8 +28,8 @@ void start_covariance(covariance *c, real initial_variance);
 int predictable(const covariance *c, real fading, real state_noise, real energy);
 /* Eq. 4, still pending: P = fading P + r I. */
 void predict(covariance *c, real fading, real state_noise);
-/* Apply what is pending, set c->Ph to P c->h, and return h' P h. */
-real project(covariance *c);
+/* Apply what is pending, set c->Ph to P c->h, and return h' P h, with q the noise of the measurement. */
+real project(covariance *c, real q);
 /* Return whether S of eq. 7 is large enough for a gain: with less, K could exceed LARGEST. Such a row has next to no energy, or P leaves
  * nothing open about it, and without measurement noise it tells nothing. */
 int tells(const covariance *c, real S);
