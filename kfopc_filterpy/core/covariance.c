@@ -132,6 +132,7 @@ static real lift(covariance *c, real variance, real least)
     real amount = missing < 0 ? ROUNDING * c->owed->bound - 2 * missing : 0;
     if (variance + amount * energy < least) amount = (least - variance) / energy;
     for (int32_t i = 0; i < c->n; i++) row_of(c, i)[i] += amount, c->Ph[i] += amount * c->h[i];
+    c->owed->bound += amount;
     return dot(c->h, c->Ph, c->n);
 }
 
