@@ -9,6 +9,7 @@ from filterpy.kalman import KalmanFilter
 
 from .._validate import as_count
 from ..bounds.settings import SuggestedSettings
+from ..filters.guards import undoing
 from ..filters.kfopc import KFOPC
 from ..filters.power_budget import PowerBudgetKalmanFilter
 from ..paths.channels import is_path_matrix
@@ -132,11 +133,16 @@ class KalmanController(CoreController):
         d, x = float(block.fields["disturbance"].item()), float(block.latest("reference").flat[0])
         h, powers = block.latest("filtered_reference").reshape(1, -1)[:, : self.n_taps].copy(), self.constraint
         powers.preview(d, h[0, 0], x)  # raises if a square overflows, before anything changes
-        estimator.predict()
-        if isinstance(estimator, KFOPC):
-            estimator.update(d, H=h, reference=x)
-        else:
-            estimator.update(np.full((1,) * np.ndim(estimator.x), d), H=h)
+        undo = undoing(estimator)
+        try:
+            estimator.predict()
+            if isinstance(estimator, KFOPC):
+                estimator.update(d, H=h, reference=x)
+            else:
+                estimator.update(np.full((1,) * np.ndim(estimator.x), d), H=h)
+        except BaseException:  # the prediction must not stay
+            undo()
+            raise
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
 

@@ -102,27 +102,55 @@ static void fade(covariance *c)
     c->owed->pending = 0;
 }
 
-/* Raise the whole diagonal, because rounding has made h'P h negative; return the new h'P h. */
-static real lift(covariance *c, real variance)
+/* Set g to T x. */
+static void multiply(const covariance *c, const real *x, real *g)
 {
-    const real amount = -2 * variance / dot(c->h, c->h, c->n) + ROUNDING * largest_variance(c);
+    const real *a = c->T;
+    memset(g, 0, sizeof(real) * (size_t)c->padded);
+    for (int32_t i = 0; i < c->padded; i++) {
+        const int32_t group = i / PARTS * PARTS;
+        g[i] += dot(a, x, group + PARTS);
+        add_scaled(g, x[i], a, group); /* the upper triangle's */
+        a += group + PARTS;
+    }
+}
+
+/* Raise the whole diagonal, because h'P h is negative or below `least`; return the new h'P h.
+ *
+ * If P stayed indefinite, each downdate would make its negative eigenvalue larger. That eigenvalue is estimated by the
+ * lesser one of [a, b; b, d], which is P in the plane of h and P h. */
+static real lift(covariance *c, real variance, real least)
+{
+    real *x = c->careful, *Px = c->careful + c->padded;
+    const real energy = dot(c->h, c->h, c->n), a = variance / energy;
+    if (!(energy > 0)) return 0; /* too small to carry information */
+    for (int32_t i = 0; i < c->padded; i++) x[i] = c->Ph[i] - a * c->h[i];
+    multiply(c, x, Px);
+    const real size = dot(x, x, c->padded), b2 = size / energy, d = dot(x, Px, c->padded) / size;
+    const real half = (real)fabs(a - d) / 2, value = (a < d ? a : d) - b2 / (half + root(half * half + b2));
+    const real missing = within(value, MOST) ? value : a;
+    real amount = missing < 0 ? ROUNDING * c->owed->bound - 2 * missing : 0;
+    if (variance + amount * energy < least) amount = (least - variance) / energy;
     for (int32_t i = 0; i < c->n; i++) row_of(c, i)[i] += amount, c->Ph[i] += amount * c->h[i];
+    c->owed->bound += amount;
     return dot(c->h, c->Ph, c->n);
 }
 
-/* Return an h'P h that may be lost in the rounding of P, raised if it is negative, and make sure that P recovers.
+/* Return an h'P h that may be lost in the rounding of P, and make sure that P recovers. It is raised if it is negative, or
+ * if q does not cover the rounding either.
  *
  * If P is large along some directions and the reference excites only others, the variances along these fall below the
  * last digit of P's elements, and rounding may make them negative. Each sample would then reduce 1/P further, until S
  * turns negative. So from then on P gets as much state noise as its largest element is rounded by. */
-static real blurred(covariance *c, real variance, real blur)
+static real blurred(covariance *c, real variance, real blur, real q)
 {
     c->owed->bound = largest_variance(c);
-    if (variance < blur * c->owed->bound) c->owed->floored = 1;
-    return variance < 0 ? lift(c, variance) : variance;
+    const real lost = blur * c->owed->bound;
+    if (variance < lost) c->owed->floored = 1;
+    return variance < 0 || variance + q < lost ? lift(c, variance, lost - q) : variance;
 }
 
-real project(covariance *c)
+real project(covariance *c, real q)
 {
     anc_owed *owed = c->owed;
     if (owed->floored != 0) {
@@ -133,7 +161,7 @@ real project(covariance *c)
     if (owed->scale != 1) fade(c);
     const real variance = pass(c, owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
     owed->scale = 1, owed->diagonal = owed->pending = 0;
-    return variance < blur * owed->bound ? blurred(c, variance, blur) : variance;
+    return variance < blur * owed->bound ? blurred(c, variance, blur, q) : variance;
 }
 
 /* Numbers in twice the precision, as a rounded value and the rest. */
@@ -287,7 +315,7 @@ int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *
     covariance c = in_memory(memory, n);
     if (!predictable(&c, 1, 0, dot(h, h, n))) return ANC_NO_SOLUTION;
     memcpy(c.h, h, sizeof(real) * (size_t)n);
-    const real S = project(&c) + q, y = z - dot(h, w, n);
+    const real S = project(&c, q) + q, y = z - dot(h, w, n);
     result[0] = y, result[1] = S;
     if (!(S > 0)) return ANC_NO_SOLUTION;
     if (!within(root(c.owed->bound) * (y / root(S)), MOST)) return ANC_LOUD_STEP;
@@ -302,7 +330,7 @@ int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h,
     if (!predictable(&c, fading, r, dot(h, h, n))) return ANC_NO_SOLUTION;
     predict(&c, fading, r);
     memcpy(c.h, h, sizeof(real) * (size_t)n);
-    const real S = project(&c) + q, y = z - dot(h, w, n);
+    const real S = project(&c, q) + q, y = z - dot(h, w, n);
     if (tells(&c, S)) correct(&c, w, y, downdate(&c, S, q), LARGEST);
     else memset(c.u, 0, sizeof(real) * (size_t)c.padded); /* P is what it was predicted to be */
     result[0] = y, result[1] = S;

@@ -29,8 +29,8 @@ void start_covariance(covariance *c, real initial_variance);
 int predictable(const covariance *c, real fading, real state_noise, real energy);
 /* Eq. 4, still pending: P = fading P + r I. */
 void predict(covariance *c, real fading, real state_noise);
-/* Apply what is pending, set c->Ph to P c->h, and return h' P h. */
-real project(covariance *c);
+/* Apply what is pending, set c->Ph to P c->h, and return h' P h; q is the measurement noise. */
+real project(covariance *c, real q);
 /* Return whether S is large enough for a gain; otherwise K could exceed LARGEST. Without measurement noise, S is too
  * small for a row that carries no information: one of hardly any energy, or along which P is zero. */
 int tells(const covariance *c, real S);

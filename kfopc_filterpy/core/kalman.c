@@ -43,7 +43,7 @@ static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
     const int32_t K = f->s.K;
     const real q = f->s.setting[MEASUREMENT_NOISE][k];
     observe(f, rows, k);
-    const real S = project(&f->c) + q; /* eq. 7 */
+    const real S = project(&f->c, q) + q; /* eq. 7 */
     const int tell = tells(&f->c, S);
     const real inverse_root = tell ? downdate(&f->c, S, q) : 0;
     for (int32_t scenario = 0; scenario < f->s.S; scenario++) {

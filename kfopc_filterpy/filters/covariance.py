@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any, NamedTuple
 
@@ -37,6 +38,7 @@ class RandomWalkCovariance:
     """
 
     _seen: Seen | None = None  # what `seen` has found
+    passes = 0  # over the triangle, so far
 
     def __init__(self, P: np.ndarray) -> None:
         self.n = len(P)
@@ -108,6 +110,16 @@ class RandomWalkCovariance:
         owed["scale"], owed["diagonal"] = scale, diagonal
         self.prior = scale, diagonal, -scale * pending
 
+    def undoing(self) -> Callable[[], None]:
+        """Return a function that takes back predictions from now on, unless a pass has applied them."""
+        owed, prior, shown, passes = self.seen.owed.copy(), self.prior, self._shown, self.passes
+
+        def take_back() -> None:
+            if self.passes == passes:
+                self.seen.owed[:], self.prior, self._shown = owed, prior, shown
+
+        return take_back
+
     def before_update(self) -> tuple[Moment, Moment | np.ndarray]:
         """Return P now, and P_prior in a form that an update keeps."""
         now, prior = self.now, self.prior
@@ -117,6 +129,7 @@ class RandomWalkCovariance:
 
     def projected(self, before: Moment, prior: Moment | np.ndarray) -> None:
         """Record the pass of an update, refused or not: P is still what it was `before`, but nothing is pending."""
+        self.passes += 1
         self.prior = prior
         self._shown = []
         if isinstance(self.prior, tuple):

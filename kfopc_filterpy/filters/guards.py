@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -35,6 +35,19 @@ def restore(kf: KalmanFilter, state: State) -> None:
     kf.__dict__.update(attributes)
     for name, value in private.items():
         setattr(kf, name, value)
+
+
+def undoing(kf: KalmanFilter) -> Callable[[], None]:
+    """Return a function that takes back the steps of a filter from now on; a random walk's only if no pass has applied them."""
+    before, covariance = state_of(kf), getattr(kf, "_covariance", None)
+    take_back = None if covariance is None else covariance.undoing()
+
+    def undo() -> None:
+        restore(kf, before)
+        if take_back is not None:
+            take_back()
+
+    return undo
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from ..controllers.base import FilteredReferenceController
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
 from ..core.block import Block, Shape, reason_of
-from ..core.running import DIVERGED, RUNNING, Plant, Record, Signals, Steps
+from ..core.running import DIVERGED, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals, Steps
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, NUMBERS
@@ -271,7 +271,7 @@ class _SideBySide:
                 for scenario in np.flatnonzero(~(np.abs(plant.control) <= plant.limit)):
                     self._silence(int(scenario), done, plant, signals)
             elif status != RUNNING:
-                self._raise_refusal(plant, done)
+                self._raise_refusal(plant, status, done)
             if progress:
                 progress(count * (done - begin))
 
@@ -282,20 +282,21 @@ class _SideBySide:
         if scenario not in self.diverged_at:
             self.diverged_at[scenario] = sample
             self._at_divergence[scenario] = {name: field.copy() for name, field in rows.items()}
-        rows["weights"][:] = 0.0
+        rows["weights"][:] = rows["control_signal"][:] = 0.0  # MOV-FxLMS adapts to both
         plant.silence(scenario)
         for signal in (signals.disturbance, signals.sensor_noise):
             if signal is not None:
                 signal[scenario, sample:] = 0.0
 
-    def _raise_refusal(self, plant: Plant, sample: int) -> None:
-        """Raise ValueError with the reason for which the core refused a sample."""
+    def _raise_refusal(self, plant: Plant, status: int, sample: int) -> None:
+        """Raise ValueError with the reason for which the core refused a sample: called again, the step says it."""
+        where = f"sample {sample} of the run"
+        if status == REFUSED_REFERENCE:
+            self._block.reference[:] = plant.reference
+            raise ValueError(f"{reason_of(self._block.emit())} ({where})")
         self._block.error[:] = plant.error
-        answer = self._block.update()
         loudest = int(np.argmax(np.abs(plant.error)))
-        raise ValueError(
-            f"{reason_of(answer)} (sample {sample} of the run, the loudest error is controllers[{loudest}]'s)"
-        )
+        raise ValueError(f"{reason_of(self._block.update())} ({where}, the loudest error is controllers[{loudest}]'s)")
 
     def give_back(self) -> None:
         """Write the present state into the blocks of the controllers."""

@@ -225,6 +225,30 @@ def test_a_refused_update_leaves_no_prediction_behind(by_block):
     assert controller.constraint.disturbance_power == before.constraint.disturbance_power
 
 
+@pytest.mark.parametrize("kind", ["random walk", "full", "filterpy"])
+def test_a_refused_update_of_an_estimator_leaves_no_prediction_behind(kind):
+    """A silent reference without measurement noise has no solution."""
+    if kind == "random walk":
+        kf = KFOPC.random_walk(3, state_noise=0.1, measurement_noise=0.0)
+    else:
+        kf = KFOPC(3, 1) if kind == "full" else KalmanFilter(3, 1)
+        kf.R[:] = 0.0
+    controller = KalmanController(kf, [1.0])
+    controller.control_signal(1.0)
+    controller.update(1.0)
+    for _ in range(3):
+        controller.control_signal(0.0)
+    before = copy.deepcopy(kf)
+    for _ in range(3):
+        with pytest.raises((ValueError, np.linalg.LinAlgError)):
+            controller.update(1.0)
+    for name in ("x", "P", "x_prior", "P_prior", "P_post", "K"):
+        np.testing.assert_array_equal(getattr(kf, name), getattr(before, name), err_msg=name)
+    controller.control_signal(2.0)
+    controller.update(1.0)
+    assert kf.x[0] != before.x[0]
+
+
 @pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
 def test_constrained_control_of_a_flat_path_keeps_its_rated_power(name):
     """The control signal that cancels all has four times the rated power; alpha = 1/2 leaves it the rated power."""

@@ -266,6 +266,24 @@ def test_p_stays_semidefinite_where_rounding_hides_what_is_known(n: int) -> None
     assert abs(y) < 1.0
 
 
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("n_microphones", "n_references"), [(2, 2), (1, 1)])
+def test_rounding_of_a_large_start_does_not_grow(n_microphones: int, n_references: int, seed: int) -> None:
+    """P0/q = 1e15, r = 0, rows of several paths: what rounding made negative in P stays small, and so do the weights."""
+    rng, taps, q = np.random.default_rng(seed), 12, 1e-3
+    paths = rng.standard_normal((n_microphones, 2, 5))
+    x = rng.standard_normal((n_references, 400))
+    filtered = [[np.convolve(one, path) for path in own for one in x] for own in paths]
+    cov, w = new_covariance(1e12 * np.eye(2 * n_references * taps)), np.zeros(2 * n_references * taps)
+    for k in range(taps, 400):
+        for own in filtered:
+            row = np.concatenate([signal[k : k - taps : -1] for signal in own])
+            stepped(cov, w, row, rng.standard_normal(), 0.0, q, 1.0)
+    values = np.linalg.eigvalsh(covariance_matrix(cov, w.size))
+    assert values[0] >= -1e-14 * values[-1]
+    assert np.abs(w).max() < 100.0
+
+
 # ---- A P whose small variances are lost in the rounding of its large ones
 
 SMALL_NOISE = 1e-9  # so that a step changes next to nothing of P along the direction

@@ -326,6 +326,26 @@ def test_a_disturbance_whose_square_overflows_names_the_scenario_and_the_sample(
     assert_untouched(made, untouched)
 
 
+def test_a_reference_that_is_too_loud_is_refused_with_its_reason():
+    x, own = differing(3, 300)
+    x[50] = 1e150
+    made, untouched = filters(3), filters(3)
+    with pytest.raises(ValueError, match=r"the reference is too loud.*\(sample 50 of the run\)"):
+        run_scenarios(made, x, fs=FS, **own)
+    assert_untouched(made, untouched)
+
+
+def test_a_scenario_that_diverges_by_a_huge_control_signal_leaves_the_others_alone():
+    """MOV-FxLMS takes a step in proportion to its last control signal."""
+    x, own = differing(3, 300)
+    own["disturbance"][1] *= 1e40
+    made, alone = ([MOVFxLMS(7, S_HAT, step_size=1e-3, rated_power=0.1) for _ in range(3)] for _ in range(2))
+    results = run_scenarios(made, x, **own)
+    assert [r.diverged_at_s is not None for r in results] == [False, True, False]
+    expected = [simulate(c, x, **{name: value[i] for name, value in own.items()}) for i, c in enumerate(alone)]
+    assert_as_alone(results, expected, made[::2], alone[::2])
+
+
 # ---- What each scenario may have of its own
 
 
