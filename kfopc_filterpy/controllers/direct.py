@@ -47,7 +47,7 @@ class DirectKalman(CoreController):
     fading : float, default 1
         Factor of P in each sample, filterpy's ``alpha`` squared; 1 or above.
     n_references : int, default 1
-        Number of references I.
+        Number of references I; None: one channel only.
     rated_power : float or array_like, shape (J,), optional
         Rated output power of all loudspeakers, or of each, for KF-OPC; None for KF-ANC.
     constraint : OutputPowerConstraint or sequence of J of them, optional
@@ -101,7 +101,7 @@ class DirectKalman(CoreController):
         measurement_noise: Any,
         initial_variance: float = 1.0,
         fading: float = 1.0,
-        n_references: int = 1,
+        n_references: int | None = 1,
         rated_power: Any = None,
         constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,

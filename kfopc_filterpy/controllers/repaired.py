@@ -31,10 +31,10 @@ class RepairedKFOPC(DirectKalman):
 
     Parameters
     ----------
-    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, n_references, amplifier, limiter
-        As for `DirectKalman`.
-    constraint : OutputPowerConstraint or sequence of J of them
-        Constraint that computes the powers and the factor, or that of each loudspeaker. Copies are kept.
+    n_taps, secondary_path, state_noise, measurement_noise, initial_variance, amplifier, limiter
+        As for `DirectKalman`, for one channel.
+    constraint : OutputPowerConstraint
+        Constraint that computes the powers and the factor. A copy is kept.
     gain_of, trim_s, factor_at
         As for `kf_opc_repaired`.
 
@@ -59,7 +59,7 @@ class RepairedKFOPC(DirectKalman):
         n_taps: int,
         secondary_path: Any,
         *,
-        constraint: Any,
+        constraint: OutputPowerConstraint,
         gain_of: str = "control",
         trim_s: float | None = DEFAULT_TRIM_S,
         factor_at: str = "output",
@@ -68,14 +68,14 @@ class RepairedKFOPC(DirectKalman):
         self.gain_of = as_choice(gain_of, "gain_of", ("reference", "control"))
         self.trim_s = None if trim_s is None else as_positive(trim_s, "trim_s", unit="s")
         self.factor_at = as_choice(factor_at, "factor_at", ("measurement", "output"))
-        fs = (constraint if isinstance(constraint, OutputPowerConstraint) else constraint[0]).fs
         super().__init__(
             n_taps,
             secondary_path,
+            n_references=None,
             constraint=constraint,
             name="KF-OPC repaired",
             of_control=float(gain_of == "control"),
-            trim_rate=0.0 if self.trim_s is None else 1.0 / (self.trim_s * fs),
+            trim_rate=0.0 if self.trim_s is None else 1.0 / (self.trim_s * constraint.fs),
             at_output=float(factor_at == "output"),
             **settings,
         )

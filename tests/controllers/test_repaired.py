@@ -263,6 +263,7 @@ ESTIMATOR: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
         ({"rated_power": None}, ValueError, "give either rated_power= or constraint="),
         ({"constraint": OutputPowerConstraint(1.0)}, ValueError, "give either rated_power= or constraint="),
         ({"constraint": 1.0, "rated_power": None}, TypeError, "constraint must be an OutputPowerConstraint"),
+        ({"secondary_path": np.ones((2, 2, 4))}, ValueError, "RepairedKFOPC takes one channel"),
         ({"n_taps": 0}, ValueError, "n_taps must be at least 1"),
         ({"state_noise": -1.0}, ValueError, "state_noise must not be negative"),
         ({"amplifier": abs}, TypeError, "one of kfopc_filterpy's amplifier models"),
