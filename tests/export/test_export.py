@@ -70,8 +70,7 @@ ALGORITHMS = {
     "fast array": (FastArrayKalman, {"measurement_noise": 1.0, "rated_power": RATED}),
     "finite memory": (FastArrayKalman, {"measurement_noise": 1.0, "memory": 500}),
 }
-ONE_CHANNEL = {"FxRLS", "fast array", "finite memory"}
-ONE_REFERENCE = {*ONE_CHANNEL, "repaired"}
+ONE_CHANNEL = {"FxRLS", "fast array", "finite memory", "repaired"}
 
 
 def limiter(rated_power=RATED, window=WINDOW):
@@ -100,7 +99,7 @@ def with_everything(name):
             settings[each] = [settings[each], 1.5 * settings[each]]
     if name.startswith("KF"):
         settings["measurement_noise"] = [1e-2, 1.5e-2]
-    if name not in ONE_REFERENCE:
+    if two:
         settings["n_references"] = 2
     limiters = [limiter(), limiter(0.3)] if two else limiter()
     controller = kind(L, S_TWO_HAT if two else S_HAT, limiter=limiters, **settings)
@@ -221,7 +220,7 @@ def test_float32_follows_python(name, tmp_path):
 
 @pytest.mark.parametrize("options", [(), ("-O1", "-DLANES_OF_ONE=1"), ("-O1", "-march=native")], ids=" ".join)
 def test_the_bits_do_not_depend_on_the_processor(options, tmp_path):
-    trained, result = trained_and_run("repaired, everything")
+    trained, result = trained_and_run("KF-OPC, everything")
     out = Program(trained, tmp_path, options=options).run(result.reference, result.error)
     np.testing.assert_array_equal(out.y, result.control_signal)
 
@@ -393,7 +392,7 @@ def test_a_control_signal_that_overflows_is_silent_and_its_update_is_refused(dty
     ("name", "dtype"),
     [
         ("rescaling, everything", "float32"),
-        ("repaired, everything", "float64"),
+        ("KF-OPC, everything", "float64"),
         ("KF-OPC, twice the precision", "float32"),
         ("finite memory, everything", "float64"),
     ],
@@ -443,7 +442,7 @@ def test_a_file_needs_what_it_names_but_not_what_it_defines_itself():
 def test_only_the_calls_are_visible_and_only_the_mathematics_library_is_needed(tmp_path):
     if shutil.which("nm") is None:
         pytest.skip("needs nm, which lists a file's symbols")
-    for name in ("MOV, everything", "repaired, everything", "finite memory, everything"):
+    for name in ("MOV, everything", "KF-OPC, everything", "finite memory, everything"):
         path = export_c(CONTROLLERS[name](), tmp_path / "anc.c").path
         succeeds(c_compiler(), "-std=c99", "-O1", *WARNINGS, "-c", path, "-o", tmp_path / "anc.o")
         symbols = subprocess.run(["nm", str(tmp_path / "anc.o")], capture_output=True, text=True, check=True).stdout
