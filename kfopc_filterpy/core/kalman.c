@@ -29,14 +29,6 @@ static void observe(kalman *f, const lines *rows, int32_t k)
     for (int32_t ji = 0; ji < n; ji++) memcpy(f->c.h + times(ji, f->s.L), newest(rows, k * n + ji), sizeof(real) * (size_t)f->s.L);
 }
 
-static real energy(const signals *s, const lines *rows, int32_t k)
-{
-    const int32_t n = s->J * s->I;
-    real sum = 0;
-    for (int32_t ji = 0; ji < n; ji++) sum += dot(newest(rows, k * n + ji), newest(rows, k * n + ji), s->L);
-    return sum;
-}
-
 /* Measure z at microphone k: eq. 5-9 for every scenario, with one gain. */
 static void measure(kalman *f, const lines *rows, int32_t k, const real *z)
 {
@@ -58,9 +50,10 @@ int correct_weights(kalman *f)
 {
     signals *s = &f->s;
     const real fading = *s->setting[FADING], state_noise = *s->setting[STATE_NOISE];
+    const int32_t n = s->J * s->I;
     for (int32_t k = 0; k < s->K; k++)
-        if (!predictable(&f->c, fading, state_noise, energy(s, &s->filtered, k)) ||
-            (s->G && !predictable(&f->c, fading, state_noise, energy(s, &s->guarded, k))))
+        if (!predictable(&f->c, fading, state_noise, energy_of(s, &s->filtered, k * n, n)) ||
+            (s->G && !predictable(&f->c, fading, state_noise, energy_of(s, &s->guarded, k * n, n))))
             return ANC_NO_SOLUTION;
     predict(&f->c, fading, state_noise); /* eq. 4, once a sample */
     for (int32_t k = 0; k < s->K; k++) measure(f, &s->filtered, k, f->scaled);

@@ -24,19 +24,12 @@ const anc_algorithm anc_fxlms = {"FxLMS", fxlms, layout_plain, start_plain, filt
 enum { REGULARIZATION = STEP_SIZE + 1 };
 static const anc_setting fxnlms[] = {{"step_size", 0, 0, ANC_ONE}, {"regularization", 0, 0, ANC_ONE}, {0}};
 
-static real energy(const signals *s, const lines *rows)
-{
-    real sum = 0;
-    for (int32_t row = 0; row < rows->rows; row++) sum += dot(newest(rows, row), newest(rows, row), s->L);
-    return sum;
-}
-
 static int update_fxnlms(anc_view *view, const real *error)
 {
     signals *s = (signals *)view;
     if (!error) return ANC_DONE;
     const int refused = estimate(s, error);
-    const real all = *s->setting[REGULARIZATION] + energy(s, &s->filtered) + energy(s, &s->guarded);
+    const real all = *s->setting[REGULARIZATION] + energy_of(s, &s->filtered, 0, s->filtered.rows) + energy_of(s, &s->guarded, 0, s->guarded.rows);
     for (int32_t sj = 0; sj < s->S * s->J; sj++) set_step(s, sj, 1, *s->setting[STEP_SIZE] / all, 0);
     return refused ? refused : descend(s, error);
 }

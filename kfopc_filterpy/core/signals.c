@@ -171,6 +171,13 @@ real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t
     return sum;
 }
 
+real energy_of(const signals *s, const lines *rows, int32_t first, int32_t count)
+{
+    real sum = 0;
+    for (int32_t row = first; row < first + count; row++) sum += dot(newest(rows, row), newest(rows, row), s->L);
+    return sum;
+}
+
 int estimate_disturbance(signals *s, const real *error)
 {
     real x2 = 0;

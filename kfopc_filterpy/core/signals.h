@@ -81,6 +81,7 @@ void preview(signals *s);                          /* the second half: the power
 real least_factor(const signals *s, int32_t scenario); /* of its loudspeakers that a microphone hears, previewed */
 void commit(signals *s);                           /* take the previewed powers */
 real heard_output(const signals *s, const lines *rows, int32_t scenario, int32_t k); /* sum_ji w_ji' x'_kji, or with the guarded rows */
+real energy_of(const signals *s, const lines *rows, int32_t first, int32_t count); /* of the L newest samples of rows */
 void set_step(signals *s, int32_t sj, real keep, real mu, real penalty);
 int descend(signals *s, const real *error);        /* the steps of all loudspeakers; commits */
 #endif
