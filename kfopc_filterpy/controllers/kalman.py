@@ -132,7 +132,6 @@ class KalmanController(CoreController):
         block, estimator = self._opened(), self.estimator
         d, x = float(block.fields["disturbance"].item()), float(block.latest("reference").flat[0])
         h, powers = block.latest("filtered_reference").reshape(1, -1)[:, : self.n_taps].copy(), self.constraint
-        powers.preview(d, h[0, 0], x)  # raises if a square overflows, before anything changes
         undo = undoing(estimator)
         try:
             estimator.predict()

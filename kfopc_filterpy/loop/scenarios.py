@@ -150,9 +150,8 @@ def simulate_scenarios(
     results = {name: np.full((count, x.size), np.nan) for name in RESULTS}
     noisy = [noise.filled(row) is not None for noise, row in zip(noises, results["error"], strict=True)]
     results["error"][np.logical_not(noisy)] = 0.0
-    present = np.array(
-        np.broadcast_to(d, (count, x.size)), order="C"
-    )  # a copy, in which the disturbance of a diverged scenario is set to zero
+    # A copy, in which the disturbance of a diverged scenario is set to zero.
+    present = np.array(np.broadcast_to(d, (count, x.size)), order="C")
     signals = Signals(x[None], present, results["error"] if any(noisy) else None, *results.values())
     recorded = {
         name: np.full((count, x.size), np.nan) for name in (RECORDED + POWERS[:2] if record_powers else RECORDED)
