@@ -299,7 +299,7 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
         const real taken = power_at(t, price, v, u, &solved);
         if (!solved) {
             const real least = (real)1e-6 * t->scale;
-            price = 2 * price > least ? 2 * price : least;
+            price = 2 * price < least ? least : 2 * price;
             continue;
         }
         const real away = taken - power;
@@ -331,7 +331,7 @@ static void take_references(budget *f)
             for (int32_t a = 0; a < I; a++) {
                 real *restrict R = c ? f->short_R + times(((c - 1) * I + i) * I + a, L) : f->R + times(i * I + a, lags);
                 correlate(sums, work_row(f, c), B, f->x + times(a, H), lags);
-                for (int32_t l = 0; l < lags; l++) R[l] = fade[c] * R[l] + sums[l];
+                for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade[c], sums[l]);
             }
             if (i == 0) f->weight[c] = fade[c] * f->weight[c] + sum[c];
         }

@@ -372,17 +372,19 @@ static void add_products(plant *f, const real *v, int32_t at_v, int32_t n, const
     correlate(column, u, B, v, n); /* c = 0 */
     if (v == u) last[0] = column[0];
     else correlate(last, v, B, u, m); /* i = 0 */
-    for (int32_t i = 0; i < n; i++) {
+    real *restrict first = row_of_data(f, at_v) + at_u;
+    for (int32_t c = 0; c < (v == u ? 1 : m); c++) first[c] = faded(first[c], forget, sign * last[c]);
+    for (int32_t i = 1; i < n; i++) {
         const int32_t columns = v == u ? i + 1 : m;
         real *restrict row = row_of_data(f, at_v + i) + at_u, *restrict sums = next;
         const real *restrict before = last;
-        if (i) {
-            const real gone = v[B + i - 1], come = v[i - 1];
-            sums[0] = column[i];
-            for (int32_t c = 1; c < columns; c++) sums[c] = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
-            next = last, last = sums;
+        const real gone = v[B + i - 1], come = v[i - 1];
+        sums[0] = column[i], row[0] = faded(row[0], forget, sign * column[i]);
+        for (int32_t c = 1; c < columns; c++) {
+            const real sum = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
+            sums[c] = sum, row[c] = faded(row[c], forget, sign * sum);
         }
-        for (int32_t c = 0; c < columns; c++) row[c] = forget * row[c] + sign * last[c];
+        next = last, last = sums;
     }
 }
 
@@ -399,7 +401,7 @@ static void add_block(plant *f, const real *x, const real *y, const real *e, rea
         for (int32_t k = 0; k < f->K; k++) {
             real *restrict r = f->r + times(k, f->n) + row;
             correlate(sums, e + times(k, B), B, v, n);
-            for (int32_t i = 0; i < n; i++) r[i] = forget * r[i] + sign * sums[i];
+            for (int32_t i = 0; i < n; i++) r[i] = faded(r[i], forget, sign * sums[i]);
         }
         for (int32_t b = 0, column = 0; b <= a; b++) {
             const real *u = b < f->I ? x + times(b, f->history) : y + times(b - f->I, f->history);
