@@ -307,7 +307,7 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
         const real slope = solve_factorised(t->f, u, NULL);
         if (!(slope > 0)) break;
         /* power^-1/2 has the slope taken^-3/2 u' T^-1 u */
-        price = largest(price + taken * (root(taken / power) - 1) / slope, 0);
+        price = larger(price + taken * (root(taken / power) - 1) / slope, 0);
     }
     return price;
 }
@@ -391,7 +391,7 @@ static real share_of(const budget *f, int32_t j, const real *v)
         for (int c = 0; c <= SCALES; c++) {
             const int32_t n = blocks[c];
             if (t != T - n) continue;
-            const real left = largest((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / largest(power[c], LEAST_POWER);
+            const real left = larger((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / larger(power[c], LEAST_POWER);
             if (share == 0 || left < share) share = left;
         }
         if (t < T) spent += f->book[times(t, J) + (size_t)j];
@@ -405,16 +405,16 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
     const real rated = f->s.setting[RATED_POWER][j];
-    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * largest(left, 0);
+    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0);
     toeplitz_system t = {f, f->A + times(j * I * J + j, I) * row, f->C + (f->lags - L), row, times(J, I) * row, row_C, times(I, 1) * row_C, rest, 0};
     int solved;
     t.scale = t.A[L - 1] / t.R[L - 1];
     /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
-    f->steady[J + j] = largest(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
+    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
     /* 3 What the account holds makes power cheaper, 4 but none that saves little of the error. */
     for (int n = 0; n < 4; n++) account *= account;
-    real price = largest(f->steady[J + j] * account, WORTHWHILE * *f->error / (rated * (real)J));
+    real price = larger(f->steady[J + j] * account, WORTHWHILE * *f->error / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
     /* 5 The account must stand it. */
     const real share = power > 0 ? share_of(f, j, v) : 1;
@@ -480,7 +480,7 @@ static void solve_all(budget *f)
         multiply_toeplitz(f, part, f->A + times(j * I * J + j, I) * row, row_A, row, w);
         error += dot(w, part, n) + 2 * dot(w, below, n) - 2 * dot(w, f->b + times(j, n), n);
     }
-    *f->error = largest(error, q);
+    *f->error = larger(error, q);
 }
 
 /* A sample. */

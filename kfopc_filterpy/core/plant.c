@@ -266,8 +266,8 @@ static int solve_means(plant *f, int32_t first, real q, real size)
         /* sum e^2 - 2 theta'r + theta'G theta, where G theta = r + q P (mean - theta) */
         const real ee = f->set_ee[k], residual = ee - dot(theta, f->set_r + times(k, n), n) + q * bend, samples = f->numbers->set_aside;
         /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
-        const real noise = (residual + (real)n * f->q[k]) / (largest(samples - (real)split / 2, 0) + (real)n);
-        f->q[k] = largest(noise, (real)1e-6 * ee / samples);
+        const real noise = (residual + (real)n * f->q[k]) / (larger(samples - (real)split / 2, 0) + (real)n);
+        f->q[k] = larger(noise, (real)1e-6 * ee / samples);
     }
     return 1;
 }
@@ -321,7 +321,7 @@ static int is_alarm(const plant *f, const real *x, const real *y, real unexplain
 {
     const plant_numbers *known = f->numbers;
     if (f->counts[AGE] <= (*f->alarms ? QUIET : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
-    const real limit = SURPRISE * q + largest(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
+    const real limit = SURPRISE * q + larger(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
     if (unexplained <= limit) return 0;
     real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
     for (int32_t draw = 0; draw < DRAWS; draw++) {

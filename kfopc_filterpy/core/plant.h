@@ -65,6 +65,6 @@ static inline real faded(real sum, real forget, real more)
     return next < NEARLY_ZERO && next > -NEARLY_ZERO ? 0 : next;
 }
 
-static inline real largest(real a, real b) { return a > b ? a : b; }
+static inline real larger(real a, real b) { return a > b ? a : b; }
 static inline void count_up(int32_t *count) { *count += *count < 1 << 30; }
 #endif
