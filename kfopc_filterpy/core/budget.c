@@ -209,6 +209,7 @@ static int factorise(const toeplitz_system *t, real price)
             real *restrict T = f->sums + times(i * I + c, lags);
             for (int32_t l = 0; l < lags; l++) T[l] = A[l] + price * R[l];
             if (i == c) T[L - 1] = A[L - 1] * (1 + REGULAR) + price * R[L - 1];
+            if (i == c && T[L - 1] == 0) T[L - 1] = 1; /* a reference that is silent, or that nobody hears: its filter is zero */
             D[i * I + c] = E[i * I + c] = T[L - 1];
             F[times(i * I + c, L)] = B[i * I + c] = i == c;
         }
@@ -408,7 +409,8 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0);
     toeplitz_system t = {f, f->A + times(j * I * J + j, I) * row, f->C + (f->lags - L), row, times(J, I) * row, row_C, times(I, 1) * row_C, rest, 0};
     int solved;
-    t.scale = t.A[L - 1] / t.R[L - 1];
+    for (int32_t i = 0; i < I && !(t.scale > 0); i++) /* of the first reference that is not silent */
+        t.scale = t.A[(t.row_A + t.next_A) * (size_t)i + (size_t)(L - 1)] / larger(t.R[(t.row_R + t.next_R) * (size_t)i + (size_t)(L - 1)], LEAST_POWER);
     /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
     f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
