@@ -17,6 +17,7 @@ from .studies import (
     broadband,
     constraint,
     duct,
+    kf_pb,
     mismatch,
     multichannel,
     power_budget,
@@ -36,6 +37,7 @@ STUDIES: dict[str, Study] = {
 FURTHER: dict[str, Study] = {  # beyond the paper
     "duct-motor": (duct.main_motor, duct.planned_runs),
     "constraint": (constraint.main, constraint.planned_runs),
+    "kf_pb": (kf_pb.main, kf_pb.planned_runs),
     "power_budget": (power_budget.main, power_budget.planned_runs),
     "mismatch": (mismatch.main, mismatch.planned_runs),
     "uncertain_path": (uncertain_path.main, uncertain_path.planned_runs),

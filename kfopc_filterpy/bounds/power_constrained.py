@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal, per_loudspeaker
+from ..metrics import overshoot
 from ..paths.channels import is_path_matrix
 from ..paths.models import path_taps
 from .channels import ChannelStretch, channel_record
@@ -201,6 +202,47 @@ class PowerConstrainedWiener:
         return {
             name: reduction_db(mean_square(getattr(self, name).error[..., part]), disturbance_power) for name in names
         }
+
+    def within_windows(self, window_s: float = 0.1) -> ControlFilter:
+        """Return the filter for the whole record whose power keeps the budget in every window.
+
+        It shows what a hard promise costs, such as that of `OutputLimiter`: beside `whole`, which keeps the budget on
+        average.
+
+        Parameters
+        ----------
+        window_s : float, default 0.1
+            Length of the sliding window in seconds.
+
+        Returns
+        -------
+        ControlFilter
+            The filter with the smallest error among those of one price of power, to 0.2 % of the budget.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If `window_s` is not above 0.
+
+        Examples
+        --------
+        >>> x = np.random.default_rng(0).standard_normal(4000) * np.repeat([1.0, 2.0], 2000)
+        >>> bound = power_constrained_wiener(x, x, [1.0], n_taps=8, rated_power=0.5, fs=1000.0)
+        >>> print(f"{bound.whole.noise_reduction_db:.1f} dB, {bound.within_windows().noise_reduction_db:.1f} dB")
+        5.2 dB, 3.1 dB
+        """
+        stretch, power = self.whole.stretch, np.asarray(self.rated_power, dtype=np.float64)
+        correlations: Any = stretch.correlations()
+        for _ in range(50):
+            weights, penalty = weights_within(stretch, correlations, power if power.ndim else float(power))
+            y = stretch.control_signal(weights)
+            peak = np.asarray(overshoot(y, self.rated_power, self.fs, window_s=window_s))
+            # A loudspeaker that keeps the budget without a price needs no more power.
+            if np.all((np.abs(peak - 1.0) <= 0.002) | ((peak <= 1.0) & (np.asarray(penalty) == 0.0))):
+                break
+            power = power / np.where((peak < 1.0) & (np.asarray(penalty) == 0.0), 1.0, peak)
+        times = {"start_s": self.whole.start_s, "end_s": self.whole.end_s, "stretch": stretch}
+        return ControlFilter(**vars(stretch.solution(weights)), **times, penalty=penalty, constraint_factor=1.0)
 
 
 def power_constrained_wiener(

@@ -518,3 +518,30 @@ def test_parts_outside_the_record_are_refused(start_s, end_s, message):
     found = power_constrained_wiener(x, d, s, 8, 0.1, fs=FS)
     with pytest.raises(ValueError, match=message):
         found.noise_reduction_over(start_s, end_s)
+
+
+@pytest.mark.parametrize("window_s", [0.02, 0.1, 1.0])
+def test_filter_within_windows_keeps_the_budget_in_each_of_them_and_spends_it_in_one(window_s):
+    rng = np.random.default_rng(5)
+    x = rng.standard_normal(8000) * np.repeat([1.0, 3.0], 4000)
+    d = np.convolve(x, [0.0, 0.7, 0.4])[: x.size]
+    bound = power_constrained_wiener(x, d, [0.0, 1.0, 0.3], n_taps=16, rated_power=0.2, fs=1000.0)
+    found = bound.within_windows(window_s)
+    width = round(window_s * 1000.0)
+    powers = np.convolve(found.control_signal**2, np.ones(width), "valid") / width
+    assert powers.max() == pytest.approx(0.2, rel=0.002)  # the tolerance that the method states
+    assert found.noise_reduction_db < bound.whole.noise_reduction_db
+    # A budget that no window needs costs nothing.
+    rich = power_constrained_wiener(x, d, [0.0, 1.0, 0.3], n_taps=16, rated_power=1e6, fs=1000.0)
+    np.testing.assert_allclose(rich.within_windows(window_s).weights, rich.whole.weights, rtol=1e-12)
+
+
+def test_filter_within_windows_keeps_the_budget_of_each_loudspeaker():
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal((1, 6000)) * np.repeat([1.0, 2.0], 3000)
+    paths = rng.standard_normal((2, 2, 4)) * [[[1.0], [0.3]], [[0.2], [1.0]]]
+    d = rng.standard_normal((2, 1)) * x
+    bound = power_constrained_wiener(x, d, paths, n_taps=8, rated_power=[0.05, 2e-5], fs=1000.0)
+    y = bound.within_windows(0.1).control_signal
+    powers = np.array([np.convolve(own**2, np.ones(100), "valid") / 100 for own in y]).max(axis=1)
+    np.testing.assert_allclose(powers, [0.05, 2e-5], rtol=0.002)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from oracles.signals import Controller
@@ -22,11 +23,11 @@ UNKNOWN = 2.0  # after an alarm: root mean square of the error of a secondary pa
 KEPT = 4  # after an alarm: what is known of the primary paths counts as so many samples for each tap
 DRAWS = 8  # of the posterior, that stand for its covariance
 SURPRISE, MISFIT, USUAL = 4.0, 0.03, 5.0  # alarm: beyond the noise; of the disturbance; of the usual misfit
-ACCOUNT = 8.0  # the price falls by e^-8 for a full account
-WORTHWHILE = 0.2  # power that saves less than this share of the error is not spent
+ACCOUNT = 4.0  # the price falls by e^-4 for a full account
+WINDOW = 8  # the filter is solved for the references of an exponential window of the averaging time over this
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
-SCALES = (100, 40, 10, 4)  # t: the last block, and exponential windows of the averaging time over these
+SCALES = (100, 40, 4)  # t: the last block, that window, and windows of the averaging time over these
 QUIET = 31  # blocks from one alarm to the next, at least
 WORK = 2.0**26  # operations of a factorisation in a block
 
@@ -40,7 +41,10 @@ def gram(u, v, B, n, m):
     """Return sum_t u(t - i) v(t - j), i < n, j < m, over the last B samples t."""
     G = np.empty((n, m))
     G[0], G[:, 0] = lagged(v, u[-B:], m), lagged(u, v[-B:], n)
-    (a, b), (c, d) = (u[::-1], v[::-1]), (u[-B - 1 :: -1], v[-B - 1 :: -1])  # newest first: at the end, before the block
+    (a, b), (c, d) = (
+        (u[::-1], v[::-1]),
+        (u[-B - 1 :: -1], v[-B - 1 :: -1]),
+    )  # newest first: at the end, before the block
     for i in range(1, n):  # along the diagonals, the window of t moves by one sample
         G[i, 1:] = G[i - 1, :-1] + c[i - 1] * d[: m - 1] - a[i - 1] * b[: m - 1]
     return G
@@ -227,6 +231,8 @@ class Plant:
 class PowerBudget(Controller):
     """KF-PB; `w` is the control filter."""
 
+    HOLD: ClassVar[float] = 1.0  # 0: the price that is held falls at once
+
     rated_power: np.ndarray  # (J,)
     fs: float = 16000.0
     averaging_s: float = 10.0
@@ -235,7 +241,7 @@ class PowerBudget(Controller):
 
     def __post_init__(self):
         super().__post_init__()
-        (K, J, M), (_, I, L) = self.s_hat.shape, self.w.shape  # noqa: E741
+        (_, J, M), (_, I, L) = self.s_hat.shape, self.w.shape  # noqa: E741
         N, B = L + M - 1, max(round(self.block_s * self.fs), 1)
         self.B, self.N, self.lags = B, N, L + N
         self.g = math.exp(-1 / (self.averaging_s * self.fs))  # of the window of the references, a sample
@@ -247,10 +253,12 @@ class PowerBudget(Controller):
         self.heard = 0  # samples that the delay lines hold
         self.R = np.zeros((I, I, self.lags))  # windowed sums of x_i(t) x_i'(t - l)
         self.short = np.zeros((len(SCALES), I, I, L))
-        self.weight, self.short_weight = 0.0, np.zeros(len(SCALES))
-        self.book = np.ones((self.blocks, J))  # power of each block over the rating, newest first; full before the start
+        self.weights = np.zeros(1 + len(SCALES))
+        self.book = np.ones(
+            (self.blocks, J)
+        )  # power of each block over the rating, newest first; full before the start
         self.price, self.steady_price, self.held_price = np.zeros(J), np.zeros(J), np.zeros(J)
-        self.error, self.alarms = 0.0, 0
+        self.alarms = 0
 
     def output(self):
         """Return y_j = sum_i v_ji * x_i, and note what is asked."""
@@ -274,7 +282,10 @@ class PowerBudget(Controller):
             missing = any(sample is None for sample in e)
             spent = [sample for sample in asked if sample is not None]
             self.end_block(
-                np.transpose(x), np.transpose(y), None if missing else np.transpose(e), np.sum(spent, axis=0) / self.B if spent else None
+                np.transpose(x),
+                np.transpose(y),
+                None if missing else np.transpose(e),
+                np.sum(spent, axis=0) / self.B if spent else None,
             )
 
     def end_block(self, x, y, e, asked):
@@ -294,21 +305,22 @@ class PowerBudget(Controller):
     def take_references(self):
         """Add the block to the windows of the references; x is zero before the first, so they are positive definite."""
         B, n = self.B, self.lags
-        for scale, R, lags in [(1, self.R, n), *((c, R, len(self.x[0])) for c, R in zip(SCALES, self.short, strict=True))]:
+        short = [(c, R, self.w.shape[2]) for c, R in zip(SCALES, self.short, strict=True)]
+        for scale, R, lags in [(WINDOW, self.R, n), *short]:
             g = self.g**scale
             window = g ** np.arange(B - 1, -1, -1.0)
             R *= g**B
             for i, u in enumerate(self.x_past):
                 for a, v in enumerate(self.x_past):
                     R[i, a] += lagged(v, window * u[-B:], lags)
-        self.weight = self.g**B * self.weight + np.sum(self.g ** np.arange(B))
-        for c, scale in enumerate(SCALES):
-            self.short_weight[c] = self.g ** (scale * B) * self.short_weight[c] + np.sum(self.g ** (scale * np.arange(B)))
+        for c, scale in enumerate((WINDOW, *SCALES)):
+            g = self.g**scale
+            self.weights[c] = g**B * self.weights[c] + np.sum(g ** np.arange(B))
 
     def solve(self):
         """Give each loudspeaker in turn the filter of least expected error at its price, given the others'."""
-        (J, I, L), (K, _, M), N = self.w.shape, self.s_hat.shape, self.N  # noqa: E741
-        R = self.R / self.weight * self.g ** (np.arange(self.lags) / 2)
+        (J, I, L), M, N = self.w.shape, self.s_hat.shape[2], self.N  # noqa: E741
+        R = self.R / self.weights[0] * self.g ** (WINDOW / 2 * np.arange(self.lags))
         R = np.concatenate([np.swapaxes(R, 0, 1)[..., :0:-1], R], axis=2)  # C_xx(l), l from 1 - lags on
         ss, ps = self.plant.correlations()
         middle = self.lags - 1
@@ -324,19 +336,10 @@ class PowerBudget(Controller):
                 for c in range(I):
                     # E[d(t) x'_ji(t - l)] = sum_u (p_c ~ s_j)(u) C_ci(l - u), l from 0 on
                     b[j, i] += np.convolve(R[c, i, middle - N + 1 : middle + L + M - 1], ps[c, j], "valid")
-        d2 = sum(
-            np.correlate(p[i], p[a], "full") @ R[a, i, middle - N + 1 : middle + N]
-            for p in self.plant.p
-            for i in range(I)
-            for a in range(I)
-        )
         left = 1.0 - np.mean(self.book, axis=0)  # of the account
         for j in range(J):
             rest = b[j] - sum(product(A[j, :, a], self.w[a]) for a in range(J) if a != j)
             self.spend(j, A[j, :, j], rest, R, left[j])
-        error = np.sum(self.plant.q) + d2 - 2 * np.sum(self.w * b)
-        error += sum(np.sum(self.w[j] * product(A[j, :, a], self.w[a])) for j in range(J) for a in range(J))
-        self.error = max(error, np.sum(self.plant.q))
 
     def spend(self, j, A, b, R, left):
         """Set the price of loudspeaker j, and its filter at that price."""
@@ -345,27 +348,24 @@ class PowerBudget(Controller):
         system = System(A, R[:, :, middle - L + 1 : middle + L], b)
         # 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only.
         self.steady_price[j], _, _ = system.price_of(rho, self.steady_price[j])
-        self.held_price[j] = max(self.steady_price[j], self.held_price[j] * self.plant.forget)
-        # 3 What the account holds makes power cheaper, 4 but none that saves little of the error.
-        price = max(
-            self.held_price[j] * (1.0 - ACCOUNT / 16 * max(left, 0.0)) ** 16,
-            WORTHWHILE * self.error / (rho * len(self.rated_power)),
-        )
+        self.held_price[j] = max(self.steady_price[j], self.HOLD * self.held_price[j] * self.plant.forget)
+        # 3 What the account holds makes power cheaper.
+        price = self.held_price[j] * (1.0 - ACCOUNT / 16 * max(left, 0.0)) ** 16
         v, power = system.at(price)
-        # 5 The account must stand it if the last t goes on for twice as long, for every t.
-        share = self.share(j, v) if power > 0 else 1.0
+        # 4 The account must stand it if the last t goes on for twice as long, for every t.
+        share = self.share(j, v, power) if power > 0 else 1.0
         if share < 1.0:
             price, v, _ = system.price_of(share * power, price)
         self.price[j], self.w[j] = price, v
 
-    def share(self, j, v):
-        """Return the largest share of its power that the account of loudspeaker j stands, for the filter v, (I, L)."""
+    def share(self, j, v, power):
+        """Return the largest share of its power that the account of loudspeaker j stands, for a filter v, (I, L), and its power."""
         spent = np.concatenate([[0.0], np.cumsum(self.book[:, j])])
         T, L = self.blocks, v.shape[1]
         y = sum(filtered(h, u, self.B) for h, u in zip(v, self.x_past, strict=True))
-        expected = [(np.mean(y**2), T // SHORTEST)]  # power, for how many blocks
+        expected = [(np.mean(y**2), T // SHORTEST), (power, round(TWICE * T / WINDOW))]  # power, for how many blocks
         taper = self.g ** (np.arange(L) / 2)
-        for scale, R, weight in zip(SCALES, self.short, self.short_weight, strict=True):
+        for scale, R, weight in zip(SCALES, self.short, self.weights[1:], strict=True):
             power = 0.0
             for i in range(len(v)):
                 for a in range(len(v)):

@@ -1,0 +1,103 @@
+"""Print what each rule of KF-PB's price is worth, with the oracle: ``python tests/helpers/budget_ablation.py``.
+
+It takes about ten minutes.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).resolve().parents[1])]
+
+from oracles import power_budget as law  # noqa: E402
+
+from comparisons.studies import kf_pb as study  # noqa: E402
+
+CASES = (
+    ("duct", "compressor"),
+    ("duct", "band noise"),
+    ("duct", "bursts"),
+    ("duct", "compressor, 12 dB louder from 8 s on"),
+    ("duct", "compressor, 12 dB softer from 8 s on"),
+    ("duct", "band noise, 10 dB louder for 4 s"),
+    ("duct", "band noise, then compressor"),
+    ("band-pass", "swelling band noise"),
+)
+
+
+def run(case: study.Rated, **settings: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the error and the control signal after switch-on, computed in blocks."""
+    own = law.PowerBudget(
+        s_hat=case.secondary[np.newaxis, np.newaxis],
+        n_taps=study.N_TAPS,
+        rated_power=np.array([case.rated_power]),
+        fs=study.FS,
+        **settings,
+    )
+    B, on = own.B, round(study.SILENT_S * study.FS)
+    taps = case.secondary.size
+    x, d = case.reference, case.disturbance
+    y, e = np.zeros(x.size + taps), d.copy()  # y is delayed by `taps` samples
+    ends = range(B, x.size + 1, B)
+    for b in ends:
+        a = b - B
+        sounds = a >= on
+        if sounds:
+            past = np.concatenate([own.x_past[0], x[a:b]])
+            y[taps + a : taps + b] = law.filtered(own.w[0, 0], past, B)
+            e[a:b] -= law.filtered(case.secondary, y[: taps + b], B)
+        spent = np.array([np.mean(y[taps + a : taps + b] ** 2)]) if sounds else None
+        own.end_block(x[np.newaxis, a:b], y[np.newaxis, taps + a : taps + b], e[np.newaxis, a:b], spent)
+    return e[on:], y[taps + on :]
+
+
+@contextmanager
+def without(rule: str) -> Iterator[dict[str, float]]:
+    """Switch a rule off; the settings of the controller that this takes."""
+    kept = {name: getattr(law, name) for name in ("ACCOUNT", "WINDOW")}
+    share, hold = law.PowerBudget.share, law.PowerBudget.HOLD
+    settings = {"spread": 0.0}
+    if rule == "account":
+        law.ACCOUNT = 0.0
+    elif rule == "the shorter window":
+        law.WINDOW = 1
+    elif rule == "hold":
+        law.PowerBudget.HOLD = 0.0
+    elif rule == "what the account stands":
+        law.PowerBudget.share = lambda *_: 1.0
+    elif rule == "with the path verified":
+        settings = {}
+    try:
+        yield settings
+    finally:
+        law.PowerBudget.share, law.PowerBudget.HOLD = share, hold
+        for name, value in kept.items():
+            setattr(law, name, value)
+
+
+def main() -> None:
+    """Print a line for each rule."""
+    pairs, made = study.all_paths(), study.noises()
+    cases = [study.make_rated(pairs[path], made[noise][1](), study.SHARES[0]) for path, noise in CASES]
+    rules = ("nothing", "hold", "account", "the shorter window", "what the account stands", "with the path verified")
+    print(f"{'without':26}{'over the bound, mean':>22}{'worst dB':>10}{'power over 10 s, most':>24}")
+    with tqdm(total=len(rules) * len(cases)) as bar:
+        for rule in rules:
+            gains, powers = [], []
+            for case in cases:
+                with without(rule) as settings:
+                    e, y = run(case, **settings)
+                gains.append(case.reduction_db(e) - case.reduction_db(case.bound_error))
+                powers.append(study.overshoot(y, case.rated_power, study.FS, window_s=study.AVERAGING_S))
+                bar.update()
+            bar.write(f"{rule:26}{np.mean(gains):+22.2f}{min(gains):+10.2f}{max(powers):24.2f}", file=sys.stdout)
+
+
+if __name__ == "__main__":
+    main()
