@@ -15,13 +15,13 @@ static const anc_setting budget_settings[] = {
     {"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER}, {"block", 1, 65536, ANC_ONE}, {"averaging", 20, 100000, ANC_ONE},
     {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
 
-static const real ACCOUNT = 0.5f;     /* the price falls by (1 - ACCOUNT)^16, about e^-8 at first, for a full account */
-static const real WORTHWHILE = (real)0.2; /* power that saves less than this share of the error is not spent */
+static const real ACCOUNT = 0.25f;    /* the price falls by (1 - ACCOUNT)^16, about e^-4, for a full account */
 static const real NEAR = (real)0.005;/* of the power that a price is to yield */
 static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
-enum { SCALES = 4, TWICE = 2 };       /* what lasted t may go on for twice as long */
+enum { SCALES = 3, TWICE = 2 };       /* what lasted t may go on for twice as long */
 enum { SHORTEST = 20 };               /* ... and for a twentieth of the averaging time */
-static const int32_t SCALE[SCALES + 1] = {1, 100, 40, 10, 4}; /* t: exponential windows of the averaging time over these */
+/* t: exponential windows of the averaging time over these. The filter is solved for the references of the first. */
+static const int32_t SCALE[SCALES + 1] = {8, 100, 40, 4};
 enum { NEWTON = 20 };                 /* steps */
 #ifdef ANC_FLOAT
 static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f, LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
@@ -42,7 +42,6 @@ typedef struct {
     real *weight;                /* (1 + SCALES) of these windows */
     real *book;                  /* (T, J) power of each block over the rating, newest first */
     real *price, *steady;        /* (J); (2, J) the price that spends the rating, and that price as it is held */
-    real *error;                 /* (1) expected, summed over microphones */
     real *C;                     /* (I, I, 2 lags - 1) of the references, both signs of l */
     real *A;                     /* (J, I, J, I, 2L - 1) of the filtered references */
     real *b;                     /* (J, I, L) of these with d */
@@ -55,7 +54,7 @@ typedef struct {
     int32_t width;
 } budget;
 
-enum { REST, BELOW, SOLUTION, PLAYED, VECTORS_OF_TAPS };
+enum { REST, SOLUTION, PLAYED, VECTORS_OF_TAPS };
 enum { WORKS = SCALES + 2 };
 
 /* Layout. */
@@ -98,7 +97,6 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     f->book = reals(at, "book", ANC_STATE, 1, 1, f->T, J);
     f->price = reals(at, "price", ANC_STATE, 1, 1, 1, J);
     f->steady = reals(at, "steady_price", ANC_STATE, 1, 1, 2, J);
-    f->error = reals(at, "expected_error", ANC_STATE, 1, 1, 1, 1);
     f->C = reals(at, "two_sided", ANC_SCRATCH, 1, I, I, 2 * lags - 1);
     f->A = reals(at, "filtered_correlation", ANC_SCRATCH, J * I, J, I, 2 * L - 1);
     f->b = reals(at, "with_disturbance", ANC_SCRATCH, 1, J, I, L);
@@ -323,7 +321,7 @@ static void take_references(budget *f)
     for (int c = 0; c <= SCALES; c++) g[c] = raised(*f->s.setting[WINDOW], SCALE[c]), fade[c] = raised(g[c], B);
     for (int32_t i = 0; i < I; i++) {
         const real *u = f->x + times(i, H);
-        real share[SCALES + 1] = {1, 1, 1, 1, 1}, sum[SCALES + 1] = {0};
+        real share[SCALES + 1] = {1, 1, 1, 1}, sum[SCALES + 1] = {0};
         for (int32_t t = 0; t < B; t++)
             for (int c = 0; c <= SCALES; c++) work_row(f, c)[t] = share[c] * u[t], sum[c] += share[c], share[c] *= g[c];
         for (int c = 0; c <= SCALES; c++) {
@@ -343,7 +341,7 @@ static void take_references(budget *f)
 static void correlate_references(budget *f)
 {
     const int32_t I = f->s.I, lags = f->lags;
-    const real g = root(*f->s.setting[WINDOW]), weight = *f->weight;
+    const real g = root(raised(*f->s.setting[WINDOW], SCALE[0])), weight = *f->weight;
     for (int32_t i = 0; i < I; i++)
         for (int32_t a = 0; a < I; a++) {
             const real *R = f->R + times(i * I + a, lags), *other = f->R + times(a * I + i, lags);
@@ -362,18 +360,18 @@ static int32_t lasting(int32_t T, int32_t scale, int32_t least)
     return rounded > least ? rounded : least;
 }
 
-/* Return the largest share of its power that the account of loudspeaker j stands, for the filter v: it must stand it if the
- * last t goes on for twice as long, for every t. */
-static real share_of(const budget *f, int32_t j, const real *v)
+/* Return the largest share of its power that the account of loudspeaker j stands, for the filter v and its power: it must
+ * stand it if the last t goes on for twice as long, for every t. */
+static real share_of(const budget *f, int32_t j, const real *v, real taken)
 {
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L, T = f->T, B = f->plant.B, least = T / SHORTEST;
-    real power[SCALES + 1] = {0}, spent = 0, share = 0;
-    int32_t blocks[SCALES + 1] = {least};
+    real power[SCALES + 2] = {taken}, spent = 0, share = 0; /* of all scales, and last that of the block */
+    int32_t blocks[SCALES + 2];
     real *y = work_row(f, 0), *part = work_row(f, 1), *wide = work_row(f, 2);
     memset(y, 0, sizeof(real) * (size_t)B);
     for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, f->x + times(i, f->plant.history), B), add_to(y, part, B);
-    power[0] = dot(y, y, B) / (real)B;
-    for (int c = 1; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
+    power[SCALES + 1] = dot(y, y, B) / (real)B, blocks[SCALES + 1] = least;
+    for (int c = 0; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
     for (int32_t a = 0; a < I; a++) {
         memcpy(wide, v + times(a, L), sizeof(real) * (size_t)L);
         memset(wide + L, 0, sizeof(real) * (size_t)L);
@@ -389,7 +387,7 @@ static real share_of(const budget *f, int32_t j, const real *v)
         }
     }
     for (int32_t t = 0; t <= T; t++) {
-        for (int c = 0; c <= SCALES; c++) {
+        for (int c = 0; c < SCALES + 2; c++) {
             const int32_t n = blocks[c];
             if (t != T - n) continue;
             const real left = larger((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / larger(power[c], LEAST_POWER);
@@ -414,12 +412,12 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
     f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
-    /* 3 What the account holds makes power cheaper, 4 but none that saves little of the error. */
+    /* 3 What the account holds makes power cheaper. */
     for (int n = 0; n < 4; n++) account *= account;
-    real price = larger(f->steady[J + j] * account, WORTHWHILE * *f->error / (rated * (real)J));
+    real price = f->steady[J + j] * account;
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
-    /* 5 The account must stand it. */
-    const real share = power > 0 ? share_of(f, j, v) : 1;
+    /* 4 The account must stand it. */
+    const real share = power > 0 ? share_of(f, j, v, power) : 1;
     if (share < 1) price = price_of(&t, share * power, price, v);
     f->price[j] = price;
     memcpy(weights_of(&f->s, j), v, sizeof(real) * times(I, L));
@@ -453,36 +451,24 @@ static void correlate_filtered(budget *f)
 /* Give each loudspeaker in turn the filter of least expected error at its price, given the others'. */
 static void solve_all(budget *f)
 {
-    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, N = f->plant.N, n = I * L;
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, n = I * L;
     const size_t row = (size_t)(2 * L - 1), row_A = times(J, I) * row;
-    real *rest = taps_of(f, REST), *below = taps_of(f, BELOW), *part = taps_of(f, PLAYED), q = 0, error;
+    real *rest = taps_of(f, REST), *part = taps_of(f, PLAYED);
     if (f->plant.counts[STALE]) expect(&f->plant);
     correlate_references(f);
     correlate_filtered(f);
-    for (int32_t k = 0; k < f->s.K; k++) q += f->plant.q[k];
-    error = q;
-    for (int32_t i = 0; i < I; i++) /* E[d^2] */
-        for (int32_t a = 0; a < I; a++)
-            error += dot(f->plant.pp + times(i * I + a, 2 * N - 1), f->C + times(a * I + i, 2 * f->lags - 1) + (f->lags - N), 2 * N - 1);
     for (int32_t j = 0; j < J; j++) {
         real left = 0;
         for (int32_t t = 0; t < f->T; t++) left += f->book[times(t, J) + (size_t)j];
         left = 1 - left / (real)f->T;
-        memset(below, 0, sizeof(real) * (size_t)n);
         memcpy(rest, f->b + times(j, n), sizeof(real) * (size_t)n);
         for (int32_t a = 0; a < J; a++) {
             if (a == j) continue;
             multiply_toeplitz(f, part, f->A + times(j * I * J + a, I) * row, row_A, row, weights_of(&f->s, a));
-            if (a < j) add_to(below, part, n);
             add_scaled(rest, -1, part, n);
         }
         spend(f, j, rest, left);
-        /* |sum_j x'_j'w_j|^2 and its product with d */
-        const real *w = weights_of(&f->s, j);
-        multiply_toeplitz(f, part, f->A + times(j * I * J + j, I) * row, row_A, row, w);
-        error += dot(w, part, n) + 2 * dot(w, below, n) - 2 * dot(w, f->b + times(j, n), n);
     }
-    *f->error = larger(error, q);
 }
 
 /* A sample. */

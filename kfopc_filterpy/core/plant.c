@@ -74,7 +74,6 @@ void layout_posterior(plant *f, const signals *s, int32_t block, int exact, anc_
     f->set_ee = reals(at, "set_aside_energy", ANC_STATE, 1, 1, 1, K);
     f->ss = reals(at, "path_correlation", ANC_STATE, 1, J, J, 2 * M - 1);
     f->ps = reals(at, "cross_correlation", ANC_STATE, 1, I, J, N + M - 1);
-    f->pp = reals(at, "primary_correlation", ANC_STATE, 1, I, I, 2 * N - 1);
     f->sides = reals(at, "right_sides", ANC_SCRATCH, 1, 1, f->padded + J * M, PARTS);
     f->work = reals(at, "plant_work", ANC_SCRATCH, 1, 1, PLANT_ROWS, f->width);
 }
@@ -485,10 +484,8 @@ static void expect_also(plant *f, const real *theta, real weight)
 void expect(plant *f)
 {
     const int32_t I = f->I, J = f->J, N = f->N, M = f->M, lags = 2 * M - 1;
-    real *wide = work_of(f, 1), *sums = work_of(f, 2);
     memset(f->ss, 0, sizeof(real) * times(J * J, lags));
     memset(f->ps, 0, sizeof(real) * times(I * J, N + M - 1));
-    memset(f->pp, 0, sizeof(real) * times(I * I, 2 * N - 1));
     for (int32_t k = 0; k < f->K; k++) {
         const real *p = f->theta + times(k, f->n);
         if (f->exact) { /* theta has no s: put it beside p */
@@ -497,13 +494,6 @@ void expect(plant *f)
             memcpy(both + times(I, N), f->path + times(k * J, M), sizeof(real) * times(J, M));
             expect_also(f, both, 1);
         } else expect_also(f, p, 1);
-        for (int32_t i = 0; i < I; i++) {
-            widened(wide, p + times(i, N), N, N - 1);
-            for (int32_t a = 0; a < I; a++) {
-                correlate(sums, p + times(a, N), N, wide, 2 * N - 1);
-                add_to(f->pp + times(i * I + a, 2 * N - 1), sums, 2 * N - 1);
-            }
-        }
     }
     for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) /* of the mean noise */
         expect_also(f, f->draws + times(draw, f->n), (real)f->K / DRAWS);

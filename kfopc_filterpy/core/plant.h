@@ -30,7 +30,7 @@ typedef struct {
     real *G, *r, *ee;        /* lower triangle in rows; (K, n) sum e z; (K) sum e^2 */
     real *factor, *inverse;  /* of the data set aside, in panels, and 1 / its diagonal */
     real *set_r, *set_ee;    /* r and ee, set aside with it */
-    real *ss, *ps, *pp;      /* (J, J, 2M - 1), (I, J, N + M - 1), (I, I, 2N - 1) expected correlations */
+    real *ss, *ps;           /* (J, J, 2M - 1), (I, J, N + M - 1) expected correlations */
     real *sides;             /* (padded, PARTS) right sides of a solution */
     real *work;              /* (PLANT_ROWS, width) */
 } plant;
@@ -42,9 +42,8 @@ void start_posterior(plant *f, real spread);
 /* Take a block: x, (I, history), and y, (J, history), of which it is the newest part, and its errors, (K, B), which are
  * overwritten. `known`: there was enough to learn from that an alarm is possible. */
 void learn(plant *f, const real *x, const real *y, real *e, real forget, int known);
-/* Set ss, ps and pp to those of the posterior, summed over microphones: with a ~ b for sum_m a(m + u) b(m),
- * ss_ja is E[s_j ~ s_a](u) with u from 1 - M up, pp_ia is p_i ~ p_a from 1 - N up, and ps_ij is E[p_i ~ s_j] from N - 1
- * down, as it is convolved. */
+/* Set ss and ps to those of the posterior, summed over microphones: with a ~ b for sum_m a(m + u) b(m), ss_ja is
+ * E[s_j ~ s_a](u) with u from 1 - M up, and ps_ij is E[p_i ~ s_j] from N - 1 down, as it is convolved. */
 void expect(plant *f);
 
 static inline void add_to(real *restrict to, const real *restrict from, int32_t n)
