@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from helpers.comparing import assert_same_run
+from kfopc_filterpy.controllers.shared_gain import SharedGainKalman
 
 from kfopc_filterpy import (
     KFOPC,
@@ -32,7 +33,6 @@ from kfopc_filterpy import (
     output_power,
     simulate,
 )
-from kfopc_filterpy.controllers.shared_gain import SharedGainKalman
 
 K, J, I, L = 3, 2, 2, 5  # microphones, loudspeakers, references, taps  # noqa: E741
 FS = 16000.0

@@ -17,6 +17,9 @@ from helpers.controllers import ALL, OWN, SEVERAL, OwnController, made, own_ampl
 from helpers.loop import S_HAT, run
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from kfopc_filterpy.controllers.blocks import BlockController
+from kfopc_filterpy.controllers.compiled_controller import CompiledController
+from kfopc_filterpy.controllers.primary_paths import PrimaryPathController
 
 import kfopc_filterpy
 from kfopc_filterpy import FxLMS, controllers, kf_anc, simulate
@@ -24,11 +27,8 @@ from kfopc_filterpy.bench import algorithms, make_controller, make_scene
 from kfopc_filterpy.checkpoint import Checkpointed
 from kfopc_filterpy.controllers import MonitoredController, PathTracker, VirtualMicrophones
 from kfopc_filterpy.controllers.base import FilteredReferenceController, WrappedController
-from kfopc_filterpy.controllers.blocks import BlockController
-from kfopc_filterpy.controllers.compiled_controller import CompiledController
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.controllers.lms import LMSController
-from kfopc_filterpy.controllers.primary_paths import PrimaryPathController
 
 BASES = {
     FilteredReferenceController,

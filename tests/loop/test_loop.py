@@ -25,6 +25,7 @@ from helpers.loop import (
 from helpers.naming import plain
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kfopc_filterpy.kernels.delay_lines import delay_line, newest, push
 from oracles import modified_anc as oracle
 
 from kfopc_filterpy import (
@@ -38,7 +39,6 @@ from kfopc_filterpy import (
     kf_opc,
     simulate,
 )
-from kfopc_filterpy.kernels.delay_lines import delay_line, newest, push
 
 
 def controller(name, *, rated_power=0.3, window="exponential", gain=None, known=None, n_taps=N_TAPS):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.channels import constrained_filters, correlation, random_paths
+from kfopc_filterpy.power.budget import allocate
+from kfopc_filterpy.power.channels import RIDGE, ChannelBudget
 
 from kfopc_filterpy.paths import PathTolerance, guard_filter, path_uncertainty
 from kfopc_filterpy.power import PowerBudget
-from kfopc_filterpy.power.budget import allocate
-from kfopc_filterpy.power.channels import RIDGE, ChannelBudget
 
 GUARD = guard_filter(path_uncertainty(PathTolerance(delay_samples=1.0), [1.0]), [1.0])
 assert GUARD is not None
