@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_nonnegative, per_channel
-from ..core.covariance import OWED, full_covariance
+from ..core.triangle import OWED, full_covariance
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from .base import constraint_or_none

@@ -16,7 +16,7 @@ from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_w
 from kfopc_filterpy.bench import Runs, StudyReport, algorithms, make_controller, write_report
 from kfopc_filterpy.bench import registry as registered
 
-KEPT = ("KF-PB (shared gain)", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
+KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
 
 
 def through(paths: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -34,7 +34,6 @@ from kfopc_filterpy import (
     kf_anc,
     kf_opc,
     kf_opc_repaired,
-    kf_pb,
     simulate,
 )
 from kfopc_filterpy.controllers import CoreController, MonitoredController, load_algorithm
@@ -518,7 +517,6 @@ def of_a_file(folder):
 
 NOT_EXPORTED = {
     "a number": (lambda folder: 3.0, "float .* is not in the core"),
-    "KF-PB": (lambda folder: kf_pb(4, S_HAT, rated_power=RATED, **NOISES), "KF-PB .* is not in the core"),
     "monitor": (lambda folder: MonitoredController(made("KF-OPC")), r"MonitoredController\) is not in the core"),
     "own calls": (lambda folder: Own(4, S_HAT, step_size=0.1), r"FxLMS \(Own\) has calls of its own"),
     "estimator": (
