@@ -418,7 +418,7 @@ REFUSED = [
     (
         lambda: [kf_pb(7, S_HAT, rated_power=1.0, fs=FS)] * 2,
         ValueError,
-        "KF-PB",
+        r"controllers\[0\], KF-PB, learns the plant.*: use simulate",
     ),
     (lambda: [kf_anc(7, S_HAT[None, None], state_noise=1e-5, measurement_noise=0.1)], TypeError, "of one channel"),
     (lambda: [KalmanController(KFOPC(7), S)], ValueError, r"controllers\[0\] has steps of its own in Python"),
