@@ -42,7 +42,8 @@ typedef struct {
     const int32_t *limiter_windows; /* (S, J) samples of each limiter's window; NULL without limiters */
     const anc_real *path;           /* (K, J, M) estimated secondary paths */
     const anc_real *guard;          /* (G) filter W; NULL without */
-    const anc_real *settings;       /* the algorithm's own in its order: one number each, or as many as `each` says */
+    const anc_real *settings;       /* the algorithm's own in its order: one number each, or as many as `each` says. NULL:
+                                     * each at its least, if only the shape of a block is asked for */
 } anc_plan;
 
 typedef enum { ANC_ONE, ANC_EACH_LOUDSPEAKER, ANC_EACH_MICROPHONE } anc_each;
@@ -61,7 +62,7 @@ typedef void anc_visitor(void *to, const char *name, anc_role role, anc_type typ
 /* A walk over the fields of a block: to measure it, to describe it, or to find them in memory. */
 typedef struct {
     char *memory; /* NULL: only measure */
-    size_t size;  /* so far; SIZE_MAX: more than a machine can address */
+    size_t size;  /* so far; SIZE_MAX: more than a machine can address, or than the algorithm takes */
     anc_visitor *visit;
     void *to;
 } anc_layout;
@@ -81,7 +82,7 @@ typedef struct {
 
 extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_optimal_leaky, anc_mov, anc_mov_fixed, anc_two_gradient,
     anc_clipping, anc_rescaling, anc_kalman, anc_diagonal, anc_fast_array, anc_finite_memory, anc_repaired,
-    anc_signals_alone;
+    anc_power_budget, anc_signals_alone;
 
 /* Bytes of a block; 0 if its shape is refused: a count below 1, or too large. */
 ANC_PUBLIC size_t anc_size(const anc_algorithm *algorithm, const anc_plan *plan);

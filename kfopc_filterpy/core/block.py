@@ -215,6 +215,8 @@ class Block:
         self._library: Any = load().held
         keep = self._plan_arrays(path, settings, guard)
         self._require_sizes(keep, memory is None)
+        if memory is not None:
+            keep["settings"] = self._settings_in(memory, keep)
         plan = _plan_of(shape, keep)
         of = ctypes.byref
         self._library.anc_size.restype = ctypes.c_size_t
@@ -270,8 +272,24 @@ class Block:
             "limiter_windows": np.array(shape.limiter_windows, np.int32),
             "path": np.array([] if path is None else path, np.float64, order="C"),
             "guard": np.array([] if guard is None else guard, np.float64),
-            "settings": np.concatenate([*values, np.zeros(1)]),
+            "settings": np.concatenate([*values, np.zeros(1)]) if settings else np.array([]),
         }
+
+    def _settings_in(self, memory: NDArray[np.uint8], arrays: dict[str, np.ndarray]) -> np.ndarray:
+        """Return the settings of a block, on which the size of the fields after them may depend."""
+        found: dict[bytes, NDArray[np.float64]] = {}
+
+        def keep(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
+            if role == _SETTING:
+                found[name] = memory[offset : offset + 8 * axes[3]]
+
+        plan = _plan_of(self.shape, {**arrays, "settings": np.array([])})
+        self._library.anc_describe(ctypes.c_void_p(self.algorithm.pointer), ctypes.byref(plan), VISITOR(keep), None)
+        values = [found.get(name.encode(), memory[:0]) for name, _ in self.algorithm.settings]
+        expected = sum(8 * (getattr(self.shape, each) if each else 1) for _, each in self.algorithm.settings)
+        if sum(value.size for value in values) != expected:
+            raise ValueError(f"the memory of {memory.size} bytes is not that of a controller of {self.shape}")
+        return np.concatenate([*(value.view(np.float64) for value in values), np.zeros(1)])
 
     def _require_sizes(self, arrays: Mapping[str, np.ndarray], fresh: bool) -> None:
         """Raise ValueError if the core would see another shape, or read beyond an array."""
@@ -280,7 +298,7 @@ class Block:
             raise ValueError(f"a controller of this size cannot be made: {shape}")
         sizes: dict[str, tuple[int, ...]] = dict.fromkeys(("power_windows", "limiter_windows"), (0, loudspeakers))
         if fresh:
-            if self.algorithm.settings and arrays["settings"].size == 1:
+            if self.algorithm.settings and not arrays["settings"].size:
                 raise ValueError(
                     f"{self.algorithm.name} needs its settings {[one.name for one in self.algorithm.settings]}"
                 )

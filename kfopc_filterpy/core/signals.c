@@ -47,7 +47,7 @@ static int32_t longest(const int32_t *lengths, int32_t n)
     return most;
 }
 
-void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at)
+static void layout_all(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at, int with_filtered)
 {
     const int32_t S = p->scenarios, K = p->microphones, J = p->loudspeakers, I = p->references;
     const int32_t L = p->taps, M = p->path_taps, G = p->guard_taps;
@@ -61,7 +61,7 @@ void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, 
     for (int i = 0; settings[i].name; i++) s->setting[i] = reals(at, settings[i].name, ANC_SETTING, 1, 1, 1, numbers_of(settings + i, p));
     s->amplifier = (anc_amplifier *)reals(at, "amplifier", ANC_SETTING, 1, S, J, COLUMNS(anc_amplifier));
     s->x = layout_lines(at, "reference", "reference_at", 1, 1, I, filtered + M + ANC_GUARD_TAPS - 2);
-    s->filtered = layout_lines(at, "filtered_reference", "filtered_reference_at", K, J, I, filtered);
+    s->filtered = layout_lines(at, "filtered_reference", "filtered_reference_at", with_filtered ? K : 0, J, I, filtered);
     s->guarded = layout_lines(at, "guarded_reference", "guarded_reference_at", G ? K : 0, J, I, L);
     s->y = layout_lines(at, "output", "output_at", 1, S, J, M);
     s->weights = reals(at, "weights", ANC_STATE, S, J, I, L);
@@ -78,6 +78,9 @@ void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, 
     s->squares = reals(at, "squares", ANC_SCRATCH, 1, S, J, ANC_POWERS);
     s->step = reals(at, "step", ANC_SCRATCH, 1, S, J, STEPS);
 }
+
+void layout_signals(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at) { layout_all(s, p, settings, at, 1); }
+void layout_unfiltered(signals *s, const anc_plan *p, const anc_setting *settings, anc_layout *at) { layout_all(s, p, settings, at, 0); }
 
 /* Set the loudest reference, so that nothing that is filtered from it overflows. */
 static void set_loudest(signals *s)
@@ -131,7 +134,7 @@ int take_reference(signals *s, const real *reference)
     advance(&s->x), advance(&s->filtered);
     if (s->G) advance(&s->guarded);
     for (int32_t i = 0; i < s->I; i++) *newest(&s->x, i) = reference[i];
-    for (int32_t kj = 0; kj < s->K * s->J; kj++)
+    for (int32_t kj = 0; s->filtered.rows && kj < s->K * s->J; kj++)
         for (int32_t i = 0; i < s->I; i++) {
             const int32_t row = kj * s->I + i;
             *newest(&s->filtered, row) = dot(s->path + times(kj, s->M), newest(&s->x, i), s->M); /* x' = s^ * x */
@@ -298,7 +301,7 @@ int64_t anc_listen(const anc_algorithm *a, anc_view *view, const real *x, const 
 void anc_refilter(anc_view *view)
 {
     signals *s = (signals *)view;
-    for (int32_t kj = 0; kj < s->K * s->J; kj++)
+    for (int32_t kj = 0; s->filtered.rows && kj < s->K * s->J; kj++)
         for (int32_t i = 0; i < s->I; i++) {
             real *filtered = newest(&s->filtered, kj * s->I + i);
             for (int32_t n = 0; n < s->filtered.taps; n++) filtered[n] = dot(s->path + times(kj, s->M), newest(&s->x, i) + n, s->M);

@@ -63,6 +63,7 @@ real *reals(anc_layout *at, const char *name, anc_role role, int32_t n0, int32_t
 int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n);
 int32_t numbers_of(const anc_setting *setting, const anc_plan *plan); /* how many a setting has */
 void layout_signals(signals *s, const anc_plan *plan, const anc_setting *settings, anc_layout *at);
+void layout_unfiltered(signals *s, const anc_plan *plan, const anc_setting *settings, anc_layout *at); /* without x' */
 void start_signals(signals *s, const anc_plan *plan, const anc_setting *settings);
 
 /* The same as functions of an algorithm, and the usual control signal: the weights' output. */

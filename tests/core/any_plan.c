@@ -92,18 +92,19 @@ int main(int argc, char **argv)
         plan.power_windows = below(2) ? windows[0] : NULL;
         plan.limiter_windows = plan.limited ? windows[1] : NULL;
         if (plan.loudspeakers > MOST || plan.scenarios > MOST) plan.power_windows = plan.limiter_windows = NULL, plan.limited = 0;
-        const size_t bytes = anc_size(a, &plan);
-        if (!bytes || bytes > 1 << 22) continue; /* refused, or as large as a test should be */
-        const int32_t taps = plan.microphones * plan.loudspeakers * plan.path_taps;
         anc_real settings[8 * (MOST + 1)], *value = settings;
-        if (plan.scenarios > MOST || plan.loudspeakers > MOST || plan.microphones > MOST) continue;
-        for (int s = 0; a->settings[s].name; s++)
+        const int few = plan.scenarios <= MOST && plan.loudspeakers <= MOST && plan.microphones <= MOST;
+        for (int s = 0; few && a->settings[s].name; s++)
             for (int32_t n = 0; n < numbers(a->settings + s, &plan); n++) *value++ = tidy ? algorithms[number].settings[s] : any();
+        plan.settings = few ? settings : NULL; /* the size may depend on them */
+        const size_t bytes = anc_size(a, &plan);
+        if (!bytes || bytes > 1 << 22 || !few) continue; /* refused, or as large as a test should be */
+        const int32_t taps = plan.microphones * plan.loudspeakers * plan.path_taps;
         anc_real *path = malloc(sizeof *path * (size_t)taps), *guard = malloc(sizeof *guard * (size_t)(plan.guard_taps + 1));
         if (!path || !guard) return 2;
         for (int32_t n = 0; n < taps; n++) path[n] = tidy ? noise() : mostly_noise();
         for (int32_t n = 0; n < plan.guard_taps; n++) guard[n] = tidy ? noise() : mostly_noise();
-        plan.path = path, plan.guard = guard, plan.settings = settings;
+        plan.path = path, plan.guard = guard;
         opened += run(a, &plan, bytes);
         free(path), free(guard);
     }

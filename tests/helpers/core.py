@@ -33,6 +33,13 @@ ALGORITHMS: dict[str, Mapping[str, float]] = {
     "diagonal": {"state_noise": 2.0**-20, "measurement_noise": 2.0**-7, "initial_variance": 2.0**-7},
     "fast_array": {"measurement_noise": 2.0**-4, "initial_variance": 2.0**-4, "forgetting": 1.0},
     "finite_memory": {"measurement_noise": 2.0**-4, "initial_variance": 2.0**-4, "memory": 64.0},
+    "power_budget": {
+        "rated_power": 2.0**-6,
+        "block": 16.0,
+        "averaging": 20.0,
+        "window": 1 - 2.0**-8,
+        "spread": 2.0**-2,
+    },
     "signals_alone": {},
 }
 

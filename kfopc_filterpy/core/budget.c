@@ -1,0 +1,547 @@
+/* KF-PB: a posterior of the plant, the control filter of least expected error, and one price of power a loudspeaker.
+ *
+ *     y = v * x            asked of the loudspeakers
+ *     e = p * x - s * y    heard by the microphones, and noise
+ *
+ * After every block of B samples, the posterior of p and s takes the block (plant.c). Then the filter of each loudspeaker in
+ * turn becomes the one of least expected error at the price of its power, (A + price R) v = b: A is the correlation of its
+ * filtered references, R that of the references, b theirs with what the others leave of the disturbance. N = L + M - 1 taps
+ * of a primary path are all that control can reach; `lags` is L + N. C_ab(l) = E[a(t) b(t - l)]. */
+#include "plant.h"
+#include <string.h>
+
+enum { RATED_POWER, BLOCK, AVERAGING, WINDOW, SPREAD };
+static const anc_setting budget_settings[] = {
+    {"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER}, {"block", 1, 65536, ANC_ONE}, {"averaging", 20, 100000, ANC_ONE},
+    {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
+
+static const real ACCOUNT = 0.5f;     /* the price falls by (1 - ACCOUNT)^16, about e^-8 at first, for a full account */
+static const real WORTHWHILE = (real)0.2; /* power that saves less than this share of the error is not spent */
+static const real NEAR = (real)0.005;/* of the power that a price is to yield */
+static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
+enum { SCALES = 4, TWICE = 2 };       /* what lasted t may go on for twice as long */
+enum { SHORTEST = 20 };               /* ... and for a twentieth of the averaging time */
+static const int32_t SCALE[SCALES + 1] = {1, 100, 40, 10, 4}; /* t: exponential windows of the averaging time over these */
+enum { NEWTON = 20 };                 /* steps */
+#ifdef ANC_FLOAT
+static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f, LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
+#else
+static const real LOUDEST_LEARNT = 1e50, LOUDEST_PLAYED = 1e100, LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
+#endif
+
+enum { FILLED, MISSING, ASKED, HEARD, BUDGET_COUNTS }; /* samples of the block; flags of the block; samples of all blocks */
+
+typedef struct {
+    signals s;
+    plant plant;
+    int32_t T, lags;             /* blocks of the account */
+    real *x, *y, *errors;        /* (I, history), (J, history), (K, B), newest first */
+    real *asked;                 /* (2, J) now; sum of squares of the block */
+    int32_t *counts;
+    real *R, *short_R;           /* (I, I, lags), (SCALES, I, I, L) windowed sums of x_i(t) x_a(t - l) */
+    real *weight;                /* (1 + SCALES) of these windows */
+    real *book;                  /* (T, J) power of each block over the rating, newest first */
+    real *price, *steady;        /* (J); (2, J) the price that spends the rating, and that price as it is held */
+    real *error;                 /* (1) expected, summed over microphones */
+    real *C;                     /* (I, I, 2 lags - 1) of the references, both signs of l */
+    real *A;                     /* (J, I, J, I, 2L - 1) of the filtered references */
+    real *b;                     /* (J, I, L) of these with d */
+    real *sums;                  /* (I, I, 2L - 1) A + price R of one loudspeaker */
+    real *predictors;            /* (L rows of I, I, 1 to L) see `factorise` */
+    real *forward;               /* (I, I, L) */
+    real *small;                 /* (L + 6, I, I) see `factorise` */
+    real *vectors;               /* (VECTORS_OF_TAPS, I, L) */
+    real *work;                  /* (WORKS, width) */
+    int32_t width;
+} budget;
+
+enum { REST, BELOW, SOLUTION, PLAYED, VECTORS_OF_TAPS };
+enum { WORKS = SCALES + 2 };
+
+/* Layout. */
+
+/* Return whether the algorithm takes the plan, so that all products of counts below fit into an int32. */
+static int takes(const anc_plan *p, real block, real averaging)
+{
+    const double most = 1 << 28, K = p->microphones, J = p->loudspeakers, I = p->references, L = p->taps, M = p->path_taps;
+    const double N = L + M - 1, n = I * N + J * M, B = block, T = averaging;
+    if (p->guard_taps || p->scenarios != 1 || !(B >= 1 && B <= 65536 && T >= 20 && T <= 100000)) return 0;
+    return n <= 1 << 14 && K * n <= most && J * T <= most && J * J * I * I * 2 * L <= most && (I + J + K) * (2 * L + M + B) <= most &&
+           I * I * L * L <= most && I * I * 5 * (L + N) <= most && K * J * M <= most && J * J * 2 * M <= most && I * J * 2 * N <= most;
+}
+
+static void layout_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+{
+    typedef char fits_into_a_view[sizeof(budget) <= sizeof(anc_view) ? 1 : -1];
+    budget *f = (budget *)view;
+    signals *s = &f->s;
+    const int32_t J = plan->loudspeakers;
+    const real *own = plan->settings ? plan->settings + J : NULL; /* after the rated powers */
+    const real block = own ? own[BLOCK - 1] : 1, averaging = own ? own[AVERAGING - 1] : SHORTEST;
+    (void)sizeof(fits_into_a_view);
+    if (!takes(plan, block, averaging)) {
+        at->size = SIZE_MAX;
+        return;
+    }
+    layout_unfiltered(s, plan, settings, at);
+    layout_posterior(&f->plant, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
+    const int32_t I = s->I, L = s->L, N = f->plant.N, H = f->plant.history, lags = L + N;
+    f->T = (int32_t)averaging, f->lags = lags, f->width = 2 * lags + f->plant.B;
+    f->x = reals(at, "reference_history", ANC_STATE, 1, 1, I, H);
+    f->y = reals(at, "output_history", ANC_STATE, 1, 1, J, H);
+    f->errors = reals(at, "block_errors", ANC_STATE, 1, 1, s->K, f->plant.B);
+    f->asked = reals(at, "asked", ANC_STATE, 1, 1, 2, J);
+    f->counts = int32s(at, "budget_counts", ANC_STATE, BUDGET_COUNTS);
+    f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
+    f->short_R = reals(at, "short_correlations", ANC_STATE, SCALES, I, I, L);
+    f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 1 + SCALES);
+    f->book = reals(at, "book", ANC_STATE, 1, 1, f->T, J);
+    f->price = reals(at, "price", ANC_STATE, 1, 1, 1, J);
+    f->steady = reals(at, "steady_price", ANC_STATE, 1, 1, 2, J);
+    f->error = reals(at, "expected_error", ANC_STATE, 1, 1, 1, 1);
+    f->C = reals(at, "two_sided", ANC_SCRATCH, 1, I, I, 2 * lags - 1);
+    f->A = reals(at, "filtered_correlation", ANC_SCRATCH, J * I, J, I, 2 * L - 1);
+    f->b = reals(at, "with_disturbance", ANC_SCRATCH, 1, J, I, L);
+    f->sums = reals(at, "priced", ANC_SCRATCH, 1, I, I, 2 * L - 1);
+    f->predictors = reals(at, "predictors", ANC_SCRATCH, I, I, L + 1, (L + 1) / 2);
+    f->forward = reals(at, "forward_predictor", ANC_SCRATCH, 1, I, I, L);
+    f->small = reals(at, "small_matrices", ANC_SCRATCH, 1, L + 6, I, I);
+    f->vectors = reals(at, "vectors", ANC_SCRATCH, 1, VECTORS_OF_TAPS, I, L);
+    f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, WORKS, f->width);
+}
+
+static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings)
+{
+    budget *f = (budget *)view;
+    start_signals(&f->s, plan, settings);
+    start_posterior(&f->plant, *f->s.setting[SPREAD]);
+    for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* full before the start */
+}
+
+/* Return g^n. */
+static real raised(real g, int32_t n)
+{
+    real power = 1;
+    for (; n; n /= 2, g *= g)
+        if (n % 2) power *= g;
+    return power;
+}
+
+static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
+static real *taps_of(const budget *f, int32_t number) { return f->vectors + times(number, f->s.I * f->s.L); }
+
+/* Toeplitz systems. The blocks of a matrix are given by their lags, (I, I, 2L - 1) at some stride: T(l)_ic, l from 1 - L up,
+ * is the block m - l = that lag to the right of the diagonal. T(-l) = T(l)'. */
+
+typedef struct {
+    budget *f;
+    const real *A, *R; /* at lag 1 - L of their first elements */
+    size_t next_A, row_A, next_R, row_R;
+    const real *b;     /* (I, L) */
+    real scale;
+} toeplitz_system;
+
+/* Set to_i = sum_c T_ic v_c. */
+static void multiply_toeplitz(const budget *f, real *to, const real *T, size_t row, size_t next, const real *v)
+{
+    const int32_t I = f->s.I, L = f->s.L;
+    real *part = work_row(f, 0);
+    memset(to, 0, sizeof(real) * times(I, L));
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t c = 0; c < I; c++) {
+            real *restrict sums = to + times(i, L);
+            correlate(part, v + times(c, L), L, T + row * (size_t)i + next * (size_t)c, L); /* from the last tap to the first */
+            for (int32_t l = 0; l < L; l++) sums[l] += part[L - 1 - l];
+        }
+}
+
+/* Factorise the lower triangle of a small matrix, I by I, in place, with the inverse of the diagonal in its place. Return 0 if
+ * it is not positive definite. */
+static int factorise_small(real *C, int32_t I)
+{
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t c = 0; c <= i; c++) {
+            real sum = C[i * I + c];
+            for (int32_t k = 0; k < c; k++) sum -= C[i * I + k] * C[c * I + k];
+            if (c < i) C[i * I + c] = sum * C[c * I + c];
+            else if (!(sum > 0 && isfinite(sum))) return 0;
+            else C[i * I + i] = 1 / root(sum);
+        }
+    return 1;
+}
+
+/* Solve C z = z; then C' z = z. */
+static void forward_small(const real *C, real *z, int32_t I, int32_t stride)
+{
+    for (int32_t i = 0; i < I; i++) {
+        for (int32_t k = 0; k < i; k++) z[i * stride] -= C[i * I + k] * z[k * stride];
+        z[i * stride] *= C[i * I + i];
+    }
+}
+
+static void backward_small(const real *C, real *z, int32_t I, int32_t stride)
+{
+    for (int32_t i = I - 1; i >= 0; i--) {
+        for (int32_t k = i + 1; k < I; k++) z[i * stride] -= C[k * I + i] * z[k * stride];
+        z[i * stride] *= C[i * I + i];
+    }
+}
+
+/* The backward predictor B of order m, (I, I, m + 1). */
+static real *predictor_of(const budget *f, int32_t m) { return f->predictors + times(f->s.I, f->s.I) * (times(m, m + 1) / 2); }
+static real *factor_of(const budget *f, int32_t m) { return f->small + times(m, f->s.I * f->s.I); }
+
+/* Factorise T = A + price R by Whittle's recursion; return 0 if it is not positive definite.
+ *
+ * For the first m + 1 blocks T_m of T: T_m B_m = [0, ..., 0, E], T_m F = [D, 0, ..., 0], where the last block of B_m and the
+ * first of F are 1. So T^-1 = sum_m B_m E_m^-1 B_m'. With Delta = sum_k T(k - m - 1) F_k:
+ *     F  = [F, 0] - [0, B] E^-1 Delta      D = D - Delta' E^-1 Delta
+ *     B  = [0, B] - [F, 0] D^-1 Delta'     E = E - Delta D^-1 Delta'                                        */
+static int factorise(const toeplitz_system *t, real price)
+{
+    const budget *f = t->f;
+    const int32_t I = f->s.I, L = f->s.L, lags = 2 * L - 1, square = I * I;
+    real *D = factor_of(f, L), *E = D + square, *Delta = E + square, *P = Delta + square, *Q = P + square;
+    real *F = f->forward, *B = predictor_of(f, 0);
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t c = 0; c < I; c++) {
+            const real *A = t->A + t->row_A * (size_t)i + t->next_A * (size_t)c, *R = t->R + t->row_R * (size_t)i + t->next_R * (size_t)c;
+            real *restrict T = f->sums + times(i * I + c, lags);
+            for (int32_t l = 0; l < lags; l++) T[l] = A[l] + price * R[l];
+            if (i == c) T[L - 1] = A[L - 1] * (1 + REGULAR) + price * R[L - 1];
+            D[i * I + c] = E[i * I + c] = T[L - 1];
+            F[times(i * I + c, L)] = B[i * I + c] = i == c;
+        }
+    for (int32_t m = 0;; m++) {
+        real *C = factor_of(f, m), *next = predictor_of(f, m + 1);
+        memcpy(C, E, sizeof(real) * (size_t)square);
+        if (!factorise_small(C, I)) return 0;
+        if (m == L - 1) return 1;
+        for (int32_t i = 0; i < I; i++)
+            for (int32_t c = 0; c < I; c++) {
+                real sum = 0;
+                for (int32_t k = 0; k < I; k++) sum += dot(f->sums + times(i * I + k, lags) + (L - 2 - m), F + times(k * I + c, L), m + 1);
+                Delta[i * I + c] = P[i * I + c] = Q[c * I + i] = sum;
+            }
+        for (int32_t c = 0; c < I; c++) forward_small(C, P + c, I, I), backward_small(C, P + c, I, I);
+        real *of_D = factor_of(f, L + 5);
+        memcpy(of_D, D, sizeof(real) * (size_t)square);
+        if (!factorise_small(of_D, I)) return 0;
+        for (int32_t c = 0; c < I; c++) forward_small(of_D, Q + c, I, I), backward_small(of_D, Q + c, I, I);
+        for (int32_t i = 0; i < I; i++)
+            for (int32_t c = 0; c < I; c++) {
+                real *restrict to = next + times(i * I + c, m + 2);
+                to[0] = 0;
+                memcpy(to + 1, B + times(i * I + c, m + 1), sizeof(real) * (size_t)(m + 1));
+                for (int32_t k = 0; k < I; k++) {
+                    add_scaled(to, -Q[k * I + c], F + times(i * I + k, L), m + 1);
+                    E[i * I + c] -= Delta[i * I + k] * Q[k * I + c];
+                    D[i * I + c] -= Delta[k * I + i] * P[k * I + c];
+                }
+            }
+        for (int32_t i = 0; i < I; i++)
+            for (int32_t c = 0; c < I; c++) {
+                real *to = F + times(i * I + c, L);
+                to[m + 1] = 0;
+                for (int32_t k = 0; k < I; k++) add_scaled(to + 1, -P[k * I + c], B + times(i * I + k, m + 1), m + 1);
+            }
+        B = next;
+    }
+}
+
+/* Set v to T^-1 u; return u'T^-1 u. */
+static real solve_factorised(const budget *f, const real *u, real *v)
+{
+    const int32_t I = f->s.I, L = f->s.L;
+    real *z = factor_of(f, L), energy = 0;
+    if (v) memset(v, 0, sizeof(real) * times(I, L));
+    for (int32_t m = 0; m < L; m++) {
+        const real *B = predictor_of(f, m), *C = factor_of(f, m);
+        for (int32_t c = 0; c < I; c++) {
+            z[c] = 0;
+            for (int32_t i = 0; i < I; i++) z[c] += dot(B + times(i * I + c, m + 1), u + times(i, L), m + 1);
+        }
+        forward_small(C, z, I, 1);
+        for (int32_t c = 0; c < I; c++) energy += z[c] * z[c];
+        if (!v) continue;
+        backward_small(C, z, I, 1);
+        for (int32_t i = 0; i < I; i++)
+            for (int32_t c = 0; c < I; c++) add_scaled(v + times(i, L), z[c], B + times(i * I + c, m + 1), m + 1);
+    }
+    return energy;
+}
+
+/* Set v to the filter at a price, u to R v, and return its power; 0 and no filter if there is no solution. */
+static real power_at(const toeplitz_system *t, real price, real *v, real *u, int *solved)
+{
+    const budget *f = t->f;
+    const int32_t n = f->s.I * f->s.L;
+    *solved = factorise(t, price);
+    if (*solved) {
+        solve_factorised(f, t->b, v);
+        for (int32_t i = 0; i < n; i++) *solved = *solved && within(v[i], LARGEST_TAP);
+    }
+    if (!*solved) {
+        memset(v, 0, sizeof(real) * (size_t)n);
+        return 0;
+    }
+    multiply_toeplitz(f, u, t->R, t->row_R, t->next_R, v);
+    return dot(v, u, n);
+}
+
+/* Return the least price >= 0 at which the filter takes at most `power`; set v to it. power^-1/2 is a concave function of the
+ * price, nearly a line, so Newton's steps approach from below. */
+static real price_of(const toeplitz_system *t, real power, real start, real *v)
+{
+    real price = start < 1e6f * t->scale ? start : 0, *u = taps_of(t->f, PLAYED);
+    int solved = 0;
+    for (int n = 0; n < NEWTON; n++) {
+        const real taken = power_at(t, price, v, u, &solved);
+        if (!solved) {
+            const real least = (real)1e-6 * t->scale;
+            price = 2 * price > least ? 2 * price : least;
+            continue;
+        }
+        const real away = taken - power;
+        if (within(away, NEAR * power) || (price == 0 && taken <= power)) break;
+        const real slope = solve_factorised(t->f, u, NULL);
+        if (!(slope > 0)) break;
+        /* power^-1/2 has the slope taken^-3/2 u' T^-1 u */
+        price = largest(price + taken * (root(taken / power) - 1) / slope, 0);
+    }
+    return price;
+}
+
+/* The references. */
+
+/* Add the block to the windows of the references; x is zero before the first, so they are positive definite. */
+static void take_references(budget *f)
+{
+    const int32_t I = f->s.I, L = f->s.L, B = f->plant.B, H = f->plant.history;
+    real g[SCALES + 1], fade[SCALES + 1];
+    for (int c = 0; c <= SCALES; c++) g[c] = raised(*f->s.setting[WINDOW], SCALE[c]), fade[c] = raised(g[c], B);
+    for (int32_t i = 0; i < I; i++) {
+        const real *u = f->x + times(i, H);
+        real share[SCALES + 1] = {1, 1, 1, 1, 1}, sum[SCALES + 1] = {0};
+        for (int32_t t = 0; t < B; t++)
+            for (int c = 0; c <= SCALES; c++) work_row(f, c)[t] = share[c] * u[t], sum[c] += share[c], share[c] *= g[c];
+        for (int c = 0; c <= SCALES; c++) {
+            const int32_t lags = c ? L : f->lags;
+            real *sums = work_row(f, WORKS - 1);
+            for (int32_t a = 0; a < I; a++) {
+                real *restrict R = c ? f->short_R + times(((c - 1) * I + i) * I + a, L) : f->R + times(i * I + a, lags);
+                correlate(sums, work_row(f, c), B, f->x + times(a, H), lags);
+                for (int32_t l = 0; l < lags; l++) R[l] = fade[c] * R[l] + sums[l];
+            }
+            if (i == 0) f->weight[c] = fade[c] * f->weight[c] + sum[c];
+        }
+    }
+}
+
+/* Set C to the correlations of the references at both signs of l, tapered. */
+static void correlate_references(budget *f)
+{
+    const int32_t I = f->s.I, lags = f->lags;
+    const real g = root(*f->s.setting[WINDOW]), weight = *f->weight;
+    for (int32_t i = 0; i < I; i++)
+        for (int32_t a = 0; a < I; a++) {
+            const real *R = f->R + times(i * I + a, lags), *other = f->R + times(a * I + i, lags);
+            real *C = f->C + times(i * I + a, 2 * lags - 1) + (lags - 1), taper = 1;
+            for (int32_t l = 0; l < lags; l++, taper *= g) C[l] = R[l] / weight * taper, C[-l] = other[l] / weight * taper;
+        }
+}
+
+/* The account. */
+
+/* Return TWICE T / scale, rounded to the nearest, halves to the even one, and at least `least`. */
+static int32_t lasting(int32_t T, int32_t scale, int32_t least)
+{
+    const int32_t whole_blocks = TWICE * T / scale, rest = TWICE * T % scale;
+    const int32_t rounded = whole_blocks + (2 * rest > scale || (2 * rest == scale && whole_blocks % 2));
+    return rounded > least ? rounded : least;
+}
+
+/* Return the largest share of its power that the account of loudspeaker j stands, for the filter v: it must stand it if the
+ * last t goes on for twice as long, for every t. */
+static real share_of(const budget *f, int32_t j, const real *v)
+{
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, T = f->T, B = f->plant.B, least = T / SHORTEST;
+    real power[SCALES + 1] = {0}, spent = 0, share = 0;
+    int32_t blocks[SCALES + 1] = {least};
+    real *y = work_row(f, 0), *part = work_row(f, 1), *wide = work_row(f, 2);
+    memset(y, 0, sizeof(real) * (size_t)B);
+    for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, f->x + times(i, f->plant.history), B), add_to(y, part, B);
+    power[0] = dot(y, y, B) / (real)B;
+    for (int c = 1; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
+    for (int32_t a = 0; a < I; a++) {
+        memcpy(wide, v + times(a, L), sizeof(real) * (size_t)L);
+        memset(wide + L, 0, sizeof(real) * (size_t)L);
+        for (int32_t i = 0; i < I; i++) {
+            correlate(part, v + times(i, L), L, wide, L); /* sum_m v_a(m + l) v_i(m) */
+            for (int c = 1; c <= SCALES; c++) {
+                /* E[y^2] = sum_l (v_i ~ v_a)(l) C_ia(l), with both signs of l in the two orders of i and a */
+                const real *R = f->short_R + times(((c - 1) * I + i) * I + a, L), g = raised(root(*f->s.setting[WINDOW]), SCALE[c]);
+                real taper = g, sum = 0;
+                for (int32_t l = 1; l < L; l++, taper *= g) sum += taper * R[l] * part[l];
+                power[c] += (part[0] * R[0] + 2 * sum) / f->weight[c];
+            }
+        }
+    }
+    for (int32_t t = 0; t <= T; t++) {
+        for (int c = 0; c <= SCALES; c++) {
+            const int32_t n = blocks[c];
+            if (t != T - n) continue;
+            const real left = largest((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / largest(power[c], LEAST_POWER);
+            if (share == 0 || left < share) share = left;
+        }
+        if (t < T) spent += f->book[times(t, J) + (size_t)j];
+    }
+    return share;
+}
+
+/* Set the price of loudspeaker j, and its filter at that price, given what the others leave. */
+static void spend(budget *f, int32_t j, const real *rest, real left)
+{
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
+    const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
+    const real rated = f->s.setting[RATED_POWER][j];
+    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * largest(left, 0);
+    toeplitz_system t = {f, f->A + times(j * I * J + j, I) * row, f->C + (f->lags - L), row, times(J, I) * row, row_C, times(I, 1) * row_C, rest, 0};
+    int solved;
+    t.scale = t.A[L - 1] / t.R[L - 1];
+    /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
+    f->steady[j] = price_of(&t, rated, f->steady[j], v);
+    f->steady[J + j] = largest(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
+    /* 3 What the account holds makes power cheaper, 4 but none that saves little of the error. */
+    for (int n = 0; n < 4; n++) account *= account;
+    real price = largest(f->steady[J + j] * account, WORTHWHILE * *f->error / (rated * (real)J));
+    const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
+    /* 5 The account must stand it. */
+    const real share = power > 0 ? share_of(f, j, v) : 1;
+    if (share < 1) price = price_of(&t, share * power, price, v);
+    f->price[j] = price;
+    memcpy(weights_of(&f->s, j), v, sizeof(real) * times(I, L));
+}
+
+/* The correlations of the filtered references, and with the disturbance. */
+static void correlate_filtered(budget *f)
+{
+    const plant *p = &f->plant;
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, M = f->s.M, N = p->N, middle = f->lags - 1, lags = 2 * L - 1, both = 2 * f->lags - 1;
+    real *part = work_row(f, 0);
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t i = 0; i < I; i++) {
+            for (int32_t a = 0; a <= j; a++)
+                for (int32_t c = 0; c < (a < j ? I : i + 1); c++) {
+                    /* E[x'_ji(t) x'_ac(t - l)] = sum_u (s_j ~ s_a)(u) C_ic(l - u); (s_a ~ s_j)(u) = (s_j ~ s_a)(-u) */
+                    real *A = f->A + times((j * I + i) * J * I + a * I + c, lags), *other = f->A + times((a * I + c) * J * I + j * I + i, lags);
+                    const int32_t from = other == A ? L - 1 : 0; /* the lags of one signal with itself are symmetric */
+                    correlate(A + from, p->ss + times(a * J + j, 2 * M - 1), 2 * M - 1, f->C + times(i * I + c, both) + (middle - L - M + 2 + from), lags - from);
+                    for (int32_t l = from ? L : 0; l < lags; l++) other[lags - 1 - l] = A[l];
+                }
+            real *b = f->b + times(j * I + i, L);
+            memset(b, 0, sizeof(real) * (size_t)L);
+            for (int32_t c = 0; c < I; c++) { /* E[d(t) x'_ji(t - l)] = sum_u (p_c ~ s_j)(u) C_ci(l - u) */
+                correlate(part, p->ps + times(c * J + j, N + M - 1), N + M - 1, f->C + times(c * I + i, both) + (middle - N + 1), L);
+                add_to(b, part, L);
+            }
+        }
+}
+
+/* Give each loudspeaker in turn the filter of least expected error at its price, given the others'. */
+static void solve_all(budget *f)
+{
+    const int32_t I = f->s.I, J = f->s.J, L = f->s.L, N = f->plant.N, n = I * L;
+    const size_t row = (size_t)(2 * L - 1), row_A = times(J, I) * row;
+    real *rest = taps_of(f, REST), *below = taps_of(f, BELOW), *part = taps_of(f, PLAYED), q = 0, error;
+    if (f->plant.counts[STALE]) expect(&f->plant);
+    correlate_references(f);
+    correlate_filtered(f);
+    for (int32_t k = 0; k < f->s.K; k++) q += f->plant.q[k];
+    error = q;
+    for (int32_t i = 0; i < I; i++) /* E[d^2] */
+        for (int32_t a = 0; a < I; a++)
+            error += dot(f->plant.pp + times(i * I + a, 2 * N - 1), f->C + times(a * I + i, 2 * f->lags - 1) + (f->lags - N), 2 * N - 1);
+    for (int32_t j = 0; j < J; j++) {
+        real left = 0;
+        for (int32_t t = 0; t < f->T; t++) left += f->book[times(t, J) + (size_t)j];
+        left = 1 - left / (real)f->T;
+        memset(below, 0, sizeof(real) * (size_t)n);
+        memcpy(rest, f->b + times(j, n), sizeof(real) * (size_t)n);
+        for (int32_t a = 0; a < J; a++) {
+            if (a == j) continue;
+            multiply_toeplitz(f, part, f->A + times(j * I * J + a, I) * row, row_A, row, weights_of(&f->s, a));
+            if (a < j) add_to(below, part, n);
+            add_scaled(rest, -1, part, n);
+        }
+        spend(f, j, rest, left);
+        /* |sum_j x'_j'w_j|^2 and its product with d */
+        const real *w = weights_of(&f->s, j);
+        multiply_toeplitz(f, part, f->A + times(j * I * J + j, I) * row, row_A, row, w);
+        error += dot(w, part, n) + 2 * dot(w, below, n) - 2 * dot(w, f->b + times(j, n), n);
+    }
+    *f->error = largest(error, q);
+}
+
+/* A sample. */
+
+static void end_block(budget *f)
+{
+    const int32_t I = f->s.I, J = f->s.J, B = f->plant.B, H = f->plant.history;
+    const real heard = (real)f->counts[HEARD], forget = root(raised(*f->s.setting[WINDOW], B));
+    take_references(f);
+    if (f->counts[ASKED]) {
+        memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
+        for (int32_t j = 0; j < J; j++) f->book[j] = f->asked[J + j] / (real)B / f->s.setting[RATED_POWER][j];
+    }
+    if (!f->counts[MISSING] && f->counts[HEARD] >= f->plant.N)
+        learn(&f->plant, f->x, f->y, f->errors, forget, heard >= (real)B * (real)f->T / 10);
+    if (f->counts[HEARD] < 1 << 30) f->counts[HEARD] += B;
+    if (*f->plant.fits) solve_all(f);
+    f->counts[FILLED] = f->counts[MISSING] = f->counts[ASKED] = 0;
+    memset(f->asked + J, 0, sizeof(real) * (size_t)J);
+    for (int32_t i = 0; i < I; i++) memmove(f->x + times(i, H) + B, f->x + times(i, H), sizeof(real) * (size_t)(H - B));
+    for (int32_t j = 0; j < J; j++) memmove(f->y + times(j, H) + B, f->y + times(j, H), sizeof(real) * (size_t)(H - B));
+}
+
+/* Note a sample; at the end of a block, learn. */
+static int note(budget *f, const real *error, int controlled)
+{
+    const signals *s = &f->s;
+    const int32_t B = f->plant.B, H = f->plant.history, at = B - 1 - f->counts[FILLED];
+    for (int32_t i = 0; i < s->I; i++)
+        if (!within(*newest(&s->x, i), LOUDEST_LEARNT)) return ANC_LOUD_REFERENCE;
+    for (int32_t j = 0; j < s->J; j++)
+        if (!within(*newest(&s->y, j), LOUDEST_PLAYED) || !within(f->asked[j], LOUDEST_PLAYED)) return ANC_LOUD_REFERENCE;
+    for (int32_t k = 0; error && k < s->K; k++)
+        if (!within(error[k], LOUDEST_LEARNT)) return ANC_LOUD_ERROR;
+    for (int32_t i = 0; i < s->I; i++) f->x[times(i, H) + (size_t)at] = *newest(&s->x, i);
+    for (int32_t j = 0; j < s->J; j++) {
+        f->y[times(j, H) + (size_t)at] = *newest(&s->y, j);
+        if (controlled) f->asked[s->J + j] += f->asked[j] * f->asked[j];
+    }
+    for (int32_t k = 0; error && k < s->K; k++) f->errors[times(k, B) + (size_t)at] = error[k];
+    f->counts[MISSING] |= !error, f->counts[ASKED] |= controlled;
+    if (++f->counts[FILLED] == B) end_block(f);
+    return ANC_DONE;
+}
+
+static int control_signal_budget(anc_view *view, const real *reference, real *control)
+{
+    budget *f = (budget *)view;
+    signals *s = &f->s;
+    for (int32_t i = 0; i < s->I; i++)
+        if (!within(reference[i], LOUDEST_LEARNT)) return ANC_LOUD_REFERENCE;
+    const int refused = take_reference(s, reference);
+    for (int32_t j = 0; !refused && j < s->J; j++) {
+        f->asked[j] = filter_output(s, j);
+        emit(s, j, f->asked[j]);
+        control[j] = s->control[j];
+    }
+    return refused;
+}
+
+static int update_budget(anc_view *view, const real *error) { return note((budget *)view, error, 1); }
+static int listen_budget(anc_view *view, const real *error) { return note((budget *)view, error, 0); }
+
+const anc_algorithm anc_power_budget = {"KF-PB", budget_settings, layout_budget, start_budget, control_signal_budget, update_budget, listen_budget};

@@ -1,0 +1,515 @@
+#include "plant.h"
+#include <string.h>
+
+static const real UNKNOWN = 2;                          /* after an alarm: rms error of a secondary path, over the path */
+static const real KEPT = 4;                             /* after an alarm: the data of p count as so many samples a tap */
+static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
+enum { QUIET = 31 };                                    /* blocks from one alarm to the next, at least */
+static const double WORK = 67108864;                    /* operations of a factorisation in a block, 2^26 */
+
+/* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at once. */
+
+/* Set the next `vectors_at_once` WIDE sums. */
+static inline void sums_of(real *restrict to, const real *restrict a, int32_t n, const real *restrict b, const int vectors_at_once)
+{
+    vector sum[8];
+    for (int v = 0; v < vectors_at_once; v++) sum[v] = zero;
+    for (int32_t k = 0; k < n; k++)
+        for (int v = 0; v < vectors_at_once; v++) sum[v] += a[k] * vectors(b + k)[v];
+    for (int v = 0; v < vectors_at_once; v++) vectors_of(to)[v] = sum[v];
+}
+
+void correlate(real *restrict to, const real *restrict a, int32_t n, const real *restrict b, int32_t count)
+{
+    int32_t l = 0;
+    for (; l + 8 * WIDE <= count; l += 8 * WIDE) sums_of(to + l, a, n, b + l, 8);
+    for (; l + 4 * WIDE <= count; l += 4 * WIDE) sums_of(to + l, a, n, b + l, 4);
+    if (l < count && count >= 4 * WIDE) { /* the last ones, some of them again */
+        l = count - 4 * WIDE;
+        sums_of(to + l, a, n, b + l, 4);
+        return;
+    }
+    for (; l + WIDE <= count; l += WIDE) sums_of(to + l, a, n, b + l, 1);
+    for (; l < count; l++) {
+        real sum = 0;
+        for (int32_t k = 0; k < n; k++) sum += a[k] * b[l + k];
+        to[l] = sum;
+    }
+}
+
+/* Layout. */
+
+static int32_t whole(int32_t n) { return (n + PARTS - 1) / PARTS * PARTS; }
+
+/* G is the lower triangle, one row after the other, in groups of PARTS rows that all end with the group's last column. */
+static real *row_of_data(const plant *f, int32_t i)
+{
+    const int32_t group = i / PARTS;
+    return f->G + times(group, group + 1) * (PARTS * PARTS / 2) + times(i % PARTS, group + 1) * PARTS;
+}
+
+/* The factor has the same groups, each with its columns one after the other: a panel. */
+static real *panel_of(const plant *f, int32_t group) { return f->factor + times(group, group + 1) * (PARTS * PARTS / 2); }
+
+void layout_posterior(plant *f, const signals *s, int32_t block, int exact, anc_layout *at)
+{
+    const int32_t K = s->K, J = s->J, I = s->I, M = s->M, N = s->L + M - 1, n = I * N + (exact ? 0 : J * M);
+    const int32_t groups = whole(n) / PARTS;
+    f->K = K, f->J = J, f->I = I, f->N = N, f->M = M, f->B = block, f->n = n, f->padded = whole(n), f->exact = exact;
+    f->history = s->L + N + block, f->delay = (int32_t)((double)n * n * n / 3 / WORK), f->width = 3 * N + block;
+    f->path = s->path;
+    f->numbers = (plant_numbers *)reals(at, "plant", ANC_STATE, 1, 1, 1, COLUMNS(plant_numbers));
+    f->counts = int32s(at, "plant_counts", ANC_STATE, PLANT_COUNTS);
+    f->fits = int32s(at, "fits", ANC_STATE, 1);
+    f->alarms = int32s(at, "alarms", ANC_STATE, 1);
+    f->theta = reals(at, "theta", ANC_STATE, 1, 1, K, n);
+    f->q = reals(at, "noise", ANC_STATE, 1, 1, 1, K);
+    f->draws = reals(at, "draws", ANC_STATE, 1, 1, exact ? 0 : DRAWS, n);
+    f->G = reals(at, "data", ANC_STATE, 1, groups, groups + 1, PARTS * PARTS / 2);
+    f->r = reals(at, "data_of_errors", ANC_STATE, 1, 1, K, n);
+    f->ee = reals(at, "error_energy", ANC_STATE, 1, 1, 1, K);
+    f->factor = reals(at, "factor", ANC_STATE, 1, groups, groups + 1, PARTS * PARTS / 2);
+    f->inverse = reals(at, "inverse_diagonal", ANC_STATE, 1, 1, 1, f->padded);
+    f->set_r = reals(at, "set_aside_of_errors", ANC_STATE, 1, 1, K, n);
+    f->set_ee = reals(at, "set_aside_energy", ANC_STATE, 1, 1, 1, K);
+    f->ss = reals(at, "path_correlation", ANC_STATE, 1, J, J, 2 * M - 1);
+    f->ps = reals(at, "cross_correlation", ANC_STATE, 1, I, J, N + M - 1);
+    f->pp = reals(at, "primary_correlation", ANC_STATE, 1, I, I, 2 * N - 1);
+    f->sides = reals(at, "right_sides", ANC_SCRATCH, 1, 1, f->padded + J * M, PARTS);
+    f->work = reals(at, "plant_work", ANC_SCRATCH, 1, 1, PLANT_ROWS, f->width);
+}
+
+static void return_to_prior(plant *f)
+{
+    const int32_t split = f->I * f->N, taps = f->n - split;
+    for (int32_t k = 0; taps && k < f->K; k++)
+        memcpy(f->theta + times(k, f->n) + split, f->path + times(k, taps), sizeof(real) * (size_t)taps);
+}
+
+void start_posterior(plant *f, real spread)
+{
+    f->numbers->spread = spread;
+    f->counts[RANDOM] = 1;
+    return_to_prior(f);
+}
+
+/* Return the mean of sum_m s(m)^2 over the secondary paths. */
+static real size_of_path(const plant *f)
+{
+    const int32_t paths = f->K * f->J;
+    real sum = 0;
+    for (int32_t kj = 0; kj < paths; kj++) sum += dot(f->path + times(kj, f->M), f->path + times(kj, f->M), f->M);
+    return sum / (real)paths;
+}
+
+static real mean_noise(const plant *f)
+{
+    real sum = 0;
+    for (int32_t k = 0; k < f->K; k++) sum += f->q[k];
+    return sum / (real)f->K;
+}
+
+static real *work_of(const plant *f, int32_t row) { return f->work + times(row, f->width); }
+
+/* A fit: theta = (G + q P)^-1 (r + q P mean), with the precision P of the prior. */
+
+/* Return the precision of element i. */
+static real precision_of(const plant *f, int32_t i, real size)
+{
+    return i < f->I * f->N ? f->numbers->prior : (real)f->M / (f->numbers->spread * f->numbers->spread * size);
+}
+
+/* Set aside the data of now for a factorisation. */
+static void begin_fit(plant *f)
+{
+    const int32_t split = f->I * f->N, n = f->n;
+    plant_numbers *known = f->numbers;
+    if (known->prior == 0) { /* |p|^2 is expected to be E[d^2] / E[x^2] */
+        real x2 = 0, e2 = 0;
+        for (int32_t i = 0; i < split; i++) x2 += row_of_data(f, i)[i];
+        for (int32_t k = 0; k < f->K; k++) {
+            if (!(f->ee[k] > 0)) return;
+            e2 += f->ee[k];
+        }
+        if (!(x2 > 0)) return;
+        known->prior = x2 * (real)f->K / e2;
+        for (int32_t k = 0; k < f->K; k++) f->q[k] = (real)1e-3 * f->ee[k] / known->samples;
+    }
+    for (int32_t group = 0; group < f->padded / PARTS; group++) {
+        const real *rows = row_of_data(f, group * PARTS);
+        real *panel = panel_of(f, group);
+        const int32_t columns = PARTS * (group + 1);
+        for (int32_t c = 0; c < columns; c++)
+            for (int32_t i = 0; i < PARTS; i++) panel[PARTS * c + i] = rows[times(i, columns) + (size_t)c];
+    }
+    memcpy(f->set_r, f->r, sizeof(real) * times(f->K, n));
+    memcpy(f->set_ee, f->ee, sizeof(real) * (size_t)f->K);
+    known->set_aside = known->fitted = known->samples;
+    f->counts[PENDING] = f->delay + 1, f->counts[GROUPS] = 0, f->counts[IDLE] = 0;
+}
+
+/* Set S_ji = sum_k P_kj Q_ki, k < n: a square of PARTS by PARTS sums, WIDE of its rows at a time. */
+static void multiply_panels(real S[PARTS * PARTS], const real *restrict P, const real *restrict Q, int32_t n)
+{
+    for (int row = 0; row < PARTS; row += WIDE) {
+        vector sum[WIDE][VECTORS];
+        for (int j = 0; j < WIDE; j++)
+            for (int v = 0; v < VECTORS; v++) sum[j][v] = zero;
+        for (int32_t k = 0; k < n; k++)
+            for (int j = 0; j < WIDE; j++)
+                for (int v = 0; v < VECTORS; v++) sum[j][v] += P[PARTS * k + row + j] * vectors(Q + PARTS * k)[v];
+        for (int j = 0; j < WIDE; j++)
+            for (int v = 0; v < VECTORS; v++) vectors_of(S + PARTS * (row + j))[v] = sum[j][v];
+    }
+}
+
+/* Set element j of PARTS equations at once, X_j = (X_j - S_j - sum_(k < j) C_jk X_k) / C_jj without the division. */
+static void eliminate(real *restrict X, const real *restrict S, const real *restrict C, int j)
+{
+    for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= S[PARTS * j + i];
+    for (int k = 0; k < j; k++)
+        for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= C[PARTS * k + j] * X[PARTS * k + i];
+}
+
+/* Factorise the next group of rows; return 0 if the matrix is not positive definite. */
+static int factorise_group(plant *f, int32_t group, real q, real size)
+{
+    real S[PARTS * PARTS], *panel = panel_of(f, group);
+    for (int i = 0; i < PARTS; i++) {
+        const int32_t row = PARTS * group + i;
+        panel[PARTS * row + i] += row < f->n ? q * precision_of(f, row, size) : 1;
+    }
+    for (int32_t before = 0; before <= group; before++) {
+        const real *other = panel_of(f, before), *C = other + PARTS * PARTS * before;
+        real *X = panel + PARTS * PARTS * before, *inverse = f->inverse + PARTS * before;
+        multiply_panels(S, other, panel, PARTS * before);
+        for (int j = 0; j < PARTS; j++) {
+            eliminate(X, S, before < group ? C : X, j);
+            if (before == group) {
+                const real pivot = X[PARTS * j + j];
+                if (!(pivot > 0 && isfinite(pivot))) return 0;
+                inverse[j] = 1 / root(pivot);
+            }
+            for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= inverse[j];
+        }
+    }
+    return 1;
+}
+
+/* Solve C Z = Z for PARTS right sides. */
+static void solve_forward(const plant *f, real *Z)
+{
+    real S[PARTS * PARTS];
+    for (int32_t group = 0; group < f->padded / PARTS; group++) {
+        const real *panel = panel_of(f, group);
+        real *X = Z + PARTS * PARTS * group;
+        multiply_panels(S, panel, Z, PARTS * group);
+        for (int j = 0; j < PARTS; j++) {
+            eliminate(X, S, panel + PARTS * PARTS * group, j);
+            for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= f->inverse[PARTS * group + j];
+        }
+    }
+}
+
+/* Solve C' Z = Z. */
+static void solve_backward(const plant *f, real *Z)
+{
+    for (int32_t group = f->padded / PARTS - 1; group >= 0; group--) {
+        const real *panel = panel_of(f, group), *C = panel + PARTS * PARTS * group;
+        real *restrict X = Z + PARTS * PARTS * group;
+        for (int j = PARTS - 1; j >= 0; j--) {
+            for (int k = j + 1; k < PARTS; k++)
+                for (int i = 0; i < PARTS; i++) X[PARTS * j + i] -= C[PARTS * j + k] * X[PARTS * k + i];
+            for (int i = 0; i < PARTS; i++) X[PARTS * j + i] *= f->inverse[PARTS * group + j];
+        }
+        vector x[PARTS][VECTORS];
+        for (int j = 0; j < PARTS; j++)
+            for (int v = 0; v < VECTORS; v++) x[j][v] = vectors(X + PARTS * j)[v];
+        for (int32_t c = 0; c < PARTS * group; c++)
+            for (int v = 0; v < VECTORS; v++) {
+                vector rest = vectors(Z + PARTS * c)[v];
+                for (int j = 0; j < PARTS; j++) rest -= panel[PARTS * c + j] * x[j][v];
+                vectors_of(Z + PARTS * c)[v] = rest;
+            }
+    }
+}
+
+/* Return a random sign: the upper bit of a linear congruential generator. */
+static real sign_of(int32_t *random)
+{
+    const uint32_t next = (uint32_t)*random * 1664525u + 1013904223u;
+    memcpy(random, &next, sizeof next);
+    return next >> 31 ? 1 : -1;
+}
+
+/* Solve for the means of up to PARTS microphones from `first` on, and set their noise. */
+static int solve_means(plant *f, int32_t first, real q, real size)
+{
+    const int32_t n = f->n, split = f->I * f->N, most = f->K - first < PARTS ? f->K - first : PARTS;
+    real *Z = f->sides;
+    memset(Z, 0, sizeof(real) * times(f->padded, PARTS));
+    for (int32_t c = 0; c < most; c++)
+        for (int32_t i = 0; i < n; i++) {
+            const real mean = i < split ? 0 : f->path[times(first + c, n - split) + (size_t)(i - split)];
+            Z[PARTS * i + c] = f->set_r[times(first + c, n) + (size_t)i] + (i < split ? 0 : q * precision_of(f, i, size) * mean);
+        }
+    solve_forward(f, Z), solve_backward(f, Z);
+    for (int32_t i = 0; i < n * PARTS; i++)
+        if (!isfinite(Z[i])) return 0;
+    for (int32_t k = first; k < first + most; k++) {
+        real *theta = f->theta + times(k, n), bend = 0;
+        for (int32_t i = 0; i < n; i++) {
+            theta[i] = Z[PARTS * i + k - first];
+            const real mean = i < split ? 0 : f->path[times(k, n - split) + (size_t)(i - split)];
+            bend += precision_of(f, i, size) * theta[i] * (mean - theta[i]);
+        }
+        /* sum e^2 - 2 theta'r + theta'G theta, where G theta = r + q P (mean - theta) */
+        const real ee = f->set_ee[k], residual = ee - dot(theta, f->set_r + times(k, n), n) + q * bend, samples = f->numbers->set_aside;
+        /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
+        const real noise = (residual + (real)n * f->q[k]) / (largest(samples - (real)split / 2, 0) + (real)n);
+        f->q[k] = largest(noise, (real)1e-6 * ee / samples);
+    }
+    return 1;
+}
+
+/* The factor is complete: solve for the posterior. */
+static void end_fit(plant *f, real q, real size)
+{
+    for (int32_t first = 0; first < f->K; first += PARTS)
+        if (!solve_means(f, first, q, size)) return;
+    if (!f->exact) { /* draws: theta has the covariance q (C C')^-1 = q C'^-1 C^-1 */
+        const real scale = root(q);
+        memset(f->sides, 0, sizeof(real) * times(f->padded, PARTS));
+        for (int32_t d = 0; d < DRAWS; d++)
+            for (int32_t i = 0; i < f->n; i++) f->sides[PARTS * i + d] = sign_of(f->counts + RANDOM);
+        solve_backward(f, f->sides);
+        for (int32_t d = 0; d < DRAWS; d++)
+            for (int32_t i = 0; i < f->n; i++) f->draws[times(d, f->n) + (size_t)i] = scale * f->sides[PARTS * i + d];
+    }
+    count_up(f->fits);
+    f->counts[DOUBTFUL] = 0, f->counts[STALE] = 1;
+}
+
+/* Do a block's part of the factorisation, about as much as in any other block. */
+static void go_on_fitting(plant *f)
+{
+    const real q = mean_noise(f), size = size_of_path(f);
+    const double groups = f->padded / PARTS, blocks = f->delay + 1, done = blocks + 1 - f->counts[PENDING];
+    for (double g = f->counts[GROUPS]; g < groups && g * g * g * blocks < groups * groups * groups * done; g++) {
+        if (!factorise_group(f, f->counts[GROUPS], q, size)) {
+            f->counts[PENDING] = 0;
+            return;
+        }
+        f->counts[GROUPS]++;
+    }
+    if (--f->counts[PENDING] == 0) end_fit(f, q, size);
+}
+
+/* A block. */
+
+/* Set d to p * x and z to s * y of the block. */
+static void explain(const plant *f, const real *theta, const real *x, const real *y, real *d, real *z)
+{
+    real *part = work_of(f, 0);
+    memset(d, 0, sizeof(real) * (size_t)f->B), memset(z, 0, sizeof(real) * (size_t)f->B);
+    for (int32_t i = 0; i < f->I; i++, theta += f->N) correlate(part, theta, f->N, x + times(i, f->history), f->B), add_to(d, part, f->B);
+    for (int32_t j = 0; !f->exact && j < f->J; j++, theta += f->M) correlate(part, theta, f->M, y + times(j, f->history), f->B), add_to(z, part, f->B);
+}
+
+/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known. */
+static int is_alarm(const plant *f, const real *x, const real *y, real unexplained, real d2, real q)
+{
+    const plant_numbers *known = f->numbers;
+    if (f->counts[AGE] <= (*f->alarms ? QUIET : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
+    const real limit = SURPRISE * q + largest(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
+    if (unexplained <= limit) return 0;
+    real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
+    for (int32_t draw = 0; draw < DRAWS; draw++) {
+        explain(f, f->draws + times(draw, f->n), x, y, d, z);
+        add_scaled(d, -1, z, f->B);
+        doubt += dot(d, d, f->B) / (real)f->B;
+    }
+    return unexplained > limit + SURPRISE * (doubt / DRAWS);
+}
+
+/* The secondary paths have changed: they return to their prior; of the primary paths, a share is kept. */
+static void begin_anew(plant *f)
+{
+    const int32_t n = f->n, split = f->I * f->N;
+    plant_numbers *known = f->numbers;
+    const real kept = KEPT * (real)n < known->samples ? KEPT * (real)n / known->samples : 1;
+    for (int32_t k = 0; k < f->K; k++) {
+        real *r = f->r + times(k, n);
+        for (int32_t i = split; i < n; i++) { /* as if s had been known until now */
+            add_scaled(r, -f->theta[times(k, n) + (size_t)i], row_of_data(f, i), split);
+            r[i] = 0;
+        }
+        for (int32_t i = 0; i < split; i++) r[i] *= kept;
+    }
+    known->samples *= kept;
+    for (int32_t i = 0; i < n; i++) {
+        real *row = row_of_data(f, i);
+        for (int32_t c = 0; c <= i; c++) row[c] = i < split ? kept * row[c] : 0;
+    }
+    for (int32_t k = 0; k < f->K; k++) { /* sum e^2 = q samples + 2 theta'r - theta'G theta */
+        const real *theta = f->theta + times(k, n);
+        real energy = known->samples * f->q[k] + 2 * dot(theta, f->r + times(k, n), split);
+        for (int32_t i = 0; i < split; i++) energy -= theta[i] * (2 * dot(row_of_data(f, i), theta, i) + row_of_data(f, i)[i] * theta[i]);
+        f->ee[k] = energy;
+    }
+    known->spread = UNKNOWN, known->fitted = 0;
+    f->counts[AGE] = f->counts[IDLE] = f->counts[PENDING] = 0, f->counts[DOUBTFUL] = f->counts[STALE] = 1;
+    memset(f->draws, 0, sizeof(real) * times(DRAWS, n));
+    return_to_prior(f);
+}
+
+/* Let the part of G that is sum v(t - i) u(t - c), i < n, c < m, fade and take a block: along the diagonals of the sums, the
+ * window of t moves by one sample. On the diagonal of G, v is u. */
+static void add_products(plant *f, const real *v, int32_t at_v, int32_t n, const real *u, int32_t at_u, int32_t m, real sign, real forget)
+{
+    const int32_t B = f->B;
+    real *column = work_of(f, 2), *last = work_of(f, 3), *next = work_of(f, 4);
+    correlate(column, u, B, v, n); /* c = 0 */
+    if (v == u) last[0] = column[0];
+    else correlate(last, v, B, u, m); /* i = 0 */
+    for (int32_t i = 0; i < n; i++) {
+        const int32_t columns = v == u ? i + 1 : m;
+        real *restrict row = row_of_data(f, at_v + i) + at_u, *restrict sums = next;
+        const real *restrict before = last;
+        if (i) {
+            const real gone = v[B + i - 1], come = v[i - 1];
+            sums[0] = column[i];
+            for (int32_t c = 1; c < columns; c++) sums[c] = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
+            next = last, last = sums;
+        }
+        for (int32_t c = 0; c < columns; c++) row[c] = forget * row[c] + sign * last[c];
+    }
+}
+
+/* Add the block to the data. */
+static void add_block(plant *f, const real *x, const real *y, const real *e, real forget)
+{
+    const int32_t signals_of_all = f->I + (f->exact ? 0 : f->J), B = f->B;
+    real *sums = work_of(f, 1);
+    f->numbers->fitted *= forget, f->numbers->samples = forget * f->numbers->samples + (real)B;
+    for (int32_t k = 0; k < f->K; k++) f->ee[k] = forget * f->ee[k] + dot(e + times(k, B), e + times(k, B), B);
+    for (int32_t a = 0, row = 0; a < signals_of_all; a++) {
+        const real *v = a < f->I ? x + times(a, f->history) : y + times(a - f->I, f->history), sign = a < f->I ? 1 : -1;
+        const int32_t n = a < f->I ? f->N : f->M;
+        for (int32_t k = 0; k < f->K; k++) {
+            real *restrict r = f->r + times(k, f->n) + row;
+            correlate(sums, e + times(k, B), B, v, n);
+            for (int32_t i = 0; i < n; i++) r[i] = forget * r[i] + sign * sums[i];
+        }
+        for (int32_t b = 0, column = 0; b <= a; b++) {
+            const real *u = b < f->I ? x + times(b, f->history) : y + times(b - f->I, f->history);
+            const int32_t m = b < f->I ? f->N : f->M;
+            add_products(f, v, row, n, u, column, m, b < f->I ? sign : -sign, forget);
+            column += m;
+        }
+        row += n;
+    }
+}
+
+void learn(plant *f, const real *x, const real *y, real *e, real forget, int known)
+{
+    const int32_t B = f->B;
+    const real samples = (real)B * (real)f->K, q = mean_noise(f);
+    real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2), unexplained = 0, d2 = 0;
+    plant_numbers *numbers = f->numbers;
+    for (int32_t k = 0; k < f->K; k++) {
+        real *error = e + times(k, B);
+        for (int32_t j = 0; f->exact && j < f->J; j++) /* s^ is right: what it plays is no news */
+            correlate(part, f->path + times(k * f->J + j, f->M), f->M, y + times(j, f->history), B), add_to(error, part, B);
+        explain(f, f->theta + times(k, f->n), x, y, d, z);
+        d2 += dot(d, d, B);
+        for (int32_t t = 0; t < B; t++) d[t] = error[t] - d[t] + z[t];
+        unexplained += dot(d, d, B);
+    }
+    unexplained /= samples, d2 /= samples;
+    int loud = 0;
+    for (int32_t j = 0; j < f->J; j++)
+        for (int32_t t = 0; t < B + f->M - 1; t++) loud |= y[times(j, f->history) + (size_t)t] != 0;
+    count_up(f->counts + AGE), count_up(f->counts + IDLE);
+    if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
+    if (known && loud && !f->exact && is_alarm(f, x, y, unexplained, d2, q)) count_up(f->alarms), begin_anew(f);
+    else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
+        const real share = unexplained < d2 ? unexplained / d2 : 1;
+        numbers->misfit = forget * forget * numbers->misfit + share * share;
+        numbers->seen = forget * forget * numbers->seen + 1;
+    }
+    add_block(f, x, y, e, forget);
+    const int news = numbers->samples - numbers->fitted > numbers->samples / 8 || (f->counts[SOUNDS] && f->counts[AGE] <= 16);
+    if (!f->counts[PENDING] && (news || (unexplained > 2 * q && f->counts[IDLE] >= 8))) begin_fit(f);
+    if (f->counts[PENDING]) go_on_fitting(f);
+}
+
+/* Set `to` to a with zeros around it, `more` on either side. */
+static const real *widened(real *to, const real *a, int32_t n, int32_t more)
+{
+    memset(to, 0, sizeof(real) * (size_t)more);
+    memcpy(to + more, a, sizeof(real) * (size_t)n);
+    memset(to + more + n, 0, sizeof(real) * (size_t)more);
+    return to;
+}
+
+static void reverse(real *restrict to, const real *restrict a, int32_t n)
+{
+    for (int32_t i = 0; i < n; i++) to[i] = a[n - 1 - i];
+}
+
+/* Add the weighted correlations of one theta. */
+static void expect_also(plant *f, const real *theta, real weight)
+{
+    const int32_t I = f->I, J = f->J, N = f->N, M = f->M;
+    const real *s = theta + times(I, N);
+    real *wide = work_of(f, 1), *sums = work_of(f, 2), *turned = work_of(f, 3);
+    for (int32_t j = 0; j < J; j++)
+        for (int32_t a = 0; a <= j; a++) {
+            correlate(sums, s + times(a, M), M, widened(wide, s + times(j, M), M, M - 1), 2 * M - 1);
+            add_scaled(f->ss + times(j * J + a, 2 * M - 1), weight, sums, 2 * M - 1);
+        }
+    for (int32_t i = 0; i < I; i++) {
+        reverse(sums, theta + times(i, N), N);
+        widened(wide, sums, N, M - 1);
+        for (int32_t j = 0; j < J; j++) {
+            reverse(turned, s + times(j, M), M);
+            correlate(sums, turned, M, wide, N + M - 1);
+            add_scaled(f->ps + times(i * J + j, N + M - 1), weight, sums, N + M - 1);
+        }
+    }
+}
+
+void expect(plant *f)
+{
+    const int32_t I = f->I, J = f->J, N = f->N, M = f->M, lags = 2 * M - 1;
+    real *wide = work_of(f, 1), *sums = work_of(f, 2);
+    memset(f->ss, 0, sizeof(real) * times(J * J, lags));
+    memset(f->ps, 0, sizeof(real) * times(I * J, N + M - 1));
+    memset(f->pp, 0, sizeof(real) * times(I * I, 2 * N - 1));
+    for (int32_t k = 0; k < f->K; k++) {
+        const real *p = f->theta + times(k, f->n);
+        if (f->exact) { /* theta has no s: put it beside p */
+            real *both = f->sides;
+            memcpy(both, p, sizeof(real) * times(I, N));
+            memcpy(both + times(I, N), f->path + times(k * J, M), sizeof(real) * times(J, M));
+            expect_also(f, both, 1);
+        } else expect_also(f, p, 1);
+        for (int32_t i = 0; i < I; i++) {
+            widened(wide, p + times(i, N), N, N - 1);
+            for (int32_t a = 0; a < I; a++) {
+                correlate(sums, p + times(a, N), N, wide, 2 * N - 1);
+                add_to(f->pp + times(i * I + a, 2 * N - 1), sums, 2 * N - 1);
+            }
+        }
+    }
+    for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) /* of the mean noise */
+        expect_also(f, f->draws + times(draw, f->n), (real)f->K / DRAWS);
+    const real doubt = (real)f->K * UNKNOWN * UNKNOWN * size_of_path(f);
+    for (int32_t j = 0; j < J; j++) {
+        for (int32_t a = 0; a < j; a++) reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
+        /* Not yet verified: anything may be wrong, even the polarity. */
+        if (!f->exact && f->counts[DOUBTFUL]) f->ss[times(j * J + j, lags) + (size_t)(M - 1)] += doubt;
+    }
+    f->counts[STALE] = 0;
+}
