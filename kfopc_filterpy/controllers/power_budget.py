@@ -22,6 +22,12 @@ DEFAULT_AVERAGING_S = 10.0
 DEFAULT_UNCERTAINTY = 0.3
 BLOCK_S = 0.032
 LEAST_BLOCKS = 20  # in the averaging time
+# What is known of the plant: fields of `plant.c`.
+POSTERIOR = (
+    *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
+    *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy"),
+    *("path_correlation", "cross_correlation", "primary_correlation"),
+)
 
 
 class PowerBudgetController(CoreController):
@@ -40,7 +46,9 @@ class PowerBudgetController(CoreController):
     one. Power that saves less than a fifth of the error is not spent.
 
     The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to an
-    unknown path around the given one: the loudspeakers are nearly silent until it has been learnt again.
+    unknown path around the given one: the loudspeakers are nearly silent until it has been learnt again. A new
+    `secondary_path` that is assigned begins the posterior anew, also that of the primary paths; the control filter stays
+    until the first solution, and so does the account.
 
     `kf_pb` makes it, with the same parameters, and takes suggested settings too.
 
@@ -198,6 +206,13 @@ class PowerBudgetController(CoreController):
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""
+        block = self._opened()
+        spread = block.fields["spread"]
+        if spread.item() > 0.0 and self._uncertainty is not None:  # measured paths: another distance from the new path
+            spread[:] = rms_relative_error(self._uncertainty, self._estimated_path()) or spread
+        fresh = block.fresh(block.shape)
+        for name in POSTERIOR:
+            block.fields[name][:] = fresh.fields[name]
 
     def looped(self) -> Looped | None:
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""
