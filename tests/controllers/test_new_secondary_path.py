@@ -248,7 +248,7 @@ def test_kf_pb_learns_around_the_new_paths() -> None:
     told.secondary_path = NEW_PATHS
     emitted = drive_several(made, 0, 2000)
     np.testing.assert_allclose(drive_several(told, 0, 2000), emitted, rtol=1e-9, atol=1e-12)
-    assert np.abs(emitted[-1]).max() > 0.01
+    assert np.abs(emitted).max() > 0.01
 
 
 def test_the_covariance_of_several_channels_grows_by_what_the_paths_changed() -> None:
