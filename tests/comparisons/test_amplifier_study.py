@@ -47,7 +47,7 @@ def small() -> Any:
 def test_planned_runs_are_those_taken(small: Any) -> None:
     _, done, planned, _ = small
     # two cases, two overdrives: three filters of 5 settings twice, FxLMS of 14, clipping of 14 x 2; 5 + 3 at their best
-    assert planned == done == 2 * 2 * (2 * 15 + 14 + 28 + 8)
+    assert planned == done == 2 * 2 * (2 * 11 + 14 + 28 + 8)
 
 
 def test_the_report_is_complete(small: Any) -> None:

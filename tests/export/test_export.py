@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.c99 import FAST, WARNINGS, Program, c_compiler, compiler, succeeds
 from helpers.channels import random_paths, through
+from helpers.controllers import short_blocks
 
 from kfopc_filterpy import (
     KFOPC,
@@ -118,6 +119,10 @@ CONTROLLERS = {f"{name}, everything": lambda name=name: with_everything(name) fo
         L, S_HAT, rated_power=RATED, state_noise=1e-6, measurement_noise=1e-6, initial_variance=100.0
     ),
     "repaired": lambda: made("repaired"),
+    "KF-PB": lambda: short_blocks(L, S_HAT, rated_power=RATED, fs=16000.0),
+    "KF-PB, everything": lambda: short_blocks(
+        L, S_TWO_HAT, rated_power=[RATED, 0.3], fs=16000.0, n_references=2, limiter=[limiter(), limiter(0.3)]
+    ),
     "fast array": lambda: made("fast array"),
 }
 
