@@ -210,6 +210,7 @@ static int factorise(const toeplitz_system *t, real price)
             real *restrict T = f->sums + times(i * I + c, lags);
             for (int32_t l = 0; l < lags; l++) T[l] = A[l] + price * R[l];
             if (i == c) T[L - 1] = A[L - 1] * (1 + REGULAR) + price * R[L - 1];
+            if (i == c && T[L - 1] == 0) T[L - 1] = 1; /* a reference that is silent, or that nobody hears: its filter is zero */
             D[i * I + c] = E[i * I + c] = T[L - 1];
             F[times(i * I + c, L)] = B[i * I + c] = i == c;
         }
@@ -300,7 +301,7 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
         const real taken = power_at(t, price, v, u, &solved);
         if (!solved) {
             const real least = (real)1e-6 * t->scale;
-            price = 2 * price > least ? 2 * price : least;
+            price = 2 * price < least ? least : 2 * price;
             continue;
         }
         const real away = taken - power;
@@ -308,7 +309,7 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
         const real slope = solve_factorised(t->f, u, NULL);
         if (!(slope > 0)) break;
         /* power^-1/2 has the slope taken^-3/2 u' T^-1 u */
-        price = largest(price + taken * (root(taken / power) - 1) / slope, 0);
+        price = larger(price + taken * (root(taken / power) - 1) / slope, 0);
     }
     return price;
 }
@@ -332,7 +333,7 @@ static void take_references(budget *f)
             for (int32_t a = 0; a < I; a++) {
                 real *restrict R = c ? f->short_R + times(((c - 1) * I + i) * I + a, L) : f->R + times(i * I + a, lags);
                 correlate(sums, work_row(f, c), B, f->x + times(a, H), lags);
-                for (int32_t l = 0; l < lags; l++) R[l] = fade[c] * R[l] + sums[l];
+                for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade[c], sums[l]);
             }
             if (i == 0) f->weight[c] = fade[c] * f->weight[c] + sum[c];
         }
@@ -392,7 +393,7 @@ static real share_of(const budget *f, int32_t j, const real *v)
         for (int c = 0; c <= SCALES; c++) {
             const int32_t n = blocks[c];
             if (t != T - n) continue;
-            const real left = largest((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / largest(power[c], LEAST_POWER);
+            const real left = larger((real)T - spent, LEAST_SHARE * (real)n) / (real)n * f->s.setting[RATED_POWER][j] / larger(power[c], LEAST_POWER);
             if (share == 0 || left < share) share = left;
         }
         if (t < T) spent += f->book[times(t, J) + (size_t)j];
@@ -406,16 +407,17 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
     const real rated = f->s.setting[RATED_POWER][j];
-    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * largest(left, 0);
+    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0);
     toeplitz_system t = {f, f->A + times(j * I * J + j, I) * row, f->C + (f->lags - L), row, times(J, I) * row, row_C, times(I, 1) * row_C, rest, 0};
     int solved;
-    t.scale = t.A[L - 1] / t.R[L - 1];
+    for (int32_t i = 0; i < I && !(t.scale > 0); i++) /* of the first reference that is not silent */
+        t.scale = t.A[(t.row_A + t.next_A) * (size_t)i + (size_t)(L - 1)] / larger(t.R[(t.row_R + t.next_R) * (size_t)i + (size_t)(L - 1)], LEAST_POWER);
     /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
-    f->steady[J + j] = largest(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
+    f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
     /* 3 What the account holds makes power cheaper, 4 but none that saves little of the error. */
     for (int n = 0; n < 4; n++) account *= account;
-    real price = largest(f->steady[J + j] * account, WORTHWHILE * *f->error / (rated * (real)J));
+    real price = larger(f->steady[J + j] * account, WORTHWHILE * *f->error / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
     /* 5 The account must stand it. */
     const real share = power > 0 ? share_of(f, j, v) : 1;
@@ -481,7 +483,7 @@ static void solve_all(budget *f)
         multiply_toeplitz(f, part, f->A + times(j * I * J + j, I) * row, row_A, row, w);
         error += dot(w, part, n) + 2 * dot(w, below, n) - 2 * dot(w, f->b + times(j, n), n);
     }
-    *f->error = largest(error, q);
+    *f->error = larger(error, q);
 }
 
 /* A sample. */

@@ -266,8 +266,8 @@ static int solve_means(plant *f, int32_t first, real q, real size)
         /* sum e^2 - 2 theta'r + theta'G theta, where G theta = r + q P (mean - theta) */
         const real ee = f->set_ee[k], residual = ee - dot(theta, f->set_r + times(k, n), n) + q * bend, samples = f->numbers->set_aside;
         /* The earlier estimate counts as n samples: a short record leaves little noise by chance. */
-        const real noise = (residual + (real)n * f->q[k]) / (largest(samples - (real)split / 2, 0) + (real)n);
-        f->q[k] = largest(noise, (real)1e-6 * ee / samples);
+        const real noise = (residual + (real)n * f->q[k]) / (larger(samples - (real)split / 2, 0) + (real)n);
+        f->q[k] = larger(noise, (real)1e-6 * ee / samples);
     }
     return 1;
 }
@@ -321,7 +321,7 @@ static int is_alarm(const plant *f, const real *x, const real *y, real unexplain
 {
     const plant_numbers *known = f->numbers;
     if (f->counts[AGE] <= (*f->alarms ? QUIET : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
-    const real limit = SURPRISE * q + largest(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
+    const real limit = SURPRISE * q + larger(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
     if (unexplained <= limit) return 0;
     real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
     for (int32_t draw = 0; draw < DRAWS; draw++) {
@@ -372,17 +372,19 @@ static void add_products(plant *f, const real *v, int32_t at_v, int32_t n, const
     correlate(column, u, B, v, n); /* c = 0 */
     if (v == u) last[0] = column[0];
     else correlate(last, v, B, u, m); /* i = 0 */
-    for (int32_t i = 0; i < n; i++) {
+    real *restrict first = row_of_data(f, at_v) + at_u;
+    for (int32_t c = 0; c < (v == u ? 1 : m); c++) first[c] = faded(first[c], forget, sign * last[c]);
+    for (int32_t i = 1; i < n; i++) {
         const int32_t columns = v == u ? i + 1 : m;
         real *restrict row = row_of_data(f, at_v + i) + at_u, *restrict sums = next;
         const real *restrict before = last;
-        if (i) {
-            const real gone = v[B + i - 1], come = v[i - 1];
-            sums[0] = column[i];
-            for (int32_t c = 1; c < columns; c++) sums[c] = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
-            next = last, last = sums;
+        const real gone = v[B + i - 1], come = v[i - 1];
+        sums[0] = column[i], row[0] = faded(row[0], forget, sign * column[i]);
+        for (int32_t c = 1; c < columns; c++) {
+            const real sum = before[c - 1] + (gone * u[B + c - 1] - come * u[c - 1]);
+            sums[c] = sum, row[c] = faded(row[c], forget, sign * sum);
         }
-        for (int32_t c = 0; c < columns; c++) row[c] = forget * row[c] + sign * last[c];
+        next = last, last = sums;
     }
 }
 
@@ -399,7 +401,7 @@ static void add_block(plant *f, const real *x, const real *y, const real *e, rea
         for (int32_t k = 0; k < f->K; k++) {
             real *restrict r = f->r + times(k, f->n) + row;
             correlate(sums, e + times(k, B), B, v, n);
-            for (int32_t i = 0; i < n; i++) r[i] = forget * r[i] + sign * sums[i];
+            for (int32_t i = 0; i < n; i++) r[i] = faded(r[i], forget, sign * sums[i]);
         }
         for (int32_t b = 0, column = 0; b <= a; b++) {
             const real *u = b < f->I ? x + times(b, f->history) : y + times(b - f->I, f->history);

@@ -52,6 +52,19 @@ static inline void add_to(real *restrict to, const real *restrict from, int32_t 
     for (int32_t i = 0; i < n; i++) to[i] += from[i];
 }
 
-static inline real largest(real a, real b) { return a > b ? a : b; }
+/* Let sums fade and add new ones. What is nearly zero is zero: in a long silence, numbers that fade would become so small
+ * that processors compute slowly. */
+#ifdef ANC_FLOAT
+static const real NEARLY_ZERO = 1e-30f;
+#else
+static const real NEARLY_ZERO = 1e-290;
+#endif
+static inline real faded(real sum, real forget, real more)
+{
+    const real next = forget * sum + more;
+    return next < NEARLY_ZERO && next > -NEARLY_ZERO ? 0 : next;
+}
+
+static inline real larger(real a, real b) { return a > b ? a : b; }
 static inline void count_up(int32_t *count) { *count += *count < 1 << 30; }
 #endif

@@ -191,9 +191,32 @@ def test_opened_again_it_goes_on_to_the_bit() -> None:
         if n == 2000:
             other = Core.__new__(Core)
             other.block = Block(core.block.algorithm, core.block.shape, memory=core.block.memory)
+            for name in other.block.scratch:
+                other.block.fields[name][:] = np.nan
         for one in (core, other):
             if one is not None:
                 y = one.control_signal(x[:, n])
                 one.update(d[:, n] - y)
     assert np.any(y)
-    assert other.block.memory.tobytes() == core.block.memory.tobytes()
+    for name in core.block.states:
+        assert other.block.fields[name].tobytes() == core.block.fields[name].tobytes(), name
+
+
+def test_a_silent_reference_or_loudspeaker_leaves_the_others_at_work() -> None:
+    """The oracle takes neither: its matrices are singular."""
+    s, x, d, _ = scene(8, 2, 2, 2, 3.0)
+    s[:, 1] = 0.0
+    x[1] = 0.0
+    d = np.array([np.convolve(h, x[0])[: x.shape[1]] for h in ([0, 0, 0, 1, 0.5], [0, 0, 0, 0, 0.7])])
+    rated = 0.5 * np.mean(d**2)
+    settings = {"rated_power": rated, "block": 64, "averaging": 60, "window": np.exp(-1 / 3840), "spread": 0.0}
+    core = Core(s, 12, 2, settings)
+    line, e, y = np.zeros(s.shape[1:]), np.zeros_like(d), np.zeros((2, d.shape[1]))
+    for n in range(x.shape[1]):
+        y[:, n] = core.control_signal(x[:, n])
+        push(line, y[:, n])
+        e[:, n] = d[:, n] - np.einsum("kjm,jm->k", s, line)
+        core.update(e[:, n])
+    assert np.mean(e[:, -2000:] ** 2) < 0.9 * np.mean(d[:, -2000:] ** 2)
+    assert 0.2 * rated < np.mean(y[0] ** 2) < 1.05 * rated
+    assert np.all(y[1] == 0.0)
