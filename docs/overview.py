@@ -67,7 +67,7 @@ class Overload:
 
     @property
     def settings(self) -> dict[str, float]:
-        """Settings of all three Kalman filters: those of the tutorial on the constraint factor."""
+        """Settings of KF-ANC and KF-OPC: those of the tutorial on the constraint factor."""
         q = 1e-3 * self.full_control.disturbance_power
         variance = self.full_control.control_power / (TAPS * np.mean(self.signals[0] ** 2))
         return {"state_noise": 1e-8 * q, "measurement_noise": q, "initial_variance": float(variance)}
@@ -78,8 +78,11 @@ class Overload:
         if algorithm == "KF-ANC":
             controller = kf_anc(TAPS, s, **self.settings)
         else:
-            make = {"KF-OPC": kf_opc, "KF-PB": kf_pb}[algorithm]
-            controller = make(TAPS, s, rated_power=rated, **self.settings)
+            controller = (
+                kf_pb(TAPS, s, rated_power=rated, fs=FS)
+                if algorithm == "KF-PB"
+                else kf_opc(TAPS, s, rated_power=rated, **self.settings)
+            )
         x, d = self.signals
         result = simulate(
             controller, x, disturbance=d, secondary_path=s, amplifier=HardClipAmplifier(2 * rated**0.5), fs=FS,

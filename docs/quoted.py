@@ -512,12 +512,12 @@ def _further() -> Iterator[Quote]:
         "With a wrong gain KF-PB",
         *(2, 3, 0, 1),
     )
-    tolerance, cost = "uncertain-path", "With an exact path the default guard costs at most 0.5 dB,"
+    tolerance, cost = "uncertain-path", "With an exact path the default uncertainty costs at most 0.5 dB,"
     yield quote(
         tolerance,
         "{:.0f} of {:.0f} runs have a second after the first that is louder than without control; the least reduction is "
         "{:.1f} dB. Without a guard, {:.0f} runs have louder seconds, the loudest by {:.1f} dB",
-        "With its default guard KF-PB",
+        "With its default uncertainty KF-PB",
         *(0, 1, 2, 3, 5),
     )
     yield quote(tolerance, "it is {:.0f} of {:.0f} runs too", "With the error stated as a tolerance KF-PB", 0, 1)

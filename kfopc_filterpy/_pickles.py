@@ -27,7 +27,7 @@ import scipy.linalg
 from filterpy.common import inv_diagonal
 from filterpy.kalman import KalmanFilter
 
-FOLDERS = ("core", "kernels", "paths", "power", "filters", "controllers", "realtime")  # whose classes can be named
+FOLDERS = ("core", "paths", "power", "filters", "controllers", "realtime")  # whose classes can be named
 OUTSIDE = (KalmanFilter, inv_diagonal, np.linalg.inv, np.linalg.pinv, scipy.linalg.inv, scipy.linalg.pinv)  # and these
 MADE = (np.ndarray, np.random.Generator, deque, Counter)  # and these, which `_made` knows
 GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")  # numpy's bit generators
@@ -196,10 +196,6 @@ def _array(memory: memoryview, shape: tuple[int, ...], fields: Any, aligned: boo
         return np.fromiter(fields, object).reshape(shape)
     order, at, scalar = how
     array = np.ndarray(shape, _dtype(fields, aligned), memory[at:], order=order)  # numpy takes a negative offset
-    if array.dtype.names is not None:
-        from .kernels.records import as_records  # imported here, because it loads numba
-
-        array = as_records(array)
     return array[()] if scalar else array
 
 

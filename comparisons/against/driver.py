@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,6 @@ from kfopc_filterpy import (
     simulate_scenarios,
 )
 from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker, VirtualMicrophones
-from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import (
     DataUnavailableError,
@@ -237,13 +237,14 @@ class OwnController:
 
 LMS: dict[str, Any] = {"step": 0.05}
 PEAK: dict[str, Any] = LMS | {"amplitude_limit": 0.8}
+EARLIER = KALMAN if "form" in signature(kf_pb).parameters else {}  # KF-PB of earlier versions needs noises
 # One channel: each is called with a scene and further options. Constraints keep a state, so each run has its own.
 SINGLE: dict[str, Any] = {
     "KF-ANC": lambda s, **o: made(kf_anc, s, **KALMAN, **o),
     "KF-OPC": lambda s, **o: made(kf_opc, s, constraint=rated(), **KALMAN, **o),
     "KF-OPC, sliding": lambda s, **o: made(kf_opc, s, constraint=rated(window="sliding"), **KALMAN, **o),
     "KF-OPC repaired": lambda s, **o: made(kf_opc_repaired, s, constraint=rated(), **KALMAN, **o),
-    "KF-PB": lambda s, **o: made(kf_pb, s, rated_power=RATED_POWER, fs=FS, memory_s=0.05, **KALMAN, **o),
+    "KF-PB": lambda s, **o: made(kf_pb, s, rated_power=RATED_POWER, fs=FS, **EARLIER, **o),
     "FxRLS": lambda s, **o: made(fx_rls, s, forgetting=0.9995, **o),
     "diagonal KF": lambda s, **o: made(DiagonalKalman, s, **KALMAN, **o),
     "diagonal KF-OPC": lambda s, **o: made(DiagonalKalman, s, constraint=rated(), **KALMAN, **o),
@@ -279,10 +280,6 @@ AROUND: dict[str, Make] = {
     "KF-PB, exact path": lambda s: SINGLE["KF-PB"](s, secondary_path_uncertainty=None),
     "KF-OPC, uncertain path": lambda s: with_tolerance(SINGLE["KF-OPC"](s)),
     "FxLMS, uncertain path": lambda s: with_tolerance(SINGLE["FxLMS"](s)),
-    "KF-PB, shared gain": lambda s: kf_pb(s.n_taps, s.estimate, rated_power=RATED_POWER, fs=FS, form="shared gain"),
-    "KF-PB, frequency domain": lambda s: kf_pb(
-        s.n_taps, s.estimate, rated_power=RATED_POWER, fs=FS, form="frequency domain", block=16
-    ),
     "filterpy's filter": lambda s: KalmanController(set_up(KalmanFilter(s.n_taps, 1)), s.estimate),
     "KFOPC": lambda s: KalmanController(set_up(KFOPC(s.n_taps, constraint=rated())), s.estimate),
     "LimitedController": lambda s: LimitedController(OwnController(s), limiter()),
@@ -307,12 +304,9 @@ SEVERAL: dict[str, Make] = {
     "KF-ANC, uncertain path": lambda s: with_tolerance(made(kf_anc, s, **KALMAN)),
     "KF-OPC": lambda s: made(kf_opc, s, constraint=both(rated), **KALMAN),
     "KF-OPC, limiter": lambda s: made(kf_opc, s, constraint=both(rated), limiter=both(limiter), **KALMAN),
-    "KF-PB, direct": lambda s: made(kf_pb, s, rated_power=[0.1, 0.2], form="direct", fs=FS, memory_s=0.05, **KALMAN),
-    "KF-PB, shared gain": lambda s: made(kf_pb, s, rated_power=[0.1, 0.2], fs=FS),
+    "KF-PB": lambda s: made(kf_pb, s, rated_power=[0.1, 0.2], fs=FS),
     "KF-PB, exact path": lambda s: made(kf_pb, s, rated_power=[0.1, 0.2], fs=FS, secondary_path_uncertainty=None),
-    "KF-PB, frequency domain": lambda s: made(
-        kf_pb, s, rated_power=0.1, form="frequency domain", fs=FS, block=16, limiter=both(limiter)
-    ),
+    "KF-PB, limiter": lambda s: made(kf_pb, s, rated_power=0.1, fs=FS, limiter=both(limiter)),
     "FxLMS": lambda s: made(FxLMS, s, **LMS),
     "FxLMS, limiter": lambda s: made(FxLMS, s, limiter=both(limiter), **LMS),
     "FxLMS, uncertain path": lambda s: with_tolerance(made(FxLMS, s, **LMS)),
@@ -327,7 +321,7 @@ SEVERAL: dict[str, Make] = {
     "clipping FxLMS": lambda s: made(ClippingFxLMS, s, **PEAK),
 }
 AROUND_SEVERAL: dict[str, Make] = {
-    "MonitoredController": lambda s: MonitoredController(SEVERAL["KF-PB, shared gain"](s), fs=FS, window_s=0.01),
+    "MonitoredController": lambda s: MonitoredController(SEVERAL["KF-OPC"](s), fs=FS, window_s=0.01),
     "FeedbackNeutralizer": lambda s: FeedbackNeutralizer(
         SEVERAL["KF-ANC"](s), 0.1 * decaying(s.n_references, 2, 6, 6, 1), amplifier=HARD
     ),
@@ -339,9 +333,7 @@ ROOM_2 = [*SEVERAL, *AROUND_SEVERAL]
 ROOM_4: dict[str, Make] = {
     "KF-ANC": SEVERAL["KF-ANC"],
     "KF-OPC": lambda s: made(kf_opc, s, rated_power=0.1, **KALMAN),
-    "KF-PB, direct": lambda s: made(kf_pb, s, rated_power=0.1, form="direct", fs=FS, **KALMAN),
-    "KF-PB, shared gain": lambda s: made(kf_pb, s, rated_power=0.1, fs=FS),
-    "KF-PB, frequency domain": lambda s: made(kf_pb, s, rated_power=0.1, form="frequency domain", fs=FS),
+    "KF-PB": lambda s: made(kf_pb, s, rated_power=0.1, fs=FS),
     "FxLMS": SEVERAL["FxLMS"],
     "FxNLMS": SEVERAL["FxNLMS"],
     "MOV": lambda s: made(MOVFxLMS, s, rated_power=0.1, **LMS),
@@ -451,7 +443,6 @@ FILTERS: dict[str, Callable[[], Any]] = {
     "KFOPC": lambda: set_up(KFOPC(TAPS, constraint=rated())),
     "random walk": lambda: KFOPC.random_walk(TAPS, **KALMAN),
     "random walk, KF-OPC": lambda: KFOPC.random_walk(TAPS, constraint=rated(), **KALMAN),
-    "power budget": lambda: PowerBudgetKalmanFilter(TAPS, rated_power=RATED_POWER, fs=FS, memory_s=0.05, **KALMAN),
 }
 
 

@@ -174,7 +174,6 @@ def all_cases() -> list[Case]:
     filters: tuple[tuple[str, Any, dict[str, Any]], ...] = (
         ("KF-ANC", kf_anc, {}),
         ("KF-OPC", kf_opc, rated),
-        ("KF-PB", kf_pb, rated),
     )
     lms = {
         "FxLMS": (FxLMS, {}),
@@ -191,6 +190,7 @@ def all_cases() -> list[Case]:
     return [
         *(kalman_case(name, make, ratio, **settings) for name, make, settings in filters for ratio in (1e4, 1e12)),
         Case("KF-OPC, limiter", partial(limited_kf_opc, **zero), ratio=1e12),
+        Case("KF-PB", partial(kf_pb, TAPS, SECONDARY, **rated)),
         Case("diagonal KF", partial(DiagonalKalman, TAPS, SECONDARY, **zero), ratio=1e12),
         Case("KF-ANC, 2 x 2", partial(kf_anc, TAPS // 2, paths, **zero), ratio=1e12, secondary=paths, share=0.1),
         Case(

@@ -10,7 +10,6 @@ import json
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -154,7 +153,7 @@ def channel_times(taps: int = 512) -> list[dict[str, Any]]:
         run, block = variants.channel_blocks(*sizes)
         reference = min(seconds(single) for _ in range(3)) / samples
         blocks = [seconds(run) for _ in range(CHANNEL_BLOCKS)]
-        names = ("form", "references", "loudspeakers", "microphones", "n_taps", "n_primary")
+        names = ("references", "loudspeakers", "microphones", "n_taps")
         rows.append(
             dict(zip(names, sizes, strict=True))
             | {
@@ -168,13 +167,13 @@ def channel_times(taps: int = 512) -> list[dict[str, Any]]:
 
 def channel_table(rows: list[dict[str, Any]], taps: int = 512) -> str:
     """Return the times of several channels for the terminal."""
-    title = f"KF-PB: I x J x K, taps L, L_p                 µs a sample   times one channel of {taps} taps   worst block / its duration"
+    title = f"KF-PB: I x J x K, taps L    µs a sample   times one channel of {taps} taps   worst block / its duration"
     return "\n".join(
         [
             title,
             *(
-                f"{row['form']:16}{row['references']:6} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}, {row['n_primary']:4}"
-                f"{row['us_per_sample']:14.1f}{row['times_one_channel']:22.2f}{row['worst_block_share']:36.2f}"
+                f"{row['references']:6} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}"
+                f"{row['us_per_sample']:18.1f}{row['times_one_channel']:22.2f}{row['worst_block_share']:36.2f}"
                 for row in rows
             ),
         ]
@@ -215,12 +214,10 @@ def block_table(rows: list[dict[str, Any]]) -> str:
 
 
 def first_use_s(name: str) -> float:
-    """Return the seconds that a first use takes longer than the second, with nothing compiled yet."""
-    with tempfile.TemporaryDirectory() as cache:
-        path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-        environment = os.environ | {"NUMBA_CACHE_DIR": cache, "PYTHONPATH": path}
-        command = [sys.executable, "-c", FIRST_USE.format(name=variants.FIRST_USES[name].__name__)]
-        ran = subprocess.run(command, env=environment, capture_output=True, text=True)
+    """Return the seconds that the first use in a process takes longer than the second."""
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
+    command = [sys.executable, "-c", FIRST_USE.format(name=variants.FIRST_USES[name].__name__)]
+    ran = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
     if ran.returncode:
         raise RuntimeError(f"the first run failed: {ran.stderr}")
     return float(ran.stdout)
@@ -304,7 +301,7 @@ def remarks(result: dict[str, Any]) -> list[str]:
             f"P(0|0): {w['first_samples_us']:.0f} µs."
             for w in result["worst_sample"]
         ),
-        "First use, nothing compiled yet: "
+        "First use in a process: "
         + ", ".join(f"{took:.1f} s for {name}" for name, took in result["first_use_s"].items())
         + ".",
         f"{' and '.join(OTHER_RECURSIONS)}: another recursion, with forgetting in place of state noise.",

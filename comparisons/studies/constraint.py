@@ -28,10 +28,10 @@ from kfopc_filterpy.bench import (
     make_controller,
     tune,
 )
+from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot, short_time_power
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
-from kfopc_filterpy.power import PowerBudget
 
 from .cases import (
     FS,
@@ -573,13 +573,12 @@ def _amplifier_table(clipped: Sequence[ClippedRow]) -> Table:
 
 
 def _parameters(tuned: Mapping[Case, Mapping[str, Tuned]]) -> dict[str, Parameter]:
-    defaults = PowerBudget(1, 1.0)
     return case_parameters(Parameter(N_TAPS, "the aim's own")) | {
         "rated_power": Parameter(list(SHARES), "shares of the unconstrained control power of each noise"),
         "durations_s": Parameter(list(DURATIONS_S), "from switch-on on; the steady half counts"),
         "seeds": Parameter(list(SEEDS), "of noise; of a tone, its phase; of the recording, where it begins"),
         "limiter_window_s": Parameter(WINDOW_S, "default of OutputLimiter"),
-        "KF-PB memory_s, averaging_s": Parameter([defaults.memory_s, defaults.averaging_s], "defaults of PowerBudget"),
+        "KF-PB averaging_s": Parameter(DEFAULT_AVERAGING_S, "default of kf_pb"),
         "r E[x'^2]/q": Parameter(
             {str(case): {name: own[name].setting for name in TUNED} for case, own in tuned.items()},
             f"tuned on the first seed, {DURATIONS_S[0]:g} s, 25 %: {Tuned.RULE}",

@@ -33,10 +33,9 @@ from .rooms import MEASURED, RECORDINGS, SIZES, Place, equally_rated, level_map_
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
-KF_PB = "KF-PB (shared gain)"
-DEFAULT_MEMORY_S = 0.5  # setting of KF_PB by default
-DIRECT = ("KF-ANC", "KF-OPC", "KF-PB")  # their state consists of all weights
-MOST_WEIGHTS = 256  # limit for the direct forms: a sample takes K J^2 L^2 operations
+KF_PB = "KF-PB"
+DIRECT = ("KF-ANC", "KF-OPC")  # their state consists of all weights
+MOST_WEIGHTS = 256  # limit for them: a sample takes K J^2 L^2 operations
 CONVERGENCE_WINDOW_S, CONVERGENCE_DB = 0.25, 1.0
 SHOWN = ("4 x 4", "band noise")  # shown in the figures over time and in the map
 EQUAL = "one equal rating"
@@ -64,12 +63,11 @@ class Outcome:
     scene: Scene
     rows: list[ChannelRow]
     tuned: dict[str, Tuned]
-    untuned: ChannelRow  # KF-PB with its default settings
     results: dict[str, SimulationResult]
 
 
 def names(place: Place) -> list[str]:
-    """Return the algorithms that run in a place: the direct forms only in small systems."""
+    """Return the algorithms that run in a place: those of all weights only in small systems."""
     weights = place.secondary.shape[1] * place.n_taps
     return [name for name in algorithms(several_channels=True) if name not in DIRECT or weights <= MOST_WEIGHTS]
 
@@ -140,8 +138,7 @@ def _outcome(runs: Runs, name: str, noise: str) -> Outcome:
         for own, best in tuned.items()
     ]
     rows += _equal_rows(name, noise, equally_rated(scene), tuned[KF_PB].setting)
-    untuned = channel_row(name, noise, scene, run_setting(scene, KF_PB, DEFAULT_MEMORY_S), algorithm=KF_PB)
-    return Outcome(place, scene, rows, tuned, untuned, results if (name, noise) == SHOWN else {})
+    return Outcome(place, scene, rows, tuned, results if (name, noise) == SHOWN else {})
 
 
 def _final_runs(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> Iterable[tuple[str, SimulationResult]]:
@@ -309,10 +306,10 @@ def _rivals_verdict(rows: Sequence[ChannelRow]) -> Verdict:
 
 
 def _is_rival(row: ChannelRow) -> bool:
-    """Return whether a row belongs to an algorithm, other than a form of KF-PB, that kept every rating."""
+    """Return whether a row belongs to an algorithm, other than KF-PB, that kept every rating."""
     return (
         row.algorithm in algorithms(several_channels=True)
-        and not row.algorithm.startswith("KF-PB")
+        and row.algorithm != KF_PB
         and row.within_budget
         and np.isfinite(row.noise_reduction_db)
     )
@@ -320,20 +317,12 @@ def _is_rival(row: ChannelRow) -> bool:
 
 def _notes(rows: Sequence[ChannelRow], outcomes: dict[Where, Outcome]) -> list[str]:
     notes = [
-        f"The direct forms ({', '.join(DIRECT)}), whose state consists of all J L weights, run only in systems of up "
+        f"{' and '.join(DIRECT)}, whose state consists of all J L weights, run only in systems of up "
         f"to {MOST_WEIGHTS} weights. In larger ones, the scaled Wiener solution stands for KF-OPC: it is what KF-OPC "
         "would reach in the steady state if its factor kept the ratings.",
         f"'{FREE}' is the Wiener solution without a limit, with a small ridge: directions of the weights in which the "
         "noise has hardly any energy are left out. The ratings are a quarter of its powers.",
     ]
-    lost = [
-        _row(outcome, KF_PB).noise_reduction_db - outcome.untuned.noise_reduction_db for outcome in outcomes.values()
-    ]
-    notes.append(
-        f"{KF_PB} with its default settings is {np.mean(lost):.2f} dB below its best setting on average, "
-        f"{max(lost):.2f} dB at worst; its largest power is "
-        f"{max(outcome.untuned.power for outcome in outcomes.values()):.3f} times the rating."
-    )
     left_out = [str(size) for size in SIZES if f"{size} x {size}" not in places()]
     if left_out:
         notes.append("pyroomacoustics is not installed: the built-in rooms are left out.")

@@ -23,9 +23,9 @@ from kfopc_filterpy.bench import (
     algorithms,
     run_setting,
 )
+from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot, short_time_power
 from kfopc_filterpy.paths import Duct, duct_paths, path_taps
-from kfopc_filterpy.power import PowerBudget
 
 from .cases import (
     FS,
@@ -418,7 +418,7 @@ def _notes(pairs: Iterable[str], rows: Sequence[TrackingRow]) -> list[str]:
         "the budget allows less than 1 dB, so the constrained algorithms count as settled whatever they do.",
         "The constrained algorithms recover late from a loud noise because its power stays in their memory. KF-OPC's fades "
         f"with {Scene.power_memory_s:g} s: 20 dB take 4.6 times that to be forgotten. KF-PB remembers for "
-        f"{PowerBudget(1, 1.0).averaging_s:g} s, because the noise may become loud again. "
+        f"{DEFAULT_AVERAGING_S:g} s, because the noise may become loud again. "
         "At the jump itself they overspend, since an estimate of power follows behind the noise; only "
         "a limiter behind the filter holds from the first sample.",
         "Settings are tuned on the mean NSE over the whole run, which a single change hardly moves: the Kalman filters get "

@@ -1,4 +1,4 @@
-"""Study: KF-PB with a secondary path that is known within a tolerance, and what its guard gains and costs."""
+"""Study: KF-PB with a secondary path that is not as it knows it, and what it gains by allowing for that."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, Verdict, run_setting
+from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
-from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 from .cases import (
@@ -50,19 +50,19 @@ ERRORS: dict[str, dict[str, float]] = {  # of the estimate
 }
 EXACT, IDENTIFIED = "exact", "identified"
 IDENTIFICATION_S = 5.0
-NO_GUARD, DEFAULT, STATED = "no guard", "default", "stated"
-GUARDS = (NO_GUARD, DEFAULT, STATED)
+NOTHING, DEFAULT, STATED = "nothing", "default", "stated"
+ALLOWANCES = (NOTHING, DEFAULT, STATED)
 COST_DB = 0.5
 Knowledge = tuple[np.ndarray, Any]  # taps of the estimate, and what is stated of its uncertainty
 BOTTOM_DB = -8.0  # of the figure
 
 
 @dataclass(frozen=True, kw_only=True)
-class GuardRow(WindowRow):
-    """KF-PB with an estimate that is wrong by `error`, and a guard; the noise reduction is over the steady half."""
+class AllowanceRow(WindowRow):
+    """KF-PB with an estimate that is wrong by `error`, and an allowance; the noise reduction is over the steady half."""
 
     error: str
-    guard: str
+    allowance: str
     worst_second_db: float = np.nan  # least noise reduction over a second after the first
 
 
@@ -74,7 +74,7 @@ def planned_runs() -> int:
 def main(runs: Runs) -> StudyReport:
     """Run the study on all paths and noises at hand."""
     pairs = paths()
-    rows: list[GuardRow] = []
+    rows: list[AllowanceRow] = []
     settings = {}
     for path, pair in pairs.items():
         estimates = known_paths(pair)
@@ -89,9 +89,9 @@ def main(runs: Runs) -> StudyReport:
         title="A secondary path that is known within a tolerance",
         summary=(
             f"KF-PB at {100 * RATED_SHARE:g} % of the power that the unconstrained filter needs. Its estimate of the "
-            "secondary path is a sample, 3 dB or 45 degrees off at all frequencies, or was identified. Without a guard it "
-            "takes the estimate for exact; by default it allows for a sample of delay; stated is the error as it is, or "
-            "the uncertainty that the identification returned."
+            "secondary path is a sample, 3 dB or 45 degrees off at all frequencies, or was identified. It allows for "
+            "nothing, which takes the estimate for exact, for its default, or for the error as it is, or the uncertainty "
+            "that the identification returned, as stated."
         ),
         fs=FS,
         rated_power=RATED_SHARE,
@@ -103,7 +103,7 @@ def main(runs: Runs) -> StudyReport:
             "wide_band_hz": Parameter(list(WIDE_HZ), "up to three eighths of the sample rate"),
             "high_tone_hz": Parameter(HIGH_TONE_HZ, "a quarter of the sample rate: a sample is 90 degrees"),
             "seed": Parameter(SEED, "of noise and sensor noise"),
-            "settings": Parameter(settings, "tuned with the exact path and no guard"),
+            "settings": Parameter(settings, "with the exact path"),
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
@@ -150,22 +150,28 @@ def known_paths(pair: Pair) -> dict[str, Knowledge]:
 
 
 def jobs() -> list[tuple[str, str]]:
-    """Return what is run of each case: error of the estimate and guard. Nothing is to be stated of an exact path."""
-    wrong = [(error, guard) for error in (IDENTIFIED, *ERRORS) for guard in GUARDS]
-    return [(EXACT, NO_GUARD), (EXACT, DEFAULT), *wrong]
+    """Return what is run of each case: error of the estimate, and what is allowed for. Nothing is to be stated of an exact path."""
+    wrong = [(error, allowance) for error in (IDENTIFIED, *ERRORS) for allowance in ALLOWANCES]
+    return [(EXACT, NOTHING), (EXACT, DEFAULT), *wrong]
 
 
 def run_job(
     scene: Scene, estimates: Mapping[str, Knowledge], best: Tuned | None, path: str, noise: str, job: tuple[str, str]
-) -> GuardRow:
-    """Run KF-PB with an estimate and a guard."""
-    error, guard = job
-    place: dict[str, Any] = {"path": path, "noise": noise, "algorithm": ALGORITHM, "error": error, "guard": guard}
+) -> AllowanceRow:
+    """Run KF-PB with an estimate and an allowance."""
+    error, allowance = job
+    place: dict[str, Any] = {
+        "path": path,
+        "noise": noise,
+        "algorithm": ALGORITHM,
+        "error": error,
+        "allowance": allowance,
+    }
     estimate, uncertainty = estimates[error]
-    allowed = {NO_GUARD: None, DEFAULT: ONE_SAMPLE, STATED: uncertainty}[guard]
+    allowed = {NOTHING: None, DEFAULT: DEFAULT_UNCERTAINTY, STATED: uncertainty}[allowance]
     known = replace(scene, secondary_estimate=estimate, secondary_path_uncertainty=allowed)
     result = None if best is None else run_setting(known, ALGORITHM, best.setting)
-    row = GuardRow(**place, **figures_of(result, scene.rated_power))
+    row = AllowanceRow(**place, **figures_of(result, scene.rated_power))
     if result is None or row.diverged_at_s is not None:
         return row
     return replace(row, worst_second_db=min(seconds_db(result)[1:]))
@@ -187,58 +193,60 @@ def seconds_db(result: SimulationResult) -> list[float]:
 # ---- Claims and notes
 
 
-def verdicts(rows: Sequence[GuardRow]) -> list[Verdict]:
+def verdicts(rows: Sequence[AllowanceRow]) -> list[Verdict]:
     """Return the findings, each on all cases."""
     return [
-        *(_never_louder(rows, guard) for guard in (DEFAULT, STATED)),
+        *(_never_louder(rows, allowance) for allowance in (DEFAULT, STATED)),
         _cost(rows, False),
         _cost(rows, True),
         _cost_identified(rows),
     ]
 
 
-def _value(row: GuardRow) -> float:
+def _value(row: AllowanceRow) -> float:
     return -np.inf if row.diverged_at_s is not None else row.worst_second_db
 
 
-def _where(row: GuardRow) -> str:
+def _where(row: AllowanceRow) -> str:
     return f"{row.path}, {row.noise}, {row.error}"
 
 
-def _never_louder(rows: Iterable[GuardRow], guard: str) -> Verdict:
+def _never_louder(rows: Iterable[AllowanceRow], allowance: str) -> Verdict:
     words = {
-        DEFAULT: "With its default guard KF-PB makes the noise louder in no second after the first",
+        DEFAULT: "With its default uncertainty KF-PB makes the noise louder in no second after the first",
         STATED: "With the error stated as a tolerance KF-PB makes the noise louder in no second after the first",
     }
     wrong = [row for row in rows if row.error != EXACT]
-    own, bare = ([row for row in wrong if row.guard == one] for one in (guard, NO_GUARD))
+    own, bare = ([row for row in wrong if row.allowance == one] for one in (allowance, NOTHING))
     louder, bare_louder = ([row for row in some if not _value(row) >= 0.0] for some in (own, bare))
     worst, bare_worst = min(own, key=_value), min(bare, key=_value)
     return Verdict(
-        words[guard],
+        words[allowance],
         not louder,
-        f"{len(louder)} of {len(own)} runs do, the worst second is {_value(worst):.1f} dB ({_where(worst)}); without "
-        f"a guard {len(bare_louder)} of {len(bare)} do, the worst second is {_value(bare_worst):.1f} dB "
+        f"{len(louder)} of {len(own)} runs do, the worst second is {_value(worst):.1f} dB ({_where(worst)}); if "
+        f"nothing is allowed for {len(bare_louder)} of {len(bare)} do, the worst second is {_value(bare_worst):.1f} dB "
         f"({_where(bare_worst)})",
     )
 
 
-def _cost(rows: Sequence[GuardRow], beyond: bool) -> Verdict:
+def _cost(rows: Sequence[AllowanceRow], beyond: bool) -> Verdict:
     some = [row for row in rows if (row.noise in BEYOND) == beyond]
     noise = "white noise" if beyond else "noises below three eighths of the sample rate"
-    return _cost_of(some, EXACT, DEFAULT, f"With an exact path the default guard costs at most {COST_DB:g} dB, {noise}")
+    return _cost_of(
+        some, EXACT, DEFAULT, f"With an exact path the default uncertainty costs at most {COST_DB:g} dB, {noise}"
+    )
 
 
-def _cost_identified(rows: Iterable[GuardRow]) -> Verdict:
+def _cost_identified(rows: Iterable[AllowanceRow]) -> Verdict:
     words = f"With a path that was identified and the uncertainty that came with it, at most {COST_DB:g} dB are lost"
     return _cost_of(rows, IDENTIFIED, STATED, words)
 
 
-def _cost_of(rows: Iterable[GuardRow], error: str, guard: str, words: str) -> Verdict:
-    """Return a verdict on what is lost in comparison with an exact path and no guard."""
-    reduction = {(row.case, row.error, row.guard): row.noise_reduction_db for row in rows}
+def _cost_of(rows: Iterable[AllowanceRow], error: str, allowance: str, words: str) -> Verdict:
+    """Return a verdict on what is lost in comparison with an exact path that is taken for exact."""
+    reduction = {(row.case, row.error, row.allowance): row.noise_reduction_db for row in rows}
     cases = {case: None for case, *_ in reduction}
-    costs = {str(case): reduction[case, EXACT, NO_GUARD] - reduction[case, error, guard] for case in cases}
+    costs = {str(case): reduction[case, EXACT, NOTHING] - reduction[case, error, allowance] for case in cases}
     where = max(costs, key=lambda case: costs[case])
     return Verdict(
         words,
@@ -247,15 +255,13 @@ def _cost_of(rows: Iterable[GuardRow], error: str, guard: str, words: str) -> Ve
     )
 
 
-def _notes(pairs: Mapping[str, Any], rows: Sequence[GuardRow]) -> list[str]:
-    powers = [row.power for row in rows if row.diverged_at_s is None and row.guard == DEFAULT]
+def _notes(pairs: Mapping[str, Any], rows: Sequence[AllowanceRow]) -> list[str]:
+    powers = [row.power for row in rows if row.diverged_at_s is None and row.allowance == DEFAULT]
     return [
         *without_measured(pairs),
-        f"With its default guard KF-PB spends {min(powers):.2f} to {max(powers):.2f} of its rated power over the steady "
+        f"With its default uncertainty KF-PB spends {min(powers):.2f} to {max(powers):.2f} of its rated power over the steady "
         "half, whatever is wrong with the estimate.",
-        "The default guard weakens the control above a sixth of the sample rate and leaves almost none above three eighths, "
-        "where a path a sample early or late could make a tone louder by more than 3 dB. That costs noise reduction if "
-        "much of the noise is there and the path is exact after all. State what is known of the path then.",
+        "KF-PB learns the path while it controls: what is allowed for counts until it has been learned.",
         f"The identification hears {IDENTIFICATION_S:g} s of white noise, {-SENSOR_NOISE_DB:g} dB above the microphone's noise.",
         "A constant phase error cannot be had at all frequencies with a causal estimate; it is fitted from 0.01 to 0.45 "
         "of the sample rate.",
@@ -266,27 +272,33 @@ def _notes(pairs: Mapping[str, Any], rows: Sequence[GuardRow]) -> list[str]:
 # ---- Tables and figures
 
 
-def _table(stem: str, caption: str, rows: Sequence[GuardRow], figure: str) -> Table:
+def _table(stem: str, caption: str, rows: Sequence[AllowanceRow], figure: str) -> Table:
     def cells() -> Iterator[tuple[tuple[str, ...], str, Any]]:
         for row in rows:
-            yield (row.path, row.noise, row.error), row.guard, cell(row, figure)
+            yield (row.path, row.noise, row.error), row.allowance, cell(row, figure)
 
-    return by_algorithm(stem, caption, ["paths", "noise", "estimate"], GUARDS, cells())
+    return by_algorithm(stem, caption, ["paths", "noise", "estimate"], ALLOWANCES, cells())
 
 
-def _figure(rows: Sequence[GuardRow]) -> FigureItem:
+def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:
     """Return a figure of the worst seconds: a panel for each pair of paths, a group for each error."""
     names, estimates = list(dict.fromkeys(row.path for row in rows)), [EXACT, IDENTIFIED, *ERRORS]
     figure, axes = new_figure((10.5, 4.2), 1, len(names), sharey=True)
-    markers = {NO_GUARD: ("x", "C3"), DEFAULT: ("o", "C0"), STATED: ("^", "C2")}
+    markers = {NOTHING: ("x", "C3"), DEFAULT: ("o", "C0"), STATED: ("^", "C2")}
     bottom = max(BOTTOM_DB, min(_value(row) for row in rows))
     for ax, path in zip(axes[0], names, strict=True):
-        for place, guard in enumerate(GUARDS):
-            own = [row for row in rows if (row.path, row.guard) == (path, guard)]
+        for place, allowance in enumerate(ALLOWANCES):
+            own = [row for row in rows if (row.path, row.allowance) == (path, allowance)]
             x = [estimates.index(row.error) + 0.25 * (place - 1) for row in own]
-            marker, colour = markers[guard]
+            marker, colour = markers[allowance]
             ax.plot(
-                x, [max(_value(row), bottom) for row in own], marker, color=colour, markersize=5, alpha=0.8, label=guard
+                x,
+                [max(_value(row), bottom) for row in own],
+                marker,
+                color=colour,
+                markersize=5,
+                alpha=0.8,
+                label=allowance,
             )
         ax.axhline(0.0, color=MARK, linewidth=1)
         ax.set_xticks(range(len(estimates)), estimates, rotation=40, ha="right", fontsize="small")

@@ -1,6 +1,6 @@
 """Pages that show the package's source with numbered lines, and links to lines, found by their text.
 
-The role ``{line}`kernels.covariance: S = x + q` `` links to the one line of ``kfopc_filterpy/kernels/covariance.py`` that
+The role ``{line}`core.kalman: S = x + q` `` links to the one line of ``kfopc_filterpy/core/kalman.c`` that
 contains the text. If no line contains it, or several do, that is a warning: a page cannot keep pointing at code that has
 moved or changed.
 """

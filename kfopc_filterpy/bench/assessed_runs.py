@@ -87,7 +87,6 @@ class Plan:
         if name == "KF-OPC":
             each = [OutputPowerConstraint(one.rated_power, fs=self.fs) for one in each_of(limits)]
             return kf_opc(n_taps, self.s, constraint=each if several else each[0], **outside, **noises)
-        own = {"form": "shared gain", "path_memory_s": self.memory_s} if several else {"form": "direct", **noises}
         return kf_pb(
             n_taps,
             self.s,
@@ -95,7 +94,6 @@ class Plan:
             fs=self.fs,
             secondary_path_uncertainty=self.uncertainty,
             **outside,
-            **own,
         )
 
     @property

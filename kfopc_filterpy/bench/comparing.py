@@ -22,7 +22,7 @@ from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_sol
 from .tuning import RULE, AllDivergedError, run_setting, tune
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
-OF_SEVERAL_CHANNELS = ("KF-PB (shared gain)", "MOV-FxLMS", "FxLMS")
+OF_SEVERAL_CHANNELS = ("KF-PB", "MOV-FxLMS", "FxLMS")
 SCALED = (
     " The rated powers are {}{}. Powers are relative to the rated power, and peaks to its square root, of the loudspeaker "
     "for which they are largest."
@@ -55,7 +55,7 @@ def compare_recordings(
         As for `assess`.
     names : sequence of str, optional
         Algorithms, see `algorithms`; by default "KF-PB", "KF-OPC", "MOV-FxLMS" and "FxLMS". With several channels, by
-        default "KF-PB (shared gain)", "MOV-FxLMS" and "FxLMS": the filters that estimate all weights together take long.
+        default "KF-PB", "MOV-FxLMS" and "FxLMS": the filters that estimate all weights together take long.
     seconds : float, optional
         Part of the record that is used, from its start; by default all of it.
     bar : tqdm bar, optional

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-_BUDGET = "keeps the rated power, and spends it where it reduces the noise most"
-
 DESCRIPTIONS = {
     "KF-ANC": "a Kalman filter that learns the control filter and knows no rated power",
     "KF-OPC": "KF-ANC with the disturbance scaled by a constraint factor, which is meant to keep the rated power",
     "KF-OPC repaired": "KF-OPC with the secondary path's gain for the control signal, trimmed by the measured power",
-    "KF-PB": f"a Kalman filter that {_BUDGET}",
-    "KF-PB (shared gain)": f"a Kalman filter of the primary paths that {_BUDGET}",
-    "KF-PB (frequency domain)": f"a Kalman filter of the primary paths, in the frequency domain, that {_BUDGET}",
+    "KF-PB": "a Kalman filter that learns the paths, keeps the rated power, and spends it where it reduces the noise most",
     "diagonal KF": "KF-ANC that leaves out how the weights' errors depend on each other; it computes and learns less",
     "diagonal KF-OPC": "the diagonal KF with KF-OPC's constraint factor",
     "FxRLS": "recursive least squares with exponential forgetting; it knows no rated power",

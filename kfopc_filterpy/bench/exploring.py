@@ -115,7 +115,7 @@ class ExploreSettings:
     path_tolerance_samples : float, default 1.0
         Error of that delay which KF-PB takes account of. The other algorithms do not use it.
     state_noise : float, default 1e-7
-        State noise r of the Kalman filters, as r E[x'^2]/q.
+        State noise r of KF-OPC and KF-ANC, as r E[x'^2]/q.
     step_size : float, default 0.03125
         Step size mu of the LMS algorithms, as mu L E[x'^2].
     clips : bool, default True
@@ -375,7 +375,8 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
         secondary_estimate=scene.secondary,
         secondary_path_uncertainty=PathTolerance(delay_samples=settings.path_tolerance_samples),
     )
-    setting = settings.state_noise if REGISTRY[settings.algorithm].symbol == "r" else settings.step_size
+    own = REGISTRY[settings.algorithm]
+    setting = {"r": settings.state_noise, "mu": settings.step_size}.get(own.symbol, own.first[0])
     run = scene.run(make_controller(scene, settings.algorithm, setting))
     with reachable_weights():
         bound = power_constrained_solution(*scene.settled, scene.secondary, N_TAPS, rated)

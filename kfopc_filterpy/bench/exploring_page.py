@@ -187,13 +187,13 @@ class _Page:
     def _enable(self) -> None:
         """Let only the controls be moved that the run depends on."""
         algorithm, kind = self.controls["algorithm"].value, self.controls["rating_kind"].active
-        is_kalman = REGISTRY[algorithm].symbol == "r"
+        symbol = REGISTRY[algorithm].symbol
         disabled = {
             "relative_rating": kind != RELATIVE,
             "absolute_rating": kind != ABSOLUTE,
             "tolerance": algorithm != "KF-PB",
-            "state_noise": not is_kalman,
-            "step_size": is_kalman,
+            "state_noise": symbol != "r",
+            "step_size": symbol != "mu",
         }
         for name, value in disabled.items():
             self.controls[name].update(disabled=value, styles={"opacity": "0.4" if value else "1"})
@@ -216,7 +216,7 @@ class _Page:
 
     def _run(self) -> None:
         self._is_running, self._is_asked = True, False
-        self.texts["status"].text = "Computing … (compiling an algorithm, once, takes up to half a minute)"
+        self.texts["status"].text = "Computing …"
         start = time.perf_counter()
         future = self.pool.submit(explore, self.setup, self._settings())
         future.add_done_callback(lambda done: self.document.add_next_tick_callback(partial(self._show, done, start)))

@@ -27,6 +27,8 @@ PARAMETERS = {
     "amplifier": ("", "amplifier"),
     "amplitude": ("", "amplitude of the reference"),
     "amplitude_limits": (r"A^2", "limits of the peak-limited algorithms, squared, over the amplifier's"),
+    "averaging time in s": ("", "time over which the power is averaged in s"),
+    "averaging_s": ("", "time over which the power is averaged in s"),
     "band_hz": ("", "band of the noise in Hz"),
     "change_s": ("", "time of the change in s"),
     "duration_s": ("", "duration in s"),

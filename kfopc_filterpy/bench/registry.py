@@ -40,7 +40,7 @@ STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
-MEMORY_GRID = (0.125, 0.25, 0.5, 1.0, 2.0)  # in s
+AVERAGING_S = 10.0
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
@@ -56,7 +56,7 @@ class Algorithm:
         Function of a scene, the first setting in the scene's units, the second setting, and the amplifier known to the
         disturbance estimate. It returns a fresh controller.
     symbol : str
-        Parameter that the first setting sets: "r", "mu", "1 - lambda" or "memory_s".
+        Parameter that the first setting sets: "r", "mu", "1 - lambda" or "averaging_s".
     kind : str
         The first setting as a formula, without units.
     first : tuple of float
@@ -115,7 +115,7 @@ class Algorithm:
         return [(one, two) for one in (best[0] / 2, best[0], 2 * best[0]) for two in near]
 
     def value(self, scene: Scene, setting: Setting) -> float:
-        """Return the r, mu, 1 - lambda or memory in s that a `setting` stands for, in the units of a `scene`."""
+        """Return the r, mu, 1 - lambda or averaging time in s that a `setting` stands for, in the units of a `scene`."""
         first = setting[0] if isinstance(setting, tuple) else setting
         if self.symbol == "r":
             return first * scene.measurement_noise / scene.filtered_power
@@ -134,8 +134,8 @@ def _references(scene: Scene) -> dict[str, Any]:
     return {"n_references": len(scene.references[0])} if scene.secondary.ndim == 3 else {}
 
 
-def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[..., Controller]:
-    """Return a function that makes Kalman filters: with a constraint, `free` of one, or with a power `budget`."""
+def _kalman(make: Any, *, free: bool = False) -> Callable[..., Controller]:
+    """Return a function that makes Kalman filters: with a constraint, or `free` of one."""
 
     def made(scene: Scene, r: float, _: float, amplifier: Amplifier | None) -> Controller:
         settings: dict[str, Any] = {
@@ -145,33 +145,24 @@ def _kalman(make: Any, *, free: bool = False, budget: bool = False) -> Callable[
             "amplifier": amplifier,
             **_references(scene),
         }
-        if budget:
-            settings |= {"rated_power": scene.rated_power, "fs": scene.fs, "form": "direct"}
-            settings |= {"secondary_path_uncertainty": scene.secondary_path_uncertainty}
-        elif not free:
+        if not free:
             settings |= {"constraint": _constraint(scene)}
         return make(scene.n_taps, scene.known_secondary, **settings)
 
     return made
 
 
-def _primary_paths(form: str) -> Callable[..., Controller]:
-    """Return a function that makes KF-PB in a `form` that estimates the primary paths."""
-
-    def made(scene: Scene, memory_s: float, _: float, amplifier: Amplifier | None) -> Controller:
-        return kf_pb(
-            scene.n_taps,
-            scene.known_secondary,
-            rated_power=scene.rated_power,
-            secondary_path_uncertainty=scene.secondary_path_uncertainty,
-            form=form,
-            memory_s=memory_s,
-            fs=scene.fs,
-            amplifier=amplifier,
-            **_references(scene),
-        )
-
-    return made
+def _power_budget(scene: Scene, averaging_s: float, _: float, amplifier: Amplifier | None) -> Controller:
+    return kf_pb(
+        scene.n_taps,
+        scene.known_secondary,
+        rated_power=scene.rated_power,
+        secondary_path_uncertainty=scene.secondary_path_uncertainty,
+        fs=scene.fs,
+        averaging_s=averaging_s,
+        amplifier=amplifier,
+        **_references(scene),
+    )
 
 
 def _rated(kind: Any, **more: Any) -> Callable[..., Controller]:
@@ -265,23 +256,15 @@ _PEAK: dict[str, Any] = _STEP | {
 _FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
 _KNOWS: dict[str, Any] = {"knows_amplifier": True}
 _CHANNELS: dict[str, Any] = {"several_channels": True}
-_PRIMARY_PATHS: dict[str, Any] = {
-    "symbol": "memory_s",
-    "kind": "memory of the references' correlation in s",
-    "first": MEMORY_GRID,
-    "one_channel": False,
-    **_KNOWS,
-    **_CHANNELS,
-}
 REGISTRY: dict[str, Algorithm] = {
     "KF-ANC": Algorithm(
         _kalman(kf_anc, free=True), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE, **_CHANNELS
     ),
     "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS),
     "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired), **_RANDOM_WALK),
-    "KF-PB": Algorithm(_kalman(kf_pb, budget=True), **_RANDOM_WALK, **_CHANNELS),
-    "KF-PB (shared gain)": Algorithm(_primary_paths("shared gain"), **_PRIMARY_PATHS),
-    "KF-PB (frequency domain)": Algorithm(_primary_paths("frequency domain"), **_PRIMARY_PATHS),
+    "KF-PB": Algorithm(
+        _power_budget, symbol="averaging_s", kind="averaging time in s", first=(AVERAGING_S,), **_KNOWS, **_CHANNELS
+    ),
     "diagonal KF": Algorithm(_kalman(DiagonalKalman, free=True), **_DIAGONAL, **_FREE),
     "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman), **_DIAGONAL),
     "FxRLS": Algorithm(_rls, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
@@ -328,10 +311,10 @@ def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
     >>> from kfopc_filterpy.bench import algorithms
     >>> [name for name, algorithm in algorithms().items() if algorithm.of_paper]
     ['KF-ANC', 'KF-OPC', 'FxLMS', 'MOV-FxLMS']
-    >>> algorithms()["KF-PB"].grid
+    >>> algorithms()["KF-OPC"].grid
     [1e-08, 1e-07, 1e-06, 1e-05, 0.0001]
-    >>> "KF-PB (shared gain)" in algorithms(), "KF-PB (shared gain)" in algorithms(several_channels=True)
-    (False, True)
+    >>> "FxRLS" in algorithms(), "FxRLS" in algorithms(several_channels=True)
+    (True, False)
     """
     wanted = "several_channels" if several_channels else "one_channel"
     return MappingProxyType({name: own for name, own in REGISTRY.items() if getattr(own, wanted)})

@@ -317,7 +317,7 @@ def tune(
     ...                    power_multiple=2.0, n_taps=8)
     >>> best = tune(Runs(), scene, ["KF-PB"])["KF-PB"]
     >>> best.within_budget, len(best.trials)
-    (True, 5)
+    (True, 1)
     """
     if names is None:
         names = [name for name, algorithm in REGISTRY.items() if algorithm.of_paper]
@@ -350,4 +350,5 @@ def _best(trials: Sequence[Trial], rated_power: Any) -> Tuned | None:
 def _at_edge(setting: Setting, trials: Sequence[Trial]) -> bool:
     tried = np.array([np.atleast_1d(trial.setting) for trial in trials])
     own = np.atleast_1d(setting)
-    return bool(np.any((own == tried.min(axis=0)) | (own == tried.max(axis=0))))
+    least, most = tried.min(axis=0), tried.max(axis=0)
+    return bool(np.any(((own == least) | (own == most)) & (least < most)))

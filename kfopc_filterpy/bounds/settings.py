@@ -149,8 +149,8 @@ def suggest_settings(
     With several channels, J and :math:`E[d^2]` are means over the K microphones and :math:`E[x'^2]` is the mean over
     loudspeakers and references of the sum over microphones, whose measurements inform the same weights. The fractions of
     L are multiplied by J I / K, the weights per tap and microphone. :math:`P_0` then is
-    :math:`K E[d^2] / (J I L\, E[x'^2])`. These q, r and :math:`P_0` are for the direct form; `SharedGainKalman` takes
-    only the length.
+    :math:`K E[d^2] / (J I L\, E[x'^2])`. `kf_pb` takes only the length and the sample
+    rate.
 
     Directions of the weights with less than 1e-11 of the energy do not count, as in `wiener_solution`. q contains neither
     what a clipping amplifier cuts off nor the errors of the path estimate, which a silent run does not show.

@@ -2,9 +2,7 @@ from .base import Controller as Controller
 from .core_controller import CoreController as CoreController
 from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman
-from .direct_budget import DirectPowerBudget as DirectPowerBudget
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
-from .frequency_domain import FrequencyDomainKalman as FrequencyDomainKalman
 from .leaky import leak_factor as leak_factor
 from .monitored import HealthEvent as HealthEvent
 from .monitored import MonitoredController as MonitoredController
@@ -13,6 +11,5 @@ from .path_tracker import PathChange as PathChange
 from .path_tracker import PathTracker as PathTracker
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .processing import RefusedUpdate as RefusedUpdate
-from .shared_gain import SharedGainKalman as SharedGainKalman
 from .virtual import KalmanObserver as KalmanObserver
 from .virtual import VirtualMicrophones as VirtualMicrophones

@@ -156,7 +156,6 @@ class Looped(NamedTuple):
     steps: Steps
     control_filter: np.ndarray  # (J, I, L) or (L,): the next control signal's
     recorded: dict[str, np.ndarray]  # constraint_factor and others, (J,) or (1,), as of the last sample
-    after: Callable[[], None]  # call it after each stretch, even if it was interrupted
     in_use: AbstractContextManager[Any] = nullcontext()
     owner: Any = None  # what must exist meanwhile
 
@@ -164,8 +163,7 @@ class Looped(NamedTuple):
 class FilteredReferenceController(BlockProcessing, Checkpointed):
     """Channels, paths, limiter, constraint and blocks: what the built-in controllers share.
 
-    Their signals are in a block of the core (`core_controller.CoreController`) or, until their algorithm has moved there,
-    in arrays of numba's compiled code (`compiled_controller.CompiledController`).
+    Their signals are in a block of the core, see `core_controller.CoreController`.
 
     Parameters
     ----------
@@ -209,15 +207,13 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         constraint: Constraints | None = None,
         limiter: OutputLimiter | Sequence[OutputLimiter] | None = None,
-        filtered_taps: int | None = None,
-        history: int = 0,
     ) -> None:
         self.n_taps = as_count(n_taps, "n_taps")
         secondary = self._read_paths(secondary_path, n_references, multichannel)
         self._limiter = self._checked_limiter(limiter)
         self._constrained = constraint is not None
         self._own_constraint = self._checked_constraint(constraint)
-        self._begin(secondary, amplifier, filtered_taps=filtered_taps, history=history)
+        self._begin(secondary, amplifier)
 
     # What a subclass defines.
 
@@ -229,9 +225,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         """Adapt to the error e(n) that the last control signal left."""
         raise NotImplementedError
 
-    def _begin(
-        self, secondary: np.ndarray, amplifier: Any, *, filtered_taps: int | None = None, history: int = 0
-    ) -> None:
+    def _begin(self, secondary: np.ndarray, amplifier: Any) -> None:
         """Make silent signals for checked paths, (n_path,) or (K, J, n_path)."""
         raise NotImplementedError
 
@@ -338,7 +332,7 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
         second observation. An uncertainty can be assigned for KF-ANC, KF-OPC, the diagonal Kalman filter and the LMS
         family, with one channel or several; not for the fast-array filter, which takes one observation. `kf_pb` takes
-        it as a setting, which cannot be changed.
+        it as a setting, which cannot be changed, and learns the path.
         """
         return deepcopy(self._uncertainty)
 
@@ -365,9 +359,8 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         A new estimate can be assigned between two samples, also during a run: taps or an FIR system, or paths with the
         same channels, no longer than the present estimate. The stored references are filtered again with it, so the
         next update knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's
-        covariance grows, because its weights belong to the old path. Running powers, and the correlations of KF-PB for
-        one channel, forget the old path within their memory. KF-PB for several channels solves for the new paths at the
-        end of the block.
+        covariance grows, because its weights belong to the old path. Running powers forget the old path within their
+        memory. KF-PB begins to learn the plant anew, around the new path.
         """
         return self._estimated_path().copy()
 
@@ -512,10 +505,9 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
         rows = [np.atleast_2d(signal) for signal in (x, e, y)]
         done = 0
         while done < n_samples:
-            end = min(done + (self.samples_to_block() or LONGEST_CALL), n_samples)
+            end = min(done + LONGEST_CALL, n_samples)
             with looped.in_use:
                 status, done = process(looped.steps, rows[0], rows[1], rows[2], flags, done, end)
-            looped.after()
             if done < end:
                 self._raise_refusal(x[..., done], e[..., done], done, status)
         return y
@@ -584,10 +576,6 @@ class FilteredReferenceController(BlockProcessing, Checkpointed):
             }
             | named,
         )
-
-    def samples_to_block(self) -> int:
-        """Return the number of samples until the controller works between blocks; 0 if it never does."""
-        return 0
 
 
 def calls_of(kind: type) -> tuple[Any, Any]:

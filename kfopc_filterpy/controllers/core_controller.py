@@ -109,9 +109,7 @@ class CoreController(FilteredReferenceController):
             limiter=limiter,
         )
 
-    def _begin(
-        self, secondary: np.ndarray, amplifier: Any, *, filtered_taps: int | None = None, history: int = 0
-    ) -> None:
+    def _begin(self, secondary: np.ndarray, amplifier: Any) -> None:
         models = amplifier_models(amplifier, self.n_loudspeakers)
         algorithm = self._algorithm()
         block = Block(
@@ -283,7 +281,6 @@ class CoreController(FilteredReferenceController):
             Steps(block.address, *block.algorithm.steps),
             self._weights(),
             {name: constraint[field] for name, field in RECORDED.items()},
-            after=_nothing,
             in_use=block.in_use,
             owner=block,
         )
@@ -292,7 +289,3 @@ class CoreController(FilteredReferenceController):
 def _rows(room: np.ndarray, length: int) -> np.ndarray:
     """Return three rows of a length at the start of the room for three of the longest."""
     return room.reshape(-1)[: 3 * length].reshape(3, length)
-
-
-def _nothing() -> None:
-    """Do nothing after a stretch: all that has changed is in the block."""

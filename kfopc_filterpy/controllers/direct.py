@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_nonnegative, per_channel
-from ..kernels.covariance import OWED, full_covariance
+from ..core.triangle import OWED, full_covariance
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from .base import constraint_or_none
@@ -70,7 +70,7 @@ class DirectKalman(CoreController):
     --------
     KFOPC : The same equations as a filterpy filter, ``dim_z=K``.
     KalmanController : The same structure around any filterpy filter.
-    controllers.SharedGainKalman : A form whose cost hardly depends on the numbers of loudspeakers and microphones.
+    kf_pb : A filter that learns the plant, and spends the rated power where it reduces the noise most.
 
     Notes
     -----

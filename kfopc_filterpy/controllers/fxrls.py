@@ -72,8 +72,7 @@ def fx_rls(
     if is_path_matrix(secondary_path):
         raise ValueError(
             "fx_rls takes one channel, because with several every microphone would need a covariance of its own: use "
-            "controllers.SharedGainKalman, one least-squares estimate for all microphones whose path_memory_s is the "
-            "memory, or an LMS algorithm such as FxNLMS"
+            "kf_pb, which makes one least-squares estimate for all microphones, or an LMS algorithm such as FxNLMS"
         )
     forgetting = as_positive(forgetting, "forgetting")
     if forgetting > 1.0:

@@ -7,12 +7,9 @@ from typing import Any
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._validate import as_count
 from ..bounds.settings import SuggestedSettings
 from ..filters.guards import undoing
 from ..filters.kfopc import KFOPC
-from ..filters.power_budget import PowerBudgetKalmanFilter
-from ..paths.channels import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
@@ -44,7 +41,7 @@ class KalmanController(CoreController):
     Raises
     ------
     TypeError
-        An estimator that is not a filterpy KalmanFilter, or that has a power budget (use `PowerBudgetController`).
+        An estimator that is not a filterpy KalmanFilter.
     ValueError
         An estimator of several measurements.
 
@@ -78,8 +75,6 @@ class KalmanController(CoreController):
                 f"estimator must have one measurement, dim_z = 1, got dim_z = {estimator.dim_z}; "
                 "kf_anc and kf_opc take several microphones"
             )
-        if isinstance(estimator, PowerBudgetKalmanFilter):
-            raise TypeError("estimator has a power budget: use PowerBudgetController, or kf_pb")
         self.estimator = estimator
         super().__init__(
             estimator.dim_x, secondary_path, settings={}, n_references=None, amplifier=amplifier, limiter=limiter
@@ -305,10 +300,10 @@ def _kalman(
     return at_suggested_rate(controller, n_taps)
 
 
-def with_suggested(n_taps: Any, settings: dict[str, Any], instead: str = "") -> tuple[Any, dict[str, Any]]:
+def with_suggested(n_taps: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """Return the taps and the settings; the suggested ones, if there are any, replace those that are None.
 
-    A noise that is still missing raises TypeError; the message says how to find it, or what to give `instead`.
+    A noise that is still missing raises TypeError; the message says how to find it.
     """
     suggested: dict[str, Any] = {"initial_variance": 1.0}
     if isinstance(n_taps, SuggestedSettings):
@@ -316,8 +311,8 @@ def with_suggested(n_taps: Any, settings: dict[str, Any], instead: str = "") -> 
     settings = suggested | {name: value for name, value in settings.items() if value is not None}
     if not {"state_noise", "measurement_noise"} <= settings.keys():
         raise TypeError(
-            f"give state_noise and measurement_noise{instead}, or pass the result of suggest_settings(reference, "
-            "disturbance, secondary_path), from a run with a silent loudspeaker, as n_taps"
+            "give state_noise and measurement_noise, or pass the result of suggest_settings(reference, disturbance, "
+            "secondary_path), from a run with a silent loudspeaker, as n_taps"
         )
     return n_taps, settings
 
@@ -337,8 +332,3 @@ def at_suggested_rate(controller: Any, n_taps: Any) -> Any:
         except ValueError as error:
             raise ValueError(f"in the suggested settings, {error}") from None
     return controller
-
-
-def is_multichannel(secondary_path: Any, n_references: int) -> bool:
-    """Return whether signals have a channel axis: if the secondary path has, or if there are several references."""
-    return is_path_matrix(secondary_path) or as_count(n_references, "n_references") > 1

@@ -114,10 +114,10 @@ class MonitoredController(WrappedController):
     Examples
     --------
     >>> import numpy as np
-    >>> from kfopc_filterpy import kf_pb, simulate
+    >>> from kfopc_filterpy import kf_anc, simulate
     >>> from kfopc_filterpy.controllers import MonitoredController
     >>> path = np.array([0.0, 1.0, 0.4])
-    >>> controller = kf_pb(8, -path, rated_power=1.0, fs=2000.0, state_noise=1e-8, measurement_noise=1e-3)  # wrong sign
+    >>> controller = kf_anc(8, -path, state_noise=1e-8, measurement_noise=1e-3)  # wrong sign
     >>> monitored = MonitoredController(controller, fs=2000.0)
     >>> x = np.random.default_rng(0).standard_normal(6000)
     >>> result = simulate(monitored, x, primary_path=[0.0, 0.0, 0.5], secondary_path=path, fs=2000.0)

@@ -1,279 +1,225 @@
-"""KF-PB: a Kalman filter, with the control filter of least error within the rated power."""
+"""KF-PB: a posterior of the plant, and the control filter of least expected error within the rated power."""
 
 from __future__ import annotations
 
-from copy import deepcopy
-from typing import Any, NamedTuple
+import math
+from collections.abc import Sequence
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from .._validate import as_choice, as_number
+from .._validate import as_nonnegative, as_positive
 from ..bounds.settings import SuggestedSettings
-from ..filters.power_budget import PowerBudgetKalmanFilter
-from ..filters.random_walk import new_numbers
-from ..kernels.covariance import Covariance, kalman_step, new_covariance
-from ..kernels.delay_lines import latest, newest
-from ..paths.uncertainty import GUARD_TAPS, ONE_SAMPLE, as_uncertainty, guard_filter
+from ..paths.uncertainty import as_uncertainty, rms_relative_error
 from ..power.amplifiers import Amplifier
-from ..power.budget import BudgetState, advance_budget, follow_noise, note_sample, take_noted
-from ..power.constraint import (
-    ConstraintState,
-    advance_constraint,
-    commit_constraint,
-    preview_constraint,
-    squares_are_finite,
-)
-from ..power.limiter import OutputLimiter
-from .base import NO_SOLUTION, calls_of
-from .compiled_controller import CompiledController
-from .direct_budget import DirectPowerBudget
-from .frequency_domain import FrequencyDomainKalman
-from .kalman import at_suggested_rate, is_multichannel, with_suggested
-from .primary_paths import PrimaryPathController
-from .shared_gain import SharedGainKalman
-from .step import (
-    Lines,
-    adapt,
-    control_filter,
-    disturbance_estimate,
-    emitted,
-    estimate_once,
-    follow,
-    power_weight,
-    skip,
-    unheard,
+from ..power.constraint import DEFAULT_FS
+from .base import Looped
+from .core_controller import CoreController, Limiters
+from .kalman import at_suggested_rate
+
+DEFAULT_AVERAGING_S = 10.0
+DEFAULT_UNCERTAINTY = 0.3
+BLOCK_S = 0.032
+LEAST_BLOCKS = 20  # in the averaging time
+# What is known of the plant: fields of `plant.c`.
+POSTERIOR = (
+    *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
+    *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy"),
+    *("path_correlation", "cross_correlation", "primary_correlation"),
 )
 
 
-class PowerBudgetState(NamedTuple):
-    """State of KF-PB."""
+class PowerBudgetController(CoreController):
+    r"""KF-PB, the Kalman filter with a power budget: the least expected error within the rated power.
 
-    lines: Lines
-    weights: np.ndarray
-    constraint: ConstraintState  # computes the powers; its factor is fixed at 1
-    gains: Covariance
-    numbers: np.ndarray  # record: the filter's variances and the results of the last update
-    budget: BudgetState
+    Block by block of 32 ms, it learns a Gaussian posterior of the primary paths p and the secondary paths s, from
 
+    .. math:: e = p * x - s * y + \text{noise}
 
-@adapt.register(PowerBudgetState)
-def adapt_power_budget(state, error, control_signal):
-    """Apply eq. 2-8, then let the budget find the control filter for the estimate."""
-    d, filtered, x = (
-        disturbance_estimate(state.lines, error),
-        latest(state.lines.filtered),
-        latest(state.lines.reference),
-    )
-    if not squares_are_finite(d, filtered, x):
-        return False
-    preview_constraint(state.constraint, d, filtered, x)
-    w, numbers = state.weights, state.numbers[0]
-    h = newest(state.lines.filtered, w.size)
-    y, S = kalman_step(state.gains, w, h, d, numbers.state_noise, numbers.measurement_noise, numbers.alpha_sq)
-    if not np.isfinite(y):
-        return False
-    numbers.measurement, numbers.residual, numbers.variance = d, y, S
-    commit_constraint(state.constraint, d, filtered, x)
-    advance_budget(state.budget, state.weights, x, filtered, control_signal)
-    return True
+    and gives each loudspeaker the control filter v of least expected error at a price :math:`\lambda` of its power,
 
+    .. math:: \min_v E[(p * x - s * v * x)^2] + \lambda E[(v * x)^2]
 
-@emitted.register(PowerBudgetState)
-def note_emitted(state, y):
-    """Note what was played: power is spent whether the estimate adapts to the sample or not."""
-    note_sample(state.budget, latest(state.lines.reference), latest(state.lines.filtered), y)
+    where the expectation includes what is not known of p and s. The price follows from an account: over any
+    `averaging_s`, the mean power is kept to the rated power, and what a quiet time has left can be spent in a louder
+    one. Power that saves less than a fifth of the error is not spent.
 
+    The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to an
+    unknown path around the given one: the loudspeakers are nearly silent until it has been learnt again. A new
+    `secondary_path` that is assigned begins the posterior anew, also that of the primary paths; the control filter stays
+    until the first solution, and so does the account.
 
-@skip.register(PowerBudgetState)
-def skip_power_budget(state):
-    """Let the budget process what was played."""
-    take_noted(state.budget)
-
-
-@unheard.register(PowerBudgetState)
-def unheard_by_power_budget(state):
-    """Add the sample to the correlations."""
-    follow_noise(state.budget, latest(state.lines.reference), latest(state.lines.filtered))
-
-
-@follow.register(PowerBudgetState)
-def follow_power_budget(state, error):
-    """Add the sample to the powers and the correlations."""
-    d, filtered, x = (
-        disturbance_estimate(state.lines, error),
-        latest(state.lines.filtered),
-        latest(state.lines.reference),
-    )
-    advance_constraint(state.constraint, d, filtered, x)
-    follow_noise(state.budget, x, filtered)
-    return True
-
-
-@control_filter.register(PowerBudgetState)
-def filter_of_power_budget(state):
-    """Return the budget's control filter."""
-    return state.budget.control_filter
-
-
-@power_weight.register(PowerBudgetState)
-def weight_of_power_budget(state: PowerBudgetState) -> np.ndarray:
-    """Return lambda, (1,)."""
-    weight: np.ndarray = state.budget.numbers["weight"]
-    return weight
-
-
-class PowerBudgetController(CompiledController):
-    """The modified ANC structure around a filter with a power budget; `kf_pb` also makes the filter.
+    `kf_pb` makes it, with the same parameters, and takes suggested settings too.
 
     Parameters
     ----------
-    estimator : PowerBudgetKalmanFilter
-        Filter whose state is the estimate of the unconstrained control filter.
-    secondary_path, amplifier, name, limiter
-        As for `KalmanController`; the default name is KF-PB.
+    n_taps : int
+        Taps L of each control filter.
+    secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
+        Estimated secondary path, or those from J loudspeakers to K microphones.
+    rated_power : float or array_like, shape (J,)
+        Rated output power of all loudspeakers or of each, the mean square of the control signal.
+    n_references : int, default 1
+        Number of references I.
+    amplifier : callable or sequence of J of them, optional
+        Known amplifier model: the loudspeakers then play amplifier(y), not y.
+    limiter : OutputLimiter or sequence of J of them, optional
+        Limiter of the control signal, not shared with another controller.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        What the guard of the estimator's budget was made for, see `paths.path_uncertainty`. A new secondary path then
-        gets a guard of its own. By default the guard of the budget stays.
+        How far the true secondary path may be from the estimate: a relative rms error, by default 0.3, or whatever
+        `paths.path_uncertainty` takes, such as the `uncertainty` of an identification. None: the path is exact, and is
+        not verified.
+    fs : float, default 16000
+        Sample rate in Hz.
+    averaging_s : float, default 10
+        Time in seconds over which the mean power is kept to the rated power, at least 20 blocks of 32 ms.
 
     Raises
     ------
-    TypeError
-        An estimator without a power budget.
-    ValueError
-        An uncertainty that needs a guard, and a budget whose guard `paths.guard_filter` did not make.
+    ValueError, TypeError
+        A setting that is out of range, or whose shape does not fit the secondary paths.
+
+    See Also
+    --------
+    power_constrained_wiener : The best fixed filter within a rated power.
+    kf_opc : The paper's constraint, by one factor.
+
+    Notes
+    -----
+    The posterior is solved for again when there is an eighth more data, in :math:`O((IN + JM)^3)` operations, which
+    are spread over as many blocks as they need; M are the taps of a secondary path and N = L + M - 1 those of a primary
+    one. It forgets over twice `averaging_s`. `listen` learns the primary paths before the control is switched on.
+
+    References
+    ----------
+    S. M. Kay, "Fundamentals of statistical signal processing: estimation theory", 1993, section 12.5, for the
+    posterior. S. J. Elliott, "Signal processing for active control", 2001, section 3.4, for the filter at a price of
+    its power. The account and the alarm are the package's.
 
     Examples
     --------
+    >>> import numpy as np
+    >>> from kfopc_filterpy import simulate
     >>> from kfopc_filterpy.controllers import PowerBudgetController
-    >>> from kfopc_filterpy.filters import PowerBudgetKalmanFilter
-    >>> kf = PowerBudgetKalmanFilter(4, state_noise=1e-6, measurement_noise=0.1, rated_power=0.5)
-    >>> controller = PowerBudgetController(kf, secondary_path=[1.0])
-    >>> controller.name, controller.rated_power, controller.power_weight
-    ('KF-PB', 0.5, 0.0)
+    >>> path = [0.0, 1.0, 0.3]
+    >>> controller = PowerBudgetController(16, path, rated_power=0.25, fs=2000.0, averaging_s=2.0)
+    >>> x = np.random.default_rng(0).standard_normal(12000)
+    >>> result = simulate(controller, x, [0.0, 0.0, 0.0, 1.0], path, fs=2000)
+    >>> bool(np.mean(result.control_signal[-4000:] ** 2) < 1.05 * 0.25)
+    True
+    >>> controller.alarms
+    0
     """
+
+    name = "KF-PB"
+    algorithm = "power_budget"
+    checks = MappingProxyType({"spread": as_nonnegative})
 
     def __init__(
         self,
-        estimator: PowerBudgetKalmanFilter,
+        n_taps: int,
         secondary_path: Any,
         *,
-        amplifier: Amplifier | None = None,
-        name: str | None = None,
-        limiter: OutputLimiter | None = None,
-        secondary_path_uncertainty: Any = None,
+        rated_power: Any,
+        n_references: int = 1,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        limiter: Limiters = None,
+        secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY,
+        fs: float = DEFAULT_FS,
+        averaging_s: float = DEFAULT_AVERAGING_S,
     ) -> None:
-        if not isinstance(estimator, PowerBudgetKalmanFilter):
-            raise TypeError(f"estimator must be a PowerBudgetKalmanFilter, got {type(estimator).__name__}")
-        super().__init__(estimator.dim_x, secondary_path, amplifier=amplifier, limiter=limiter)
-        self.estimator = estimator
-        gains = new_covariance(np.zeros((1, 1)))
-        self._state = PowerBudgetState(*self._common(), gains, new_numbers(), estimator.budget.state)
-        self.name = name or "KF-PB"
-        present = estimator.budget.state.guard.size
-        if guard_filter(secondary_path_uncertainty, self.secondary_path) is not None and present != GUARD_TAPS:
-            raise ValueError(
-                f"secondary_path_uncertainty needs a guard of {GUARD_TAPS} taps in the estimator's budget, got {present}: "
-                "make it with paths.guard_filter, or both with kf_pb"
-            )
+        self._fs = as_positive(fs, "fs", unit="Hz")
+        samples = as_positive(averaging_s, "averaging_s", unit="s") * self._fs
+        block = max(round(BLOCK_S * self._fs), 1)
+        super().__init__(
+            n_taps,
+            secondary_path,
+            settings={
+                "rated_power": rated_power,
+                "block": block,
+                "averaging": max(round(samples / block), LEAST_BLOCKS),
+                "window": math.exp(-1.0 / samples),
+                "spread": rms_relative_error(secondary_path_uncertainty, secondary_path),
+            },
+            n_references=n_references,
+            amplifier=amplifier,
+            limiter=limiter,
+        )
         self._uncertainty = as_uncertainty(secondary_path_uncertainty)
 
-    def _read_rated_power(self) -> float | None:
-        return self.estimator.rated_power
+    def _takes_guard(self) -> bool:
+        return False  # the posterior knows how far the path may be off
 
-    def _take_rated_power(self, value: float) -> None:
-        self.estimator.rated_power = value
+    def _read_rated_power(self) -> Any:
+        return self._of_setting("rated_power")
 
-    @property
-    def weights(self) -> np.ndarray:
-        """Estimate of the unconstrained control filter w, (L,); a copy."""
-        return np.array(self.estimator.x, dtype=np.float64).reshape(-1)
-
-    @property
-    def control_filter(self) -> np.ndarray:
-        """Control filter within the rated power, which generates y, (L,); a copy."""
-        return self.estimator.control_filter
-
-    @property
-    def power_weight(self) -> float:
-        """Weight lambda of the control power."""
-        return self.estimator.power_weight
+    def _take_rated_power(self, value: Any) -> None:
+        """Use another rated power; what was spent before counts against the one of its time."""
+        self._opened().fields["rated_power"].ravel()[:] = value
 
     @property
     def _powers_fs(self) -> float:
-        return self.estimator.budget.fs
+        return self._fs
+
+    @property
+    def power_weight(self) -> Any:
+        """Price of power of the last block, or with several channels that of each loudspeaker, (J,)."""
+        return self._per_channel("price")
+
+    @property
+    def measurement_noise(self) -> Any:
+        """Power of what the plant's model does not explain, or with several channels that at each microphone, (K,).
+
+        It is 0 before the first posterior.
+        """
+        return self._per_channel("noise")
+
+    @property
+    def primary_path(self) -> np.ndarray:
+        """Posterior mean of the primary path, (N,), or with several channels (K, I, N); N = L + M - 1."""
+        paths = self._means()[0]
+        return paths if self.multichannel else paths[0, 0]
+
+    @property
+    def identified_path(self) -> np.ndarray:
+        """Posterior mean of the secondary path, of the shape of `secondary_path`; that itself if it is exact."""
+        paths = self._means()[1]
+        return paths if self.multichannel else paths[0, 0]
+
+    @property
+    def alarms(self) -> int:
+        """Number of times so far that the errors contradicted the secondary path."""
+        return int(self._opened().fields["alarms"].item())
+
+    def _means(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the posterior means, (K, I, N) and (K, J, M)."""
+        block = self._opened()
+        theta, given = block.fields["theta"].reshape(self.n_microphones, -1), block.fields["secondary_path"][0]
+        n = self.n_references * (self.n_taps + given.shape[-1] - 1)
+        primary = theta[:, :n].reshape(self.n_microphones, self.n_references, -1).copy()
+        return primary, theta[:, n:].reshape(given.shape).copy() if theta.shape[1] > n else given.copy()
+
+    def _per_channel(self, name: str) -> Any:
+        values = self._opened().fields[name].ravel()
+        return values.copy() if self.multichannel else float(values[0])
 
     def _after_new_path(self, before: np.ndarray) -> None:
-        """Let P grow; measured paths, for example, have another distance from the new path, and so another guard."""
-        variance = self._variance_by_new_path(before)
-        if variance > 0.0:
-            self.estimator.P = self.estimator.P + variance * np.eye(self.n_taps)
-        if self._uncertainty is not None:
-            self.estimator.budget.use_guard(guard_filter(self._uncertainty, self.secondary_path))
+        """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""
+        block = self._opened()
+        spread = block.fields["spread"]
+        if spread.item() > 0.0 and self._uncertainty is not None:  # measured paths: another distance from the new path
+            spread[:] = rms_relative_error(self._uncertainty, self._estimated_path()) or spread
+        fresh = block.fresh(block.shape)
+        for name in POSTERIOR:
+            block.fields[name][:] = fresh.fields[name]
 
-    def control_signal(self, reference: float) -> float:
-        """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        reference = as_number(reference, "reference")
-        self._see_weights()
-        return float(self._emit(reference))
-
-    def _see_weights(self) -> None:
-        """Copy the estimator's weights into the state."""
-        self._state.weights[:] = np.reshape(self.estimator.x, -1)
-
-    def update(self, error: float) -> None:
-        """Adapt to the error e(n) that the last control signal left (eq. 2-9)."""
-        error = as_number(error, "error")
-        state = self._steppable_state()
-        if state is None:
-            self._update_through_estimator(error)
-        elif self._adapt(error):
-            self.estimator.after_compiled(state.weights.copy())
-        else:
-            # This raises, with the reason. On a copy, because its prediction would stay.
-            deepcopy(self)._update_through_estimator(error)
-            raise ValueError(NO_SOLUTION)
-
-    def _update_through_estimator(self, error: float) -> None:
-        """Call the estimator's `predict` and `update`."""
-        d = estimate_once(self._state.lines, error)
-        h = newest(self._state.lines.filtered, self.n_taps).reshape(1, -1).copy()
-        x, powers = latest(self._state.lines.reference), self.constraint
-        powers.preview(d, h[0, 0], x)  # raises if a square overflows, before anything changes
-        self.estimator.predict()
-        self.estimator.update(d, H=h, reference=x, control_signal=self._y)
-        powers.advance(d, h[0, 0], x)
-
-    def _steppable_state(self) -> Any:
-        """Return the state with the estimator's covariance; None if the estimator's step is not compiled."""
-        estimator = self.estimator
-        if type(estimator) is not PowerBudgetKalmanFilter or not estimator.steps_compiled():
+    def looped(self) -> Looped | None:
+        """Return what the core's loop needs to run this controller; None if Python must call the steps."""
+        looped = super().looped()
+        if looped is None:
             return None
-        arrays, numbers = estimator.compiled_arrays()
-        self._see_weights()
-        if arrays is not self._state.gains or numbers is not self._state.numbers:
-            self._state = self._state._replace(gains=arrays, numbers=numbers)
-        return self._state
-
-    def compiled_state(self) -> Any:
-        """Return the state for the compiled steps; None if Python must call the steps."""
-        state = self._steppable_state() if calls_of(type(self)) == calls_of(PowerBudgetController) else None
-        if state is not None:
-            state.numbers["variance"] = np.nan  # NaN until the first update
-        return state
-
-    def after_compiled(self, state: Any) -> None:
-        """Give the estimator the results in `state`."""
-        if not np.isnan(state.numbers["variance"][0]):
-            self.estimator.after_compiled(state.weights.copy())
-
-    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
-        """Follow the noise before the control is switched on; see `FilteredReferenceController.listen`."""
-        self._see_weights()
-        super().listen(references, errors, adapt=adapt)
-
-
-FORMS = ("direct", "shared gain", "frequency domain")
-PRIMARY_PATH_FORMS: dict[str, Any] = {"shared gain": SharedGainKalman, "frequency domain": FrequencyDomainKalman}
+        return looped._replace(recorded={**looped.recorded, "power_weight": self._opened().fields["price"].ravel()})
 
 
 def kf_pb(
@@ -281,100 +227,72 @@ def kf_pb(
     secondary_path: Any,
     *,
     rated_power: Any,
-    state_noise: float | None = None,
-    measurement_noise: Any = None,
-    initial_variance: float | None = None,
     n_references: int = 1,
     amplifier: Any = None,
     limiter: Any = None,
-    secondary_path_uncertainty: Any = ONE_SAMPLE,
-    form: str | None = None,
-    **settings: Any,
-) -> PowerBudgetController | DirectPowerBudget | PrimaryPathController:
-    """Return KF-PB, the power-budgeted Kalman filter, which has the least error within the rated power.
+    secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY,
+    fs: float | None = None,
+    averaging_s: float = DEFAULT_AVERAGING_S,
+) -> PowerBudgetController:
+    """Return KF-PB, the Kalman filter with a power budget, which has the least error within the rated power.
+
+    It has no step size or noises to tune. With one channel or several, it learns the primary and secondary paths while
+    it controls; see `controllers.PowerBudgetController`.
 
     Parameters
     ----------
     n_taps : int or SuggestedSettings
-        Taps L of a control filter. Or pass the result of `suggest_settings`, which also supplies the defaults of the
-        sample rate and of the noises.
+        Taps L of a control filter. Or pass the result of `suggest_settings`, of which KF-PB takes the taps and the
+        sample rate.
     secondary_path : array_like, shape (n_path,) or (K, J, n_path), or control system
         Estimated secondary path, or those from J loudspeakers to K microphones.
     rated_power : float or array_like, shape (J,)
         Rated output power, of all loudspeakers or of each.
-    state_noise, measurement_noise, initial_variance
-        As for `kf_anc`, for the direct form only.
     n_references, amplifier, limiter
-        As for `kf_anc`. Behind its limiter, the direct form for one channel asks for more power only if that lowers the
-        error (see `PowerBudget`).
+        As for `kf_anc`.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        How far the true secondary path may differ from the estimate, see `paths.path_uncertainty`; by default a
-        sample of delay. The control filter is weaker where the path is less certain, and almost zero where control
-        could make the noise much louder (with a sample of delay, above three eighths of the sample rate; with several
-        loudspeakers above a quarter; with more microphones than loudspeakers above a sixth). If you have identified the
-        path, pass the `uncertainty` of the result, which costs next to nothing. None: the path is exact.
-    form : {"direct", "shared gain", "frequency domain"}, optional
-        "direct" estimates the control filters (the paper's equations), in O(K (J I L)^2) per sample. "shared gain"
-        estimates the primary paths (`SharedGainKalman`); "frequency domain" does the same for long paths
-        (`FrequencyDomainKalman`). By default direct for one channel, shared gain for several.
-    **settings
-        Further settings. The direct form takes `fs`, `memory_s` and `averaging_s`, see `PowerBudget` for one channel and
-        `DirectPowerBudget` for several. For the other forms, see their classes.
+        How far the true secondary path may be from the estimate: a relative rms error, by default 0.3, or whatever
+        `paths.path_uncertainty` takes. If you have identified the path, pass the `uncertainty` of the result. None:
+        the path is exact, and is not verified.
+    fs : float, optional
+        Sample rate in Hz; by default that of suggested settings, or 16 kHz.
+    averaging_s : float, default 10
+        Time in seconds over which the mean power is kept to the rated power.
 
     Returns
     -------
-    PowerBudgetController, DirectPowerBudget, SharedGainKalman or FrequencyDomainKalman
-        The controller. Its `control_filter` generates the control signal. In the direct form, `weights` is the estimate
-        of the unconstrained control filter.
+    PowerBudgetController
+        A controller named KF-PB. With several channels, its signals and weights have channel axes.
 
     Raises
     ------
     ValueError, TypeError
-        The direct form without suggested settings or `state_noise` and `measurement_noise`, another form with a setting
-        of the direct form, another sample rate than that of the suggested settings, or a setting that the class refuses.
+        A setting that is out of range, or whose shape does not fit the secondary paths; another sample rate than that
+        of the suggested settings.
 
     Examples
     --------
     >>> import numpy as np
     >>> from kfopc_filterpy import kf_pb
-    >>> kf_pb(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).name
-    'KF-PB'
+    >>> kf_pb(8, [1.0], rated_power=0.5).rated_power
+    0.5
     >>> paths = np.zeros((2, 2, 8))  # two loudspeakers, two microphones
     >>> paths[:, :, 1] = [[1.0, 0.3], [0.2, 1.0]]
     >>> kf_pb(32, paths, rated_power=[0.5, 0.2])
-    <KF-PB (shared gain): 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2>
+    <KF-PB: 2 microphones, 2 loudspeakers, 1 reference, 32 taps, rated power 0.5, 0.2, constraint factor 1, 1>
     """
-    controller: PowerBudgetController | DirectPowerBudget | SharedGainKalman | FrequencyDomainKalman
-    several = is_multichannel(secondary_path, n_references)
-    form = as_choice(form or ("shared gain" if several else "direct"), "form", FORMS)
-    common = {"rated_power": rated_power, "amplifier": amplifier, "limiter": limiter}
-    channels = {"n_references": n_references, "secondary_path_uncertainty": secondary_path_uncertainty}
-    noises = {
-        "state_noise": state_noise,
-        "measurement_noise": measurement_noise,
-        "initial_variance": initial_variance,
-    }
-    if isinstance(n_taps, SuggestedSettings):
-        settings = {"fs": n_taps.fs} | settings
-    if form in PRIMARY_PATH_FORMS:
-        given = [name for name, value in noises.items() if value is not None]
-        if given:
-            raise TypeError(f"the {form} form takes path_memory_s instead of {', '.join(given)}")
-        taps = n_taps.n_taps if isinstance(n_taps, SuggestedSettings) else n_taps
-        controller = PRIMARY_PATH_FORMS[form](taps, secondary_path, **channels, **common, **settings)
-    else:
-        taps, noises = with_suggested(n_taps, noises, ", or form='shared gain', which does not need them")
-        settings |= noises
-        if several:
-            controller = DirectPowerBudget(taps, secondary_path, **channels, **common, **settings)
-        else:
-            guard = guard_filter(secondary_path_uncertainty, secondary_path)
-            estimator = PowerBudgetKalmanFilter(taps, rated_power=rated_power, guard=guard, **settings)
-            controller = PowerBudgetController(
-                estimator,
-                secondary_path,
-                amplifier=amplifier,
-                limiter=limiter,
-                secondary_path_uncertainty=secondary_path_uncertainty,
-            )
+    suggested = n_taps if isinstance(n_taps, SuggestedSettings) else None
+    if fs is None:
+        fs = DEFAULT_FS if suggested is None else suggested.fs
+    controller = PowerBudgetController(
+        n_taps if suggested is None else suggested.n_taps,  # type: ignore[arg-type]
+        secondary_path,
+        rated_power=rated_power,
+        n_references=n_references,
+        amplifier=amplifier,
+        limiter=limiter,
+        secondary_path_uncertainty=secondary_path_uncertainty,
+        fs=fs,
+        averaging_s=averaging_s,
+    )
     return at_suggested_rate(controller, n_taps)

@@ -324,11 +324,15 @@ class Block:
         at, taps = self.fields[f"{name}_at"].item(), (field.shape[-1] - SLACK) // 4  # as `layout_lines` makes them
         return field[..., at : at + taps]
 
-    def remade(self, shape: Shape, guard: NDArray[np.float64] | None = None) -> Block:
-        """Return a block of another shape that goes on from this one: fields of the same name and shape are copied."""
+    def fresh(self, shape: Shape, guard: NDArray[np.float64] | None = None) -> Block:
+        """Return a block that has heard nothing, with the secondary path and the settings of this one."""
         own = {name: self.fields[name].ravel() for name, _ in self.algorithm.settings}
         settings = {name: own[name] if each else own[name][0] for name, each in self.algorithm.settings}
-        other = Block(self.algorithm, shape, path=self.fields["secondary_path"][0], settings=settings, guard=guard)
+        return Block(self.algorithm, shape, path=self.fields["secondary_path"][0], settings=settings, guard=guard)
+
+    def remade(self, shape: Shape, guard: NDArray[np.float64] | None = None) -> Block:
+        """Return a block of another shape that goes on from this one: fields of the same name and shape are copied."""
+        other = self.fresh(shape, guard)
         for name, field in self.fields.items():
             if other.fields[name].shape == field.shape and name != "guard":
                 other.fields[name][:] = field

@@ -29,7 +29,8 @@ static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f, LARGEST_TAP = 1
 static const real LOUDEST_LEARNT = 1e50, LOUDEST_PLAYED = 1e100, LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
 #endif
 
-enum { FILLED, MISSING, ASKED, HEARD, BUDGET_COUNTS }; /* samples of the block; flags of the block; samples of all blocks */
+enum { FILLED, MISSING, ASKED, HEARD, AWAITED, BUDGET_COUNTS }; /* samples of the block; flags of the block; samples of all
+ * blocks; whether the error of the last control signal is still to come */
 
 typedef struct {
     signals s;
@@ -509,7 +510,7 @@ static int note(budget *f, const real *error, int controlled)
         if (controlled) f->asked[s->J + j] += f->asked[j] * f->asked[j];
     }
     for (int32_t k = 0; error && k < s->K; k++) f->errors[times(k, B) + (size_t)at] = error[k];
-    f->counts[MISSING] |= !error, f->counts[ASKED] |= controlled;
+    f->counts[MISSING] |= !error, f->counts[ASKED] |= controlled, f->counts[AWAITED] = 0;
     if (++f->counts[FILLED] == B) end_block(f);
     return ANC_DONE;
 }
@@ -519,13 +520,15 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
     budget *f = (budget *)view;
     signals *s = &f->s;
     for (int32_t i = 0; i < s->I; i++)
-        if (!within(reference[i], LOUDEST_LEARNT)) return ANC_LOUD_REFERENCE;
+        if (!within(reference[i], LOUDEST_LEARNT) || !within(reference[i], *s->loudest)) return ANC_LOUD_REFERENCE;
+    if (f->counts[AWAITED]) note(f, NULL, 1); /* that error never came */
     const int refused = take_reference(s, reference);
     for (int32_t j = 0; !refused && j < s->J; j++) {
         f->asked[j] = filter_output(s, j);
         emit(s, j, f->asked[j]);
         control[j] = s->control[j];
     }
+    f->counts[AWAITED] = !refused;
     return refused;
 }
 

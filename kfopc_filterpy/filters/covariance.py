@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..kernels.covariance import Covariance, copy_covariance, covariance_at, new_covariance, owed_of
+from ..core.triangle import Covariance, copy_covariance, covariance_at, new_covariance, owed_of
 from .guards import INDEFINITE_LIMIT, require_semidefinite
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
@@ -148,12 +148,6 @@ class RandomWalkCovariance:
     def missed(self) -> None:
         """Record a missed sample: P is P_post."""
         self.posterior = self.now
-
-    def after_compiled(self) -> None:
-        """Record that the compiled loop updated `arrays`: at most one downdate is pending."""
-        self._shown = []
-        self.prior = TRIANGLE
-        self.updated()
 
 
 def require_covariance(P: np.ndarray) -> None:

@@ -258,7 +258,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         elif self._constraint is not None and (one or isinstance(self._constraint, tuple)):
             self._constraint.rated_power = value
         else:
-            from ..power.constraint import OutputPowerConstraint  # numba, only if it is needed
+            from ..power.constraint import OutputPowerConstraint
 
             settings = self._constraint or self._lifted or OutputPowerConstraint(1.0)
             together = one or isinstance(settings, tuple)

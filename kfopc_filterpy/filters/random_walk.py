@@ -11,19 +11,20 @@ import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..core.block import LOUD_STEP, NO_SOLUTION
-from ..kernels.covariance import Covariance, covariance_update, direction_of
-from ..kernels.records import new_record
+from ..core.triangle import covariance_update, direction_of
 from ..power.constraint import OutputPowerConstraint
 from .covariance import RandomWalkCovariance, require_covariance
 from .guards import SILENT_REFERENCE, State, checked_measurement, require_observation
 from .kfopc import KFOPC
 
+NUMBERS = np.dtype(
+    [(name, np.float64) for name in ("state_noise", "measurement_noise", "measurement", "residual", "variance")]
+)
+
 
 def new_numbers() -> np.ndarray:
-    """Return the record that a filter shares with the compiled loop: its variances and the last update's results."""
-    return new_record(
-        state_noise=0.0, measurement_noise=0.0, alpha_sq=1.0, measurement=0.0, residual=0.0, variance=np.nan
-    )
+    """Return the record of a filter's variances and of the results of its last update."""
+    return np.array([(0.0, 0.0, 0.0, 0.0, np.nan)], NUMBERS)
 
 
 def _made_when_read(name: str, make: Callable[[Any], np.ndarray], description: str) -> Any:
@@ -403,21 +404,3 @@ class RandomWalkKFOPC(KFOPC):
     def _record(self, x: np.ndarray) -> None:
         self._log_likelihood = self._likelihood = self._mahalanobis = None
         self.x, self.x_post = x, x.copy()
-
-    # Steps of KF-PB that numba compiles: the arrays are handed out, updated and taken back.
-
-    def steps_compiled(self) -> bool:
-        """Return whether this filter uses the random-walk equations, and not filterpy's own."""
-        return self._F is None and self._Q is None and self.inv is np.linalg.inv
-
-    def compiled_arrays(self) -> tuple[Covariance, np.ndarray]:
-        """Return the covariance arrays and the variances."""
-        self._take_in_edits()
-        self._numbers["alpha_sq"] = self._alpha_sq
-        return self._covariance.arrays, self._numbers
-
-    def after_compiled(self, weights: np.ndarray) -> None:
-        """Adopt the results of one or more compiled samples; the filter keeps the array `weights`, (n,)."""
-        self._covariance.after_compiled()
-        self._K, self._made = None, {}
-        self._record(weights.reshape(np.shape(self.x)))

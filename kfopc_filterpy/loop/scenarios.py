@@ -12,6 +12,7 @@ from .._validate import as_positive, as_signal
 from ..controllers.base import FilteredReferenceController
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
+from ..controllers.power_budget import PowerBudgetController
 from ..core.block import Block, Shape, reason_of
 from ..core.running import DIVERGED, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals, Steps
 from ..paths.models import is_system, path_taps
@@ -192,6 +193,10 @@ def _blocks_that_share(controllers: list[Any], fs: float) -> list[Block]:
             raise ValueError(
                 f"controllers[{i}] has steps of its own in Python: scenarios share the gains of kf_anc, kf_opc and "
                 "others whose steps are in the core"
+            )
+        if isinstance(controller, PowerBudgetController):
+            raise ValueError(
+                f"controllers[{i}], {controller.name}, learns the plant, which differs from scenario to scenario: use simulate"
             )
         if looped.owner.algorithm.path is not None:
             raise ValueError(

@@ -213,7 +213,7 @@ class _Run:
     progress: Callable[[int], Any] | None
 
     def loop(self, looped: Looped) -> tuple[bool, int]:
-        """Run in the core, stretch by stretch: a run can be interrupted between them, and the controller may work."""
+        """Run in the core, stretch by stretch: a run can be interrupted between them."""
         sources = looped.recorded
         records = [Record(sources[name], signal) for name, signal in self.recorded.items() if name in sources]
         if len(self.weights):
@@ -221,12 +221,9 @@ class _Run:
             records.append(Record(looped.control_filter.reshape(-1), rows, self.every, in_rows=True))
         status, begin, n_samples = RUNNING, 0, self.signals.error.shape[1]
         while begin < n_samples and status == RUNNING:
-            end = min(begin + (self.controller.samples_to_block() or STRETCH), n_samples)
-            try:
-                with looped.in_use:
-                    status, done = self.plant.run(looped.steps, self.signals, records, begin, end)
-            finally:  # even if interrupted, the controller must have the state of its last sample
-                looped.after()
+            end = min(begin + STRETCH, n_samples)
+            with looped.in_use:
+                status, done = self.plant.run(looped.steps, self.signals, records, begin, end)
             if self.progress:
                 self.progress(done - begin)
             begin = done

@@ -163,6 +163,18 @@ def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     return error
 
 
+def rms_relative_error(uncertainty: Any, secondary_path: Any) -> float:
+    """Return the root mean square of the relative error over the spectrum of a secondary path; 0 if it is exact."""
+    stated = as_uncertainty(uncertainty)
+    if stated is None or isinstance(stated, float):
+        return stated or 0.0
+    paths, _ = secondary_paths(secondary_path)
+    weights = np.sum(np.abs(_response(paths)) ** 2, axis=(1, 2))
+    weights = weights if np.any(weights > 0.0) else np.ones(N_FREQUENCIES)
+    weights[[0, -1]] *= 0.5  # each other frequency stands for two of the whole circle
+    return float(np.sqrt(np.average(path_uncertainty(stated, secondary_path) ** 2, weights=weights)))
+
+
 def as_uncertainty(value: Any) -> PathTolerance | float | np.ndarray | None:
     """Return an uncertainty as it is stated, checked, and an array as a copy."""
     if value is None or isinstance(value, PathTolerance):

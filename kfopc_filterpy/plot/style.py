@@ -31,8 +31,6 @@ STYLES: dict[str, tuple[str, Any, str]] = {
     "MOV-FxLMS fixed": ("#117733", _DASHED, "2"),
     "MOV-FxLMS by variance": ("#661100", _DASHED, "4"),
     "MOV-MFxLMS": ("#88CCEE", _DASHED, "3"),
-    "KF-PB (shared gain)": ("#DDAA33", "-", "^"),
-    "KF-PB (frequency domain)": ("#994F00", "-", "H"),
 }
 UNLISTED = ("#000000", ":", "x")  # an algorithm that is not in the table
 COLOURS = 6  # curves without an algorithm take the colours and markers of the first so many rows

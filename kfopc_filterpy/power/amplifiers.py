@@ -15,19 +15,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from .._validate import as_positive
-from ..core.calls import amplify_all, amplify_compiled
+from ..core.calls import amplify_all
 from ..core.running import HARD_CLIP, LINEAR, SOFT_SATURATION
-from ..kernels.compiling import part
-from ..kernels.records import as_records
 
 # The structure of the core, see anc.h.
 MODEL = np.dtype([(name, np.float64) for name in ("kind", "limit", "sharpness")])
-
-
-@part()
-def amplify(amplifier, y):
-    """Return the output for one sample y; `amplifier` is the record of a model."""
-    return amplify_compiled(amplifier.ctypes.data, y)
 
 
 @dataclass(frozen=True)
@@ -40,7 +32,7 @@ class _Amplifier:
     def model(self) -> np.ndarray:
         """Record of kind, limit and sharpness for the compiled loop."""
         limit, sharpness = getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)
-        return as_records(np.array([(self.kind, limit, sharpness)], MODEL))
+        return np.array([(self.kind, limit, sharpness)], MODEL)
 
     def __call__(self, signal: Any) -> Any:
         """Return the output for `signal`, a number or an array of any shape."""
@@ -140,4 +132,4 @@ def amplifier_models(amplifier: Any, n_loudspeakers: int) -> np.ndarray:
             "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "
             f"{n_loudspeakers} loudspeakers, got {amplifier!r}"
         )
-    return as_records(np.array(models))
+    return np.array(models)

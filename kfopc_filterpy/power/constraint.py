@@ -8,15 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_choice, as_nonnegative, as_number, as_positive
-from ..core.calls import commit, commit_compiled, preview, preview_compiled
-from ..kernels.compiling import inlined, part
-from ..kernels.records import as_records
+from ..core.calls import commit, preview
 
 DEFAULT_FS = 16000.0
 DEFAULT_MEMORY_S = 0.5
 
-# Below the smallest normal number a ratio of powers has no digits left: such a reference counts as silent.
-SILENCE = float(np.finfo(np.float64).tiny)
 
 # Structures of the core, see anc.h.
 _MEANS = ("disturbance", "filtered_reference", "reference")
@@ -28,73 +24,12 @@ REFERENCE = _MEANS.index("reference")
 
 
 class ConstraintState(NamedTuple):
-    """State that the compiled functions below read and update."""
+    """State that the core reads and updates."""
 
     powers: np.ndarray  # (3,) of POWER: disturbance, filtered reference, reference
     window: np.ndarray  # (3, m) this lap's squares, then the last lap's sums from each index on; m = 0: exponential
     numbers: np.ndarray  # (1,) of NUMBERS: settings, values last used
     previewed: np.ndarray  # (1,) of PREVIEWED: room for what the next sample would make of them
-
-
-@inlined
-def preview_squares(state, disturbance, filtered_reference, reference):
-    """Return the constraint factor with a sample's squares included, the power and gain behind it; nothing is changed.
-
-    The squares can be sums over channels. If that of the reference is NaN (none given), the powers of the reference and
-    the filtered reference stay as they are.
-    """
-    preview_compiled(*_addresses(state), disturbance, filtered_reference, reference)
-    previewed = state.previewed[0]
-    return previewed.factor, previewed.power, previewed.gain
-
-
-@inlined
-def preview_constraint(state, disturbance, filtered_reference, reference):
-    """Return what `preview_squares` does, for a sample of one channel."""
-    return preview_squares(
-        state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
-    )
-
-
-@inlined
-def commit_squares(state, disturbance, filtered_reference, reference):
-    """Add the squares that were last previewed to the running powers."""
-    commit_compiled(*_addresses(state), disturbance, filtered_reference, reference)
-
-
-@inlined
-def commit_constraint(state, disturbance, filtered_reference, reference):
-    """Add the sample that was last previewed to the running powers."""
-    commit_squares(state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference)
-
-
-@inlined
-def advance_constraint(state, disturbance, filtered_reference, reference):
-    """Add this sample to the running powers and return the constraint factor."""
-    return advance_squares(
-        state, disturbance * disturbance, filtered_reference * filtered_reference, reference * reference
-    )
-
-
-@inlined
-def advance_squares(state, disturbance, filtered_reference, reference):
-    """Add squares, which can be sums over channels, to the running powers and return the constraint factor."""
-    factor, _, _ = preview_squares(state, disturbance, filtered_reference, reference)
-    commit_squares(state, disturbance, filtered_reference, reference)
-    return factor
-
-
-@inlined
-def _addresses(state):
-    """Return where the core finds the numbers, the powers, the window with its length, and room for a preview."""
-    window, room = state.window, state.previewed.ctypes.data
-    return state.numbers.ctypes.data, state.powers.ctypes.data, window.ctypes.data, window.shape[1], room
-
-
-@part()
-def squares_are_finite(d, filtered, x):
-    """Return whether the squares of this sample are finite: an infinite power would never be forgotten."""
-    return np.isfinite(d * d) and np.isfinite(filtered * filtered) and np.isfinite(x * x)
 
 
 class OutputPowerConstraint:
@@ -146,14 +81,12 @@ class OutputPowerConstraint:
         self.window = as_choice(window, "window", ("exponential", "sliding"))
         samples = self.memory_s * self.fs
         length = max(round(samples), 1) if window == "sliding" else 0
-        numbers = as_records(np.zeros(1, NUMBERS))
+        numbers = np.zeros(1, NUMBERS)
         numbers["rated_power"], numbers["rate"] = rated_power, -math.expm1(-1.0 / samples)
         for name in ("supplied_factor", "supplied_power", "supplied_gain", "gain"):
             numbers[name] = math.nan
         numbers["factor"] = 1.0
-        self._state = ConstraintState(
-            as_records(np.zeros(3, POWER)), np.zeros((3, length)), numbers, as_records(np.zeros(1, PREVIEWED))
-        )
+        self._state = ConstraintState(np.zeros(3, POWER), np.zeros((3, length)), numbers, np.zeros(1, PREVIEWED))
         self._given_gain = secondary_path_gain
         self.secondary_path_gain = secondary_path_gain
 
@@ -169,7 +102,7 @@ class OutputPowerConstraint:
 
     @property
     def state(self) -> ConstraintState:
-        """Arrays that the compiled loop updates."""
+        """Arrays that the core updates."""
         return self._state
 
     @property
@@ -261,7 +194,7 @@ class OutputPowerConstraint:
         return float(self._state.numbers["factor"][0])
 
     def _places(self, previewed: np.ndarray) -> tuple[int, int, int, int, int]:
-        """Return what `_addresses` does, with other room for a preview."""
+        """Return where the core finds the numbers, the powers, the window with its length, and room for a preview."""
         powers, window, numbers, _ = (array.ctypes.data for array in self._state)
         return numbers, powers, window, self._state.window.shape[1], previewed.ctypes.data
 

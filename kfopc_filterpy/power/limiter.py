@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_number, as_positive, as_signal
-from ..core.calls import limit, limit_all, limit_compiled
-from ..kernels.compiling import part
-from ..kernels.records import as_records
+from ..core.calls import limit, limit_all
 from .constraint import DEFAULT_FS
 
 DEFAULT_WINDOW_S = 0.1
@@ -39,7 +37,7 @@ NUMBERS = np.dtype(
 
 
 class LimiterState(NamedTuple):
-    """State that `limit_sample` reads and updates.
+    """State that the core reads and updates.
 
     A lap is N samples. The rows of `laps`, N + 1 each, are the output energies, the input energies and this lap's output
     energies one by one; limiter.c says how they are used.
@@ -47,12 +45,6 @@ class LimiterState(NamedTuple):
 
     numbers: np.ndarray  # (1,) of NUMBERS: settings, then values that each sample updates
     laps: np.ndarray  # (3, N + 1)
-
-
-@part()
-def limit_sample(state, u):
-    """Return the output y for the next input u; NaN, with nothing changed, if u is not finite."""
-    return limit_compiled(state.numbers.ctypes.data, state.laps.ctypes.data, u)
 
 
 class OutputLimiter:
@@ -64,7 +56,7 @@ class OutputLimiter:
 
     A signal well within the rating passes unchanged. Any other is scaled before the budget of the window is used up, by
     a gain that leaves tones undistorted. Only samples that would still exceed the rating are clipped. There is no
-    delay. Call the limiter with each sample, or use ``limit_sample(limiter.state, u)`` in a compiled loop.
+    delay. Call the limiter with each sample.
 
     Parameters
     ----------
@@ -140,7 +132,7 @@ class OutputLimiter:
 
     @property
     def state(self) -> LimiterState:
-        """Arrays that `limit_sample` updates."""
+        """Arrays that the core updates."""
         return self._state
 
     @property
@@ -228,7 +220,7 @@ def _silent_state(size: int, rated_power: float, amplitude_limit: float | None) 
         size=size,
         spans=spans,
     )
-    numbers = as_records(np.zeros(1, NUMBERS))
+    numbers = np.zeros(1, NUMBERS)
     for name, value in settings.items():
         numbers[name] = value
     horizons = np.arange(1, spans + 1) * size // spans

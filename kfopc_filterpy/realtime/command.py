@@ -171,10 +171,8 @@ def _controller(plant: IdentifiedPlant, options: argparse.Namespace, limit: floa
         "fs": plant.fs,
     }
     if several:
-        references = len(np.atleast_2d(plant.references))
-        return kf_pb(options.taps, plant.taps, n_references=references, limiter=limiters, **settings)
-    settings |= plant.suggested(options.taps).settings
-    return kf_pb(options.taps, plant.taps, limiter=limiters[0], **settings)
+        settings["n_references"] = len(np.atleast_2d(plant.references))
+    return kf_pb(options.taps, plant.taps, limiter=limiters if several else limiters[0], **settings)
 
 
 class _Screen:

@@ -5,42 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-
-from ..kernels.compiling import compiled
-from ..kernels.records import new_record
+from scipy.signal import lfilter
 
 GOOD, NOT_FINITE, CLIPPED, STUCK, OFFSET, REPEATED = range(6)
 KINDS = ("good", "not finite", "clipped", "stuck", "offset", "repeated")
 LARGEST = 1e100  # a larger value is no sound, and its square may overflow
 OFFSET_SHARE = 0.5  # of the power: a microphone has no offset, and a low tone a far smaller one
 LEAST_OFFSET = 0.01  # of full scale: converters have a small offset, which shows in silence
-
-
-@compiled(nogil=True)
-def inspect(samples, state, kinds):
-    """Set the kind of each sample of one channel, and replace bad ones in place.
-
-    A value that is not finite, or that is stuck, becomes 0. A clipped one is kept, because it is the best estimate
-    there is. An offset is subtracted.
-    """
-    s = state[0]
-    for n in range(samples.size):
-        v = samples[n]
-        kinds[n] = GOOD
-        if not abs(v) <= LARGEST:
-            kinds[n], samples[n] = NOT_FINITE, 0.0
-            continue
-        s.equal = s.equal + 1 if v == s.last else 0
-        s.last = v
-        if s.equal >= s.most_equal:
-            kinds[n], samples[n] = STUCK, 0.0
-        elif abs(v) >= s.full_scale:
-            kinds[n] = CLIPPED
-        else:
-            s.mean += s.rate * (v - s.mean)
-            s.power += s.rate * (v * v - s.power)
-            if s.mean * s.mean > OFFSET_SHARE * s.power and abs(s.mean) >= s.least_offset:
-                kinds[n], samples[n] = OFFSET, v - s.mean
 
 
 class Inspector:
@@ -59,26 +30,51 @@ class Inspector:
     """
 
     def __init__(self, n_channels: int, *, most_equal: int, rate: float, full_scale: float) -> None:
-        self._states = [
-            new_record(
-                last=np.nan,
-                equal=0,
-                most_equal=most_equal,
-                mean=0.0,
-                power=0.0,
-                rate=rate,
-                full_scale=full_scale,
-                least_offset=LEAST_OFFSET * full_scale if np.isfinite(full_scale) else 0.0,
-            )
-            for _ in range(n_channels)
-        ]
+        self.most_equal, self.rate, self.full_scale = most_equal, rate, full_scale
+        self.least_offset = LEAST_OFFSET * full_scale if np.isfinite(full_scale) else 0.0
+        self._last = np.full(n_channels, np.nan)
+        self._equal = np.zeros(n_channels, np.int64)  # samples that were equal to the one before, in a row
+        self._means = np.zeros((n_channels, 2))  # of the signal and of its square
 
     def __call__(self, block: np.ndarray) -> np.ndarray:
         """Return the kind of each sample, (n_channels, n_samples), and replace bad ones in `block`, of that shape."""
         kinds = np.empty(block.shape, dtype=np.int64)
-        for samples, state, kind in zip(block, self._states, kinds, strict=True):
-            inspect(samples, state, kind)
+        for channel, samples in enumerate(block):
+            kinds[channel] = self._inspect(channel, samples)
         return kinds
+
+    def _inspect(self, channel: int, samples: np.ndarray) -> np.ndarray:
+        """Return the kind of each sample of one channel, and replace bad ones in place.
+
+        A value that is not finite, or that is stuck, becomes 0. A clipped one is kept, because it is the best estimate
+        there is. An offset is subtracted.
+        """
+        sound = np.abs(samples) <= LARGEST
+        heard = samples[sound]
+        kinds = np.where(np.abs(samples) >= self.full_scale, CLIPPED, GOOD)
+        kinds[~sound] = NOT_FINITE
+        if heard.size:
+            kinds[np.flatnonzero(sound)[self._equal_before(channel, heard) >= self.most_equal]] = STUCK
+        good = np.flatnonzero(kinds == GOOD)
+        if good.size:
+            v = samples[good]
+            kept, mean = 1.0 - self.rate, self._means[channel]
+            means, _ = lfilter([self.rate], [1.0, -kept], [v, v * v], zi=kept * mean[:, np.newaxis])
+            mean[:] = means[:, -1]
+            offset = (means[0] ** 2 > OFFSET_SHARE * means[1]) & (np.abs(means[0]) >= self.least_offset)
+            kinds[good[offset]] = OFFSET
+            samples[good[offset]] -= means[0, offset]
+        samples[(kinds == NOT_FINITE) | (kinds == STUCK)] = 0.0
+        return kinds
+
+    def _equal_before(self, channel: int, heard: np.ndarray) -> np.ndarray:
+        """Return how many samples before each one are equal to it, in a row."""
+        n = np.arange(heard.size)
+        differs = heard != np.concatenate([[self._last[channel]], heard[:-1]])
+        begin = np.maximum.accumulate(np.where(differs, n, -1 - self._equal[channel]))
+        equal = n - begin
+        self._last[channel], self._equal[channel] = heard[-1], equal[-1]
+        return equal
 
 
 def is_repeated(block: Any, last: Any) -> bool:

@@ -367,8 +367,8 @@ def run(
     of the interface; check that a control filter can reduce the noise in time; fade in; control; fade out. A `Supervisor`
     stands between the controller and the interface. The run stops by itself after three divergences within ten minutes.
 
-    The interface is started twice: to listen and identify, and to control. In between the controller is made and
-    compiled, which takes seconds. Meanwhile no blocks are read or written. If the streams stayed open, they would overflow
+    The interface is started twice: to listen and identify, and to control. In between the path is computed and the
+    controller is made, which can take seconds. Meanwhile no blocks are read or written. If the streams stayed open, they would overflow
     and run dry, and the round trip could then differ from the one identified.
 
     Parameters
@@ -429,10 +429,7 @@ def run(
     >>> primary[[80, 90]] = 1.0, 0.4
     >>> plant = SimulatedInterface(noise, [0.0, 0.9, 0.3], primary_path=primary, block=32)
     >>> def make(plant):
-    ...     settings = plant.suggested(n_taps=32).settings
-    ...     return kf_pb(
-    ...         32, plant.taps, rated_power=2.0, secondary_path_uncertainty=plant.uncertainty, **settings
-    ...     )
+    ...     return kf_pb(32, plant.taps, rated_power=2.0, secondary_path_uncertainty=plant.uncertainty)
     >>> report = run(make, plant, amplitude_limit=10.0, seconds=2.0, identify_s=2.0)
     >>> report.stopped_by, report.round_trip_samples, bool(report.reduction_db[0] > 10.0)
     ('end', 65, True)
@@ -485,7 +482,7 @@ def _open(interface: Interface) -> Iterator[None]:
 
 
 def _warm_up(supervisor: Supervisor, block: int) -> None:
-    """Process blocks with a copy of the controller, so that everything is compiled before the first real one."""
+    """Process blocks with a copy of the controller, so that all that it uses is loaded before the first real one."""
     x, e = 1e-3 * np.random.default_rng(0).standard_normal(
         (2, supervisor.n_references + supervisor.n_microphones, block)
     )

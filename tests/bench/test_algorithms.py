@@ -173,7 +173,7 @@ def test_edges_of_one_and_of_two_settings() -> None:
 
 def test_the_state_noises_of_the_full_kalman_filters_are_one_grid() -> None:
     full = [own for name, own in REGISTRY.items() if own.symbol == "r" and not name.startswith("diagonal")]
-    assert len(full) == 4
+    assert len(full) == 3
     assert all(own.first == STATE_NOISE_GRID for own in full)
     assert len(REGISTRY["leaky FxLMS"].grid) == 14 * len(PRICE_GRID)
 

@@ -42,6 +42,6 @@ def test_the_summary_says_whether_the_amplifier_clips(compared):
 
 
 def test_a_setting_at_the_edge_comes_with_advice():
-    assert "nothing is to be done" in _edge("KF-PB", 1e-8)
-    assert "a setting beyond it may do better" in _edge("KF-PB", 1e-4)
+    assert "nothing is to be done" in _edge("KF-OPC", 1e-8)
+    assert "a setting beyond it may do better" in _edge("KF-OPC", 1e-4)
     assert "mu L E[x'^2] and leak over E[x'^2] = 0.000122, 0.00383," in _edge("leaky FxLMS", (1.22e-4, 3.83e-3))

@@ -43,18 +43,12 @@ def test_the_run_is_the_one_that_simulate_gives():
     d = np.convolve(x, BAND_PASS.primary)[: x.size]
     gain = np.sqrt(10**0.3 / np.mean(d[8000:] ** 2))
     x, d = gain * x, gain * d
-    filtered = np.convolve(x, BAND_PASS.secondary)[: x.size]
     np.testing.assert_allclose(result.disturbance, d[8000:], rtol=1e-9, atol=1e-12)
-    # q for itself: a batch fit to the disturbance with sensor noise 60 dB below, which is nearly all that is left.
-    q = 1e-6 * np.mean(d[8000:] ** 2)
     controller = kf_pb(
         N_TAPS,
         BAND_PASS.secondary,
         rated_power=10**-0.9,
-        state_noise=1e-6 * q / np.mean(filtered**2),
-        measurement_noise=q,
-        initial_variance=result.full_power / (N_TAPS * np.mean(x**2)),
-        secondary_path_uncertainty=PathTolerance(delay_samples=0.5),
+        secondary_path_uncertainty=PathTolerance(delay_samples=1.0),
         fs=16000.0,
     )
     own = simulate(controller, x, disturbance=d, secondary_path=BAND_PASS.secondary, fs=16000.0, switch_on_s=0.5)
@@ -117,19 +111,18 @@ def test_nothing_is_outside_the_band_of_the_noise():
     assert result.disturbance_spectrum_db[inside].min() > result.disturbance_spectrum_db[outside].max() + 40.0
 
 
-def test_kf_pb_that_is_prepared_for_the_path_error_does_better_with_it_and_worse_without():
+def test_kf_pb_learns_a_path_that_is_four_samples_late_whatever_the_tolerance():
     def run(error: float, tolerance: float) -> tuple[float, float]:
         result = explore(BAND_PASS, ExploreSettings(path_error_samples=error, path_tolerance_samples=tolerance))
         near = (result.frequencies_hz > 1700) & (result.frequencies_hz < 1950)
         louder = np.mean(result.error_spectrum_db[near] - result.disturbance_spectrum_db[near])
         return result.noise_reduction_db, float(louder)
 
-    unprepared, louder = run(4.0, 0.5)
-    prepared, as_loud = run(4.0, 4.0)
-    assert prepared > unprepared + 1.0
-    assert louder > 2.0
-    assert as_loud < 0.5
-    assert run(0.0, 4.0)[0] < run(0.0, 0.5)[0] - 1.0
+    exact, _ = run(0.0, 0.5)
+    for tolerance in (0.5, 4.0):
+        reduction, louder = run(4.0, tolerance)
+        assert reduction > exact - 0.5
+        assert louder < 0.5
 
 
 def test_a_rating_beyond_what_the_noise_takes_leaves_nothing_clipped_and_all_of_the_reduction():

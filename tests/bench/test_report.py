@@ -404,7 +404,7 @@ def test_the_introduction_is_on_the_algorithms_of_the_report(tmp_path):
     without = write_report([compared], tmp_path / "without").read_text(encoding="utf-8")
     assert f"<h1>{page_module.WITHOUT_VERDICTS}</h1>" in without
     assert page_module.PAPER not in html.unescape(without)
-    assert "KF-PB, a Kalman filter that keeps the rated power" in without
+    assert "KF-PB, a Kalman filter that learns the paths" in without
 
 
 def test_every_algorithm_has_a_description():

@@ -187,16 +187,9 @@ def test_a_revision_is_checked_out_once_if_it_is_kept(tmp_path: Path, monkeypatc
 
 
 def test_every_controller_of_the_package_is_in_a_case() -> None:
-    """Those that others make or wrap are named by what makes them: `kf_pb` has three forms."""
+    """Those that others make or wrap are named by what makes them."""
     text = inspect.getsource(driver)
-    made_by_functions = {
-        "CoreController",
-        "DirectKalman",
-        "DirectPowerBudget",
-        "SharedGainKalman",
-        "FrequencyDomainKalman",
-    }
-    made_by_functions |= {"PowerBudgetController"}
+    made_by_functions = {"CoreController", "DirectKalman", "PowerBudgetController"}
     for namespace in (kfopc_filterpy, controllers):
         for name in namespace.__all__:
             value = getattr(namespace, name)

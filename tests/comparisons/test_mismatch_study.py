@@ -47,7 +47,7 @@ def small() -> Any:
 def test_planned_runs_are_those_taken(small: Any) -> None:
     _, done, planned, _ = small
     # band noise and a tone, five different paths, three filters of 5 settings and two of 14
-    assert planned == done == 2 * 5 * (3 * 5 + 2 * 14)
+    assert planned == done == 2 * 5 * (2 * 5 + 1 + 2 * 14)
 
 
 def test_the_report_is_complete(small: Any) -> None:
@@ -68,7 +68,7 @@ def test_the_report_is_complete(small: Any) -> None:
     # two cases, seven amounts, both tunings
     assert len(keys) == len(set(keys)) == 2 * 7 * len(STUDIED) * 2
     tried = report.parameters["settings"].value["duct, tone"]["phase 0"]
-    assert [len(tried[name]["tried"]) for name in STUDIED] == [5, 5, 5, 14, 14]
+    assert [len(tried[name]["tried"]) for name in STUDIED] == [5, 5, 1, 14, 14]
 
 
 @pytest.mark.parametrize(("stem", "tuned_with"), [("exact", EXACT), ("wrong", WRONG), ("power", EXACT)])

@@ -45,7 +45,9 @@ def small() -> Any:
         patch.setattr(power_budget, "SEEDS", (1, 2))
         patch.setattr(power_budget, "CASES", (CASE, Case("measured duct", "motor")))
         for name, own in REGISTRY.items():
-            patch.setitem(algorithms.REGISTRY, name, replace(own, first=own.first[1:8:3], second=own.second[1:8:3]))
+            patch.setitem(
+                algorithms.REGISTRY, name, replace(own, first=own.first[1:8:3] or own.first, second=own.second[1:8:3])
+            )
         runs = Runs()
         pair, noise = power_budget.paths()["duct"], noises()["band noise"]
         first, scene = (make_case(pair, noise(DURATION_S + 0.5, seed), n_taps=TAPS) for seed in (1, 2))

@@ -55,8 +55,8 @@ def small() -> Any:
 
 def test_planned_runs_are_those_taken(small: Any) -> None:
     _, done, planned, _ = small
-    # three events, three filters of 5 settings and two of 14, and each at its best; two starts of the sweep
-    assert planned == done == 3 * (3 * 5 + 2 * 14 + 5) + 2
+    # three events, two filters of 5 settings, one of 1 and two of 14, and each at its best; two starts of the sweep
+    assert planned == done == 3 * (2 * 5 + 1 + 2 * 14 + 5) + 2
 
 
 def test_the_report_is_complete(small: Any) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.controllers import short_blocks
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MU, N_TAPS, P0, S_HAT, Q, R, S, noises
 
 from kfopc_filterpy import (
@@ -16,7 +17,6 @@ from kfopc_filterpy import (
     OutputPowerConstraint,
     kf_anc,
     kf_opc,
-    kf_pb,
     simulate,
 )
 from kfopc_filterpy.controllers import FeedbackNeutralizer, PathTracker
@@ -39,7 +39,7 @@ MAKERS: dict[str, Any] = {
     "FxLMS": lambda: FxLMS(N_TAPS, S_HAT, step_size=MU),
     "KF-ANC": lambda: kf_anc(N_TAPS, S_HAT, **KALMAN),
     "KF-OPC": lambda: kf_opc(N_TAPS, S_HAT, constraint=OutputPowerConstraint(0.3, fs=FS), **KALMAN),
-    "KF-PB": lambda: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, **KALMAN),
+    "KF-PB": lambda: short_blocks(N_TAPS, S_HAT, rated_power=0.3),
     "path tracker": lambda: PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), rng=1, fs=FS),
     "limited": lambda: LimitedController(Proportional(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
     "own": Proportional,

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import FxLMS, OutputLimiter, SimulationResult, kf_pb, noise_reduction_db, simulate
+from kfopc_filterpy import (
+    FxLMS,
+    OutputLimiter,
+    OutputPowerConstraint,
+    SimulationResult,
+    kf_opc,
+    noise_reduction_db,
+    simulate,
+)
 from kfopc_filterpy.controllers import MonitoredController
 from kfopc_filterpy.signals import compressor_noise
 
@@ -17,8 +25,9 @@ PRIMARY = np.array([0.0] * 8 + [0.8, 0.4])
 
 
 def made(path: np.ndarray = PATH, **changed: Any) -> Any:
-    settings: dict[str, Any] = {"rated_power": 1.0, "fs": FS, "state_noise": 1e-8, "measurement_noise": 1e-3}
-    return kf_pb(24, path, **settings | changed)
+    constraint = OutputPowerConstraint(1.0, fs=FS)
+    settings: dict[str, Any] = {"constraint": constraint, "state_noise": 1e-8, "measurement_noise": 1e-3}
+    return kf_opc(24, path, **settings | changed)
 
 
 def run(controller: Any, x: np.ndarray, **changed: Any) -> SimulationResult:
@@ -183,11 +192,11 @@ def test_several_channels() -> None:
     primary = np.stack([PRIMARY, 0.7 * PRIMARY])[:, np.newaxis]
     x = white(6.0)[np.newaxis]
     options: dict[str, Any] = {"primary_path": primary, "secondary_path": paths, "fs": FS}
-    right = MonitoredController(kf_pb(24, paths, rated_power=1.0, fs=FS), fs=FS)
+    right = MonitoredController(made(paths), fs=FS)
     result = simulate(right, x, **options)
     assert right.health == []
     assert noise_reduction_db(result.error, result.disturbance) > 3.0
-    wrong = MonitoredController(kf_pb(24, -paths, rated_power=1.0, fs=FS), fs=FS)
+    wrong = MonitoredController(made(-paths), fs=FS)
     simulate(wrong, x, **options)
     assert "louder" in [event.what for event in wrong.health]
 

@@ -32,7 +32,6 @@ from kfopc_filterpy import (
     output_power,
     simulate,
 )
-from kfopc_filterpy.controllers.shared_gain import SharedGainKalman
 
 K, J, I, L = 3, 2, 2, 5  # microphones, loudspeakers, references, taps  # noqa: E741
 FS = 16000.0
@@ -466,7 +465,7 @@ def test_several_references_need_no_channel_axes() -> None:
         (lambda: MOVFxLMS(L, PATHS, step_size=MU, rated_power=1.0, penalty_factor=np.nan), ValueError, "penalty_factor must be finite"),
         (lambda: MOVFxLMS(L, ONE_PATH, step_size=MU, rated_power=[1.0, 2.0]), ValueError, "must be one for one loudspeaker, got 2"),
         (lambda: FxNLMS(L, PATHS, step_size=MU, regularization=0.0), ValueError, "regularization must be greater than 0"),
-        (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use controllers.SharedGainKalman, .* FxNLMS"),
+        (lambda: fx_rls(L, PATHS), ValueError, "fx_rls takes one channel, .* use kf_pb, .* FxNLMS"),
         (lambda: KalmanController(KFOPC(L), PATHS), ValueError, "KalmanController takes one channel"),
         (lambda: FastArrayKalman(L, PATHS, measurement_noise=1.0), ValueError, "FastArrayKalman takes one channel: .* with the setting n_references take several"),
     ],
@@ -517,13 +516,3 @@ def test_one_channel_refuses_arrays_and_several_channels_need_paths_with_axes() 
         FxLMS(L, ONE_PATH, step_size=MU).update([1.0, 2.0])
     with pytest.raises(ValueError, match="controller has one channel: give it secondary paths"):
         run(FxLMS(L, ONE_PATH, step_size=MU), noise(9))
-
-
-def test_shared_gain_kalman_is_always_multichannel() -> None:
-    """Though its path has no channel axes; it stores no filtered references, and its rate is checked."""
-    one = SharedGainKalman(8, ONE_PATH, rated_power=0.5, fs=FS)
-    assert one.multichannel
-    assert one.control_signal([1.0]).shape == (1,)
-    assert one._state.lines.filtered.size == 0
-    with pytest.raises(ValueError, match="power memory is for 16000 Hz"):
-        one.require_sample_rate(8000.0)

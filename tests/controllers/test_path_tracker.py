@@ -33,7 +33,7 @@ MAKERS: dict[str, Any] = {
     "FxLMS": lambda s: FxLMS(L, s, step_size=0.0005),
     "FxNLMS": lambda s: FxNLMS(L, s, step_size=0.02),
     "KF-ANC": lambda s: kf_anc(L, s, **KALMAN),
-    "KF-PB": lambda s: kf_pb(L, s, rated_power=4.0, fs=FS, **KALMAN),
+    "KF-PB": lambda s: kf_pb(L, s, rated_power=4.0, fs=FS),
 }
 
 

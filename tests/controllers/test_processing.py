@@ -40,15 +40,14 @@ KALMAN: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 1e-2, "initi
 ONE: dict[str, Any] = {
     "KF-OPC": lambda: kf_opc(12, PATH, constraint=OutputPowerConstraint(0.3, fs=FS), **KALMAN),
     "KF-PB with a limiter": lambda: kf_pb(
-        12, PATH, rated_power=0.3, fs=FS, limiter=OutputLimiter(0.3, fs=FS, window_s=0.01), **KALMAN
+        12, PATH, rated_power=0.3, fs=FS, limiter=OutputLimiter(0.3, fs=FS, window_s=0.01)
     ),
     "FxLMS": lambda: FxLMS(12, PATH, step_size=1e-3),
     "monitored": lambda: MonitoredController(FxLMS(12, PATH, step_size=1e-3), fs=FS, window_s=0.02),
     "neutralized": lambda: FeedbackNeutralizer(FxLMS(12, PATH, step_size=1e-3), [0.0, 0.1]),
 }
 SEVERAL: dict[str, Any] = {
-    "shared gain": lambda: kf_pb(8, PATHS, rated_power=[0.2, 0.3], fs=FS, n_references=2),
-    "frequency domain": lambda: kf_pb(8, PATHS, rated_power=0.2, fs=FS, n_references=2, form="frequency domain"),
+    "KF-PB of several channels": lambda: kf_pb(8, PATHS, rated_power=[0.2, 0.3], fs=FS, n_references=2),
     "direct": lambda: kf_anc(8, PATHS, n_references=2, **KALMAN),
     "FxLMS of several channels": lambda: FxLMS(8, PATHS, step_size=1e-3, n_references=2),
 }

@@ -12,8 +12,8 @@ import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.channels import random_paths, through
 
-from kfopc_filterpy import FxLMS, HardClipAmplifier, noise_reduction_db, simulate
-from kfopc_filterpy.controllers import KalmanObserver, SharedGainKalman, VirtualMicrophones
+from kfopc_filterpy import FxLMS, HardClipAmplifier, kf_pb, noise_reduction_db, simulate
+from kfopc_filterpy.controllers import KalmanObserver, VirtualMicrophones
 from kfopc_filterpy.paths import ObservationFilters
 
 FS, TAPS, J = 4000.0, 12, 2
@@ -66,10 +66,10 @@ class Recorded:
 
 
 @pytest.mark.parametrize("switch_on_s", [0.0, 50 / FS], ids=["at once", "after listening"])
-@pytest.mark.parametrize("kind", ["FxLMS", "shared gain"])
+@pytest.mark.parametrize("kind", ["FxLMS", "KF-PB"])
 def test_with_exact_filters_it_is_the_controller_that_hears_the_virtual_places(kind: str, switch_on_s: float) -> None:
     def one() -> Any:
-        return inner() if kind == "FxLMS" else SharedGainKalman(TAPS, SECONDARY[VIRTUAL], rated_power=0.2, fs=FS)
+        return inner() if kind == "FxLMS" else kf_pb(TAPS, SECONDARY[VIRTUAL], rated_power=0.2, fs=FS)
 
     controller, there = made(controller=one()), one()
     got = run(controller, switch_on_s=switch_on_s)
@@ -286,7 +286,7 @@ def test_models_that_do_not_fit_are_refused(model: Any, changed: dict, error: ty
 
 def test_a_run_at_another_rate_is_refused() -> None:
     paths = random_paths(2, 1, 6, seed=1)
-    inner_one = SharedGainKalman(TAPS, paths[1:], rated_power=1.0, fs=FS)
+    inner_one = kf_pb(TAPS, paths[1:], rated_power=1.0, fs=FS)
     controller = VirtualMicrophones(inner_one, paths, [[[1.0]]], physical=[0])
     with pytest.raises(ValueError, match="power memory is for 4000 Hz"):
         simulate(controller, noise(), disturbance=np.zeros((2, 1500)), secondary_path=paths, fs=2 * FS)

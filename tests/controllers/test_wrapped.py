@@ -33,7 +33,7 @@ X = np.random.default_rng(0).standard_normal(2000)
 RATED: dict[str, Any] = {
     "KF-OPC": lambda power: kf_opc(8, PATH, rated_power=power, **KALMAN),
     "KF-OPC repaired": lambda power: kf_opc_repaired(8, PATH, rated_power=power, **KALMAN),
-    "KF-PB": lambda power: kf_pb(8, PATH, rated_power=power, fs=FS, **KALMAN),
+    "KF-PB": lambda power: kf_pb(8, PATH, rated_power=power, fs=FS),
     "diagonal": lambda power: DiagonalKalman(8, PATH, rated_power=power, **KALMAN),
     "fast array": lambda power: FastArrayKalman(8, PATH, measurement_noise=1e-3, rated_power=power),
     "MOV": lambda power: MOVFxLMS(8, PATH, step_size=1e-3, rated_power=power),
@@ -41,9 +41,7 @@ RATED: dict[str, Any] = {
 }
 SEVERAL: dict[str, Any] = {
     "KF-OPC": lambda power: kf_opc(8, PATHS, rated_power=power, **KALMAN),
-    "direct": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS, form="direct", **KALMAN),
-    "shared gain": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS),
-    "frequency domain": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS, form="frequency domain"),
+    "KF-PB": lambda power: kf_pb(8, PATHS, rated_power=power, fs=FS),
     "MOV": lambda power: MOVFxLMS(8, PATHS, step_size=1e-4, rated_power=power),
 }
 WRAPPERS: dict[str, Any] = {
@@ -93,7 +91,7 @@ def test_rated_powers_of_several_loudspeakers_can_be_assigned(name: str) -> None
 
 
 def test_a_controller_without_a_rated_power_takes_none() -> None:
-    for controller in (kf_anc(8, PATH, **KALMAN), FxLMS(8, PATH, step_size=1e-3), kf_pb(8, PATHS, rated_power=None)):
+    for controller in (kf_anc(8, PATH, **KALMAN), FxLMS(8, PATH, step_size=1e-3)):
         with pytest.raises(ValueError, match="has no rated power that could be changed; kf_opc"):
             controller.rated_power = 1.0
 

@@ -135,7 +135,7 @@ scene.run(controller)
 assert "sign FxLMS" in registry.algorithms(several_channels=True)
 """
 
-SECTION = TEXT.split("<!-- add-a-controller")[1].split("### Compiled functions")[0]
+SECTION = TEXT.split("<!-- add-a-controller")[1].split("## Build the core")[0]
 SIGN, MEAN = re.findall(r"^```c\n(.*?)^```", SECTION, flags=re.M | re.S)
 CLASS, REGISTERED, STYLED, OUTSIDE = re.findall(r"^```python\n(.*?)^```", SECTION, flags=re.M | re.S)
 
@@ -144,7 +144,6 @@ def check(folder: Path, package: Path, *, imported: str, more: str = "") -> None
     """Run `CHECK` in a folder, in a process of its own, with caches of its own."""
     (folder / "check.py").write_text(CHECK.format(imported=imported, more=more), encoding="utf-8")
     environment = os.environ | {
-        "NUMBA_CACHE_DIR": str(folder / "cache"),
         "KFOPC_CACHE": str(folder / "cache"),
         "PYTHONPATH": os.pathsep.join([str(package), str(ROOT / "tests")]),
     }

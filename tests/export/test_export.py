@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from helpers.c99 import FAST, WARNINGS, Program, c_compiler, compiler, succeeds
 from helpers.channels import random_paths, through
+from helpers.controllers import short_blocks
 
 from kfopc_filterpy import (
     KFOPC,
@@ -34,7 +35,6 @@ from kfopc_filterpy import (
     kf_anc,
     kf_opc,
     kf_opc_repaired,
-    kf_pb,
     simulate,
 )
 from kfopc_filterpy.controllers import CoreController, MonitoredController, load_algorithm
@@ -119,6 +119,10 @@ CONTROLLERS = {f"{name}, everything": lambda name=name: with_everything(name) fo
         L, S_HAT, rated_power=RATED, state_noise=1e-6, measurement_noise=1e-6, initial_variance=100.0
     ),
     "repaired": lambda: made("repaired"),
+    "KF-PB": lambda: short_blocks(L, S_HAT, rated_power=RATED, fs=16000.0),
+    "KF-PB, everything": lambda: short_blocks(
+        L, S_TWO_HAT, rated_power=[RATED, 0.3], fs=16000.0, n_references=2, limiter=[limiter(), limiter(0.3)]
+    ),
     "fast array": lambda: made("fast array"),
 }
 
@@ -518,7 +522,6 @@ def of_a_file(folder):
 
 NOT_EXPORTED = {
     "a number": (lambda folder: 3.0, "float .* is not in the core"),
-    "KF-PB": (lambda folder: kf_pb(4, S_HAT, rated_power=RATED, **NOISES), "KF-PB .* is not in the core"),
     "monitor": (lambda folder: MonitoredController(made("KF-OPC")), r"MonitoredController\) is not in the core"),
     "own calls": (lambda folder: Own(4, S_HAT, step_size=0.1), r"FxLMS \(Own\) has calls of its own"),
     "estimator": (

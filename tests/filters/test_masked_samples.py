@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from kfopc_filterpy import KFOPC
-from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 
 N, STEPS, MISSING = 4, 40, (0, 7, 8, 39)
 NOISES: dict[str, Any] = {"state_noise": 0.01, "measurement_noise": 0.5}
@@ -18,7 +17,6 @@ MAKERS: dict[str, Callable[[], KFOPC]] = {
     "general, constrained": lambda: KFOPC(N, rated_power=0.5),
     "random walk": lambda: KFOPC.random_walk(N, **NOISES),
     "random walk, constrained": lambda: KFOPC.random_walk(N, rated_power=0.5, **NOISES),
-    "power budget": lambda: PowerBudgetKalmanFilter(N, rated_power=0.5, **NOISES),
 }
 rng = np.random.default_rng(4)
 ROWS, REFERENCES, Z = rng.normal(size=(STEPS, N)), rng.normal(size=STEPS), 3.0 * rng.normal(size=STEPS)
@@ -55,8 +53,6 @@ def test_masked_samples_are_missing_with_references(kind: str, behind: float, sh
     kf, other = MAKERS[kind](), MAKERS[kind]()
     z = Z.reshape(shape)
     require_same_run(kf, other, masked(z, behind), by_hand(z), Hs=list(ROWS), references=REFERENCES)
-    if isinstance(kf, PowerBudgetKalmanFilter):
-        np.testing.assert_array_equal(kf.control_filter, other.control_filter)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("kind", ["general", "random walk"])

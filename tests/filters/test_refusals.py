@@ -15,7 +15,6 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 from kfopc_filterpy import KFOPC
-from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 
 N = 3
 ROW = np.array([1.0, 0.5, -0.25])
@@ -26,7 +25,6 @@ MAKERS: dict[str, Callable[[], KFOPC]] = {
     "constrained": lambda: KFOPC(N, rated_power=0.5),
     "random walk": lambda: KFOPC.random_walk(N, **NOISES),
     "random walk, constrained": lambda: KFOPC.random_walk(N, rated_power=0.5, **NOISES),
-    "power budget": lambda: PowerBudgetKalmanFilter(N, rated_power=0.5, **NOISES),
 }
 every_kind = pytest.mark.parametrize("kind", MAKERS)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from kfopc_filterpy import KFOPC, OutputPowerConstraint
-from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 
 NOISES: dict[str, Any] = {"state_noise": 1e-6, "measurement_noise": 0.1}
 
@@ -37,20 +36,11 @@ def test_the_random_walk_filter(column: bool) -> None:
     )
 
 
-def test_the_filter_with_a_power_budget() -> None:
-    kf = PowerBudgetKalmanFilter(9, rated_power=0.5, **NOISES)
-    assert repr(kf) == (
-        "<PowerBudgetKalmanFilter: dim_x 9, dim_z 1, state noise 1e-06, measurement noise 0.1, rated power 0.5, "
-        "constraint factor 1, norm of x 0>"
-    )
-
-
 @pytest.mark.parametrize(
     "make",
     [
         KFOPC,
         lambda n: KFOPC.random_walk(n, **NOISES),
-        lambda n: PowerBudgetKalmanFilter(n, rated_power=0.5, **NOISES),
     ],
 )
 def test_up_to_eight_states_all_is_shown(make: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -38,8 +39,8 @@ from kfopc_filterpy.controllers import (
     MonitoredController,
     PathTracker,
     VirtualMicrophones,
+    power_budget,
 )
-from kfopc_filterpy.filters import PowerBudgetKalmanFilter
 from kfopc_filterpy.paths import PathTolerance
 
 KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
@@ -49,12 +50,18 @@ def constraint(**settings: Any) -> OutputPowerConstraint:
     return OutputPowerConstraint(0.3, **{"fs": FS, "memory_s": MEMORY_S} | settings)
 
 
+def short_blocks(taps: int, path: Any, **settings: Any) -> Any:
+    """Return KF-PB with blocks of 16 samples, of which a short run has many, and an averaging time of 20 blocks."""
+    with mock.patch.object(power_budget, "BLOCK_S", 16 / FS):
+        return kf_pb(taps, path, **{"fs": FS, "averaging_s": 320 / FS} | settings)
+
+
 MAKERS: dict[str, Any] = {
     "KF-ANC": lambda **o: kf_anc(N_TAPS, S_HAT, **KALMAN, **o),
     "KF-OPC": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
     "KF-OPC, sliding": lambda **o: kf_opc(N_TAPS, S_HAT, constraint=constraint(window="sliding"), **KALMAN, **o),
     "KF-OPC repaired": lambda **o: kf_opc_repaired(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
-    "KF-PB": lambda **o: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, memory_s=0.05, **KALMAN, **o),
+    "KF-PB": lambda **o: short_blocks(N_TAPS, S_HAT, rated_power=0.3, **o),
     "fxRLS": lambda **o: fx_rls(N_TAPS, S_HAT, forgetting=0.999, **o),
     "diagonal KF": lambda **o: DiagonalKalman(N_TAPS, S_HAT, **KALMAN, **o),
     "diagonal KF-OPC": lambda **o: DiagonalKalman(N_TAPS, S_HAT, constraint=constraint(), **KALMAN, **o),
@@ -111,10 +118,9 @@ def limiters() -> list[OutputLimiter]:
 SEVERAL: dict[str, Any] = {
     "kf_anc": lambda: kf_anc(L, PATHS, **KALMAN, **MANY),
     "kf_opc": lambda: kf_opc(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
-    "kf_pb, direct": lambda: kf_pb(L, PATHS, rated_power=[0.02, 0.05], form="direct", fs=FS, **KALMAN, **MANY),
-    "kf_pb": lambda: kf_pb(L, PATHS, rated_power=[0.02, 0.05], fs=FS, **MANY),
-    "kf_pb, frequency domain": lambda: kf_pb(
-        L, PATHS, rated_power=0.05, form="frequency domain", fs=FS, block=16, limiter=limiters(), **MANY
+    "kf_pb": lambda: short_blocks(L, PATHS, rated_power=[0.02, 0.05], **MANY),
+    "kf_pb, exact path": lambda: short_blocks(
+        L, PATHS, rated_power=0.05, secondary_path_uncertainty=None, limiter=limiters(), **MANY
     ),
     "DiagonalKalman": lambda: DiagonalKalman(L, PATHS, constraint=constraints(), limiter=limiters(), **KALMAN, **MANY),
     "FxLMS": lambda: FxLMS(L, PATHS, step_size=MU, limiter=limiters(), **MANY),
@@ -210,7 +216,7 @@ AROUND: dict[str, Any] = {
     "a user's filter": lambda: KalmanController(_filterpys(OwnFilter), S_HAT),
     "KFOPC": lambda: KalmanController(_full(constraint=constraint()), S_HAT),
     "fading memory": lambda: KalmanController(_faded(KFOPC.random_walk(N_TAPS, **KALMAN)), S_HAT, name="faded"),
-    "KF-PB, limiter": lambda: kf_pb(N_TAPS, S_HAT, rated_power=0.3, fs=FS, limiter=OutputLimiter(0.2, fs=FS), **KALMAN),
+    "KF-PB, exact path": lambda: short_blocks(N_TAPS, S_HAT, rated_power=0.3, secondary_path_uncertainty=None),
     "guarded KF-OPC": lambda: _guarded(kf_opc(N_TAPS, S_HAT, constraint=constraint(), **KALMAN)),
     "guarded FxLMS": lambda: _guarded(FxLMS(N_TAPS, S_HAT, step_size=MU)),
     "guarded FxLMS, many": lambda: _guarded(FxLMS(L, PATHS, step_size=MU, **MANY)),
@@ -247,5 +253,4 @@ FILTERS: dict[str, Any] = {
     "KFOPC, loudspeakers": lambda: _full(constraint=constraints()),
     "random walk": lambda: KFOPC.random_walk(N_TAPS, **KALMAN),
     "random walk, KF-OPC": lambda: KFOPC.random_walk(N_TAPS, constraint=constraint(), **KALMAN),
-    "power budget": lambda: PowerBudgetKalmanFilter(N_TAPS, rated_power=0.3, fs=FS, memory_s=0.05, **KALMAN),
 }

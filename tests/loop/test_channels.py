@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from helpers.channels import random_paths, through
 
-from kfopc_filterpy import FxLMS, bandpass_path, simulate
-from kfopc_filterpy.controllers import SharedGainKalman
+from kfopc_filterpy import FxLMS, bandpass_path, kf_pb, simulate
 from kfopc_filterpy.paths import fir_path
 
 K, J, REFERENCES, N = 3, 2, 2, 400
@@ -103,7 +102,7 @@ def test_a_divergence_ends_the_run_with_nan() -> None:
         ({"record_weights_every": 10}, "attribute weights"),
         ({"switch_on_s": 0.01}, "listen"),
         ({"rated_power": [1.0, 2.0, 3.0]}, "each of the 2 loudspeakers"),
-        ({"controller": SharedGainKalman(8, SECONDARY)}, "made for 1 references"),
+        ({"controller": kf_pb(8, SECONDARY, rated_power=1.0)}, "made for 1 references"),
         ({"controller": FxLMS(8, [1.0], step_size=0.1)}, "one channel"),
     ],
     ids=range(15),

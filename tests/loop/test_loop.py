@@ -38,7 +38,6 @@ from kfopc_filterpy import (
     kf_opc,
     simulate,
 )
-from kfopc_filterpy.kernels.delay_lines import delay_line, newest, push
 
 
 def controller(name, *, rated_power=0.3, window="exponential", gain=None, known=None, n_taps=N_TAPS):
@@ -209,22 +208,6 @@ def test_pieces_of_the_compiled_loop_do_not_show(name, step, monkeypatch):
 
 
 # ---- The delay line
-
-
-@given(
-    taps=st.integers(1, 40),
-    samples=st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=60),
-    repeats=st.integers(1, 12),
-)
-@settings(max_examples=60)
-def test_newest_are_the_last_samples_pushed(taps, samples, repeats):
-    line, pushed = delay_line(taps), [0.0] * taps
-    for sample in samples * repeats:  # up to 720 samples: across several wraps of 4 * 40 + 64
-        push(line, sample)
-        pushed.append(sample)
-        for n in {1, (taps + 1) // 2, taps}:
-            np.testing.assert_array_equal(newest(line, n), pushed[: -n - 1 : -1])
-    assert newest(line, taps).flags.c_contiguous
 
 
 # ---- What must hold for any signal

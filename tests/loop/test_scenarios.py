@@ -416,9 +416,9 @@ REFUSED = [
     ),
     (lambda: [*filters(2), "KF-OPC"], TypeError, r"controllers\[2\] must be a controller of the core.*got 'KF-OPC'"),
     (
-        lambda: [kf_pb(7, S_HAT, rated_power=1.0, fs=FS, state_noise=1e-5, measurement_noise=0.1)],
-        TypeError,
-        "of the core",
+        lambda: [kf_pb(7, S_HAT, rated_power=1.0, fs=FS)] * 2,
+        ValueError,
+        r"controllers\[0\], KF-PB, learns the plant.*: use simulate",
     ),
     (lambda: [kf_anc(7, S_HAT[None, None], state_noise=1e-5, measurement_noise=0.1)], TypeError, "of one channel"),
     (lambda: [KalmanController(KFOPC(7), S)], ValueError, r"controllers\[0\] has steps of its own in Python"),

@@ -1,4 +1,4 @@
-"""The core's covariance (`covariance.h`) in an array of its own, for filters that Python or numba's code steps.
+"""The core's covariance (`covariance.h`) in an array of its own, for filters that Python steps.
 
 P = scale (T - pending u u') + diagonal I, with the lower triangle T and u = P x' / sqrt(S) of the last update.
 """
@@ -10,10 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..core.calls import covariance_fields, covariance_step_compiled
-from ..core.calls import covariance_update as covariance_update
-from .compiling import inlined, part
-from .vectors import FAST
+from .calls import covariance_fields
+from .calls import covariance_update as covariance_update
 
 GROUP = 8  # rows of T that have one length, `PARTS` in vectors.h
 LINE = 64  # bytes in a cache line
@@ -90,12 +88,6 @@ def covariance_at(cov: Covariance, n: int, scale: float, diagonal: float, weight
     return full_covariance(cov.memory[_fields(n)[1]["triangle"]], direction_of(cov, n), scale, diagonal, weight)
 
 
-def covariance_matrix(cov: Covariance, n: int) -> np.ndarray:
-    """Return P as a new full symmetric array (n, n)."""
-    scale, diagonal, pending, *_ = owed_of(cov).item()
-    return covariance_at(cov, n, scale, diagonal, -scale * pending)
-
-
 def _groups(triangle: np.ndarray, n: int) -> list[tuple[np.ndarray, int]]:
     """Return views of the groups of rows of T, each with its first row's index."""
     groups, at = [], 0
@@ -104,31 +96,3 @@ def _groups(triangle: np.ndarray, n: int) -> list[tuple[np.ndarray, int]]:
         groups.append((triangle[at : at + size].reshape(GROUP, -1), group))
         at += size
     return groups
-
-
-@inlined
-def kalman_step(cov, w, h, scaled_measurement, state_noise, noise, alpha_sq):
-    """Process one sample (eq. 2-9): predict, correct the weights `w` in place, return the innovation and S.
-
-    If P could overflow, the innovation is NaN and nothing has changed.
-    """
-    cov.result[0] = cov.result[1] = np.nan
-    covariance_step_compiled(
-        cov.memory.ctypes.data,
-        w.size,
-        w.ctypes.data,
-        h.ctypes.data,
-        scaled_measurement,
-        state_noise,
-        noise,
-        alpha_sq,
-        cov.result.ctypes.data,
-    )
-    return cov.result[0], cov.result[1]
-
-
-@part(fastmath=FAST)
-def correct_weights(w, gain_direction, innovation_over_root):
-    """Apply eq. 5, w(n|n) = w(n|n-1) + K (d - x'w), with K = u / sqrt(S)."""
-    for i in range(w.size):
-        w[i] += gain_direction[i] * innovation_over_root

@@ -1,1 +1,0 @@
-"""Compiled arithmetic that knows no acoustics."""

@@ -1,0 +1,363 @@
+"""KF-PB as a controller: what it is made with, refuses, tells and keeps. Its equations have tests against the oracle."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.channels import random_paths
+from helpers.comparing import assert_same_run
+
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    OutputLimiter,
+    kf_pb,
+    noise_reduction_db,
+    output_power,
+    simulate,
+    suggest_settings,
+)
+from kfopc_filterpy.controllers import PowerBudgetController
+from kfopc_filterpy.paths import PathTolerance, fir_path, misalignment_db
+from kfopc_filterpy.paths.uncertainty import rms_relative_error
+
+FS, L, M = 2000.0, 16, 8
+BLOCK = 64  # samples in 32 ms
+AVERAGING_S = 2.0
+S = np.array([0.0, 0.0, 1.0, -0.4, 0.2, 0.1, 0.0, 0.0])
+PRIMARY = np.array([0.0, 0.0, 0.0, 0.0, 0.9, 0.5, -0.3, 0.1])
+K, J, I = 3, 2, 2  # noqa: E741
+PATHS, PRIMARIES = random_paths(K, J, M, seed=1), random_paths(K, I, 12, seed=2, delay=4)
+SETTINGS: dict[str, Any] = {"rated_power": 0.25, "fs": FS, "averaging_s": AVERAGING_S}
+
+
+def made(path: Any = S, **settings: Any) -> PowerBudgetController:
+    return kf_pb(L, path, **SETTINGS | settings)
+
+
+def several(**settings: Any) -> PowerBudgetController:
+    return made(PATHS, **{"n_references": I, "rated_power": [0.02, 0.05]} | settings)
+
+
+def noise(seconds: float, seed: int = 0, channels: int | None = None) -> np.ndarray:
+    n = round(seconds * FS)
+    return np.random.default_rng(seed).standard_normal(n if channels is None else (channels, n))
+
+
+def run(controller: Any, x: np.ndarray, **options: Any) -> Any:
+    plant = (PRIMARY, S) if x.ndim == 1 else (PRIMARIES, PATHS)
+    plants = {"primary_path": plant[0], "secondary_path": plant[1], "fs": FS, "sensor_noise_std": 0.01, "rng": 1}
+    return simulate(controller, x, **plants | options)
+
+
+def worst_mean(y: np.ndarray, averaging_s: float = AVERAGING_S) -> float:
+    """The largest mean power over the averaging time, within the run."""
+    n = round(averaging_s * FS / BLOCK) * BLOCK
+    total = np.concatenate([[0.0], np.cumsum(y**2)])
+    return float(np.max(total[n:] - total[:-n]) / n)
+
+
+# ---- Settings
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"rated_power": 0.0}, ValueError, "rated_power must be greater than 0"),
+        ({"rated_power": np.nan}, ValueError, "rated_power must be"),
+        ({"rated_power": None}, TypeError, "rated_power"),
+        ({"rated_power": [1.0, 1.0]}, (TypeError, ValueError), "rated_power"),
+        ({"secondary_path_uncertainty": -0.1}, ValueError, "secondary_path_uncertainty must not be negative"),
+        ({"secondary_path_uncertainty": np.inf}, ValueError, "secondary_path_uncertainty must be finite"),
+        ({"secondary_path_uncertainty": "little"}, TypeError, "secondary_path_uncertainty"),
+        ({"secondary_path_uncertainty": np.ones((2, 1, 2, 3))}, ValueError, r"must be \(M, n_taps\)"),
+        ({"averaging_s": 0.0}, ValueError, "averaging_s must be greater than 0"),
+        ({"fs": -1.0}, ValueError, "fs must be greater than 0"),
+        ({"limiter": 1.0}, TypeError, "limiter must be an OutputLimiter"),
+        ({"amplifier": "loud"}, TypeError, "amplifier must be None"),
+        ({"n_references": 0}, ValueError, "n_references must be at least 1"),
+        ({"path": np.full(4, np.nan)}, ValueError, "secondary_path must be finite"),
+    ],
+)
+def test_a_setting_that_is_out_of_range_is_refused_by_name(settings: dict, error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        made(**settings)
+
+
+def test_rated_powers_must_fit_the_loudspeakers() -> None:
+    with pytest.raises(ValueError, match="each of the 2 loudspeakers"):
+        several(rated_power=[1.0, 1.0, 1.0])
+    with pytest.raises(ValueError, match="rated_power must be greater than 0"):
+        several(rated_power=[1.0, -1.0])
+    np.testing.assert_array_equal(several(rated_power=0.1).rated_power, [0.1, 0.1])
+
+
+def test_another_sample_rate_than_that_of_the_run_is_refused() -> None:
+    with pytest.raises(ValueError, match="fs is 4000 Hz but the controller's power memory is for 2000 Hz"):
+        run(made(), noise(0.1), fs=4000.0)
+    with pytest.raises(ValueError, match="secondary path is for 8000 Hz"):
+        run(made(fir_path(S, 8000.0)), noise(0.1))
+
+
+def test_suggested_settings_give_the_taps_and_the_rate() -> None:
+    x = noise(8.0)
+    suggested = suggest_settings(x, np.convolve(x, PRIMARY)[: x.size], S, fs=FS, n_taps=8)
+    controller = kf_pb(suggested, S, rated_power=0.25)
+    assert controller.n_taps == 8
+    controller.require_sample_rate(FS)
+    with pytest.raises(ValueError, match="in the suggested settings, fs is 2000 Hz"):
+        kf_pb(suggested, S, rated_power=0.25, fs=16000.0)
+    with pytest.raises(ValueError, match="limiter is for 16000 Hz"):
+        kf_pb(suggested, S, rated_power=0.25, limiter=OutputLimiter(0.3))
+
+
+def test_the_spread_is_the_rms_of_the_error_over_the_spectrum_of_the_path() -> None:
+    """A path of energy 1 that is flat, off by a sample of delay: E |e^jw - 1|^2 = 2. Measured ones: |dS|^2 / |S|^2."""
+    assert rms_relative_error(None, S) == 0.0
+    assert rms_relative_error(0.2, S) == 0.2
+    assert rms_relative_error(PathTolerance(delay_samples=1.0), [0.0, 1.0]) == pytest.approx(np.sqrt(2.0), rel=1e-3)
+    assert rms_relative_error(PathTolerance(gain_db=6.0), S) == pytest.approx(10**0.3 - 1.0)
+    other = S + 0.1 * np.random.default_rng(1).standard_normal(M)
+    expected = np.linalg.norm(other - S) / np.linalg.norm(S)
+    assert rms_relative_error(other[np.newaxis], S) == pytest.approx(expected, rel=1e-6)
+    assert rms_relative_error(np.full(257, 0.3), PATHS) == pytest.approx(0.3)
+    assert made(secondary_path_uncertainty=PathTolerance(gain_db=6.0))._of_setting("spread") == pytest.approx(
+        10**0.3 - 1.0
+    )
+
+
+def test_the_uncertainty_is_kept_as_it_was_stated_and_cannot_be_changed() -> None:
+    controller = made(secondary_path_uncertainty=PathTolerance(phase_deg=10.0))
+    assert controller.secondary_path_uncertainty == PathTolerance(phase_deg=10.0)
+    with pytest.raises(ValueError, match="no secondary_path_uncertainty can be assigned to KF-PB"):
+        controller.secondary_path_uncertainty = 0.1
+
+
+# ---- What it tells
+
+
+def test_shapes_for_one_channel() -> None:
+    controller = made()
+    run(controller, noise(1.0))
+    assert controller.weights.shape == controller.control_filter.shape == (L,)
+    assert controller.primary_path.shape == (L + M - 1,)
+    assert controller.identified_path.shape == controller.secondary_path.shape == (M,)
+    for name in ("rated_power", "power_weight", "measurement_noise"):
+        assert isinstance(getattr(controller, name), float)
+    assert isinstance(controller.alarms, int)
+    assert repr(controller) == "<KF-PB: 16 taps, rated power 0.25, constraint factor 1>"
+
+
+def test_shapes_for_several_channels() -> None:
+    controller = several()
+    result = run(controller, noise(1.0, channels=I))
+    assert result.control_signal.shape == (J, round(FS))
+    assert controller.weights.shape == controller.control_filter.shape == (J, I, L)
+    assert controller.primary_path.shape == (K, I, L + M - 1)
+    assert controller.identified_path.shape == (K, J, M)
+    assert controller.rated_power.shape == controller.power_weight.shape == (J,)
+    assert controller.measurement_noise.shape == (K,)
+
+
+def test_an_exact_path_is_told_as_it_was_given() -> None:
+    controller = made(secondary_path_uncertainty=None)
+    run(controller, noise(1.0))
+    np.testing.assert_array_equal(controller.identified_path, S)
+    assert controller.primary_path.shape == (L + M - 1,)
+
+
+def test_it_learns_both_paths() -> None:
+    """The true path is 30 % louder than the estimate, and a little different."""
+    true = 1.3 * S + np.array([0.0, 0.0, 0.0, 0.1, -0.1, 0.0, 0.0, 0.0])
+    controller = made(rated_power=1.0)
+    before = misalignment_db(controller.identified_path, true)
+    run(controller, noise(8.0), secondary_path=true)
+    assert misalignment_db(controller.identified_path, true) < min(before - 6.0, -15.0)
+    assert misalignment_db(controller.primary_path[: PRIMARY.size], PRIMARY) < -15.0
+    np.testing.assert_array_equal(controller.secondary_path, S)  # as the user gave it
+    assert controller.measurement_noise == pytest.approx(1e-4, rel=0.5)
+    assert controller.alarms == 0
+
+
+def test_the_price_is_recorded() -> None:
+    result = run(made(rated_power=0.05), noise(3.0), record_powers=True)
+    assert result.power_weight.shape == result.error.shape
+    assert result.power_weight[-1] > 0.0
+    assert np.all(run(made(rated_power=1e3), noise(3.0), record_powers=True).power_weight >= 0.0)
+
+
+# ---- Runs
+
+
+@pytest.mark.parametrize("make", [made, several, lambda: made(secondary_path_uncertainty=None)])
+def test_the_compiled_run_is_the_steps_bit_for_bit(make: Callable[[], Any]) -> None:
+    fast, slow = make(), make()
+    x = noise(0.6, channels=I if fast.multichannel else None)
+    options: dict[str, Any] = {"switch_on_s": 0.1, "record_weights_every": 7}
+    assert_same_run(run(fast, x, **options), run(slow, x, compiled=False, **options))
+    np.testing.assert_array_equal(fast.weights, slow.weights)
+    assert np.any(fast.weights)
+
+
+@pytest.mark.parametrize("make", [made, several])
+def test_a_copy_and_a_checkpoint_resume_to_the_bit(make: Callable[[], Any], tmp_path: Path) -> None:
+    controller = make()
+    x, more = (noise(1.013, seed, I if controller.multichannel else None) for seed in (0, 1))
+    run(controller, x)
+    controller.save(tmp_path / "run.kfopc")
+    twins = [copy.deepcopy(controller), PowerBudgetController.load(tmp_path / "run.kfopc")]
+    expected = run(controller, more)
+    for twin in twins:
+        assert_same_run(run(twin, more), expected)
+        np.testing.assert_array_equal(twin.identified_path, controller.identified_path)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: c.update(np.nan), "error must be finite"),
+        (lambda c: c.update(1e200), "the error is too loud"),
+        (lambda c: c.control_signal(np.inf), "reference must be finite"),
+        (lambda c: c.control_signal(1e200), "the reference is too loud"),
+        (lambda c: c.listen(np.ones(3), np.ones(2)), "errors"),
+        (lambda c: setattr(c, "rated_power", -1.0), "rated_power must be greater than 0"),
+        (lambda c: setattr(c, "secondary_path", np.ones(M + 1)), "at most the 8 taps"),
+    ],
+)
+def test_what_is_refused_changes_nothing(call: Callable[[Any], Any], message: str) -> None:
+    refusing, twin = made(), made()
+    for one in (refusing, twin):
+        run(one, noise(0.5))
+    with pytest.raises(ValueError, match=message):
+        call(refusing)
+    assert_same_run(run(refusing, noise(0.5, 1)), run(twin, noise(0.5, 1)))
+
+
+def test_the_power_is_kept_over_any_averaging_time_and_used() -> None:
+    x = noise(16.0)
+    x[round(6 * FS) : round(8 * FS)] *= 3.0
+    controller = made()
+    result = run(controller, x)
+    assert worst_mean(result.control_signal) < 1.05 * 0.25
+    assert output_power(result.control_signal[-round(3 * FS) :], steady=1.0) > 0.5 * 0.25
+    assert noise_reduction_db(result.error, result.disturbance) > 2.0
+
+
+def test_powers_of_several_loudspeakers_are_kept() -> None:
+    controller = several()
+    result = run(controller, noise(10.0, channels=I))
+    for y, rated in zip(result.control_signal, controller.rated_power, strict=True):
+        assert worst_mean(y) < 1.05 * rated
+
+
+def test_a_rated_power_that_is_assigned_during_a_run_holds_from_then_on() -> None:
+    controller = made()
+    run(controller, noise(6.0))
+    controller.rated_power = 0.02
+    assert controller.rated_power == 0.02
+    y = run(controller, noise(10.0, 1)).control_signal
+    assert worst_mean(y[round(AVERAGING_S * FS) :]) < 1.05 * 0.02
+    controller.rated_power = 0.2
+    y = run(controller, noise(10.0, 2)).control_signal
+    assert np.mean(y[-round(3 * FS) :] ** 2) > 0.06
+
+
+def test_it_listens_before_it_is_switched_on() -> None:
+    controller = made(rated_power=10.0)
+    x = noise(4.0)
+    result = run(controller, x, switch_on_s=2.0)
+    first = slice(BLOCK, 8 * BLOCK)  # the result begins when it is switched on
+    assert noise_reduction_db(result.error[first], result.disturbance[first], steady=1.0) > 6.0
+    listening = made(rated_power=10.0)
+    listening.listen(x, np.convolve(x, PRIMARY)[: x.size])
+    assert misalignment_db(listening.primary_path[: PRIMARY.size], PRIMARY) < -20.0
+    assert np.any(listening.weights)
+
+
+def test_what_is_played_is_spent_while_it_does_not_adapt() -> None:
+    """Blocks whose errors are unknown teach nothing, and the power counts all the same."""
+    controller = made()
+    run(controller, noise(6.0))
+    x, played = noise(10.0, 1), []
+    for begin in range(0, x.size, BLOCK):
+        part = slice(begin, begin + BLOCK)
+        played.append(controller.process(x[part], np.zeros(x[part].size), adapt=False))
+    assert worst_mean(np.concatenate(played)) < 1.05 * 0.25
+    assert controller.alarms == 0
+
+
+# ---- Verification
+
+
+def flipped(**settings: Any) -> tuple[PowerBudgetController, Any]:
+    """A controller whose secondary path gets the other polarity after six seconds, and its run from then on."""
+    controller = made(rated_power=1.0, **settings)
+    run(controller, noise(6.0))
+    return controller, run(controller, noise(12.0, 1), secondary_path=-S)
+
+
+def test_a_path_whose_polarity_flips_raises_an_alarm_and_is_learnt_again() -> None:
+    controller, result = flipped()
+    assert controller.alarms >= 1
+    assert misalignment_db(controller.identified_path, -S) < -10.0
+    last = slice(-round(3 * FS), None)
+    assert noise_reduction_db(result.error[last], result.disturbance[last], steady=1.0) > 3.0
+
+
+def test_a_path_that_stays_raises_none() -> None:
+    controller = made(rated_power=1.0)
+    run(controller, noise(12.0))
+    assert controller.alarms == 0
+
+
+def test_an_exact_path_is_never_doubted() -> None:
+    controller, _ = flipped(secondary_path_uncertainty=None)
+    assert controller.alarms == 0
+
+
+def test_a_wrong_polarity_from_the_start_does_not_make_the_noise_much_louder() -> None:
+    controller = made(-S, rated_power=1.0)
+    result = run(controller, noise(12.0), switch_on_s=2.0)
+    seconds, own = (np.split(signal**2, 10) for signal in (result.error, result.disturbance))
+    changes = [10 * np.log10(np.mean(e) / np.mean(d)) for e, d in zip(seconds, own, strict=True)]
+    assert max(changes[1:]) < 1.0
+    assert changes[-1] < -3.0
+
+
+def test_a_new_path_is_learnt_around_and_the_control_filter_stays() -> None:
+    controller = made(rated_power=1.0)
+    run(controller, noise(6.0))
+    weights = controller.weights
+    controller.secondary_path = -S
+    np.testing.assert_array_equal(controller.weights, weights)
+    np.testing.assert_array_equal(controller.secondary_path, -S)
+    np.testing.assert_array_equal(controller.identified_path, -S)
+    result = run(controller, noise(6.0, 1), secondary_path=-S)
+    assert controller.alarms == 0
+    assert noise_reduction_db(result.error, result.disturbance) > 6.0
+
+
+# ---- With a limiter, and an amplifier
+
+
+def test_a_limiter_holds_in_every_window() -> None:
+    controller = made(limiter=OutputLimiter(0.25, fs=FS, window_s=0.1))
+    result = run(controller, noise(8.0))
+    assert worst_mean(result.control_signal, 0.128) < 0.25 * 1.6  # windows of 0.1 s in 0.128 s
+    total = np.concatenate([[0.0], np.cumsum(result.control_signal**2)])
+    assert np.max(total[200:] - total[:-200]) / 200 <= 0.25 * (1 + 1e-9)
+    assert noise_reduction_db(result.error, result.disturbance) > 1.0
+    assert controller.alarms == 0  # it hears what was played
+
+
+def test_a_known_amplifier_is_no_error_of_the_path() -> None:
+    amplifier = HardClipAmplifier(0.5)
+    known = made(rated_power=1.0, amplifier=amplifier)
+    result = run(known, noise(8.0), amplifier=amplifier)
+    assert known.alarms == 0
+    assert misalignment_db(known.identified_path, S) < -15.0
+    assert noise_reduction_db(result.error, result.disturbance) > 1.0
