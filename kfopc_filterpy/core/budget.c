@@ -23,6 +23,8 @@ enum { SHORTEST = 20 };               /* ... and for a twentieth of the averagin
 /* t: exponential windows of the averaging time over these. The filter is solved for the references of the first. */
 static const int32_t SCALE[SCALES + 1] = {8, 100, 40, 4};
 enum { NEWTON = 20 };                 /* steps */
+/* No sample that is learnt from is louder, neither x and e nor what is played, and no filter has a larger tap. So no sum of
+ * products overflows. REGULAR: share of the diagonal that is added to it, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
 static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f, LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
 #else
