@@ -16,6 +16,7 @@ static const anc_setting budget_settings[] = {
     {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
 
 static const real ACCOUNT = 0.25f;    /* the price falls by (1 - ACCOUNT)^16, about e^-4, for a full account */
+static const real WORTHWHILE = (real)0.2; /* power that saves less than this share of the noise is not spent */
 static const real NEAR = (real)0.005;/* of the power that a price is to yield */
 static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
 enum { SCALES = 3, TWICE = 2 };       /* what lasted t may go on for twice as long */
@@ -407,7 +408,7 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     const int32_t I = f->s.I, J = f->s.J, L = f->s.L;
     const size_t row = (size_t)(2 * L - 1), row_C = (size_t)(2 * f->lags - 1);
     const real rated = f->s.setting[RATED_POWER][j];
-    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0);
+    real *v = taps_of(f, SOLUTION), account = 1 - ACCOUNT * larger(left, 0), q = 0;
     toeplitz_system t = {f, f->A + times(j * I * J + j, I) * row, f->C + (f->lags - L), row, times(J, I) * row, row_C, times(I, 1) * row_C, rest, 0};
     int solved;
     for (int32_t i = 0; i < I && !(t.scale > 0); i++) /* of the first reference that is not silent */
@@ -415,9 +416,10 @@ static void spend(budget *f, int32_t j, const real *rest, real left)
     /* 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only. */
     f->steady[j] = price_of(&t, rated, f->steady[j], v);
     f->steady[J + j] = larger(f->steady[j], f->steady[J + j] * root(raised(*f->s.setting[WINDOW], f->plant.B)));
-    /* 3 What the account holds makes power cheaper. */
+    /* 3 What the account holds makes power cheaper, but none that saves little of the noise. */
     for (int n = 0; n < 4; n++) account *= account;
-    real price = f->steady[J + j] * account;
+    for (int32_t k = 0; k < f->s.K; k++) q += f->plant.q[k];
+    real price = larger(f->steady[J + j] * account, WORTHWHILE * q / (rated * (real)J));
     const real power = power_at(&t, price, v, taps_of(f, PLAYED), &solved);
     /* 4 The account must stand it. */
     const real share = power > 0 ? share_of(f, j, v, power) : 1;

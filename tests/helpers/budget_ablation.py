@@ -60,11 +60,13 @@ def run(case: study.Rated, **settings: float) -> tuple[np.ndarray, np.ndarray]:
 @contextmanager
 def without(rule: str) -> Iterator[dict[str, float]]:
     """Switch a rule off; the settings of the controller that this takes."""
-    kept = {name: getattr(law, name) for name in ("ACCOUNT", "WINDOW")}
+    kept = {name: getattr(law, name) for name in ("ACCOUNT", "WINDOW", "WORTHWHILE")}
     share, hold = law.PowerBudget.share, law.PowerBudget.HOLD
     settings = {"spread": 0.0}
     if rule == "account":
         law.ACCOUNT = 0.0
+    elif rule == "floor":
+        law.WORTHWHILE = 0.0
     elif rule == "the shorter window":
         law.WINDOW = 1
     elif rule == "hold":
@@ -85,7 +87,15 @@ def main() -> None:
     """Print a line for each rule."""
     pairs, made = study.all_paths(), study.noises()
     cases = [study.make_rated(pairs[path], made[noise][1](), study.SHARES[0]) for path, noise in CASES]
-    rules = ("nothing", "hold", "account", "the shorter window", "what the account stands", "with the path verified")
+    rules = (
+        "nothing",
+        "hold",
+        "account",
+        "floor",
+        "the shorter window",
+        "what the account stands",
+        "with the path verified",
+    )
     print(f"{'without':26}{'over the bound, mean':>22}{'worst dB':>10}{'power over 10 s, most':>24}")
     with tqdm(total=len(rules) * len(cases)) as bar:
         for rule in rules:

@@ -24,6 +24,7 @@ KEPT = 4  # after an alarm: what is known of the primary paths counts as so many
 DRAWS = 8  # of the posterior, that stand for its covariance
 SURPRISE, MISFIT, USUAL = 4.0, 0.03, 5.0  # alarm: beyond the noise; of the disturbance; of the usual misfit
 ACCOUNT = 4.0  # the price falls by e^-4 for a full account
+WORTHWHILE = 0.2  # power that saves less than this share of the noise is not spent
 WINDOW = 8  # the filter is solved for the references of an exponential window of the averaging time over this
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
@@ -349,8 +350,11 @@ class PowerBudget(Controller):
         # 1 The price at which the filter spends the rating over the window of x. 2 It falls slowly only.
         self.steady_price[j], _, _ = system.price_of(rho, self.steady_price[j])
         self.held_price[j] = max(self.steady_price[j], self.HOLD * self.held_price[j] * self.plant.forget)
-        # 3 What the account holds makes power cheaper.
-        price = self.held_price[j] * (1.0 - ACCOUNT / 16 * max(left, 0.0)) ** 16
+        # 3 What the account holds makes power cheaper, but none that saves little of the noise.
+        price = max(
+            self.held_price[j] * (1.0 - ACCOUNT / 16 * max(left, 0.0)) ** 16,
+            WORTHWHILE * np.sum(self.plant.q) / (rho * len(self.rated_power)),
+        )
         v, power = system.at(price)
         # 4 The account must stand it if the last t goes on for twice as long, for every t.
         share = self.share(j, v, power) if power > 0 else 1.0
