@@ -16,7 +16,7 @@ static const anc_setting budget_settings[] = {
     {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
 
 static const real ACCOUNT = 0.25f;    /* the price falls by (1 - ACCOUNT)^16, about e^-4, for a full account */
-static const real WORTHWHILE = (real)0.2; /* power that saves less than this share of the noise is not spent */
+static const real WORTHWHILE = 0.5f; /* power that saves less than this share of the noise is not spent */
 static const real NEAR = (real)0.005;/* of the power that a price is to yield */
 static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
 enum { SCALES = 3, TWICE = 2 };       /* what lasted t may go on for twice as long */
