@@ -277,7 +277,7 @@ class Block:
 
     def _settings_in(self, memory: NDArray[np.uint8], arrays: dict[str, np.ndarray]) -> np.ndarray:
         """Return the settings of a block, on which the size of the fields after them may depend."""
-        found: dict[bytes, NDArray[np.float64]] = {}
+        found: dict[bytes, NDArray[np.uint8]] = {}
 
         def keep(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
             if role == _SETTING:
