@@ -15,7 +15,7 @@ static const anc_setting budget_settings[] = {
     {"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER}, {"block", 1, 65536, ANC_ONE}, {"averaging", 20, 100000, ANC_ONE},
     {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
 
-static const real ACCOUNT = 0.5f;     /* the price falls by (1 - ACCOUNT)^16, about e^-8 at first, for a full account */
+static const real ACCOUNT = 0.5f;     /* what is left of the account lowers the price by (1 - ACCOUNT left)^16, about e^(-8 left) */
 static const real WORTHWHILE = (real)0.2; /* power that saves less than this share of the error is not spent */
 static const real NEAR = (real)0.005;/* of the power that a price is to yield */
 static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
@@ -23,6 +23,8 @@ enum { SCALES = 4, TWICE = 2 };       /* what lasted t may go on for twice as lo
 enum { SHORTEST = 20 };               /* ... and for a twentieth of the averaging time */
 static const int32_t SCALE[SCALES + 1] = {1, 100, 40, 10, 4}; /* t: exponential windows of the averaging time over these */
 enum { NEWTON = 20 };                 /* steps */
+/* No sample that is learnt from is louder, neither x and e nor what is played, and no filter has a larger tap. So no sum of
+ * products overflows. REGULAR: share of the diagonal that is added to it, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
 static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f, LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
 #else

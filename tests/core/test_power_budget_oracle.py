@@ -157,9 +157,18 @@ def test_several_channels(spread: float) -> None:
     compare(oracle, core, x, d, lambda n: s)
 
 
-def test_unequal_counts() -> None:
-    s, x, d, _ = scene(4, 3, 2, 1, 4.0)
-    oracle, core = pair(s, 9, 1, np.array([0.25, 0.1]) * np.mean(d**2), 0.3, 2.0)
+@pytest.mark.parametrize(("K", "J", "references"), [(3, 2, 1), (9, 1, 1), (1, 3, 1), (2, 1, 3)])
+def test_unequal_counts(K: int, J: int, references: int) -> None:
+    """Nine microphones are more than a solution takes at once."""
+    s, x, d, _ = scene(4, K, J, references, 3.0)
+    oracle, core = pair(s, 9, references, np.linspace(0.25, 0.1, J) * np.mean(d**2), 0.3, 2.0)
+    compare(oracle, core, x, d, lambda n: s)
+
+
+def test_a_factorisation_that_takes_several_blocks() -> None:
+    s, x, d, _ = scene(9, 1, 1, 1, 2.5, M=400)
+    oracle, core = pair(s, 200, 1, np.array([0.25 * np.mean(d**2)]), 0.3, 2.0)
+    assert oracle.plant.delay > 2
     compare(oracle, core, x, d, lambda n: s)
 
 
