@@ -106,7 +106,7 @@ class PowerBudgetController(CoreController):
     >>> path = [0.0, 1.0, 0.3]
     >>> controller = PowerBudgetController(16, path, rated_power=0.25, fs=2000.0, averaging_s=2.0)
     >>> x = np.random.default_rng(0).standard_normal(12000)
-    >>> result = simulate(controller, x, [0.0, 0.0, 0.0, 1.0], path, fs=2000)
+    >>> result = simulate(controller, x, primary_path=[0.0, 0.0, 0.0, 1.0], secondary_path=path, fs=2000.0)
     >>> bool(np.mean(result.control_signal[-4000:] ** 2) < 1.05 * 0.25)
     True
     >>> controller.alarms
