@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from oracles.limiter import Limiter
 from oracles.power_budget import PowerBudget
 from oracles.signals import push
 
+from kfopc_filterpy import OutputLimiter
 from kfopc_filterpy.core.block import Algorithm, Block, Shape
 
 FS, RATE = 2000.0, 1e-6
@@ -35,9 +37,10 @@ def coloured(rng: np.random.Generator, channels: int, n: int) -> np.ndarray:
 class Core:
     """The core's controller, called as the oracle is."""
 
-    def __init__(self, s: np.ndarray, taps: int, references: int, settings: dict[str, Any]) -> None:
+    def __init__(self, s: np.ndarray, taps: int, references: int, settings: dict[str, Any], window: int = 0) -> None:
         K, J, M = s.shape
-        self.block = Block(Algorithm("power_budget"), Shape(K, J, references, taps, M), path=s, settings=settings)
+        shape = Shape(K, J, references, taps, M, limiter_windows=(window,) * J if window else ())
+        self.block = Block(Algorithm("power_budget"), shape, path=s, settings=settings)
 
     def control_signal(self, x: np.ndarray) -> np.ndarray:
         self.block.reference[:] = x
@@ -77,7 +80,8 @@ def pair(s: np.ndarray, taps: int, references: int, share: np.ndarray, spread: f
         "window": oracle.g,
         "spread": spread,
     }
-    return oracle, Core(s, taps, references, settings)
+    limiters = more.get("limiters")
+    return oracle, Core(s, taps, references, settings, limiters[0].N if limiters else 0)
 
 
 def compare(oracle, core, x, d, true, *, on=0, heard=None):
@@ -182,14 +186,27 @@ def test_missing_errors_after_silence() -> None:
     compare(oracle, core, x, d, lambda n: s, on=1501, heard=heard)
 
 
-def test_a_limiter_and_an_amplifier_model() -> None:
-    """The account takes what was asked, the posterior what was played."""
+def test_an_amplifier_model() -> None:
+    """The posterior takes what was played."""
     s, x, d, _ = scene(6, 1, 1, 1, 6.0)
     oracle, core = pair(
         s, 24, 1, np.array([0.25 * np.mean(d**2)]), 0.3, 2.0, amplifiers=[lambda y: min(max(y, -0.5), 0.5)]
     )
     core.block.fields["amplifier"][0, 0, 0] = [1, 0.5, 1]
     compare(oracle, core, x, d, lambda n: s)
+
+
+def test_a_limiter() -> None:
+    """The account takes what was asked, which the limiter, of half the rating, lets pass in part."""
+    s, x, d, _ = scene(6, 1, 1, 1, 6.0)
+    rated = 0.25 * np.mean(d**2)
+    own, theirs = (make(rated / 2, fs=FS, window_s=0.1) for make in (OutputLimiter, Limiter))
+    oracle, core = pair(s, 24, 1, np.array([rated]), 0.3, 2.0, limiters=[theirs])
+    laps = core.block.fields["laps"][0, 0]
+    own.live_in(core.block.fields["limiter"][0, 0, 0], laps)
+    compare(oracle, core, x, d, lambda n: s)
+    played = np.mean(core.block.fields["output_history"] ** 2)
+    assert played < 0.9 * rated * np.mean(oracle.book[:10])
 
 
 def test_opened_again_it_goes_on_to_the_bit() -> None:
