@@ -141,3 +141,20 @@ def test_everything_an_install_brings_is_pinned():
 @pytest.mark.parametrize("command", README_COMMANDS)
 def test_readme_states_the_command_on_a_line_of_its_own(command):
     assert command in [line.strip() for line in read("README.md").splitlines()]
+
+
+REMOVED = {
+    "controllers": ("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"),
+    "filters": ("PowerBudgetKalmanFilter",),
+    "power": ("PowerBudget",),
+}
+
+
+@pytest.mark.parametrize(("namespace", "name"), [(space, name) for space, names in REMOVED.items() for name in names])
+def test_a_removed_name_says_what_to_use(namespace, name):
+    module = importlib.import_module(f"kfopc_filterpy.{namespace}")
+    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use kf_pb"):
+        getattr(module, name)
+    assert name not in dir(module)
+    with pytest.raises(AttributeError, match="no_such_name"):
+        _ = module.no_such_name

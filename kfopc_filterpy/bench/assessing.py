@@ -21,6 +21,7 @@ from kfopc_filterpy._validate import (
     per_channel,
 )
 from kfopc_filterpy.bounds import coherence_bound
+from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
@@ -32,7 +33,6 @@ from kfopc_filterpy.metrics import (
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
-from kfopc_filterpy.paths.uncertainty import ONE_SAMPLE, allowed_share, guard_filter
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
@@ -61,7 +61,7 @@ def assess(
     beside: Sequence[str] | None = None,
     n_taps: int | None = None,
     memory_s: float | None = None,
-    secondary_path_uncertainty: Any = ONE_SAMPLE,
+    secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY,
     pascal_per_unit: Any = None,
     switch_on_s: float | None = None,
     bar: Any = None,
@@ -93,8 +93,7 @@ def assess(
     want_db : float, default 6
         Noise reduction wanted in dB.
     algorithm : {"KF-PB", "KF-OPC", "FxLMS"}, default "KF-PB"
-        Controller that the verdict is on. It has a limiter, which keeps the rating in every window. With several channels
-        KF-PB is the form with a shared gain.
+        Controller that the verdict is on. It has a limiter, which keeps the rating in every window.
     beside : sequence of str, optional
         Algorithms to run beside it, without a limiter, as published; by default the other two, but KF-OPC only if all
         control filters together have at most 256 taps, because its cost grows with the square of them.
@@ -102,11 +101,10 @@ def assess(
         Taps of a control filter; by default `suggest_settings` finds them, at most 256, and at most 1024 in all filters
         together.
     memory_s : float, optional
-        Memory of the Kalman filters in s; by default 0.25 s, and 1 s with several channels, where KF-PB estimates the
-        primary paths.
+        Memory of KF-OPC in s, by which the settings are suggested; by default 0.25 s, and 1 s with several channels.
     secondary_path_uncertainty : PathTolerance, float or array_like, optional
-        How far the true secondary path may differ from `secondary`, see `paths.path_uncertainty`; by default a
-        sample of delay. None: it is exact.
+        How far the true secondary path may differ from `secondary`, for KF-PB, which learns the path as it controls:
+        a relative error, by default 0.3, or what `paths.path_uncertainty` takes. None: it is exact.
     pascal_per_unit : float or array_like, shape (K,), optional
         Sound pressure at the error microphone in Pa for a value of 1, of all microphones or of each. With it, sound levels
         are computed.
@@ -169,7 +167,6 @@ def assess(
     if memory_s is None:
         memory_s = CHANNEL_MEMORY_S if several else MEMORY_S
     start = switch_on_sample(switch_on_s, fs, x.shape[-1])
-    guard = guard_filter(secondary_path_uncertainty, s)
     notes: list[str] = []
     announce(bar, 0, "bounds")
     with warnings.catch_warnings(record=True) as caught:
@@ -183,7 +180,7 @@ def assess(
             n_taps=None if n_taps is None else as_count(n_taps, "n_taps"),
             max_taps=longest_filter(J * n_references),
         )
-        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs, guard)
+        bounds = FixedFilters(x[..., start:], d[..., start:], s, settings.n_taps, fs)
         limits = with_excursion(limits, ratings, bounds)
         official = bounds.within(limits.rated_power)
         required = bounds.needed(want_db, limits.rated_power)
@@ -214,8 +211,7 @@ def assess(
         coherence_db=None if disturbance is None else max(_coherence_db(bounds.x, bounds.d, fs), bounds.time_db),
         time_db=bounds.time_db,
         filter_db=bounds.filter_db,
-        path_db=bounds.path_db,
-        power_db=bounds.guarded(limits.rated_power)[1],
+        power_db=bounds.limited(limits.rated_power)[1],
     )
     cause = None if reached >= want_db else _cause(ceilings, want_db)
     if cause == "adaptation" and _reduction(plan.run(algorithm, limited=True, freed=NEARLY_FREE)) >= want_db:
@@ -245,7 +241,7 @@ def assess(
         expected_rated_power=required * _price(share_taken(run, limits), bound_share),
         causality_margin_s=None if primary is None else _margin_s(primary, s, fs),
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
-        band=_band(bounds.d, s, 1.0 - allowed_share(secondary_path_uncertainty, s) > 10 ** (-want_db / 20), fs),
+        band=_band(bounds.d, s, fs),
         levels=None if pascals is None else _levels(run, pascals),
         excursion_mm=excursion_mm(ratings, run),
         settings=settings,
@@ -362,8 +358,6 @@ def _cause(ceilings: Ceilings, want_db: float) -> str:
         return "coherence"
     if ceilings.filter_db < want_db:
         return "causality" if ceilings.time_db >= want_db else "filter"
-    if ceilings.path_db < want_db:
-        return "path"
     return "amplifier" if ceilings.power_db < want_db else "adaptation"
 
 
@@ -373,7 +367,7 @@ def _coherence_db(x: np.ndarray, d: np.ndarray, fs: float) -> float:
     return coherence_bound(x, d, fs, segment=segment).overall_db
 
 
-def _band(d: np.ndarray, s: np.ndarray, held_back: np.ndarray, fs: float) -> Band:
+def _band(d: np.ndarray, s: np.ndarray, fs: float) -> Band:
     """Return where the disturbance is, and which share of it the loudspeakers together hardly reach."""
     frequencies, powers = welch(np.atleast_2d(d), fs, nperseg=min(4096, d.shape[-1]))
     share = powers.sum(axis=0) / powers.sum()
@@ -383,8 +377,7 @@ def _band(d: np.ndarray, s: np.ndarray, held_back: np.ndarray, fs: float) -> Ban
     gain = np.sum([np.abs(frequency_response(one, frequencies, fs=fs)) ** 2 for one in paths], axis=0)
     inside = (frequencies >= low) & (frequencies <= high)
     mean = float(np.mean(gain[inside])) if np.any(inside) else float(gain.max())
-    uncertain = np.interp(frequencies, np.linspace(0.0, fs / 2, held_back.size), held_back) > 0.5
-    return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()), float(share[uncertain].sum()))
+    return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()))
 
 
 def _levels(run: SimulationResult, pascal: Any) -> Levels:

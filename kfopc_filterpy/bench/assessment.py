@@ -45,7 +45,7 @@ SCHEMA = Path(__file__).with_name("verdict.schema.json")
 ROOM_FOR_RESPONSE = 1.25  # times the time that a control filter must last
 MOST_TAPS = 1024  # that advice names: longer filters take very long
 RATE_OF_BAND = 2.5  # least sample rate over the highest frequency of the noise
-CAUSES = ("coherence", "causality", "filter", "path", "amplifier", "adaptation")
+CAUSES = ("coherence", "causality", "filter", "amplifier", "adaptation")
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,6 @@ class Ceilings:
         A filter that may look ahead, with any power.
     filter_db : float
         A filter of this length, with any power.
-    path_db : float
-        The same, held back where the secondary path is uncertain.
     power_db : float
         The same, within the rated power.
     """
@@ -69,7 +67,6 @@ class Ceilings:
     coherence_db: float | None
     time_db: float
     filter_db: float
-    path_db: float
     power_db: float
 
 
@@ -84,15 +81,11 @@ class Band:
     weak_share : float
         Share of the disturbance's power at frequencies at which the secondary path lies more than 20 dB below its mean
         power gain in that band.
-    uncertain_share : float
-        Share of the disturbance's power at frequencies at which the uncertainty of the secondary path allows less than
-        the noise reduction wanted.
     """
 
     low_hz: float
     high_hz: float
     weak_share: float
-    uncertain_share: float
 
 
 @dataclass(frozen=True)
@@ -129,7 +122,7 @@ class Assessment:
     want_db, noise_reduction_db : float
         Noise reduction wanted, and the controller's over the steady half, in dB.
     limited_by : str or None
-        What limits: "coherence", "causality", "filter" (its length), "path" (how well it is known), "amplifier" or
+        What limits: "coherence", "causality", "filter" (its length), "amplifier" or
         "adaptation"; None if the rating is enough.
     advice : tuple of str
         What to change.
@@ -244,7 +237,6 @@ class Assessment:
             "coherence": np.nan if c.coherence_db is None else c.coherence_db,
             "time": c.time_db,
             "filter": c.filter_db,
-            "path": c.path_db,
             "power": c.power_db,
         }
         return {name: _db(value) for name, value in numbers.items()} | {
@@ -362,9 +354,7 @@ _REASONS = {
     "causality": "Causality limits: with more time a filter of {taps} taps reaches {time}, in time only {filter}, "
     "with any power.",
     "filter": "The filter limits: {taps} taps reach {filter} with any power, and more time does not help.",
-    "path": "The secondary path limits: a filter of {taps} taps reaches {filter} with any power, but only {path} if it "
-    "is held back because the path is uncertain.",
-    "amplifier": "The amplifier limits: with any power {path} are in reach, with {rated} {power} for a fixed filter.",
+    "amplifier": "The amplifier limits: with any power {filter} are in reach, with {rated} {power} for a fixed filter.",
     "adaptation": "The adaptation limits: a fixed filter reaches {power} within the rated power, the controller {reached}, "
     "and more power does not help it.",
 }
@@ -395,11 +385,6 @@ def advice_on(verdict: Assessment) -> list[str]:
         ]
     if verdict.limited_by == "filter":
         return _advice_on_length(verdict)
-    if verdict.limited_by == "path":
-        return [
-            f"{verdict.band.uncertain_share:.1%} of the noise lies where the uncertainty of the secondary path allows "
-            f"less than {want}. Measure the path again and state a smaller uncertainty, or use a higher sample rate."
-        ]
     if verdict.limited_by == "adaptation":
         return [
             "Try a longer memory for a steady noise, a shorter one for a noise that changes, or a longer record: the "

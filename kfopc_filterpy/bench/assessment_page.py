@@ -25,7 +25,6 @@ CHAIN = (  # what each ceiling may use, and the cause if it is too low
     ("coherence_db", "Everything that the reference explains of the disturbance", "coherence"),
     ("time_db", "A filter of {taps} taps that may look ahead, any power", "filter"),
     ("filter_db", "A filter of {taps} taps, in time, any power", "causality"),
-    ("path_db", "The same, held back where the secondary path is uncertain", "path"),
     ("power_db", "The same, within the rated power", "amplifier"),
 )
 
@@ -313,11 +312,6 @@ def _checks(verdict: Assessment) -> list[tuple[str, str]]:
             "Band of the noise",
             f"90 % of its power from {band.low_hz:.0f} to {band.high_hz:.0f} Hz; "
             f"{band.weak_share:.1%} where the loudspeaker is 20 dB weaker than its mean there",
-        ),
-        (
-            "Secondary path",
-            f"{band.uncertain_share:.1%} of the noise's power lies where its uncertainty allows less than "
-            f"{verdict.want_db:g} dB",
         ),
     ]
     if verdict.levels is not None:

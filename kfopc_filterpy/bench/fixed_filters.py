@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 
 from kfopc_filterpy.bounds import budgeted_rated_power
 from kfopc_filterpy.bounds.channels import ChannelStretch, full_channel_stretch
@@ -39,15 +38,11 @@ class FixedFilters:
         Taps of a filter.
     fs : float
         Sample rate in Hz.
-    guard : ndarray, optional
-        Filter that guards against an uncertain path, see `guard_filter`.
     """
 
     stretch: Stretch | ChannelStretch
 
-    def __init__(
-        self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float, guard: np.ndarray | None
-    ) -> None:
+    def __init__(self, x: np.ndarray, d: np.ndarray, s: np.ndarray, n_taps: int, fs: float) -> None:
         past = s.shape[-1] + n_taps - 2  # samples that fill the delay lines
         first = max(x.shape[-1] // 2 - past, 0)
         self.x, self.d, self.s, self.n_taps, self.fs = x[..., first:], d[..., first:], s, n_taps, fs
@@ -59,16 +54,9 @@ class FixedFilters:
         self.correlations: Any = self.stretch.correlations()
         self.free = self.stretch.solution(self.correlations.weights())
         self.filter_db = self.free.noise_reduction_db
-        self._guarded = self.correlations if guard is None else self._held_back(guard)
-        self.path_db = self.stretch.solution(self._guarded.weights()).noise_reduction_db
         ahead = sorted({round(share * n_taps) for share in LOOK_AHEAD} - {0})
         self.ahead = {samples: self._ahead_db(samples) for samples in ahead}
         self.time_db = max([self.filter_db, *self.ahead.values()])
-
-    def _held_back(self, guard: np.ndarray) -> Any:
-        """Return the correlations with the penalty of the guard, E[(v * W * x')^2]."""
-        penalty = self.stretch.correlation(lfilter(guard, 1.0, self.stretch.filtered))
-        return replace(self.correlations, filtered=self.correlations.filtered + penalty)
 
     def _ahead_db(self, samples: int) -> float:
         """Return the noise reduction of a filter that knows the reference so many samples ahead."""
@@ -82,9 +70,9 @@ class FixedFilters:
         """Return the shortest look-ahead, of those tried, that reaches a noise reduction; None if none does."""
         return next((samples / self.fs for samples, reached in self.ahead.items() if reached >= want_db), None)
 
-    def guarded(self, rated_power: Any) -> tuple[np.ndarray, float]:
-        """Return the filter within the rated power that is held back by the guard, and its noise reduction in dB."""
-        weights, _ = weights_within(self.stretch, self._guarded, rated_power)
+    def limited(self, rated_power: Any) -> tuple[np.ndarray, float]:
+        """Return the filter within the rated power, and its noise reduction in dB."""
+        weights, _ = weights_within(self.stretch, self.correlations, rated_power)
         return weights, self.stretch.solution(weights).noise_reduction_db
 
     def within(self, rated_power: Any) -> float:

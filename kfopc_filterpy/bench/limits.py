@@ -180,7 +180,7 @@ def _keeping(limits: Limits, j: int, rating: LoudspeakerRating, bounds: FixedFil
 
     def excess(log_power: float) -> float:
         tried = [*each[:j], replace(each[j], rated_power=float(np.exp(log_power))), *each[j + 1 :]]
-        weights = bounds.guarded(_like(limits, tried).rated_power)[0]
+        weights = bounds.limited(_like(limits, tried).rated_power)[0]
         y = np.atleast_2d(bounds.stretch.control_signal(weights))[j]
         return float(np.log(np.mean(y**2) / rating.excursion_rated_power(y, bounds.fs)))
 

@@ -21,7 +21,8 @@ from .kalman import at_suggested_rate
 DEFAULT_AVERAGING_S = 10.0
 DEFAULT_UNCERTAINTY = 0.3
 BLOCK_S = 0.032
-LEAST_BLOCKS = 20  # in the averaging time
+LEAST_BLOCKS, MOST_BLOCKS = 20, 100_000  # in the averaging time
+LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
 # What is known of the plant: fields of `plant.c`.
 POSTERIOR = (
     *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
@@ -105,7 +106,7 @@ class PowerBudgetController(CoreController):
     >>> path = [0.0, 1.0, 0.3]
     >>> controller = PowerBudgetController(16, path, rated_power=0.25, fs=2000.0, averaging_s=2.0)
     >>> x = np.random.default_rng(0).standard_normal(12000)
-    >>> result = simulate(controller, x, [0.0, 0.0, 0.0, 1.0], path, fs=2000)
+    >>> result = simulate(controller, x, primary_path=[0.0, 0.0, 0.0, 1.0], secondary_path=path, fs=2000.0)
     >>> bool(np.mean(result.control_signal[-4000:] ** 2) < 1.05 * 0.25)
     True
     >>> controller.alarms
@@ -132,6 +133,8 @@ class PowerBudgetController(CoreController):
         self._fs = as_positive(fs, "fs", unit="Hz")
         samples = as_positive(averaging_s, "averaging_s", unit="s") * self._fs
         block = max(round(BLOCK_S * self._fs), 1)
+        if samples > MOST_BLOCKS * block:
+            raise ValueError(f"averaging_s must be at most {MOST_BLOCKS * block / self._fs:g} s, got {averaging_s:g}")
         super().__init__(
             n_taps,
             secondary_path,
@@ -140,13 +143,21 @@ class PowerBudgetController(CoreController):
                 "block": block,
                 "averaging": max(round(samples / block), LEAST_BLOCKS),
                 "window": math.exp(-1.0 / samples),
-                "spread": rms_relative_error(secondary_path_uncertainty, secondary_path),
+                "spread": self._spread(secondary_path_uncertainty, secondary_path),
             },
             n_references=n_references,
             amplifier=amplifier,
             limiter=limiter,
         )
         self._uncertainty = as_uncertainty(secondary_path_uncertainty)
+
+    @staticmethod
+    def _spread(uncertainty: Any, secondary_path: Any) -> float:
+        """Return the relative rms error of the path as the core takes it, 0 if the path is exact."""
+        error = rms_relative_error(uncertainty, secondary_path)
+        if error > MOST_SPREAD:
+            raise ValueError(f"secondary_path_uncertainty must be at most {MOST_SPREAD:g}, got {error:g}")
+        return max(error, LEAST_SPREAD) if error > 0.0 else 0.0
 
     def _takes_guard(self) -> bool:
         return False  # the posterior knows how far the path may be off
@@ -209,7 +220,7 @@ class PowerBudgetController(CoreController):
         block = self._opened()
         spread = block.fields["spread"]
         if spread.item() > 0.0 and self._uncertainty is not None:  # measured paths: another distance from the new path
-            spread[:] = rms_relative_error(self._uncertainty, self._estimated_path()) or spread
+            spread[:] = self._spread(self._uncertainty, self._estimated_path()) or LEAST_SPREAD
         fresh = block.fresh(block.shape)
         for name in POSTERIOR:
             block.fields[name][:] = fresh.fields[name]

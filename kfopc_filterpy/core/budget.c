@@ -296,7 +296,7 @@ static real power_at(const toeplitz_system *t, real price, real *v, real *u, int
  * price, nearly a line, so Newton's steps approach from below. */
 static real price_of(const toeplitz_system *t, real power, real start, real *v)
 {
-    real price = start < 1e6f * t->scale ? start : 0, *u = taps_of(t->f, PLAYED);
+    real price = start < (real)1e6 * t->scale ? start : 0, *u = taps_of(t->f, PLAYED);
     int solved = 0;
     for (int n = 0; n < NEWTON; n++) {
         const real taken = power_at(t, price, v, u, &solved);

@@ -144,7 +144,10 @@ def changed(at: int, **figures: Any) -> list[AllowanceRow]:
 def test_all_findings_hold_on_good_rows() -> None:
     found = verdicts(GOOD)
     assert all(verdict.reproduced for verdict in found)
-    assert "if nothing is allowed for 1 of 1 do, the worst second is -7.0 dB (duct, white, a sample late)" in found[0].figure
+    assert (
+        "if nothing is allowed for 1 of 1 do, the worst second is -7.0 dB (duct, white, a sample late)"
+        in found[0].figure
+    )
     assert found[2].figure == "0.40 dB on average, 0.40 dB at most (duct, motor)"
 
 

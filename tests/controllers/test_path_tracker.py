@@ -45,7 +45,7 @@ def misalignment_db(estimate: np.ndarray, path: np.ndarray) -> float:
     return float(10 * np.log10(np.sum((estimate - path) ** 2) / np.sum(path**2)))
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", [name for name in MAKERS if name != "KF-PB"])  # which learns the path by itself
 def test_after_a_jump_it_is_as_good_as_one_that_was_identified_anew(name: str) -> None:
     x, d = noises(12.0)
 

@@ -75,6 +75,8 @@ def worst_mean(y: np.ndarray, averaging_s: float = AVERAGING_S) -> float:
         ({"secondary_path_uncertainty": np.inf}, ValueError, "secondary_path_uncertainty must be finite"),
         ({"secondary_path_uncertainty": "little"}, TypeError, "secondary_path_uncertainty"),
         ({"secondary_path_uncertainty": np.ones((2, 1, 2, 3))}, ValueError, r"must be \(M, n_taps\)"),
+        ({"secondary_path_uncertainty": 1e4}, ValueError, "secondary_path_uncertainty must be at most 1000"),
+        ({"averaging_s": 1e4}, ValueError, "averaging_s must be at most 3200 s"),
         ({"averaging_s": 0.0}, ValueError, "averaging_s must be greater than 0"),
         ({"fs": -1.0}, ValueError, "fs must be greater than 0"),
         ({"limiter": 1.0}, TypeError, "limiter must be an OutputLimiter"),

@@ -35,7 +35,7 @@ def test_the_figures_say_what_the_page_says():
     c, half = verdict.ceilings, v.x.size // 2
     free = wiener_solution(v.x[half:], np.convolve(v.x, v.p)[half : v.x.size], v.s, 256)
     assert abs(c.filter_db - free.noise_reduction_db) < 0.5  # another stretch of the record
-    assert c.path_db - c.power_db < 2 < c.power_db - verdict.noise_reduction_db
+    assert c.filter_db - c.power_db < 2 < c.power_db - verdict.noise_reduction_db
     assert json.loads((v.folder / "verdict" / "verdict.json").read_text("utf-8"))["enough"] is True
 
     v = page.run()
