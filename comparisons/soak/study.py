@@ -256,8 +256,6 @@ def process_mb() -> float:
 
 def covariance_of(controller: Any) -> np.ndarray | None:
     """Return P of a controller that has one."""
-    if hasattr(controller, "estimator"):
-        return controller.estimator.P
     if hasattr(controller, "variances"):
         return np.diag(controller.variances)
     return getattr(controller, "covariance", None)
