@@ -14,7 +14,7 @@ from scipy.signal import fftconvolve
 from kfopc_filterpy import MOVFxLMS, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table, Verdict
 from kfopc_filterpy.metrics import overshoot
-from kfopc_filterpy.paths import perturbed_path
+from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import DataUnavailableError, load_measured_duct, load_measured_room, looped
 
 from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, paths, with_jump
@@ -34,7 +34,7 @@ FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "3 dB louder": lambda s: 10**0.15 * s,
     "3 dB softer": lambda s: 10**-0.15 * s,
     "polarity": lambda s: -s,
-    "another phase": lambda s: perturbed_path(s, fs=FS, phase_deg=120.0),
+    "another phase": lambda s: path_taps(perturbed_path(s, fs=FS, phase_deg=120.0)),
 }
 JUMP_S = 8.0  # of the fault, from switch-on on
 
