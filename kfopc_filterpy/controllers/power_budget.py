@@ -27,7 +27,10 @@ LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
 POSTERIOR = (
     *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
     *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy"),
-    *("path_correlation", "cross_correlation", "primary_correlation"),
+    *(
+        "path_correlation",
+        "cross_correlation",
+    ),
 )
 
 
