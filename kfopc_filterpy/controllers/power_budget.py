@@ -47,7 +47,7 @@ class PowerBudgetController(CoreController):
 
     where the expectation includes what is not known of p and s. The price follows from an account: over any
     `averaging_s`, the mean power is kept to the rated power, and what a quiet time has left can be spent in a louder
-    one. Power that saves less than a fifth of the error is not spent.
+    one. Power that would save less than half of the noise is not spent.
 
     The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to an
     unknown path around the given one: the loudspeakers are nearly silent until it has been learnt again. A new
