@@ -357,6 +357,7 @@ def _constraint() -> Iterator[Quote]:
         lambda r: r.clipped("KF-ANC", "power"),
     )
 
+
 def _power_range() -> Iterator[Quote]:
     """What the README, the front page and the limitations begin with."""
     words = "KF-OPC's output power was {:.2f} to {:.2f} times the rated power"
