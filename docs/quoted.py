@@ -376,6 +376,7 @@ TABLED = (
     "bound",
     "bound of the record",
     "scaled Wiener",
+    "KF-PB",
     "KF-OPC",
     "KF-OPC repaired",
     "diagonal KF-OPC",
