@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 DOCS = Path(__file__).resolve().parent
-SHORT_S, LONG_S = 8.0, 60.0  # runs of the constraint study; only the long ones last several averaging times
+LONG_S = 60.0  # runs of the constraint study; only the long ones last several averaging times
 STUDIES, CONSTRAINT = "python -m comparisons", "python -m comparisons constraint"
 FIELD = re.compile(r"\{:\.(\d)f\}")
 
@@ -346,93 +346,29 @@ def _constraint() -> Iterator[Quote]:
     def quote(words: str, numbers: Callable[[Results], Sequence[float]], page: str = "constraint.md") -> Quote:
         return Quote(page, words, ("constraint",), numbers, CONSTRAINT)
 
-    for name in ("KF-OPC", "KF-OPC repaired", "KF-PB"):
+    for name in ("KF-OPC", "KF-OPC repaired"):
         line = "{:.2f}-{:.2f} | {:.2f} ({:.2f}) dB | {:.2f}-{:.2f} | {:.2f} ({:.2f}) dB | {:.1f} |"
         yield quote(f"| {name} | {line}", lambda r, name=name: r.summary(name))
     db = "| {:.1f} dB | {:.1f} dB | {:.1f} dB | {:.1f} dB |"
-    for name in ("KF-ANC", "KF-OPC", "KF-PB"):
+    for name in ("KF-ANC", "KF-OPC"):
         yield quote(f"| {name}, noise reduction {db}", lambda r, name=name: r.clipped(name, "noise reduction dB"))
     yield quote(
         "| KF-ANC, output power over the rated one | {:.0f} | {:.1f} | {:.1f} | {:.1f} |",
         lambda r: r.clipped("KF-ANC", "power"),
     )
-    yield quote(
-        "noise reduction is within {:.2f} dB of that of the run without it, and $\\lambda$ within {:.2f} dB, in {:.0f} runs",
-        lambda r: [r.said("constraint", "8 seconds after a jump")[i] for i in (1, 2, 0)],
-    )
-    yield quote(
-        "With the limiter, KF-PB reduces the noise by {:.2f} dB more than KF-OPC on average, and by {:.2f} dB less at worst",
-        lambda r: [abs(number) for number in r.said("constraint", "Behind the limiter KF-PB")[:2]],
-    )
-    yield quote(
-        "to within {:.2f} dB of the bound, in {:.0f} runs",
-        lambda r: [r.said("constraint", "Behind the limiter a tone")[i] for i in (1, 0)],
-    )
-    yield quote("rated power in any of {:.0f} runs", lambda r: r.said("constraint", "With the limiter")[:1])
-    yield quote(
-        "converges in {:.2f} of KF-ANC's time on average, {:.2f} at most",
-        lambda r: r.said("constraint", "KF-PB converges")[:2],
-    )
-    yield quote(
-        "In {:.0f} of the {:.0f} runs of 8 s with varying noise KF-PB stays more than 1 dB below",
-        lambda r: [
-            sum(x["bound_db"] - x["noise_reduction_db"] > 1.0 for x in r.rows("KF-PB", False, SHORT_S)),
-            len(r.rows("KF-PB", False, SHORT_S)),
-        ],
-    )
-    yield quote(
-        "last four of eight seconds is {:.3f} to {:.3f} of the rated one",
-        lambda r: r.said("constraint", "KF-PB on stationary noise")[1:3],
-    )
-    yield quote("up to {:.1f} dB while the recorded motor runs down", lambda r: [_worst_loss(r, "motor")])
-    yield quote(
-        "In the runs of 60 s it is {:.2f} dB above it on average, and {:.2f} dB below it at worst",
-        lambda r: [abs(number) for number in r.said("constraint", "KF-PB on swelling and bursty noise")[3:5]],
-    )
 
 
 def _power_range() -> Iterator[Quote]:
     """What the README, the front page and the limitations begin with."""
-    words = "KF-OPC's output power was {:.2f} to {:.2f} times the rated power and KF-PB's {:.2f} to {:.2f} times"
+    words = "KF-OPC's output power was {:.2f} to {:.2f} times the rated power"
     for page in ("../README.md", "index.md", "limits.md"):
         yield Quote(page, words, ("constraint",), _least_and_most_power, CONSTRAINT)
 
 
 def _least_and_most_power(results: Results) -> list[float]:
-    """Output power over the rated power of KF-OPC and of KF-PB, over all runs of a minute."""
-    return [
-        extreme(row["power"] for stationary in (True, False) for row in results.rows(name, stationary))
-        for name in ("KF-OPC", "KF-PB")
-        for extreme in (min, max)
-    ]
-
-
-def _worst_loss(results: Results, noise: str) -> float:
-    """Largest loss of KF-PB compared with the bound, on one noise, in the short runs of the constraint study."""
-    rows = [row for row in results.rows("KF-PB", False, SHORT_S) if row["noise"] == noise]
-    return max(row["bound_db"] - row["noise_reduction_db"] for row in rows)
-
-
-def _with_wrong_gain(results: Results, noise: str, tuned_with: str) -> list[dict[str, Any]]:
-    """Runs of KF-PB in the mismatch study with a gain that is wrong, or right, on one noise."""
-    wanted = {"algorithm": "KF-PB", "kind": "gain", "noise": noise, "tuned_with": tuned_with}
-    return [row for row in results.extra("mismatch", "rows") if wanted.items() <= row.items()]
-
-
-def _state_noise_again(results: Results) -> list[float]:
-    """Return the state noise that a tone gets with an estimate 12 dB too low, over that of the exact path."""
-    exact, again = (
-        next(row["setting"] for row in _with_wrong_gain(results, "tone", tuned_with) if row["amount"] == -12.0)
-        for tuned_with in ("exact path", "wrong path")
-    )
-    return [again / exact]
-
-
-def _loss_by_gain(results: Results) -> list[float]:
-    """Return the largest loss on band noise, compared with the same paths and the exact gain, without tuning again."""
-    rows = _with_wrong_gain(results, "band noise", "exact path")
-    exact = {row["path"]: row["noise_reduction_db"] for row in rows if row["amount"] == 0.0}
-    return [max(exact[row["path"]] - row["noise_reduction_db"] for row in rows)]
+    """Output power over the rated power of KF-OPC, over all runs of a minute."""
+    powers = [row["power"] for stationary in (True, False) for row in results.rows("KF-OPC", stationary)]
+    return [min(powers), max(powers)]
 
 
 CASES = (("duct", "band noise"), ("duct", "compressor"), ("measured duct", "compressor"), ("measured duct", "motor"))
@@ -487,7 +423,7 @@ def _budget_line(results: Results, algorithm: str) -> list[float]:
 
 
 def _further() -> Iterator[Quote]:
-    """Numbers from the verdicts of the studies of wrong estimates, tracking, amplifiers and rooms."""
+    """Numbers from the verdicts of the studies of wrong estimates, tracking and amplifiers."""
 
     def quote(study: str, words: str, claim: str, *which: int) -> Quote:
         def numbers(results: Results) -> list[float]:
@@ -498,52 +434,25 @@ def _further() -> Iterator[Quote]:
 
     yield quote(
         "mismatch",
-        "costs KF-ANC {:.1f} dB and KF-PB {:.1f} dB without tuning again; FxLMS diverges, MOV-FxLMS loses {:.1f} dB",
+        "costs KF-ANC {:.1f} dB without tuning again; FxLMS diverges, MOV-FxLMS loses {:.1f} dB",
         "A gain up to",
-        *(0, 1, 2),
+        *(0, 2),
     )
-    mismatch = "python -m comparisons mismatch"
-    yield Quote("studies.md", "KF-PB takes {:.2f} of that state noise", ("mismatch",), _state_noise_again, mismatch)
-    yield Quote("studies.md", "Band noise loses {:.1f} dB at most without", ("mismatch",), _loss_by_gain, mismatch)
-    yield quote("mismatch", "diverge in none of {:.0f} runs", "KF-OPC, KF-PB and MOV-FxLMS never", 1)
     yield quote(
         "mismatch",
-        "KF-PB spends {:.2f} to {:.2f} of its rated power, KF-OPC {:.2f} to {:.2f}",
+        "With a wrong gain KF-OPC spends {:.2f} to {:.2f} of its rated power",
         "With a wrong gain KF-PB",
-        *(2, 3, 0, 1),
+        *(0, 1),
     )
-    tolerance, cost = "uncertain-path", "With an exact path the default uncertainty costs at most 0.5 dB,"
-    yield quote(
-        tolerance,
-        "{:.0f} of {:.0f} runs have a second after the first that is louder than without control; the least reduction is "
-        "{:.1f} dB. Without a guard, {:.0f} runs have louder seconds, the loudest by {:.1f} dB",
-        "With its default uncertainty KF-PB",
-        *(0, 1, 2, 3, 5),
-    )
-    yield quote(tolerance, "it is {:.0f} of {:.0f} runs too", "With the error stated as a tolerance KF-PB", 0, 1)
-    yield quote(tolerance, "costs {:.2f} dB on average and {:.2f} dB at most if the noise", f"{cost} noises", 0, 1)
-    yield quote(tolerance, "it costs {:.2f} dB on average and {:.2f} dB at most.", f"{cost} white", 0, 1)
-    yield quote(
-        tolerance, "{:.2f} dB are lost on average and {:.2f} dB at most, white", "With a path that was identified", 0, 1
-    )
-    steady, recorded = "On steady noise KF-PB reaches", "On recordings KF-PB reaches"
-    room = "multichannel"
-    yield quote(room, "KF-PB is {:.2f} dB below the bound on average and {:.2f} dB at worst; on the", steady, 0, 1)
-    yield quote(room, "each second, {:.2f} dB and {:.2f} dB. The settings", recorded, 0, 1)
-    yield quote(room, "of steady noise is {:.2f} to {:.2f} of the rating", "Steady noise: every loudspeaker", 0, 1)
-    yield quote(room, "seconds of the recordings at most {:.2f}. This", "Recordings: every loudspeaker", 1)
-    yield quote(room, "rating by {:.1f} dB on average and by {:.1f} dB at worst", "No method of another kind", 0, 1)
     yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
     yield quote("amplifier", "its reduction is at best {:.1f} dB larger", "KF-OPC reduces the noise more", 0)
     yield quote("amplifier", "it is {:.1f} dB smaller", "KF-OPC reduces the noise more", 1)
     yield quote(
         "amplifier",
-        "KF-OPC and KF-PB keep {:.2f} to {:.2f} and {:.2f} to {:.2f} of",
+        "KF-OPC keeps {:.2f} to {:.2f} of its rated power",
         "KF-OPC and KF-PB keep",
         0,
         1,
-        2,
-        3,
     )
 
 

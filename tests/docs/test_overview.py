@@ -38,7 +38,10 @@ def test_the_caption_says_what_the_runs_give(runs, page):
     assert runs["KF-OPC"][1] == pytest.approx(float(said), abs=0.05)
     assert runs["KF-OPC"][0] > 2
     assert "KF-PB reduces the noise as much within the rated power" in text
-    assert runs["KF-PB"][1] < 1.01  # it keeps the mean over ten seconds; a shorter time scatters
+    (most,) = re.findall(
+        r"in the three shown it takes up to ([\d.]+) times", text
+    )  # of the whole figure, here one point
+    assert runs["KF-PB"][1] < float(most)
     assert runs["KF-PB"][0] >= runs["KF-OPC"][0]
 
 

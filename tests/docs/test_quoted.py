@@ -17,11 +17,6 @@ import quoted  # noqa: E402
 
 # Numbers in dB that are not results: aims, settings, definitions, and what an example on the page prints.
 DEFINITIONS = {
-    "constraint.md": [
-        "a second that is 20 dB louder",
-        "A jump of 20 dB",
-        "it is within 0.5 dB",
-    ],
     "limits.md": ["settles to 3 dB of a steady value", "falls to -20 dB of the filter's"],
 }
 
