@@ -20,9 +20,17 @@ def test_the_figures_say_what_the_page_says() -> None:
         assert np.mean(errors["with PathTracker"][:96000].reshape(-1, 800) ** 2, axis=1).max() < 10**0.65 * np.mean(
             v.d**2
         )
-    v = page.run(until="If nothing changes")
+    v = page.run(until="KF-PB needs no tracker")
     assert np.isnan(v.alone).any()
     assert v.reduction_db(v.tracked, 21, 22) > v.reduction_db(v.anew, 21, 22) - 1.0
+    v = page.run(until="If nothing changes")
+    for path_at, seconds in ((v.door, 12), (v.drift, 22)):
+        budgeted = v.kf_pb(v.n_taps, v.closed, rated_power=1e6, fs=v.fs)
+        error = v.run(budgeted, path_at, seconds)
+        assert budgeted.alarms == 1
+        assert np.mean(error.reshape(-1, 800) ** 2, axis=1).max() < np.mean(v.d**2)  # never louder than without control
+        assert v.reduction_db(error, seconds - 1, seconds) > 28.0
+    assert 10.0 < v.reduction_db(error, 2, 12) < v.reduction_db(v.tracked, 2, 12) - 5.0  # during the drift
     v = page.run(until="Sound that returns to the reference microphone")
     assert 0.0 < v.loss < 0.06
     assert not v.tracker.changes  # of the last run, in which the primary path drifts

@@ -25,7 +25,7 @@ def test_the_figures_say_what_the_page_says():
     level = {name: noise_reduction_db(run.error, run.disturbance) for name, run in v.runs.items()}
     power = {name: output_power(run.control_signal) / v.rated for name, run in v.runs.items()}
     assert power["KF-OPC"] > 1.25
-    assert abs(power["KF-PB"] - 1) < 0.015
+    assert abs(power["KF-PB"] - 1) < 0.02
     assert abs(power["KF-OPC repaired"] - 1) < 0.02
     assert v.reach["whole"] > level["KF-PB"] > v.reach["whole"] - 0.25
     assert level["KF-PB"] > level["KF-OPC repaired"] + 0.5

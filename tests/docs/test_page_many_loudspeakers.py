@@ -18,5 +18,6 @@ def test_the_figures_say_what_the_page_says():
     np.testing.assert_allclose(output_power(v.scaled.control_signal) / v.rated, 1.0, atol=0.1)
     steps = v.enough.rated_power[1:] / v.enough.rated_power[:-1]
     assert np.all((steps > 2) & (steps < 4))  # three decibels more
-    np.testing.assert_allclose(v.two.control_signal[1], 0.0, atol=1e-9)
+    tried, later = (np.mean(v.two.control_signal[1, part] ** 2) for part in (slice(v.fs), slice(v.fs, None)))
+    assert tried > 0.1 * v.rated[1] > 10 * later
     assert 1 < noise_reduction_db(v.two.error, v.two.disturbance) < budgeted

@@ -32,6 +32,9 @@ def test_the_figures_say_what_the_page_says():
         keeps = overshoot(run.control_signal, 20 * v.ohm, v.fs, window_s=0.1) <= 1 + 1e-6
         assert keeps == (name == "KF-PB")
         assert (output_power(run.control_signal) > 20 * v.ohm) == (name != "KF-PB")
+    assert v.p.size == v.s.size == 918
+    begins = np.flatnonzero(verdict.runs["KF-PB"].control_signal)[0] / v.fs
+    assert 0.9 < begins < 1.3  # the first solution, in s from the switch-on
     c, half = verdict.ceilings, v.x.size // 2
     free = wiener_solution(v.x[half:], np.convolve(v.x, v.p)[half : v.x.size], v.s, 256)
     assert abs(c.filter_db - free.noise_reduction_db) < 0.5  # another stretch of the record
