@@ -386,10 +386,7 @@ def advice_on(verdict: Assessment) -> list[str]:
     if verdict.limited_by == "filter":
         return _advice_on_length(verdict)
     if verdict.limited_by == "adaptation":
-        return [
-            "Try a longer memory for a steady noise, a shorter one for a noise that changes, or a longer record: the "
-            "controller may not have settled."
-        ]
+        return ["Try a longer record: the controller may not have settled."]
     advice = [
         f"About {verdict.power(needed)} would do for {want}. This is an estimate: the power that the best fixed filter "
         "needs, raised by as much as this controller takes more than such a filter."
@@ -397,7 +394,7 @@ def advice_on(verdict: Assessment) -> list[str]:
     if not np.all(np.isfinite(needed)):
         advice = [
             f"A fixed filter would need {verdict.power(verdict.required_rated_power)} for {want}; this controller did "
-            "not reduce the noise at all. Try another memory."
+            "not reduce the noise at all. Try a longer record."
         ]
     if verdict.band.weak_share > 0.1:
         advice.append(

@@ -1,6 +1,6 @@
 """Print what each rule of KF-PB's price is worth, with the oracle: ``python tests/helpers/budget_ablation.py``.
 
-It takes about ten minutes.
+It takes about five minutes.
 """
 
 from __future__ import annotations
@@ -21,13 +21,10 @@ from comparisons.studies import kf_pb as study  # noqa: E402
 
 CASES = (
     ("duct", "compressor"),
-    ("duct", "band noise"),
     ("duct", "bursts"),
     ("duct", "compressor, 12 dB louder from 8 s on"),
-    ("duct", "compressor, 12 dB softer from 8 s on"),
-    ("duct", "band noise, 10 dB louder for 4 s"),
-    ("duct", "band noise, then compressor"),
-    ("band-pass", "swelling band noise"),
+    ("band-pass", "compressor, 10 dB louder for 4 s"),
+    ("band-pass", "band noise, then compressor"),
 )
 
 
