@@ -34,7 +34,7 @@ FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "3 dB louder": lambda s: 10**0.15 * s,
     "3 dB softer": lambda s: 10**-0.15 * s,
     "polarity": lambda s: -s,
-    "another phase": lambda s: path_taps(perturbed_path(s, fs=FS, phase_deg=120.0)),
+    "another phase": lambda s: path_taps(perturbed_path(s, fs=FS, phase_deg=120.0))[: s.size],
 }
 JUMPS = {  # dB, from and to s after switch-on
     "12 dB louder from 8 s on": (12.0, 8.0, DURATION_S),
