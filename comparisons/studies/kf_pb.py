@@ -89,11 +89,13 @@ class FaultRow:
 def noises() -> dict[str, tuple[str, Callable[[], np.ndarray]]]:
     """Return the class and the samples of each noise, recordings where they are at hand."""
     duration = SILENT_S + DURATION_S
-    made = {name: partial(make, duration, SEED) for name, make in made_noises().items()}
+    made: dict[str, Callable[[], np.ndarray]] = {
+        name: partial(make, duration, SEED) for name, make in made_noises().items()
+    }
     recorded = {name: partial(looped, samples, duration, fs=FS) for name, samples in recordings().items()}
     steady = {name: made[name] for name in ("compressor", "band noise")} | recorded
     some = list(steady)[::2]  # a made one, and a recorded one where it is at hand
-    changing = {name: made[name] for name in ("bursts", "swelling band noise")}
+    changing: dict[str, Callable[[], np.ndarray]] = {name: made[name] for name in ("bursts", "swelling band noise")}
     for words, (gain_db, begin_s, end_s) in JUMPS.items():
         changing |= {f"{name}, {words}": partial(jumping, steady[name], gain_db, begin_s, end_s) for name in some}
     changing["band noise, then compressor"] = lambda: mixed(steady["band noise"](), steady["compressor"]())
@@ -282,7 +284,8 @@ def jobs() -> tuple[list[tuple[str, str, float]], list[tuple[str, str]]]:
 
 def planned_runs() -> int:
     """Return the number of jobs, each of which makes several runs."""
-    return sum(map(len, jobs()))
+    classes, faults = jobs()
+    return len(classes) + len(faults)
 
 
 def main(runs: Runs) -> StudyReport:
@@ -381,8 +384,16 @@ def class_table(rows: Sequence[ClassRow]) -> Table:
         first = [row.first_second_db for row in own]
         lines.append(
             [
-                *(kind, len(own), max(row.power for row in own), np.mean(bound), min(bound), np.mean(mov), min(mov)),
-                *(np.mean(first), max(row.first_power for row in own)),
+                *(
+                    kind,
+                    len(own),
+                    max(row.power for row in own),
+                    float(np.mean(bound)),
+                    min(bound),
+                    float(np.mean(mov)),
+                    min(mov),
+                ),
+                *(float(np.mean(first)), max(row.first_power for row in own)),
             ]
         )
     return Table("classes", "KF-PB by class of noise, from the second second on", headings, lines)
@@ -408,7 +419,7 @@ def fault_table(rows: Sequence[FaultRow]) -> Table:
             lost = [row.lost_db for row in own]
             lines.append(
                 [
-                    *(fault, begins, min(row.worst_second_db for row in own), np.mean(lost), max(lost)),
+                    *(fault, begins, min(row.worst_second_db for row in own), float(np.mean(lost)), max(lost)),
                     *(min(row.alarms for row in own), max(row.alarms for row in own)),
                 ]
             )

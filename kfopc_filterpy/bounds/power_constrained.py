@@ -241,7 +241,7 @@ class PowerConstrainedWiener:
             if np.all((np.abs(peak - 1.0) <= 0.002) | ((peak <= 1.0) & (np.asarray(penalty) == 0.0))):
                 break
             power = power / np.where((peak < 1.0) & (np.asarray(penalty) == 0.0), 1.0, peak)
-        times = {"start_s": self.whole.start_s, "end_s": self.whole.end_s, "stretch": stretch}
+        times: dict[str, Any] = {"start_s": self.whole.start_s, "end_s": self.whole.end_s, "stretch": stretch}
         return ControlFilter(**vars(stretch.solution(weights)), **times, penalty=penalty, constraint_factor=1.0)
 
 

@@ -47,10 +47,11 @@ class PowerBudgetController(CoreController):
 
     where the expectation includes what is not known of p and s. The price follows from an account: over any
     `averaging_s`, the mean power is kept to the rated power, and what a quiet time has left can be spent in a louder
-    one. Power that would save less than half of the noise is not spent.
+    one. Power is not spent where a
+    whole rating of it would save less than half of the measurement noise.
 
-    The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to an
-    unknown path around the given one: the loudspeakers are nearly silent until it has been learnt again. A new
+    The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to the given
+    path with a large uncertainty. The loudspeakers play little until the path has been learned again. A new
     `secondary_path` that is assigned begins the posterior anew, also that of the primary paths; the control filter stays
     until the first solution, and so does the account.
 
@@ -91,7 +92,7 @@ class PowerBudgetController(CoreController):
 
     Notes
     -----
-    The posterior is solved for again when there is an eighth more data, in :math:`O((IN + JM)^3)` operations, which
+    The posterior is computed again when an eighth of the data is new, or earlier if the error is large, in :math:`O((IN + JM)^3)` operations, which
     are spread over as many blocks as they need; M are the taps of a secondary path and N = L + M - 1 those of a primary
     one. It forgets over twice `averaging_s`. `listen` learns the primary paths before the control is switched on.
 
@@ -250,7 +251,7 @@ def kf_pb(
 ) -> PowerBudgetController:
     """Return KF-PB, the Kalman filter with a power budget, which has the least error within the rated power.
 
-    It has no step size or noises to tune. With one channel or several, it learns the primary and secondary paths while
+    It has no step size and no noise variances to tune. With one channel or several, it learns the primary and secondary paths while
     it controls; see `controllers.PowerBudgetController`.
 
     Parameters

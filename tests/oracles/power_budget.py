@@ -22,13 +22,17 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_toe
 UNKNOWN = 2.0  # after an alarm: root mean square of the error of a secondary path, over the path
 KEPT = 4  # after an alarm: what is known of the primary paths counts as so many samples for each tap
 DRAWS = 8  # of the posterior, that stand for its covariance
-SURPRISE, MISFIT, USUAL = 4.0, 0.03, 5.0  # alarm: beyond the noise; of the disturbance; of the usual misfit
-ACCOUNT = 4.0  # the price falls by e^-4 for a full account
-WORTHWHILE = 0.5  # power that saves less than this share of the noise is not spent
+SURPRISE, MISFIT, USUAL = (
+    4.0,
+    0.03,
+    5.0,
+)  # alarm: times the noise and the doubt; least share of the disturbance; times the usual misfit
+ACCOUNT = 4.0  # the price falls to (1 - 4/16)^16 = 0.01 of itself if nothing of the account is spent
+WORTHWHILE = 0.5  # a rating of power must save at least this share of the measurement noise
 WINDOW = 8  # the filter is solved for the references of an exponential window of the averaging time over this
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
-SCALES = (100, 40, 4)  # t: the last block, that window, and windows of the averaging time over these
+SCALES = (100, 40, 4)  # t: windows of the averaging time over these; besides, the last block and the window above
 QUIET = 31  # blocks from one alarm to the next, at least
 WORK = 2.0**26  # operations of a factorisation in a block
 
@@ -257,7 +261,7 @@ class PowerBudget(Controller):
         self.weights = np.zeros(1 + len(SCALES))
         self.book = np.ones(
             (self.blocks, J)
-        )  # power of each block over the rating, newest first; full before the start
+        )  # power of each block over the rating, newest first; spent before the start
         self.price, self.steady_price, self.held_price = np.zeros(J), np.zeros(J), np.zeros(J)
         self.alarms = 0
 
