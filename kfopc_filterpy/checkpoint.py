@@ -89,8 +89,8 @@ class Checkpointed:
     def load(cls, path: str | os.PathLike[str], *, trusted: Iterable[Any] = ()) -> Self:
         """Return what `save` wrote into a file: an object of this class, or of one derived from it.
 
-        It continues to the bit with the same versions of this package, numpy and scipy, the same compiled code
-        on disk and the same kind of processor. Otherwise it continues from the same state, but rounding may differ.
+        It continues to the bit with the same versions of this package, numpy and scipy. Otherwise it
+        continues from the same state, but rounding may differ.
 
         Parameters
         ----------

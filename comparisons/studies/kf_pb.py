@@ -13,6 +13,7 @@ from scipy.signal import fftconvolve
 
 from kfopc_filterpy import MOVFxLMS, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table, Verdict
+from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import DataUnavailableError, load_measured_duct, load_measured_room, looped
@@ -22,7 +23,6 @@ from .parts import MARK, new_figure, without_measured
 
 N_TAPS = 256
 SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on
-AVERAGING_S = 10.0
 SHARES = (0.25, 0.1)  # rated power over the power that full control needs
 SEED = 1
 STEADY, CHANGING = "steady and recorded", "jumps, bursts, mixes"
@@ -55,7 +55,7 @@ class ClassRow:
     noise_reduction_db: float
     bound_db: float
     mov_db: float
-    power: float  # largest over any `AVERAGING_S`, over the rated one
+    power: float  # largest over any `DEFAULT_AVERAGING_S`, over the rated one
     first_second_db: float  # noise reduction less that of the bound
     first_power: float  # over the first second, over the rated one
 
@@ -207,14 +207,14 @@ def class_row(pairs: dict[str, Pair], job: tuple[str, str, float]) -> ClassRow:
         noise_reduction_db=case.reduction_db(error),
         bound_db=case.reduction_db(case.bound_error),
         mov_db=best_mov_db(case),
-        power=overshoot(y, case.rated_power, FS, window_s=AVERAGING_S),
+        power=overshoot(y, case.rated_power, FS, window_s=DEFAULT_AVERAGING_S),
         first_second_db=case.reduction_db(error, 0.0, 1.0) - case.reduction_db(case.bound_error, 0.0, 1.0),
         first_power=float(np.mean(y[: round(FS)] ** 2)) / case.rated_power,
     )
 
 
 def best_mov_db(case: Rated) -> float:
-    """Return the noise reduction of the best MOV-FxLMS whose power over every `AVERAGING_S` is within the rating."""
+    """Return the noise reduction of the best MOV-FxLMS whose power over every `DEFAULT_AVERAGING_S` is within the rating."""
     filtered = fftconvolve(case.reference, case.secondary)[: case.reference.size]
     gain = np.var(filtered) / np.var(case.reference)
     best = -np.inf
@@ -225,7 +225,7 @@ def best_mov_db(case: Rated) -> float:
             result = case.run(controller)
             if result.diverged_at_s is not None:
                 continue
-            if overshoot(result.control_signal, case.rated_power, FS, window_s=AVERAGING_S) <= 1.0:
+            if overshoot(result.control_signal, case.rated_power, FS, window_s=DEFAULT_AVERAGING_S) <= 1.0:
                 best = max(best, case.reduction_db(result.error))
     return best
 

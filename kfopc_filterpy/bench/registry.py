@@ -27,6 +27,7 @@ from kfopc_filterpy import (
     kf_pb,
 )
 from kfopc_filterpy.controllers import Controller, penalty_factor
+from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 from .scene import Scene
@@ -40,7 +41,6 @@ STEP_SIZE_GRID = tuple((2.0 ** -np.arange(1.0, 15.0)).tolist())
 DIAGONAL_GRID = (1e-12, 1e-11, 1e-10, 1e-9, *STATE_NOISE_GRID)
 FORGETTING_GRID = (1e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid around the best value follows
-AVERAGING_S = 10.0
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
@@ -263,7 +263,12 @@ REGISTRY: dict[str, Algorithm] = {
     "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS),
     "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired), **_RANDOM_WALK),
     "KF-PB": Algorithm(
-        _power_budget, symbol="averaging_s", kind="averaging time in s", first=(AVERAGING_S,), **_KNOWS, **_CHANNELS
+        _power_budget,
+        symbol="averaging_s",
+        kind="averaging time in s",
+        first=(DEFAULT_AVERAGING_S,),
+        **_KNOWS,
+        **_CHANNELS,
     ),
     "diagonal KF": Algorithm(_kalman(DiagonalKalman, free=True), **_DIAGONAL, **_FREE),
     "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman), **_DIAGONAL),

@@ -15,8 +15,8 @@ static const anc_setting budget_settings[] = {
     {"rated_power", 1e-30f, 0, ANC_EACH_LOUDSPEAKER}, {"block", 1, 65536, ANC_ONE}, {"averaging", 20, 100000, ANC_ONE},
     {"window", 0, 1, ANC_ONE}, {"spread", 0, 1000, ANC_ONE}, {0}};
 
-static const real ACCOUNT = 0.25f;    /* the price falls by (1 - ACCOUNT)^16, about e^-4, for a full account */
-static const real WORTHWHILE = 0.5f; /* power that saves less than this share of the noise is not spent */
+static const real ACCOUNT = 0.25f;    /* the price falls to (1 - ACCOUNT)^16 = 0.01 of itself if nothing of the account is spent */
+static const real WORTHWHILE = 0.5f; /* a rating of power must save at least this share of the noise */
 static const real NEAR = (real)0.005;/* of the power that a price is to yield */
 static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
 enum { SCALES = 3, TWICE = 2 };       /* what lasted t may go on for twice as long */
@@ -117,7 +117,7 @@ static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting
     budget *f = (budget *)view;
     start_signals(&f->s, plan, settings);
     start_posterior(&f->plant, *f->s.setting[SPREAD]);
-    for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* full before the start */
+    for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* spent before the start */
 }
 
 /* Return g^n. */

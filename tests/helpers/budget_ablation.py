@@ -101,7 +101,7 @@ def main() -> None:
                 with without(rule) as settings:
                     e, y = run(case, **settings)
                 gains.append(case.reduction_db(e) - case.reduction_db(case.bound_error))
-                powers.append(study.overshoot(y, case.rated_power, study.FS, window_s=study.AVERAGING_S))
+                powers.append(study.overshoot(y, case.rated_power, study.FS, window_s=study.DEFAULT_AVERAGING_S))
                 bar.update()
             bar.write(f"{rule:26}{np.mean(gains):+22.2f}{min(gains):+10.2f}{max(powers):24.2f}", file=sys.stdout)
 
