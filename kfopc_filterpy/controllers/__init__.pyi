@@ -4,11 +4,9 @@ from .core_controller import load_algorithm as load_algorithm
 from .direct import DirectKalman as DirectKalman
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .leaky import leak_factor as leak_factor
-from .monitored import HealthEvent as HealthEvent
-from .monitored import MonitoredController as MonitoredController
 from .mov import penalty_factor as penalty_factor
-from .path_tracker import PathChange as PathChange
-from .path_tracker import PathTracker as PathTracker
+from .verified import PathEvent as PathEvent
+from .verified import VerifiedController as VerifiedController
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .processing import RefusedUpdate as RefusedUpdate
 from .virtual import KalmanObserver as KalmanObserver

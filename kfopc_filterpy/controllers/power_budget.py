@@ -4,37 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
-from .._validate import as_nonnegative, as_positive
+from .._validate import as_positive
 from ..bounds.settings import SuggestedSettings
-from ..paths.uncertainty import as_uncertainty, rms_relative_error
+from ..paths.uncertainty import as_uncertainty
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from .base import Looped
-from .core_controller import CoreController, Limiters
+from .core_controller import Limiters
 from .kalman import at_suggested_rate
+from .posterior import DEFAULT_UNCERTAINTY, PosteriorController, block_of, relative_spread
 
 DEFAULT_AVERAGING_S = 10.0
-DEFAULT_UNCERTAINTY = 0.3
-BLOCK_S = 0.032
 LEAST_BLOCKS, MOST_BLOCKS = 20, 100_000  # in the averaging time
-LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
-# What is known of the plant: fields of `plant.c`.
-POSTERIOR = (
-    *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
-    *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy"),
-    *(
-        "path_correlation",
-        "cross_correlation",
-    ),
-)
 
 
-class PowerBudgetController(CoreController):
+class PowerBudgetController(PosteriorController):
     r"""KF-PB, the Kalman filter with a power budget: the least expected error within the rated power.
 
     Block by block of 32 ms, it learns a Gaussian posterior of the primary paths p and the secondary paths s, from
@@ -119,7 +105,6 @@ class PowerBudgetController(CoreController):
 
     name = "KF-PB"
     algorithm = "power_budget"
-    checks = MappingProxyType({"spread": as_nonnegative})
 
     def __init__(
         self,
@@ -136,7 +121,7 @@ class PowerBudgetController(CoreController):
     ) -> None:
         self._fs = as_positive(fs, "fs", unit="Hz")
         samples = as_positive(averaging_s, "averaging_s", unit="s") * self._fs
-        block = max(round(BLOCK_S * self._fs), 1)
+        block = block_of(self._fs)
         if samples > MOST_BLOCKS * block:
             raise ValueError(f"averaging_s must be at most {MOST_BLOCKS * block / self._fs:g} s, got {averaging_s:g}")
         super().__init__(
@@ -147,24 +132,13 @@ class PowerBudgetController(CoreController):
                 "block": block,
                 "averaging": max(round(samples / block), LEAST_BLOCKS),
                 "window": math.exp(-1.0 / samples),
-                "spread": self._spread(secondary_path_uncertainty, secondary_path),
+                "spread": relative_spread(secondary_path_uncertainty, secondary_path),
             },
             n_references=n_references,
             amplifier=amplifier,
             limiter=limiter,
         )
         self._uncertainty = as_uncertainty(secondary_path_uncertainty)
-
-    @staticmethod
-    def _spread(uncertainty: Any, secondary_path: Any) -> float:
-        """Return the relative rms error of the path as the core takes it, 0 if the path is exact."""
-        error = rms_relative_error(uncertainty, secondary_path)
-        if error > MOST_SPREAD:
-            raise ValueError(f"secondary_path_uncertainty must be at most {MOST_SPREAD:g}, got {error:g}")
-        return max(error, LEAST_SPREAD) if error > 0.0 else 0.0
-
-    def _takes_guard(self) -> bool:
-        return False  # the posterior knows how far the path may be off
 
     def _read_rated_power(self) -> Any:
         return self._of_setting("rated_power")
@@ -181,53 +155,6 @@ class PowerBudgetController(CoreController):
     def power_weight(self) -> Any:
         """Price of power of the last block, or with several channels that of each loudspeaker, (J,)."""
         return self._per_channel("price")
-
-    @property
-    def measurement_noise(self) -> Any:
-        """Power of what the plant's model does not explain, or with several channels that at each microphone, (K,).
-
-        It is 0 before the first posterior.
-        """
-        return self._per_channel("noise")
-
-    @property
-    def primary_path(self) -> np.ndarray:
-        """Posterior mean of the primary path, (N,), or with several channels (K, I, N); N = L + M - 1."""
-        paths = self._means()[0]
-        return paths if self.multichannel else paths[0, 0]
-
-    @property
-    def identified_path(self) -> np.ndarray:
-        """Posterior mean of the secondary path, of the shape of `secondary_path`; that itself if it is exact."""
-        paths = self._means()[1]
-        return paths if self.multichannel else paths[0, 0]
-
-    @property
-    def alarms(self) -> int:
-        """Number of times so far that the errors contradicted the secondary path."""
-        return int(self._opened().fields["alarms"].item())
-
-    def _means(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the posterior means, (K, I, N) and (K, J, M)."""
-        block = self._opened()
-        theta, given = block.fields["theta"].reshape(self.n_microphones, -1), block.fields["secondary_path"][0]
-        n = self.n_references * (self.n_taps + given.shape[-1] - 1)
-        primary = theta[:, :n].reshape(self.n_microphones, self.n_references, -1).copy()
-        return primary, theta[:, n:].reshape(given.shape).copy() if theta.shape[1] > n else given.copy()
-
-    def _per_channel(self, name: str) -> Any:
-        values = self._opened().fields[name].ravel()
-        return values.copy() if self.multichannel else float(values[0])
-
-    def _after_new_path(self, before: np.ndarray) -> None:
-        """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""
-        block = self._opened()
-        spread = block.fields["spread"]
-        if spread.item() > 0.0 and self._uncertainty is not None:  # measured paths: another distance from the new path
-            spread[:] = self._spread(self._uncertainty, self._estimated_path()) or LEAST_SPREAD
-        fresh = block.fresh(block.shape)
-        for name in POSTERIOR:
-            block.fields[name][:] = fresh.fields[name]
 
     def looped(self) -> Looped | None:
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""

@@ -82,7 +82,7 @@ typedef struct {
 
 extern ANC_PUBLIC const anc_algorithm anc_fxlms, anc_fxnlms, anc_leaky, anc_optimal_leaky, anc_mov, anc_mov_fixed, anc_two_gradient,
     anc_clipping, anc_rescaling, anc_kalman, anc_diagonal, anc_fast_array, anc_finite_memory, anc_repaired,
-    anc_power_budget, anc_signals_alone;
+    anc_power_budget, anc_observer, anc_signals_alone;
 
 /* Bytes of a block; 0 if its shape is refused: a count below 1, or too large. */
 ANC_PUBLIC size_t anc_size(const anc_algorithm *algorithm, const anc_plan *plan);

@@ -24,24 +24,20 @@ enum { SHORTEST = 20 };               /* ... and for a twentieth of the averagin
 /* t: exponential windows of the averaging time over these. The filter is solved for the references of the first. */
 static const int32_t SCALE[SCALES + 1] = {8, 100, 40, 4};
 enum { NEWTON = 20 };                 /* steps */
-/* No sample that is learnt from is louder, neither x and e nor what is played, and no filter has a larger tap. So no sum of
- * products overflows. REGULAR: share of the diagonal that is added to it, so that rounding leaves the matrix definite. */
+/* No filter has a larger tap. REGULAR: share of the diagonal that is added to it, so that rounding leaves the matrix definite. */
 #ifdef ANC_FLOAT
-static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f, LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
+static const real LARGEST_TAP = 1e6f, REGULAR = 1e-5f, LEAST_POWER = 1e-30f;
 #else
-static const real LOUDEST_LEARNT = 1e50, LOUDEST_PLAYED = 1e100, LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
+static const real LARGEST_TAP = 1e50, REGULAR = 1e-7, LEAST_POWER = 1e-300;
 #endif
 
-enum { FILLED, MISSING, ASKED, HEARD, AWAITED, BUDGET_COUNTS }; /* samples of the block; flags of the block; samples of all
- * blocks; whether the error of the last control signal is still to come */
 
 typedef struct {
     signals s;
     plant plant;
     int32_t T, lags;             /* blocks of the account */
-    real *x, *y, *errors;        /* (I, history), (J, history), (K, B), newest first */
     real *asked;                 /* (2, J) now; sum of squares of the block */
-    int32_t *counts;
+    int32_t *controlled;         /* whether control was on in the block */
     real *R, *short_R;           /* (I, I, lags), (SCALES, I, I, L) windowed sums of x_i(t) x_a(t - l) */
     real *weight;                /* (1 + SCALES) of these windows */
     real *book;                  /* (T, J) power of each block over the rating, newest first */
@@ -88,13 +84,10 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     }
     layout_unfiltered(s, plan, settings, at);
     layout_posterior(&f->plant, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
-    const int32_t I = s->I, L = s->L, N = f->plant.N, H = f->plant.history, lags = L + N;
+    const int32_t I = s->I, L = s->L, N = f->plant.N, lags = L + N;
     f->T = (int32_t)averaging, f->lags = lags, f->width = 2 * lags + f->plant.B;
-    f->x = reals(at, "reference_history", ANC_STATE, 1, 1, I, H);
-    f->y = reals(at, "output_history", ANC_STATE, 1, 1, J, H);
-    f->errors = reals(at, "block_errors", ANC_STATE, 1, 1, s->K, f->plant.B);
     f->asked = reals(at, "asked", ANC_STATE, 1, 1, 2, J);
-    f->counts = int32s(at, "budget_counts", ANC_STATE, BUDGET_COUNTS);
+    f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
     f->short_R = reals(at, "short_correlations", ANC_STATE, SCALES, I, I, L);
     f->weight = reals(at, "window_weights", ANC_STATE, 1, 1, 1, 1 + SCALES);
@@ -118,15 +111,6 @@ static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting
     start_signals(&f->s, plan, settings);
     start_posterior(&f->plant, *f->s.setting[SPREAD]);
     for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* spent before the start */
-}
-
-/* Return g^n. */
-static real raised(real g, int32_t n)
-{
-    real power = 1;
-    for (; n; n /= 2, g *= g)
-        if (n % 2) power *= g;
-    return power;
 }
 
 static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
@@ -320,11 +304,11 @@ static real price_of(const toeplitz_system *t, real power, real start, real *v)
 /* Add the block to the windows of the references; x is zero before the first, so they are positive definite. */
 static void take_references(budget *f)
 {
-    const int32_t I = f->s.I, L = f->s.L, B = f->plant.B, H = f->plant.history;
+    const int32_t I = f->s.I, L = f->s.L, B = f->plant.B;
     real g[SCALES + 1], fade[SCALES + 1];
     for (int c = 0; c <= SCALES; c++) g[c] = raised(*f->s.setting[WINDOW], SCALE[c]), fade[c] = raised(g[c], B);
     for (int32_t i = 0; i < I; i++) {
-        const real *u = f->x + times(i, H);
+        const real *u = history_of(&f->plant, i);
         real share[SCALES + 1] = {1, 1, 1, 1}, sum[SCALES + 1] = {0};
         for (int32_t t = 0; t < B; t++)
             for (int c = 0; c <= SCALES; c++) work_row(f, c)[t] = share[c] * u[t], sum[c] += share[c], share[c] *= g[c];
@@ -333,7 +317,7 @@ static void take_references(budget *f)
             real *sums = work_row(f, WORKS - 1);
             for (int32_t a = 0; a < I; a++) {
                 real *restrict R = c ? f->short_R + times(((c - 1) * I + i) * I + a, L) : f->R + times(i * I + a, lags);
-                correlate(sums, work_row(f, c), B, f->x + times(a, H), lags);
+                correlate(sums, work_row(f, c), B, history_of(&f->plant, a), lags);
                 for (int32_t l = 0; l < lags; l++) R[l] = faded(R[l], fade[c], sums[l]);
             }
             if (i == 0) f->weight[c] = fade[c] * f->weight[c] + sum[c];
@@ -373,7 +357,7 @@ static real share_of(const budget *f, int32_t j, const real *v, real taken)
     int32_t blocks[SCALES + 2];
     real *y = work_row(f, 0), *part = work_row(f, 1), *wide = work_row(f, 2);
     memset(y, 0, sizeof(real) * (size_t)B);
-    for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, f->x + times(i, f->plant.history), B), add_to(y, part, B);
+    for (int32_t i = 0; i < I; i++) correlate(part, v + times(i, L), L, history_of(&f->plant, i), B), add_to(y, part, B);
     power[SCALES + 1] = dot(y, y, B) / (real)B, blocks[SCALES + 1] = least;
     for (int c = 0; c <= SCALES; c++) blocks[c] = lasting(T, SCALE[c], least);
     for (int32_t a = 0; a < I; a++) {
@@ -480,42 +464,36 @@ static void solve_all(budget *f)
 
 static void end_block(budget *f)
 {
-    const int32_t I = f->s.I, J = f->s.J, B = f->plant.B, H = f->plant.history;
-    const real heard = (real)f->counts[HEARD], forget = root(raised(*f->s.setting[WINDOW], B));
+    const int32_t J = f->s.J, B = f->plant.B;
     take_references(f);
-    if (f->counts[ASKED]) {
+    if (*f->controlled) {
         memmove(f->book + J, f->book, sizeof(real) * times(f->T - 1, J));
         for (int32_t j = 0; j < J; j++) f->book[j] = f->asked[J + j] / (real)B / f->s.setting[RATED_POWER][j];
     }
-    if (!f->counts[MISSING] && f->counts[HEARD] >= f->plant.N)
-        learn(&f->plant, f->x, f->y, f->errors, forget, heard >= (real)B * (real)f->T / 10);
-    if (f->counts[HEARD] < 1 << 30) f->counts[HEARD] += B;
+    learn(&f->plant, root(raised(*f->s.setting[WINDOW], B)));
     if (*f->plant.fits) solve_all(f);
-    f->counts[FILLED] = f->counts[MISSING] = f->counts[ASKED] = 0;
+    *f->controlled = 0;
     memset(f->asked + J, 0, sizeof(real) * (size_t)J);
-    for (int32_t i = 0; i < I; i++) memmove(f->x + times(i, H) + B, f->x + times(i, H), sizeof(real) * (size_t)(H - B));
-    for (int32_t j = 0; j < J; j++) memmove(f->y + times(j, H) + B, f->y + times(j, H), sizeof(real) * (size_t)(H - B));
+    begin_block(&f->plant);
 }
 
 /* Note a sample; at the end of a block, learn. */
 static int note(budget *f, const real *error, int controlled)
 {
     const signals *s = &f->s;
-    const int32_t B = f->plant.B, H = f->plant.history, at = B - 1 - f->counts[FILLED];
     for (int32_t i = 0; i < s->I; i++)
         if (!within(*newest(&s->x, i), LOUDEST_LEARNT)) return ANC_LOUD_REFERENCE;
     for (int32_t j = 0; j < s->J; j++)
         if (!within(*newest(&s->y, j), LOUDEST_PLAYED) || !within(f->asked[j], LOUDEST_PLAYED)) return ANC_LOUD_REFERENCE;
     for (int32_t k = 0; error && k < s->K; k++)
         if (!within(error[k], LOUDEST_LEARNT)) return ANC_LOUD_ERROR;
-    for (int32_t i = 0; i < s->I; i++) f->x[times(i, H) + (size_t)at] = *newest(&s->x, i);
+    for (int32_t i = 0; i < s->I; i++) *place_of(&f->plant, i) = *newest(&s->x, i);
     for (int32_t j = 0; j < s->J; j++) {
-        f->y[times(j, H) + (size_t)at] = *newest(&s->y, j);
+        *place_of(&f->plant, s->I + j) = *newest(&s->y, j);
         if (controlled) f->asked[s->J + j] += f->asked[j] * f->asked[j];
     }
-    for (int32_t k = 0; error && k < s->K; k++) f->errors[times(k, B) + (size_t)at] = error[k];
-    f->counts[MISSING] |= !error, f->counts[ASKED] |= controlled, f->counts[AWAITED] = 0;
-    if (++f->counts[FILLED] == B) end_block(f);
+    *f->controlled |= controlled;
+    if (complete_sample(&f->plant, error)) end_block(f);
     return ANC_DONE;
 }
 
@@ -525,14 +503,14 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
     signals *s = &f->s;
     for (int32_t i = 0; i < s->I; i++)
         if (!within(reference[i], LOUDEST_LEARNT) || !within(reference[i], *s->loudest)) return ANC_LOUD_REFERENCE;
-    if (f->counts[AWAITED]) note(f, NULL, 1); /* that error never came */
+    if (f->plant.heard[AWAITED]) note(f, NULL, 1); /* that error never came */
     const int refused = take_reference(s, reference);
     for (int32_t j = 0; !refused && j < s->J; j++) {
         f->asked[j] = filter_output(s, j);
         emit(s, j, f->asked[j]);
         control[j] = s->control[j];
     }
-    f->counts[AWAITED] = !refused;
+    f->plant.heard[AWAITED] = !refused;
     return refused;
 }
 

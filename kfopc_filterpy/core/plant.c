@@ -5,6 +5,7 @@ static const real UNKNOWN = 2;                          /* after an alarm: rms e
 static const real KEPT = 4;                             /* after an alarm: the data of p count as so many samples a tap */
 static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
 enum { QUIET = 31 };                                    /* blocks from one alarm to the next, at least */
+static const real KNOWN = (real)0.05;                    /* no alarm before as much of the memory was heard */
 static const double WORK = 67108864;                    /* operations of a factorisation in a block, 2^26 */
 
 /* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at once. */
@@ -62,6 +63,9 @@ void layout_posterior(plant *f, const signals *s, int32_t block, int exact, anc_
     f->counts = int32s(at, "plant_counts", ANC_STATE, PLANT_COUNTS);
     f->fits = int32s(at, "fits", ANC_STATE, 1);
     f->alarms = int32s(at, "alarms", ANC_STATE, 1);
+    f->z = reals(at, "history", ANC_STATE, 1, 1, I + J, f->history);
+    f->errors = reals(at, "block_errors", ANC_STATE, 1, 1, K, block);
+    f->heard = int32s(at, "block_counts", ANC_STATE, BLOCK_COUNTS);
     f->theta = reals(at, "theta", ANC_STATE, 1, 1, K, n);
     f->q = reals(at, "noise", ANC_STATE, 1, 1, 1, K);
     f->draws = reals(at, "draws", ANC_STATE, 1, 1, exact ? 0 : DRAWS, n);
@@ -306,17 +310,34 @@ static void go_on_fitting(plant *f)
 
 /* A block. */
 
+int complete_sample(plant *f, const real *error)
+{
+    const int32_t at = f->B - 1 - f->heard[FILLED];
+    for (int32_t k = 0; error && k < f->K; k++) f->errors[times(k, f->B) + (size_t)at] = error[k];
+    f->heard[MISSING] |= !error, f->heard[AWAITED] = 0;
+    return ++f->heard[FILLED] == f->B;
+}
+
+void begin_block(plant *f)
+{
+    f->heard[FILLED] = f->heard[MISSING] = 0;
+    for (int32_t i = 0; i < f->I + f->J; i++) memmove(history_of(f, i) + f->B, history_of(f, i), sizeof(real) * (size_t)(f->history - f->B));
+}
+
 /* Set d to p * x and z to s * y of the block. */
-static void explain(const plant *f, const real *theta, const real *x, const real *y, real *d, real *z)
+static void explain(const plant *f, const real *theta, real *d, real *z)
 {
     real *part = work_of(f, 0);
     memset(d, 0, sizeof(real) * (size_t)f->B), memset(z, 0, sizeof(real) * (size_t)f->B);
-    for (int32_t i = 0; i < f->I; i++, theta += f->N) correlate(part, theta, f->N, x + times(i, f->history), f->B), add_to(d, part, f->B);
-    for (int32_t j = 0; !f->exact && j < f->J; j++, theta += f->M) correlate(part, theta, f->M, y + times(j, f->history), f->B), add_to(z, part, f->B);
+    for (int32_t i = 0; i < f->I + (f->exact ? 0 : f->J); i++) {
+        const int32_t taps = i < f->I ? f->N : f->M;
+        correlate(part, theta, taps, history_of(f, i), f->B), add_to(i < f->I ? d : z, part, f->B);
+        theta += taps;
+    }
 }
 
 /* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known. */
-static int is_alarm(const plant *f, const real *x, const real *y, real unexplained, real d2, real q)
+static int is_alarm(const plant *f, real unexplained, real d2, real q)
 {
     const plant_numbers *known = f->numbers;
     if (f->counts[AGE] <= (*f->alarms ? QUIET : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
@@ -324,7 +345,7 @@ static int is_alarm(const plant *f, const real *x, const real *y, real unexplain
     if (unexplained <= limit) return 0;
     real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
     for (int32_t draw = 0; draw < DRAWS; draw++) {
-        explain(f, f->draws + times(draw, f->n), x, y, d, z);
+        explain(f, f->draws + times(draw, f->n), d, z);
         add_scaled(d, -1, z, f->B);
         doubt += dot(d, d, f->B) / (real)f->B;
     }
@@ -388,41 +409,42 @@ static void add_products(plant *f, const real *v, int32_t at_v, int32_t n, const
 }
 
 /* Add the block to the data. */
-static void add_block(plant *f, const real *x, const real *y, const real *e, real forget)
+static void add_block(plant *f, real forget)
 {
-    const int32_t signals_of_all = f->I + (f->exact ? 0 : f->J), B = f->B;
+    const int32_t regressors = f->I + (f->exact ? 0 : f->J), B = f->B;
     real *sums = work_of(f, 1);
     f->numbers->fitted *= forget, f->numbers->samples = forget * f->numbers->samples + (real)B;
-    for (int32_t k = 0; k < f->K; k++) f->ee[k] = forget * f->ee[k] + dot(e + times(k, B), e + times(k, B), B);
-    for (int32_t a = 0, row = 0; a < signals_of_all; a++) {
-        const real *v = a < f->I ? x + times(a, f->history) : y + times(a - f->I, f->history), sign = a < f->I ? 1 : -1;
+    for (int32_t k = 0; k < f->K; k++) f->ee[k] = forget * f->ee[k] + dot(f->errors + times(k, B), f->errors + times(k, B), B);
+    for (int32_t a = 0, row = 0; a < regressors; a++) {
         const int32_t n = a < f->I ? f->N : f->M;
+        const real sign = a < f->I ? 1 : -1;
         for (int32_t k = 0; k < f->K; k++) {
             real *restrict r = f->r + times(k, f->n) + row;
-            correlate(sums, e + times(k, B), B, v, n);
+            correlate(sums, f->errors + times(k, B), B, history_of(f, a), n);
             for (int32_t i = 0; i < n; i++) r[i] = faded(r[i], forget, sign * sums[i]);
         }
         for (int32_t b = 0, column = 0; b <= a; b++) {
-            const real *u = b < f->I ? x + times(b, f->history) : y + times(b - f->I, f->history);
             const int32_t m = b < f->I ? f->N : f->M;
-            add_products(f, v, row, n, u, column, m, b < f->I ? sign : -sign, forget);
+            add_products(f, history_of(f, a), row, n, history_of(f, b), column, m, b < f->I ? sign : -sign, forget);
             column += m;
         }
         row += n;
     }
 }
 
-void learn(plant *f, const real *x, const real *y, real *e, real forget, int known)
+/* Learn from a block whose errors are all known, after as many as a primary path has taps. */
+static void learn_heard(plant *f, real forget)
 {
     const int32_t B = f->B;
     const real samples = (real)B * (real)f->K, q = mean_noise(f);
+    const int known = (real)f->heard[HEARD] / (real)B * (1 - forget) >= KNOWN;
     real *part = work_of(f, 0), *d = work_of(f, 1), *z = work_of(f, 2), unexplained = 0, d2 = 0;
     plant_numbers *numbers = f->numbers;
     for (int32_t k = 0; k < f->K; k++) {
-        real *error = e + times(k, B);
+        real *error = f->errors + times(k, B);
         for (int32_t j = 0; f->exact && j < f->J; j++) /* s^ is right: what it plays is no news */
-            correlate(part, f->path + times(k * f->J + j, f->M), f->M, y + times(j, f->history), B), add_to(error, part, B);
-        explain(f, f->theta + times(k, f->n), x, y, d, z);
+            correlate(part, f->path + times(k * f->J + j, f->M), f->M, history_of(f, f->I + j), B), add_to(error, part, B);
+        explain(f, f->theta + times(k, f->n), d, z);
         d2 += dot(d, d, B);
         for (int32_t t = 0; t < B; t++) d[t] = error[t] - d[t] + z[t];
         unexplained += dot(d, d, B);
@@ -430,19 +452,25 @@ void learn(plant *f, const real *x, const real *y, real *e, real forget, int kno
     unexplained /= samples, d2 /= samples;
     int loud = 0;
     for (int32_t j = 0; j < f->J; j++)
-        for (int32_t t = 0; t < B + f->M - 1; t++) loud |= y[times(j, f->history) + (size_t)t] != 0;
+        for (int32_t t = 0; t < B + f->M - 1; t++) loud |= history_of(f, f->I + j)[t] != 0;
     count_up(f->counts + AGE), count_up(f->counts + IDLE);
     if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
-    if (known && loud && !f->exact && is_alarm(f, x, y, unexplained, d2, q)) count_up(f->alarms), begin_anew(f);
+    if (known && loud && !f->exact && is_alarm(f, unexplained, d2, q)) count_up(f->alarms), begin_anew(f);
     else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
         const real share = unexplained < d2 ? unexplained / d2 : 1;
         numbers->misfit = forget * forget * numbers->misfit + share * share;
         numbers->seen = forget * forget * numbers->seen + 1;
     }
-    add_block(f, x, y, e, forget);
+    add_block(f, forget);
     const int news = numbers->samples - numbers->fitted > numbers->samples / 8 || (f->counts[SOUNDS] && f->counts[AGE] <= 16);
     if (!f->counts[PENDING] && (news || (unexplained > 2 * q && f->counts[IDLE] >= 8))) begin_fit(f);
     if (f->counts[PENDING]) go_on_fitting(f);
+}
+
+void learn(plant *f, real forget)
+{
+    if (!f->heard[MISSING] && f->heard[HEARD] >= f->N) learn_heard(f, forget);
+    if (f->heard[HEARD] < 1 << 30) f->heard[HEARD] += f->B;
 }
 
 /* Set `to` to a with zeros around it, `more` on either side. */

@@ -19,12 +19,16 @@ enum { AGE, IDLE, SOUNDS, DOUBTFUL, STALE, RANDOM, PENDING, GROUPS, PLANT_COUNTS
 /* AGE: blocks since the loudspeakers sound, or since an alarm; IDLE: since the last fit began; DOUBTFUL: no fit since the
  * alarm; STALE: the correlations are not those of the posterior; PENDING: 1 + blocks until the fit ends, 0: none; GROUPS:
  * those of its rows that are factorised. */
+enum { FILLED, MISSING, HEARD, AWAITED, BLOCK_COUNTS };
+/* FILLED, MISSING: samples of this block, and whether an error of it is; HEARD: samples of all blocks; AWAITED: the error of
+ * the last control signal is still to come. */
 
 typedef struct {
     int32_t K, J, I, N, M, B, n, padded, history, exact, delay, width; /* delay: blocks that a factorisation takes */
     const real *path;        /* s^, (K, J, M) */
     plant_numbers *numbers;
-    int32_t *counts, *fits, *alarms;
+    int32_t *counts, *fits, *alarms, *heard; /* heard: BLOCK_COUNTS */
+    real *z, *errors;        /* (I + J, history) x and y, (K, B) of this block, newest first */
     real *theta, *q;         /* (K, n), (K) mean and noise */
     real *draws;             /* (DRAWS, n) of theta less its mean, for the mean noise */
     real *G, *r, *ee;        /* lower triangle in rows; (K, n) sum e z; (K) sum e^2 */
@@ -39,9 +43,14 @@ typedef struct {
 void correlate(real *restrict to, const real *restrict a, int32_t n, const real *restrict b, int32_t count);
 void layout_posterior(plant *f, const signals *s, int32_t block, int exact, anc_layout *at);
 void start_posterior(plant *f, real spread);
-/* Take a block: x, (I, history), and y, (J, history), of which it is the newest part, and its errors, (K, B), which are
- * overwritten. `known`: there was enough to learn from that an alarm is possible. */
-void learn(plant *f, const real *x, const real *y, real *e, real forget, int known);
+static inline real *history_of(const plant *f, int32_t signal) { return f->z + times(signal, f->history); } /* x, then y */
+/* Return where the newest sample of x or y belongs. */
+static inline real *place_of(const plant *f, int32_t signal) { return history_of(f, signal) + (f->B - 1 - f->heard[FILLED]); }
+/* Take the errors of the newest samples, NULL: they were not heard. Return whether the block is complete. */
+int complete_sample(plant *f, const real *error);
+/* Learn from a complete block, whose errors are overwritten. `forget` is the window of the data for a block. */
+void learn(plant *f, real forget);
+void begin_block(plant *f);
 /* Set ss and ps to those of the posterior, summed over microphones: with a ~ b for sum_m a(m + u) b(m), ss_ja is
  * E[s_j ~ s_a](u) with u from 1 - M up, and ps_ij is E[p_i ~ s_j] from N - 1 down, as it is convolved. */
 void expect(plant *f);
@@ -64,6 +73,20 @@ static inline real faded(real sum, real forget, real more)
     return next < NEARLY_ZERO && next > -NEARLY_ZERO ? 0 : next;
 }
 
+/* No sample that is learnt from is louder, neither x and e nor what is played, so no sum of products overflows. */
+#ifdef ANC_FLOAT
+static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f;
+#else
+static const real LOUDEST_LEARNT = 1e50, LOUDEST_PLAYED = 1e100;
+#endif
+
 static inline real larger(real a, real b) { return a > b ? a : b; }
+static inline real raised(real g, int32_t n) /* g^n */
+{
+    real power = 1;
+    for (; n; n /= 2, g *= g)
+        if (n % 2) power *= g;
+    return power;
+}
 static inline void count_up(int32_t *count) { *count += *count < 1 << 30; }
 #endif

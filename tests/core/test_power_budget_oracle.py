@@ -205,7 +205,7 @@ def test_a_limiter() -> None:
     laps = core.block.fields["laps"][0, 0]
     own.live_in(core.block.fields["limiter"][0, 0, 0], laps)
     compare(oracle, core, x, d, lambda n: s)
-    played = np.mean(core.block.fields["output_history"] ** 2)
+    played = np.mean(core.block.fields["history"][..., -1, :] ** 2)
     assert played < 0.9 * rated * np.mean(oracle.book[:10])
 
 

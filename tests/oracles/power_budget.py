@@ -34,6 +34,7 @@ TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
 SCALES = (100, 40, 4)  # t: windows of the averaging time over these; besides, the last block and the window above
 QUIET = 31  # blocks from one alarm to the next, at least
+KNOWN = 0.05  # no alarm before as much of the memory was heard
 WORK = 2.0**26  # operations of a factorisation in a block
 
 
@@ -302,7 +303,7 @@ class PowerBudget(Controller):
         if asked is not None:
             self.book = np.concatenate([[asked / self.rated_power], self.book[:-1]])
         if e is not None and self.heard >= self.N:
-            self.alarms += self.plant.learn(self.x_past, self.y_past, e, self.heard >= B * self.blocks / 10)
+            self.alarms += self.plant.learn(self.x_past, self.y_past, e, self.heard / B * (1 - self.plant.forget) >= KNOWN)
         self.heard += B
         if self.plant.fits:
             self.solve()

@@ -1,0 +1,138 @@
+"""Controllers that learn a posterior of the plant: KF-PB, and the observer beside another controller."""
+
+from __future__ import annotations
+
+import math
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from .._validate import as_nonnegative
+from ..paths.uncertainty import rms_relative_error
+from .core_controller import CoreController
+
+DEFAULT_UNCERTAINTY = 0.3  # relative rms error of a secondary path
+LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
+BLOCK_S = 0.032  # from one posterior to the next, at least
+# What is known of the plant: fields of `plant.c`.
+POSTERIOR = (
+    *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
+    *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy", "path_correlation", "cross_correlation"),
+)
+
+
+def block_of(fs: float) -> int:
+    """Return the number of samples in a block at a sample rate."""
+    return max(round(BLOCK_S * fs), 1)
+
+
+def relative_spread(uncertainty: Any, secondary_path: Any) -> float:
+    """Return the relative rms error of the path as the core takes it, 0 if the path is exact."""
+    error = rms_relative_error(uncertainty, secondary_path)
+    if error > MOST_SPREAD:
+        raise ValueError(f"secondary_path_uncertainty must be at most {MOST_SPREAD:g}, got {error:g}")
+    return max(error, LEAST_SPREAD) if error > 0.0 else 0.0
+
+
+class PosteriorController(CoreController):
+    """Base class: what is known of the plant, from the fields of `plant.c`."""
+
+    checks = MappingProxyType({"spread": as_nonnegative})
+
+    @property
+    def alarms(self) -> int:
+        """Number of times so far that the errors contradicted the secondary path."""
+        return int(self._opened().fields["alarms"].item())
+
+    @property
+    def primary_path(self) -> np.ndarray:
+        """Posterior mean of the primary path, (N,), or with several channels (K, I, N); N = L + M - 1."""
+        paths = self._means()[0].copy()
+        return paths if self.multichannel else paths[0, 0]
+
+    @property
+    def identified_path(self) -> np.ndarray:
+        """Posterior mean of the secondary path, of the shape of `secondary_path`; that itself if it is exact."""
+        paths = self._means()[1].copy()
+        return paths if self.multichannel else paths[0, 0]
+
+    @property
+    def measurement_noise(self) -> Any:
+        """Power of what the plant's model does not explain, or with several channels that at each microphone, (K,).
+
+        It is 0 before the first posterior.
+        """
+        return self._per_channel("noise")
+
+    def _per_channel(self, name: str) -> Any:
+        values = self._opened().fields[name].ravel()
+        return values.copy() if self.multichannel else float(values[0])
+
+    def _heard_references(self) -> int:
+        """Return the number of references I."""
+        return self.n_references
+
+    def _means(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the posterior means where the core has them, (K, I, N) and (K, J, M)."""
+        block, n_references = self._opened(), self._heard_references()
+        theta, given = block.fields["theta"].reshape(self.n_microphones, -1), block.fields["secondary_path"][0]
+        n = n_references * (self.n_taps + given.shape[-1] - 1)
+        primary = theta[:, :n].reshape(self.n_microphones, n_references, -1)
+        return primary, theta[:, n:].reshape(given.shape) if theta.shape[1] > n else given
+
+    def _takes_guard(self) -> bool:
+        return False  # the posterior knows how far the path may be off
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""
+        block = self._opened()
+        spread = block.fields["spread"]
+        if spread.item() > 0.0 and self._uncertainty is not None:  # measured paths: another distance from the new path
+            spread[:] = relative_spread(self._uncertainty, self._estimated_path()) or LEAST_SPREAD
+        fresh = block.fresh(block.shape)
+        for name in POSTERIOR:
+            block.fields[name][:] = fresh.fields[name]
+
+
+class PathObserver(PosteriorController):
+    """The posterior alone: as references it takes those of the controller, and then what the loudspeakers play.
+
+    Parameters
+    ----------
+    n_taps : int
+        Taps L of the control filters.
+    secondary_path : ndarray, shape (K, J, M)
+        Estimated secondary paths.
+    n_references : int
+        Number of references I of the controller.
+    spread : float
+        Relative rms error of the estimate, above 0.
+    fs : float
+        Sample rate in Hz.
+    memory_s : float
+        Memory in seconds.
+    """
+
+    name = "path observer"
+    algorithm = "observer"
+
+    def __init__(
+        self, n_taps: int, secondary_path: np.ndarray, *, n_references: int, spread: float, fs: float, memory_s: float
+    ) -> None:
+        self.block = block_of(fs)
+        super().__init__(
+            n_taps,
+            secondary_path,
+            settings={"block": self.block, "window": math.exp(-2.0 / (memory_s * fs)), "spread": spread},
+            n_references=n_references + secondary_path.shape[1],
+            multichannel=True,
+        )
+
+    def _heard_references(self) -> int:
+        return self.n_references - self.n_loudspeakers
+
+    @property
+    def fits(self) -> int:
+        """Number of posteriors so far."""
+        return int(self._opened().fields["fits"].item())
