@@ -167,8 +167,8 @@ def as_rate_ratio(fs: float, new_fs: float) -> tuple[int, int]:
     ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_DENOMINATOR)
     if not ratio or abs(fs * ratio - new_fs) > 1e-12 * new_fs:  # an irrational ratio comes within 2e-10
         raise ValueError(
-            f"fs and new_fs must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and "
-            f"{new_fs:g} Hz; round the rates to whole Hz"
+            f"sample rates must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and {new_fs:g} Hz; "
+            "round them to whole Hz"
         )
     return ratio.numerator, ratio.denominator
 

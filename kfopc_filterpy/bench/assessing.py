@@ -33,6 +33,7 @@ from kfopc_filterpy.metrics import (
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
+from kfopc_filterpy.paths.file_checks import require_sound
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
@@ -267,11 +268,7 @@ def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any,
     x = _recording(noise, "noise")
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")
     K, J, _ = s.shape
-    for k in np.flatnonzero(~np.any(s, axis=(1, 2))):
-        which, mend = "secondary", "record it again"
-        if K > 1:
-            which, mend = f"secondary[{k}]", "leave out a microphone that is not reached"
-        raise ValueError(f"{which} must not be silent: every value is 0; {mend}")
+    require_sound("secondary", s)
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", length=x.shape[1])
         if len(d) != K:
