@@ -242,14 +242,16 @@ def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Any:
-    """Return how far the secondary path may be wrong: by other measurements, or by tolerances."""
+    """Return how far the secondary path may be wrong: by other measurements, by tolerances, or as `assess` has it."""
+    from ..controllers.power_budget import DEFAULT_UNCERTAINTY
     from ..paths import PathTolerance
     from ..paths.uncertainty import as_gain_error
 
     tolerances = (options.path_error_samples, options.path_error_deg, options.path_error_db)
     if not options.secondary_again:
-        samples = 1.0 if options.path_error_samples is None else options.path_error_samples
-        deg, db = (one or 0.0 for one in tolerances[1:])
+        if tolerances == (None, None, None):
+            return DEFAULT_UNCERTAINTY
+        samples, deg, db = (one or 0.0 for one in tolerances)
         return PathTolerance(samples, deg, as_gain_error(db, "--path-error-db"))
     if tolerances != (None, None, None):
         raise ValueError("--secondary-again stands in place of --path-error-...: leave out one of them")

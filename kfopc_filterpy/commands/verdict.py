@@ -39,14 +39,14 @@ def add_to(commands: Any) -> None:
     about = "KF-PB (default), KF-OPC or FxLMS, behind a limiter; the others beside it"
     parser.add_argument("--algorithm", default="KF-PB", help=about)
     add_count(parser, "--taps", help="taps of the control filter (default: found, at most 256)")
-    about = "memory of the filter (default: 0.25 s, several channels 1 s)"
+    about = "memory of KF-OPC; a length that is found suits it too (default: 0.25 s, several channels 1 s)"
     add_number(parser, "--memory", "s", help=about)
     path = parser.add_argument_group(
         "secondary path",
-        "how far it may be wrong, for KF-PB, which learns it as it controls",
+        "how far it may be wrong, for KF-PB, which learns it as it controls (default: a relative rms error of 0.3); "
+        "errors that are stated add up",
     )
-    about = "by default 1"
-    add_number(path, "--path-error-samples", "", as_nonnegative, metavar="N", help=f"error of its delay; {about}")
+    add_number(path, "--path-error-samples", "", as_nonnegative, metavar="N", help="error of its delay")
     add_number(path, "--path-error-deg", "deg", as_nonnegative, help="error of its phase")
     add_number(path, "--path-error-db", "dB", as_nonnegative, help="error of its gain")
     about = "another measurement of it, which tells how far it may be wrong; may be repeated"

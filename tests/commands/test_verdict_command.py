@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+from inspect import signature
 
 import jsonschema
 import numpy as np
 import pytest
 from helpers.commands import FS, SCENE, process
 
+from kfopc_filterpy import bench
 from kfopc_filterpy.bench import assess
 from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
+from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import band_limited_noise, write_wav
 
 
@@ -58,6 +62,28 @@ def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(comma
         _, out, err = command("verdict", "clipped.wav", *options, *resampled)
         assert sum("is clipped" in note for note in json.loads(out)["notes"]) == 1
         assert "is clipped" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], signature(assess).parameters["secondary_path_uncertainty"].default),
+        (["--path-error-samples", 2], PathTolerance(delay_samples=2.0)),
+        (["--path-error-deg", 10, "--path-error-db", 3], PathTolerance(phase_deg=10.0, gain_db=3.0)),
+    ],
+)
+def test_a_path_error_is_the_one_that_is_stated_or_the_default_of_assess(command, monkeypatch, options, expected):
+    asked = {}
+
+    def stop(*signals, **settings):
+        asked.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(bench, "assess", stop)
+    command("verdict", *SCENE, "--rated-power", 1, *options)
+    assert asked["secondary_path_uncertainty"] == expected
+    told = " ".join(command("verdict", "--help")[1].split())
+    assert f"(default: a relative rms error of {DEFAULT_UNCERTAINTY:g})" in told
 
 
 def test_a_second_measurement_of_the_path_may_tell_how_well_it_is_known(command, folder):
