@@ -33,7 +33,7 @@ from kfopc_filterpy.metrics import (
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
-from kfopc_filterpy.paths.file_checks import require_sound
+from kfopc_filterpy.paths.file_checks import require_heard, require_sound
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
@@ -296,8 +296,7 @@ def _recording(value: Any, name: str, length: int | None = None) -> np.ndarray:
     for number, channel in enumerate(channels):
         which = name if len(channels) == 1 else f"{name}[{number}]"
         as_signal(channel, which, length=length)
-        if np.all(channel == channel[0]):
-            raise ValueError(f"{which} must not be silent: every value is the same")
+    require_heard(name, channels)
     return channels - channels.mean(axis=1, keepdims=True)
 
 

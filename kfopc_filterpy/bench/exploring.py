@@ -324,7 +324,8 @@ def read_setup(
     if len(set(rates.values())) > 1:
         listed = ", ".join(f"{files[kind]} {rate:g} Hz" for kind, rate in rates.items())
         raise ValueError(
-            f"the files must have one sample rate, got {listed}: choose fs, to which all are resampled, for example {min(rates.values()):g}"
+            f"the files must have one sample rate, got {listed}: choose one with the option fs, {min(rates.values()):g} for "
+            "example"
         )
     rate = next(iter(rates.values()))
     if fs is None and rate > MOST_FS:

@@ -20,6 +20,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
     parser.add_argument("--secondary", metavar="FILE", help="impulse response, control signal to error microphone")
     add_number(parser, "--fs", "Hz", help="resample everything to this rate")
+    add_count(parser, "--channel", 0, help="channel of files with several, from 0")
     add_count(parser, "--port", 0, default=5006, help="port; 0 is any free one (default: 5006)")
 
 
@@ -29,7 +30,8 @@ def explore(options: argparse.Namespace) -> int:
 
     setups = list(explore_setups())
     if options.primary and options.secondary:
-        setups.insert(0, read_setup(options.noise, options.primary, options.secondary, fs=options.fs))
+        files = (options.noise, options.primary, options.secondary)
+        setups.insert(0, read_setup(*files, fs=options.fs, channel=options.channel))
     elif options.noise or options.primary or options.secondary:
         raise ValueError(
             "your own files need both --primary and --secondary; without files, the page has built-in paths"

@@ -39,8 +39,12 @@ class Files:
         return _only_channel(self._read(path, is_path=True), path)
 
     def channels(self, path: str) -> np.ndarray:
-        """Return all channels of a recording, (n_channels, n_samples)."""
-        return np.atleast_2d(self._read(path, is_path=False).samples)
+        """Return all channels of a recording, (n_channels, n_samples), none of them silent."""
+        from ..paths.file_checks import require_heard
+
+        channels = np.atleast_2d(self._read(path, is_path=False).samples)
+        require_heard(path, channels)
+        return channels
 
     def noise_paths(self, paths: Sequence[str], option: str, noise: np.ndarray) -> np.ndarray:
         """Return a matrix of paths that are to go with a noise: shorter than it, and not silent."""

@@ -112,8 +112,8 @@ def inspect(options: argparse.Namespace) -> int:
             require_sound(name, matrix)
         if len(primary) != len(paths):
             raise ValueError(
-                f"--primary must lead to the {len(paths)} microphone(s) of {options.path}, got {len(primary)}: choose one "
-                "with --channel"
+                f"--primary must lead to the {len(paths)} microphone(s) of {options.path}, got {len(primary)}: give the paths "
+                "to each of them"
             )
     fs = files.fs
     several = paths.shape[:2] != (1, 1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from itertools import count
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
@@ -63,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
 
     interface = _simulated(options) if options.noise is not None else _sound_card(options)
     limit = 4.0 * options.rated_power**0.5 if options.amplitude_limit is None else options.amplitude_limit
-    show = None if options.quiet else _Screen(sys.stderr)
+    show = None if options.quiet else _screen(sys.stderr)
     try:
         report = run_supervised(
             lambda plant: _controller(plant, options, limit),
@@ -77,8 +79,8 @@ def run(options: argparse.Namespace) -> int:
     except FaultError as fault:
         print(f"{options.prog}: {fault}", file=sys.stderr)
         return FAULT
-    if show is not None:
-        show.end()
+    if show is not None and sys.stderr.isatty():
+        print(file=sys.stderr)  # the line of the levels ends
     print(_summary(report, interface.fs, interface.block))
     return FAULT if report.stopped_by.startswith("fault") else DONE
 
@@ -148,41 +150,31 @@ def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
     from .. import OutputLimiter, kf_pb
 
     several = np.ndim(plant.taps) == 3
-    limiters = [
-        OutputLimiter(options.rated_power, fs=plant.fs, amplitude_limit=limit)
-        for _ in range(plant.taps.shape[1] if several else 1)
-    ]
+    n_loudspeakers = plant.taps.shape[1] if several else 1
+    limiters = [OutputLimiter(options.rated_power, fs=plant.fs, amplitude_limit=limit) for _ in range(n_loudspeakers)]
     return kf_pb(
         options.taps,
         plant.taps,
         rated_power=options.rated_power,
+        n_references=len(np.atleast_2d(plant.references)),
         limiter=limiters if several else limiters[0],
         secondary_path_uncertainty=plant.uncertainty,
         fs=plant.fs,
-        **({"n_references": len(np.atleast_2d(plant.references))} if several else {}),
     )
 
 
-class _Screen:
-    """One line in the terminal that shows the present levels."""
+def _screen(stream: TextIO) -> Callable[[Levels], None]:
+    """Return what shows the present levels: in one line of a terminal, or in a line of a file every five seconds."""
+    calls = count(1)
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self._is_terminal = stream, stream.isatty()
-        self._calls = 0
+    def show(levels: Levels) -> None:
+        if stream.isatty():
+            stream.write(f"\r\x1b[K{describe(levels)}")
+        elif next(calls) % 20 == 0:
+            stream.write(f"{describe(levels)}\n")
+        stream.flush()
 
-    def __call__(self, levels: Levels) -> None:
-        line = describe(levels)
-        self._calls += 1
-        if self._is_terminal:
-            self._stream.write(f"\r\x1b[K{line}")
-        elif self._calls % 20 == 0:  # in a file, a line every five seconds
-            self._stream.write(f"{line}\n")
-        self._stream.flush()
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._is_terminal:
-            self._stream.write("\n")
+    return show
 
 
 def describe(levels: Levels) -> str:

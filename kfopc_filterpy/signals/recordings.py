@@ -298,7 +298,7 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
     require_file(path)
     kind = _SUFFIXES.get(Path(path).suffix.lower()) or _kind_of(path)
     if variable is not None and kind not in _NAMED:
-        raise ValueError(f"{path} is {kind}, which has no named variables: leave out the variable")
+        raise ValueError(f"{path} is {kind}, which has no named variables: leave out the option variable")
     with reading(path, kind):
         content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
     if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):

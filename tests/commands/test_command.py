@@ -27,7 +27,7 @@ def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
         (["verdict", *SCENE], "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6"),
         (["verdict", *SCENE, "--watt", "20"], "need --ohm"),
         (["verdict", *SCENE, "--watt", "20", "--ohm", "8", "--rated-power", "1"], "leave out one of them"),
-        (["verdict", *SCENE, "--watt", "twenty", "--ohm", "8"], "--watt must be a single number W, got 'twenty'"),
+        (["verdict", *SCENE, "--watt", "twenty", "--ohm", "8"], "--watt must be a single number in W, got 'twenty'"),
         (
             ["verdict", *SCENE, "--watt", "-20", "--ohm", "8"],
             "--watt must be greater than 0 W, got -20; see kfopc verdict --help",

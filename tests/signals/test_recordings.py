@@ -119,13 +119,13 @@ def test_a_variable_of_several_is_chosen_by_name(tmp_path):
         read_recording(tmp_path / "x.mat", variable="z")
     np.savez(tmp_path / "x.npz", a=[1.0, 2.0], b=[3.0, 4.0])
     with pytest.raises(
-        ValueError, match=r"x\.npz holds several variables: a \(2,\), b \(2,\); choose one of them as the variable"
+        ValueError, match=r"x\.npz holds several variables: a \(2,\), b \(2,\); choose one with the option variable"
     ):
         read_recording(tmp_path / "x.npz", fs=FS)
     assert read_recording(tmp_path / "x.npz", variable="b", fs=FS).samples.tolist() == [3.0, 4.0]
     write_wav(tmp_path / "x.wav", [1.0, 2.0], FS)
     with pytest.raises(
-        ValueError, match=r"x\.wav is an audio file, which has no named variables: leave out the variable"
+        ValueError, match=r"x\.wav is an audio file, which has no named variables: leave out the option variable"
     ):
         read_recording(tmp_path / "x.wav", variable="b")
 
