@@ -196,7 +196,7 @@ def assess(
         )
     names = [algorithm, *(name for name in others if name != algorithm)]
 
-    plan = Plan(x, d, s, fs, start, limits, settings, memory_s, secondary_path_uncertainty, bar)
+    plan = Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar)
     announce(bar, sum(map(plan.planned_samples, names)), ", ".join(names))
     runs: dict[str, SimulationResult] = {}
     for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
