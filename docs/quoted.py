@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -500,7 +501,7 @@ def _losses(results: Results, path: str) -> list[float]:
     """What each stage loses, from 40 dB down, and what is left, on average over the noises."""
     rows = [[40.0, *row["reduction_db"]] for row in results.extra("loss-map", "rows") if row["path"] == path]
     mean = [sum(stage) / len(rows) for stage in zip(*rows, strict=True)]
-    return [*(before - after for before, after in zip(mean, mean[1:], strict=False)), mean[-1]]
+    return [*(before - after for before, after in pairwise(mean)), mean[-1]]
 
 
 QUOTES: tuple[Quote, ...] = (
