@@ -145,7 +145,7 @@ class VerifiedController(WrappedController):
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} with a verified path"
         self.events: list[PathEvent] = []
         path = self._paths()
-        K, J, M = path.shape
+        J, M = path.shape[1:]
         n_references = getattr(controller, "n_references", 1)
         self._amplifiers = amplifier_functions(amplifier, J)
         uncertainty = getattr(controller, "secondary_path_uncertainty", None)
@@ -198,6 +198,7 @@ class VerifiedController(WrappedController):
         self._p = self._observer.primary_path[..., ::-1].copy()
         self._s = self._paths()[..., ::-1].copy()
         self._noise = float(np.sum(self._observer.measurement_noise))
+        self._known = self._observer.fits > 0
 
     def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
@@ -286,13 +287,17 @@ class VerifiedController(WrappedController):
 
     def _judge(self, error: float, disturbance: float, alone: float) -> None:
         """Compare powers: silence follows at once if the control makes the noise louder."""
-        if not self._observer.fits:
-            return
+        if not self._known:
+            if self.volume > 0.0:  # another path was assigned while it plays
+                return
+            disturbance = error  # in silence
         self._error += self._rate * (error - self._error)
         self._disturbance += self._rate * (disturbance - self._disturbance)
         self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
             self._sums += error, disturbance, 1.0
+        if not self._known:
+            return
         expected = self._disturbance + self._excess
         if self.volume > 0.0 and self._error > (SUSPECT if self._held_for else LOUD) * expected:
             self._stop("louder")
