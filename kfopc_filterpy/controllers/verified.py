@@ -133,7 +133,9 @@ class VerifiedController(WrappedController):
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
         super().__init__(controller)
-        if hasattr(controller, "physical") or not (hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")):
+        if hasattr(controller, "physical") or not (
+            hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
+        ):
             raise TypeError(
                 f"controller must have secondary_path and n_taps, as the built-in ones have, got {controller!r}; "
                 "virtual microphones have other paths than those that are heard"
@@ -165,13 +167,16 @@ class VerifiedController(WrappedController):
         self._withheld = np.zeros((J, M - 1 + self._block))
         self._n = self._samples = 0  # of this block, and of all
         self._awaits_error = False
-        self.volume, self._pause_s = 0.0, FIRST_PAUSE_S
+        self.volume, self._pause_s = 0.0, 0.0
         self._wait = 0  # samples until the volume is next changed
         self._alarms, self._held_for = 0, 0  # alarms so far; samples until the controller may adapt
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
         self._error = self._disturbance = self._alone = 0.0  # powers over AVERAGE_S; `alone`: at full volume
         self._excess = 0.0  # power of noise that is not p * x, found in silence
-        self._sums, self._silent_for = np.zeros(3), 0  # energies and number of samples at this volume; samples of silence
+        self._sums, self._silent_for = (
+            np.zeros(3),
+            0,
+        )  # energies and number of samples at this volume; samples of silence
         self._use_posterior()
 
     def __repr__(self) -> str:
@@ -224,7 +229,8 @@ class VerifiedController(WrappedController):
         if self._awaits_error:
             self._take(None)
         if not np.all(np.abs(own) <= LOUDEST):
-            self._stop("not finite")
+            if self.volume > 0.0 or not self._held_for:
+                self._stop("not finite")
             own = np.zeros(len(self._withheld))
         y = self.volume * own
         self._push(x, y, own - y)
@@ -344,13 +350,16 @@ class VerifiedController(WrappedController):
 
     def _stop(self, what: str) -> None:
         """Be silent, and let a fresh controller adapt in silence, with the path and the limiter in use."""
-        self._note(what)
+        if self.volume > 0.0 or not self.events or self.events[-1].what != what:  # else as before, in the same silence
+            self._note(what)
         before, self.controller = self.controller, deepcopy(self._fresh)
         self.controller.secondary_path = before.secondary_path
         if hasattr(before, "limiter"):
             self.controller.limiter = before.limiter
+        if self.volume > 0.0 or not self._pause_s:
+            self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
-        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self._held_for = max(self._held_for, self._p.shape[-1])  # it has no past: first it hears the references
         self._error = self._alone = self._disturbance + self._excess
         self._sums = np.zeros(3)
 
