@@ -57,7 +57,8 @@ class VerifiedController(WrappedController):
     posterior, an alarm resets the secondary path to the controller's first one with a large uncertainty, and the controller does not adapt for
     0.25 s, in which the path is learned again.
 
-    The posterior also tells how loud the noise would be without control, :math:`p * x`. If the error is 3 dB louder over
+    The posterior also tells how loud the noise would be without control, :math:`p * x`, but with no louder p than when the
+    loudspeakers were last silent. If the error is 3 dB louder over
     0.1 s (0.75 dB after an alarm), the loudspeakers are silent at once, and a fresh copy of the controller takes over. It
     adapts in silence to :math:`e - \hat s * y`, what it would hear at full volume. After half a second, it plays at a
     twentieth of its volume, which is doubled every 0.25 s in which the noise is not 0.75 dB louder. A failure doubles the
@@ -173,10 +174,11 @@ class VerifiedController(WrappedController):
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
         self._error = self._disturbance = self._alone = 0.0  # powers over AVERAGE_S; `alone`: at full volume
         self._excess = 0.0  # power of noise that is not p * x, found in silence
-        self._sums, self._silent_for = (
-            np.zeros(3),
-            0,
-        )  # energies and number of samples at this volume; samples of silence
+        # The primary path as it was when the room was last silent, the share of its power that was heard then, and its
+        # average. What the control does not explain could be taken for a louder primary path, but not in silence.
+        self._quiet_p, self._share, self._quiet = self._observer.primary_path[..., ::-1].copy(), 1.0, 0.0
+        self._sums = np.zeros(4)  # energies and number of samples at this volume
+        self._silent_for = 0  # samples of silence
         self._use_posterior()
 
     def __repr__(self) -> str:
@@ -204,6 +206,8 @@ class VerifiedController(WrappedController):
         self._s = self._paths()[..., ::-1].copy()
         self._noise = float(np.sum(self._observer.measurement_noise))
         self._known = self._observer.fits > 0
+        if self.volume == 0.0 or self._silent_for >= self._s.shape[-1] + self._block:
+            self._quiet_p, self._share = self._p, 1.0
 
     def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
@@ -281,8 +285,9 @@ class VerifiedController(WrappedController):
         if errors is not None and alone is not None:
             self._observer.update(errors)
             newest = self._x[:, self._n : self._n + self._p.shape[-1]]
-            expected = np.einsum("kin,in->k", self._p, newest)
-            self._judge(float(errors @ errors), float(expected @ expected) + self._noise, float(alone @ alone))
+            now, quiet = (np.einsum("kin,in->k", p, newest) for p in (self._p, self._quiet_p))
+            powers = [float(one @ one) for one in (errors, now, quiet, alone)]
+            self._judge(powers[0], powers[1] + self._noise, self._share * (powers[2] + self._noise), powers[3])
         self._n += 1
         self._samples += 1
         self._held_for = max(self._held_for - 1, 0)
@@ -291,20 +296,21 @@ class VerifiedController(WrappedController):
 
     # ---- Decisions
 
-    def _judge(self, error: float, disturbance: float, alone: float) -> None:
+    def _judge(self, error: float, disturbance: float, quiet: float, alone: float) -> None:
         """Compare powers: silence follows at once if the control makes the noise louder."""
         if not self._known:
             if self.volume > 0.0:  # another path was assigned while it plays
                 return
-            disturbance = error  # in silence
+            disturbance = quiet = error  # in silence
         self._error += self._rate * (error - self._error)
         self._disturbance += self._rate * (disturbance - self._disturbance)
+        self._quiet += self._rate * (quiet - self._quiet)
         self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
-            self._sums += error, disturbance, 1.0
+            self._sums += error, disturbance, quiet, 1.0
         if not self._known:
             return
-        expected = self._disturbance + self._excess
+        expected = min(self._disturbance, self._quiet) + self._excess
         if self.volume > 0.0 and self._error > (SUSPECT if self._held_for else LOUD) * expected:
             self._stop("louder")
         elif self.volume < 1.0 and self._alone > UNSTABLE * expected:
@@ -335,13 +341,14 @@ class VerifiedController(WrappedController):
 
     def _turn_up(self) -> None:
         """Play louder, unless the noise has become louder at this volume."""
-        error, disturbance, samples = self._sums
-        self._sums = np.zeros(3)
-        if self.volume > 0.0 and error > SUSPECT * (disturbance + samples * self._excess):
+        error, disturbance, quiet, samples = self._sums
+        self._sums = np.zeros(4)
+        if self.volume > 0.0 and error > SUSPECT * (min(disturbance, quiet) + samples * self._excess):
             self._stop("louder")
             return
         if self.volume == 0.0 and samples:
             self._excess = max(float(error - disturbance) / samples, 0.0)
+            self._share = min(float(error / disturbance), 1.0) if disturbance > 0.0 else 1.0
         started = any(event.what not in ("alarm", "full volume") for event in self.events)
         self.volume = min(max(2.0 * self.volume, LEAST_VOLUME), 1.0) if started else 1.0
         self._wait = round(STEP_S * self.fs)
@@ -361,7 +368,7 @@ class VerifiedController(WrappedController):
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
         self._held_for = max(self._held_for, self._p.shape[-1])  # it has no past: first it hears the references
         self._error = self._alone = self._disturbance + self._excess
-        self._sums = np.zeros(3)
+        self._sums = np.zeros(4)
 
     def _note(self, what: str) -> None:
         self.events.append(PathEvent(self._samples / self.fs, what))
