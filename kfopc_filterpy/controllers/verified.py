@@ -237,7 +237,8 @@ class VerifiedController(WrappedController):
                 self._stop("not finite")
             own = np.zeros(len(self._withheld))
         y = self.volume * own
-        self._push(x, y, own - y)
+        played = self._played(y)
+        self._push(x, played, self._played(own) - played)
         return self._shaped(y)
 
     def update(self, error: Any) -> None:
@@ -254,6 +255,8 @@ class VerifiedController(WrappedController):
     def listen(self, references: Any, errors: Any) -> None:
         """Follow `references` and `errors` before the control is switched on, with silent output."""
         x, e = (np.atleast_2d(as_channels(s, n)) for s, n in ((references, "references"), (errors, "errors")))
+        _require_moderate(x, "references")
+        _require_moderate(e, "errors")
         listening(self.controller).listen(references, errors)
         if self._awaits_error:
             self._take(None)
@@ -265,17 +268,20 @@ class VerifiedController(WrappedController):
     def _channels(self, value: Any, count: int, name: str, what: str) -> np.ndarray:
         """Return a checked sample, of which the observer refuses none."""
         sample = channel_sample(value, count, name, what) if self.multichannel else np.array([as_number(value, name)])
-        if np.any(np.abs(sample) > LOUDEST):
-            raise ValueError(f"{name} is too loud, above {LOUDEST:g}: scale the signals; nothing was changed")
+        _require_moderate(sample, name)
         return sample
 
+    def _played(self, y: np.ndarray) -> np.ndarray:
+        """Return what the amplifiers, as far as they are known, make of the control signals."""
+        if self._amplifiers is None:
+            return y
+        return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
+
     def _push(self, x: np.ndarray, y: np.ndarray, withheld: np.ndarray) -> None:
-        """Take the signals of a sample whose error is still to come."""
+        """Take the signals of a sample whose error is still to come; y and what is withheld of it: after the amplifiers."""
         self._x[:, self._x.shape[1] - self._block + self._n] = x
         self._withheld[:, self._withheld.shape[1] - self._block + self._n] = withheld
         self._silent_for = 0 if y.any() else self._silent_for + 1
-        if self._amplifiers is not None:
-            y = np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
         self._observer.control_signal(np.concatenate((x, y)))
         self._awaits_error = True
 
@@ -375,3 +381,9 @@ class VerifiedController(WrappedController):
 
     def _rates(self) -> dict[str, float | None]:
         return {"verification": self.fs}
+
+
+def _require_moderate(signal: np.ndarray, name: str) -> None:
+    """Raise ValueError for samples that the observer would refuse."""
+    if np.any(np.abs(signal) > LOUDEST):
+        raise ValueError(f"{name} must not be louder than {LOUDEST:g}: scale the signals; nothing was changed")
