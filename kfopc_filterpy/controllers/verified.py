@@ -177,7 +177,7 @@ class VerifiedController(WrappedController):
         # The primary path as it was when the room was last silent, the share of its power that was heard then, and its
         # average. What the control does not explain could be taken for a louder primary path, but not in silence.
         self._quiet_p, self._share, self._quiet = self._observer.primary_path[..., ::-1].copy(), 1.0, 0.0
-        self._sums = np.zeros(4)  # energies and number of samples at this volume
+        self._sums = np.zeros(3)  # energies and number of samples at this volume
         self._silent_for = 0  # samples of silence
         self._use_posterior()
 
@@ -313,7 +313,7 @@ class VerifiedController(WrappedController):
         self._quiet += self._rate * (quiet - self._quiet)
         self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
-            self._sums += error, disturbance, quiet, 1.0
+            self._sums += error, disturbance, 1.0
         if not self._known:
             return
         expected = min(self._disturbance, self._quiet) + self._excess
@@ -347,9 +347,10 @@ class VerifiedController(WrappedController):
 
     def _turn_up(self) -> None:
         """Play louder, unless the noise has become louder at this volume."""
-        error, disturbance, quiet, samples = self._sums
-        self._sums = np.zeros(4)
-        if self.volume > 0.0 and error > SUSPECT * (min(disturbance, quiet) + samples * self._excess):
+        error, disturbance, samples = self._sums
+        self._sums = np.zeros(3)
+        # Not `quiet`: it can only learn the path while it plays, and p may have been learned meanwhile.
+        if self.volume > 0.0 and error > SUSPECT * (disturbance + samples * self._excess):
             self._stop("louder")
             return
         if self.volume == 0.0 and samples:
@@ -374,7 +375,7 @@ class VerifiedController(WrappedController):
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
         self._held_for = max(self._held_for, self._p.shape[-1])  # it has no past: first it hears the references
         self._error = self._alone = self._disturbance + self._excess
-        self._sums = np.zeros(4)
+        self._sums = np.zeros(3)
 
     def _note(self, what: str) -> None:
         self.events.append(PathEvent(self._samples / self.fs, what))
