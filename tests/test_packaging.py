@@ -150,16 +150,20 @@ def test_the_guide_says_what_each_extra_is_for():
 
 
 REMOVED = {
-    "controllers": ("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"),
-    "filters": ("PowerBudgetKalmanFilter",),
-    "power": ("PowerBudget",),
+    ("controllers", "kf_pb"): ("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"),
+    ("controllers", "VerifiedController"): ("PathTracker", "MonitoredController"),
+    ("controllers", "PathEvent"): ("PathChange", "HealthEvent"),
+    ("filters", "kf_pb"): ("PowerBudgetKalmanFilter",),
+    ("power", "kf_pb"): ("PowerBudget",),
 }
 
 
-@pytest.mark.parametrize(("namespace", "name"), [(space, name) for space, names in REMOVED.items() for name in names])
-def test_a_removed_name_says_what_to_use(namespace, name):
+@pytest.mark.parametrize(
+    ("namespace", "instead", "name"), [(*key, name) for key, names in REMOVED.items() for name in names]
+)
+def test_a_removed_name_says_what_to_use(namespace, instead, name):
     module = importlib.import_module(f"kfopc_filterpy.{namespace}")
-    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use kf_pb"):
+    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use {instead}"):
         getattr(module, name)
     assert name not in dir(module)
     with pytest.raises(AttributeError, match="no_such_name"):

@@ -4,12 +4,18 @@ import lazy_loader
 
 from .._removed import naming_removed
 
+VERIFIED = "VerifiedController, which learns the paths while it controls"
+
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 __getattr__ = naming_removed(
     __getattr__,
     __name__,
     {
         "DirectPowerBudget": "kf_pb, which is one form for all channels",
+        "MonitoredController": VERIFIED,
+        "HealthEvent": "PathEvent, of VerifiedController",
+        "PathTracker": VERIFIED,
+        "PathChange": "PathEvent, of VerifiedController",
         "FrequencyDomainKalman": "kf_pb, which is one form for all channels",
         "SharedGainKalman": "kf_pb, which is one form for all channels",
     },

@@ -57,7 +57,8 @@ class VerifiedController(WrappedController):
     posterior, an alarm resets the secondary path to the controller's first one with a large uncertainty, and the controller does not adapt for
     0.25 s, in which the path is learned again.
 
-    The posterior also tells how loud the noise would be without control, :math:`p * x`. If the error is 3 dB louder over
+    The posterior also tells how loud the noise would be without control, :math:`p * x`, but with no louder p than when the
+    loudspeakers were last silent. If the error is 3 dB louder over
     0.1 s (0.75 dB after an alarm), the loudspeakers are silent at once, and a fresh copy of the controller takes over. It
     adapts in silence to :math:`e - \hat s * y`, what it would hear at full volume. After half a second, it plays at a
     twentieth of its volume, which is doubled every 0.25 s in which the noise is not 0.75 dB louder. A failure doubles the
@@ -133,7 +134,9 @@ class VerifiedController(WrappedController):
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
         super().__init__(controller)
-        if hasattr(controller, "physical") or not (hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")):
+        if hasattr(controller, "physical") or not (
+            hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
+        ):
             raise TypeError(
                 f"controller must have secondary_path and n_taps, as the built-in ones have, got {controller!r}; "
                 "virtual microphones have other paths than those that are heard"
@@ -145,7 +148,7 @@ class VerifiedController(WrappedController):
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} with a verified path"
         self.events: list[PathEvent] = []
         path = self._paths()
-        K, J, M = path.shape
+        J, M = path.shape[1:]
         n_references = getattr(controller, "n_references", 1)
         self._amplifiers = amplifier_functions(amplifier, J)
         uncertainty = getattr(controller, "secondary_path_uncertainty", None)
@@ -165,13 +168,17 @@ class VerifiedController(WrappedController):
         self._withheld = np.zeros((J, M - 1 + self._block))
         self._n = self._samples = 0  # of this block, and of all
         self._awaits_error = False
-        self.volume, self._pause_s = 0.0, FIRST_PAUSE_S
+        self.volume, self._pause_s = 0.0, 0.0
         self._wait = 0  # samples until the volume is next changed
         self._alarms, self._held_for = 0, 0  # alarms so far; samples until the controller may adapt
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
         self._error = self._disturbance = self._alone = 0.0  # powers over AVERAGE_S; `alone`: at full volume
         self._excess = 0.0  # power of noise that is not p * x, found in silence
-        self._sums, self._silent_for = np.zeros(3), 0  # energies and number of samples at this volume; samples of silence
+        # The primary path as it was when the room was last silent, the share of its power that was heard then, and its
+        # average. What the control does not explain could be taken for a louder primary path, but not in silence.
+        self._quiet_p, self._share, self._quiet = self._observer.primary_path[..., ::-1].copy(), 1.0, 0.0
+        self._sums = np.zeros(3)  # energies and number of samples at this volume
+        self._silent_for = 0  # samples of silence
         self._use_posterior()
 
     def __repr__(self) -> str:
@@ -198,6 +205,9 @@ class VerifiedController(WrappedController):
         self._p = self._observer.primary_path[..., ::-1].copy()
         self._s = self._paths()[..., ::-1].copy()
         self._noise = float(np.sum(self._observer.measurement_noise))
+        self._known = self._observer.fits > 0
+        if self.volume == 0.0 or self._silent_for >= self._s.shape[-1] + self._block:
+            self._quiet_p, self._share = self._p, 1.0
 
     def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
@@ -223,10 +233,12 @@ class VerifiedController(WrappedController):
         if self._awaits_error:
             self._take(None)
         if not np.all(np.abs(own) <= LOUDEST):
-            self._stop("not finite")
+            if self.volume > 0.0 or not self._held_for:
+                self._stop("not finite")
             own = np.zeros(len(self._withheld))
         y = self.volume * own
-        self._push(x, y, own - y)
+        played = self._played(y)
+        self._push(x, played, self._played(own) - played)
         return self._shaped(y)
 
     def update(self, error: Any) -> None:
@@ -243,6 +255,8 @@ class VerifiedController(WrappedController):
     def listen(self, references: Any, errors: Any) -> None:
         """Follow `references` and `errors` before the control is switched on, with silent output."""
         x, e = (np.atleast_2d(as_channels(s, n)) for s, n in ((references, "references"), (errors, "errors")))
+        _require_moderate(x, "references")
+        _require_moderate(e, "errors")
         listening(self.controller).listen(references, errors)
         if self._awaits_error:
             self._take(None)
@@ -254,17 +268,20 @@ class VerifiedController(WrappedController):
     def _channels(self, value: Any, count: int, name: str, what: str) -> np.ndarray:
         """Return a checked sample, of which the observer refuses none."""
         sample = channel_sample(value, count, name, what) if self.multichannel else np.array([as_number(value, name)])
-        if np.any(np.abs(sample) > LOUDEST):
-            raise ValueError(f"{name} is too loud, above {LOUDEST:g}: scale the signals; nothing was changed")
+        _require_moderate(sample, name)
         return sample
 
+    def _played(self, y: np.ndarray) -> np.ndarray:
+        """Return what the amplifiers, as far as they are known, make of the control signals."""
+        if self._amplifiers is None:
+            return y
+        return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
+
     def _push(self, x: np.ndarray, y: np.ndarray, withheld: np.ndarray) -> None:
-        """Take the signals of a sample whose error is still to come."""
+        """Take the signals of a sample whose error is still to come; y and what is withheld of it: after the amplifiers."""
         self._x[:, self._x.shape[1] - self._block + self._n] = x
         self._withheld[:, self._withheld.shape[1] - self._block + self._n] = withheld
         self._silent_for = 0 if y.any() else self._silent_for + 1
-        if self._amplifiers is not None:
-            y = np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
         self._observer.control_signal(np.concatenate((x, y)))
         self._awaits_error = True
 
@@ -274,8 +291,9 @@ class VerifiedController(WrappedController):
         if errors is not None and alone is not None:
             self._observer.update(errors)
             newest = self._x[:, self._n : self._n + self._p.shape[-1]]
-            expected = np.einsum("kin,in->k", self._p, newest)
-            self._judge(float(errors @ errors), float(expected @ expected) + self._noise, float(alone @ alone))
+            now, quiet = (np.einsum("kin,in->k", p, newest) for p in (self._p, self._quiet_p))
+            powers = [float(one @ one) for one in (errors, now, quiet, alone)]
+            self._judge(powers[0], powers[1] + self._noise, self._share * (powers[2] + self._noise), powers[3])
         self._n += 1
         self._samples += 1
         self._held_for = max(self._held_for - 1, 0)
@@ -284,16 +302,21 @@ class VerifiedController(WrappedController):
 
     # ---- Decisions
 
-    def _judge(self, error: float, disturbance: float, alone: float) -> None:
+    def _judge(self, error: float, disturbance: float, quiet: float, alone: float) -> None:
         """Compare powers: silence follows at once if the control makes the noise louder."""
-        if not self._observer.fits:
-            return
+        if not self._known:
+            if self.volume > 0.0:  # another path was assigned while it plays
+                return
+            disturbance = quiet = error  # in silence
         self._error += self._rate * (error - self._error)
         self._disturbance += self._rate * (disturbance - self._disturbance)
+        self._quiet += self._rate * (quiet - self._quiet)
         self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
             self._sums += error, disturbance, 1.0
-        expected = self._disturbance + self._excess
+        if not self._known:
+            return
+        expected = min(self._disturbance, self._quiet) + self._excess
         if self.volume > 0.0 and self._error > (SUSPECT if self._held_for else LOUD) * expected:
             self._stop("louder")
         elif self.volume < 1.0 and self._alone > UNSTABLE * expected:
@@ -326,11 +349,13 @@ class VerifiedController(WrappedController):
         """Play louder, unless the noise has become louder at this volume."""
         error, disturbance, samples = self._sums
         self._sums = np.zeros(3)
+        # Not `quiet`: it can only learn the path while it plays, and p may have been learned meanwhile.
         if self.volume > 0.0 and error > SUSPECT * (disturbance + samples * self._excess):
             self._stop("louder")
             return
         if self.volume == 0.0 and samples:
             self._excess = max(float(error - disturbance) / samples, 0.0)
+            self._share = min(float(error / disturbance), 1.0) if disturbance > 0.0 else 1.0
         started = any(event.what not in ("alarm", "full volume") for event in self.events)
         self.volume = min(max(2.0 * self.volume, LEAST_VOLUME), 1.0) if started else 1.0
         self._wait = round(STEP_S * self.fs)
@@ -339,13 +364,16 @@ class VerifiedController(WrappedController):
 
     def _stop(self, what: str) -> None:
         """Be silent, and let a fresh controller adapt in silence, with the path and the limiter in use."""
-        self._note(what)
+        if self.volume > 0.0 or not self.events or self.events[-1].what != what:  # else as before, in the same silence
+            self._note(what)
         before, self.controller = self.controller, deepcopy(self._fresh)
         self.controller.secondary_path = before.secondary_path
         if hasattr(before, "limiter"):
             self.controller.limiter = before.limiter
+        if self.volume > 0.0 or not self._pause_s:
+            self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
-        self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
+        self._held_for = max(self._held_for, self._p.shape[-1])  # it has no past: first it hears the references
         self._error = self._alone = self._disturbance + self._excess
         self._sums = np.zeros(3)
 
@@ -354,3 +382,9 @@ class VerifiedController(WrappedController):
 
     def _rates(self) -> dict[str, float | None]:
         return {"verification": self.fs}
+
+
+def _require_moderate(signal: np.ndarray, name: str) -> None:
+    """Raise ValueError for samples that the observer would refuse."""
+    if np.any(np.abs(signal) > LOUDEST):
+        raise ValueError(f"{name} must not be louder than {LOUDEST:g}: scale the signals; nothing was changed")

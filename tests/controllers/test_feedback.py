@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.controllers import short_blocks
+from helpers.controllers import quickly_verified, short_blocks
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MU, N_TAPS, P0, S_HAT, Q, R, S, noises
 
 from kfopc_filterpy import (
@@ -19,7 +19,7 @@ from kfopc_filterpy import (
     kf_opc,
     simulate,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, PathTracker
+from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import fir_path
 
 KALMAN: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
@@ -40,7 +40,7 @@ MAKERS: dict[str, Any] = {
     "KF-ANC": lambda: kf_anc(N_TAPS, S_HAT, **KALMAN),
     "KF-OPC": lambda: kf_opc(N_TAPS, S_HAT, constraint=OutputPowerConstraint(0.3, fs=FS), **KALMAN),
     "KF-PB": lambda: short_blocks(N_TAPS, S_HAT, rated_power=0.3),
-    "path tracker": lambda: PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), rng=1, fs=FS),
+    "verified path": lambda: quickly_verified(FxLMS(N_TAPS, S_HAT, step_size=MU)),
     "limited": lambda: LimitedController(Proportional(), OutputLimiter(0.05, fs=FS, window_s=0.01)),
     "own": Proportional,
 }

@@ -25,7 +25,7 @@ from kfopc_filterpy import (
     noise_reduction_db,
     simulate,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker
+from kfopc_filterpy.controllers import FeedbackNeutralizer, VerifiedController
 from kfopc_filterpy.paths import PathTolerance, fir_path
 
 NEW = np.array([0.0, 0.0, -0.7, 0.2])
@@ -281,17 +281,9 @@ def test_after_a_jump_of_the_plant_the_new_paths_are_as_good_as_a_new_controller
 
 def test_wrappers_pass_a_new_path_on() -> None:
     inner = FxLMS(N_TAPS, S_HAT, step_size=MU)
-    for wrapped in (FeedbackNeutralizer(inner, [0.0, 0.1]), MonitoredController(inner, fs=FS)):
+    for wrapped in (FeedbackNeutralizer(inner, [0.0, 0.1]), VerifiedController(inner, fs=FS)):
         wrapped.secondary_path = NEW
         np.testing.assert_array_equal(inner.secondary_path, NEW)
         np.testing.assert_array_equal(wrapped.secondary_path, NEW)
         wrapped.secondary_path = S_HAT
         np.testing.assert_array_equal(inner.secondary_path, S_HAT)
-
-
-def test_a_tracker_knows_a_path_that_is_assigned() -> None:
-    """It judges other paths against this one."""
-    tracker = PathTracker(FxLMS(N_TAPS, S_HAT, step_size=MU), fs=FS, rng=1)
-    tracker.secondary_path = NEW
-    np.testing.assert_array_equal(tracker.controller.secondary_path, NEW)
-    np.testing.assert_array_equal(tracker._paths, [[NEW]])

@@ -28,7 +28,7 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, RefusedUpdate, VirtualMicrophones
+from kfopc_filterpy.controllers import FeedbackNeutralizer, RefusedUpdate, VerifiedController, VirtualMicrophones
 
 FS = 4000.0
 DELAY = 40  # samples of the longest block
@@ -43,7 +43,7 @@ ONE: dict[str, Any] = {
         12, PATH, rated_power=0.3, fs=FS, limiter=OutputLimiter(0.3, fs=FS, window_s=0.01)
     ),
     "FxLMS": lambda: FxLMS(12, PATH, step_size=1e-3),
-    "monitored": lambda: MonitoredController(FxLMS(12, PATH, step_size=1e-3), fs=FS, window_s=0.02),
+    "verified": lambda: VerifiedController(FxLMS(12, PATH, step_size=1e-3), fs=FS),
     "neutralized": lambda: FeedbackNeutralizer(FxLMS(12, PATH, step_size=1e-3), [0.0, 0.1]),
 }
 SEVERAL: dict[str, Any] = {
@@ -165,7 +165,7 @@ def test_bad_blocks_are_refused_before_anything_changes(name: str) -> None:
     np.testing.assert_array_equal(controller.process(good, good), untouched.process(good, good))
 
 
-@pytest.mark.parametrize("name", ["KF-OPC", "FxLMS", "FxLMS of several channels", "monitored"])
+@pytest.mark.parametrize("name", ["KF-OPC", "FxLMS", "FxLMS of several channels", "verified"])
 def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> None:
     controller = (ONE | SEVERAL)[name]()
     steps = deepcopy(controller)
@@ -174,7 +174,7 @@ def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> 
     e = 0.3 * x
     e[..., 120] = 1e200  # finite, but its square is not
     y = np.zeros_like(x)
-    with pytest.raises(RefusedUpdate, match=r"overflow|finite square|too loud") as caught:
+    with pytest.raises(RefusedUpdate, match=r"overflow|finite square|loud") as caught:
         controller.process(x, e, out=y)
     assert caught.value.sample == 120
     y[..., 121:] = controller.process(x[..., 121:], e[..., 121:])

@@ -23,7 +23,7 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
-from kfopc_filterpy.controllers import MonitoredController
+from kfopc_filterpy.controllers import FeedbackNeutralizer, VerifiedController
 from kfopc_filterpy.paths import PathTolerance, guard_filter, path_uncertainty
 from kfopc_filterpy.signals import tone
 
@@ -226,9 +226,9 @@ def test_what_takes_no_uncertainty_says_what_does() -> None:
         with pytest.raises(ValueError, match="no secondary_path_uncertainty can be assigned to"):
             controller.secondary_path_uncertainty = 0.1
         assert controller.secondary_path_uncertainty == before == (TOLERANCE if "KF-PB" in controller.name else None)
-        monitored = MonitoredController(controller, fs=FS)
+        wrapped = FeedbackNeutralizer(controller, [0.0, 0.1])
         with pytest.raises(ValueError, match="no secondary_path_uncertainty can be assigned to"):
-            monitored.secondary_path_uncertainty = 0.1
+            wrapped.secondary_path_uncertainty = 0.1
     with pytest.raises(ValueError, match="must not be negative"):
         kf_anc(4, TRUE, **settings).secondary_path_uncertainty = -1.0
     guarded, plain = kf_anc(4, TRUE, **settings), kf_anc(4, TRUE, **settings)
@@ -238,10 +238,8 @@ def test_what_takes_no_uncertainty_says_what_does() -> None:
 
 
 def test_an_uncertainty_assigned_to_a_wrapper_reaches_the_controller() -> None:
-    """And the copy that a monitor starts again with."""
-    monitored = MonitoredController(kf_anc(4, TRUE, state_noise=0.0, measurement_noise=0.1), fs=FS)
-    assert monitored.secondary_path_uncertainty is None
-    monitored.secondary_path_uncertainty = 0.1
-    assert monitored.secondary_path_uncertainty == 0.1
-    for inner in (monitored.controller, monitored._fresh):
-        assert inner.secondary_path_uncertainty == 0.1  # type: ignore[attr-defined]
+    verified = VerifiedController(kf_anc(4, TRUE, state_noise=0.0, measurement_noise=0.1), fs=FS)
+    assert verified.secondary_path_uncertainty is None
+    verified.secondary_path_uncertainty = 0.1
+    assert verified.secondary_path_uncertainty == 0.1
+    assert verified.controller.secondary_path_uncertainty == 0.1

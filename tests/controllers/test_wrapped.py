@@ -21,7 +21,7 @@ from kfopc_filterpy import (
     kf_pb,
     simulate,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker
+from kfopc_filterpy.controllers import FeedbackNeutralizer, VerifiedController
 from kfopc_filterpy.paths import PathTolerance
 
 FS = 16000.0
@@ -45,10 +45,9 @@ SEVERAL: dict[str, Any] = {
     "MOV": lambda power: MOVFxLMS(8, PATHS, step_size=1e-4, rated_power=power),
 }
 WRAPPERS: dict[str, Any] = {
-    "monitor": lambda inner: MonitoredController(inner, fs=FS),
-    "tracker": lambda inner: PathTracker(inner, rng=1, fs=FS),
+    "verifier": lambda inner: VerifiedController(inner, fs=FS),
     "neutraliser": lambda inner: FeedbackNeutralizer(inner, [0.0, 0.1]),
-    "monitored tracker": lambda inner: MonitoredController(PathTracker(inner, rng=1, fs=FS), fs=FS),
+    "verified neutraliser": lambda inner: VerifiedController(FeedbackNeutralizer(inner, [0.0, 0.1]), fs=FS),
 }
 
 
@@ -110,7 +109,7 @@ def test_what_is_assigned_to_a_wrapper_reaches_the_controller(name: str) -> None
 
 @pytest.mark.parametrize("setting", ["limiter", "rated_power", "secondary_path", "secondary_path_uncertainty"])
 def test_a_setting_that_the_controller_lacks_is_not_taken(setting: str) -> None:
-    wrapper, own = MonitoredController(Own()), Own()
+    wrapper, own = FeedbackNeutralizer(Own(), [0.0, 0.1]), Own()
     with pytest.raises(AttributeError, match=f"Own has no {setting} that could be assigned"):
         setattr(wrapper, setting, 1.0)
     assert not hasattr(wrapper, setting)
@@ -118,7 +117,7 @@ def test_a_setting_that_the_controller_lacks_is_not_taken(setting: str) -> None:
 
 
 def test_the_limiter_of_a_users_controller_can_be_replaced() -> None:
-    controller = MonitoredController(LimitedController(Own(), OutputLimiter(1.0)))
+    controller = FeedbackNeutralizer(LimitedController(Own(), OutputLimiter(1.0)), [0.0, 0.1])
     controller.limiter = limiter = OutputLimiter(0.5)
     assert controller.controller.limiter is limiter
     with pytest.raises(TypeError, match="limiter must be an OutputLimiter, got 1"):

@@ -36,10 +36,10 @@ from kfopc_filterpy import (
 from kfopc_filterpy.controllers import (
     FeedbackNeutralizer,
     KalmanObserver,
-    MonitoredController,
-    PathTracker,
+    VerifiedController,
     VirtualMicrophones,
-    power_budget,
+    posterior,
+    verified,
 )
 from kfopc_filterpy.paths import PathTolerance
 
@@ -52,7 +52,7 @@ def constraint(**settings: Any) -> OutputPowerConstraint:
 
 def short_blocks(taps: int, path: Any, **settings: Any) -> Any:
     """Return KF-PB with blocks of 16 samples, of which a short run has many, and an averaging time of 20 blocks."""
-    with mock.patch.object(power_budget, "BLOCK_S", 16 / FS):
+    with mock.patch.object(posterior, "BLOCK_S", 16 / FS):
         return kf_pb(taps, path, **{"fs": FS, "averaging_s": 320 / FS} | settings)
 
 
@@ -146,9 +146,12 @@ class OwnFilter(KalmanFilter):
 class OwnController:
     """A user's controller: FxLMS with a path that only delays, in the arrays that a user would take."""
 
+    n_taps = 6
+
     def __init__(self) -> None:
         self.weights, self.x = np.zeros(6), [0.0] * 8
         self.count, self.emissions = 0, []
+        self.secondary_path = np.array([0.0, 1.0])
 
     def control_signal(self, reference: float) -> float:
         self.x = [reference, *self.x[:-1]]
@@ -202,12 +205,10 @@ def _observer() -> KalmanObserver:
     return KalmanObserver(model, n_physical=2, sensor_noise_std=0.1)
 
 
-def _monitored(controller: Any, **settings: Any) -> MonitoredController:
-    return MonitoredController(controller, **{"fs": FS, "window_s": 0.005, "pause_s": 0.01} | settings)
-
-
-def _tracked(controller: Any, **settings: Any) -> PathTracker:
-    return PathTracker(controller, **{"rng": 7, "fs": FS, "memory_s": 0.2, "check_s": 0.02, "p_value": 0.3} | settings)
+def quickly_verified(controller: Any, **settings: Any) -> VerifiedController:
+    """Return a controller with blocks of 16 samples and a short average, so that a short run has many."""
+    with mock.patch.object(posterior, "BLOCK_S", 16 / FS), mock.patch.object(verified, "AVERAGE_S", 0.005):
+        return VerifiedController(controller, **{"fs": FS, "memory_s": 0.2} | settings)
 
 
 AROUND: dict[str, Any] = {
@@ -222,16 +223,13 @@ AROUND: dict[str, Any] = {
     "guarded FxLMS, many": lambda: _guarded(FxLMS(L, PATHS, step_size=MU, **MANY)),
     "guarded KF-ANC, many": lambda: _guarded(kf_anc(L, PATHS, **KALMAN, **MANY)),
     "LimitedController": lambda: LimitedController(OwnController(), OutputLimiter(0.02, fs=FS, window_s=0.01)),
-    "MonitoredController": lambda: _monitored(MAKERS["KF-PB"]()),
-    "MonitoredController, wrong path": lambda: _monitored(kf_anc(N_TAPS, -S_HAT, **KALMAN)),
-    "MonitoredController, many": lambda: _monitored(SEVERAL["kf_pb"]()),
-    "MonitoredController, a user's": lambda: _monitored(OwnController()),
-    "PathTracker": lambda: _tracked(FxLMS(N_TAPS, -S_HAT, step_size=MU)),
-    "PathTracker, KF-OPC": lambda: _tracked(MAKERS["KF-OPC"](), rng=np.random.Generator(np.random.MT19937(3))),
-    "PathTracker, amplifier": lambda: _tracked(MAKERS["KF-PB"](), amplifier=HardClipAmplifier(0.7)),
-    "PathTracker, a user's amplifier": lambda: _tracked(MAKERS["KF-ANC"](), amplifier=own_amplifier),
-    "PathTracker, many": lambda: _tracked(SEVERAL["FxLMS"]()),
-    "FeedbackNeutralizer": lambda: FeedbackNeutralizer(_tracked(MAKERS["FxLMS"]()), [0.0, 0.1, 0.05]),
+    "VerifiedController": lambda: quickly_verified(FxLMS(N_TAPS, -S_HAT, step_size=MU)),
+    "VerifiedController, wrong path": lambda: quickly_verified(kf_anc(N_TAPS, -S_HAT, **KALMAN)),
+    "VerifiedController, amplifier": lambda: quickly_verified(MAKERS["KF-OPC"](), amplifier=HardClipAmplifier(0.7)),
+    "VerifiedController, a user's amplifier": lambda: quickly_verified(MAKERS["KF-ANC"](), amplifier=own_amplifier),
+    "VerifiedController, a user's": lambda: quickly_verified(OwnController()),
+    "VerifiedController, many": lambda: quickly_verified(SEVERAL["FxLMS"]()),
+    "FeedbackNeutralizer": lambda: FeedbackNeutralizer(quickly_verified(MAKERS["FxLMS"]()), [0.0, 0.1, 0.05]),
     "FeedbackNeutralizer, many": lambda: FeedbackNeutralizer(
         SEVERAL["kf_anc"](), random_paths(I, J, 3, seed=4), amplifier=HardClipAmplifier(0.7)
     ),

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
-from kfopc_filterpy.controllers import MonitoredController
+from kfopc_filterpy.controllers import VerifiedController
 from kfopc_filterpy.realtime import SimulatedInterface, Supervisor
 
 FS = 8000.0
@@ -36,7 +36,7 @@ MAKERS: dict[str, Any] = {
         initial_variance=1e-2,
     ),
     "FxLMS of several channels": lambda: FxLMS(16, PATHS, step_size=3e-4),
-    "monitored": lambda: MonitoredController(FxLMS(24, PATH, step_size=1e-3), fs=FS, window_s=0.1),
+    "verified": lambda: VerifiedController(FxLMS(24, PATH, step_size=1e-3), fs=FS),
 }
 
 
@@ -111,7 +111,9 @@ BAD: dict[str, Any] = {
     log_length=st.floats(0.0, 5.0),
     action=st.sampled_from(["mute", "reset", "freeze"]),
 )
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == "verified" else []) for name in MAKERS]
+)
 def test_whatever_comes_in_what_goes_out_is_finite_and_within_the_limit(
     name: str, fault: str, where: str, begin: int, log_length: float, action: str
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 from helpers.checkpoints import assert_same_contents
 
 from kfopc_filterpy import FxLMS
-from kfopc_filterpy.controllers import MonitoredController
+from kfopc_filterpy.controllers import VerifiedController
 from kfopc_filterpy.realtime import Supervisor
 
 FS, BLOCK, BLOCKS = 8000.0, 32, 60
@@ -39,7 +39,7 @@ class OwnController:
 MAKERS: dict[str, Any] = {
     "one channel": lambda: FxLMS(8, PATH, step_size=1e-3),
     "two of each": lambda: FxLMS(8, PATHS, step_size=3e-4, n_references=2),
-    "monitored": lambda: MonitoredController(FxLMS(8, PATH, step_size=1e-3), fs=FS, window_s=0.02, pause_s=0.02),
+    "verified": lambda: VerifiedController(FxLMS(8, PATH, step_size=1e-3), fs=FS),
     "own": OwnController,
 }
 
@@ -83,7 +83,7 @@ def run(supervisor: Supervisor, begin: int, end: int) -> np.ndarray:
         ("one channel", "reset"),
         ("one channel", "freeze"),
         ("two of each", "mute"),
-        ("monitored", ""),
+        ("verified", ""),
         ("own", ""),
     ],
 )
