@@ -143,6 +143,12 @@ def test_readme_states_the_command_on_a_line_of_its_own(command):
     assert command in [line.strip() for line in read("README.md").splitlines()]
 
 
+def test_the_guide_says_what_each_extra_is_for():
+    section = read("docs/guide.md").split("\n## Install\n")[1].split("\n## ")[0]
+    named = [name for row in re.findall(r"^\| (`.*?) \|", section, flags=re.M) for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(named) == sorted(tomllib.loads(read("pyproject.toml"))["project"]["optional-dependencies"])
+
+
 REMOVED = {
     "controllers": ("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"),
     "filters": ("PowerBudgetKalmanFilter",),
