@@ -286,9 +286,10 @@ class VerifiedController(WrappedController):
 
     def _judge(self, error: float, disturbance: float, alone: float) -> None:
         """Compare powers: silence follows at once if the control makes the noise louder."""
-        if not self._observer.fits:
-            return
         self._error += self._rate * (error - self._error)
+        if not self._observer.fits:  # silence so far: what is heard is the disturbance
+            self._disturbance = self._alone = self._error
+            return
         self._disturbance += self._rate * (disturbance - self._disturbance)
         self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
@@ -348,6 +349,7 @@ class VerifiedController(WrappedController):
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self._error = self._alone = self._disturbance + self._excess
         self._sums = np.zeros(3)
+        self._held_for = max(self._held_for, self._p.shape[-1])  # until it has heard the references, and the room is silent
 
     def _note(self, what: str) -> None:
         self.events.append(PathEvent(self._samples / self.fs, what))
