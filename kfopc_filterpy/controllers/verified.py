@@ -291,8 +291,8 @@ class VerifiedController(WrappedController):
             self._disturbance = self._alone = self._error
             return
         self._disturbance += self._rate * (disturbance - self._disturbance)
-        self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
+            self._alone += self._rate * (alone - self._alone)
             self._sums += error, disturbance, 1.0
         expected = self._disturbance + self._excess
         if self.volume > 0.0 and self._error > (SUSPECT if self._held_for else LOUD) * expected:
