@@ -98,7 +98,7 @@ class Checkpointed:
             Name of the file.
         trusted : iterable of classes and functions, optional
             Your own classes and functions that are part of the object, such as the class of a controller in a
-            `MonitoredController`, or an amplifier. The class on which `load` is called is trusted anyway. Objects of
+            `VerifiedController`, or an amplifier. The class on which `load` is called is trusted anyway. Objects of
             your classes get their attributes; neither ``__new__`` nor ``__init__`` is called, and no setter.
 
         Returns

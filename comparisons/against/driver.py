@@ -48,7 +48,7 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
-from kfopc_filterpy.controllers import FeedbackNeutralizer, MonitoredController, PathTracker, VirtualMicrophones
+from kfopc_filterpy.controllers import FeedbackNeutralizer, VirtualMicrophones
 from kfopc_filterpy.paths import PathTolerance
 from kfopc_filterpy.signals import (
     DataUnavailableError,
@@ -283,12 +283,6 @@ AROUND: dict[str, Make] = {
     "filterpy's filter": lambda s: KalmanController(set_up(KalmanFilter(s.n_taps, 1)), s.estimate),
     "KFOPC": lambda s: KalmanController(set_up(KFOPC(s.n_taps, constraint=rated())), s.estimate),
     "LimitedController": lambda s: LimitedController(OwnController(s), limiter()),
-    "MonitoredController": lambda s: MonitoredController(
-        FxLMS(s.n_taps, -s.estimate, step_size=0.02 / s.n_taps), fs=FS, window_s=0.01, pause_s=0.02
-    ),
-    "PathTracker": lambda s: PathTracker(
-        SINGLE["KF-OPC"](s), rng=7, fs=FS, memory_s=0.4, check_s=0.05, p_value=0.3, amplifier=HARD
-    ),
     "FeedbackNeutralizer": lambda s: FeedbackNeutralizer(SINGLE["FxLMS"](s), [0.0, 0.1, 0.05]),
 }
 
@@ -321,7 +315,6 @@ SEVERAL: dict[str, Make] = {
     "clipping FxLMS": lambda s: made(ClippingFxLMS, s, **PEAK),
 }
 AROUND_SEVERAL: dict[str, Make] = {
-    "MonitoredController": lambda s: MonitoredController(SEVERAL["KF-OPC"](s), fs=FS, window_s=0.01),
     "FeedbackNeutralizer": lambda s: FeedbackNeutralizer(
         SEVERAL["KF-ANC"](s), 0.1 * decaying(s.n_references, 2, 6, 6, 1), amplifier=HARD
     ),

@@ -10,6 +10,8 @@ __getattr__ = naming_removed(
     __name__,
     {
         "DirectPowerBudget": "kf_pb, which is one form for all channels",
+        **dict.fromkeys(("MonitoredController", "PathTracker"), "VerifiedController"),
+        **dict.fromkeys(("HealthEvent", "PathChange"), "PathEvent, in the events of a VerifiedController"),
         "FrequencyDomainKalman": "kf_pb, which is one form for all channels",
         "SharedGainKalman": "kf_pb, which is one form for all channels",
     },

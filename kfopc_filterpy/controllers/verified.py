@@ -35,9 +35,10 @@ class PathEvent:
     time_s : float
         Time since the first sample, in s.
     what : str
-        "alarm": the errors contradict the secondary path, which is learned anew; "louder": the noise is louder than it
-        would be without control; "unstable": the adaptation diverges although the path is right; "not finite": the control signal
-        is NaN or Inf; "full volume": the control signal is no longer turned down.
+        "alarm": the errors contradict the secondary path, which is learned anew; "full volume": the control signal is
+        no longer turned down. The others stop the control. "louder": the noise is louder than it would be without
+        control; "unstable": the adaptation diverges while the control signal is turned down; "not finite": the control
+        signal is NaN, Inf or above 1e50.
     """
 
     time_s: float
@@ -52,29 +53,33 @@ class VerifiedController(WrappedController):
 
     .. math:: e = p * x - s * y + \text{noise}
 
-    There is no probe: the control signal itself tells what the path is, as long as the primary path is the one that was
-    learned. The controller gets the posterior's secondary path, and keeps its weights. If the errors contradict the
-    posterior, an alarm resets the secondary path to the controller's first one with a large uncertainty, and the controller does not adapt for
-    0.25 s, in which the path is learned again.
+    There is no probe: the control signal itself tells what the secondary path is, as long as the primary path stays. A
+    primary path that drifts can be taken for a secondary path that changes.
 
-    The posterior also tells how loud the noise would be without control, :math:`p * x`. If the error is 3 dB louder over
-    0.1 s (0.75 dB after an alarm), the loudspeakers are silent at once, and a fresh copy of the controller takes over. It
-    adapts in silence to :math:`e - \hat s * y`, what it would hear at full volume. After half a second, it plays at a
-    twentieth of its volume, which is doubled every 0.25 s in which the noise is not 0.75 dB louder. A failure doubles the
-    pause before the next start, up to 32 s. What silence shows to be louder than :math:`p * x`, a noise that no reference hears, is
-    expected from then on, and forgotten within the memory.
+    The controller gets the posterior's secondary path, and keeps its weights. If the errors contradict the posterior, this
+    is an alarm. The secondary path returns to the first one, now with a large uncertainty, and is learned again. The
+    controller does not adapt for 0.25 s.
+
+    The posterior also tells how loud the noise would be without control, :math:`p * x`. If the error is 3 dB louder in the
+    mean over 0.1 s (0.75 dB after an alarm), the loudspeakers are silent at once, and a fresh copy of the controller takes
+    over. It adapts in silence to :math:`e - \hat s * y`, what it would hear at full volume. After half a second, it plays
+    at a twentieth of its volume. The volume is doubled every 0.25 s, unless the noise is 0.75 dB louder than without
+    control. Each failure doubles the pause before the next start, up to 32 s.
+
+    A noise that no reference hears makes the error louder than :math:`p * x`. While the loudspeakers are silent, the power
+    of this noise is measured. From then on it is expected too, and it is forgotten within the memory.
 
     The loudspeakers are silent until there is a first posterior. `listen` gives it before the control is switched on.
 
     Parameters
     ----------
     controller : Controller
-        Any controller with `secondary_path`, which can be assigned, and `n_taps`, as the built-in ones have. It must be
-        possible to copy it, and it has not processed a sample yet. `kf_pb` verifies its path itself.
+        Any controller with `n_taps` and a `secondary_path` that can be assigned, as the built-in ones have. It is copied,
+        so it must not have processed a sample yet. `kf_pb` is refused: it verifies its path itself.
     fs : float, default 16000
         Sample rate in Hz.
     memory_s : float, default 20
-        Memory of the posterior in s. A shorter one follows a path that drifts faster, and knows less of one that stays.
+        Memory of the posterior in s. A shorter one forgets an old path sooner, and knows a path that stays less exactly.
     amplifier : callable or sequence of J of them, optional
         Known amplifiers, functions of a sample, as for the controller.
 
@@ -98,14 +103,15 @@ class VerifiedController(WrappedController):
 
     Notes
     -----
-    The path is believed to the controller's `secondary_path_uncertainty`, or to 0.3 of its rms if that is not set. The
-    estimate has as many taps as the controller's, so make that with a path that is filled with zeros to the length of the
-    longest path that may occur.
+    At the start, the estimated path may be wrong by the controller's `secondary_path_uncertainty`, or by 0.3 of its rms if
+    that is not set. What is learned has as many taps as the controller's path. So make the controller with a path that is
+    filled with zeros to the length of the longest path that may occur.
 
-    A new start keeps the limiter, and the uncertainty and the rated power that were assigned; what was changed inside the
+    A new start keeps the limiter, and the uncertainty and the rated power that were assigned. What was changed inside the
     controller is lost.
 
-    `simulate` calls it from Python sample by sample. The posterior is the core's: see `controllers.PowerBudgetController`.
+    `simulate` calls it from Python sample by sample. The core computes the posterior, as for
+    `controllers.PowerBudgetController`.
 
     Examples
     --------

@@ -110,7 +110,7 @@ class Supervisor(Checkpointed):
     `save` and `load` include the controller, its copies, the fades and pauses under way, and the health record. Call
     `save` between two blocks.
 
-    It cannot see that the noise becomes louder in the room: put the controller into a `MonitoredController` for that, for
+    It cannot see that the noise becomes louder in the room: put the controller into a `VerifiedController` for that, for
     example for a microphone or a loudspeaker whose sign was flipped.
 
     Examples
