@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -456,6 +457,53 @@ def _further() -> Iterator[Quote]:
     )
 
 
+def _kf_pb() -> Iterator[Quote]:
+    """The tables of the page on KF-PB."""
+
+    def quote(study: str, words: str, numbers: Callable[[Results], Sequence[float]]) -> Quote:
+        return Quote("kf_pb.md", words, (study,), numbers, f"python -m comparisons {study.replace('-', '_')}")
+
+    for kind in ("steady and recorded", "jumps, bursts, mixes"):
+        yield quote(
+            "kf-pb",
+            f"| {kind} | {{:.0f}} | {{:.3f}} at most | {{:.2f}}, {{:.2f}} dB | {{:.0f}} % | {{:.2f}}, {{:.2f}} dB; {{:.0f}} % below "
+            "-0.5 dB | {:.1f} dB |",
+            lambda r, kind=kind: _class_line(r, kind),
+        )
+    for fault in ("two samples late", "two samples early", "3 dB louder", "3 dB softer", "polarity", "another phase"):
+        for begins, words in (("start", "the start"), ("jump", "a jump")):
+            yield quote(
+                "kf-pb",
+                f"| {fault} | {words} | {{:.1f}} dB | {{:.2f}}, {{:.2f}} dB | {{:.0f}} to {{:.0f}} |",
+                lambda r, fault=fault, begins=begins: _fault_line(r, fault, begins),
+            )
+    for path in ("band-pass", "duct", "measured duct", "measured room"):
+        yield quote("loss-map", f"| {path} |" + 7 * " {:.1f} |", lambda r, path=path: _losses(r, path))
+
+
+def _class_line(results: Results, kind: str) -> list[float]:
+    rows = [row for row in results.extra("kf-pb", "rows") if row["kind"] == kind]
+    bound, mov = ([row["noise_reduction_db"] - row[of] for row in rows] for of in ("bound_db", "mov_db"))
+    shares = [100.0 * sum(test) / len(rows) for test in ([b >= -1.0 for b in bound], [m < -0.5 for m in mov])]
+    means = [sum(values) / len(rows) for values in (bound, mov, [row["first_second_db"] for row in rows])]
+    most = max(row["power"] for row in rows)
+    return [len(rows), most, means[0], min(bound), shares[0], means[1], min(mov), shares[1], means[2]]
+
+
+def _fault_line(results: Results, fault: str, begins: str) -> list[float]:
+    rows = [row for row in results.extra("kf-pb", "faults") if (row["fault"], row["begins"]) == (fault, begins)]
+    lost, alarms = [row["lost_db"] for row in rows], [row["alarms"] for row in rows]
+    worst = min(row["worst_second_db"] for row in rows)
+    return [worst, sum(lost) / len(rows), max(lost), min(alarms), max(alarms)]
+
+
+def _losses(results: Results, path: str) -> list[float]:
+    """What each stage loses, from 40 dB down, and what is left, on average over the noises."""
+    rows = [[40.0, *row["reduction_db"]] for row in results.extra("loss-map", "rows") if row["path"] == path]
+    mean = [sum(stage) / len(rows) for stage in zip(*rows, strict=True)]
+    return [*(before - after for before, after in pairwise(mean)), mean[-1]]
+
+
 QUOTES: tuple[Quote, ...] = (
     *_tonal(),
     *_broadband(),
@@ -464,6 +512,7 @@ QUOTES: tuple[Quote, ...] = (
     *_power_range(),
     *_algorithms(),
     *_further(),
+    *_kf_pb(),
 )
 
 

@@ -83,7 +83,7 @@ def as_number(value: Any, name: str, *, unit: str = "") -> float:
     """Return `value` as a finite float."""
     if type(value) is float and math.isfinite(value):  # fast path: called for every sample
         return value
-    unit = f" {unit}" if unit else ""
+    unit = f" in {unit}" if unit else ""
     if isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}")
     try:
@@ -167,8 +167,8 @@ def as_rate_ratio(fs: float, new_fs: float) -> tuple[int, int]:
     ratio = Fraction(new_fs / fs).limit_denominator(_LARGEST_DENOMINATOR)
     if not ratio or abs(fs * ratio - new_fs) > 1e-12 * new_fs:  # an irrational ratio comes within 2e-10
         raise ValueError(
-            f"fs and new_fs must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and "
-            f"{new_fs:g} Hz; round the rates to whole Hz"
+            f"sample rates must be in a ratio of whole numbers up to {_LARGEST_DENOMINATOR}, got {fs:g} and {new_fs:g} Hz; "
+            "round them to whole Hz"
         )
     return ratio.numerator, ratio.denominator
 

@@ -308,7 +308,7 @@ FORGED: dict[str, tuple[bytes, str]] = {
         "names kfopc_filterpy.core.library.Path",
     ),
     "a function of the package": (called("kfopc_filterpy.core.own:load_algorithm", text("a.c")), "none of"),
-    "the command line": (called("kfopc_filterpy.cli:main"), "names kfopc_filterpy.cli.main"),
+    "the command line": (called("kfopc_filterpy.commands:main"), "names kfopc_filterpy.commands.main"),
     "a module that is not there": (called("kfopc_filterpy.power.nothing:A"), "ModuleNotFoundError"),
     "a folder above": (called("kfopc_filterpy.power.:os"), "names "),
     "a constructor": (called(f"{CLASS}:OutputLimiter", text("1")), "OutputLimiter has other fields"),

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kfopc_filterpy import KFOPC, FxLMS, OutputPowerConstraint, cli, kf_opc
+from kfopc_filterpy import KFOPC, FxLMS, OutputPowerConstraint, kf_opc
+from kfopc_filterpy.commands import main
 from kfopc_filterpy.controllers import RefusedUpdate
 from kfopc_filterpy.realtime import Supervisor
 from kfopc_filterpy.signals import write_wav
@@ -290,7 +291,7 @@ def test_a_wrong_command_is_told_in_one_line(
                 continue  # a whole run takes longer than all the wrong ones
             arguments[place : place + int(rng.integers(0, 2))] = [word]
         try:
-            code = cli.main(arguments)
+            code = main(arguments)
         except SystemExit as end:
             code = end.code
         err = capsys.readouterr().err

@@ -33,7 +33,6 @@ class Plan:
     start: int
     limits: Limits
     settings: SuggestedSettings
-    memory_s: float
     uncertainty: Any
     bar: Any
     lock: Any = field(default_factory=threading.Lock)

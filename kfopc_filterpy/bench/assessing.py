@@ -33,6 +33,7 @@ from kfopc_filterpy.metrics import (
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
+from kfopc_filterpy.paths.file_checks import require_heard, require_sound
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
@@ -195,7 +196,7 @@ def assess(
         )
     names = [algorithm, *(name for name in others if name != algorithm)]
 
-    plan = Plan(x, d, s, fs, start, limits, settings, memory_s, secondary_path_uncertainty, bar)
+    plan = Plan(x, d, s, fs, start, limits, settings, secondary_path_uncertainty, bar)
     announce(bar, sum(map(plan.planned_samples, names)), ", ".join(names))
     runs: dict[str, SimulationResult] = {}
     for name, outcome in zip(names, Runs().map(lambda name: plan.outcome(name, name == algorithm), names), strict=True):
@@ -267,11 +268,7 @@ def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any,
     x = _recording(noise, "noise")
     s, _ = secondary_paths(secondary, fs=fs, name="secondary")
     K, J, _ = s.shape
-    for k in np.flatnonzero(~np.any(s, axis=(1, 2))):
-        which, mend = "secondary", "record it again"
-        if K > 1:
-            which, mend = f"secondary[{k}]", "leave out a microphone that is not reached"
-        raise ValueError(f"{which} must not be silent: every value is 0; {mend}")
+    require_sound("secondary", s)
     if disturbance is not None:
         d = _recording(disturbance, "disturbance", length=x.shape[1])
         if len(d) != K:
@@ -299,8 +296,7 @@ def _recording(value: Any, name: str, length: int | None = None) -> np.ndarray:
     for number, channel in enumerate(channels):
         which = name if len(channels) == 1 else f"{name}[{number}]"
         as_signal(channel, which, length=length)
-        if np.all(channel == channel[0]):
-            raise ValueError(f"{which} must not be silent: every value is the same")
+    require_heard(name, channels)
     return channels - channels.mean(axis=1, keepdims=True)
 
 

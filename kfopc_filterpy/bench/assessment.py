@@ -360,8 +360,8 @@ _REASONS = {
 }
 
 
-def advice_on(verdict: Assessment) -> list[str]:
-    """Return what to change, in sentences."""
+def advice_on(verdict: Assessment, *, fs: str = "fs=", n_taps: str = "n_taps=") -> list[str]:
+    """Return what to change, in sentences; `fs` and `n_taps` are what the caller writes before these settings."""
     want = f"{verdict.want_db:g} dB"
     needed = verdict.expected_rated_power
     if verdict.enough:
@@ -384,7 +384,7 @@ def advice_on(verdict: Assessment) -> list[str]:
             "electronics."
         ]
     if verdict.limited_by == "filter":
-        return _advice_on_length(verdict)
+        return _advice_on_length(verdict, fs, n_taps)
     if verdict.limited_by == "adaptation":
         return ["Try a longer record: the controller may not have settled."]
     advice = [
@@ -404,21 +404,21 @@ def advice_on(verdict: Assessment) -> list[str]:
     return advice
 
 
-def _advice_on_length(verdict: Assessment) -> list[str]:
+def _advice_on_length(verdict: Assessment, fs: str, n_taps: str) -> list[str]:
     """Return what to change about a filter that is too short, or seems to be."""
-    taps, fs, needed_s = verdict.settings.n_taps, verdict.fs, verdict.response_s
-    lasts = f"{taps} taps last {1e3 * taps / fs:.2g} ms"
-    if needed_s is None or needed_s * fs <= taps:
+    taps, rate, needed_s = verdict.settings.n_taps, verdict.fs, verdict.response_s
+    lasts = f"{taps} taps last {1e3 * taps / rate:.2g} ms"
+    if needed_s is None or needed_s * rate <= taps:
         return [
-            f"Try a filter longer than {taps} taps: {lasts} at {fs:g} Hz, more at a lower sample rate. If that gains "
+            f"Try a filter longer than {taps} taps: {lasts} at {rate:g} Hz, more at a lower sample rate. If that gains "
             "nothing, the loudspeaker does not reach what is left of the noise, or it needs to be closer to the "
             "microphone."
         ]
-    enough = 2 ** math.ceil(math.log2(ROOM_FOR_RESPONSE * needed_s * fs))
+    enough = 2 ** math.ceil(math.log2(ROOM_FOR_RESPONSE * needed_s * rate))
     slower = _slower_rate(verdict, needed_s)
-    mends = [] if slower is None else [f"resample everything with fs={slower:g}"]
+    mends = [] if slower is None else [f"resample everything with {fs}{slower:g}"]
     if enough <= MOST_TAPS:
-        mends.append(f"take a longer filter with n_taps={enough}")
+        mends.append(f"take a longer filter with {n_taps}{enough}")
     if not mends:
         mends.append(
             "move the reference microphone towards the error microphone, or give a primary path that ends sooner"

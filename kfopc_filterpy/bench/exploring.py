@@ -323,7 +323,10 @@ def read_setup(
     rates = {kind: recording.fs for kind, recording in read.items()}
     if len(set(rates.values())) > 1:
         listed = ", ".join(f"{files[kind]} {rate:g} Hz" for kind, rate in rates.items())
-        raise ValueError(f"the files must have one sample rate, got {listed}: pass fs={min(rates.values()):g}")
+        raise ValueError(
+            f"the files must have one sample rate, got {listed}: choose one with the option fs, {min(rates.values()):g} for "
+            "example"
+        )
     rate = next(iter(rates.values()))
     if fs is None and rate > MOST_FS:
         return read_setup(noise, primary, secondary, fs=MOST_FS, channel=channel, name=name)

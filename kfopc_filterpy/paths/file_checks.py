@@ -31,7 +31,18 @@ def require_same_length(disturbance: str, n_samples: int, noise: str, expected: 
         )
 
 
-def require_sound(path: str, taps: np.ndarray) -> None:
-    """Raise ValueError if an impulse response, or a matrix of them, is silent."""
-    if not np.any(taps):
-        raise ValueError(f"{path} is silent, every value is 0: record it again")
+def require_heard(name: str, channels: np.ndarray) -> None:
+    """Raise ValueError if a channel of a recording, (n_channels, n_samples), is constant."""
+    for number, channel in enumerate(channels):
+        if np.all(channel == channel[0]):
+            which = name if len(channels) == 1 else f"{name}[{number}]"
+            raise ValueError(f"{which} must not be silent: every value is the same")
+
+
+def require_sound(name: str, paths: np.ndarray) -> None:
+    """Raise ValueError if paths, (microphones, sources, taps), leave a microphone silent."""
+    for k in np.flatnonzero(~np.any(paths, axis=(1, 2))):
+        which, mend = name, "record it again"
+        if len(paths) > 1:
+            which, mend = f"{name}[{k}]", "leave out a microphone that is not reached"
+        raise ValueError(f"{which} must not be silent: every value is 0; {mend}")

@@ -48,6 +48,17 @@ LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several loudspeakers, whose errors c
 WIDEST_GAIN_DB = 20.0  # of a tolerance; with more, even the least share could make the noise much louder
 
 
+def as_gain_error(value: Any, name: str) -> float:
+    """Return the largest error of a path's gain in dB, checked."""
+    gain_db = as_nonnegative(value, name)
+    if gain_db > WIDEST_GAIN_DB:
+        raise ValueError(
+            f"{name} must be at most {WIDEST_GAIN_DB:g}, got {gain_db:g}: a path that is known no better allows no "
+            "control, measure it"
+        )
+    return gain_db
+
+
 @dataclass(frozen=True)
 class PathTolerance:
     """Tolerances of an estimated secondary path; they add up.
@@ -83,13 +94,12 @@ class PathTolerance:
     gain_db: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("delay_samples", "phase_deg", "gain_db"):
-            object.__setattr__(self, name, as_nonnegative(getattr(self, name), name))
-        if self.gain_db > WIDEST_GAIN_DB:
-            raise ValueError(
-                f"gain_db must be at most {WIDEST_GAIN_DB:g}, got {self.gain_db:g}: a path that is known no better allows "
-                "no control, measure it"
-            )
+        for name, check in (
+            ("delay_samples", as_nonnegative),
+            ("phase_deg", as_nonnegative),
+            ("gain_db", as_gain_error),
+        ):
+            object.__setattr__(self, name, check(getattr(self, name), name))
 
     def relative_error(self, omega: np.ndarray) -> np.ndarray:
         """Return the largest ``|S/S^ - 1|`` within the tolerances, at frequencies `omega` in radians per sample."""

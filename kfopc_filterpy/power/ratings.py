@@ -225,7 +225,7 @@ class LoudspeakerRating:
     _curve: tuple[np.ndarray, np.ndarray] | None = field(init=False, repr=False, compare=False, default=None)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ohm", float(np.min(_curve(self.ohm, "ohm", "ohm")[1])))
+        object.__setattr__(self, "ohm", float(np.min(as_curve(self.ohm, "ohm", "ohm")[1])))
         for name, unit in (
             ("noise_watt", "W"),
             ("sine_watt", "W"),
@@ -249,7 +249,7 @@ class LoudspeakerRating:
                 "a volt moves the cone"
             )
         if self.displacement_mm_per_volt is not None:
-            curve = _curve(self.displacement_mm_per_volt, "displacement_mm_per_volt", "mm/V")
+            curve = as_curve(self.displacement_mm_per_volt, "displacement_mm_per_volt", "mm/V")
             object.__setattr__(self, "_curve", curve)
 
     @property
@@ -379,7 +379,7 @@ def _limits(rating: Any) -> OutputLimits:
     raise TypeError(f"rating must be a rated power, an AmplifierRating or a LoudspeakerRating, got {rating!r}")
 
 
-def _curve(value: Any, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
+def as_curve(value: Any, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve's frequencies and values; one number holds at all frequencies."""
     if not isinstance(value, list | tuple | np.ndarray):
         return np.array([0.0]), np.array([as_positive(value, name, unit=unit)])

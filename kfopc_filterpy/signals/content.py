@@ -132,7 +132,7 @@ def _name_of(
         if len(shapes) == 1:
             return next(iter(shapes))
         few = "several variables" if names else "no signal"
-        raise ValueError(f"{path} holds {few}: {there}; choose one with variable=")
+        raise ValueError(f"{path} holds {few}: {there}; choose one with the option variable")
     if variable in others:
         raise ValueError(f"variable {variable!r} of {path} must hold real numbers, got {others[variable]}")
     if variable not in shapes:

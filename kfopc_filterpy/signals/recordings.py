@@ -298,7 +298,7 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
     require_file(path)
     kind = _SUFFIXES.get(Path(path).suffix.lower()) or _kind_of(path)
     if variable is not None and kind not in _NAMED:
-        raise ValueError(f"{path} is {kind}, which has no named variables: leave out variable")
+        raise ValueError(f"{path} is {kind}, which has no named variables: leave out the option variable")
     with reading(path, kind):
         content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
     if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
@@ -310,13 +310,13 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
     return content._replace(samples=np.ascontiguousarray(samples, dtype=np.float64))
 
 
-def as_channel(channel: int, samples: np.ndarray, name: object) -> int:
-    """Return `channel` if samples (n_channels, n_samples) have it."""
+def as_channel(channel: int, samples: np.ndarray, name: object, *, called: str = "channel") -> int:
+    """Return a channel if samples (n_channels, n_samples) of `name` have it; it is `called` so where it was chosen."""
     if samples.ndim > 2:
-        raise ValueError(f"{name} holds a matrix of paths, {samples.shape}, and no channels: leave out channel")
-    index = as_count(channel, "channel", minimum=0)
+        raise ValueError(f"{name} holds a matrix of paths, {samples.shape}, and no channels: leave out {called}")
+    index = as_count(channel, called, minimum=0)
     if index >= len(samples):
-        raise ValueError(f"channel must be below the {len(samples)} channel(s) of {name}, got {index}")
+        raise ValueError(f"{called} must be below the {len(samples)} channel(s) of {name}, got {index}")
     return index
 
 

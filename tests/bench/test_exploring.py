@@ -199,7 +199,8 @@ def test_paths_without_a_recording_get_gaussian_noise(files):
 def test_files_that_do_not_fit_are_refused(files, tmp_path):
     soundfile.write(tmp_path / "P8.wav", [0.0, 1.0], 8000)
     with pytest.raises(
-        ValueError, match=r"one sample rate, got .*noise.wav 48000 Hz, .*P8.wav 8000 Hz.*: pass fs=8000"
+        ValueError,
+        match=r"one sample rate, got .*noise.wav 48000 Hz, .*P8.wav 8000 Hz.*: choose one with the option fs, 8000 for example",
     ):
         read_setup(files[0], tmp_path / "P8.wav", files[2])
     with pytest.raises(FileNotFoundError, match=r"gone\.wav"):

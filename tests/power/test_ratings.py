@@ -110,7 +110,7 @@ def test_the_limiter_of_a_thermal_rating_lets_a_burst_pass_and_holds_the_mean():
         (lambda: AmplifierRating(ohm=8.0), ValueError, "sine_watt or noise_watt, or else peak_volts"),
         (lambda: AmplifierRating(ohm=8.0, sine_watt=1.0, noise_watt=1.0), ValueError, "got sine_watt and noise_watt"),
         (lambda: AmplifierRating(ohm=0.0, sine_watt=1.0), ValueError, "ohm must be greater than 0"),
-        (lambda: AmplifierRating(ohm=8.0, sine_watt="20 W"), TypeError, "sine_watt must be a single number W"),
+        (lambda: AmplifierRating(ohm=8.0, sine_watt="20 W"), TypeError, "sine_watt must be a single number in W"),
         (lambda: LoudspeakerRating(8.0), ValueError, "one of noise_watt, sine_watt and programme_watt"),
         (lambda: LoudspeakerRating(8.0, x_max_mm=3.0), ValueError, "must be given together"),
         (

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +12,6 @@ import pytest
 from scipy.signal import lfilter
 
 from kfopc_filterpy import FxLMS, HardClipAmplifier, simulate
-from kfopc_filterpy.cli import main
 from kfopc_filterpy.realtime import (
     Block,
     FaultError,
@@ -27,7 +24,6 @@ from kfopc_filterpy.realtime import (
     run,
 )
 from kfopc_filterpy.realtime.running import _first_arrival, _Watch
-from kfopc_filterpy.signals import write_wav
 
 FS = 8000.0
 S = np.array([0.0, 0.8, -0.3])
@@ -432,51 +428,3 @@ def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeyp
             SoundDevice(*channels)
     with pytest.raises(ValueError, match="output_channels must be"):
         SoundDevice([0], [1], [-1])
-
-
-def test_the_command_shows_levels_and_returns_what_ended_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_wav(tmp_path / "noise.wav", 0.1 * X, int(FS))
-    write_wav(tmp_path / "P.wav", PRIMARY, int(FS))
-    write_wav(tmp_path / "S.wav", S, int(FS))
-    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
-    options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "1"]
-    assert main(["run", *given, *options, "--seconds", "6"]) == 0
-    printed = capsys.readouterr()
-    assert "stopped by end" in printed.out
-    assert "round trip 65 samples, 8.1 ms" in printed.out
-    assert "% of the rated power" in printed.out
-    assert "health: nothing noticed" in printed.out
-    assert "--block" not in printed.out  # the bound is high enough
-    assert printed.err.startswith("kfopc run: warning: ")
-    assert "noise.wav lasts 8 s, of which listening takes 1 s and identifying 1.5 s" in printed.err
-    assert "5.5 s of control are left of the 6 s asked for" in printed.err
-    assert re.search(r"5\.0 s +reduction +[1-9]\d\.\d dB +power [\d.e-]+ \(\d+ %\) +load", printed.err)
-    for wrong, message in (
-        ([given[0], *options], "--secondary is needed"),
-        (options, "a recording with --primary and --secondary is needed"),
-        ([*given[:3], *options], "--secondary is needed"),
-        ([*given, *options, "--latency", "3"], "--latency must be at least a block"),
-        ([*given, *options, "--identify", "8"], "identifying 8 s: nothing is left to control; give a longer recording"),
-        ([*given[:4], given[0], *options], "noise.wav has 64000 samples (8 s)"),
-        ([given[0], "--disturbance", given[2], *given[3:], *options], "P.wav has 90 samples, "),
-    ):
-        assert main(["run", *wrong]) == 2
-        error = capsys.readouterr().err
-        assert message in error
-        assert len(error.splitlines()) == 1
-
-
-def test_the_command_says_if_its_blocks_make_the_anti_noise_late(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """With one tap of the primary path, an eighth of the noise's power, within the reach of blocks of 40 samples."""
-    primary = np.zeros(130)
-    primary[[70, 125]] = 1.0, 1.0
-    for name, signal in (("noise", 0.1 * X), ("P", primary), ("S", S)):
-        write_wav(tmp_path / f"{name}.wav", signal, int(FS))
-    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
-    options = ["--rated-power", "0.03", "--taps", "48", "--identify", "1.5", "--listen", "1", "--quiet"]
-    assert main(["run", *given, *options, "--block", "40", "--seconds", "1"]) == 0
-    out, err = capsys.readouterr()
-    assert "if the anti-noise comes too late, use a smaller --block: two blocks of 40 samples are 10 ms" in out
-    assert err == ""

@@ -119,12 +119,14 @@ def test_a_variable_of_several_is_chosen_by_name(tmp_path):
         read_recording(tmp_path / "x.mat", variable="z")
     np.savez(tmp_path / "x.npz", a=[1.0, 2.0], b=[3.0, 4.0])
     with pytest.raises(
-        ValueError, match=r"x\.npz holds several variables: a \(2,\), b \(2,\); choose one with variable="
+        ValueError, match=r"x\.npz holds several variables: a \(2,\), b \(2,\); choose one with the option variable"
     ):
         read_recording(tmp_path / "x.npz", fs=FS)
     assert read_recording(tmp_path / "x.npz", variable="b", fs=FS).samples.tolist() == [3.0, 4.0]
     write_wav(tmp_path / "x.wav", [1.0, 2.0], FS)
-    with pytest.raises(ValueError, match=r"x\.wav is an audio file, which has no named variables: leave out variable"):
+    with pytest.raises(
+        ValueError, match=r"x\.wav is an audio file, which has no named variables: leave out the option variable"
+    ):
         read_recording(tmp_path / "x.wav", variable="b")
 
 
@@ -222,7 +224,7 @@ def test_rates_that_contradict_or_have_no_ratio_are_refused(tmp_path):
         ValueError, match=r"x\.wav states a sampling rate of 16000 Hz, but file_fs = 8000 Hz: leave it out"
     ):
         read_recording(tmp_path / "x.wav", file_fs=8000)
-    with pytest.raises(ValueError, match=r"fs and new_fs must be in a ratio of whole numbers"):
+    with pytest.raises(ValueError, match=r"sample rates must be in a ratio of whole numbers"):
         read_recording(tmp_path / "x.wav", fs=16000 * np.pi)
     for fs in (0, -1, np.nan):
         with pytest.raises(ValueError, match=r"fs must be"):

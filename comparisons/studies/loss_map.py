@@ -1,0 +1,160 @@
+"""Study: where the noise reduction is lost, from what the reference hears to KF-PB behind a limiter."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+from kfopc_filterpy import OutputLimiter, kf_pb, power_constrained_wiener
+from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table
+
+from .cases import FS, SENSOR_NOISE_DB, Pair
+from .kf_pb import DURATION_S, FAULTS, N_TAPS, SEED, SHARES, SILENT_S, STEADY, Rated, all_paths, make_rated, noises
+from .parts import new_figure, without_measured
+
+LONG = 4 * N_TAPS  # taps that stand for a filter of any length
+FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
+STAGES = {  # what each stage adds to the one before
+    "causality": f"a causal filter of {LONG} taps, with any power",
+    "length": f"one of {N_TAPS} taps",
+    "price": "within the rated power in every second, each second with its own filter",
+    "adaptation": "KF-PB with the exact path, within the rated power over 10 s",
+    "path": f"KF-PB with an estimate {FAULT}, which it verifies",
+    "limiter": "the same behind a limiter that keeps the rated power in every 100 ms",
+}
+
+
+@dataclass(frozen=True)
+class LossRow:
+    """Noise reduction at each stage in one case, from the second second on."""
+
+    path: str
+    noise: str
+    reduction_db: list[float]  # of `STAGES`
+    window_bound_db: float  # of a fixed filter whose every 100 ms keeps the rated power
+
+    @property
+    def losses_db(self) -> np.ndarray:
+        """What each stage loses, the first one against the sensor noise; negative: a gain."""
+        return -np.diff([-SENSOR_NOISE_DB, *self.reduction_db])
+
+
+def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
+    """Run every stage of a case."""
+    path, noise = job
+    case = make_rated(pairs[path], noises()[noise][1](), SHARES[0])
+    make = partial(kf_pb, N_TAPS, rated_power=case.rated_power, fs=FS)
+    wrong = FAULTS[FAULT](case.secondary)
+    limiter = OutputLimiter(case.rated_power, fs=FS)
+    controllers = [
+        make(secondary_path=case.secondary, secondary_path_uncertainty=None),
+        make(secondary_path=wrong),
+        make(secondary_path=wrong, limiter=limiter),
+    ]
+    errors = [free_error(case, LONG), free_error(case, N_TAPS), case.bound_error]
+    errors += [case.run(controller).error for controller in controllers]
+    bound = power_constrained_wiener(
+        case.reference,
+        case.disturbance,
+        case.secondary,
+        N_TAPS,
+        rated_power=case.rated_power,
+        fs=FS,
+        switch_on_s=SILENT_S,
+    )
+    return LossRow(
+        path, noise, [case.reduction_db(error) for error in errors], case.reduction_db(bound.within_windows().error)
+    )
+
+
+def free_error(case: Rated, n_taps: int) -> np.ndarray:
+    """Return the error of the best fixed filter of a length, with any power."""
+    ridge = 1e-4 * np.var(fftconvolve(case.reference, case.secondary)[: case.reference.size])
+    with (
+        warnings.catch_warnings()
+    ):  # in directions without energy, larger weights would do better: no controller has them
+        warnings.simplefilter("ignore", np.exceptions.RankWarning)
+        solution = power_constrained_wiener(
+            *(case.reference, case.disturbance, case.secondary, n_taps),
+            rated_power=1e12,
+            fs=FS,
+            switch_on_s=SILENT_S,
+            segment_s=DURATION_S,
+            ridge=ridge,
+        )
+    return solution.unconstrained.error
+
+
+def jobs() -> list[tuple[str, str]]:
+    """Return the cases: every pair of paths with every steady noise at hand."""
+    steady = [noise for noise, (kind, _) in noises().items() if kind == STEADY]
+    return [(path, noise) for path in all_paths() for noise in steady]
+
+
+def planned_runs() -> int:
+    """Return the number of cases, each of which makes several runs."""
+    return len(jobs())
+
+
+def main(runs: Runs) -> StudyReport:
+    """Run the study on the paths and noises at hand."""
+    pairs = all_paths()
+    rows = list(runs.map(partial(loss_row, pairs), jobs()))
+    return StudyReport(
+        name="loss-map",
+        title="Where the noise reduction is lost",
+        summary=(
+            f"The sensor noise would allow {-SENSOR_NOISE_DB:g} dB. Each stage is one step nearer to a controller that runs: "
+            + "; ".join(f"{name}: {what}" for name, what in STAGES.items())
+            + "."
+        ),
+        fs=FS,
+        rated_power=1.0,
+        parameters={
+            "n_taps": Parameter(N_TAPS, "of the control filter"),
+            "duration_s": Parameter([SILENT_S, DURATION_S], "before and after the control is switched on"),
+            "rated_share": Parameter(SHARES[0], "of the power that full control needs"),
+            "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "over the disturbance"),
+            "seed": Parameter(SEED, "of noise and sensor noise"),
+        },
+        algorithms={},
+        extra={"rows": [asdict(row) for row in rows]},
+        verdicts=[],
+        figures=[loss_figure(rows)],
+        notes=without_measured(pairs),
+        tables=[loss_table(rows)],
+        claims="Findings",
+    )
+
+
+def loss_table(rows: Sequence[LossRow]) -> Table:
+    """Return a line for each case: the losses, and what is left."""
+    headings = ["path", "noise", *(f"{name}, dB" for name in STAGES), "left, dB", "bound with windows of 100 ms, dB"]
+    return Table(
+        "losses",
+        "Noise reduction lost at each stage, in dB; below zero: a gain",
+        headings,
+        [[row.path, row.noise, *row.losses_db, row.reduction_db[-1], row.window_bound_db] for row in rows],
+    )
+
+
+def loss_figure(rows: Sequence[LossRow]) -> FigureItem:
+    """Return a figure with a bar for each case, from the sensor noise down to what is left."""
+    figure, axes = new_figure((7.0, 1.2 + 0.32 * len(rows)))
+    ax, names = axes[0, 0], [f"{row.path}, {row.noise}" for row in rows]
+    left = np.array([row.reduction_db[-1] for row in rows])
+    ax.barh(names, left, color="0.25", label="left")
+    for stage, name in reversed(list(enumerate(STAGES))):
+        lost = np.maximum([row.losses_db[stage] for row in rows], 0.0)
+        ax.barh(names, lost, left=left, label=name)
+        left = left + lost
+    ax.invert_yaxis()
+    ax.set_xlabel("Noise reduction (dB)")
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    caption = "Noise reduction that is left behind a limiter, and what each stage loses; gains are not drawn."
+    return FigureItem("losses", caption, figure)

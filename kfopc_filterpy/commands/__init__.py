@@ -1,0 +1,62 @@
+"""The command `kfopc`, which is also `python -m kfopc_filterpy`: a file for each subcommand.
+
+Exit codes: 0 done, and for a verdict "enough"; 1 the verdict "not enough", or a run that a fault ended; 2 wrong input,
+said in one line; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from . import compare, data, explore, paths, run, verdict
+from .options import WRONG_INPUT, Parser
+
+EXAMPLES = """examples:
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
+  kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
+  kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
+  kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
+  kfopc explore
+  kfopc data list
+each command has its own --help"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The arguments; by default those of the process.
+
+    Returns
+    -------
+    int
+        0 done or enough, 1 not enough or stopped by a fault, 2 wrong input, 130 interrupted.
+    """
+    options, unknown = _parser().parse_known_args(arguments)
+    try:
+        if unknown:
+            raise ValueError(f"unrecognized arguments: {' '.join(unknown)}; see {options.prog} --help")
+        return options.run(options)
+    except (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError) as error:
+        print(f"{options.prog}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print(f"{options.prog}: interrupted; nothing of it was written", file=sys.stderr)
+        return 130
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        prog="kfopc",
+        description="Active noise control with a limited amplifier, from recordings.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for module in (verdict, compare, paths, run, explore, data):
+        module.add_to(commands)
+    return parser

@@ -1,0 +1,287 @@
+"""What options name: files with signals and paths, ratings, tolerances, calibrations."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .printing import warn
+
+if TYPE_CHECKING:
+    from ..signals import Recording
+
+STANDARD_INPUT = "-"
+
+
+class Files:
+    """Reader of the files of a command, which must agree on their sample rate."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self.fs = 0.0  # of the files that were read; 0 before the first
+        self.remarks: list[str] = []  # what resampling hides of the recordings that were read
+        self._first = ""
+
+    def recording(self, path: str) -> np.ndarray:
+        """Return the samples of a recording, one channel."""
+        return _only_channel(self._read(path, is_path=False), path)
+
+    def path(self, path: str) -> np.ndarray:
+        """Return the taps of a path."""
+        return _only_channel(self._read(path, is_path=True), path)
+
+    def channels(self, path: str) -> np.ndarray:
+        """Return all channels of a recording, (n_channels, n_samples), none of them silent."""
+        from ..paths.file_checks import require_heard
+
+        channels = np.atleast_2d(self._read(path, is_path=False).samples)
+        require_heard(path, channels)
+        return channels
+
+    def noise_paths(self, paths: Sequence[str], option: str, noise: np.ndarray) -> np.ndarray:
+        """Return a matrix of paths that are to go with a noise: shorter than it, and not silent."""
+        from ..paths.file_checks import require_shorter, require_sound
+
+        matrix = self.matrix(paths, option, self.options.microphones)
+        require_shorter(", ".join(paths), matrix.shape[-1], self.options.noise, noise.shape[-1], self.fs)
+        require_sound(paths[0] if len(paths) == 1 else option, matrix)
+        return matrix
+
+    def matrix(self, paths: Sequence[str], option: str, n_microphones: int | None = None) -> np.ndarray:
+        """Return the taps of paths, (microphones, sources, taps); see the examples of `verdict` for their order."""
+        each = [self._read(path, is_path=True).samples for path in paths]
+        if any(one.ndim == 3 for one in each):
+            if len(each) > 1:
+                raise ValueError(f"{option} holds a matrix of paths: leave out the other files")
+            return each[0]
+        rows = [row for one in each for row in np.atleast_2d(one)]
+        count = len(np.atleast_2d(each[0])) if n_microphones is None else n_microphones
+        if len(rows) % count:
+            raise ValueError(
+                f"{option} must give a path to each of the {count} microphone(s) from every source, got {len(rows)} in all: "
+                "choose one channel with --channel, or see the order of several with kfopc verdict --help"
+            )
+        longest = max(row.size for row in rows)
+        padded = np.array([np.pad(row, (0, longest - row.size)) for row in rows])
+        return padded.reshape(-1, count, longest).swapaxes(0, 1)
+
+    def _read(self, path: str, *, is_path: bool) -> Recording:
+        """Read a file, whose rate must be that of the files before it."""
+        from ..paths.file_checks import LONG_PATH_S
+        from ..signals.quality import clipping_remarks
+
+        with _file(path) as source:
+            read = self._chosen(path, source, is_path, self.options.fs)
+            if not is_path and read.file_fs not in (None, read.fs):  # resampling hides that samples are equal
+                self.remarks += clipping_remarks(self._chosen(path, source, is_path, None).samples, path)
+        if is_path and read.samples.shape[-1] > LONG_PATH_S * read.fs:
+            seconds = read.samples.shape[-1] / read.fs
+            warn(self.options, f"{path} lasts {seconds:.3g} s, too long for an impulse response: is it a recording?")
+        if self.fs and read.fs != self.fs:
+            raise ValueError(
+                f"{path} is sampled at {read.fs:g} Hz, {self._first} at {self.fs:g} Hz: resample both to one rate, for "
+                "example with --fs 16000"
+            )
+        self.fs, self._first = read.fs, self._first or path
+        return read
+
+    def _chosen(self, path: str, source: str, is_path: bool, fs: float | None) -> Recording:
+        from ..paths import read_path
+        from ..signals import read_recording
+
+        read = (read_path if is_path else read_recording)(source, fs=fs, variable=self.options.variable)
+        return _with_channel(read, path, self.options.channel)
+
+
+def _with_channel(read: Recording, path: str, channel: int | None) -> Recording:
+    """Return the channel that is chosen of a file; a file with one channel stays as it is."""
+    from ..signals.recordings import as_channel
+
+    if channel is None or read.samples.ndim == 1:
+        return read
+    return replace(read, samples=read.samples[as_channel(channel, read.samples, path, called="--channel")])
+
+
+def _only_channel(read: Recording, path: str) -> np.ndarray:
+    if read.samples.size != read.samples.shape[-1]:
+        raise ValueError(
+            f"{path} has {len(read.samples)} channels where one is needed: choose with --channel 0 to --channel "
+            f"{len(read.samples) - 1}"
+        )
+    return read.one_channel()
+
+
+@contextmanager
+def _file(path: str) -> Iterator[str]:
+    """Give the name of a file, for "-" of a copy of the standard input."""
+    if path != STANDARD_INPUT:
+        yield path
+        return
+    content = sys.stdin.buffer.read()
+    if not content:
+        raise ValueError("standard input is empty: pipe a file into the command")
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "standard-input"
+        copy.write_bytes(content)
+        yield str(copy)
+
+
+def scene_of(options: argparse.Namespace, files: Files) -> tuple[Any, Any, Any, Any]:
+    """Return noise, primary path, secondary path and disturbance, each with its channels."""
+    from ..paths.file_checks import require_same_length
+
+    if options.secondary is None:
+        raise ValueError("--secondary is needed: the impulse response from control signal to error microphone")
+    if options.primary is None and options.disturbance is None:
+        raise ValueError("--primary or --disturbance is needed: what arrives at the error microphone?")
+    noise, primary, disturbance = files.channels(options.noise), None, None
+    if options.primary is not None:
+        primary = files.noise_paths(options.primary, "--primary", noise)
+    secondary = files.noise_paths(options.secondary, "--secondary", noise)
+    if primary is not None and primary.shape[:2] != (len(secondary), len(noise)):
+        raise ValueError(
+            f"--primary must give a path from each of the {len(noise)} channel(s) of {options.noise} to each of the "
+            f"{len(secondary)} microphone(s), got {primary.shape[1]} to {primary.shape[0]}: choose with --channel 0 to "
+            f"--channel {max(len(noise), 2) - 1}, or see the order of several with kfopc verdict --help"
+        )
+    if options.disturbance is not None:
+        disturbance = files.channels(options.disturbance)
+        require_same_length(options.disturbance, disturbance.shape[-1], options.noise, noise.shape[-1])
+        if len(disturbance) != len(secondary):
+            raise ValueError(
+                f"--disturbance must have a channel for each of the {len(secondary)} microphone(s) of --secondary, got "
+                f"{len(disturbance)}: record all microphones together, or choose one with --channel"
+            )
+    return noise, primary, secondary, disturbance
+
+
+def _each(given: list[Any] | None, option: str, count: int, what: str) -> list[Any]:
+    """Return `count` values of an option that is given once for all, or once for each."""
+    if given is not None and len(given) not in (1, count):
+        raise ValueError(
+            f"{option} must be given once, or once for each of the {count} {what}(s), got {len(given)}: leave out the others"
+        )
+    given = given or [None]
+    return given * (count if len(given) == 1 else 1)
+
+
+OF_A_LOUDSPEAKER = (
+    *("watt", "ohm", "peak_volts", "volts_per_unit", "rated_power"),
+    *("impedance", "loudspeaker_watt", "programme_watt", "x_max_mm", "displacement"),
+)
+
+
+def ratings_of(options: argparse.Namespace, n_loudspeakers: int) -> list[Any]:
+    """Return the ratings that the options state: of one loudspeaker, or a list for each of several."""
+    stated = [
+        _each(getattr(options, name), f"--{name.replace('_', '-')}", n_loudspeakers, "loudspeaker")
+        for name in OF_A_LOUDSPEAKER
+    ]
+    each = [
+        _rating(argparse.Namespace(rating=options.rating, **dict(zip(OF_A_LOUDSPEAKER, own, strict=True))))
+        for own in zip(*stated, strict=True)
+    ]
+    return each[0] if n_loudspeakers == 1 else each
+
+
+def _rating(own: argparse.Namespace) -> list[Any]:
+    """Return the ratings of one loudspeaker."""
+    from ..power import AmplifierRating, LoudspeakerRating
+
+    if own.loudspeaker_watt is not None and own.programme_watt is not None:
+        raise ValueError("--programme-watt stands in place of --loudspeaker-watt: leave out one of them")
+    if (own.x_max_mm is None) != (own.displacement is None):
+        raise ValueError(
+            "--x-max-mm and --displacement must be given together: the excursion limit needs to know how far a volt moves "
+            "the cone"
+        )
+    ratings: list[Any] = []
+    volts = own.volts_per_unit or 1.0
+    if own.watt is not None or own.peak_volts is not None:
+        if own.ohm is None:
+            raise ValueError("--watt and --peak-volts need --ohm, the resistance they were measured with")
+        if own.rated_power is not None:
+            raise ValueError("--rated-power stands in place of --watt and --peak-volts: leave out one of them")
+        watts = {f"{own.rating}_watt": own.watt}
+        ratings.append(AmplifierRating(own.ohm, peak_volts=own.peak_volts, volts_per_unit=volts, **watts))
+    elif own.rated_power is not None:
+        ratings.append(own.rated_power)
+    if (own.loudspeaker_watt, own.programme_watt, own.x_max_mm) != (None, None, None):
+        if own.ohm is None and own.impedance is None:
+            raise ValueError("a loudspeaker's rating needs --ohm, its nominal impedance, or --impedance, its curve")
+        ratings.append(
+            LoudspeakerRating(
+                own.ohm if own.impedance is None else _curve(own.impedance, "ohm"),
+                noise_watt=own.loudspeaker_watt,
+                programme_watt=own.programme_watt,
+                x_max_mm=own.x_max_mm,
+                displacement_mm_per_volt=None if own.displacement is None else _curve(own.displacement, "mm/V"),
+                volts_per_unit=volts,
+            )
+        )
+    if not ratings:
+        raise ValueError("a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6")
+    return ratings
+
+
+def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return two columns of a CSV file: frequencies, and values in a unit."""
+    from ..power.ratings import as_curve
+
+    try:
+        columns = np.loadtxt(path, delimiter=",", ndmin=2)
+    except ValueError as error:
+        raise ValueError(f"{path} must hold two numbers in a line with a comma between them: {error}") from error
+    if columns.shape[1] != 2:
+        raise ValueError(f"{path} must hold two columns, Hz and a value in {unit}, got {columns.shape[1]}")
+    return as_curve((columns[:, 0], columns[:, 1]), path, unit)
+
+
+def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Any:
+    """Return how far the secondary path may be wrong: by other measurements, by tolerances, or as `assess` has it."""
+    from ..controllers.power_budget import DEFAULT_UNCERTAINTY
+    from ..paths import PathTolerance
+    from ..paths.uncertainty import as_gain_error
+
+    tolerances = (options.path_error_samples, options.path_error_deg, options.path_error_db)
+    if not options.secondary_again:
+        if tolerances == (None, None, None):
+            return DEFAULT_UNCERTAINTY
+        samples, deg, db = (one or 0.0 for one in tolerances)
+        return PathTolerance(samples, deg, as_gain_error(db, "--path-error-db"))
+    if tolerances != (None, None, None):
+        raise ValueError("--secondary-again stands in place of --path-error-...: leave out one of them")
+    K, J, _ = secondary.shape
+    others = files.matrix(options.secondary_again, "--secondary-again", K)  # (K, M J, taps)
+    if others.shape[0] != K or others.shape[1] % J:
+        raise ValueError(
+            f"--secondary-again must give paths from {J} loudspeakers to {K} microphones, once or several times"
+        )
+    longest = max(secondary.shape[2], others.shape[2])
+    every = [np.pad(one, ((0, 0), (0, 0), (0, longest - one.shape[2]))) for one in (secondary, others)]
+    return np.concatenate(every, axis=1).reshape(K, -1, J, longest).swapaxes(0, 1)
+
+
+def calibration_of(options: argparse.Namespace, n_microphones: int) -> Any:
+    """Return the pascals per unit of the error microphones, of all or of each; None if the options give none."""
+    from ..signals import calibration_factor, read_recording
+
+    pascals, option = options.pascal_per_unit, "--pascal-per-unit"
+    if options.calibrator is not None:
+        if pascals is not None:
+            raise ValueError("--calibrator stands in place of --pascal-per-unit: leave out one of them")
+        option, pascals = "--calibrator", []
+        for path in options.calibrator:
+            read = _with_channel(read_recording(path), path, options.channel)
+            tone = replace(read, samples=_only_channel(read, path))
+            pascals.append(calibration_factor(tone, options.calibrator_db))
+    each = _each(pascals, option, n_microphones, "microphone")
+    return each[0] if pascals is None or len(pascals) == 1 else each

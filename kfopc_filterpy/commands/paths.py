@@ -1,0 +1,223 @@
+"""`kfopc paths`: identify, inspect, convert, resample and plot impulse responses."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .inputs import Files
+from .options import DONE, add_command, add_count, add_reading, sentence
+from .printing import warn
+
+WRITTEN = (".wav", ".npy", ".csv", ".txt")
+UNRELATED, CHANCE = 0.02, 3.0  # share of a response that a path must explain, and times what chance explains
+POOR_DB = -20.0  # of the response that is left unexplained: more is too much
+
+
+def add_to(commands: Any) -> None:
+    """Add the subcommand, which has actions of its own."""
+    about = "identify, inspect, convert, resample and plot impulse responses"
+    parser = commands.add_parser("paths", help=about, description=sentence(about))
+    actions = parser.add_subparsers(required=True, metavar="ACTION")
+
+    def add(name: str, run: Any, about: str, example: str) -> Any:
+        return add_command(actions, name, run, about, f"example:\n  kfopc paths {name} {example}")
+
+    about = "fit an impulse response to a recorded excitation, noise or sweep"
+    own = add("identify", identify, about, "sent.wav received.wav --taps 512 -o S.wav")
+    own.add_argument("excitation", help="what was sent to the amplifier; - is standard input")
+    own.add_argument("response", help="what the microphone heard, recorded at the same time")
+    add_count(own, "--taps", required=True, help="length of the impulse response")
+    own.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
+    own.add_argument("--json", action="store_true", help="print JSON")
+    add_reading(own)
+    own = add("inspect", inspect, "say what an impulse response does", "S.wav --primary P.wav")
+    own.add_argument("path", help="the impulse response; - is standard input")
+    about = "impulse response of the primary path, for the causality margin"
+    own.add_argument("--primary", metavar="FILE", help=about)
+    own.add_argument("--json", action="store_true", help="print JSON")
+    add_reading(own)
+    own = add("convert", convert, "write an impulse response in another format", "S.wav S.csv")
+    add_reading(own)
+    _add_written(own)
+    own = add("resample", convert, "write an impulse response at another sample rate", "S.wav S16.wav --fs 16000")
+    add_reading(own, "the new rate", required=True)
+    _add_written(own)
+    own = add("plot", plot, "draw impulse responses and frequency responses", "P.wav S.wav -o paths.png")
+    own.add_argument("path", nargs="+", help="impulse responses of one sample rate")
+    own.add_argument("-o", "--output", metavar="FILE", required=True, help="figure to write: .png, .svg or .pdf")
+    add_reading(own)
+
+
+def _add_written(parser: Any) -> None:
+    parser.add_argument("path", help="the impulse response; - is standard input")
+    parser.add_argument("to", nargs="?", metavar="output", help=f"file to write: {', '.join(WRITTEN)}")
+    parser.add_argument("-o", "--output", metavar="FILE", help="the same")
+
+
+def identify(options: argparse.Namespace) -> int:
+    """Fit an impulse response, write it and print what it leaves unexplained."""
+    from ..paths import estimate_path
+
+    files = Files(options)
+    sent, heard = files.recording(options.excitation), files.recording(options.response)
+    shortest = min(sent.size, heard.size)  # a recorder is stopped later than the player
+    if options.taps > (shortest + 1) // 2 > 0:
+        raise ValueError(
+            f"--taps must be at most {(shortest + 1) // 2} for recordings of {shortest} samples, got {options.taps}: "
+            "identify a shorter impulse response, or record for longer"
+        )
+    found = estimate_path(sent[:shortest], heard[:shortest], options.taps, files.fs)
+    _judge_residual(options, found.residual_db, files.fs, shortest)
+    _write_path(options.output, found.taps, files.fs)
+    facts = {"n_taps": options.taps, "fs": files.fs, "residual_db": float(found.residual_db), "output": options.output}
+    text = f"{options.output}: {options.taps} taps, which leave {found.residual_db:.1f} dB of the response unexplained"
+    print(json.dumps(facts) if options.json else text)
+    return DONE
+
+
+def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float, n_samples: int) -> None:
+    """Raise ValueError if a fit explains hardly more of a response than chance would, warn if it explains little."""
+    share = 1.0 - 10 ** (residual_db / 10)
+    explained = f"explains {100 * max(share, 0.0):.1f} % of {options.response}"
+    if share < max(UNRELATED, CHANCE * options.taps / n_samples):
+        raise ValueError(
+            f"{options.excitation} {explained}, hardly more than chance would: are the files swapped, or of different "
+            "recordings? Give what was sent to the amplifier first, then what the microphone heard at the same time; "
+            "nothing was written"
+        )
+    if residual_db > POOR_DB:
+        warn(
+            options,
+            f"{options.excitation} {explained} only: play it louder or wait for silence, check that nothing is "
+            f"clipped, and give more --taps if the impulse response is longer than {1e3 * options.taps / fs:.3g} ms",
+        )
+
+
+def inspect(options: argparse.Namespace) -> int:
+    """Print what an impulse response does."""
+    from ..paths import causality_margin
+    from ..paths.file_checks import require_sound
+
+    files = Files(options)
+    paths, primary = files.matrix([options.path], options.path), None
+    if options.primary is not None:
+        primary = files.matrix([options.primary], options.primary)
+        for name, matrix in ((options.path, paths), (options.primary, primary)):
+            require_sound(name, matrix)
+        if len(primary) != len(paths):
+            raise ValueError(
+                f"--primary must lead to the {len(paths)} microphone(s) of {options.path}, got {len(primary)}: give the paths "
+                "to each of them"
+            )
+    fs = files.fs
+    several = paths.shape[:2] != (1, 1)
+    each = [
+        ({"microphone": k + 1, "loudspeaker": j + 1} if several else {}) | _facts(paths[k, j], fs)
+        for k, j in np.ndindex(*paths.shape[:2])
+    ]
+    facts: dict[str, Any] = {"paths": each} if several else each[0]
+    if primary is not None:
+        facts["causality_margin_s"] = causality_margin(primary, paths, fs=fs).margin_s
+    if options.json:
+        from ..bench.items import jsonable
+
+        print(json.dumps(jsonable(facts), allow_nan=False))
+        return DONE
+    for one in each:
+        if several:
+            print(f"microphone {one['microphone']}, loudspeaker {one['loudspeaker']}:")
+        print(_described(one))
+    if primary is not None:
+        margin = facts["causality_margin_s"]
+        late = "early enough" if margin > 0 else "too late for anything but tones"
+        print(f"causality margin {1e3 * margin:+.2f} ms: the anti-noise is {late}")
+    return DONE
+
+
+def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
+    """Return what a path does; no band and no onset if it is silent."""
+    from ..paths import achieved_band, causality_margin, secondary_path_gain
+
+    facts: dict[str, Any] = {"n_taps": taps.size, "fs": fs, "duration_s": taps.size / fs}
+    if not np.any(taps):
+        return facts | {"power_gain_db": None, "low_hz": None, "high_hz": None, "onset_s": None}
+    band = achieved_band(taps, fs=fs)
+    return facts | {
+        "power_gain_db": 10 * math.log10(max(secondary_path_gain(taps, band=(0.0, fs / 2), fs=fs), 1e-30)),
+        "low_hz": band.low_hz,
+        "high_hz": band.high_hz,
+        "onset_s": causality_margin(taps, taps, fs=fs).secondary_onset_s,
+    }
+
+
+def _described(facts: dict[str, Any]) -> str:
+    """Return what a path does in two lines."""
+    seconds = facts["duration_s"]
+    duration = f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+    length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {duration}"
+    if facts["onset_s"] is None:
+        return f"{length}; silent"
+    return (
+        f"{length}; its energy begins at {1e3 * facts['onset_s']:.3g} ms\n"
+        f"power gain {facts['power_gain_db']:.1f} dB; within 3 dB of its peak from {facts['low_hz']:.0f} to "
+        f"{facts['high_hz']:.0f} Hz"
+    )
+
+
+def convert(options: argparse.Namespace) -> int:
+    """Write an impulse response in another format or at another rate."""
+    if (options.to is None) == (options.output is None):
+        raise ValueError(f"one file to write is needed, for example {options.path} S.csv or {options.path} -o S.csv")
+    output = options.to if options.to is not None else options.output
+    files = Files(options)
+    taps = files.path(options.path)
+    _write_path(output, taps, files.fs)
+    print(f"{output}: {taps.size} taps at {files.fs:g} Hz")
+    return DONE
+
+
+def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
+    """Write taps in the format of the file's suffix: text has a column of times in s."""
+    from ..signals import write_wav
+
+    suffix = Path(output).suffix.lower()
+    if suffix == ".wav":
+        if fs != round(fs):
+            raise ValueError(
+                f"{output} must have a rate of whole Hz, as WAV files have, got {fs:g} Hz: take another --fs, or write .csv"
+            )
+        write_wav(output, taps, fs)
+    elif suffix == ".npy":
+        np.save(output, taps)
+    elif suffix in (".csv", ".txt"):
+        times = np.arange(taps.size) / fs
+        np.savetxt(output, np.column_stack([times, taps]), delimiter="," if suffix == ".csv" else "\t", fmt="%.17g")
+    else:
+        raise ValueError(f"{output} must end in {', '.join(WRITTEN)}")
+
+
+def plot(options: argparse.Namespace) -> int:
+    """Write a figure of impulse responses."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from ..plot import plot_bode, plot_impulse_responses
+
+    files = Files(options)
+    taps = {Path(name).stem: files.path(name) for name in options.path}
+    figure, axes = plt.subplots(3, 1, figsize=(7, 8), layout="constrained")
+    plot_impulse_responses(taps, fs=files.fs, ax=axes[0])
+    plot_bode(taps, fs=files.fs, ax=axes[1:])
+    output = Path(options.output)
+    output = output if output.suffix else output.with_suffix(".png")
+    figure.savefig(output, dpi=160)
+    print(f"{output} written")
+    return DONE

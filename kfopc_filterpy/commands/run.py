@@ -1,0 +1,221 @@
+"""`kfopc run`: control in real time, with levels, powers and health in the terminal."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from itertools import count
+from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
+
+from .._validate import as_nonnegative
+from .inputs import Files, scene_of
+from .options import DONE, add_command, add_count, add_number, add_scene
+from .printing import warn
+
+if TYPE_CHECKING:
+    from ..realtime import Interface, Levels, RunReport, SimulatedInterface
+
+FAULT = 1
+SMALL_BOUND_DB = 10.0  # below it, a shorter delay may be worth having
+
+EXAMPLES = """examples:
+  kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
+  kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --clock real --block 32
+  kfopc run --device 3 --references 0 --errors 1 --outputs 0 --rated-power 0.01 --amplitude-limit 0.5
+
+With a recording, the plant is simulated; several channels are given as to kfopc verdict. With --device, --references and
+--errors, it is real, at --fs or 16000 Hz: begin with a small --amplitude-limit.
+Ctrl-C fades the control out. exit code: 0 ended as asked, 1 stopped by a fault, 2 wrong input"""
+
+
+def add_to(commands: Any) -> None:
+    """Add the subcommand."""
+    about = "control noise in real time, with a sound card or a simulated plant"
+    parser = add_command(commands, "run", run, about, EXAMPLES)
+    parser.add_argument("noise", nargs="?", help="recording of the reference microphone, for a simulated plant")
+    add_scene(parser, required=False)
+    about = "simulate as fast as possible, or in real time"
+    parser.add_argument("--clock", choices=("free", "real"), default="free", help=about)
+    add_count(parser, "--latency", help="samples from writing to playing (default: two blocks)")
+    parser.add_argument("--device", help="sound card, as `python -m sounddevice` lists it; default is the system's")
+    several: dict[str, Any] = {"minimum": 0, "nargs": "+"}
+    add_count(parser, "--references", help="inputs of the reference microphones, from 0", **several)
+    add_count(parser, "--errors", help="inputs of the error microphones, from 0", **several)
+    add_count(parser, "--outputs", default=[0], help="outputs (default: 0)", **several)
+    add_count(parser, "--block", default=64, help="samples of a block (default: 64)")
+    about = "rated power, a mean square"
+    add_number(parser, "--rated-power", "", metavar="P", required=True, help=about)
+    about = "largest control signal (default: 4 sqrt(P))"
+    add_number(parser, "--amplitude-limit", "", metavar="A", help=about)
+    add_count(parser, "--taps", default=256, help="taps of the control filter (default: 256)")
+    about = "seconds of control (default: until the recording ends, or Ctrl-C)"
+    add_number(parser, "--seconds", "s", help=about)
+    add_number(parser, "--listen", "s", as_nonnegative, default=2.0, help="silence before (default: 2)")
+    add_number(parser, "--identify", "s", default=5.0, help="noise that is played (default: 5)")
+    parser.add_argument("--quiet", action="store_true", help="print only the result")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run, and print the result; return 1 if a fault ended it."""
+    from ..realtime import FaultError
+    from ..realtime import run as run_supervised
+
+    interface = _simulated(options) if options.noise is not None else _sound_card(options)
+    limit = 4.0 * options.rated_power**0.5 if options.amplitude_limit is None else options.amplitude_limit
+    show = None if options.quiet else _screen(sys.stderr)
+    try:
+        report = run_supervised(
+            lambda plant: _controller(plant, options, limit),
+            interface,
+            amplitude_limit=limit,
+            seconds=options.seconds,
+            listen_s=options.listen,
+            identify_s=options.identify,
+            on_report=show,
+        )
+    except FaultError as fault:
+        print(f"{options.prog}: {fault}", file=sys.stderr)
+        return FAULT
+    if show is not None and sys.stderr.isatty():
+        print(file=sys.stderr)  # the line of the levels ends
+    print(_summary(report, interface.fs, interface.block))
+    return FAULT if report.stopped_by.startswith("fault") else DONE
+
+
+def _sound_card(options: argparse.Namespace) -> Interface:
+    from ..realtime import SoundDevice
+
+    if options.references is None or options.errors is None:
+        raise ValueError(
+            "a recording with --primary and --secondary is needed for a simulated plant, or --references and --errors, "
+            "the inputs of a sound card"
+        )
+    if set(options.references) & set(options.errors):
+        raise ValueError("--references and --errors must be different inputs of the sound card")
+    return SoundDevice(
+        options.references,
+        options.errors,
+        options.outputs,
+        fs=options.fs or 16000.0,
+        block=options.block,
+        device=int(options.device) if (options.device or "").isdigit() else options.device,
+    )
+
+
+def _simulated(options: argparse.Namespace) -> SimulatedInterface:
+    from ..realtime import SimulatedInterface
+
+    if any(option is not None for option in (options.device, options.references, options.errors)):
+        raise ValueError(
+            "give either a recording or a sound card: --device, --references and --errors do not go with a recording"
+        )
+    if options.primary is not None and options.disturbance is not None:
+        raise ValueError("--disturbance stands in place of --primary: leave out one of them")
+    if options.latency is not None and options.latency < options.block:
+        raise ValueError(f"--latency must be at least a block, {options.block} samples, got {options.latency}")
+    files = Files(options)
+    noise, primary, secondary, disturbance = scene_of(options, files)
+    _judge_length(options, noise.shape[-1] / files.fs)
+    return SimulatedInterface(
+        noise,
+        secondary,
+        primary_path=primary,
+        disturbance=disturbance,
+        fs=files.fs,
+        block=options.block,
+        latency=options.latency,
+        clock=options.clock,
+    )
+
+
+def _judge_length(options: argparse.Namespace, lasts: float) -> None:
+    """Raise ValueError if a recording ends before the control begins, warn if it ends before the seconds asked."""
+    left = lasts - options.listen - options.identify
+    text = (
+        f"{options.noise} lasts {lasts:.3g} s, of which listening takes {options.listen:g} s and identifying "
+        f"{options.identify:g} s"
+    )
+    mend = "give a longer recording, or a shorter --listen and --identify"
+    if left <= 0:
+        raise ValueError(f"{text}: nothing is left to control; {mend}")
+    if options.seconds is not None and left < options.seconds:
+        warn(options, f"{text}: {left:.3g} s of control are left of the {options.seconds:g} s asked for; {mend}")
+
+
+def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
+    """Return KF-PB behind its limiter for what was identified."""
+    from .. import OutputLimiter, kf_pb
+
+    several = np.ndim(plant.taps) == 3
+    n_loudspeakers = plant.taps.shape[1] if several else 1
+    limiters = [OutputLimiter(options.rated_power, fs=plant.fs, amplitude_limit=limit) for _ in range(n_loudspeakers)]
+    return kf_pb(
+        options.taps,
+        plant.taps,
+        rated_power=options.rated_power,
+        n_references=len(np.atleast_2d(plant.references)),
+        limiter=limiters if several else limiters[0],
+        secondary_path_uncertainty=plant.uncertainty,
+        fs=plant.fs,
+    )
+
+
+def _screen(stream: TextIO) -> Callable[[Levels], None]:
+    """Return what shows the present levels: in one line of a terminal, or in a line of a file every five seconds."""
+    calls = count(1)
+
+    def show(levels: Levels) -> None:
+        if stream.isatty():
+            stream.write(f"\r\x1b[K{describe(levels)}")
+        elif next(calls) % 20 == 0:
+            stream.write(f"{describe(levels)}\n")
+        stream.flush()
+
+    return show
+
+
+def describe(levels: Levels) -> str:
+    """Return levels as a line of text."""
+    reductions = " ".join(f"{r:5.1f}" for r in levels.reduction_db)
+    health = ", ".join(f"{n} {what}" for what, n in levels.health.counts.items()) or "healthy"
+    return (
+        f"{levels.time_s:7.1f} s  reduction {reductions} dB  power {_powers(levels)}  load {100 * levels.load:.0f} %  "
+        f"overruns {levels.overruns}  {health}"
+    )
+
+
+def _powers(report: Levels | RunReport, of: str = "") -> str:
+    """Return the output powers, and the share of the rated power that they take."""
+    rated: Any = report.rated_power  # KF-PB always has one
+    return ", ".join(
+        f"{p:.3g} ({100 * p / r:.0f} %{of})"
+        for p, r in zip(report.powers, np.broadcast_to(rated, report.powers.shape), strict=True)
+    )
+
+
+def _summary(report: RunReport, fs: float, block: int) -> str:
+    """Return a report as text."""
+    lines = [f"{report.seconds:.1f} s under control, stopped by {report.stopped_by}"]
+    if report.round_trip_samples is not None:
+        lines.append(f"round trip {report.round_trip_samples} samples, {1e3 * report.round_trip_samples / fs:.1f} ms")
+    if np.isfinite(report.possible_db):
+        reach = f"the best filter without a rated power would reach {report.possible_db:.1f} dB"
+        if report.possible_db < SMALL_BOUND_DB and block > 1:
+            reach += (
+                f"; if the anti-noise comes too late, use a smaller --block: two blocks of {block} samples are "
+                f"{2e3 * block / fs:.2g} ms"
+            )
+        lines.append(reach)
+    reductions = ", ".join(f"{r:.1f}" for r in report.reduction_db)
+    faults = [f"{event.time_s:.2f} s: {event.what} {event.channel}".rstrip() for event in report.health.events]
+    lines += [
+        f"noise reduction {reductions} dB over the second half, against the silence before",
+        f"output power {_powers(report, ' of the rated power')}",
+        f"{report.overruns} of {report.blocks} blocks took longer than their duration, the longest {100 * report.load:.0f} % "
+        f"of it; {report.lost} samples lost, {report.underflows} blocks too late for the output",
+        "health: " + ("; ".join(faults[-10:]) or "nothing noticed"),
+    ]
+    return "\n".join(lines)

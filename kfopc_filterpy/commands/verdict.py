@@ -1,0 +1,104 @@
+"""`kfopc verdict`: whether an amplifier is enough, and what limits."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from typing import Any
+
+from .._validate import as_choice, as_nonnegative, as_number
+from .inputs import Files, calibration_of, ratings_of, scene_of, uncertainty_of
+from .options import DONE, add_command, add_count, add_number, add_output, add_recorded_scene
+from .printing import progress_bar, tell
+
+NOT_ENOUGH = 1
+
+EXAMPLES = """examples:
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --volts-per-unit 10 --want-db 6 -o out
+  kfopc verdict noise.wav --disturbance error.wav --secondary S.wav --watt 20 --ohm 8 --rating noise --json
+  kfopc verdict noise.wav --primary P.wav --secondary S.wav --fs 16000 --rated-power 1.6 --taps 256
+  cat noise.wav | kfopc verdict - --primary P.wav --secondary S.wav --rated-power 1.6
+  kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
+
+several channels: those of the noise are the references, those of the disturbance the microphones. Each --secondary is one
+loudspeaker and each --primary one reference; the channels of these files are the microphones. With files of one channel,
+say how many microphones there are, and give the files source after source, for each source its microphones in order:
+  kfopc verdict noise.wav --microphones 2 --primary P11.wav --primary P21.wav \\
+    --secondary S11.wav --secondary S21.wav --secondary S12.wav --secondary S22.wav --rated-power 1.6
+where S21 is loudspeaker 1 at microphone 2. An array (microphones, loudspeakers, taps) in a .npy, .mat or .sofa file holds
+all. Options of the rating are given once for all loudspeakers, or once for each, in their order.
+
+exit code: 0 enough, 1 not enough, 2 wrong input"""
+
+
+def add_to(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = add_command(commands, "verdict", verdict, "say whether an amplifier is enough, and what limits", EXAMPLES)
+    add_recorded_scene(parser)
+    add_number(parser, "--want-db", "dB", as_nonnegative, default=6.0, help="noise reduction wanted (default: 6)")
+    about = "KF-PB (default), KF-OPC or FxLMS, behind a limiter; the others beside it"
+    parser.add_argument("--algorithm", default="KF-PB", help=about)
+    add_count(parser, "--taps", help="taps of the control filter (default: found, at most 256)")
+    about = "memory of KF-OPC; a length that is found suits it too (default: 0.25 s, several channels 1 s)"
+    add_number(parser, "--memory", "s", help=about)
+    path = parser.add_argument_group(
+        "secondary path",
+        "how far it may be wrong, for KF-PB, which learns it as it controls (default: a relative rms error of 0.3); "
+        "errors that are stated add up",
+    )
+    add_number(path, "--path-error-samples", "", as_nonnegative, metavar="N", help="error of its delay")
+    add_number(path, "--path-error-deg", "deg", as_nonnegative, help="error of its phase")
+    add_number(path, "--path-error-db", "dB", as_nonnegative, help="error of its gain")
+    about = "another measurement of it, which tells how far it may be wrong; may be repeated"
+    path.add_argument("--secondary-again", action="append", metavar="FILE", help=about)
+    about = "calibration of the error microphone, for levels in dBA; once for all microphones, or once for each"
+    add_number(parser, "--pascal-per-unit", "Pa", action="append", help=about)
+    about = "recording of a sound calibrator by the error microphone, in place of that"
+    parser.add_argument("--calibrator", action="append", metavar="FILE", help=about)
+    add_number(parser, "--calibrator-db", "dB", as_number, default=94.0, help="its sound pressure level (default: 94)")
+    add_output(parser, "folder for the page, figures, sounds and verdict.json", "print verdict.json in place of text")
+
+
+def verdict(options: argparse.Namespace) -> int:
+    """Print a verdict, and write its page if a folder is given."""
+    if options.output is not None:  # better before the run than after it
+        import matplotlib
+
+        from ..bench.assessment_page import require_page
+        from ..bench.report import prepare_folder
+
+        matplotlib.use("Agg")
+        require_page()
+        prepare_folder(options.output)
+    from ..bench import assess
+    from ..bench.assessed_runs import ALGORITHMS
+    from ..bench.assessment import advice_on
+
+    as_choice(options.algorithm, "--algorithm", ALGORITHMS)
+    files = Files(options)
+    noise, primary, secondary, disturbance = scene_of(options, files)
+    n_microphones, n_loudspeakers, _ = secondary.shape
+    with progress_bar(options, "sample") as bar:
+        found = assess(
+            noise,
+            primary,
+            secondary,
+            rating=ratings_of(options, n_loudspeakers),
+            fs=files.fs,
+            disturbance=disturbance,
+            want_db=options.want_db,
+            algorithm=options.algorithm,
+            n_taps=options.taps,
+            memory_s=options.memory,
+            secondary_path_uncertainty=uncertainty_of(options, files, secondary),
+            pascal_per_unit=calibration_of(options, n_microphones),
+            bar=bar,
+        )
+        advice = advice_on(found, fs="--fs ", n_taps="--taps ")
+        found = replace(found, advice=tuple(advice), notes=(*found.notes, *files.remarks))
+        written = None
+        if options.output is not None:
+            bar.set_description("page")
+            written = f"{found.write(options.output)} and verdict.json"
+    tell(options, found.json if options.json else str(found), found.notes, written)
+    return DONE if found.enough else NOT_ENOUGH

@@ -1,0 +1,216 @@
+"""What all subcommands share: errors of one line, help, and how files are read."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from helpers.commands import FS, ROOT, SCENE, process
+
+
+def test_a_process_ends_with_2_and_one_line_if_the_input_is_wrong(folder):
+    ended = process(folder, "verdict", "nose.wav", *SCENE[1:], "--rated-power", "1")
+    assert ended.returncode == 2
+    assert ended.stdout == b""
+    assert ended.stderr.startswith(b"kfopc verdict: nose.wav does not exist")
+    assert ended.stderr.count(b"\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["verdict"], "the following arguments are required: noise, --secondary; see kfopc verdict --help"),
+        (["verdikt"], "invalid choice"),
+        (["verdict", *SCENE], "a rating is needed: --watt 20 --ohm 8, or --rated-power 1.6"),
+        (["verdict", *SCENE, "--watt", "20"], "need --ohm"),
+        (["verdict", *SCENE, "--watt", "20", "--ohm", "8", "--rated-power", "1"], "leave out one of them"),
+        (["verdict", *SCENE, "--watt", "twenty", "--ohm", "8"], "--watt must be a single number in W, got 'twenty'"),
+        (
+            ["verdict", *SCENE, "--watt", "-20", "--ohm", "8"],
+            "--watt must be greater than 0 W, got -20; see kfopc verdict --help",
+        ),
+        (
+            ["verdict", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "--primary or --disturbance is needed",
+        ),
+        (["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1"], "choose with --channel 0 to --channel 1"),
+        (
+            ["verdict", "stereo.wav", *SCENE[1:], "--rated-power", "1", "--channel", "2"],
+            "verdict: --channel must be below the 2",
+        ),
+        (["verdict", *SCENE[:3], "--secondary", "S16.wav", "--rated-power", "1"], "for example with --fs 16000"),
+        (["verdict", "empty.wav", *SCENE[1:], "--rated-power", "1"], "empty.wav"),
+        (["verdict", "text.wav", *SCENE[1:], "--rated-power", "1"], "cannot be read as an audio file"),
+        (["verdict", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of 'KF-PB'"),
+        (["verdict", *SCENE, "--rated-power", "1", "-o", "noise.wav"], "cannot be written"),
+        (["verdict", *SCENE, "--loudspeaker-watt", "1"], "a loudspeaker's rating needs --ohm"),
+        (
+            ["verdict", *SCENE, "--rated-power", "1", "--ohm", "8", "--x-max-mm", "1"],
+            "--x-max-mm and --displacement must be",
+        ),
+        (["compare", *SCENE, "--rated-power", "1", "--algorithm", "KF"], "--algorithm must be one of"),
+        (
+            ["compare", *SCENE, "--rated-power", "1", "--ohm", "-1", "--algorithm", "none"],
+            "--ohm must be greater than 0",
+        ),
+        (["verdict", *SCENE, "--rated-power", "1", "--volts-per-unit", "0"], "--volts-per-unit must be greater than 0"),
+        (["paths", "convert", "S.wav", "S.xyz"], "must end in .wav, .npy, .csv, .txt"),
+        (["paths", "identify", "noise.wav", "d.wav", "--taps", "0", "-o", "S.npy"], "--taps must be at least 1"),
+        (["verdict", *SCENE, "--rated-power", "1", "--want-db", "-3"], "--want-db must not be negative"),
+        (["verdict", *SCENE, "--rated-power", "1", "--taps", "0"], "--taps must be at least 1"),
+        (["verdict", *SCENE, "--rated-power", "1", "--path-error-samples", "-1"], "--path-error-samples must not be"),
+        (
+            ["verdict", *SCENE, "--ohm", "8", "--loudspeaker-watt", "1", "--programme-watt", "2"],
+            "leave out one of them",
+        ),
+        # Files that do not go together are named.
+        (
+            ["verdict", "noise.wav", "--primary", "noise.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "noise.wav has 24000 samples (3 s), noise.wav 24000 (3 s): an impulse response must be shorter",
+        ),
+        (
+            ["compare", "S.wav", "--primary", "P.wav", "--secondary", "noise.wav", "--rated-power", "1"],
+            "P.wav has 64 samples (0.008 s), S.wav 64 (0.008 s): an impulse response must be shorter than the noise, "
+            "and at most 10 s long; cut the impulse response, or are the files swapped?",
+        ),
+        (["verdict", *SCENE[:3], "--secondary", "silent.wav", "--rated-power", "1"], "silent.wav must not be silent"),
+        (
+            ["verdict", "noise.wav", "--disturbance", "short.wav", "--secondary", "S.wav", "--rated-power", "1"],
+            "short.wav has 20000 samples, noise.wav 24000: they must be recorded together",
+        ),
+        (
+            ["paths", "identify", "noise.wav", "d.wav", "--taps", "20000", "-o", "x.npy"],
+            "--taps must be at most 12000 for recordings of 24000 samples, got 20000",
+        ),
+        (["paths", "convert", "S.wav"], "S.wav -o S.csv"),
+        # The option that an argument of the package comes from is named.
+        (["verdict", *SCENE, "--rated-power", "1", "--taps", "4.5"], "--taps must be a whole number, got '4.5'"),
+        (["verdict", *SCENE, "--rated-power", "1", "--memory", "0"], "--memory must be greater than 0 s, got 0"),
+        (
+            ["verdict", *SCENE, "--rated-power", "1", "--path-error-db", "30"],
+            "--path-error-db must be at most 20, got 30",
+        ),
+        (["verdict", *SCENE, "--rated-power", "1", "--fs", "-1"], "--fs must be greater than 0 Hz, got -1"),
+        (
+            ["verdict", *SCENE, "--rated-power", "1", *["--pascal-per-unit", "1"] * 2],
+            "--pascal-per-unit must be given once, or once for each of the 1 microphone(s), got 2: leave out the others",
+        ),
+        (
+            ["verdict", *SCENE, "--ohm", "8", "--loudspeaker-watt", "1", "--impedance", "falling.csv"],
+            "of falling.csv must",
+        ),
+        (["compare", *SCENE, "--rated-power", "1", "--seconds", "0"], "--seconds must be greater than 0 s, got 0"),
+        (["explore", "--port", "-1"], "--port must be at least 0, got -1"),
+        (["paths", "resample", "S.wav", "x.wav", "--fs", "8000.5"], "take another --fs, or write .csv"),
+        (["paths", "inspect", "S.wav", "--primary", "silent.wav"], "silent.wav must not be silent"),
+        (
+            ["paths", "convert", "S.wav", "S.csv", "--bogus", "3"],
+            "unrecognized arguments: --bogus 3; see kfopc paths convert",
+        ),
+    ],
+    ids=lambda value: "-".join(value).replace("/", "") if isinstance(value, list) else "",
+)
+def test_an_error_is_one_line_that_says_what_to_do(command, arguments, message):
+    code, out, err = command(*arguments)
+    assert code == 2
+    assert out == ""
+    assert message in err
+    assert err.count("\n") == 1
+    assert err.startswith("kfopc")
+
+
+@pytest.mark.parametrize("name", ["jinja2", "PIL"])
+def test_a_missing_library_is_named_with_its_extra_before_anything_runs(command, monkeypatch, name, tmp_path):
+    from kfopc_filterpy.bench import assessment_page
+
+    found = assessment_page.find_spec
+    monkeypatch.setattr(assessment_page, "find_spec", lambda one: None if one == name else found(one))
+    code, _, err = command("verdict", *SCENE, "--rated-power", "1", "-o", tmp_path / "out")
+    assert code == 2
+    assert name in err
+    assert "extra `studies`" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_tqdm_is_named_with_its_extra(command, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    code, _, err = command("verdict", *SCENE, "--rated-power", "1")
+    assert code == 2
+    assert "tqdm" in err
+    assert "extra `studies`" in err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["verdict"], ["compare"], ["paths"], ["paths", "identify"], ["paths", "inspect"], ["paths", "plot"]],
+)
+def test_help_says_what_it_does_and_shows_an_example(command, arguments):
+    code, out, _ = command(*arguments, "--help")
+    assert code == 0
+    assert "usage: kfopc" in out
+    if arguments != ["paths"]:
+        assert "example" in out
+        assert f"  kfopc {' '.join(arguments)}".rstrip() in out
+
+
+def test_help_loads_nothing_that_takes_long():
+    """It is there in a fifth of a second; scipy alone takes longer."""
+    show = "import sys; from kfopc_filterpy.commands import main\ntry: main(['--help'])\nfinally: print('scipy' in sys.modules)"
+    shown = subprocess.run(
+        [sys.executable, "-c", show], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
+    )
+    assert shown.stdout.endswith(b"False\n"), shown.stderr
+
+
+def test_a_file_of_one_channel_is_left_alone_by_the_choice_of_a_channel(command):
+    options = ["--rated-power", "4", "--taps", "32", "--json", "--algorithm", "FxLMS"]
+    code, chosen, _ = command("verdict", "stereo.wav", *SCENE[1:], *options, "--channel", "1")
+    assert code == 0
+    assert chosen == command("verdict", *SCENE, *options)[1]
+
+
+def test_rates_that_differ_are_resampled_each_in_its_way(command):
+    """An impulse response keeps its gain, so that the power needed stays the same: 1 for full control."""
+    scene = [*SCENE[:3], "--secondary", "S16.wav", "--rated-power", "4", "--taps", "32", "--json"]
+    code, out, _ = command("verdict", *scene, "--fs", FS)
+    assert code == 0
+    assert json.loads(out)["unlimited_power"] == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--primary", "P1.wav", "--secondary", "S1.wav", "--watt", "1", "--watt", "2", "--ohm", "8"],
+            "--watt must be given once",
+        ),
+        (
+            ["--primary", "P11.wav", "--secondary", "S1.wav", "--rated-power", "1"],
+            "--primary must give a path from each",
+        ),
+        (
+            ["--primary", "P1.wav", "--secondary", "S1.wav", "--secondary", "S12.wav", "--rated-power", "1"],
+            "got 3 in all",
+        ),
+        (
+            ["--disturbance", "d.wav", "--secondary", "S1.wav", "--rated-power", "1"],
+            "--disturbance must have a channel for each",
+        ),
+        (
+            ["--primary", "P1.wav", "--secondary", "S.npy", "--secondary", "S1.wav", "--rated-power", "1"],
+            "leave out the other",
+        ),
+        (
+            ["--primary", "P1.wav", "--secondary", "S1.wav", "--microphones", "0", "--rated-power", "1"],
+            "must be at least 1",
+        ),
+    ],
+    ids=["ratings", "references", "uneven", "microphones", "matrix", "none"],
+)
+def test_channels_that_do_not_fit_are_refused(command, several, arguments, message):
+    code, _, err = command("verdict", "noise.wav", *arguments, "--fs", FS, "--quiet")
+    assert code == 2
+    assert message in err

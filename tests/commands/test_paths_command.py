@@ -1,0 +1,132 @@
+"""`kfopc paths`: impulse responses from recordings, in other formats and at other rates."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+import soundfile
+from helpers.commands import FS
+
+from kfopc_filterpy.signals import band_limited_noise, write_wav
+
+
+def test_a_path_is_identified_from_a_recording(command, folder, tmp_path):
+    rng = np.random.default_rng(0)
+    sent = rng.standard_normal(2 * FS)
+    taps = rng.standard_normal(24) * 0.8 ** np.arange(24)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "received.wav", np.convolve(sent, taps), FS)  # recorded a little longer
+    code, out, _ = command("paths", "identify", "sent.wav", "received.wav", "--taps", 24, "-o", tmp_path / "S.wav")
+    assert code == 0
+    assert "24 taps" in out
+    found, fs = soundfile.read(tmp_path / "S.wav")
+    assert fs == FS
+    np.testing.assert_allclose(found, taps, atol=1e-4)
+
+
+def test_files_that_a_path_does_not_explain_are_refused_and_nothing_is_written(command, folder, tmp_path):
+    write_wav(folder / "other.wav", band_limited_noise((100, 1500), 3.0, fs=FS, rng=2), FS)
+    code, out, err = command("paths", "identify", "noise.wav", "other.wav", "--taps", 24, "-o", tmp_path / "S.wav")
+    assert (code, out) == (2, "")
+    assert re.search(
+        r"noise.wav explains \d\.\d % of other.wav, hardly more than chance would: are the files swapped", err
+    )
+    assert not (tmp_path / "S.wav").exists()
+
+
+def test_a_fit_that_leaves_much_unexplained_is_warned_of(command, folder, tmp_path):
+    sent = np.random.default_rng(1).standard_normal(2 * FS)
+    write_wav(folder / "sent.wav", sent, FS)
+    write_wav(folder / "noisy.wav", sent + 0.3 * np.random.default_rng(2).standard_normal(sent.size), FS)
+    code, out, err = command("paths", "identify", "sent.wav", "noisy.wav", "--taps", 8, "-o", tmp_path / "S.wav")
+    assert code == 0
+    assert "8 taps" in out
+    assert "warning: sent.wav explains 91." in err  # 1 / 1.09
+    assert "longer than 1 ms" in err
+    write_wav(folder / "heard.wav", sent + 0.05 * np.random.default_rng(2).standard_normal(sent.size), FS)
+    assert command("paths", "identify", "sent.wav", "heard.wav", "--taps", 8, "-o", tmp_path / "S.wav")[2] == ""
+
+
+def test_a_recording_given_as_a_path_is_analysed_with_a_warning(command, folder):
+    write_wav(folder / "long.wav", np.random.default_rng(0).standard_normal(8 * FS), FS)
+    code, out, err = command("paths", "inspect", "long.wav", "--primary", "long.wav")
+    assert code == 0
+    assert "64000 taps at 8000 Hz, 8 s;" in out
+    assert (
+        "kfopc paths inspect: warning: long.wav lasts 8 s, too long for an impulse response: is it a recording?" in err
+    )
+    assert command("paths", "inspect", "S.wav")[2] == ""
+
+
+def test_a_written_path_may_be_named_by_an_option(command, tmp_path):
+    for action, more in (("convert", []), ("resample", ["--fs", FS])):
+        output = tmp_path / f"{action}.npy"
+        assert command("paths", action, "S.wav", "-o", output, *more)[0] == 0
+        np.testing.assert_array_equal(np.load(output), np.eye(64)[12])
+
+
+@pytest.mark.parametrize("suffix", ["wav", "npy", "csv", "txt"])
+def test_a_path_is_converted_without_loss(command, tmp_path, suffix):
+    output = tmp_path / f"S.{suffix}"
+    code, _, _ = command("paths", "convert", "S.wav", output)
+    assert code == 0
+    if suffix == "wav":
+        taps = soundfile.read(output)[0]
+    elif suffix == "npy":
+        taps = np.load(output)
+    else:
+        times, taps = np.loadtxt(output, delimiter="," if suffix == "csv" else "\t").T
+        np.testing.assert_allclose(times, np.arange(64) / FS, rtol=1e-12)
+    np.testing.assert_array_equal(taps, np.eye(64)[12])
+
+
+def test_a_path_is_resampled_with_its_gain(command, tmp_path):
+    code, _, _ = command("paths", "resample", "S.wav", tmp_path / "S.wav", "--fs", 2 * FS)
+    assert code == 0
+    taps, fs = soundfile.read(tmp_path / "S.wav")
+    assert fs == 2 * FS
+    assert taps.sum() == pytest.approx(1.0, abs=0.01)
+    assert int(np.argmax(np.abs(taps))) == 24
+
+
+def test_a_path_is_inspected_and_plotted(command, tmp_path):
+    code, out, _ = command("paths", "inspect", "S.wav", "--primary", "P.wav", "--json")
+    assert code == 0
+    facts = json.loads(out)
+    assert facts["onset_s"] == pytest.approx(12 / FS)
+    assert facts["causality_margin_s"] == pytest.approx(14 / FS)
+    assert facts["power_gain_db"] == pytest.approx(0.0, abs=1e-9)
+    code, out, _ = command("paths", "inspect", "P.wav", "--primary", "S.wav")
+    assert code == 0
+    assert "too late" in out
+    code, _, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "paths.png")
+    assert code == 0
+    assert (tmp_path / "paths.png").read_bytes().startswith(b"\x89PNG")
+    code, out, _ = command("paths", "plot", "P.wav", "S.wav", "-o", tmp_path / "plots")
+    assert out == f"{tmp_path / 'plots.png'} written\n"
+    assert (tmp_path / "plots.png").is_file()
+
+
+def test_a_matrix_of_paths_is_inspected(command, several, tmp_path):
+    _, primary, secondary = several
+    secondary = secondary.copy()
+    secondary[0, 1] = 0.0
+    np.save(tmp_path / "S.npy", secondary)
+    np.save(tmp_path / "P.npy", primary)
+    arguments = ["paths", "inspect", tmp_path / "S.npy", "--primary", tmp_path / "P.npy", "--fs", FS]
+    code, out, _ = command(*arguments, "--json")
+    assert code == 0
+    facts = json.loads(out)
+    assert [(one["microphone"], one["loudspeaker"]) for one in facts["paths"]] == [(1, 1), (1, 2), (2, 1), (2, 2)]
+    assert [one["onset_s"] for one in facts["paths"]] == [12 / FS, None, 16 / FS, 12 / FS]
+    assert [one["power_gain_db"] for one in facts["paths"]] == pytest.approx(
+        [0.0, None, 20 * np.log10(0.3), 20 * np.log10(0.8)], abs=1e-9
+    )
+    assert facts["causality_margin_s"] == pytest.approx(14 / FS)  # 26 - 12 and 28 - 12 samples
+    code, out, _ = command(*arguments)
+    assert code == 0
+    assert "microphone 1, loudspeaker 2:\n64 taps at 8000 Hz, 8 ms; silent" in out
+    assert "early enough" in out

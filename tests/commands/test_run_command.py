@@ -1,0 +1,80 @@
+"""`kfopc run`, on a simulated plant."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from kfopc_filterpy.signals import write_wav
+
+FS = 8000
+S = np.array([0.0, 0.8, -0.3])
+PRIMARY = np.zeros(90)
+PRIMARY[[70, 75, 82]] = 1.0, 0.5, -0.3
+X = np.random.default_rng(5).standard_normal(8 * FS)
+
+
+def test_the_command_shows_levels_and_returns_what_ended_it(command, tmp_path):
+    write_wav(tmp_path / "noise.wav", 0.1 * X, FS)
+    write_wav(tmp_path / "P.wav", PRIMARY, FS)
+    write_wav(tmp_path / "S.wav", S, FS)
+    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
+    options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "1"]
+    code, out, err = command("run", *given, *options, "--seconds", "6")
+    assert code == 0
+    assert "stopped by end" in out
+    assert "round trip 65 samples, 8.1 ms" in out
+    assert "% of the rated power" in out
+    assert "health: nothing noticed" in out
+    assert "--block" not in out  # the bound is high enough
+    assert err.startswith("kfopc run: warning: ")
+    assert "noise.wav lasts 8 s, of which listening takes 1 s and identifying 1.5 s" in err
+    assert "5.5 s of control are left of the 6 s asked for" in err
+    assert re.search(r"5\.0 s +reduction +[1-9]\d\.\d dB +power [\d.e-]+ \(\d+ %\) +load", err)
+    for wrong, message in (
+        ([given[0], *options], "--secondary is needed"),
+        (options, "a recording with --primary and --secondary is needed"),
+        ([*given[:3], *options], "--secondary is needed"),
+        ([*given, *options, "--latency", "3"], "--latency must be at least a block, 32 samples, got 3"),
+        ([*given, "--disturbance", given[0], *options], "--disturbance stands in place of --primary: leave out one"),
+        ([*given, *options, "--device", "3"], "--device, --references and --errors do not go with a recording"),
+        ([*given, *options, "--seconds", "nan"], "--seconds must be finite, got nan"),
+        (["--references", "0", "--errors", "0", *options], "--references and --errors must be different inputs"),
+        (["--references", "0", "x", "--errors", "1", *options], "--references must be a whole number, got 'x'"),
+        ([*given, *options, "--identify", "8"], "identifying 8 s: nothing is left to control; give a longer recording"),
+        ([*given[:4], given[0], *options], "noise.wav has 64000 samples (8 s)"),
+        ([given[0], "--disturbance", given[2], *given[3:], *options], "P.wav has 90 samples, "),
+    ):
+        code, _, error = command("run", *wrong)
+        assert code == 2
+        assert message in error
+        assert len([line for line in error.splitlines() if "warning" not in line]) == 1
+
+
+def test_the_command_says_if_its_blocks_make_the_anti_noise_late(command, tmp_path):
+    """With one tap of the primary path, an eighth of the noise's power, within the reach of blocks of 40 samples."""
+    primary = np.zeros(130)
+    primary[[70, 125]] = 1.0, 1.0
+    for name, signal in (("noise", 0.1 * X), ("P", primary), ("S", S)):
+        write_wav(tmp_path / f"{name}.wav", signal, FS)
+    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.wav")]
+    options = ["--rated-power", "0.03", "--taps", "48", "--identify", "1.5", "--listen", "1", "--quiet"]
+    code, out, err = command("run", *given, *options, "--block", "40", "--seconds", "1")
+    assert code == 0
+    assert "if the anti-noise comes too late, use a smaller --block: two blocks of 40 samples are 10 ms" in out
+    assert err == ""
+
+
+def test_a_plant_of_several_channels_is_simulated(command, tmp_path):
+    paths = np.zeros((2, 2, 4))
+    paths[:, :, 1] = [[0.9, 0.2], [0.1, 0.8]]
+    write_wav(tmp_path / "noise.wav", 0.1 * X[: 5 * FS], FS)
+    write_wav(tmp_path / "P.wav", np.stack((PRIMARY, np.roll(0.7 * PRIMARY, 3))), FS)
+    np.save(tmp_path / "S.npy", paths)
+    given = [str(tmp_path / "noise.wav"), "--primary", str(tmp_path / "P.wav"), "--secondary", str(tmp_path / "S.npy")]
+    options = ["--rated-power", "0.03", "--taps", "24", "--block", "32", "--identify", "1.5", "--listen", "0.5"]
+    code, out, err = command("run", *given, *options, "--fs", str(FS), "--quiet")
+    assert code == 0, err
+    (powers,) = re.findall(r"output power (.*)", out)
+    assert powers.count("% of the rated power") == 2

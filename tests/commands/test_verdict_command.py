@@ -1,0 +1,170 @@
+"""`kfopc verdict`: exit codes of real processes, JSON, pages, ratings, channels."""
+
+from __future__ import annotations
+
+import json
+from inspect import signature
+
+import jsonschema
+import numpy as np
+import pytest
+from helpers.commands import FS, SCENE, process
+
+from kfopc_filterpy import bench
+from kfopc_filterpy.bench import assess
+from kfopc_filterpy.bench.assessment import SCHEMA
+from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
+from kfopc_filterpy.paths import PathTolerance
+from kfopc_filterpy.signals import band_limited_noise, write_wav
+
+
+def test_a_process_ends_with_0_if_the_amplifier_is_enough_and_writes_what_it_says(folder, tmp_path):
+    out = tmp_path / "out"
+    rating = ["--watt", "10", "--ohm", "8", "--volts-per-unit", "4", "--pascal-per-unit", "1"]
+    ended = process(folder, "verdict", *SCENE, *rating, "--taps", "32", "-o", str(out))
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.startswith(b"Enough: KF-PB reaches")
+    assert sorted(path.name for path in out.iterdir()) == ["audio", "figures", "tables", "verdict.html", "verdict.json"]
+    data = json.loads((out / "verdict.json").read_text(encoding="utf-8"))
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    assert data["enough"] is True
+    assert data["rating"]["rated_power"] == pytest.approx(10 * 8 / 16)
+    assert data["levels"]["before_dba"] > data["levels"]["after_dba"]
+
+
+def test_a_process_ends_with_1_if_it_is_not_and_reads_its_standard_input(folder):
+    scene = ["-", *SCENE[1:], "--rated-power", "0.05", "--taps", "32", "--json", "--quiet"]
+    ended = process(folder, "verdict", *scene, standard_input=(folder / "noise.wav").read_bytes())
+    assert ended.returncode == 1, ended.stderr
+    data = json.loads(ended.stdout)
+    assert data["limited_by"] == "amplifier"
+    assert data["rating"]["ohm"] is None
+
+
+def test_a_verdict_names_options_in_its_advice_and_on_its_page(command, tmp_path):
+    write = ["-o", tmp_path / "out"]
+    code, out, _ = command("verdict", *SCENE, "--rated-power", "4", "--taps", "8", "--want-db", "12", *write)
+    assert code == 1
+    told = " ".join(out.split())
+    assert "8 taps last 1 ms, but the noise arrives up to 1.9 ms later than the loudspeaker's sound" in told
+    assert "take a longer filter with --taps 32." in told
+    assert "--taps 32" in (tmp_path / "out" / "verdict.html").read_text(encoding="utf-8")
+
+
+def test_a_verdict_notes_a_short_or_clipped_recording_in_terminal_and_json(command, folder):
+    clipped = np.clip(band_limited_noise((100, 1500), 6.0, fs=FS, rng=1, power=1.0), -1, 1)
+    write_wav(folder / "clipped.wav", clipped, FS)
+    options = [*SCENE[1:], "--rated-power", "4", "--taps", "16", "--json", "--algorithm", "FxLMS"]
+    _, out, err = command("verdict", "noise.wav", *options)
+    assert any("lasts only 3 s" in note for note in json.loads(out)["notes"])
+    assert "kfopc verdict: note: noise lasts only 3 s" in err
+    for resampled in ([], ["--fs", "4000"]):  # which hides that samples are equal
+        _, out, err = command("verdict", "clipped.wav", *options, *resampled)
+        assert sum("is clipped" in note for note in json.loads(out)["notes"]) == 1
+        assert "is clipped" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], signature(assess).parameters["secondary_path_uncertainty"].default),
+        (["--path-error-samples", 2], PathTolerance(delay_samples=2.0)),
+        (["--path-error-deg", 10, "--path-error-db", 3], PathTolerance(phase_deg=10.0, gain_db=3.0)),
+    ],
+)
+def test_a_path_error_is_the_one_that_is_stated_or_the_default_of_assess(command, monkeypatch, options, expected):
+    asked = {}
+
+    def stop(*signals, **settings):
+        asked.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(bench, "assess", stop)
+    command("verdict", *SCENE, "--rated-power", 1, *options)
+    assert asked["secondary_path_uncertainty"] == expected
+    told = " ".join(command("verdict", "--help")[1].split())
+    assert f"(default: a relative rms error of {DEFAULT_UNCERTAINTY:g})" in told
+
+
+def test_a_second_measurement_of_the_path_may_tell_how_well_it_is_known(command, folder):
+    write_wav(folder / "other.wav", np.eye(64)[15], FS)  # three samples later: 150 % wrong at 700 Hz
+    scene = [*SCENE, "--rated-power", "4", "--taps", "32", "--json"]
+    same, _, _ = command("verdict", *scene, "--secondary-again", "S.wav")
+    code, out, _ = command("verdict", *scene, "--secondary-again", "other.wav")
+    assert (same, code) == (0, 0)
+    assert json.loads(out)["limited_by"] is None  # the path is learned
+
+
+def test_a_loudspeakers_curves_are_read_from_files(command, folder):
+    (folder / "impedance.csv").write_text("20,7\n80,40\n300,6.4\n")
+    (folder / "displacement.csv").write_text("20,0.5\n4000,0.5\n")
+    rating = ["--watt", "100", "--ohm", "8", "--loudspeaker-watt", "1", "--impedance", "impedance.csv"]
+    options = ["--taps", "32", "--json", "--algorithm", "KF-PB"]
+    code, out, _ = command("verdict", *SCENE, *rating, *options)
+    assert code == 0
+    assert json.loads(out)["rating"]["rated_power"] == pytest.approx(6.4)
+    excursion = ["--x-max-mm", "0.1", "--displacement", "displacement.csv"]
+    code, out, _ = command("verdict", *SCENE, *rating, *excursion, *options)
+    assert code == 1
+    data = json.loads(out)
+    assert data["rating"]["decided_by"] == "loudspeaker's excursion"
+    assert data["rating"]["rated_power"] == pytest.approx((0.1 / 2 / 0.5) ** 2, rel=0.01)  # a response without colour
+    (folder / "words.csv").write_text("Hz,mm\n")
+    code, _, err = command("verdict", *SCENE, *rating, "--x-max-mm", "1", "--displacement", "words.csv")
+    assert code == 2
+    assert "words.csv must hold two numbers in a line" in err
+
+
+def test_a_calibrators_recording_gives_the_levels(command, folder):
+    """94 dB are 1 Pa rms, recorded here as 0.5: the noise of power 1 then has 2 Pa, 100 dB."""
+    t = np.arange(FS) / FS
+    write_wav(folder / "calibrator.wav", 0.5 * np.sqrt(2) * np.sin(2 * np.pi * 1000 * t), FS)
+    options = [*SCENE, "--rated-power", "4", "--taps", "32", "--json", "--calibrator", "calibrator.wav"]
+    code, out, _ = command("verdict", *options)
+    assert code == 0
+    bands = np.array(json.loads(out)["levels"]["before_db"])
+    assert 10 * np.log10(np.sum(10 ** (bands / 10))) == pytest.approx(100.0, abs=0.3)
+    code, _, err = command("verdict", *options, "--pascal-per-unit", "2")
+    assert code == 2
+    assert "leave out one of them" in err
+
+
+WAYS = {
+    "a file for each loudspeaker": [["P1.wav"], ["S1.wav", "S2.wav"], []],
+    "a file for each path": [
+        ["P11.wav", "P21.wav"],
+        ["S11.wav", "S21.wav", "S12.wav", "S22.wav"],
+        ["--microphones", 2],
+    ],
+    "one array": [["P1.wav"], ["S.npy"], ["--fs", FS]],  # it states no rate
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_several_channels_are_read_in_the_order_that_the_help_states(command, several, way):
+    primary, secondary, options = WAYS[way]
+    files = [part for name in primary for part in ("--primary", name)]
+    files += [part for name in secondary for part in ("--secondary", name)]
+    rating = ["--rated-power", 4, "--rated-power", 0.05]
+    code, out, err = command("verdict", "noise.wav", *files, *options, *rating, "--taps", 32, "--json", "--quiet")
+    x, p, s = several
+    verdict = assess(x.astype(np.float32), p, s.astype(np.float32), rating=[4.0, 0.05], fs=FS, n_taps=32)
+    data = json.loads(out)
+    assert code == (0 if verdict.enough else 1), err
+    assert data["channels"] == {"references": 1, "loudspeakers": 2, "microphones": 2}
+    assert data["rating"]["rated_power"] == [4.0, 0.05]
+    assert data["bound_db"] == pytest.approx(verdict.bound_db, abs=1e-3)
+    assert data["noise_reduction_db"] == pytest.approx(verdict.noise_reduction_db, abs=0.05)
+    assert data["unlimited_power"] == pytest.approx(verdict.unlimited_power.tolist(), rel=1e-3)
+
+
+def test_the_exit_code_is_that_of_all_amplifiers_together(command, several):
+    files = ["noise.wav", "--disturbance", "errors.wav", "--secondary", "S1.wav", "--secondary", "S2.wav"]
+    options = ["--ohm", 8, "--taps", 32, "--quiet", "--algorithm", "KF-PB"]
+    code, out, _ = command("verdict", *files, "--watt", 1, *options)
+    assert code == 0
+    assert out.startswith("Enough: KF-PB reaches")
+    code, out, _ = command("verdict", *files, "--watt", 1, "--watt", 0.0001, *options)
+    assert code == 1
+    assert "1, 0.0001 W into 8 ohm" in out
+    assert "The amplifier limits" in out

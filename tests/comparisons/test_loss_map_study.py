@@ -1,0 +1,63 @@
+"""The loss map on a small scale, against batch least squares and the runs themselves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons import __main__ as command
+from comparisons.studies import kf_pb as kf_pb_study
+from comparisons.studies import loss_map
+from comparisons.studies.cases import SENSOR_NOISE_DB, measured_data
+from comparisons.studies.kf_pb import Rated, make_rated, noises
+from kfopc_filterpy.bench import Runs, StudyReport
+
+TAPS, LONG = 12, 40
+PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """Few taps, one pair of short paths, no measured data."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KFOPC_DATA", "/no/such/folder")
+        measured_data.cache_clear()
+        kf_pb_study.recordings.cache_clear()
+        for study in (kf_pb_study, loss_map):
+            patch.setattr(study, "N_TAPS", TAPS)
+        patch.setattr(loss_map, "LONG", LONG)
+        patch.setattr(loss_map, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
+        runs = Runs()
+        yield loss_map.main(runs), runs.done, loss_map.planned_runs()
+    measured_data.cache_clear()
+    kf_pb_study.recordings.cache_clear()
+
+
+def test_planned_runs_are_those_taken(small: Any) -> None:
+    _, done, planned = small
+    assert done == planned == len(loss_map.jobs()) > 0
+    assert command.FURTHER["loss_map"] == (loss_map.main, loss_map.planned_runs)
+
+
+def test_the_losses_lead_from_the_sensor_noise_to_what_is_left(small: Any) -> None:
+    report: StudyReport = small[0]
+    for line in report.tables[0].rows:
+        losses, left = np.array(line[2:8]), line[8]
+        assert -SENSOR_NOISE_DB - losses.sum() == pytest.approx(left)
+        assert losses[1] >= -0.05  # a longer filter is not worse: the record and the ridge are the same
+        assert losses[2] > 1.0  # a quarter of the power
+        assert abs(losses[4]) < 0.5  # the path is learned within the first second
+        assert losses[5] > 0.0
+
+
+def test_a_filter_with_any_power_is_that_of_batch_least_squares() -> None:
+    """To 0.1 dB: the ridge, which least squares lacks, is 40 dB below the filtered reference."""
+    case: Rated = make_rated((PRIMARY, SECONDARY), noises()["band noise"][1](), 0.25)
+    filtered = np.convolve(case.reference, SECONDARY)[: case.reference.size]
+    begin = case.disturbance.size - case.after.size
+    rows = np.lib.stride_tricks.sliding_window_view(filtered, TAPS)[begin - TAPS + 1 :, ::-1]
+    weights = np.linalg.lstsq(rows, case.after, rcond=None)[0]
+    expected = case.reduction_db(case.after - rows @ weights)
+    assert case.reduction_db(loss_map.free_error(case, TAPS)) == pytest.approx(expected, abs=0.1)
