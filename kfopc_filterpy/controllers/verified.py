@@ -139,7 +139,8 @@ class VerifiedController(WrappedController):
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
         super().__init__(controller)
-        if hasattr(controller, "physical") or not (hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")):
+        has_path = hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
+        if hasattr(controller, "physical") or not has_path:
             raise TypeError(
                 f"controller must have secondary_path and n_taps, as the built-in ones have, got {controller!r}; "
                 "virtual microphones have other paths than those that are heard"
@@ -151,7 +152,7 @@ class VerifiedController(WrappedController):
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} with a verified path"
         self.events: list[PathEvent] = []
         path = self._paths()
-        K, J, M = path.shape
+        _, J, M = path.shape
         n_references = getattr(controller, "n_references", 1)
         self._amplifiers = amplifier_functions(amplifier, J)
         uncertainty = getattr(controller, "secondary_path_uncertainty", None)
@@ -177,7 +178,8 @@ class VerifiedController(WrappedController):
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
         self._error = self._disturbance = self._alone = 0.0  # powers over AVERAGE_S; `alone`: at full volume
         self._excess = 0.0  # power of noise that is not p * x, found in silence
-        self._sums, self._silent_for = np.zeros(3), 0  # energies and number of samples at this volume; samples of silence
+        self._sums = np.zeros(3)  # energies and number of samples at this volume
+        self._silent_for = 0  # samples of silence
         self._use_posterior()
 
     def __repr__(self) -> str:
@@ -355,7 +357,8 @@ class VerifiedController(WrappedController):
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self._error = self._alone = self._disturbance + self._excess
         self._sums = np.zeros(3)
-        self._held_for = max(self._held_for, self._p.shape[-1])  # until it has heard the references, and the room is silent
+        # Until the copy has heard the references, and the room is silent.
+        self._held_for = max(self._held_for, self._p.shape[-1])
 
     def _note(self, what: str) -> None:
         self.events.append(PathEvent(self._samples / self.fs, what))
