@@ -1,7 +1,8 @@
 """Run every controller in cases that are the same for each version of the package, or time some of them.
 
 `command` starts this file as a script, once with the working tree and once with an earlier version as the package. So it
-uses only public names that both have, and nothing else of this repository.
+uses only public names that both have, and nothing else of this repository. `VerifiedController` is looked up when its
+case is made: where a version has none, only that case fails.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from kfopc_filterpy import (
     RescalingFxLMS,
     SoftSaturationAmplifier,
     TwoGradientFxLMS,
+    controllers,
     fx_rls,
     kf_anc,
     kf_opc,
@@ -283,6 +285,9 @@ AROUND: dict[str, Make] = {
     "filterpy's filter": lambda s: KalmanController(set_up(KalmanFilter(s.n_taps, 1)), s.estimate),
     "KFOPC": lambda s: KalmanController(set_up(KFOPC(s.n_taps, constraint=rated())), s.estimate),
     "LimitedController": lambda s: LimitedController(OwnController(s), limiter()),
+    "VerifiedController": lambda s: controllers.VerifiedController(
+        FxLMS(s.n_taps, -s.estimate, step_size=0.02 / s.n_taps), fs=FS
+    ),
     "FeedbackNeutralizer": lambda s: FeedbackNeutralizer(SINGLE["FxLMS"](s), [0.0, 0.1, 0.05]),
 }
 
@@ -315,6 +320,7 @@ SEVERAL: dict[str, Make] = {
     "clipping FxLMS": lambda s: made(ClippingFxLMS, s, **PEAK),
 }
 AROUND_SEVERAL: dict[str, Make] = {
+    "VerifiedController": lambda s: controllers.VerifiedController(SEVERAL["KF-OPC"](s), fs=FS),
     "FeedbackNeutralizer": lambda s: FeedbackNeutralizer(
         SEVERAL["KF-ANC"](s), 0.1 * decaying(s.n_references, 2, 6, 6, 1), amplifier=HARD
     ),
