@@ -18,11 +18,13 @@ from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative
 AVERAGE_S = 0.1  # of the powers that are compared
 LOUD = 10**0.3  # times the disturbance that is expected: the error is too loud
 SUSPECT = 10**0.075  # ... while the path is not known, or the control signal is turned down
+NEAR = 0.25  # ... so near to it that the path in use may be wrong
 UNSTABLE = 8.0  # times the disturbance: what the controller would hear if it played at full volume
 HOLD_S = 0.25  # after an alarm
-LEAST_VOLUME, STEP_S = 0.05, 0.25  # of a new start, and the time until it is doubled
+LEARN_S = 2.0  # after the error was last near the disturbance
+LEAST_VOLUME, STEP_S = 0.05, 0.1  # of a new start, and the time until it is doubled
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 32.0
-LEAST_CHANGE = 1e-4  # of the energy of the path: smaller ones are not passed on to the controller
+LEAST_CHANGE, LARGE_CHANGE = 1e-4, 0.25  # of the energy of the path: not passed on; tried in silence first
 LOUDEST = 1e50  # of what can be learnt from, see `plant.h`
 
 
@@ -35,9 +37,10 @@ class PathEvent:
     time_s : float
         Time since the first sample, in s.
     what : str
-        "alarm": the errors contradict the secondary path, which is learned anew; "louder": the noise is louder than it
-        would be without control; "unstable": the adaptation diverges although the path is right; "not finite": the control signal
-        is NaN or Inf; "full volume": the control signal is no longer turned down.
+        "alarm": the errors contradict the secondary path, which is learned anew; "full volume": the control signal is
+        no longer turned down. The others stop the control. "louder": the noise is louder than it would be without
+        control; "another path": the secondary path has drifted far; "unstable": the adaptation diverges while the control
+        signal is turned down; "not finite": the control signal is NaN, Inf or above 1e50.
     """
 
     time_s: float
@@ -45,37 +48,40 @@ class PathEvent:
 
 
 class VerifiedController(WrappedController):
-    r"""A controller that learns its paths while it runs, and never makes the noise much louder for long.
+    r"""A controller that learns its paths while it runs, and stops at once if it makes the noise louder.
 
     Beside the controller, the posterior of `kf_pb` learns the primary paths p and the secondary paths s from the reference
     x, what the loudspeakers play, y, and the errors:
 
     .. math:: e = p * x - s * y + \text{noise}
 
-    There is no probe: the control signal itself tells what the path is, as long as the primary path is the one that was
-    learned. The controller gets the posterior's secondary path, and keeps its weights. If the errors contradict the
-    posterior, an alarm resets the secondary path to the controller's first one with a large uncertainty, and the controller does not adapt for
-    0.25 s, in which the path is learned again.
+    There is no probe: the control signal itself tells what the secondary path is, as long as the primary path stays. A
+    primary path that drifts can be taken for a secondary path that changes. So the posterior counts only while the
+    error is within 6 dB of the noise without control, which the posterior expects to be :math:`p * x`: then the
+    controller gets the posterior's secondary path, and keeps its weights. If the errors contradict the posterior, this is
+    an alarm. The secondary path returns to the first one, now with a large uncertainty, and is learned again. The
+    controller does not adapt for 0.25 s.
 
-    The posterior also tells how loud the noise would be without control, :math:`p * x`, but with no louder p than when the
-    loudspeakers were last silent. If the error is 3 dB louder over
-    0.1 s (0.75 dB after an alarm), the loudspeakers are silent at once, and a fresh copy of the controller takes over. It
-    adapts in silence to :math:`e - \hat s * y`, what it would hear at full volume. After half a second, it plays at a
-    twentieth of its volume, which is doubled every 0.25 s in which the noise is not 0.75 dB louder. A failure doubles the
-    pause before the next start, up to 32 s. What silence shows to be louder than :math:`p * x`, a noise that no reference hears, is
-    expected from then on, and forgotten within the memory.
+    If the error is 3 dB louder than :math:`p * x` in the mean over 0.1 s (0.75 dB after an alarm), the loudspeakers are
+    silent at once, and a fresh copy of the controller takes over. It adapts in silence to :math:`e - \hat s * y`, what it
+    would hear at full volume. After half a second, it plays at a twentieth of its volume. The volume is doubled every
+    0.25 s, unless the noise is 0.75 dB louder than without control. Each failure doubles the pause before the next start,
+    up to 32 s. The copy also takes over if the path has changed by a quarter of its energy without an alarm.
+
+    In silence, p is learned, and so is how much louder or softer the noise is than :math:`p * x`: a noise that no
+    reference hears is expected from then on. This ratio fades within the memory.
 
     The loudspeakers are silent until there is a first posterior. `listen` gives it before the control is switched on.
 
     Parameters
     ----------
     controller : Controller
-        Any controller with `secondary_path`, which can be assigned, and `n_taps`, as the built-in ones have. It must be
-        possible to copy it, and it has not processed a sample yet. `kf_pb` verifies its path itself.
+        Any controller with `n_taps` and a `secondary_path` that can be assigned, as the built-in ones have. It is copied,
+        so it must not have processed a sample yet. `kf_pb` is refused: it verifies its path itself.
     fs : float, default 16000
         Sample rate in Hz.
     memory_s : float, default 20
-        Memory of the posterior in s. A shorter one follows a path that drifts faster, and knows less of one that stays.
+        Memory of the posterior in s. A shorter one forgets an old path sooner, and knows a path that stays less exactly.
     amplifier : callable or sequence of J of them, optional
         Known amplifiers, functions of a sample, as for the controller.
 
@@ -99,14 +105,15 @@ class VerifiedController(WrappedController):
 
     Notes
     -----
-    The path is believed to the controller's `secondary_path_uncertainty`, or to 0.3 of its rms if that is not set. The
-    estimate has as many taps as the controller's, so make that with a path that is filled with zeros to the length of the
-    longest path that may occur.
+    At the start, the estimated path may be wrong by the controller's `secondary_path_uncertainty`, or by 0.3 of its rms if
+    that is not set. What is learned has as many taps as the controller's path. So make the controller with a path that is
+    filled with zeros to the length of the longest path that may occur.
 
-    A new start keeps the limiter, and the uncertainty and the rated power that were assigned; what was changed inside the
+    A new start keeps the limiter, and the uncertainty and the rated power that were assigned. What was changed inside the
     controller is lost.
 
-    `simulate` calls it from Python sample by sample. The posterior is the core's: see `controllers.PowerBudgetController`.
+    `simulate` calls it from Python sample by sample. The core computes the posterior, as for
+    `controllers.PowerBudgetController`.
 
     Examples
     --------
@@ -170,14 +177,15 @@ class VerifiedController(WrappedController):
         self._awaits_error = False
         self.volume, self._pause_s = 0.0, 0.0
         self._wait = 0  # samples until the volume is next changed
-        self._alarms, self._held_for = 0, 0  # alarms so far; samples until the controller may adapt
+        self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples since the last one
+        self._doubts = False  # whether the controller must not adapt, for the path is not known
+        self._deaf_for = 0  # samples until a fresh controller may adapt
+        self._learns_for = 0  # samples for which the controller still gets the posterior's path
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
-        self._error = self._disturbance = self._alone = 0.0  # powers over AVERAGE_S; `alone`: at full volume
-        self._excess = 0.0  # power of noise that is not p * x, found in silence
-        # The primary path as it was when the room was last silent, the share of its power that was heard then, and its
-        # average. What the control does not explain could be taken for a louder primary path, but not in silence.
-        self._quiet_p, self._share, self._quiet = self._observer.primary_path[..., ::-1].copy(), 1.0, 0.0
-        self._sums = np.zeros(3)  # energies and number of samples at this volume
+        # Powers over AVERAGE_S: of the error; without control, as expected; of the error at full volume.
+        self._error = self._expected = self._alone = 0.0
+        self._ratio = 1.0  # of the noise to what the posterior expects, found in the last pause
+        self._sums = np.zeros(2)  # energies of error and expected noise at this volume
         self._silent_for = 0  # samples of silence
         self._use_posterior()
 
@@ -202,12 +210,12 @@ class VerifiedController(WrappedController):
 
     def _use_posterior(self) -> None:
         """Set the paths by which samples are judged, the oldest sample first."""
-        self._p = self._observer.primary_path[..., ::-1].copy()
         self._s = self._paths()[..., ::-1].copy()
-        self._noise = float(np.sum(self._observer.measurement_noise))
         self._known = self._observer.fits > 0
+        # Only in silence: what the control plays on an unknown path could be taken for a louder primary path.
         if self.volume == 0.0 or self._silent_for >= self._s.shape[-1] + self._block:
-            self._quiet_p, self._share = self._p, 1.0
+            self._p = self._observer.primary_path[..., ::-1].copy()
+            self._noise = float(np.sum(self._observer.measurement_noise))
 
     def _shaped(self, channels: np.ndarray) -> Any:
         """Return values as the controller has them: without an axis of channels if it has one channel."""
@@ -233,7 +241,7 @@ class VerifiedController(WrappedController):
         if self._awaits_error:
             self._take(None)
         if not np.all(np.abs(own) <= LOUDEST):
-            if self.volume > 0.0 or not self._held_for:
+            if self.volume > 0.0 or not self._deaf_for:
                 self._stop("not finite")
             own = np.zeros(len(self._withheld))
         y = self.volume * own
@@ -248,7 +256,7 @@ class VerifiedController(WrappedController):
         if self.volume < 1.0 or self._withheld.any():
             newest = self._withheld[:, self._n : self._n + self._s.shape[-1]]
             alone = errors - np.einsum("kjm,jm->k", self._s, newest)
-        if not self._held_for:
+        if not (self._doubts or self._deaf_for):
             self.controller.update(self._shaped(alone))
         self._take(errors, alone)
 
@@ -260,10 +268,12 @@ class VerifiedController(WrappedController):
         listening(self.controller).listen(references, errors)
         if self._awaits_error:
             self._take(None)
-        silence = np.zeros(len(self._withheld))
+        silence, wait = np.zeros(len(self._withheld)), self._wait
         for sample, heard in zip(x.T, e.T, strict=True):
+            self._wait = self._block + 1  # a new start waits for the control
             self._push(sample, silence, silence)
             self._take(heard, heard)
+        self._wait = wait
 
     def _channels(self, value: Any, count: int, name: str, what: str) -> np.ndarray:
         """Return a checked sample, of which the observer refuses none."""
@@ -291,35 +301,32 @@ class VerifiedController(WrappedController):
         if errors is not None and alone is not None:
             self._observer.update(errors)
             newest = self._x[:, self._n : self._n + self._p.shape[-1]]
-            now, quiet = (np.einsum("kin,in->k", p, newest) for p in (self._p, self._quiet_p))
-            powers = [float(one @ one) for one in (errors, now, quiet, alone)]
-            self._judge(powers[0], powers[1] + self._noise, self._share * (powers[2] + self._noise), powers[3])
+            d = np.einsum("kin,in->k", self._p, newest)
+            self._judge(float(errors @ errors), self._ratio * (float(d @ d) + self._noise), float(alone @ alone))
         self._n += 1
         self._samples += 1
-        self._held_for = max(self._held_for - 1, 0)
+        self._deaf_for = max(self._deaf_for - 1, 0)
         if self._n == self._block:
             self._end_block()
 
     # ---- Decisions
 
-    def _judge(self, error: float, disturbance: float, quiet: float, alone: float) -> None:
+    def _judge(self, error: float, expected: float, alone: float) -> None:
         """Compare powers: silence follows at once if the control makes the noise louder."""
         if not self._known:
             if self.volume > 0.0:  # another path was assigned while it plays
                 return
-            disturbance = quiet = error  # in silence
+            expected = error  # in silence
         self._error += self._rate * (error - self._error)
-        self._disturbance += self._rate * (disturbance - self._disturbance)
-        self._quiet += self._rate * (quiet - self._quiet)
+        self._expected += self._rate * (expected - self._expected)
         self._alone += self._rate * (alone - self._alone)
         if self.volume > 0.0 or self._silent_for >= self._s.shape[-1]:  # otherwise the room still rings
-            self._sums += error, disturbance, 1.0
+            self._sums += error, expected
         if not self._known:
             return
-        expected = min(self._disturbance, self._quiet) + self._excess
-        if self.volume > 0.0 and self._error > (SUSPECT if self._held_for else LOUD) * expected:
+        if self.volume > 0.0 and self._error > (SUSPECT if self._doubts else LOUD) * self._expected:
             self._stop("louder")
-        elif self.volume < 1.0 and self._alone > UNSTABLE * expected:
+        elif self.volume < 1.0 and self._alone > UNSTABLE * self._expected:
             self._stop("unstable")
 
     def _end_block(self) -> None:
@@ -327,17 +334,26 @@ class VerifiedController(WrappedController):
         for line in (self._x, self._withheld):
             line[:, : -self._block] = line[:, self._block :].copy()
         self._n = 0
+        # A good result needs no other path: the posterior may have taken a primary path that drifts for a secondary one.
+        is_near = self.volume < 1.0 or self._error > NEAR * self._expected
+        self._learns_for = round(LEARN_S * self.fs) if is_near else max(self._learns_for - self._block, 0)
         if self._observer.alarms > self._alarms:
-            self._alarms = self._observer.alarms
-            self._held_for = round(HOLD_S * self.fs)
+            self._alarms, self._since_alarm = self._observer.alarms, 0
+        is_new = self._since_alarm < HOLD_S * self.fs  # the posterior knows little of the path
+        if is_new and is_near and not self._doubts:
             self._note("alarm")
-        if self._observer.fits and not self._held_for:
+        self._doubts = is_new and is_near
+        if self._known and self._learns_for and not is_new:
             new, old = self._observer.identified_path, self._paths()
-            if np.sum((new - old) ** 2) > LEAST_CHANGE * np.sum(old**2):
+            change = np.sum((new - old) ** 2) / max(np.sum(old**2), np.finfo(float).tiny)
+            if change > LEAST_CHANGE:
+                if change > LARGE_CHANGE and self.volume > 0.0 and self._since_alarm > self.fs:
+                    self._stop("another path")
                 self.controller.secondary_path = self._shaped_path(new)
+        self._since_alarm += self._block
         self._use_posterior()
-        self._excess *= math.exp(-self._block / (self.memory_s * self.fs))
-        if self.volume < 1.0 and self._observer.fits:
+        self._ratio **= math.exp(-self._block / (self.memory_s * self.fs))
+        if self.volume < 1.0 and self._known:
             self._wait -= self._block
             if self._wait <= 0:
                 self._turn_up()
@@ -347,19 +363,14 @@ class VerifiedController(WrappedController):
 
     def _turn_up(self) -> None:
         """Play louder, unless the noise has become louder at this volume."""
-        error, disturbance, samples = self._sums
-        self._sums = np.zeros(3)
-        # Not `quiet`: it can only learn the path while it plays, and p may have been learned meanwhile.
-        if self.volume > 0.0 and error > SUSPECT * (disturbance + samples * self._excess):
+        (error, expected), self._sums = self._sums, np.zeros(2)
+        if self.volume > 0.0 and error > SUSPECT * expected:
             self._stop("louder")
             return
-        if self.volume == 0.0 and samples:
-            self._excess = max(float(error - disturbance) / samples, 0.0)
-            self._share = min(float(error / disturbance), 1.0) if disturbance > 0.0 else 1.0
-        started = any(event.what not in ("alarm", "full volume") for event in self.events)
-        self.volume = min(max(2.0 * self.volume, LEAST_VOLUME), 1.0) if started else 1.0
-        self._wait = round(STEP_S * self.fs)
-        if self.volume == 1.0 and started:
+        if self.volume == 0.0 and error > 0.0 and expected > 0.0:
+            self._ratio *= float(error / expected)
+        self.volume, self._wait = min(max(2.0 * self.volume, LEAST_VOLUME), 1.0), round(STEP_S * self.fs)
+        if self.volume == 1.0:
             self._note("full volume")
 
     def _stop(self, what: str) -> None:
@@ -373,9 +384,9 @@ class VerifiedController(WrappedController):
         if self.volume > 0.0 or not self._pause_s:
             self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
-        self._held_for = max(self._held_for, self._p.shape[-1])  # it has no past: first it hears the references
-        self._error = self._alone = self._disturbance + self._excess
-        self._sums = np.zeros(3)
+        self._deaf_for = max(self._deaf_for, self._p.shape[-1])  # it has no past: first it hears the references
+        self._error = self._alone = self._expected
+        self._sums = np.zeros(2)
 
     def _note(self, what: str) -> None:
         self.events.append(PathEvent(self._samples / self.fs, what))
