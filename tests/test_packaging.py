@@ -150,17 +150,22 @@ def test_the_guide_says_what_each_extra_is_for():
 
 
 REMOVED = {
-    "controllers": ("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"),
-    "filters": ("PowerBudgetKalmanFilter",),
-    "power": ("PowerBudget",),
+    "bench": {"Verdict": "Claim", "verdict_sentence": "claims_sentence"},
+    "controllers": {"DirectPowerBudget": "kf_pb", "SharedGainKalman": "kf_pb", "FrequencyDomainKalman": "kf_pb"},
+    "filters": {"PowerBudgetKalmanFilter": "kf_pb"},
+    "power": {"PowerBudget": "kf_pb"},
 }
 
 
-@pytest.mark.parametrize(("namespace", "name"), [(space, name) for space, names in REMOVED.items() for name in names])
-def test_a_removed_name_says_what_to_use(namespace, name):
+@pytest.mark.parametrize(
+    ("namespace", "name", "instead"),
+    [(space, name, instead) for space, names in REMOVED.items() for name, instead in names.items()],
+)
+def test_a_removed_name_says_what_to_use(namespace, name, instead):
     module = importlib.import_module(f"kfopc_filterpy.{namespace}")
-    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use kf_pb"):
+    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use {instead}\b"):
         getattr(module, name)
+    assert instead in {*dir(module), *dir(kfopc_filterpy)}
     assert name not in dir(module)
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = module.no_such_name

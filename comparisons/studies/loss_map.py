@@ -124,11 +124,11 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=[],
+        claims=[],
         figures=[loss_figure(rows)],
         notes=without_measured(pairs),
         tables=[loss_table(rows)],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 

@@ -11,12 +11,12 @@ from .exploring import explore as explore
 from .exploring import explore_setups as explore_setups
 from .exploring import read_setup as read_setup
 from .exploring_page import serve_explore as serve_explore
+from .items import Claim as Claim
 from .items import FigureItem as FigureItem
 from .items import Parameter as Parameter
 from .items import Sound as Sound
 from .items import StudyReport as StudyReport
 from .items import Table as Table
-from .items import Verdict as Verdict
 from .registry import Algorithm as Algorithm
 from .registry import algorithms as algorithms
 from .registry import make_controller as make_controller
@@ -29,7 +29,7 @@ from .scene import Scene as Scene
 from .scene import figures_of_merit as figures_of_merit
 from .scene import make_scene as make_scene
 from .scene import with_clipping as with_clipping
-from .summary import verdict_sentence as verdict_sentence
+from .summary import claims_sentence as claims_sentence
 from .tuning import AllDivergedError as AllDivergedError
 from .tuning import Trial as Trial
 from .tuning import Tuned as Tuned

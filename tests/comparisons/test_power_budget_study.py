@@ -1,4 +1,4 @@
-"""The study of the power budget on a small scale, and its tables and verdicts from rows made by hand."""
+"""The study of the power budget on a small scale, and its tables and claims from rows made by hand."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
     assert len(report.tables[0].rows) == len(algorithms.algorithms()) + 3
     assert len(report.tables[2].rows) == len(algorithms.algorithms()) * len(SHARES)
     assert [figure.stem for figure in report.figures] == ["duct-band-noise"]
-    assert len(report.verdicts) == 3
+    assert len(report.claims) == 3
     assert report.notes[0].startswith("The measured duct was not at hand")
     write_report([report], tmp_path)
     assert (tmp_path / "tables" / "power-budget-sizing.csv").stat().st_size > 0
@@ -169,7 +169,7 @@ def test_means_are_over_seeds_and_the_worst_window_is_the_worst() -> None:
         ((2.5, np.nan), (1.0, np.nan), (2.0, 11.0), (1.0, 1.0), [False, False, False]),
     ],
 )
-def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
+def test_claims(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
     rows = (
         rows_of(BOUND, (3.0, 12.0))
         + rows_of(RECORD, (3.0, 12.0))
@@ -179,4 +179,4 @@ def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected
     for name, algorithm in algorithms.algorithms().items():
         if name != "KF-PB" and algorithm.keeps_budget:
             rows += rows_of(name, other, other_powers)
-    assert [verdict.reproduced for verdict in _claims(rows)] == expected
+    assert [claim.holds for claim in _claims(rows)] == expected
