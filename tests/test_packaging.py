@@ -150,7 +150,7 @@ def test_the_guide_says_what_each_extra_is_for():
 
 
 REMOVED = {
-    "bench": {"Verdict": "Claim", "verdict_sentence": "claims_sentence"},
+    "bench": {"Levels": "SoundLevels", "Verdict": "Claim", "verdict_sentence": "claims_sentence"},
     "controllers": {"DirectPowerBudget": "kf_pb", "SharedGainKalman": "kf_pb", "FrequencyDomainKalman": "kf_pb"},
     "filters": {"PowerBudgetKalmanFilter": "kf_pb"},
     "power": {"PowerBudget": "kf_pb"},

@@ -9,6 +9,7 @@ __getattr__ = naming_removed(
     __getattr__,
     __name__,
     {
+        "Levels": "SoundLevels",
         "Verdict": "Claim",
         "verdict_sentence": "claims_sentence",
     },

@@ -2,7 +2,7 @@ from .assessing import assess as assess
 from .assessment import Assessment as Assessment
 from .assessment import Band as Band
 from .assessment import Ceilings as Ceilings
-from .assessment import Levels as Levels
+from .assessment import SoundLevels as SoundLevels
 from .comparing import compare_recordings as compare_recordings
 from .exploring import AcousticSetup as AcousticSetup
 from .exploring import ExploreResult as ExploreResult
