@@ -154,6 +154,7 @@ REMOVED = {
     "controllers": {"DirectPowerBudget": "kf_pb", "SharedGainKalman": "kf_pb", "FrequencyDomainKalman": "kf_pb"},
     "filters": {"PowerBudgetKalmanFilter": "kf_pb"},
     "power": {"PowerBudget": "kf_pb"},
+    "realtime": {"Levels": "RunStatus"},
 }
 
 
