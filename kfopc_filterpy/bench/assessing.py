@@ -32,8 +32,8 @@ from kfopc_filterpy.metrics import (
 )
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
-from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
 from kfopc_filterpy.paths.file_checks import require_heard, require_sound
+from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_choice, as_positive, as_real_array, per_loudspeaker, require_finite
-from ..paths.channels import is_path_matrix
+from ..paths.path_matrix import is_path_matrix
 from .channels import ChannelCorrelations, channel_record
 from .wiener import reduction_db, require_sound
 
