@@ -30,7 +30,7 @@ from kfopc_filterpy.bounds import (
     power_constrained_solution,
     wiener_solution,
 )
-from kfopc_filterpy.bounds.channels import full_channel_stretch
+from kfopc_filterpy.bounds.channel_bound import full_channel_stretch
 from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal

@@ -15,7 +15,7 @@ from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, 
 from ..metrics import overshoot
 from ..paths.models import path_taps
 from ..paths.path_matrix import is_path_matrix
-from .channels import ChannelStretch, channel_record
+from .channel_bound import ChannelStretch, channel_record
 from .wiener import (
     Stretch,
     WienerSolution,
