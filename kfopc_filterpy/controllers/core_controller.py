@@ -15,7 +15,7 @@ from ..power.amplifiers import Amplifier, amplifier_models
 from ..power.constraint import NUMBERS
 from ..power.limiter import OutputLimiter
 from .base import LONGEST_CALL, FilteredReferenceController, Looped, calls_of, refused_while_listening
-from .channels import channel_sample
+from .channel_samples import channel_sample
 
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}

@@ -11,7 +11,7 @@ import numpy as np
 from .._validate import as_channels, as_nonnegative, as_number, as_positive, as_sample_count
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController
-from .channels import channel_sample
+from .channel_samples import channel_sample
 
 LONGEST_PAUSE = 64.0  # of the first pause
 WIDEST_MARGIN = 8.0  # of the first margin

@@ -19,7 +19,7 @@ from ..paths.least_squares import correlation_matrix, cross_correlation, cross_c
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS
 from .base import OVERFLOW, FilteredReferenceController, WrappedController
-from .channels import amplifier_functions, channel_sample
+from .channel_samples import amplifier_functions, channel_sample
 from .divergence import DivergenceGuard
 
 FRAME_S = 0.02  # the error's power is measured over frames of this length, or of the secondary path's if that is longer

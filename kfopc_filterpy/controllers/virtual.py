@@ -12,7 +12,7 @@ from .._validate import as_channels, as_count, as_positive, as_real_array, requi
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
 from .base import Controller, WrappedController, listening
-from .channels import amplifier_functions, push_sample
+from .channel_samples import amplifier_functions, push_sample
 
 if TYPE_CHECKING:
     import control
