@@ -11,7 +11,7 @@ import numpy as np
 
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..core.running import REFUSED_REFERENCE, Steps, process
+from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.models import is_system, path_taps, sampling_rate
 from ..paths.path_matrix import is_path_matrix, secondary_paths
 from ..paths.uncertainty import as_uncertainty, guard_filter

@@ -10,7 +10,7 @@ import numpy as np
 from .._validate import as_number, as_positive, per_channel
 from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
-from ..core.running import Steps
+from ..core.run_loop import Steps
 from ..power.amplifiers import Amplifier, amplifier_models
 from ..power.constraint import NUMBERS
 from ..power.limiter import OutputLimiter
