@@ -26,10 +26,19 @@ from kfopc_filterpy.bench import (
 )
 from kfopc_filterpy.plot import curve_style, plot_nse
 
-from . import rooms
+from . import multichannel_rooms as rooms
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Row, Setting, bound_of
+from .multichannel_rooms import (
+    MEASURED,
+    RECORDINGS,
+    SIZES,
+    Place,
+    equally_rated,
+    level_map_db,
+    make_rated_scene,
+    places,
+)
 from .parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
-from .rooms import MEASURED, RECORDINGS, SIZES, Place, equally_rated, level_map_db, make_rated_scene, places
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"

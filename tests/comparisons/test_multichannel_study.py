@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from comparisons.__main__ import FURTHER
-from comparisons.studies import multichannel, rooms
+from comparisons.studies import multichannel
+from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, EQUAL, KF_PB, SCALED, ChannelRow, claims
-from comparisons.studies.rooms import MEASURED, Place, level_map_db
+from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener, simulate
 from kfopc_filterpy.bench import Runs, StudyReport, algorithms, make_controller, write_report
 from kfopc_filterpy.bench import registry as registered
