@@ -396,7 +396,7 @@ TABLED_DB = -6.0
 
 def _algorithms() -> Iterator[Quote]:
     def quote(words: str, numbers: Callable[[Results], Sequence[float]]) -> Quote:
-        return Quote("algorithms.md", words, ("power-budget",), numbers, "python -m comparisons power_budget")
+        return Quote("algorithms.md", words, ("rated-powers",), numbers, "python -m comparisons rated_powers")
 
     line = "| {} |" + 4 * " {{:.1f}} dB, {{:.2f}} |"
     for name in TABLED:
@@ -410,7 +410,7 @@ def _algorithms() -> Iterator[Quote]:
 
 def _budget_line(results: Results, algorithm: str) -> list[float]:
     """Noise reduction and output power over the rated power in each case, means over seeds."""
-    rows = results.extra("power-budget", "rows")
+    rows = results.extra("rated-powers", "rows")
     numbers = []
     for path, noise in CASES:
         own = [

@@ -101,7 +101,7 @@ def main(runs: Runs) -> StudyReport:
         tuned[case] = _tune(runs, joined)
         rows += _measure(runs, case, scenes, joined, tuned[case])
     return StudyReport(
-        name="power-budget",
+        name="rated-powers",
         title="What a rated power buys",
         summary=(
             "Noise reduction and output power of every algorithm, each at its best setting for each rated power, and of "
