@@ -37,8 +37,8 @@ from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
 from .fixed_filters import longest_filter
-from .items import jsonable
 from .limits import Limits
+from .study_report import jsonable
 
 SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("verdict.schema.json")

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from .descriptions import described
-from .items import (
+from .mathematics import mathml, parameter, prose
+from .study_report import (
     EXCERPT_S,
     HEADROOM,
     FigureItem,
@@ -26,7 +27,6 @@ from .items import (
     loudness,
     sound_file,
 )
-from .mathematics import mathml, parameter, prose
 from .summary import claims_sentence
 
 TITLE = "Kalman filter with output power constraint"

@@ -14,7 +14,8 @@ from pathlib import Path
 from kfopc_filterpy.plot import save_figure
 from kfopc_filterpy.signals import write_wav
 
-from .items import (
+from .page import page
+from .study_report import (
     FIGURES_OF_MERIT,
     Claim,
     FigureItem,
@@ -30,7 +31,6 @@ from .items import (
     sound_file,
     table_file,
 )
-from .page import page
 from .summary import claims_sentence, glance
 
 __all__ = [

@@ -11,7 +11,7 @@ import numpy as np
 
 from kfopc_filterpy.plot import curve_style
 
-from .items import OF_THE_PAPER, FigureItem, StudyReport, jsonable
+from .study_report import OF_THE_PAPER, FigureItem, StudyReport, jsonable
 
 # Words of a claim, and what a claim that has them is about.
 SUBJECTS = {

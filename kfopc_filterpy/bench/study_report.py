@@ -1,4 +1,4 @@
-"""The parts of a study's report: claims, parameters, tables, figures, sounds."""
+"""`StudyReport`, everything that the report says of one study: claims, parameters, tables, figures, sounds."""
 
 from __future__ import annotations
 
