@@ -11,6 +11,7 @@ from .exploring import explore as explore
 from .exploring import explore_setups as explore_setups
 from .exploring import read_setup as read_setup
 from .exploring_page import serve_explore as serve_explore
+from .opening import claims_sentence as claims_sentence
 from .registry import Algorithm as Algorithm
 from .registry import algorithms as algorithms
 from .registry import make_controller as make_controller
@@ -29,7 +30,6 @@ from .study_report import Parameter as Parameter
 from .study_report import Sound as Sound
 from .study_report import StudyReport as StudyReport
 from .study_report import Table as Table
-from .summary import claims_sentence as claims_sentence
 from .tuning import AllDivergedError as AllDivergedError
 from .tuning import Trial as Trial
 from .tuning import Tuned as Tuned

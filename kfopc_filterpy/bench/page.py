@@ -13,6 +13,7 @@ import numpy as np
 
 from .descriptions import described
 from .mathematics import mathml, parameter, prose
+from .opening import claims_sentence
 from .study_report import (
     EXCERPT_S,
     HEADROOM,
@@ -27,7 +28,6 @@ from .study_report import (
     loudness,
     sound_file,
 )
-from .summary import claims_sentence
 
 TITLE = "Kalman filter with output power constraint"
 WITHOUT_CLAIMS = "Comparison of algorithms"

@@ -14,6 +14,7 @@ from pathlib import Path
 from kfopc_filterpy.plot import save_figure
 from kfopc_filterpy.signals import write_wav
 
+from .opening import claims_sentence, glance
 from .page import page
 from .study_report import (
     FIGURES_OF_MERIT,
@@ -31,7 +32,6 @@ from .study_report import (
     sound_file,
     table_file,
 )
-from .summary import claims_sentence, glance
 
 __all__ = [
     "FIGURES_OF_MERIT",

@@ -5,7 +5,7 @@ import pytest
 from helpers.reports import study
 
 from kfopc_filterpy.bench import Claim, claims_sentence
-from kfopc_filterpy.bench.summary import GLANCE, glance
+from kfopc_filterpy.bench.opening import GLANCE, glance
 
 POWER, SPEED, CLEAN = "It keeps the Rated Power", "It converges faster", "It has no harmonics"
 
