@@ -45,7 +45,7 @@ from .cases import (
     tune_all,
     with_overdrive,
 )
-from .parts import (
+from .report_parts import (
     MARK,
     by_algorithm,
     ceilings_note,

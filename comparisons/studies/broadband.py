@@ -35,7 +35,7 @@ from kfopc_filterpy.plot import (
 from kfopc_filterpy.signals import band_limited_noise
 
 from .cases import PAPER, grid_runs
-from .parts import (
+from .report_parts import (
     BANDPASS_PATHS,
     ceiling_note,
     common_parameters,

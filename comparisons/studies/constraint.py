@@ -49,7 +49,7 @@ from .cases import (
     paths,
     with_jump,
 )
-from .parts import MARK, case_parameters, cell, legend_of, new_figure
+from .report_parts import MARK, case_parameters, cell, legend_of, new_figure
 
 N_TAPS = 160
 DURATIONS_S = (8.0, 60.0)  # the first is short: it is tuned on, and convergence is measured on it

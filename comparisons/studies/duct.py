@@ -46,7 +46,7 @@ from kfopc_filterpy.plot import (
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
 from .cases import PAPER, grid_runs
-from .parts import ceiling_note, common_parameters, draw, draw_paths, milliseconds, sounds, tuning_note
+from .report_parts import ceiling_note, common_parameters, draw, draw_paths, milliseconds, sounds, tuning_note
 
 FS = 16000.0
 DURATION_S = 10.5

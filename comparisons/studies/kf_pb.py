@@ -19,7 +19,7 @@ from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import DataUnavailableError, load_measured_duct, load_measured_room, looped
 
 from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, paths, with_jump
-from .parts import MARK, new_figure, without_measured
+from .report_parts import MARK, new_figure, without_measured
 
 N_TAPS = 256
 SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on

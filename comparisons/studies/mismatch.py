@@ -26,7 +26,7 @@ from kfopc_filterpy.paths import frequency_response, group_delay, path_taps, per
 from kfopc_filterpy.plot import curve_style
 
 from .cases import BAND_HZ, FS, TONE_HZ, Case, Pair, Row, driven_case, ducts, grid_runs, grids, noise_of
-from .parts import (
+from .report_parts import (
     MARK,
     by_algorithm,
     ceilings_note,

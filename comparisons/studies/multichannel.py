@@ -38,7 +38,7 @@ from .multichannel_rooms import (
     make_rated_scene,
     places,
 )
-from .parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
+from .report_parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"

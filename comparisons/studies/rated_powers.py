@@ -39,7 +39,7 @@ from .cases import (
     paths,
     record_bound_db,
 )
-from .parts import MARK, case_parameters, new_figure, tried
+from .report_parts import MARK, case_parameters, new_figure, tried
 
 SHARES_DB = (-20.0, -15.0, -12.0, -9.0, -6.0, -3.0, 0.0)  # rated power over the unconstrained control power
 DURATION_S = 8.0

@@ -45,7 +45,7 @@ from kfopc_filterpy.plot import (
 from kfopc_filterpy.signals import tone
 
 from .cases import PAPER, Setting, grid_runs
-from .parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
+from .report_parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
 
 FS = 16000.0
 KALMAN = ("KF-ANC", "KF-OPC")

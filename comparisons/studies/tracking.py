@@ -42,7 +42,7 @@ from .cases import (
     tune_all,
     with_jump,
 )
-from .parts import (
+from .report_parts import (
     MARK,
     by_algorithm,
     ceilings_note,

@@ -31,7 +31,16 @@ from .cases import (
     paths,
     tune_all,
 )
-from .parts import MARK, by_algorithm, case_parameters, cell, legend_of, new_figure, tuned_in_words, without_measured
+from .report_parts import (
+    MARK,
+    by_algorithm,
+    case_parameters,
+    cell,
+    legend_of,
+    new_figure,
+    tuned_in_words,
+    without_measured,
+)
 
 ALGORITHM = "KF-PB"
 N_TAPS = 128

@@ -12,7 +12,7 @@ from helpers.results import single_result
 
 from comparisons.studies import broadband
 from comparisons.studies.broadband import FS, KNOWING, UNAWARE, WEIGHTS_EVERY
-from comparisons.studies.parts import first_second_db
+from comparisons.studies.report_parts import first_second_db
 from kfopc_filterpy.bench import make_scene
 from kfopc_filterpy.signals import band_limited_noise
 
