@@ -53,15 +53,15 @@ class Results:
             value = value[key]
         return value
 
-    def said(self, study: str, claim: str) -> list[float]:
-        """Numbers in the verdict on the claim that begins with these words."""
-        verdict = next(v for v in self.studies[study]["verdicts"] if v["claim"].startswith(claim))
-        return [float(number) for number in re.findall(r"[-+]?\d+(?:\.\d+)?", verdict["figure"])]
+    def said(self, study: str, words: str) -> list[float]:
+        """Numbers in what was measured for the claim that begins with these words."""
+        claim = next(claim for claim in self.studies[study]["claims"] if claim["text"].startswith(words))
+        return [float(number) for number in re.findall(r"[-+]?\d+(?:\.\d+)?", claim["measured"])]
 
     def reproduced(self) -> tuple[int, int]:
         """How many claims of the paper's studies were reproduced, and how many there are."""
-        verdicts = [v["reproduced"] for study in PAPER for v in self.studies[study]["verdicts"]]
-        return sum(verdicts), len(verdicts)
+        held = [claim["holds"] for study in PAPER for claim in self.studies[study]["claims"]]
+        return sum(held), len(held)
 
     def rows(self, algorithm: str, stationary: bool, duration_s: float = LONG_S) -> list[dict[str, Any]]:
         """Runs of an algorithm in the constraint study, on stationary or on varying noise."""
@@ -396,7 +396,7 @@ TABLED_DB = -6.0
 
 def _algorithms() -> Iterator[Quote]:
     def quote(words: str, numbers: Callable[[Results], Sequence[float]]) -> Quote:
-        return Quote("algorithms.md", words, ("power-budget",), numbers, "python -m comparisons power_budget")
+        return Quote("algorithms.md", words, ("rated-powers",), numbers, "python -m comparisons rated_powers")
 
     line = "| {} |" + 4 * " {{:.1f}} dB, {{:.2f}} |"
     for name in TABLED:
@@ -410,7 +410,7 @@ def _algorithms() -> Iterator[Quote]:
 
 def _budget_line(results: Results, algorithm: str) -> list[float]:
     """Noise reduction and output power over the rated power in each case, means over seeds."""
-    rows = results.extra("power-budget", "rows")
+    rows = results.extra("rated-powers", "rows")
     numbers = []
     for path, noise in CASES:
         own = [
@@ -424,7 +424,7 @@ def _budget_line(results: Results, algorithm: str) -> list[float]:
 
 
 def _further() -> Iterator[Quote]:
-    """Numbers from the verdicts of the studies of wrong estimates, tracking and amplifiers."""
+    """Numbers from the claims of the studies of wrong estimates, tracking and amplifiers."""
 
     def quote(study: str, words: str, claim: str, *which: int) -> Quote:
         def numbers(results: Results) -> list[float]:

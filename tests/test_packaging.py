@@ -150,21 +150,27 @@ def test_the_guide_says_what_each_extra_is_for():
 
 
 REMOVED = {
-    ("controllers", "kf_pb"): ("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"),
-    ("controllers", "VerifiedController"): ("PathTracker", "MonitoredController"),
-    ("controllers", "PathEvent"): ("PathChange", "HealthEvent"),
-    ("filters", "kf_pb"): ("PowerBudgetKalmanFilter",),
-    ("power", "kf_pb"): ("PowerBudget",),
+    "bench": {"Levels": "SoundLevels", "Verdict": "Claim", "verdict_sentence": "claims_sentence"},
+    "controllers": {
+        **dict.fromkeys(("DirectPowerBudget", "SharedGainKalman", "FrequencyDomainKalman"), "kf_pb"),
+        **dict.fromkeys(("PathTracker", "MonitoredController"), "VerifiedController"),
+        **dict.fromkeys(("PathChange", "HealthEvent"), "PathEvent"),
+    },
+    "filters": {"PowerBudgetKalmanFilter": "kf_pb"},
+    "power": {"PowerBudget": "kf_pb"},
+    "realtime": {"Levels": "RunStatus"},
 }
 
 
 @pytest.mark.parametrize(
-    ("namespace", "instead", "name"), [(*key, name) for key, names in REMOVED.items() for name in names]
+    ("namespace", "name", "instead"),
+    [(space, name, instead) for space, names in REMOVED.items() for name, instead in names.items()],
 )
-def test_a_removed_name_says_what_to_use(namespace, instead, name):
+def test_a_removed_name_says_what_to_use(namespace, name, instead):
     module = importlib.import_module(f"kfopc_filterpy.{namespace}")
-    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use {instead}"):
+    with pytest.raises(AttributeError, match=rf"kfopc_filterpy\.{namespace} has no {name} any more: use {instead}\b"):
         getattr(module, name)
+    assert instead in {*dir(module), *dir(kfopc_filterpy)}
     assert name not in dir(module)
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = module.no_such_name

@@ -16,6 +16,7 @@ from kfopc_filterpy import (
     output_power,
 )
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -23,7 +24,6 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Table,
     Tuned,
-    Verdict,
     algorithms,
     make_controller,
 )
@@ -45,7 +45,7 @@ from .cases import (
     tune_all,
     with_overdrive,
 )
-from .parts import (
+from .report_parts import (
     MARK,
     by_algorithm,
     ceilings_note,
@@ -136,7 +136,7 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=verdicts(rows),
+        claims=claims(rows),
         figures=amplifier_figures(rows),
         notes=[*_notes(pairs, rows), ceilings_note(_scenes(pairs))],
         tables=[
@@ -151,7 +151,7 @@ def main(runs: Runs) -> StudyReport:
             _table(rows, "power", "power", "Output power before the amplifier over the rated power"),
             _table(rows, "asked", "asked_power", "Power that the last weights ask for over what cancels the noise"),
         ],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 
@@ -264,7 +264,7 @@ def _run(scene: Scene, algorithm: str, best: Tuned | None, place: Mapping[str, A
 # ---- Claims and notes
 
 
-def verdicts(rows: Sequence[AmplifierRow]) -> list[Verdict]:
+def claims(rows: Sequence[AmplifierRow]) -> list[Claim]:
     """Return the findings, each on all cases."""
     return [
         _overruns(rows, "KF-ANC"),
@@ -282,13 +282,13 @@ def _of(
     return [r for r in rows if r.algorithm == algorithm and r.known == known and noise in (None, r.noise)]
 
 
-def _overruns(rows: Sequence[AmplifierRow], algorithm: str) -> Verdict:
+def _overruns(rows: Sequence[AmplifierRow], algorithm: str) -> Claim:
     driven = [row for row in _of(rows, algorithm, noise="tone") if row.overdrive_db >= 5.0]
     over = [row for row in driven if row.overruns]
     away = [row for row in driven if row.diverged_at_s is not None]
     asked = [row.asked_power for row in driven if row.diverged_at_s is None]
     growth = [row.weight_growth for row in driven if row.diverged_at_s is None]
-    return Verdict(
+    return Claim(
         f"A tone of 5 dB of overdrive or more makes {algorithm} overrun, with both amplifiers, if it does not know them",
         len(over) == len(driven) > 0,
         f"{len(over)} of {len(driven)} runs; their weights end up asking for {_span(asked)} times the power that cancels the "
@@ -301,18 +301,18 @@ def _span(values: Sequence[float]) -> str:
     return f"{np.min(values):.3g} to {np.max(values):.3g}" if values else "(none)"
 
 
-def _known(rows: Sequence[AmplifierRow]) -> Verdict:
+def _known(rows: Sequence[AmplifierRow]) -> Claim:
     own = _of(rows, "KF-ANC", known=KNOWN)
     asked = [row.asked_power for row in own if row.diverged_at_s is None]
     over = [row for row in own if row.overruns]
-    return Verdict(
+    return Claim(
         "With the amplifier known to its disturbance estimate KF-ANC overruns nowhere",
         not over,
         f"{len(over)} of {len(own)} runs overrun; weights ask for {_span(asked)} times the power that cancels the noise",
     )
 
 
-def _clean(rows: Sequence[AmplifierRow]) -> Verdict:
+def _clean(rows: Sequence[AmplifierRow]) -> Claim:
     free = {_place(row): row.harmonics_db for row in _of(rows, "KF-ANC", noise="tone") if row.overdrive_db > 0.0}
     below = {
         (name, *_place(row)): _ahead(-row.harmonics_db, -free[_place(row)])
@@ -321,7 +321,7 @@ def _clean(rows: Sequence[AmplifierRow]) -> Verdict:
         if row.overdrive_db > 0.0 and row.amplifier == "hard clip"
     }
     least = min(below, key=lambda key: below[key])
-    return Verdict(
+    return Claim(
         f"With a hard clip the harmonics of {' and '.join(KEEPS_POWER)} are {CLEANER_DB:g} dB below those of KF-ANC at every "
         "overdrive",
         below[least] >= CLEANER_DB,
@@ -340,17 +340,17 @@ def _place(row: AmplifierRow) -> tuple[str, str, float]:
     return row.path, row.amplifier, row.overdrive_db
 
 
-def _power(rows: Sequence[AmplifierRow]) -> Verdict:
+def _power(rows: Sequence[AmplifierRow]) -> Claim:
     powers = {name: [row.power for row in _of(rows, name)] for name in KEEPS_POWER}
     away = any(np.isnan(own).any() for own in powers.values())
-    return Verdict(
+    return Claim(
         "KF-OPC and KF-PB keep their rated power to 2 % at every overdrive, although they do not know the amplifier",
         not away and all(max(own) <= 1.02 for own in powers.values()),
         "output power over the rated one: " + ", ".join(f"{name} {_span(own)}" for name, own in powers.items()),
     )
 
 
-def _ordering(rows: Sequence[AmplifierRow]) -> Verdict:
+def _ordering(rows: Sequence[AmplifierRow]) -> Claim:
     free = {(_place(r), r.noise): r.noise_reduction_db for r in _of(rows, "KF-ANC")}
     leads = {
         key: _ahead(r.noise_reduction_db, free[key])
@@ -363,7 +363,7 @@ def _ordering(rows: Sequence[AmplifierRow]) -> Verdict:
         if not lead > 0.0:
             behind.setdefault(noise, set()).add(place[2])
     where = [f"{noise} at {', '.join(f'{level:g}' for level in sorted(own))} dB" for noise, own in behind.items()]
-    return Verdict(
+    return Claim(
         "KF-OPC reduces the noise more than KF-ANC at every overdrive",
         not behind,
         f"by {max(leads.values()):+.1f} dB at best and {min(leads.values()):+.1f} dB at worst"

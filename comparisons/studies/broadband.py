@@ -11,13 +11,13 @@ from scipy.linalg import toeplitz
 
 from kfopc_filterpy import SimulationResult, bandpass_path, noise_reduction_db, output_power
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
     Scene,
     StudyReport,
     Tuned,
-    Verdict,
     figures_of_merit,
     make_controller,
     make_scene,
@@ -35,7 +35,7 @@ from kfopc_filterpy.plot import (
 from kfopc_filterpy.signals import band_limited_noise
 
 from .cases import PAPER, grid_runs
-from .parts import (
+from .report_parts import (
     BANDPASS_PATHS,
     ceiling_note,
     common_parameters,
@@ -63,7 +63,7 @@ SETTLED_DB = -20.0  # of the weight error
 KNOWING = "KF-OPC, known amplifier"
 UNAWARE = "KF-OPC, q without the clipping"
 
-# Criteria of the verdicts
+# Criteria of the claims
 EXACT_MEAN, EXACT_EACH = 0.005, 0.015  # of the rated power
 FAR_OVER = 1.5  # times the rated power
 NOT_SLOWER = 1.1  # times as long
@@ -131,13 +131,13 @@ def main(runs: Runs) -> StudyReport:
             "with_clipping_amplifier": clipped_figures,
             f"convergence_time_s_at_{OTHER_N_TAPS}_taps": other,
         },
-        verdicts=[
-            power_verdict(np.array(powers["KF-OPC"]) / RATED_POWER),
-            best_reduction_verdict(reductions, {name: np.mean(own) / RATED_POWER for name, own in powers.items()}),
-            not_slower_verdict(settling, reached),
-            faster_verdict(times),
-            linear_verdict(coherence.coherence, coherence.gain, reductions["MOV-FxLMS"]),
-            clipped_verdict(clipped_figures, clipped_scene.amplitude_limit),
+        claims=[
+            power_claim(np.array(powers["KF-OPC"]) / RATED_POWER),
+            best_reduction_claim(reductions, {name: np.mean(own) / RATED_POWER for name, own in powers.items()}),
+            not_slower_claim(settling, reached),
+            faster_claim(times),
+            linear_claim(coherence.coherence, coherence.gain, reductions["MOV-FxLMS"]),
+            clipped_claim(clipped_figures, clipped_scene.amplitude_limit),
         ],
         figures=_figures_of(results, weight_errors, clipped, clipped_scene),
         sounds=sounds({name: rows[0] for name, rows in results.items()}),
@@ -258,13 +258,13 @@ def _starts(results: Sequence[SimulationResult]) -> dict[str, list[float]]:
     }
 
 
-# ---- Verdicts, of plain figures
+# ---- Claims, of plain figures
 
 
-def power_verdict(over_rated: np.ndarray) -> Verdict:
-    """Return the verdict on the output power of KF-OPC, given for each seed over the rated power."""
+def power_claim(over_rated: np.ndarray) -> Claim:
+    """Return the claim about the output power of KF-OPC, given for each seed over the rated power."""
     away = np.abs(over_rated - 1.0)
-    return Verdict(
+    return Claim(
         "KF-OPC keeps its output power to the rated power (the paper: 0.79971 of 0.8)",
         bool(abs(over_rated.mean() - 1.0) <= EXACT_MEAN and np.all(away <= EXACT_EACH)),
         f"mean over {len(over_rated)} seeds {over_rated.mean() * RATED_POWER:.5f}, each within {100 * away.max():.2f} % of "
@@ -272,10 +272,10 @@ def power_verdict(over_rated: np.ndarray) -> Verdict:
     )
 
 
-def best_reduction_verdict(reductions_db: Mapping[str, float], over_rated: Mapping[str, float]) -> Verdict:
-    """Return the verdict on KF-ANC from each algorithm's noise reduction, and its power over the rated power."""
+def best_reduction_claim(reductions_db: Mapping[str, float], over_rated: Mapping[str, float]) -> Claim:
+    """Return the claim about KF-ANC from each algorithm's noise reduction, and its power over the rated power."""
     best = all(reductions_db["KF-ANC"] > value for name, value in reductions_db.items() if name != "KF-ANC")
-    return Verdict(
+    return Claim(
         "KF-ANC has the best noise reduction, at an output power far over the rated one",
         bool(best and over_rated["KF-ANC"] > FAR_OVER),
         f"{reductions_db['KF-ANC']:.1f} dB at {over_rated['KF-ANC']:.2f} times the rated power; KF-OPC "
@@ -283,15 +283,15 @@ def best_reduction_verdict(reductions_db: Mapping[str, float], over_rated: Mappi
     )
 
 
-def not_slower_verdict(settling_s: Mapping[str, float | None], reached_s: Mapping[str, float | None]) -> Verdict:
-    """Return the verdict on Fig. 6 a from the times after which each weight error stays low, and is low first."""
+def not_slower_claim(settling_s: Mapping[str, float | None], reached_s: Mapping[str, float | None]) -> Claim:
+    """Return the claim about Fig. 6 a from the times after which each weight error stays low, and is low first."""
     anc, opc = (_or_never(settling_s[name]) for name in ("KF-ANC", "KF-OPC"))
     times = [
         f"{name} {milliseconds(time)}"
         + (f" (first there after {milliseconds(reached_s[name])})" if time is None else "")
         for name, time in settling_s.items()
     ]
-    return Verdict(
+    return Claim(
         "The constraint factor does not slow KF-ANC's convergence",
         bool(np.isfinite(opc) and opc <= NOT_SLOWER * anc),
         f"time after which the error of the weights, weighted by x', stays below {SETTLED_DB:.0f} dB of each algorithm's own "
@@ -299,11 +299,11 @@ def not_slower_verdict(settling_s: Mapping[str, float | None], reached_s: Mappin
     )
 
 
-def faster_verdict(times_s: Mapping[str, float | None]) -> Verdict:
-    """Return the verdict on Fig. 6 a from the convergence times of the NSE, each to its own steady value."""
+def faster_claim(times_s: Mapping[str, float | None]) -> Claim:
+    """Return the claim about Fig. 6 a from the convergence times of the NSE, each to its own steady value."""
     opc, mov = (_or_never(times_s[name]) for name in CONSTRAINED)
     times = f"{mov / opc:.2f} times as long" if np.isfinite([opc, mov]).all() else "no ratio"
-    return Verdict(
+    return Claim(
         "KF-OPC converges faster than MOV-FxLMS, at least twice as fast",
         bool(np.isfinite(opc) and TWICE * opc <= mov),
         f"convergence of the NSE: KF-OPC {milliseconds(times_s['KF-OPC'])}, MOV-FxLMS "
@@ -311,9 +311,9 @@ def faster_verdict(times_s: Mapping[str, float | None]) -> Verdict:
     )
 
 
-def linear_verdict(coherence: float, gain: float, mov_reduction_db: float) -> Verdict:
-    """Return the verdict on Fig. 6 c from the coherence of KF-OPC's anti-noise with the disturbance, and its gain."""
-    return Verdict(
+def linear_claim(coherence: float, gain: float, mov_reduction_db: float) -> Claim:
+    """Return the claim about Fig. 6 c from the coherence of KF-OPC's anti-noise with the disturbance, and its gain."""
+    return Claim(
         "KF-OPC's anti-noise is highly linear with the disturbance",
         bool(coherence > COHERENT),
         f"coherence {coherence:.4f}, gain {gain:.3f} ({POWER_MULTIPLE**-0.5:g} is eq. 13's factor for a flat path); "
@@ -321,8 +321,8 @@ def linear_verdict(coherence: float, gain: float, mov_reduction_db: float) -> Ve
     )
 
 
-def clipped_verdict(clipped: Mapping[str, Mapping[str, Any]], limit: float) -> Verdict:
-    """Return the verdict on the amplifier that clips from the figures of each seed, see `_starts`."""
+def clipped_claim(clipped: Mapping[str, Mapping[str, Any]], limit: float) -> Claim:
+    """Return the claim about the amplifier that clips from the figures of each seed, see `_starts`."""
 
     def of_seeds(name: str, key: str) -> np.ndarray:
         return np.array(clipped[name][key])
@@ -335,7 +335,7 @@ def clipped_verdict(clipped: Mapping[str, Mapping[str, Any]], limit: float) -> V
     def start(name: str) -> str:
         return f"{_span(of_seeds(name, first), 1)} dB, control signal up to {_span(of_seeds(name, peak), 1)}"
 
-    return Verdict(
+    return Claim(
         "Where the amplifier clips, KF-OPC is stable from the start and keeps to the rated power (runs that the paper does "
         "not show)",
         bool(starts.size and np.all(starts) and np.all(kept)),

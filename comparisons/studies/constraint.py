@@ -17,6 +17,7 @@ from kfopc_filterpy import (
     noise_reduction_db,
 )
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -24,7 +25,6 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Table,
     Tuned,
-    Verdict,
     make_controller,
     tune,
 )
@@ -49,7 +49,7 @@ from .cases import (
     paths,
     with_jump,
 )
-from .parts import MARK, case_parameters, cell, legend_of, new_figure
+from .report_parts import MARK, case_parameters, cell, legend_of, new_figure
 
 N_TAPS = 160
 DURATIONS_S = (8.0, 60.0)  # the first is short: it is tuned on, and convergence is measured on it
@@ -177,7 +177,7 @@ def main(runs: Runs) -> StudyReport:
         parameters=_parameters(tuned),
         algorithms={},
         extra={"rows": [asdict(row) for row in rows], "convergence_s": settled},
-        verdicts=_claims(rows, jumps, clipped, settled),
+        claims=_claims(rows, jumps, clipped, settled),
         figures=constraint_figures(rows, jumps, course),
         notes=_notes(made, rows),
         tables=[
@@ -187,7 +187,7 @@ def main(runs: Runs) -> StudyReport:
             _jump_table(jumps),
             _amplifier_table(clipped),
         ],
-        claims="Aims",
+        claims_heading="Aims",
     )
 
 
@@ -339,7 +339,7 @@ def run_course(scene: Scene, case: Case, tuned: Mapping[str, Tuned]) -> Course:
 
 def _claims(
     rows: Sequence[ConstraintRow], jumps: Sequence[Jump], clipped: Sequence[ClippedRow], settled: Settled
-) -> list[Verdict]:
+) -> list[Claim]:
     return [
         _steady_claim([row for row in rows if row.case.stationary and row.algorithm == "KF-PB"]),
         _varying_claim([row for row in rows if not row.case.stationary and row.algorithm == "KF-PB"]),
@@ -350,9 +350,9 @@ def _claims(
     ]
 
 
-def _steady_claim(rows: Sequence[ConstraintRow]) -> Verdict:
+def _steady_claim(rows: Sequence[ConstraintRow]) -> Claim:
     powers, losses = [row.power for row in rows], [row.loss_db for row in rows]
-    return Verdict(
+    return Claim(
         "KF-PB on stationary noise: output power 0.97 to 1.02 of the rated one, and noise reduction within 0.5 dB of the "
         "power-constrained Wiener solution, in every run",
         bool(np.min(powers) >= 0.97 and np.max(powers) <= 1.02 and np.max(losses) <= 0.5),
@@ -361,11 +361,11 @@ def _steady_claim(rows: Sequence[ConstraintRow]) -> Verdict:
     )
 
 
-def _varying_claim(rows: Sequence[ConstraintRow]) -> Verdict:
+def _varying_claim(rows: Sequence[ConstraintRow]) -> Claim:
     longest = max(row.duration_s for row in rows)
     long = [row for row in rows if row.duration_s == longest]
     powers, losses = [row.power for row in long], [row.loss_db for row in long]
-    return Verdict(
+    return Claim(
         f"KF-PB on swelling and bursty noise: output power at most 1.05 of the rated one, and noise reduction within 1 dB "
         f"of each second's own power-constrained Wiener solution, in every run of {longest:g} s, over several averaging times",
         bool(np.max(powers) <= 1.05 and np.max(losses) <= 1.0),
@@ -379,9 +379,9 @@ def _worst(rows: Sequence[ConstraintRow]) -> str:
     return f"{row.loss_db:.2f} dB ({row.place})"
 
 
-def _jump_claim(jumps: Sequence[Jump]) -> Verdict:
+def _jump_claim(jumps: Sequence[Jump]) -> Claim:
     loss, weight = (float(np.max(np.abs([getattr(jump, name) for jump in jumps]))) for name in ("loss_db", "weight_db"))
-    return Verdict(
+    return Claim(
         f"{BACK_S:g} seconds after a jump of ±{max(JUMPS_DB):g} dB, one second long, noise reduction and lambda are those without "
         "the jump, to 1 dB",
         loss <= 1.0 and weight <= 1.0,
@@ -389,11 +389,11 @@ def _jump_claim(jumps: Sequence[Jump]) -> Verdict:
     )
 
 
-def _guarantee_claim(rows: Sequence[ConstraintRow], jumps: Sequence[Jump], clipped: Sequence[ClippedRow]) -> Verdict:
+def _guarantee_claim(rows: Sequence[ConstraintRow], jumps: Sequence[Jump], clipped: Sequence[ClippedRow]) -> Claim:
     worst = [row.worst_window for row in rows if row.algorithm.endswith("limited")]
     worst += [jump.worst_window_limited for jump in jumps]
     worst += [run.worst_window for run in clipped if run.algorithm.endswith("limited")]
-    return Verdict(
+    return Claim(
         f"With the limiter no window of {1e3 * WINDOW_S:g} ms is above the rated power: level jumps, a wrong secondary path "
         "and a clipping amplifier included",
         bool(np.max(worst) <= 1 + 1e-9),
@@ -401,7 +401,7 @@ def _guarantee_claim(rows: Sequence[ConstraintRow], jumps: Sequence[Jump], clipp
     )
 
 
-def _transparency_claims(rows: Sequence[ConstraintRow]) -> list[Verdict]:
+def _transparency_claims(rows: Sequence[ConstraintRow]) -> list[Claim]:
     ours, theirs = (
         {row.place: row for row in rows if row.algorithm == f"{name} limited"} for name in ("KF-PB", "KF-OPC")
     )
@@ -409,12 +409,12 @@ def _transparency_claims(rows: Sequence[ConstraintRow]) -> list[Verdict]:
     least = min(gains, key=lambda place: -np.inf if np.isnan(gains[place]) else gains[place])
     tones = [row.loss_db for row in ours.values() if row.noise == "tone"]
     return [
-        Verdict(
+        Claim(
             "Behind the limiter KF-PB reduces the noise by at most 0.3 dB less than KF-OPC behind it, in every run",
             gains[least] >= -0.3,
             f"{np.mean(list(gains.values())):+.2f} dB on average, {gains[least]:+.2f} dB at worst ({least})",
         ),
-        Verdict(
+        Claim(
             "Behind the limiter a tone is reduced to within 0.5 dB of the bound",
             bool(np.max(tones) <= 0.5),
             f"{len(tones)} runs: {np.max(tones):.2f} dB below it at most",
@@ -422,10 +422,10 @@ def _transparency_claims(rows: Sequence[ConstraintRow]) -> list[Verdict]:
     ]
 
 
-def _convergence_claim(settled: Settled) -> Verdict:
+def _convergence_claim(settled: Settled) -> Claim:
     ratios = {name: _ratio(own["KF-PB"], own["KF-ANC"]) for name, own in settled.items()}
     slowest = max(ratios, key=lambda name: ratios[name])
-    return Verdict(
+    return Claim(
         "KF-PB converges no slower than 1.5 times KF-ANC's time",
         ratios[slowest] <= 1.5,
         f"{np.mean(list(ratios.values())):.2f} times on average, {ratios[slowest]:.2f} at most ({slowest}); NSE over 50 ms, "

@@ -1,6 +1,6 @@
 """Study 3: machine noise in a duct (the paper's Fig. 7), with a modelled and with a measured duct.
 
-The verdicts are functions of plain figures, `Figures` and `Start`, so that tests can state both outcomes.
+The claims are functions of plain figures, `Figures` and `Start`, so that tests can state both outcomes.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -21,7 +22,6 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Table,
     Tuned,
-    Verdict,
     figures_of_merit,
     make_controller,
     make_scene,
@@ -46,7 +46,7 @@ from kfopc_filterpy.plot import (
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
 from .cases import PAPER, grid_runs
-from .parts import ceiling_note, common_parameters, draw, draw_paths, milliseconds, sounds, tuning_note
+from .report_parts import ceiling_note, common_parameters, draw, draw_paths, milliseconds, sounds, tuning_note
 
 FS = 16000.0
 DURATION_S = 10.5
@@ -61,13 +61,13 @@ ALGORITHMS = (*PAPER, FIXED, "KF-PB")
 RATED = ("KF-OPC", "KF-PB", "MOV-FxLMS", FIXED)  # those with a rated power
 OTHER_MULTIPLE = 10.0  # a rated power of 10 % of what the noise needs, beside the one of 25 %
 
-# What the verdicts call keeping the rated power, over the steady half and over the worst second, and disregarding it.
+# What the claims call keeping the rated power, over the steady half and over the worst second, and disregarding it.
 KEPT, KEPT_OVER_1_S, DISREGARDED = 1.02, 1.1, 1.5
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What the verdicts need of a run; powers are over the rated power."""
+    """What the claims need of a run; powers are over the rated power."""
 
     noise_reduction_db: float  # over the steady half, by energy
     mean_nse_db: float  # over the whole run, the measure of the paper's figure
@@ -226,7 +226,7 @@ def _study(
             "constraint_factor_over_first_second": _range_of_factor(results["KF-OPC"]),
             "convergence_time_s": {algorithm: own["convergence_time_s"] for algorithm, own in algorithms.items()},
         },
-        verdicts=[
+        claims=[
             best_claim(figures),
             confined_claim(figures["KF-OPC"]),
             faster_claim(start),
@@ -247,7 +247,7 @@ def _study(
 
 
 def figures_of(result: SimulationResult, rated_power: float) -> Figures:
-    """Return the figures that the verdicts need of a run."""
+    """Return the figures that the claims need of a run."""
     return Figures(
         noise_reduction_db=noise_reduction_db(result.error, result.disturbance),
         mean_nse_db=float(np.mean(nse_db(result.error, result.disturbance, FS, NSE_WINDOW_S))),
@@ -369,8 +369,8 @@ def _start_note(opc: SimulationResult, algorithms: Mapping[str, Mapping[str, Any
     acting = "acts throughout" if high < 1.0 else "does not act all the time, and where it is 1 KF-OPC is KF-ANC"
     tested = "no second in which it acts throughout" if start is None else f"a start at {start.at_s:g} s, where it acts"
     return (
-        f"In the first second the constraint factor is {low:.2f} to {high:.2f}: the constraint {acting}. The verdict on "
-        f"convergence is on {tested}. Each algorithm's convergence to its own steady value (NSE over 50 ms): {times}."
+        f"In the first second the constraint factor is {low:.2f} to {high:.2f}: the constraint {acting}. The claim "
+        f"about convergence is tested on {tested}. Each algorithm's convergence to its own steady value (NSE over 50 ms): {times}."
     )
 
 
@@ -429,23 +429,23 @@ def _rating_table(
     )
 
 
-# ---- Verdicts
+# ---- Claims
 
 
-def best_claim(figures: Mapping[str, Figures]) -> Verdict:
-    """Return the verdict on KF-ANC, of the algorithms that the paper compares."""
+def best_claim(figures: Mapping[str, Figures]) -> Claim:
+    """Return the claim about KF-ANC, of the algorithms that the paper compares."""
     anc = figures["KF-ANC"]
     others = max(figures[name].noise_reduction_db for name in PAPER if name != "KF-ANC")
-    return Verdict(
+    return Claim(
         "KF-ANC has the best noise reduction and disregards the rated power",
         bool(anc.noise_reduction_db > others and anc.power > DISREGARDED),
         f"{anc.noise_reduction_db:.1f} dB, the next best {others:.1f} dB, at {anc.power:.2f} times the rated power",
     )
 
 
-def confined_claim(opc: Figures) -> Verdict:
-    """Return the verdict on KF-OPC's output power."""
-    return Verdict(
+def confined_claim(opc: Figures) -> Claim:
+    """Return the claim about KF-OPC's output power."""
+    return Claim(
         "KF-OPC confines the output power to the rated power",
         bool(opc.power <= KEPT and opc.worst_second <= KEPT_OVER_1_S),
         f"output power {opc.power:.3f} of the rated power over the steady half, at most {opc.worst_second:.3f} over 1 s, "
@@ -453,19 +453,19 @@ def confined_claim(opc: Figures) -> Verdict:
     )
 
 
-def faster_claim(start: Start | None) -> Verdict:
-    """Return the verdict on the start: KF-OPC must be sooner as it is, and with as much power as MOV-FxLMS."""
-    claim = "KF-OPC converges faster than MOV-FxLMS"
+def faster_claim(start: Start | None) -> Claim:
+    """Return the claim about the start: KF-OPC must be sooner as it is, and with as much power as MOV-FxLMS."""
+    text = "KF-OPC converges faster than MOV-FxLMS"
     if start is None:
-        return Verdict(
-            claim,
+        return Claim(
+            text,
             False,
             "not tested: the constraint does not act throughout any second, and without it KF-OPC is KF-ANC",
         )
     reduction, power = start.noise_reduction_db, start.power
     mov = reduction["MOV-FxLMS"]
-    return Verdict(
-        claim,
+    return Claim(
+        text,
         bool(start.time_s < start.mov_time_s and start.equal_time_s < start.mov_equal_time_s),
         f"after a start at {start.at_s:g} s, where the constraint factor is at most {start.largest_factor:.2f}, they reach a "
         f"common level in {milliseconds(start.time_s)} and {milliseconds(start.mov_time_s)}, at {power['KF-OPC']:.2f} and "
@@ -477,23 +477,23 @@ def faster_claim(start: Start | None) -> Verdict:
     )
 
 
-def nearer_claim(figures: Mapping[str, Figures]) -> Verdict:
-    """Return the verdict on whose output power is nearer to the rated power."""
+def nearer_claim(figures: Mapping[str, Figures]) -> Claim:
+    """Return the claim about whose output power is nearer to the rated power."""
     opc, mov, fixed = figures["KF-OPC"], figures["MOV-FxLMS"], figures[FIXED]
-    return Verdict(
+    return Claim(
         "KF-OPC's output power is closer to the rated power than MOV-FxLMS's",
         bool(abs(opc.power - 1.0) < abs(mov.power - 1.0)),
         f"{opc.power:.3f} against {mov.power:.3f} of the rated power; MOV-FxLMS with a fixed penalty {fixed.power:.3f}",
     )
 
 
-def better_claim(figures: Mapping[str, Figures]) -> Verdict:
-    """Return the verdict on whose noise reduction is better, by the measure of the paper's figure; both are told."""
+def better_claim(figures: Mapping[str, Figures]) -> Claim:
+    """Return the claim about whose noise reduction is better, by the measure of the paper's figure; both are told."""
     opc, mov, fixed = figures["KF-OPC"], figures["MOV-FxLMS"], figures[FIXED]
     by_nse = bool(opc.mean_nse_db < mov.mean_nse_db)
     by_energy = bool(opc.noise_reduction_db > mov.noise_reduction_db)
     ahead = {True: "KF-OPC is ahead", False: "MOV-FxLMS is ahead"}
-    return Verdict(
+    return Claim(
         "KF-OPC's noise reduction is better than MOV-FxLMS's (by the mean NSE, the measure of the paper's figure)",
         by_nse,
         f"by the mean NSE {ahead[by_nse]}: {opc.mean_nse_db:.2f} against {mov.mean_nse_db:.2f} dB; by the energy over the "

@@ -12,14 +12,14 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import MOVFxLMS, kf_pb, noise_reduction_db, power_constrained_wiener, simulate
-from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table, Verdict
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, StudyReport, Table
 from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import DataUnavailableError, load_measured_duct, load_measured_room, looped
 
 from .cases import FS, SENSOR_NOISE_DB, Pair, made_noises, paths, with_jump
-from .parts import MARK, new_figure, without_measured
+from .report_parts import MARK, new_figure, without_measured
 
 N_TAPS = 256
 SILENT_S, DURATION_S = 3.0, 20.0  # before and after the control is switched on
@@ -315,11 +315,11 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows], "faults": [asdict(row) for row in wrong]},
-        verdicts=verdicts(rows, wrong),
+        claims=claims(rows, wrong),
         figures=[loss_figure(rows)],
         notes=without_measured(pairs),
         tables=[class_table(rows), case_table(rows), fault_table(wrong)],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 
@@ -331,7 +331,7 @@ def of_class(rows: Iterable[ClassRow], kind: str) -> list[ClassRow]:
     return [row for row in rows if row.kind == kind]
 
 
-def verdicts(rows: Sequence[ClassRow], wrong: Sequence[FaultRow]) -> list[Verdict]:
+def claims(rows: Sequence[ClassRow], wrong: Sequence[FaultRow]) -> list[Claim]:
     """Return what is asked of KF-PB, and what it reaches."""
     found = []
     for kind, power, worst, within, behind in ((STEADY, 1.02, -1.0, 0.95, 0.0), (CHANGING, 1.05, -5.0, 1.0, 0.1)):
@@ -340,17 +340,17 @@ def verdicts(rows: Sequence[ClassRow], wrong: Sequence[FaultRow]) -> list[Verdic
             np.array([getattr(row, name) for row in own]) for name in ("power", "over_bound_db", "over_mov_db")
         )
         found += [
-            Verdict(
+            Claim(
                 f"Power over any 10 s at most {power:g} of the rating, {kind}",
                 bool(powers.max() <= power),
                 f"{powers.max():.3f}",
             ),
-            Verdict(
+            Claim(
                 f"At most {-worst:g} dB below the bound of each second in {100 * within:g} % of the cases, {kind}",
                 bool(np.mean(losses >= worst) >= within),
                 f"{100 * np.mean(losses >= worst):.0f} %; {losses.mean():+.2f} dB on average, {losses.min():+.2f} dB at worst",
             ),
-            Verdict(
+            Claim(
                 f"0.5 dB below the best MOV-FxLMS in at most {100 * behind:g} % of the cases, {kind}",
                 bool(np.mean(ahead < -0.5) <= behind),
                 f"{100 * np.mean(ahead < -0.5):.0f} %; {ahead.mean():+.2f} dB on average, {ahead.min():+.2f} dB at worst",
@@ -360,12 +360,12 @@ def verdicts(rows: Sequence[ClassRow], wrong: Sequence[FaultRow]) -> list[Verdic
     lost = np.array([row.lost_db for row in wrong if row.fault != "3 dB louder"])
     return [
         *found,
-        Verdict(
+        Claim(
             "With a wrong path, no second is more than 1 dB louder than without control",
             worst_second.worst_second_db >= -1.0,
             f"{worst_second.worst_second_db:+.1f} dB ({worst_second.path}, {worst_second.noise}, {worst_second.fault}, {worst_second.begins})",
         ),
-        Verdict(
+        Claim(
             "From 2 s after the fault on, at most 1 dB is lost against the right estimate",
             bool(np.mean(lost <= 1.0) == 1.0),
             f"in {100 * np.mean(lost <= 1.0):.0f} % of {lost.size} runs; {lost.mean():+.2f} dB on average",

@@ -15,7 +15,7 @@ from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table
 
 from .cases import FS, SENSOR_NOISE_DB, Pair
 from .kf_pb import DURATION_S, FAULTS, N_TAPS, SEED, SHARES, SILENT_S, STEADY, Rated, all_paths, make_rated, noises
-from .parts import new_figure, without_measured
+from .report_parts import new_figure, without_measured
 
 LONG = 4 * N_TAPS  # taps that stand for a filter of any length
 FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
@@ -124,11 +124,11 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=[],
+        claims=[],
         figures=[loss_figure(rows)],
         notes=without_measured(pairs),
         tables=[loss_table(rows)],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 

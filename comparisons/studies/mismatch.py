@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -17,7 +18,6 @@ from kfopc_filterpy.bench import (
     Table,
     Trial,
     Tuned,
-    Verdict,
     algorithms,
     best_setting,
     try_settings,
@@ -26,7 +26,7 @@ from kfopc_filterpy.paths import frequency_response, group_delay, path_taps, per
 from kfopc_filterpy.plot import curve_style
 
 from .cases import BAND_HZ, FS, TONE_HZ, Case, Pair, Row, driven_case, ducts, grid_runs, grids, noise_of
-from .parts import (
+from .report_parts import (
     MARK,
     by_algorithm,
     ceilings_note,
@@ -108,7 +108,7 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=verdicts(rows),
+        claims=claims(rows),
         figures=mismatch_figures(rows),
         notes=[*_notes(pairs, rows, accuracy), ceilings_note(scenes)],
         tables=[
@@ -122,7 +122,7 @@ def main(runs: Runs) -> StudyReport:
                 "power",
             ),
         ],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 
@@ -214,7 +214,7 @@ def _row(case: Case, rated_power: float, trial: Trial, **place: Any) -> Mismatch
 # ---- Claims and notes
 
 
-def verdicts(rows: Sequence[MismatchRow]) -> list[Verdict]:
+def claims(rows: Sequence[MismatchRow]) -> list[Claim]:
     """Return the findings, each on all cases."""
     return [
         *(_quarter_turn(rows, name) for name in ("FxLMS", "KF-ANC")),
@@ -224,7 +224,7 @@ def verdicts(rows: Sequence[MismatchRow]) -> list[Verdict]:
     ]
 
 
-def _quarter_turn(rows: Iterable[MismatchRow], name: str) -> Verdict:
+def _quarter_turn(rows: Iterable[MismatchRow], name: str) -> Claim:
     own = [
         row
         for row in rows
@@ -233,7 +233,7 @@ def _quarter_turn(rows: Iterable[MismatchRow], name: str) -> Verdict:
     below, above = [r for r in own if r.amount < 90.0], [r for r in own if r.amount > 90.0]
     lost, left = [r for r in below if r.unstable], [r for r in above if not r.unstable]
     worst, best = min(below, key=_value), max(above, key=_value)
-    return Verdict(
+    return Claim(
         f"{name} tuned with the wrong path reduces band noise at every phase error below 90 degrees, and at none above",
         not lost and not left,
         f"{len(below) - len(lost)} of {len(below)} runs below reduce it, the least by {_value(worst):.1f} dB "
@@ -249,14 +249,14 @@ def _where(row: MismatchRow) -> str:
     return f"{row.algorithm}, {row.path}, {row.noise}, {row.kind} {row.amount:+g} {UNITS[row.kind]}"
 
 
-def _gain(rows: Sequence[MismatchRow]) -> Verdict:
+def _gain(rows: Sequence[MismatchRow]) -> Claim:
     losses = {}
     for name in ("KF-ANC", "KF-PB", "FxLMS", "MOV-FxLMS"):
         own = [row for row in rows if row.kind == "gain" and row.algorithm == name and row.tuned_with == EXACT]
         exact = {(row.path, row.noise): _value(row) for row in own if row.amount == 0.0}
         losses[name] = max(exact[row.path, row.noise] - _value(row) for row in own)
     largest = max(abs(a) for a in AMOUNTS["gain"])
-    return Verdict(
+    return Claim(
         f"A gain up to {largest:g} dB off costs KF-ANC and KF-PB at most {GAIN_LOSS_DB:g} dB without tuning again",
         max(losses["KF-ANC"], losses["KF-PB"]) <= GAIN_LOSS_DB,
         "largest loss: " + ", ".join(f"{name} {_loss(loss)}" for name, loss in losses.items()),
@@ -267,12 +267,12 @@ def _loss(loss_db: float) -> str:
     return "diverges" if np.isinf(loss_db) else f"{loss_db:.1f} dB"
 
 
-def _bounded(rows: Sequence[MismatchRow]) -> Verdict:
+def _bounded(rows: Sequence[MismatchRow]) -> Claim:
     own = [row for row in rows if row.algorithm in KEEPS_POWER]
     away = [row for row in own if row.diverged_at_s is not None]
     others = [row for row in rows if row.algorithm in UNCONSTRAINED and row.tuned_with == EXACT]
     worst = min(own, key=_value)
-    return Verdict(
+    return Claim(
         f"{', '.join(KEEPS_POWER[:-1])} and {KEEPS_POWER[-1]} never diverge, whatever the mismatch and the tuning",
         not away,
         f"{len(away)} of {len(own)} runs diverged; the loudest left {-_value(worst):.1f} dB more than the noise "
@@ -281,13 +281,13 @@ def _bounded(rows: Sequence[MismatchRow]) -> Verdict:
     )
 
 
-def _power(rows: Sequence[MismatchRow]) -> Verdict:
+def _power(rows: Sequence[MismatchRow]) -> Claim:
     powers = {
         name: [row.power for row in rows if row.algorithm == name and row.tuned_with == EXACT and row.kind == "gain"]
         for name in KEEPS_POWER
     }
     ours = powers["KF-PB"]
-    return Verdict(
+    return Claim(
         "With a wrong gain KF-PB keeps 0.97 to 1.02 of its rated power, and KF-OPC does not",
         bool(np.min(ours) >= 0.97 and np.max(ours) <= 1.02)
         and not bool(np.min(powers["KF-OPC"]) >= 0.97 and np.max(powers["KF-OPC"]) <= 1.02),

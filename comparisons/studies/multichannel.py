@@ -10,6 +10,7 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, convergence_time_s, noise_reduction_db, output_power
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -18,7 +19,6 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Table,
     Tuned,
-    Verdict,
     algorithms,
     run_setting,
     try_settings,
@@ -26,10 +26,19 @@ from kfopc_filterpy.bench import (
 )
 from kfopc_filterpy.plot import curve_style, plot_nse
 
-from . import rooms
+from . import multichannel_rooms as rooms
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Row, Setting, bound_of
-from .parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
-from .rooms import MEASURED, RECORDINGS, SIZES, Place, equally_rated, level_map_db, make_rated_scene, places
+from .multichannel_rooms import (
+    MEASURED,
+    RECORDINGS,
+    SIZES,
+    Place,
+    equally_rated,
+    level_map_db,
+    make_rated_scene,
+    places,
+)
+from .report_parts import MARK, first_second_db, legend_of, new_figure, tuned_in_words
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
@@ -116,12 +125,12 @@ def main(runs: Runs) -> StudyReport | str:
         parameters=_parameters(outcomes),
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=claims(rows),
+        claims=claims(rows),
         figures=_figures(outcomes, rows),
         sounds=_sounds(outcomes),
         notes=_notes(rows, outcomes),
         tables=[_reduction_table(rows), _power_table(rows), _settling_table(rows)],
-        claims="Aims",
+        claims_heading="Aims",
     )
 
 
@@ -208,31 +217,31 @@ def _equal_rows(name: str, noise: str, scene: Scene, setting: Setting) -> list[C
 # ---- Claims and notes
 
 
-def claims(rows: Sequence[ChannelRow]) -> list[Verdict]:
-    """Return the verdicts on the aims of KF-PB."""
+def claims(rows: Sequence[ChannelRow]) -> list[Claim]:
+    """Return the aims of KF-PB, and whether they are met."""
     own = {_key(row): row for row in rows if row.algorithm == KF_PB}
     bound = {_key(row): row for row in rows if row.algorithm == BOUND}
     steady = [key for key in own if key[1] not in RECORDINGS]
     recorded = [key for key in own if key[1] in RECORDINGS]
-    verdicts = [
-        _power_verdict("Steady noise", "0.97 to 1.02", 0.97, 1.02, own, bound, steady),
-        _loss_verdict("On steady noise KF-PB reaches the bound to within 0.5 dB", 0.5, own, bound, steady),
+    found = [
+        _power_claim("Steady noise", "0.97 to 1.02", 0.97, 1.02, own, bound, steady),
+        _loss_claim("On steady noise KF-PB reaches the bound to within 0.5 dB", 0.5, own, bound, steady),
     ]
     if recorded:
-        verdicts += [
-            _power_verdict("Recordings", "at most 1.05", 0.0, 1.05, own, bound, recorded),
-            _loss_verdict(
+        found += [
+            _power_claim("Recordings", "at most 1.05", 0.0, 1.05, own, bound, recorded),
+            _loss_claim(
                 "On recordings KF-PB reaches the bound of each second to within 1 dB", 1.0, own, bound, recorded
             ),
         ]
-    return [*verdicts, _rivals_verdict(rows)]
+    return [*found, _rivals_claim(rows)]
 
 
 def _key(row: ChannelRow) -> tuple[str, str, str]:
     return row.path, row.noise, row.rating
 
 
-def _power_verdict(
+def _power_claim(
     what: str,
     aim: str,
     least: float,
@@ -240,18 +249,18 @@ def _power_verdict(
     own: dict[Any, ChannelRow],
     bound: dict[Any, ChannelRow],
     keys: Sequence[Any],
-) -> Verdict:
+) -> Claim:
     """Judge the powers, above all of loudspeakers that their rating limits."""
-    claim = f"{what}: every loudspeaker's power is {aim} of its rating if that limits it, and never more"
+    text = f"{what}: every loudspeaker's power is {aim} of its rating if that limits it, and never more"
     if diverged := _diverged(own, keys):
-        return Verdict(claim, False, diverged)
+        return Claim(text, False, diverged)
     binding = [
         power for key in keys for power, limited in zip(own[key].powers, bound[key].limited, strict=True) if limited
     ]
     free = [power for key in keys for power in own[key].powers]
     kept = bool(binding) and min(binding) >= least and max(free) <= most
-    return Verdict(
-        claim,
+    return Claim(
+        text,
         kept,
         f"{min(binding, default=np.nan):.3f} to {max(binding, default=np.nan):.3f} if the rating limits, "
         f"{max(free, default=np.nan):.3f} at most of all",
@@ -264,27 +273,27 @@ def _diverged(own: dict[Any, ChannelRow], keys: Sequence[Any]) -> str:
     return f"KF-PB diverged: {'; '.join(where)}" if where else ""
 
 
-def _loss_verdict(
-    claim: str, most_db: float, own: dict[Any, ChannelRow], bound: dict[Any, ChannelRow], keys: Sequence[Any]
-) -> Verdict:
+def _loss_claim(
+    text: str, most_db: float, own: dict[Any, ChannelRow], bound: dict[Any, ChannelRow], keys: Sequence[Any]
+) -> Claim:
     if diverged := _diverged(own, keys):
-        return Verdict(claim, False, diverged)
+        return Claim(text, False, diverged)
     losses = {key: bound[key].noise_reduction_db - own[key].noise_reduction_db for key in keys}
     worst = max(losses, key=lambda key: losses[key])
-    return Verdict(
-        claim,
+    return Claim(
+        text,
         losses[worst] <= most_db,
         f"{np.mean(list(losses.values())):.2f} dB below it on average, "
         f"{losses[worst]:.2f} dB at worst ({', '.join(worst)})",
     )
 
 
-def _rivals_verdict(rows: Sequence[ChannelRow]) -> Verdict:
+def _rivals_claim(rows: Sequence[ChannelRow]) -> Claim:
     """Judge KF-PB against the best other method that keeps the budget, for each place and noise with one."""
-    claim = "No method of another kind that keeps every rating is more than 0.3 dB better"
+    text = "No method of another kind that keeps every rating is more than 0.3 dB better"
     own = {_key(row): row for row in rows if row.algorithm == KF_PB and row.rating != EQUAL}
     if diverged := _diverged(own, list(own)):
-        return Verdict(claim, False, diverged)
+        return Claim(text, False, diverged)
     registry = algorithms(several_channels=True)
     ahead = {}
     for key, row in own.items():
@@ -294,11 +303,11 @@ def _rivals_verdict(rows: Sequence[ChannelRow]) -> Verdict:
             best = max(rivals, key=lambda other: other.noise_reduction_db)
             ahead[f"{row.case}: {best.algorithm}"] = row.noise_reduction_db - best.noise_reduction_db
     if not ahead:
-        return Verdict(claim, False, "no other method keeps the ratings anywhere: nothing to compare with")
+        return Claim(text, False, "no other method keeps the ratings anywhere: nothing to compare with")
     worst, most = min(ahead, key=lambda key: ahead[key]), max(ahead.values())
     alone = f"; in {len(own) - len(ahead)} of {len(own)} cases no other keeps them" if len(ahead) < len(own) else ""
-    return Verdict(
-        claim,
+    return Claim(
+        text,
         ahead[worst] >= -0.3,
         f"KF-PB is {np.mean(list(ahead.values())):+.2f} dB ahead of the best other on average, "
         f"{ahead[worst]:+.2f} dB at worst ({worst}), {most:+.2f} dB at best{alone}",

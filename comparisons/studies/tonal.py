@@ -19,13 +19,13 @@ from kfopc_filterpy import (
     output_power,
 )
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
     Scene,
     StudyReport,
     Tuned,
-    Verdict,
     algorithms,
     figures_of_merit,
     make_controller,
@@ -45,7 +45,7 @@ from kfopc_filterpy.plot import (
 from kfopc_filterpy.signals import tone
 
 from .cases import PAPER, Setting, grid_runs
-from .parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
+from .report_parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
 
 FS = 16000.0
 KALMAN = ("KF-ANC", "KF-OPC")
@@ -60,7 +60,7 @@ FORGETFUL = max(algorithms()["KF-ANC"].grid)  # most state noise of the grid: th
 FILTERPY_SAMPLES = 4000
 WEIGHTS_EVERY = 160
 
-# Criteria of the verdicts
+# Criteria of the claims
 HARMONICS_DB = -30.0  # over the disturbance; louder ones are harmonics, 3 % in amplitude
 CLEAN_DB = -60.0  # softer ones are none: the sensor noise is as loud
 PEAK_SHARE = 1.01  # of the amplifier's limit
@@ -124,12 +124,12 @@ def main(runs: Runs) -> StudyReport:
             "largest_weight_over_optimal": growth_of(results["KF-ANC"], optimal_weight).over_optimal,
             "filterpy_largest_difference": oracle,
         },
-        verdicts=[
-            harmonics_verdict(_number(merits["KF-ANC"], "harmonics_db"), _number(merits["KF-OPC"], "harmonics_db")),
-            peak_verdict(float(np.abs(results["KF-OPC"].control_signal).max()), scene.amplitude_limit),
-            power_verdict(_number(merits["KF-OPC"], "output_power") / RATED_POWER),
-            growth_verdict(growths),
-            reduction_verdict(
+        claims=[
+            harmonics_claim(_number(merits["KF-ANC"], "harmonics_db"), _number(merits["KF-OPC"], "harmonics_db")),
+            peak_claim(float(np.abs(results["KF-OPC"].control_signal).max()), scene.amplitude_limit),
+            power_claim(_number(merits["KF-OPC"], "output_power") / RATED_POWER),
+            growth_claim(growths),
+            reduction_claim(
                 _number(merits["KF-ANC"], "noise_reduction_db"),
                 _number(merits["KF-OPC"], "noise_reduction_db"),
                 crossings,
@@ -252,12 +252,12 @@ def _largest_difference(theirs: SimulationResult, ours: SimulationResult) -> dic
     }
 
 
-# ---- Verdicts, of plain figures
+# ---- Claims, of plain figures
 
 
-def harmonics_verdict(anc_db: float, opc_db: float) -> Verdict:
-    """Return the verdict on Fig. 5 a and b from the harmonics of both filters, in dB over the disturbance."""
-    return Verdict(
+def harmonics_claim(anc_db: float, opc_db: float) -> Claim:
+    """Return the claim about Fig. 5 a and b from the harmonics of both filters, in dB over the disturbance."""
+    return Claim(
         "KF-ANC produces harmonics, KF-OPC does not",
         bool(anc_db >= HARMONICS_DB and opc_db <= CLEAN_DB),
         f"harmonics over the disturbance: KF-ANC {anc_db:.1f} dB, KF-OPC {opc_db:.1f} dB, the sensor noise as a whole "
@@ -265,18 +265,18 @@ def harmonics_verdict(anc_db: float, opc_db: float) -> Verdict:
     )
 
 
-def peak_verdict(peak: float, limit: float) -> Verdict:
-    """Return the verdict on Fig. 5 c from the largest control signal of KF-OPC and the amplifier's limit."""
-    return Verdict(
+def peak_claim(peak: float, limit: float) -> Claim:
+    """Return the claim about Fig. 5 c from the largest control signal of KF-OPC and the amplifier's limit."""
+    return Claim(
         "The control signal of KF-OPC stays within what the amplifier can put out",
         bool(peak <= PEAK_SHARE * limit),
         f"largest control signal of the whole run {peak:.4f}, limit {limit:.4f}, kept to {100 * (PEAK_SHARE - 1):.0f} %",
     )
 
 
-def power_verdict(over_rated: float) -> Verdict:
-    """Return the verdict on the output power of KF-OPC, given over the rated power."""
-    return Verdict(
+def power_claim(over_rated: float) -> Claim:
+    """Return the claim about the output power of KF-OPC, given over the rated power."""
+    return Claim(
         "The output power of KF-OPC is the rated power",
         bool(abs(over_rated - 1.0) <= POWER_TOLERANCE),
         f"output power {over_rated * RATED_POWER:.4f}, rated power {RATED_POWER:g}",
@@ -303,8 +303,8 @@ class Growth:
         return abs(self.over_half - 1.0) <= CONSTANT_TOLERANCE
 
 
-def growth_verdict(growths: Mapping[Setting, Sequence[Growth]]) -> Verdict:
-    """Return the verdict on Fig. 5 d from the growth of KF-ANC and of KF-OPC at each state noise."""
+def growth_claim(growths: Mapping[Setting, Sequence[Growth]]) -> Claim:
+    """Return the claim about Fig. 5 d from the growth of KF-ANC and of KF-OPC at each state noise."""
     held = [anc.linear_without_bound and opc.none for anc, opc in growths.values()]
     said = "; ".join(
         f"with r E[x'^2]/q = {setting:g} its largest weight is {anc.over_optimal:.0f} times the optimal one at the end, "
@@ -313,18 +313,18 @@ def growth_verdict(growths: Mapping[Setting, Sequence[Growth]]) -> Verdict:
     )
     times = [anc.diverged_at_s for anc, _ in growths.values() if anc.diverged_at_s is not None]
     number = f"diverged after {min(times):.1f} s" if times else "the numbers do not overflow"
-    return Verdict(
+    return Claim(
         "The control filter of KF-ANC grows without bound, that of KF-OPC does not",
         bool(held) and all(held),
         f"{said}. The growth is a straight line; {number}",
     )
 
 
-def reduction_verdict(anc_db: float, opc_db: float, crossings: Sequence[float]) -> Verdict:
-    """Return the verdict on the noise reduction of both filters, with the overdrives at which the order flips."""
+def reduction_claim(anc_db: float, opc_db: float, crossings: Sequence[float]) -> Claim:
+    """Return the claim about the noise reduction of both filters, with the overdrives at which the order flips."""
     flips = " and ".join(f"{level:.1f} dB" for level in crossings)
     order = f"the order flips at {flips} of overdrive" if crossings else "the order is the same at every overdrive"
-    return Verdict(
+    return Claim(
         "KF-OPC reduces the noise more than KF-ANC",
         bool(opc_db > anc_db),
         f"{opc_db:.1f} against {anc_db:.1f} dB at {10 * np.log10(POWER_MULTIPLE):.0f} dB of overdrive; {order}, see the "

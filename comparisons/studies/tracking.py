@@ -11,6 +11,7 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult, convergence_time_s, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -19,7 +20,6 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Table,
     Tuned,
-    Verdict,
     algorithms,
     run_setting,
 )
@@ -42,7 +42,7 @@ from .cases import (
     tune_all,
     with_jump,
 )
-from .parts import (
+from .report_parts import (
     MARK,
     by_algorithm,
     ceilings_note,
@@ -168,12 +168,12 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows], "one_sweep_from_less_initial_variance_db": starts},
-        verdicts=verdicts(rows),
+        claims=claims(rows),
         figures=tracking_figures(courses, {event.name: event.shown_window_s for event in events()}),
         sounds=sounds,
         notes=[*_notes(pairs, rows), *_sweep_notes(rows, starts), ceilings_note(first)],
         tables=[*event_tables(rows), _settling_table(rows)],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 
@@ -321,7 +321,7 @@ def run_start(scene: Scene, share: float) -> float:
 # ---- Claims and notes
 
 
-def verdicts(rows: Sequence[TrackingRow]) -> list[Verdict]:
+def claims(rows: Sequence[TrackingRow]) -> list[Claim]:
     """Return the findings, each on all events and paths."""
     return [_mean_nse(rows), _sooner(rows), _jump(rows), _change(rows), _back(rows)]
 
@@ -330,23 +330,23 @@ def _by(rows: Iterable[TrackingRow], algorithm: str) -> dict[tuple[str, str], Tr
     return {(row.event, row.path): row for row in rows if row.algorithm == algorithm}
 
 
-def _mean_nse(rows: Sequence[TrackingRow]) -> Verdict:
+def _mean_nse(rows: Sequence[TrackingRow]) -> Claim:
     ours, theirs = _by(rows, "KF-ANC"), _by(rows, "FxLMS")
     leads = {key: theirs[key].mean_nse_db - row.mean_nse_db for key, row in ours.items()}
     least = min(leads, key=lambda key: leads[key])
-    return Verdict(
+    return Claim(
         "The mean NSE over the whole run of KF-ANC is below that of FxLMS, through every event",
         all(lead > 0.0 for lead in leads.values()),
         f"by {np.mean(list(leads.values())):.1f} dB on average, by {leads[least]:.2f} dB at least ({', '.join(least)})",
     )
 
 
-def _sooner(rows: Sequence[TrackingRow]) -> Verdict:
+def _sooner(rows: Sequence[TrackingRow]) -> Claim:
     ours, theirs = _by(rows, "KF-ANC"), _by(rows, "FxLMS")
     times = {
         key: (_time(row, "changed"), _time(theirs[key], "changed")) for key, row in ours.items() if key[0] in CHANGES
     }
-    return Verdict(
+    return Claim(
         "After a change of the primary path KF-ANC is back within 3 dB of its steady NSE sooner than FxLMS",
         all(one < other for one, other in times.values()),
         "KF-ANC and FxLMS: "
@@ -363,11 +363,11 @@ def _ms(time_s: float) -> str:
     return "not at all" if np.isinf(time_s) else f"{1e3 * time_s:.0f} ms"
 
 
-def _jump(rows: Sequence[TrackingRow]) -> Verdict:
+def _jump(rows: Sequence[TrackingRow]) -> Claim:
     worst = {
         (r.algorithm, r.path): r.worst_window for r in rows if r.event == "20 dB louder" and r.algorithm in CONSTRAINED
     }
-    return Verdict(
+    return Claim(
         "Through a jump of +20 dB no algorithm's constraint holds: each spends more than ten times its rated power over "
         "some 100 ms",
         all(power > 10.0 for power in worst.values()),
@@ -376,13 +376,13 @@ def _jump(rows: Sequence[TrackingRow]) -> Verdict:
     )
 
 
-def _change(rows: Sequence[TrackingRow]) -> Verdict:
+def _change(rows: Sequence[TrackingRow]) -> Claim:
     own = [row for row in rows if row.event in CHANGES and row.algorithm in CONSTRAINED]
     powers = [row.stretch_worst_window["changed"] for row in own]
     worst = own[int(np.argmax(powers))]  # NaN, of a run that diverged, counts as the largest
     before = _by(rows, "KF-ANC")
     unconstrained = max(row.stretch_worst_window["changed"] for (event, _), row in before.items() if event in CHANGES)
-    return Verdict(
+    return Claim(
         "A change of the primary path takes no constrained algorithm above twice its rated power over any 100 ms",
         bool(worst.stretch_worst_window["changed"] <= 2.0),
         f"{worst.stretch_worst_window['changed']:.2f} of it at worst ({worst.algorithm}, {worst.event}, {worst.path}); KF-ANC, "
@@ -390,12 +390,12 @@ def _change(rows: Sequence[TrackingRow]) -> Verdict:
     )
 
 
-def _back(rows: Sequence[TrackingRow]) -> Verdict:
+def _back(rows: Sequence[TrackingRow]) -> Claim:
     times = {
         name: [_time(row, "back") for row in rows if row.event == "20 dB louder" and row.algorithm == name]
         for name in ("KF-ANC", "KF-OPC", "KF-PB")
     }
-    return Verdict(
+    return Claim(
         "After a noise that was 20 dB louder KF-OPC needs more than a second, KF-PB at least half of one, KF-ANC less than 0.2 s",
         min(times["KF-OPC"]) > 1.0 and min(times["KF-PB"]) > 0.5 and max(times["KF-ANC"]) < 0.2,
         "; ".join(f"{name} {' and '.join(_ms(time) for time in own)}" for name, own in times.items()),

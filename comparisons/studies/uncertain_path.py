@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
-from kfopc_filterpy.bench import FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, Verdict, run_setting
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.signals import band_limited_noise, tone
@@ -31,7 +31,16 @@ from .cases import (
     paths,
     tune_all,
 )
-from .parts import MARK, by_algorithm, case_parameters, cell, legend_of, new_figure, tuned_in_words, without_measured
+from .report_parts import (
+    MARK,
+    by_algorithm,
+    case_parameters,
+    cell,
+    legend_of,
+    new_figure,
+    tuned_in_words,
+    without_measured,
+)
 
 ALGORITHM = "KF-PB"
 N_TAPS = 128
@@ -107,14 +116,14 @@ def main(runs: Runs) -> StudyReport:
         },
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=verdicts(rows),
+        claims=claims(rows),
         figures=[_figure(rows)],
         notes=_notes(pairs, rows),
         tables=[
             _table("worst", "Least noise reduction in dB over any second after the first", rows, "worst_second_db"),
             _table("steady", "Noise reduction in dB over the steady half", rows, "noise_reduction_db"),
         ],
-        claims="Findings",
+        claims_heading="Findings",
     )
 
 
@@ -193,7 +202,7 @@ def seconds_db(result: SimulationResult) -> list[float]:
 # ---- Claims and notes
 
 
-def verdicts(rows: Sequence[AllowanceRow]) -> list[Verdict]:
+def claims(rows: Sequence[AllowanceRow]) -> list[Claim]:
     """Return the findings, each on all cases."""
     return [
         *(_never_louder(rows, allowance) for allowance in (DEFAULT, STATED)),
@@ -211,7 +220,7 @@ def _where(row: AllowanceRow) -> str:
     return f"{row.path}, {row.noise}, {row.error}"
 
 
-def _never_louder(rows: Iterable[AllowanceRow], allowance: str) -> Verdict:
+def _never_louder(rows: Iterable[AllowanceRow], allowance: str) -> Claim:
     words = {
         DEFAULT: "With its default uncertainty KF-PB makes the noise louder in no second after the first",
         STATED: "With the error stated as a tolerance KF-PB makes the noise louder in no second after the first",
@@ -220,7 +229,7 @@ def _never_louder(rows: Iterable[AllowanceRow], allowance: str) -> Verdict:
     own, bare = ([row for row in wrong if row.allowance == one] for one in (allowance, NOTHING))
     louder, bare_louder = ([row for row in some if not _value(row) >= 0.0] for some in (own, bare))
     worst, bare_worst = min(own, key=_value), min(bare, key=_value)
-    return Verdict(
+    return Claim(
         words[allowance],
         not louder,
         f"{len(louder)} of {len(own)} runs do, the worst second is {_value(worst):.1f} dB ({_where(worst)}); if "
@@ -229,7 +238,7 @@ def _never_louder(rows: Iterable[AllowanceRow], allowance: str) -> Verdict:
     )
 
 
-def _cost(rows: Sequence[AllowanceRow], beyond: bool) -> Verdict:
+def _cost(rows: Sequence[AllowanceRow], beyond: bool) -> Claim:
     some = [row for row in rows if (row.noise in BEYOND) == beyond]
     noise = "white noise" if beyond else "noises below three eighths of the sample rate"
     return _cost_of(
@@ -237,18 +246,18 @@ def _cost(rows: Sequence[AllowanceRow], beyond: bool) -> Verdict:
     )
 
 
-def _cost_identified(rows: Iterable[AllowanceRow]) -> Verdict:
+def _cost_identified(rows: Iterable[AllowanceRow]) -> Claim:
     words = f"With a path that was identified and the uncertainty that came with it, at most {COST_DB:g} dB are lost"
     return _cost_of(rows, IDENTIFIED, STATED, words)
 
 
-def _cost_of(rows: Iterable[AllowanceRow], error: str, allowance: str, words: str) -> Verdict:
-    """Return a verdict on what is lost in comparison with an exact path that is taken for exact."""
+def _cost_of(rows: Iterable[AllowanceRow], error: str, allowance: str, words: str) -> Claim:
+    """Return a claim about what is lost in comparison with an exact path that is taken for exact."""
     reduction = {(row.case, row.error, row.allowance): row.noise_reduction_db for row in rows}
     cases = {case: None for case, *_ in reduction}
     costs = {str(case): reduction[case, EXACT, NOTHING] - reduction[case, error, allowance] for case in cases}
     where = max(costs, key=lambda case: costs[case])
-    return Verdict(
+    return Claim(
         words,
         bool(np.max(list(costs.values())) <= COST_DB),  # NaN, of a run that diverged, counts as the largest
         f"{np.mean(list(costs.values())):z.2f} dB on average, {costs[where]:z.2f} dB at most ({where})",

@@ -13,7 +13,7 @@ import numpy as np
 
 from kfopc_filterpy.plot import curve_style
 
-from ..studies.parts import MARK
+from ..studies.report_parts import MARK
 from .grid import AXES, Grid, Values
 from .table import Record
 

@@ -2,7 +2,7 @@ from .assessing import assess as assess
 from .assessment import Assessment as Assessment
 from .assessment import Band as Band
 from .assessment import Ceilings as Ceilings
-from .assessment import Levels as Levels
+from .assessment import SoundLevels as SoundLevels
 from .comparing import compare_recordings as compare_recordings
 from .exploring import AcousticSetup as AcousticSetup
 from .exploring import ExploreResult as ExploreResult
@@ -11,12 +11,7 @@ from .exploring import explore as explore
 from .exploring import explore_setups as explore_setups
 from .exploring import read_setup as read_setup
 from .exploring_page import serve_explore as serve_explore
-from .items import FigureItem as FigureItem
-from .items import Parameter as Parameter
-from .items import Sound as Sound
-from .items import StudyReport as StudyReport
-from .items import Table as Table
-from .items import Verdict as Verdict
+from .opening import claims_sentence as claims_sentence
 from .registry import Algorithm as Algorithm
 from .registry import algorithms as algorithms
 from .registry import make_controller as make_controller
@@ -29,7 +24,12 @@ from .scene import Scene as Scene
 from .scene import figures_of_merit as figures_of_merit
 from .scene import make_scene as make_scene
 from .scene import with_clipping as with_clipping
-from .summary import verdict_sentence as verdict_sentence
+from .study_report import Claim as Claim
+from .study_report import FigureItem as FigureItem
+from .study_report import Parameter as Parameter
+from .study_report import Sound as Sound
+from .study_report import StudyReport as StudyReport
+from .study_report import Table as Table
 from .tuning import AllDivergedError as AllDivergedError
 from .tuning import Trial as Trial
 from .tuning import Tuned as Tuned

@@ -32,12 +32,12 @@ from kfopc_filterpy.metrics import (
 )
 from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
-from kfopc_filterpy.paths.channels import primary_paths, secondary_paths
 from kfopc_filterpy.paths.file_checks import require_heard, require_sound
+from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
-from .assessment import Assessment, Band, Ceilings, Levels, advice_on
+from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
 from .fixed_filters import FixedFilters, longest_filter
 from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
 from .scene import Runs, one_blas_thread
@@ -376,10 +376,10 @@ def _band(d: np.ndarray, s: np.ndarray, fs: float) -> Band:
     return Band(low, high, float(share[gain < 10 ** (WEAK_DB / 10) * mean].sum()))
 
 
-def _levels(run: SimulationResult, pascal: Any) -> Levels:
+def _levels(run: SimulationResult, pascal: Any) -> SoundLevels:
     before, after = pascal * run.disturbance, pascal * run.error
     centres, bands = third_octave_levels_db(before, run.fs)
-    return Levels(
+    return SoundLevels(
         a_weighted_level_db(before, run.fs),
         a_weighted_level_db(after, run.fs),
         centres,

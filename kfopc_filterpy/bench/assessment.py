@@ -37,8 +37,8 @@ from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
 from .fixed_filters import longest_filter
-from .items import jsonable
 from .limits import Limits
+from .study_report import jsonable
 
 SCHEMA_VERSION = 1
 SCHEMA = Path(__file__).with_name("verdict.schema.json")
@@ -89,7 +89,7 @@ class Band:
 
 
 @dataclass(frozen=True)
-class Levels:
+class SoundLevels:
     """Sound levels without and with control; third-octave bands.
 
     Attributes
@@ -152,7 +152,7 @@ class Assessment:
         does, or if none is needed.
     band : Band
         Where the noise is.
-    levels : Levels or None
+    levels : SoundLevels or None
         Sound levels, if the calibration is known.
     excursion_mm : float or None
         Largest excursion in the run, if a loudspeaker's rating has one.
@@ -196,7 +196,7 @@ class Assessment:
     causality_margin_s: float | None
     helpful_delay_s: float | None
     band: Band
-    levels: Levels | None
+    levels: SoundLevels | None
     excursion_mm: float | None
     settings: SuggestedSettings
     figures: Mapping[str, Mapping[str, Any]]

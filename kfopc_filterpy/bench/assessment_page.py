@@ -12,9 +12,9 @@ import numpy as np
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 
-from .items import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
 from .page import images, players, rendered
 from .report import prepare_folder, write_files, write_whole
+from .study_report import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
 
 if TYPE_CHECKING:
     from .assessment import Assessment

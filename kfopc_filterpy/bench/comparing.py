@@ -15,10 +15,10 @@ from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 from .assessed_runs import recorded_scene
 from .assessing import recorded_signals, switch_on_sample
 from .fixed_filters import longest_filter
-from .items import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
 from .limits import ChannelLimits, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
 from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution
+from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")

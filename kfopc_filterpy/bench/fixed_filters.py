@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy.bounds import budgeted_rated_power
-from kfopc_filterpy.bounds.channels import ChannelStretch, full_channel_stretch
+from kfopc_filterpy.bounds.channel_bound import ChannelStretch, full_channel_stretch
 from kfopc_filterpy.bounds.power_constrained import weights_within
 from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
 

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from .descriptions import described
-from .items import (
+from .mathematics import mathml, parameter, prose
+from .opening import claims_sentence
+from .study_report import (
     EXCERPT_S,
     HEADROOM,
     FigureItem,
@@ -26,11 +28,9 @@ from .items import (
     loudness,
     sound_file,
 )
-from .mathematics import mathml, parameter, prose
-from .summary import verdict_sentence
 
 TITLE = "Kalman filter with output power constraint"
-WITHOUT_VERDICTS = "Comparison of algorithms"
+WITHOUT_CLAIMS = "Comparison of algorithms"
 PAPER = (
     "J. Ji, D. Shi, B. Wang, X. Shen, Z. Luo and W.-S. Gan, “Preventing output saturation in active noise control: "
     "An output-constrained Kalman filter approach”."
@@ -54,11 +54,11 @@ def page(studies: Sequence[StudyReport], folder: Path, lead: FigureItem | None) 
     names = [name for study in studies for name in study.algorithms]
     return rendered(
         TEMPLATE,
-        title=TITLE if any(study.verdicts for study in studies) else WITHOUT_VERDICTS,
+        title=TITLE if any(study.claims for study in studies) else WITHOUT_CLAIMS,
         paper=PAPER if "KF-OPC" in names else "",
         described=described(name for name in names if name != "KF-OPC"),
         lead=first,
-        verdict=verdict_sentence(studies),
+        claims=claims_sentence(studies),
         headroom=HEADROOM,
         excerpt_s=EXCERPT_S,
         parts=[_part(study, own, folder) for study, own in zip(studies, figures, strict=True)],
@@ -89,7 +89,7 @@ def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> di
     headings, merit = _merit(study)
     return {
         "study": study,
-        "held": sum(bool(verdict.reproduced) for verdict in study.verdicts),
+        "held": sum(bool(claim.holds) for claim in study.claims),
         "merit_headings": headings,
         "merit": merit,
         "figures": figures,

@@ -14,14 +14,16 @@ from pathlib import Path
 from kfopc_filterpy.plot import save_figure
 from kfopc_filterpy.signals import write_wav
 
-from .items import (
+from .opening import claims_sentence, glance
+from .page import page
+from .study_report import (
     FIGURES_OF_MERIT,
+    Claim,
     FigureItem,
     Parameter,
     Sound,
     StudyReport,
     Table,
-    Verdict,
     cells,
     columns,
     figure_file,
@@ -30,17 +32,15 @@ from .items import (
     sound_file,
     table_file,
 )
-from .page import page
-from .summary import glance, verdict_sentence
 
 __all__ = [
     "FIGURES_OF_MERIT",
+    "Claim",
     "FigureItem",
     "Parameter",
     "Sound",
     "StudyReport",
     "Table",
-    "Verdict",
     "prepare_folder",
     "results_table",
     "write_report",
@@ -146,7 +146,7 @@ def write_files(study: StudyReport, path: Path) -> None:
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
-    """Return the studies' figures of merit, verdicts and tables as text for a terminal.
+    """Return the studies' figures of merit, claims and tables as text for a terminal.
 
     Parameters
     ----------
@@ -160,10 +160,10 @@ def results_table(studies: Sequence[StudyReport]) -> str:
 
     Examples
     --------
-    >>> from kfopc_filterpy.bench import StudyReport, Verdict, results_table
+    >>> from kfopc_filterpy.bench import StudyReport, Claim, results_table
     >>> study = StudyReport(
     ...     "tonal", "A tone", "", 16000, 1.0, {}, {"KF-OPC": {"noise_reduction_db": 10.1, "output_power": 0.9999}},
-    ...     verdicts=[Verdict("KF-OPC keeps its rated power", True, "0.9999 of 1")],
+    ...     claims=[Claim("KF-OPC keeps its rated power", True, "0.9999 of 1")],
     ... )
     >>> print(results_table([study]))
     tonal: A tone (rated power 1)
@@ -183,14 +183,14 @@ def results_table(studies: Sequence[StudyReport]) -> str:
         names = ["", "", *study.algorithms]
         if study.algorithms:
             lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})
-        for verdict in study.verdicts:
-            mark = study.marks[0 if verdict.reproduced else 1].upper()
-            lines += textwrap.wrap(verdict.claim, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
-            lines += textwrap.wrap(verdict.figure, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
+        for claim in study.claims:
+            mark = study.marks[0 if claim.holds else 1].upper()
+            lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
+            lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
         for table in study.tables:
             lines += ["", table.caption, *_aligned(table)]
         lines.append("")
-    return "\n".join([*lines, *textwrap.wrap(verdict_sentence(studies), 116)])
+    return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
 
 
 def _aligned(table: Table) -> list[str]:

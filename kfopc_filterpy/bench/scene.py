@@ -30,12 +30,12 @@ from kfopc_filterpy.bounds import (
     power_constrained_solution,
     wiener_solution,
 )
-from kfopc_filterpy.bounds.channels import full_channel_stretch
+from kfopc_filterpy.bounds.channel_bound import full_channel_stretch
 from kfopc_filterpy.controllers import CoreController
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
-from kfopc_filterpy.paths.channels import is_path_matrix, secondary_paths
+from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed

@@ -13,9 +13,9 @@ import numpy as np
 
 from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal, per_loudspeaker
 from ..metrics import overshoot
-from ..paths.channels import is_path_matrix
 from ..paths.models import path_taps
-from .channels import ChannelStretch, channel_record
+from ..paths.path_matrix import is_path_matrix
+from .channel_bound import ChannelStretch, channel_record
 from .wiener import (
     Stretch,
     WienerSolution,

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_channels, as_count, as_positive
-from ..paths.channels import is_path_matrix, secondary_paths
 from ..paths.least_squares import RANK_TOLERANCE
 from ..paths.models import path_taps
+from ..paths.path_matrix import is_path_matrix, secondary_paths
 from ..power.constraint import DEFAULT_FS
-from .channels import ChannelStretch, full_channel_stretch
+from .channel_bound import ChannelStretch, full_channel_stretch
 from .wiener import ERROR_THAT_MATTERS, Stretch, full_stretch, mean_square, reduction_db
 
 # A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the

@@ -125,7 +125,7 @@ def inspect(options: argparse.Namespace) -> int:
     if primary is not None:
         facts["causality_margin_s"] = causality_margin(primary, paths, fs=fs).margin_s
     if options.json:
-        from ..bench.items import jsonable
+        from ..bench.study_report import jsonable
 
         print(json.dumps(jsonable(facts), allow_nan=False))
         return DONE

@@ -16,7 +16,7 @@ from .options import DONE, add_command, add_count, add_number, add_scene
 from .printing import warn
 
 if TYPE_CHECKING:
-    from ..realtime import Interface, Levels, RunReport, SimulatedInterface
+    from ..realtime import Interface, RunReport, RunStatus, SimulatedInterface
 
 FAULT = 1
 SMALL_BOUND_DB = 10.0  # below it, a shorter delay may be worth having
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"{options.prog}: {fault}", file=sys.stderr)
         return FAULT
     if show is not None and sys.stderr.isatty():
-        print(file=sys.stderr)  # the line of the levels ends
+        print(file=sys.stderr)  # the line of the status ends
     print(_summary(report, interface.fs, interface.block))
     return FAULT if report.stopped_by.startswith("fault") else DONE
 
@@ -163,31 +163,31 @@ def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
     )
 
 
-def _screen(stream: TextIO) -> Callable[[Levels], None]:
-    """Return what shows the present levels: in one line of a terminal, or in a line of a file every five seconds."""
+def _screen(stream: TextIO) -> Callable[[RunStatus], None]:
+    """Return what shows the status of a run: in one line of a terminal, or in a line of a file every five seconds."""
     calls = count(1)
 
-    def show(levels: Levels) -> None:
+    def show(status: RunStatus) -> None:
         if stream.isatty():
-            stream.write(f"\r\x1b[K{describe(levels)}")
+            stream.write(f"\r\x1b[K{describe(status)}")
         elif next(calls) % 20 == 0:
-            stream.write(f"{describe(levels)}\n")
+            stream.write(f"{describe(status)}\n")
         stream.flush()
 
     return show
 
 
-def describe(levels: Levels) -> str:
-    """Return levels as a line of text."""
-    reductions = " ".join(f"{r:5.1f}" for r in levels.reduction_db)
-    health = ", ".join(f"{n} {what}" for what, n in levels.health.counts.items()) or "healthy"
+def describe(status: RunStatus) -> str:
+    """Return the status of a run as a line of text."""
+    reductions = " ".join(f"{r:5.1f}" for r in status.reduction_db)
+    health = ", ".join(f"{n} {what}" for what, n in status.health.counts.items()) or "healthy"
     return (
-        f"{levels.time_s:7.1f} s  reduction {reductions} dB  power {_powers(levels)}  load {100 * levels.load:.0f} %  "
-        f"overruns {levels.overruns}  {health}"
+        f"{status.time_s:7.1f} s  reduction {reductions} dB  power {_powers(status)}  load {100 * status.load:.0f} %  "
+        f"overruns {status.overruns}  {health}"
     )
 
 
-def _powers(report: Levels | RunReport, of: str = "") -> str:
+def _powers(report: RunStatus | RunReport, of: str = "") -> str:
     """Return the output powers, and the share of the rated power that they take."""
     rated: Any = report.rated_power  # KF-PB always has one
     return ", ".join(

@@ -11,9 +11,9 @@ import numpy as np
 
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..core.running import REFUSED_REFERENCE, Steps, process
-from ..paths.channels import is_path_matrix, secondary_paths
+from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.models import is_system, path_taps, sampling_rate
+from ..paths.path_matrix import is_path_matrix, secondary_paths
 from ..paths.uncertainty import as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifier
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint

@@ -10,12 +10,12 @@ import numpy as np
 from .._validate import as_number, as_positive, per_channel
 from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
-from ..core.running import Steps
+from ..core.run_loop import Steps
 from ..power.amplifiers import Amplifier, amplifier_models
 from ..power.constraint import NUMBERS
 from ..power.limiter import OutputLimiter
 from .base import LONGEST_CALL, FilteredReferenceController, Looped, calls_of, refused_while_listening
-from .channels import channel_sample
+from .channel_samples import channel_sample
 
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}

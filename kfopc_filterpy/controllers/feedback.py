@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_channels, as_number
-from ..paths.channels import is_path_matrix, path_matrix
 from ..paths.models import is_system, path_taps, sampling_rate
+from ..paths.path_matrix import is_path_matrix, path_matrix
 from .base import Controller, WrappedController, listening
-from .channels import amplifier_functions, channel_sample, push_sample
+from .channel_samples import amplifier_functions, channel_sample, push_sample
 
 
 class FeedbackNeutralizer(WrappedController):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .._validate import as_positive
-from ..paths.channels import is_path_matrix
+from ..paths.path_matrix import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.limiter import OutputLimiter
 from .direct import DirectKalman

@@ -8,7 +8,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from ..bounds.settings import SuggestedSettings
-from ..filters.guards import undoing
+from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from .._validate import as_channels, as_count, as_positive, as_real_array, require_finite
-from ..paths.channels import secondary_paths
 from ..paths.observation import ObservationFilters
+from ..paths.path_matrix import secondary_paths
 from .base import Controller, WrappedController, listening
-from .channels import amplifier_functions, push_sample
+from .channel_samples import amplifier_functions, push_sample
 
 if TYPE_CHECKING:
     import control

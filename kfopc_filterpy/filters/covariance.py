@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..core.triangle import Covariance, copy_covariance, covariance_at, new_covariance, owed_of
-from .guards import INDEFINITE_LIMIT, require_semidefinite
+from .checked_steps import INDEFINITE_LIMIT, require_semidefinite
 
 ASYMMETRY_LIMIT = 1e-8  # of the largest element: more than rounding can cause
 LARGEST = float(np.finfo(np.float64).max)

@@ -13,7 +13,7 @@ from filterpy.kalman import KalmanFilter
 
 from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
 from ..checkpoint import Checkpointed
-from .guards import (
+from .checked_steps import (
     SILENT_REFERENCE,
     State,
     all_or_nothing,

@@ -13,8 +13,8 @@ from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..core.block import LOUD_STEP, NO_SOLUTION
 from ..core.triangle import covariance_update, direction_of
 from ..power.constraint import OutputPowerConstraint
+from .checked_steps import SILENT_REFERENCE, State, checked_measurement, require_observation
 from .covariance import RandomWalkCovariance, require_covariance
-from .guards import SILENT_REFERENCE, State, checked_measurement, require_observation
 from .kfopc import KFOPC
 
 NUMBERS = np.dtype(

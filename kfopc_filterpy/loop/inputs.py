@@ -11,8 +11,8 @@ from scipy.signal import fftconvolve
 
 from .._validate import as_channels, as_generator, as_nonnegative, as_signal
 from ..controllers.base import listening
-from ..paths.channels import primary_paths
 from ..paths.models import path_taps
+from ..paths.path_matrix import primary_paths
 
 DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
 

@@ -14,7 +14,7 @@ from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
 from ..controllers.power_budget import PowerBudgetController
 from ..core.block import Block, Shape, reason_of
-from ..core.running import DIVERGED, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals, Steps
+from ..core.run_loop import DIVERGED, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals, Steps
 from ..paths.models import is_system, path_taps
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, NUMBERS

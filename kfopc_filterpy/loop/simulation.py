@@ -10,9 +10,9 @@ import numpy as np
 
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController, Looped
-from ..core.running import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
-from ..paths.channels import is_path_matrix, path_matrix, secondary_paths
+from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps
+from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
 from ..power.amplifiers import Amplifier, amplifier_models, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .inputs import (

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_band, as_number, as_positive, as_signal
-from .channels import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .models import finite_taps, is_system, path_taps, sampling_rate
+from .path_matrix import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 
 STABILITY_BOUND_DEG = 90.0
 """Phase error of the estimate beyond which filtered-reference adaptation diverges, in degrees."""

@@ -21,7 +21,6 @@ from .._validate import (
     require_finite,
 )
 from .analysis import frequency_response
-from .channels import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .least_squares import (
     RANK_TOLERANCE,
     correlation_matrix,
@@ -30,6 +29,7 @@ from .least_squares import (
     minimum_norm_solve,
 )
 from .models import fir_path, path_taps, sampling_rate
+from .path_matrix import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .uncertainty import relative_to
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._validate import as_count
-from .channels import sampled_path_matrix
+from .path_matrix import sampled_path_matrix
 
 if TYPE_CHECKING:
     import control

@@ -30,7 +30,7 @@ import numpy as np
 from scipy.signal import minimum_phase, windows
 
 from .._validate import as_nonnegative, as_real_array, require_finite
-from .channels import secondary_paths
+from .path_matrix import secondary_paths
 
 N_FREQUENCIES = 257  # from 0 to fs/2
 OMEGA = np.linspace(0.0, np.pi, N_FREQUENCIES)

@@ -16,7 +16,7 @@ import numpy as np
 
 from .._validate import as_positive
 from ..core.calls import amplify_all
-from ..core.running import HARD_CLIP, LINEAR, SOFT_SATURATION
+from ..core.run_loop import HARD_CLIP, LINEAR, SOFT_SATURATION
 
 # The structure of the core, see anc.h.
 MODEL = np.dtype([(name, np.float64) for name in ("kind", "limit", "sharpness")])

@@ -5,9 +5,9 @@ from .interfaces import Interface as Interface
 from .interfaces import SimulatedInterface as SimulatedInterface
 from .running import FaultError as FaultError
 from .running import IdentifiedPlant as IdentifiedPlant
-from .running import Levels as Levels
 from .running import NotCausalError as NotCausalError
 from .running import RunReport as RunReport
+from .running import RunStatus as RunStatus
 from .running import measure_round_trip as measure_round_trip
 from .running import run as run
 from .sound_device import SoundDevice as SoundDevice

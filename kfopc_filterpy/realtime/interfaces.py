@@ -10,9 +10,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from .._validate import as_channels, as_choice, as_count, as_generator, as_nonnegative, as_positive
-from ..controllers.channels import amplifier_functions
-from ..paths.channels import is_path_matrix, path_matrix, primary_paths, secondary_paths
+from ..controllers.channel_samples import amplifier_functions
 from ..paths.models import path_taps
+from ..paths.path_matrix import is_path_matrix, path_matrix, primary_paths, secondary_paths
 
 
 class Block(NamedTuple):

@@ -39,8 +39,8 @@ class FaultError(RuntimeError):
 
 
 @dataclass
-class Levels:
-    """Levels since the last report, handed to `on_report`.
+class RunStatus:
+    """How a run goes: levels, powers, load and health since the last report, handed to `on_report`.
 
     Attributes
     ----------
@@ -355,7 +355,7 @@ def run(
     excitation: float | None = None,
     n_path: int | None = None,
     check_causality: bool = True,
-    on_report: Callable[[Levels], Any] | None = None,
+    on_report: Callable[[RunStatus], Any] | None = None,
     report_every_s: float = 0.25,
     should_stop: Callable[[], bool] | None = None,
     rng: Any = 0,
@@ -394,7 +394,7 @@ def run(
     check_causality : bool, default True
         Whether to refuse a plant in which no causal filter can reduce the noise that was heard.
     on_report : callable, optional
-        Called with `Levels` every `report_every_s` seconds.
+        Called with `RunStatus` every `report_every_s` seconds.
     report_every_s : float, default 0.25
         Time between two reports in seconds.
     should_stop : callable, optional
@@ -542,7 +542,7 @@ class _Watch:
         supervisor: Supervisor,
         silence: _Heard,
         every_s: float,
-        on_report: Callable[[Levels], Any] | None,
+        on_report: Callable[[RunStatus], Any] | None,
     ) -> None:
         self._session, self._supervisor, self._on_report = session, supervisor, on_report
         self._every = max(round(as_positive(every_s, "report_every_s", unit="s") * supervisor.fs), 1)
@@ -585,12 +585,12 @@ class _Watch:
                 ]
         if self._n >= self._every:
             if self._on_report is not None:
-                self._on_report(self._levels())
+                self._on_report(self._status())
             self._new_sums()
 
-    def _levels(self) -> Levels:
+    def _status(self) -> RunStatus:
         e, x, y = self._e / self._n, self._x / self._n, self._y / self._n
-        return Levels(
+        return RunStatus(
             time_s=self._samples / self._supervisor.fs,
             reduction_db=_db(self._before, e),
             reference_level_db=_db(x, np.ones_like(x)),

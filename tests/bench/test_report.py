@@ -66,7 +66,7 @@ def test_results_are_strict_json_of_the_agreed_layout(written):
     assert list(results) == ["studies"]
     assert list(results["studies"]) == ["tonal", "duct-measured"]
     study = results["studies"]["tonal"]
-    assert set(study) == {"rated_power", "parameters", "algorithms", "verdicts", "extra"}
+    assert set(study) == {"rated_power", "parameters", "algorithms", "claims", "extra"}
     assert study["rated_power"] == 0.8
     assert study["parameters"] == {"q": 1e-4, "seeds": [0, 1, 2], "tried": [[1e-7, None], [1e-6, "diverged"]]}
     assert study["algorithms"]["KF-ANC"] == {
@@ -78,7 +78,7 @@ def test_results_are_strict_json_of_the_agreed_layout(written):
         "convergence_time_s": None,
         "diverged_at_s": 1.5,
     }
-    assert study["verdicts"][1] == {"claim": "it is faster", "reproduced": False, "figure": "no"}
+    assert study["claims"][1] == {"text": "it is faster", "holds": False, "measured": "no"}
     assert study["extra"] == {"sweep": {"over_db": [0, 1], "best": [1.0, None]}, "flip": 4.5}
 
 
@@ -104,9 +104,9 @@ def test_page_uses_no_network(written):
 
 
 def test_page_opens_with_the_argument(written):
-    """What KF-OPC is, the figure, the verdict; the table of verdicts, once; of each study the figures before all else."""
+    """What KF-OPC is, the figure, the claims in a sentence; their table, once; of each study the figures before all else."""
     source = (written / "report.html").read_text(encoding="utf-8")
-    marks = ["KF-OPC is a Kalman filter", '<figure class="first"', 'class="verdict"', 'id="verdicts"', 'id="tonal"']
+    marks = ["KF-OPC is a Kalman filter", '<figure class="first"', 'class="claims"', 'id="claims"', 'id="tonal"']
     places = [source.index(mark) for mark in marks]
     assert places == sorted(places)
     assert source.count('<th scope="col" class="value">Claim</th>') == 1
@@ -330,8 +330,8 @@ def test_without_tables_there_is_no_folder_of_tables(written):
     assert sorted(path.name for path in written.iterdir()) == ["audio", "figures", "report.html", "results.json"]
 
 
-def test_whose_claims_the_verdicts_are_on(tmp_path):
-    source = write_report([study(claims="Aims"), study("duct")], tmp_path).read_text(encoding="utf-8")
+def test_what_the_claims_are_is_their_heading(tmp_path):
+    source = write_report([study(claims_heading="Aims"), study("duct")], tmp_path).read_text(encoding="utf-8")
     assert re.findall(r"</a>: (.*?)</th>", source) == ["aims, 1 of 2 met", "claims of the paper, 1 of 2 reproduced"]
 
 
@@ -400,9 +400,9 @@ def test_the_introduction_is_on_the_algorithms_of_the_report(tmp_path):
     with_it = write_report([study()], tmp_path / "with").read_text(encoding="utf-8")
     assert page_module.PAPER in html.unescape(with_it)
     assert "KF-ANC, a Kalman filter that learns the control filter" in with_it
-    compared = study(algorithms={"KF-PB": merit, "own": merit}, verdicts=[])
+    compared = study(algorithms={"KF-PB": merit, "own": merit}, claims=[])
     without = write_report([compared], tmp_path / "without").read_text(encoding="utf-8")
-    assert f"<h1>{page_module.WITHOUT_VERDICTS}</h1>" in without
+    assert f"<h1>{page_module.WITHOUT_CLAIMS}</h1>" in without
     assert page_module.PAPER not in html.unescape(without)
     assert "KF-PB, a Kalman filter that learns the paths" in without
 

@@ -7,7 +7,7 @@ import pytest
 from helpers.channels import constrained_filters, dense_systems, random_paths, through
 
 from kfopc_filterpy import power_constrained_wiener
-from kfopc_filterpy.bounds.channels import block_correlation
+from kfopc_filterpy.bounds.channel_bound import block_correlation
 
 FS, K, J, REFERENCES, TAPS = 1000.0, 3, 2, 2, 10
 SECONDARY = random_paths(K, J, 7, seed=0)

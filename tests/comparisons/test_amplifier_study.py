@@ -1,4 +1,4 @@
-"""The study of the amplifier on a small scale, harmonics against the Fourier series, verdicts from rows made by hand."""
+"""The study of the amplifier on a small scale, harmonics against the Fourier series, claims from rows made by hand."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_planned_runs_are_those_taken(small: Any) -> None:
 
 def test_the_report_is_complete(small: Any) -> None:
     report: StudyReport = small[0]
-    assert (report.name, report.claims, len(report.verdicts)) == ("amplifier", "Findings", 6)
+    assert (report.name, report.claims_heading, len(report.claims)) == ("amplifier", "Findings", 6)
     assert [item.stem for item in report.figures] == ["duct-tone-hard-clip", "duct-band-noise-soft-saturation"]
     rows = report.extra["rows"]
     keys = [(row["noise"], row["overdrive_db"], row["known"], row["algorithm"]) for row in rows]
@@ -151,7 +151,7 @@ def test_harmonics_of_a_clipped_sine_are_those_of_its_fourier_series(overdrive_d
     assert measured == pytest.approx(expected, abs=0.3)
 
 
-# ---- Verdicts from rows made by hand
+# ---- Claims from rows made by hand
 
 
 def _row(algorithm: str, overdrive_db: float = 10.0, **more: Any) -> AmplifierRow:
@@ -178,38 +178,38 @@ def _row(algorithm: str, overdrive_db: float = 10.0, **more: Any) -> AmplifierRo
 def test_overrunning_is_asking_for_too_much_or_diverging(asked: float, at: float | None, met: bool) -> None:
     rows = [_row("KF-ANC", asked_power=9.0), _row("KF-ANC", 20.0, asked_power=asked, diverged_at_s=at)]
     rows += [_row("KF-ANC", 0.0), _row("KF-ANC", noise="band noise"), _row("KF-ANC", known=KNOWN)]  # not claimed
-    assert amplifier._overruns(rows, "KF-ANC").reproduced == met
+    assert amplifier._overruns(rows, "KF-ANC").holds == met
 
 
 @pytest.mark.parametrize(("overdrive_db", "met"), [(5.0, False), (4.9, True)])
 def test_overrunning_is_claimed_from_5_db_on(overdrive_db: float, met: bool) -> None:
     rows = [_row("KF-ANC", asked_power=9.0), _row("KF-ANC", overdrive_db, asked_power=1.9)]
-    assert amplifier._overruns(rows, "KF-ANC").reproduced == met
+    assert amplifier._overruns(rows, "KF-ANC").holds == met
 
 
 def test_overruns_are_told_of_the_runs_that_went_on() -> None:
     rows = [_row("KF-ANC", asked_power=9.0, weight_growth=1.5), _row("KF-ANC", asked_power=4.0, weight_growth=1.25)]
     rows += [_row("KF-ANC", diverged_at_s=at, asked_power=np.nan, weight_growth=np.nan) for at in (0.5, 0.0, 1.0)]
-    figure = amplifier._overruns(rows, "KF-ANC").figure
+    figure = amplifier._overruns(rows, "KF-ANC").measured
     assert figure.startswith("5 of 5 runs; their weights end up asking for 4 to 9 times the power")
     assert "and grow 1.25 to 1.5 times over the second half; 3 passed 1e6 times the rated amplitude" in figure
 
 
 def test_overruns_of_no_run_prove_nothing() -> None:
-    assert not amplifier._overruns([_row("KF-ANC", 0.0, asked_power=9.0)], "KF-ANC").reproduced
+    assert not amplifier._overruns([_row("KF-ANC", 0.0, asked_power=9.0)], "KF-ANC").holds
 
 
 @pytest.mark.parametrize(("asked", "met"), [(1.9, True), (2.1, False)])
 def test_the_known_amplifier_is_judged_where_known(asked: float, met: bool) -> None:
     rows = [_row("KF-ANC", asked_power=50.0), _row("KF-ANC", known=KNOWN, asked_power=asked)]
-    assert amplifier._known(rows).reproduced == met
+    assert amplifier._known(rows).holds == met
 
 
 @pytest.mark.parametrize(("level", "met"), [(-60.1, True), (-59.9, False)])
 def test_harmonics_are_compared_at_each_overdrive(level: float, met: bool) -> None:
     rows = [_row("KF-ANC"), _row("KF-OPC", harmonics_db=-70.0), _row("KF-PB", harmonics_db=level)]
     rows += [_row("KF-ANC", 0.0, harmonics_db=-62.0), _row("KF-OPC", 0.0, harmonics_db=-62.0)]  # nothing is clipped
-    assert amplifier._clean(rows).reproduced == met
+    assert amplifier._clean(rows).holds == met
 
 
 @pytest.mark.parametrize(
@@ -224,24 +224,24 @@ def test_harmonics_are_compared_at_each_overdrive(level: float, met: bool) -> No
 def test_harmonics_of_a_run_that_diverged_are_behind_all(anc_db: float, pb_db: float, said: str) -> None:
     rows = [_row("KF-ANC"), _row("KF-OPC", harmonics_db=-70.0)]
     rows += [_row("KF-ANC", 0.5, harmonics_db=anc_db), _row("KF-PB", 0.5, harmonics_db=pb_db)]
-    verdict = amplifier._clean(rows)
-    assert verdict.reproduced == np.isfinite(pb_db)
-    assert verdict.figure.startswith(said)
+    claim = amplifier._clean(rows)
+    assert claim.holds == np.isfinite(pb_db)
+    assert claim.measured.startswith(said)
 
 
 @pytest.mark.parametrize(("power", "met"), [(1.02, True), (1.021, False), (np.nan, False)])
 def test_power_is_kept_at_every_overdrive(power: float, met: bool) -> None:
     rows = [_row("KF-OPC"), _row("KF-PB"), _row("KF-PB", 20.0, power=power)]
-    assert amplifier._power(rows).reproduced == met
+    assert amplifier._power(rows).holds == met
 
 
 @pytest.mark.parametrize(("reduction", "met"), [(5.01, True), (5.0, False), (4.99, False)])
 def test_the_order_is_that_of_each_overdrive(reduction: float, met: bool) -> None:
     rows = [_row("KF-ANC"), _row("KF-OPC", noise_reduction_db=9.0), _row("KF-ANC", 0.0), _row("KF-OPC", 0.0)]
     rows += [_row("KF-ANC", 20.0), _row("KF-OPC", 20.0, noise_reduction_db=reduction)]
-    verdict = amplifier._ordering(rows)
-    assert verdict.reproduced == met
-    assert ("somewhere not: tone at 20 dB" in verdict.figure) != met
+    claim = amplifier._ordering(rows)
+    assert claim.holds == met
+    assert ("somewhere not: tone at 20 dB" in claim.measured) != met
 
 
 def test_the_command_knows_the_study() -> None:

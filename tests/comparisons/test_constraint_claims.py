@@ -35,8 +35,8 @@ def row(**changed: Any) -> ConstraintRow:
 @pytest.mark.parametrize("first", [True, False])
 def test_a_run_without_a_figure_is_not_held(claim: Any, first: bool) -> None:
     bad = row(power=np.nan, noise_reduction_db=np.nan)
-    assert not claim([bad, row()] if first else [row(), bad]).reproduced
-    assert claim([row(), row()]).reproduced
+    assert not claim([bad, row()] if first else [row(), bad]).holds
+    assert claim([row(), row()]).holds
 
 
 def test_a_limited_run_without_a_figure_is_not_held() -> None:
@@ -46,8 +46,8 @@ def test_a_limited_run_without_a_figure_is_not_held() -> None:
         row(algorithm="KF-PB limited", seed=2, noise_reduction_db=np.nan, worst_window=np.nan),
         row(algorithm="KF-OPC limited", seed=2),
     ]
-    assert not constraint._guarantee_claim(rows, [], []).reproduced
-    assert not any(verdict.reproduced for verdict in constraint._transparency_claims(rows))
+    assert not constraint._guarantee_claim(rows, [], []).holds
+    assert not any(claim.holds for claim in constraint._transparency_claims(rows))
 
 
 @pytest.mark.parametrize(
@@ -63,12 +63,12 @@ def test_a_limited_run_without_a_figure_is_not_held() -> None:
 )
 def test_what_does_not_settle_is_slower(ours: float | None, theirs: float, held: bool) -> None:
     settled = {"other": {"KF-PB": 0.5, "KF-ANC": 1.0}, "this": {"KF-PB": ours, "KF-ANC": theirs}}
-    assert constraint._convergence_claim(settled).reproduced == held
+    assert constraint._convergence_claim(settled).holds == held
 
 
 def test_claims_and_cells_are_text_on_the_page(tmp_path: Any) -> None:
     table = Table("a", "A", ["x"], [[np.nan]])
-    text = write_report([study(claims="Aims <of> it", tables=[table])], tmp_path).read_text(encoding="utf-8")
+    text = write_report([study(claims_heading="Aims <of> it", tables=[table])], tmp_path).read_text(encoding="utf-8")
     assert "<of>" not in text
     assert ">nan<" not in text
 

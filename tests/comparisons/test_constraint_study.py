@@ -1,4 +1,4 @@
-"""The study of the constraint on a small scale, its verdicts from rows made by hand, its scenes against a dense solve."""
+"""The study of the constraint on a small scale, its claims from rows made by hand, its scenes against a dense solve."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from comparisons import __main__ as command
 from comparisons.studies import cases, constraint
 from comparisons.studies.cases import Case, make_case
 from comparisons.studies.constraint import SHARES, ClippedRow, ConstraintRow, Jump
-from kfopc_filterpy.bench import Runs, Scene, StudyReport, Table, results_table, verdict_sentence, write_report
+from kfopc_filterpy.bench import Runs, Scene, StudyReport, Table, claims_sentence, results_table, write_report
 from kfopc_filterpy.paths import duct_paths, path_taps
 
 TAPS = 16
@@ -54,8 +54,8 @@ def test_planned_runs_are_those_taken(small: Any) -> None:
 
 def test_the_report_is_complete(small: Any) -> None:
     report: StudyReport = small[0]
-    assert (report.name, report.fs, report.rated_power, report.claims) == ("constraint", 16000.0, 0.25, "Aims")
-    assert len(report.verdicts) == 7
+    assert (report.name, report.fs, report.rated_power, report.claims_heading) == ("constraint", 16000.0, 0.25, "Aims")
+    assert len(report.claims) == 7
     assert [item.stem for item in report.figures] == ["loss", "power", "window", "course", "limiter", "jumps"]
     assert report.parameters["n_taps"].value == TAPS
     assert report.parameters["durations_s"].value == [2.0]
@@ -166,15 +166,15 @@ def test_the_summary_holds_what_the_rows_of_an_algorithm_say(small: Any) -> None
         assert window == max(r["worst_window"] for r in own)
 
 
-def test_the_terminal_shows_verdicts_and_tables(small: Any) -> None:
+def test_the_terminal_shows_claims_and_tables(small: Any) -> None:
     shown = results_table([small[0]])
     assert shown.startswith("constraint: The constraint that holds (rated power 0.25)\n")
-    assert shown.replace("\n", " ").endswith(f" {verdict_sentence([small[0]])}")
+    assert shown.replace("\n", " ").endswith(f" {claims_sentence([small[0]])}")
     for table in small[0].tables:
         assert table.caption in shown
 
 
-# ---- Verdicts from rows made by hand
+# ---- Claims from rows made by hand
 
 
 TONE, SWELLING = Case("duct", "tone"), Case("duct", "swelling band noise")
@@ -229,11 +229,11 @@ def test_loss_is_what_the_bound_is_above() -> None:
         ({"noise_reduction_db": 12.0, "bound_db": 10.0}, True),
     ],
 )
-def test_verdict_on_stationary_noise(changes: dict, kept: bool) -> None:
+def test_claim_on_stationary_noise(changes: dict, kept: bool) -> None:
     for rows in ([row(seed=1), row(seed=2, **changes)], [row(seed=2, **changes), row(seed=1)]):
-        assert constraint._steady_claim(rows).reproduced is kept
-    verdict = constraint._steady_claim([row(power=0.98), row(seed=3, share=0.1, noise_reduction_db=9.0)])
-    assert verdict.figure == (
+        assert constraint._steady_claim(rows).holds is kept
+    claim = constraint._steady_claim([row(power=0.98), row(seed=3, share=0.1, noise_reduction_db=9.0)])
+    assert claim.measured == (
         "2 runs: output power 0.980 to 1.000, 0.60 dB below the bound on average and 1.10 dB (duct, tone, 10 %, 8 s, "
         "seed 3) at worst"
     )
@@ -250,9 +250,9 @@ def test_verdict_on_stationary_noise(changes: dict, kept: bool) -> None:
         ({"noise_reduction_db": 9.0, "bound_db": 10.01}, False),
     ],
 )
-def test_verdict_on_varying_noise(changes: dict, kept: bool) -> None:
+def test_claim_on_varying_noise(changes: dict, kept: bool) -> None:
     for rows in ([row(), row(**changes)], [row(**changes), row()]):
-        assert constraint._varying_claim(rows).reproduced is kept
+        assert constraint._varying_claim(rows).holds is kept
 
 
 @pytest.mark.parametrize(
@@ -268,32 +268,32 @@ def test_verdict_on_varying_noise(changes: dict, kept: bool) -> None:
         ({"weight_db": -1.01}, False),
     ],
 )
-def test_verdict_on_jumps(changes: dict, kept: bool) -> None:
-    verdict = constraint._jump_claim([jump(), jump(**changes)])
-    assert verdict.reproduced is kept
+def test_claim_on_jumps(changes: dict, kept: bool) -> None:
+    claim = constraint._jump_claim([jump(), jump(**changes)])
+    assert claim.holds is kept
     loss, weight = abs(changes.get("loss_db", 0.2)), abs(changes.get("weight_db", 0.3))
-    assert verdict.figure == f"2 runs: noise reduction off by {loss:.2f} dB and lambda by {weight:.2f} dB at most"
-    assert "±20 dB" in verdict.claim
+    assert claim.measured == f"2 runs: noise reduction off by {loss:.2f} dB and lambda by {weight:.2f} dB at most"
+    assert "±20 dB" in claim.text
 
 
-def test_verdict_on_the_guarantee() -> None:
+def test_claim_on_the_guarantee() -> None:
     """Of limited runs alone: the others' windows may be anything."""
     free = [row(worst_window=9.0), row(algorithm="KF-OPC", worst_window=9.0)]
     limited, over = row(algorithm="KF-PB limited", worst_window=1.0), 1 + 2e-9
     of_opc = row(algorithm="KF-OPC limited", worst_window=over)
     others = [clipped(), clipped(algorithm="KF-ANC", worst_window=9.0)]
-    verdict = constraint._guarantee_claim([*free, limited], [jump()], others)
-    assert verdict.reproduced is True
-    assert verdict.figure == "3 runs: 1.000000000 of the rated power at most"
+    claim = constraint._guarantee_claim([*free, limited], [jump()], others)
+    assert claim.holds is True
+    assert claim.measured == "3 runs: 1.000000000 of the rated power at most"
     nearly = replace(limited, worst_window=1 + 5e-10)
-    assert constraint._guarantee_claim([*free, nearly], [jump()], others).reproduced is True
+    assert constraint._guarantee_claim([*free, nearly], [jump()], others).holds is True
     for rows, jumps, clips in (
         ([replace(limited, worst_window=over)], [jump()], others),
         ([limited, of_opc], [jump()], others),
         ([limited], [jump(worst_window_limited=over)], others),
         ([limited], [jump()], [*others, clipped(worst_window=over)]),
     ):
-        assert constraint._guarantee_claim([*free, *rows], jumps, clips).reproduced is False
+        assert constraint._guarantee_claim([*free, *rows], jumps, clips).holds is False
 
 
 def pair(reduction: float, of_opc: float, **changes: Any) -> list[ConstraintRow]:
@@ -304,53 +304,55 @@ def pair(reduction: float, of_opc: float, **changes: Any) -> list[ConstraintRow]
     ]
 
 
-def test_verdicts_behind_the_limiter() -> None:
+def test_claims_behind_the_limiter() -> None:
     """Compared case by case; the rows without a limiter, and KF-OPC's losses, count for nothing."""
     free = [row(noise_reduction_db=0.0), row(algorithm="KF-OPC", noise_reduction_db=50.0)]
     noise = {"noise": SWELLING.noise, "seed": 4, "share": 0.1}
     compared, tones = constraint._transparency_claims([*free, *pair(10.0, 8.0), *pair(7.75, 8.0, **noise)])
-    assert (compared.reproduced, tones.reproduced) == (True, True)
-    assert compared.figure == ("+0.88 dB on average, -0.25 dB at worst (duct, swelling band noise, 10 %, 8 s, seed 4)")
-    assert tones.figure == "1 runs: 0.10 dB below it at most"
+    assert (compared.holds, tones.holds) == (True, True)
+    assert compared.measured == (
+        "+0.88 dB on average, -0.25 dB at worst (duct, swelling band noise, 10 %, 8 s, seed 4)"
+    )
+    assert tones.measured == "1 runs: 0.10 dB below it at most"
     compared, tones = constraint._transparency_claims([*free, *pair(9.5, 8.0), *pair(7.5, 8.0, **noise)])
-    assert (compared.reproduced, tones.reproduced) == (False, False)
+    assert (compared.holds, tones.holds) == (False, False)
 
 
 @pytest.mark.parametrize(("of_pb", "met"), [(7.71, True), (7.69, False)])
 def test_behind_the_limiter_a_third_of_a_decibel_is_allowed(of_pb: float, met: bool) -> None:
     compared, _ = constraint._transparency_claims(pair(10.0, 8.0) + pair(of_pb, 8.0, noise="bursts"))
-    assert compared.reproduced is met
+    assert compared.holds is met
 
 
 @pytest.mark.parametrize(("reduction", "met"), [(9.61, True), (9.59, False)])
 def test_behind_the_limiter_a_tone_is_half_a_decibel_from_the_bound(reduction: float, met: bool) -> None:
     _, tones = constraint._transparency_claims(pair(reduction, 8.0) + pair(1.0, 0.0, noise="bursts"))
-    assert tones.reproduced is met
+    assert tones.holds is met
 
 
 def test_each_claim_is_on_its_own_rows() -> None:
-    """Wrong figures of KF-OPC, and of the other kind of noise, change no verdict on KF-PB."""
+    """Wrong figures of KF-OPC, and of the other kind of noise, change no claim about KF-PB."""
     limited = pair(10.0, 9.9)
     rows = [row(), row(noise=SWELLING.noise, power=0.5), row(algorithm="KF-OPC", power=2.0, noise_reduction_db=0.0)]
     settled = {"duct": {"KF-PB": 1.0, "KF-ANC": 1.0}}
 
     def met(rows: list[ConstraintRow]) -> list[bool]:
         limits = [replace(own, worst_window=1.0) for own in limited]
-        return [v.reproduced for v in constraint._claims(rows + limits, [jump()], [clipped()], settled)]
+        return [claim.holds for claim in constraint._claims(rows + limits, [jump()], [clipped()], settled)]
 
     assert met(rows) == [True] * 7
     assert met([*rows, row(power=0.5)]) == [False] + [True] * 6
     assert met([*rows, row(noise=SWELLING.noise, power=1.1)]) == [True, False] + [True] * 5
 
 
-def test_verdict_on_convergence() -> None:
+def test_claim_on_convergence() -> None:
     kept = {"a": {"KF-PB": 1.5, "KF-ANC": 1.0}, "b": {"KF-PB": 0.25, "KF-ANC": 0.5}}
-    verdict = constraint._convergence_claim(kept)
-    assert verdict.reproduced
-    assert verdict.figure == "1.00 times on average, 1.50 at most (a); NSE over 50 ms, pooled over seeds"
-    assert not constraint._convergence_claim(kept | {"c": {"KF-PB": 1.51, "KF-ANC": 1.0}}).reproduced
+    claim = constraint._convergence_claim(kept)
+    assert claim.holds
+    assert claim.measured == "1.00 times on average, 1.50 at most (a); NSE over 50 ms, pooled over seeds"
+    assert not constraint._convergence_claim(kept | {"c": {"KF-PB": 1.51, "KF-ANC": 1.0}}).holds
     for order in (kept | {"c": {"KF-PB": 1.6, "KF-ANC": 1.0}}, {"c": {"KF-PB": 1.6, "KF-ANC": 1.0}} | kept):
-        assert not constraint._convergence_claim(order).reproduced
+        assert not constraint._convergence_claim(order).holds
 
 
 @pytest.mark.parametrize(

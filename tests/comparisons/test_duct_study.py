@@ -1,4 +1,4 @@
-"""The duct study: each verdict from figures made by hand, both outcomes close to the threshold, and where it starts."""
+"""The duct study: each claim from figures made by hand, both outcomes close to the threshold, and where it starts."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def all_figures(**changed: Figures) -> dict[str, Figures]:
 def test_the_best_is_ahead_of_all_of_the_paper_and_beyond_the_power(reduction: float, power: float, met: bool) -> None:
     made = all_figures(KF_ANC=figures(noise_reduction_db=reduction, power=power))
     made["KF-PB"] = figures(noise_reduction_db=20.0)  # not of the paper
-    assert duct.best_claim(made).reproduced is met
+    assert duct.best_claim(made).holds is met
 
 
 @pytest.mark.parametrize("rival", ["KF-OPC", "FxLMS", "MOV-FxLMS"])
 def test_every_rival_of_the_paper_counts(rival: str) -> None:
     made = all_figures()
-    assert duct.best_claim(made).reproduced
-    assert not duct.best_claim(made | {rival: figures(noise_reduction_db=10.1)}).reproduced
+    assert duct.best_claim(made).holds
+    assert not duct.best_claim(made | {rival: figures(noise_reduction_db=10.1)}).holds
 
 
 @pytest.mark.parametrize(
@@ -61,9 +61,9 @@ def test_every_rival_of_the_paper_counts(rival: str) -> None:
     ],
 )
 def test_confined_is_over_the_steady_half_and_over_every_second(changed: dict[str, float], met: bool) -> None:
-    verdict = duct.confined_claim(figures(**changed))
-    assert verdict.reproduced is met
-    assert f"{changed.get('worst_50_ms', 1.5):.1f} times the rated power over 50 ms" in verdict.figure
+    claim = duct.confined_claim(figures(**changed))
+    assert claim.holds is met
+    assert f"{changed.get('worst_50_ms', 1.5):.1f} times the rated power over 50 ms" in claim.measured
 
 
 def start(time_s: float, equal_time_s: float) -> Start:
@@ -93,17 +93,17 @@ def start(time_s: float, equal_time_s: float) -> Start:
     ],
 )
 def test_faster_is_sooner_at_equal_power_too(time_s: float, equal_time_s: float, met: bool) -> None:
-    verdict = duct.faster_claim(start(time_s, equal_time_s))
-    assert verdict.reproduced is met
-    assert "after a start at 3 s, where the constraint factor is at most 0.80" in verdict.figure
-    assert f"puts out 0.91 as well, in {1e3 * equal_time_s:.1f} ms and 10.0 ms" in verdict.figure
-    assert "6.50 against 5.00 dB, and 4.50 dB at equal power" in verdict.figure
+    claim = duct.faster_claim(start(time_s, equal_time_s))
+    assert claim.holds is met
+    assert "after a start at 3 s, where the constraint factor is at most 0.80" in claim.measured
+    assert f"puts out 0.91 as well, in {1e3 * equal_time_s:.1f} ms and 10.0 ms" in claim.measured
+    assert "6.50 against 5.00 dB, and 4.50 dB at equal power" in claim.measured
 
 
 def test_without_a_second_under_the_constraint_nothing_is_claimed() -> None:
-    verdict = duct.faster_claim(None)
-    assert not verdict.reproduced
-    assert verdict.figure.startswith("not tested")
+    claim = duct.faster_claim(None)
+    assert not claim.holds
+    assert claim.measured.startswith("not tested")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_without_a_second_under_the_constraint_nothing_is_claimed() -> None:
 )
 def test_nearer_counts_both_sides_of_the_rated_power(opc: float, mov: float, met: bool) -> None:
     made = all_figures(KF_OPC=figures(power=opc), MOV_FxLMS=figures(power=mov))
-    assert duct.nearer_claim(made).reproduced is met
+    assert duct.nearer_claim(made).holds is met
 
 
 @pytest.mark.parametrize(
@@ -136,10 +136,10 @@ def test_better_is_by_the_papers_measure_and_both_are_told(
     nse: float, reduction: float, met: bool, by_energy: str
 ) -> None:
     made = all_figures(KF_OPC=figures(mean_nse_db=nse, noise_reduction_db=reduction))
-    verdict = duct.better_claim(made)
-    assert verdict.reproduced is met
-    assert f"by the mean NSE {'KF-OPC' if met else 'MOV-FxLMS'} is ahead" in verdict.figure
-    assert f"by the energy over the steady half {by_energy} is ahead" in verdict.figure
+    claim = duct.better_claim(made)
+    assert claim.holds is met
+    assert f"by the mean NSE {'KF-OPC' if met else 'MOV-FxLMS'} is ahead" in claim.measured
+    assert f"by the energy over the steady half {by_energy} is ahead" in claim.measured
 
 
 # ---- The start

@@ -1,4 +1,4 @@
-"""The study of mismatch on a small scale, its verdicts from rows made by hand, the bound of 90 degrees from theory."""
+"""The study of mismatch on a small scale, its claims from rows made by hand, the bound of 90 degrees from theory."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_planned_runs_are_those_taken(small: Any) -> None:
 
 def test_the_report_is_complete(small: Any) -> None:
     report: StudyReport = small[0]
-    assert (report.name, report.claims, len(report.verdicts)) == ("mismatch", "Findings", 5)
+    assert (report.name, report.claims_heading, len(report.claims)) == ("mismatch", "Findings", 5)
     assert [item.stem for item in report.figures] == [
         "reduction-duct-band-noise",
         "power-duct-band-noise",
@@ -169,7 +169,7 @@ def test_fxlms_of_a_tone_decays_below_90_degrees_and_grows_past_it(phase_deg: fl
     assert (late > early) == grows
 
 
-# ---- Verdicts from rows made by hand
+# ---- Claims from rows made by hand
 
 
 def _row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **more: Any) -> MismatchRow:
@@ -199,20 +199,20 @@ def test_the_bound_of_90_degrees_needs_both_sides(below_db: float, above_db: flo
         _row(amount=105.0, noise_reduction_db=20.0, noise="tone"),  # another noise
         _row(amount=105.0, noise_reduction_db=20.0, tuned_with=EXACT),  # another tuning
     ]
-    verdict = mismatch._quarter_turn(rows, "FxLMS")
-    assert verdict.reproduced == met
+    claim = mismatch._quarter_turn(rows, "FxLMS")
+    assert claim.holds == met
     # The least of those below, and the best of those above.
-    assert verdict.figure.startswith(
+    assert claim.measured.startswith(
         f"{1 + (below_db > 0.0)} of 2 runs below reduce it, the least by {below_db:.1f} dB"
     )
-    assert "phase +89 degrees" in verdict.figure
+    assert "phase +89 degrees" in claim.measured
     best = "-inf" if np.isnan(above_db) else f"{above_db:.1f}"
-    assert f"{int(above_db > 0.0)} of 1 above, the best of which is {best} dB" in verdict.figure
+    assert f"{int(above_db > 0.0)} of 1 above, the best of which is {best} dB" in claim.measured
 
 
 def test_the_best_above_90_degrees_is_told() -> None:
     rows = [_row(amount=0.0), *(_row(amount=a, noise_reduction_db=-a) for a in (120.0, 100.0, 150.0))]
-    assert "0 of 3 above, the best of which is -100.0 dB" in mismatch._quarter_turn(rows, "FxLMS").figure
+    assert "0 of 3 above, the best of which is -100.0 dB" in mismatch._quarter_turn(rows, "FxLMS").measured
 
 
 @pytest.mark.parametrize(("left_db", "met"), [(5.1, True), (5.0, True), (4.9, False), (np.nan, False)])
@@ -232,23 +232,23 @@ def test_the_loss_to_a_wrong_gain_is_against_the_exact_path(left_db: float, met:
             diverged_at_s=0.1 if np.isnan(left_db) else None,
         )
     )
-    verdict = mismatch._gain(rows)
-    assert verdict.reproduced == met
+    claim = mismatch._gain(rows)
+    assert claim.holds == met
     lost = "diverges" if np.isnan(left_db) else f"{6.0 - left_db:.1f} dB"
-    assert verdict.figure == f"largest loss: KF-ANC 0.0 dB, KF-PB {lost}, FxLMS 0.0 dB, MOV-FxLMS 0.0 dB"
-    assert verdict.claim.startswith("A gain up to 12 dB off")
+    assert claim.measured == f"largest loss: KF-ANC 0.0 dB, KF-PB {lost}, FxLMS 0.0 dB, MOV-FxLMS 0.0 dB"
+    assert claim.text.startswith("A gain up to 12 dB off")
 
 
 def test_one_divergence_is_one_too_many() -> None:
     rows = [_row(algorithm=name) for name in mismatch.KEEPS_POWER] + [_row(algorithm="FxLMS", tuned_with=EXACT)]
-    assert mismatch._bounded(rows).reproduced
+    assert mismatch._bounded(rows).holds
     loud = mismatch._bounded([*rows, _row(algorithm="KF-PB", noise_reduction_db=-3.5)])
-    assert loud.reproduced  # louder, but bounded
-    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in loud.figure
-    assert not mismatch._bounded([*rows, _row(algorithm="KF-PB", diverged_at_s=2.0)]).reproduced
+    assert loud.holds  # louder, but bounded
+    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in loud.measured
+    assert not mismatch._bounded([*rows, _row(algorithm="KF-PB", diverged_at_s=2.0)]).holds
     others = mismatch._bounded([*rows, _row(algorithm="FxLMS", tuned_with=EXACT, diverged_at_s=2.0)])
-    assert others.reproduced
-    assert others.figure.endswith("Of the unconstrained algorithms tuned with the exact path 1 of 2 diverged")
+    assert others.holds
+    assert others.measured.endswith("Of the unconstrained algorithms tuned with the exact path 1 of 2 diverged")
 
 
 @pytest.mark.parametrize(
@@ -271,7 +271,7 @@ def test_power_under_a_wrong_gain(ours: float, theirs: float, met: bool) -> None
         _row("gain", 6.0, name, tuned_with=EXACT, power=power)
         for name, power in (("KF-PB", ours), ("KF-OPC", theirs), ("MOV-FxLMS", 1.0))
     ]
-    assert mismatch._power(rows).reproduced == met
+    assert mismatch._power(rows).holds == met
 
 
 def test_unstable_is_diverged_or_louder() -> None:

@@ -1,4 +1,4 @@
-"""The multichannel study on a small scale, and its verdicts from rows made by hand."""
+"""The multichannel study on a small scale, and its claims from rows made by hand."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from comparisons.__main__ import FURTHER
-from comparisons.studies import multichannel, rooms
+from comparisons.studies import multichannel
+from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, EQUAL, KF_PB, SCALED, ChannelRow, claims
-from comparisons.studies.rooms import MEASURED, Place, level_map_db
+from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener, simulate
 from kfopc_filterpy.bench import Runs, StudyReport, algorithms, make_controller, write_report
 from kfopc_filterpy.bench import registry as registered
@@ -144,7 +145,7 @@ def test_without_rooms_the_study_says_so(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "pyroomacoustics" in report
 
 
-# ---- Verdicts
+# ---- Claims
 
 
 def rows_of(
@@ -178,7 +179,7 @@ def rows_of(
 
 
 def held(**changes: float) -> list[bool]:
-    return [verdict.reproduced for verdict in claims(rows_of(**changes))]
+    return [claim.holds for claim in claims(rows_of(**changes))]
 
 
 @pytest.mark.parametrize(
@@ -198,7 +199,7 @@ def held(**changes: float) -> list[bool]:
         ({"rival_db": 8.05}, [True, True, True, True, True]),
     ],
 )
-def test_verdicts_on_both_sides_of_each_threshold(changes: dict[str, float], expected: list[bool]) -> None:
+def test_claims_on_both_sides_of_each_threshold(changes: dict[str, float], expected: list[bool]) -> None:
     assert held(**changes) == expected
 
 
@@ -216,12 +217,12 @@ def test_verdicts_on_both_sides_of_each_threshold(changes: dict[str, float], exp
 def test_one_case_of_several_is_enough_to_fail_a_claim(changes: dict[str, float], failed: list[int]) -> None:
     case = [replace(row, noise="white noise") for row in rows_of(**changes) if row.path != MEASURED]
     for rows in (rows_of() + case, case + rows_of()):
-        assert [k for k, verdict in enumerate(claims(rows)) if not verdict.reproduced] == failed
+        assert [k for k, claim in enumerate(claims(rows)) if not claim.holds] == failed
         loss = max(changes.get("loss_db", 0.2), 0.2)
-        assert f"{loss:.2f} dB at worst" in claims(rows)[1].figure
+        assert f"{loss:.2f} dB at worst" in claims(rows)[1].measured
         lead = min(3.0 - 0.2, 8.0 - changes.get("loss_db", 0.2) - changes.get("rival_db", 5.0))
-        assert f"{lead:+.2f} dB at worst" in claims(rows)[-1].figure
-        assert claims(rows)[-1].figure.endswith("+2.80 dB at best")  # a rival in every case
+        assert f"{lead:+.2f} dB at worst" in claims(rows)[-1].measured
+        assert claims(rows)[-1].measured.endswith("+2.80 dB at best")  # a rival in every case
 
 
 def test_the_rival_is_the_best_of_those_that_keep_every_rating() -> None:
@@ -230,12 +231,12 @@ def test_the_rival_is_the_best_of_those_that_keep_every_rating() -> None:
     others = [name for name, own in algorithms(several_channels=True).items() if own.keeps_budget]
     name = next(name for name in others if not name.startswith("KF-PB") and name != "MOV-FxLMS")
     better = replace(rival, algorithm=name, noise_reduction_db=8.2)
-    assert [claims(order)[-1].reproduced for order in ([*rows, better], [better, *rows])] == [False, False]
-    assert f"-0.40 dB at worst (4 x 4, tones: {name})" in claims([*rows, better])[-1].figure
+    assert [claims(order)[-1].holds for order in ([*rows, better], [better, *rows])] == [False, False]
+    assert f"-0.40 dB at worst (4 x 4, tones: {name})" in claims([*rows, better])[-1].measured
     worse = replace(better, noise_reduction_db=1.0)
-    assert "+2.80 dB at worst (4 x 4, tones: MOV-FxLMS)" in claims([*rows, worse])[-1].figure
+    assert "+2.80 dB at worst (4 x 4, tones: MOV-FxLMS)" in claims([*rows, worse])[-1].measured
     alone = [row for row in rows if (row.path, row.algorithm) != (MEASURED, "MOV-FxLMS")]
-    assert claims(alone)[-1].figure.endswith("+2.80 dB at best; in 1 of 2 cases no other keeps them")
+    assert claims(alone)[-1].measured.endswith("+2.80 dB at best; in 1 of 2 cases no other keeps them")
 
 
 @pytest.mark.parametrize("place", [0, 1])
@@ -244,17 +245,17 @@ def test_a_kf_pb_that_diverges_meets_nothing(place: int) -> None:
     at = [k for k, row in enumerate(rows) if row.algorithm == KF_PB][place]
     rows[at] = replace(rows[at], diverged_at_s=1.0, noise_reduction_db=np.nan, power=np.nan, powers=[])
     expected = [place == 1] * 2 + [place == 0] * 2 + [False]
-    assert [verdict.reproduced for verdict in claims(rows)] == expected
-    assert sum("diverged" in verdict.figure for verdict in claims(rows)) == 3
+    assert [claim.holds for claim in claims(rows)] == expected
+    assert sum("diverged" in claim.measured for claim in claims(rows)) == 3
 
 
 def test_without_a_rival_there_is_no_lead() -> None:
-    verdict = claims([row for row in rows_of() if row.algorithm != "MOV-FxLMS"])[-1]
-    assert not verdict.reproduced
-    assert "nothing to compare with" in verdict.figure
+    claim = claims([row for row in rows_of() if row.algorithm != "MOV-FxLMS"])[-1]
+    assert not claim.holds
+    assert "nothing to compare with" in claim.measured
 
 
-def test_without_recordings_there_is_no_verdict_on_them() -> None:
+def test_without_recordings_there_is_no_claim_on_them() -> None:
     assert len(claims([row for row in rows_of() if row.path != MEASURED])) == 3
 
 

@@ -1,4 +1,4 @@
-"""The study of tracking on a small scale, its scenes against plain convolutions, its verdicts from rows made by hand."""
+"""The study of tracking on a small scale, its scenes against plain convolutions, its claims from rows made by hand."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_planned_runs_are_those_taken(small: Any) -> None:
 
 def test_the_report_is_complete(small: Any) -> None:
     report: StudyReport = small[0]
-    assert (report.name, report.claims, len(report.verdicts)) == ("tracking", "Findings", 5)
+    assert (report.name, report.claims_heading, len(report.claims)) == ("tracking", "Findings", 5)
     assert [item.stem for item in report.figures] == ["20-db-louder", "sign", "one-sweep"]
     assert [sound.stem for sound in report.sounds] == ["sign-disturbance", "sign-kf-anc", "sign-kf-pb", "sign-fxlms"]
     assert {(sound.group, sound.from_s) for sound in report.sounds} == {("sign", 0.0)}  # the change is at 0.5 s
@@ -178,7 +178,7 @@ def test_an_algorithm_without_a_setting_is_lost() -> None:
     assert row.settled_s == {"changed": None}
 
 
-# ---- Verdicts from rows made by hand
+# ---- Claims from rows made by hand
 
 
 def _row(event: str, algorithm: str, **more: Any) -> TrackingRow:
@@ -203,11 +203,11 @@ def _row(event: str, algorithm: str, **more: Any) -> TrackingRow:
 def test_mean_nse_is_compared_event_by_event(nse: float, met: bool) -> None:
     rows = [_row("sign", "KF-ANC", mean_nse_db=-9.0), _row("sign", "FxLMS")]
     rows += [_row("delay", "KF-ANC", mean_nse_db=nse), _row("delay", "FxLMS")]
-    verdict = tracking._mean_nse(rows)
-    assert verdict.reproduced == met
+    claim = tracking._mean_nse(rows)
+    assert claim.holds == met
     if np.isfinite(nse):
         assert (
-            verdict.figure
+            claim.measured
             == f"by {(4.0 - 5.0 - nse) / 2:.1f} dB on average, by {-5.0 - nse:.2f} dB at least (delay, duct)"
         )
 
@@ -216,14 +216,14 @@ def test_mean_nse_is_compared_event_by_event(nse: float, met: bool) -> None:
 def test_sooner_needs_every_change(time: float | None, met: bool) -> None:
     rows = [_row("sign", "KF-ANC", settled_s={"changed": time}), _row("sign", "FxLMS")]
     rows += [_row("sweeps", "KF-ANC", settled_s={}), _row("sweeps", "FxLMS", settled_s={})]
-    assert tracking._sooner(rows).reproduced == met
+    assert tracking._sooner(rows).holds == met
 
 
 @pytest.mark.parametrize(("worst", "met"), [(10.01, True), (10.0, False), (9.99, False)])
 def test_a_jump_breaks_every_constraint(worst: float, met: bool) -> None:
     rows = [_row("20 dB louder", name, worst_window=30.0) for name in tracking.CONSTRAINED[1:]]
     rows.append(_row("20 dB louder", tracking.CONSTRAINED[0], worst_window=worst))
-    assert tracking._jump(rows).reproduced == met
+    assert tracking._jump(rows).holds == met
 
 
 @pytest.mark.parametrize(("worst", "met"), [(2.0, True), (2.01, False), (np.nan, False)])
@@ -234,9 +234,9 @@ def test_a_change_is_judged_by_its_stretch(worst: float, met: bool) -> None:
         _row("delay", name, stretch_worst_window={"changed": 1.5}) for name in tracking.CONSTRAINED if name != "KF-PB"
     ]
     for all_rows in (rows, [*rows, *others], [*others, *rows]):  # one is enough, wherever it stands
-        verdict = tracking._change(all_rows)
-        assert verdict.reproduced == met
-        assert verdict.figure.startswith(f"{worst:.2f} of it at worst (KF-PB, delay, duct)")
+        claim = tracking._change(all_rows)
+        assert claim.holds == met
+        assert claim.measured.startswith(f"{worst:.2f} of it at worst (KF-PB, delay, duct)")
 
 
 @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ def test_a_change_is_judged_by_its_stretch(worst: float, met: bool) -> None:
 def test_back_after_a_loud_noise(opc: float | None, pb: float, anc: float | None, met: bool) -> None:
     times = {"KF-OPC": opc, "KF-PB": pb, "KF-ANC": anc}
     rows = [_row("20 dB louder", name, settled_s={"louder": 0.0, "back": time}) for name, time in times.items()]
-    assert tracking._back(rows).reproduced == met
+    assert tracking._back(rows).holds == met
 
 
 def test_the_command_knows_the_study() -> None:

@@ -1,4 +1,4 @@
-"""The study of a secondary path that is known within a tolerance: small, and its verdicts from rows made by hand."""
+"""The study of a secondary path that is known within a tolerance: small, and its claims from rows made by hand."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from comparisons.studies.uncertain_path import (
     NOTHING,
     STATED,
     AllowanceRow,
+    claims,
     jobs,
     seconds_db,
     stated,
-    verdicts,
 )
 from kfopc_filterpy import SimulationResult, simulate
 from kfopc_filterpy.bench import Runs, StudyReport
@@ -56,7 +56,7 @@ def test_planned_runs_are_those_taken(small: Any) -> None:
 
 def test_the_report_is_complete(small: Any) -> None:
     report: StudyReport = small[0]
-    assert (report.name, report.claims, len(report.verdicts)) == ("uncertain-path", "Findings", 5)
+    assert (report.name, report.claims_heading, len(report.claims)) == ("uncertain-path", "Findings", 5)
     assert [item.stem for item in report.figures] == ["worst-seconds"]
     assert report.notes[0] == "The measured duct was not at hand (KFOPC_DATA): it is left out."
     rows = report.extra["rows"]
@@ -113,7 +113,7 @@ class _Half:
         pass
 
 
-# ---- Verdicts on rows made by hand
+# ---- Claims on rows made by hand
 
 
 def row(noise: str = "white", error: str = "a sample late", allowance: str = DEFAULT, **figures: Any) -> AllowanceRow:
@@ -142,13 +142,13 @@ def changed(at: int, **figures: Any) -> list[AllowanceRow]:
 
 
 def test_all_findings_hold_on_good_rows() -> None:
-    found = verdicts(GOOD)
-    assert all(verdict.reproduced for verdict in found)
+    found = claims(GOOD)
+    assert all(claim.holds for claim in found)
     assert (
         "if nothing is allowed for 1 of 1 do, the worst second is -7.0 dB (duct, white, a sample late)"
-        in found[0].figure
+        in found[0].measured
     )
-    assert found[2].figure == "0.40 dB on average, 0.40 dB at most (duct, motor)"
+    assert found[2].measured == "0.40 dB on average, 0.40 dB at most (duct, motor)"
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_all_findings_hold_on_good_rows() -> None:
     ],
 )
 def test_each_finding_fails_alone(at: int, figures: dict[str, Any], finding: int) -> None:
-    assert [n for n, verdict in enumerate(verdicts(changed(at, **figures))) if not verdict.reproduced] == [finding]
+    assert [n for n, claim in enumerate(claims(changed(at, **figures))) if not claim.holds] == [finding]
 
 
 def test_the_command_knows_the_study() -> None:

@@ -8,7 +8,10 @@ import re
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from kfopc_filterpy.bench import Claim, StudyReport
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 sys.path.insert(0, str(DOCS))
@@ -72,6 +75,16 @@ def test_a_quote_is_held_to_its_last_digit_and_a_missing_one_is_wrong():
     absent = dataclasses.replace(quote, words="leads KF-ANC by {:.1f} dB everywhere, {:.1f}")
     assert absent.found() is None
     assert len(absent.wrong(fake_results(4.587))) == 1
+
+
+def test_what_a_claim_measured_is_found_by_its_first_words():
+    held, missed = Claim("It is faster", True, "1.5 s, -3 dB"), Claim("It is louder", np.bool_(False), "7")
+    study = StudyReport("tonal", "", "", 16000.0, 1.0, {}, {}, claims=[held, missed])
+    results = fake_results(1.0)
+    vars(results)["studies"] = dict.fromkeys(quoted.PAPER, study.result)
+    assert results.said("tonal", "It is f") == [1.5, -3.0]
+    assert results.said("tonal", "It is l") == [7.0]
+    assert results.reproduced() == (len(quoted.PAPER), 2 * len(quoted.PAPER))
 
 
 def test_the_table_of_quotes_names_a_command_for_each():

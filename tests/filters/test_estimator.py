@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kfopc_filterpy import KFOPC, OutputPowerConstraint
-from kfopc_filterpy.filters import guards
+from kfopc_filterpy.filters.checked_steps import state_of
 from kfopc_filterpy.power.constraint import ConstraintState
 
 TAPS, STATE_NOISE, NOISE = 5, 1e-4, 0.3
@@ -340,7 +340,7 @@ def deep_equal(a: Any, b: Any) -> bool:
 
 def state(kf: KFOPC) -> dict:
     """All that a filter holds, and what the random-walk filter makes of it when read."""
-    attributes, private = guards.state_of(kf)
+    attributes, private = state_of(kf)
     made = {name: getattr(kf, name) for name in ("y", "z", "S", "SI", "x_prior", "K")}
     return {key: value for key, value in (attributes | private | made).items() if key not in ("_views", "_made", "_K")}
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from kfopc_filterpy.bench import FigureItem, Parameter, Sound, StudyReport, Verdict
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Sound, StudyReport
 
 FS = 8000.0
 D = np.sin(np.arange(400) / 3)
@@ -38,7 +38,7 @@ def study(name: str = "tonal", **changes: Any) -> StudyReport:
             "KF-OPC": {"output_power": 0.79971, "clipped_fraction": 0.25, "harmonics_db": float("nan")},
         },
         "extra": {"sweep": {"over_db": np.arange(2), "best": np.array([1.0, -np.inf])}, "flip": np.float32(4.5)},
-        "verdicts": [Verdict("KF-OPC < rated", True, "0.79971 of 0.8"), Verdict("it is faster", np.bool_(False), "no")],
+        "claims": [Claim("KF-OPC < rated", True, "0.79971 of 0.8"), Claim("it is faster", np.bool_(False), "no")],
         "figures": [FigureItem("a-spectra", 'Spectra "of" e & d.', figure())],
         "sounds": [Sound("disturbance", "Disturbance", D), Sound("kf-anc", "Residual", np.append(D[:-1] / 2, np.nan))],
         "notes": ["One <note>."],

@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from kfopc_filterpy.paths import estimate_path, identify_secondary_path
-from kfopc_filterpy.paths.channels import path_matrix
+from kfopc_filterpy.paths.path_matrix import path_matrix
 
 FS = 8000.0
 N_TAPS = 12

@@ -16,8 +16,8 @@ from kfopc_filterpy.realtime import (
     Block,
     FaultError,
     Interface,
-    Levels,
     NotCausalError,
+    RunStatus,
     SimulatedInterface,
     SoundDevice,
     measure_round_trip,
@@ -82,7 +82,7 @@ def test_a_real_clock_waits_for_the_blocks_and_loses_those_not_fetched() -> None
 
 
 def test_a_run_identifies_fades_in_reduces_and_fades_out() -> None:
-    reports: list[Levels] = []
+    reports: list[RunStatus] = []
     interface = plant()
     report = started(interface, seconds=3.0, on_report=reports.append, report_every_s=0.5)
     assert report.stopped_by == "end"
@@ -248,23 +248,23 @@ def test_a_report_has_the_levels_since_the_last_one() -> None:
         health=None,
     )
     silence: Any = SimpleNamespace(e=np.full((1, 10), 2.0))  # a power of 4 before
-    reports: list[Levels] = []
+    reports: list[RunStatus] = []
     watch = _Watch(session, supervisor, silence, 1.0, reports.append)
     for n, power in enumerate([1.0, 3.0, 4.0, 4.0, 10.0, 30.0]):  # blocks of half a second
         session.load_since_report = max(session.load_since_report, 0.1 * (6 - n))
         watch.add(Block(np.full((1, 2), 10.0), np.full((1, 2), np.sqrt(power))), np.full((1, 2), np.sqrt(2.0 * power)))
-    assert [levels.time_s for levels in reports] == [1.0, 2.0, 3.0]
+    assert [status.time_s for status in reports] == [1.0, 2.0, 3.0]
     error = np.array([2.0, 4.0, 20.0])
-    np.testing.assert_allclose([levels.powers[0] for levels in reports], 2.0 * error)
-    np.testing.assert_allclose([levels.error_level_db[0] for levels in reports], 10 * np.log10(error))
-    np.testing.assert_allclose([levels.reduction_db[0] for levels in reports], 10 * np.log10(4.0 / error))
-    np.testing.assert_allclose([levels.reference_level_db[0] for levels in reports], 20.0)
-    np.testing.assert_allclose([levels.load for levels in reports], [0.6, 0.4, 0.2])
+    np.testing.assert_allclose([status.powers[0] for status in reports], 2.0 * error)
+    np.testing.assert_allclose([status.error_level_db[0] for status in reports], 10 * np.log10(error))
+    np.testing.assert_allclose([status.reduction_db[0] for status in reports], 10 * np.log10(4.0 / error))
+    np.testing.assert_allclose([status.reference_level_db[0] for status in reports], 20.0)
+    np.testing.assert_allclose([status.load for status in reports], [0.6, 0.4, 0.2])
     assert reports[0].rated_power == [0.5]
 
 
 def test_an_error_in_a_report_is_raised_after_the_loudspeakers_have_faded_out() -> None:
-    def fails(levels: Levels) -> None:
+    def fails(status: RunStatus) -> None:
         raise RuntimeError("disk full")
 
     interface = plant()
@@ -291,7 +291,7 @@ def test_a_run_stops_on_a_fault_when_told_to_and_on_ctrl_c() -> None:
     assert run(right, plant(), should_stop=enough, **settings).stopped_by == "user"
     assert len(blocks) == 50
 
-    def interrupted(levels: Levels) -> None:
+    def interrupted(status: RunStatus) -> None:
         raise KeyboardInterrupt
 
     assert run(right, plant(), on_report=interrupted, **settings).stopped_by == "user"
@@ -373,7 +373,7 @@ def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(monkeypatch
     card = Card(plant())
     card.lost_at, card.dry_at, card.repeated_at = [640, 641], [], [680]
     monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
-    reports: list[Levels] = []
+    reports: list[RunStatus] = []
     device = SoundDevice([2], [3], [1], fs=FS, block=32)
     report = started(
         device, step_size=0.2, amplitude_limit=0.8, seconds=1.6, on_report=reports.append, report_every_s=0.8
@@ -381,7 +381,7 @@ def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(monkeypatch
     assert report.health.samples == {"lost": 2 * 32, "repeated": 2 * 32}  # of the reference and of the error
     assert report.lost == reports[-1].lost == 64
     # The time goes on while samples are lost; a report is due after so many that were heard.
-    assert [levels.time_s for levels in reports] == [0.8 + 64 / FS, 1.6 + 64 / FS]
+    assert [status.time_s for status in reports] == [0.8 + 64 / FS, 1.6 + 64 / FS]
     assert report.seconds == pytest.approx(1.6 + 64 / FS)
 
 

@@ -1,4 +1,4 @@
-"""The parts of a study's report: verdicts, parameters, tables, figures, sounds."""
+"""`StudyReport`, everything that the report says of one study: claims, parameters, tables, figures, sounds."""
 
 from __future__ import annotations
 
@@ -31,22 +31,22 @@ EXCERPT_S = 4.0  # what the page plays of a sound; the file has all of it
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One claim, and what was measured.
+class Claim:
+    """One claim of a study, and what was measured.
 
     Parameters
     ----------
-    claim : str
+    text : str
         The claim as a sentence.
-    reproduced : bool
+    holds : bool
         Whether it holds.
-    figure : str
+    measured : str
         What was measured, in words.
     """
 
-    claim: str
-    reproduced: bool
-    figure: str
+    text: str
+    holds: bool
+    measured: str
 
 
 @dataclass(frozen=True)
@@ -227,8 +227,8 @@ class StudyReport:
         Figures of merit by algorithm: keys out of `FIGURES_OF_MERIT`; None, NaN or left out if undefined.
     extra : dict of str to Any
         Further figures for results.json: numbers, text, arrays, lists and mappings of them.
-    verdicts : list of Verdict
-        One for each claim of the paper.
+    claims : list of Claim
+        The paper's claims, or the study's own.
     figures : list of FigureItem
         Figures in their order.
     sounds : list of Sound
@@ -237,13 +237,14 @@ class StudyReport:
         Further remarks.
     tables : list of Table
         Further tables in their order.
-    claims : str
-        Whose claims the verdicts are on.
+    claims_heading : str
+        What the claims are: "Claims of the paper", which are reproduced or not; all others, such as "Aims", are met or
+        not.
     watt_per_power : float, optional
         Power in W of a mean square of 1, if it is known: page and terminal then show output powers in W.
     conditions : sequence of str
-        Conditions that all its verdicts are under, in words that follow "with", such as "a tone". What failed verdicts
-        have in common is found among them.
+        Conditions that all its claims are under, in words that follow "with", such as "a tone". What the claims that do
+        not hold have in common is found among them.
 
     Raises
     ------
@@ -259,12 +260,12 @@ class StudyReport:
     parameters: dict[str, Parameter]
     algorithms: dict[str, dict[str, float | None]]
     extra: dict[str, Any] = field(default_factory=dict)
-    verdicts: list[Verdict] = field(default_factory=list)
+    claims: list[Claim] = field(default_factory=list)
     figures: list[FigureItem] = field(default_factory=list)
     sounds: list[Sound] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    claims: str = OF_THE_PAPER
+    claims_heading: str = OF_THE_PAPER
     conditions: Sequence[str] = ()
     watt_per_power: float | None = None
 
@@ -281,8 +282,8 @@ class StudyReport:
 
     @property
     def marks(self) -> tuple[str, str]:
-        """Words for a verdict that holds, and for one that does not."""
-        return ("reproduced", "not reproduced") if self.claims == OF_THE_PAPER else ("met", "not met")
+        """Words for a claim that holds, and for one that does not."""
+        return ("reproduced", "not reproduced") if self.claims_heading == OF_THE_PAPER else ("met", "not met")
 
     @property
     def rating(self) -> str:
@@ -300,10 +301,7 @@ class StudyReport:
             "algorithms": {
                 name: {key: figures.get(key) for key in FIGURES_OF_MERIT} for name, figures in self.algorithms.items()
             },
-            "verdicts": [
-                {"claim": verdict.claim, "reproduced": verdict.reproduced, "figure": verdict.figure}
-                for verdict in self.verdicts
-            ],
+            "claims": [{"text": claim.text, "holds": claim.holds, "measured": claim.measured} for claim in self.claims],
             "extra": self.extra,
         }
         return jsonable(values, f"study {self.name!r}")

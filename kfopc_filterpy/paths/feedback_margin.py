@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._validate import as_positive
-from .channels import is_path_matrix
 from .models import path_taps, sampling_rate
+from .path_matrix import is_path_matrix
 
 if TYPE_CHECKING:
     import control

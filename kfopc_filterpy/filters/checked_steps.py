@@ -1,4 +1,4 @@
-"""Guards of a filterpy filter: they check the arguments of a step, and undo a step that fails."""
+"""Checks of the steps of a filterpy filter: of their arguments, and of what they leave; a step that fails is undone."""
 
 from __future__ import annotations
 

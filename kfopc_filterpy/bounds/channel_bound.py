@@ -15,7 +15,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.signal import correlate, fftconvolve
 
 from .._validate import as_channels, as_count
-from ..paths.channels import secondary_paths
+from ..paths.path_matrix import secondary_paths
 from .wiener import WienerSolution, mean_square, reduction_db, require_sound
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight

@@ -1,4 +1,4 @@
-"""The study of the power budget on a small scale, and its tables and verdicts from rows made by hand."""
+"""The study of rated powers on a small scale, and its tables and claims from rows made by hand."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from comparisons.__main__ import FURTHER
-from comparisons.studies import cases, power_budget
+from comparisons.studies import cases, rated_powers
 from comparisons.studies.cases import Case, make_case, noises, paths
-from comparisons.studies.power_budget import (
+from comparisons.studies.rated_powers import (
     BOUND,
     RECORD,
     SCALED,
@@ -38,18 +38,18 @@ def small() -> Any:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
         cases.measured_data.cache_clear()
         pairs = paths()
-        patch.setattr(power_budget, "paths", lambda: {"duct": tuple(path[:200] for path in pairs["duct"])})
-        patch.setattr(power_budget, "N_TAPS", TAPS)
-        patch.setattr(power_budget, "DURATION_S", DURATION_S)
-        patch.setattr(power_budget, "SHARES_DB", SHARES)
-        patch.setattr(power_budget, "SEEDS", (1, 2))
-        patch.setattr(power_budget, "CASES", (CASE, Case("measured duct", "motor")))
+        patch.setattr(rated_powers, "paths", lambda: {"duct": tuple(path[:200] for path in pairs["duct"])})
+        patch.setattr(rated_powers, "N_TAPS", TAPS)
+        patch.setattr(rated_powers, "DURATION_S", DURATION_S)
+        patch.setattr(rated_powers, "SHARES_DB", SHARES)
+        patch.setattr(rated_powers, "SEEDS", (1, 2))
+        patch.setattr(rated_powers, "CASES", (CASE, Case("measured duct", "motor")))
         for name, own in REGISTRY.items():
             patch.setitem(
                 algorithms.REGISTRY, name, replace(own, first=own.first[1:8:3] or own.first, second=own.second[1:8:3])
             )
         runs = Runs()
-        pair, noise = power_budget.paths()["duct"], noises()["band noise"]
+        pair, noise = rated_powers.paths()["duct"], noises()["band noise"]
         first, scene = (make_case(pair, noise(DURATION_S + 0.5, seed), n_taps=TAPS) for seed in (1, 2))
         rated = replace(
             first,
@@ -58,7 +58,7 @@ def small() -> Any:
             disturbances=[first.disturbances[0], scene.disturbances[0]],
             seeds=[1, 2],
         )
-        outcome = power_budget.main(runs), runs.done, power_budget.planned_runs()
+        outcome = rated_powers.main(runs), runs.done, rated_powers.planned_runs()
         settings = {cells[3]: cells for cells in outcome[0].tables[2].rows if cells[2] == -10.0}
         again = {}
         for name in ("KF-OPC", "leaky FxLMS", "FxLMS"):
@@ -80,7 +80,7 @@ def small() -> Any:
 
 def test_planned_runs_are_those_taken(small: Any) -> None:
     assert small[1] == small[2]
-    assert FURTHER["power_budget"] == (power_budget.main, power_budget.planned_runs)
+    assert FURTHER["rated_powers"] == (rated_powers.main, rated_powers.planned_runs)
 
 
 def test_rows_are_what_plain_runs_give(small: Any) -> None:
@@ -107,11 +107,11 @@ def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
     assert len(report.tables[0].rows) == len(algorithms.algorithms()) + 3
     assert len(report.tables[2].rows) == len(algorithms.algorithms()) * len(SHARES)
     assert [figure.stem for figure in report.figures] == ["duct-band-noise"]
-    assert len(report.verdicts) == 3
+    assert len(report.claims) == 3
     assert report.notes[0].startswith("The measured duct was not at hand")
     write_report([report], tmp_path)
-    assert (tmp_path / "tables" / "power-budget-sizing.csv").stat().st_size > 0
-    assert (tmp_path / "figures" / "power-budget-duct-band-noise.png").stat().st_size > 10_000
+    assert (tmp_path / "tables" / "rated-powers-sizing.csv").stat().st_size > 0
+    assert (tmp_path / "figures" / "rated-powers-duct-band-noise.png").stat().st_size > 10_000
 
 
 def rows_of(name: str, reductions: Any, powers: Any = (1.0, 1.0), seed: int = 1) -> list[BudgetRow]:
@@ -169,7 +169,7 @@ def test_means_are_over_seeds_and_the_worst_window_is_the_worst() -> None:
         ((2.5, np.nan), (1.0, np.nan), (2.0, 11.0), (1.0, 1.0), [False, False, False]),
     ],
 )
-def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
+def test_claims(own: Any, powers: Any, other: Any, other_powers: Any, expected: list[bool]) -> None:
     rows = (
         rows_of(BOUND, (3.0, 12.0))
         + rows_of(RECORD, (3.0, 12.0))
@@ -179,4 +179,4 @@ def test_verdicts(own: Any, powers: Any, other: Any, other_powers: Any, expected
     for name, algorithm in algorithms.algorithms().items():
         if name != "KF-PB" and algorithm.keeps_budget:
             rows += rows_of(name, other, other_powers)
-    assert [verdict.reproduced for verdict in _claims(rows)] == expected
+    assert [claim.holds for claim in _claims(rows)] == expected

@@ -1,4 +1,4 @@
-"""Verdicts on the paper's Fig. 6 from figures made by hand, on both sides of every threshold, and what they rest on."""
+"""Claims on the paper's Fig. 6 from figures made by hand, on both sides of every threshold, and what they rest on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from helpers.results import single_result
 
 from comparisons.studies import broadband
 from comparisons.studies.broadband import FS, KNOWING, UNAWARE, WEIGHTS_EVERY
-from comparisons.studies.parts import first_second_db
+from comparisons.studies.report_parts import first_second_db
 from kfopc_filterpy.bench import make_scene
 from kfopc_filterpy.signals import band_limited_noise
 
@@ -32,7 +32,7 @@ from kfopc_filterpy.signals import band_limited_noise
     ],
 )
 def test_power(powers: list[float], held: bool) -> None:
-    assert broadband.power_verdict(np.array(powers)).reproduced is held
+    assert broadband.power_claim(np.array(powers)).holds is held
 
 
 @pytest.mark.parametrize(
@@ -50,8 +50,8 @@ def test_best_reduction(anc_db: float, others_db: float, power: float, held: boo
     for best_other in ("KF-OPC", "FxLMS", "MOV-FxLMS"):
         reductions = {"KF-ANC": anc_db, "KF-OPC": 1.0, "FxLMS": 1.0, "MOV-FxLMS": 1.0} | {best_other: others_db}
         powers = dict.fromkeys(reductions, 1.0) | {"KF-ANC": power}
-        assert broadband.best_reduction_verdict(reductions, powers).reproduced is held
-        assert broadband.best_reduction_verdict(dict(reversed(reductions.items())), powers).reproduced is held
+        assert broadband.best_reduction_claim(reductions, powers).holds is held
+        assert broadband.best_reduction_claim(dict(reversed(reductions.items())), powers).holds is held
 
 
 @pytest.mark.parametrize(
@@ -69,9 +69,9 @@ def test_best_reduction(anc_db: float, others_db: float, power: float, held: boo
 )
 def test_not_slower(opc: float | None, anc: float | None, held: bool) -> None:
     reached = dict.fromkeys(("KF-ANC", "KF-OPC", "MOV-FxLMS"), 0.0615)
-    verdict = broadband.not_slower_verdict({"KF-ANC": anc, "KF-OPC": opc, "MOV-FxLMS": None}, reached)
-    assert verdict.reproduced is held
-    assert verdict.figure.endswith("MOV-FxLMS does not settle (first there after 61.5 ms)")
+    claim = broadband.not_slower_claim({"KF-ANC": anc, "KF-OPC": opc, "MOV-FxLMS": None}, reached)
+    assert claim.holds is held
+    assert claim.measured.endswith("MOV-FxLMS does not settle (first there after 61.5 ms)")
 
 
 @pytest.mark.parametrize(
@@ -87,15 +87,15 @@ def test_not_slower(opc: float | None, anc: float | None, held: bool) -> None:
     ],
 )
 def test_twice_as_fast(opc: float | None, mov: float | None, held: bool) -> None:
-    verdict = broadband.faster_verdict({"KF-ANC": 1.0, "KF-OPC": opc, "FxLMS": 1.0, "MOV-FxLMS": mov})
-    assert verdict.reproduced is held
+    claim = broadband.faster_claim({"KF-ANC": 1.0, "KF-OPC": opc, "FxLMS": 1.0, "MOV-FxLMS": mov})
+    assert claim.holds is held
     both = opc is not None and mov is not None and np.isfinite(opc)
-    assert (f"{mov / opc:.2f} times as long" if both else "no ratio") in verdict.figure
+    assert (f"{mov / opc:.2f} times as long" if both else "no ratio") in claim.measured
 
 
 @pytest.mark.parametrize(("coherence", "held"), [(1.0, True), (0.991, True), (0.99, False), (np.nan, False)])
 def test_linear(coherence: float, held: bool) -> None:
-    assert broadband.linear_verdict(coherence, 0.5, 6.0).reproduced is held
+    assert broadband.linear_claim(coherence, 0.5, 6.0).holds is held
 
 
 def clipped(**own: list[float]) -> dict[str, dict[str, Any]]:
@@ -125,11 +125,11 @@ def clipped(**own: list[float]) -> dict[str, dict[str, Any]]:
     ],
 )
 def test_clipped(own: dict[str, list[float]], held: bool) -> None:
-    verdict = broadband.clipped_verdict(clipped(**own), 1.265)
-    assert verdict.reproduced is held
-    assert "15.7 % of the samples are clipped" in verdict.figure
+    claim = broadband.clipped_claim(clipped(**own), 1.265)
+    assert claim.holds is held
+    assert "15.7 % of the samples are clipped" in claim.measured
     # The first second of the q of a linear amplifier and of the known amplifier, which stay as they are.
-    assert verdict.figure.count("4.7 to 4.8 dB, control signal up to 3.9 to 4.7") >= 2
+    assert claim.measured.count("4.7 to 4.8 dB, control signal up to 3.9 to 4.7") >= 2
 
 
 def test_the_power_of_a_run_that_diverged_is_undefined() -> None:

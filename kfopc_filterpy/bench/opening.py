@@ -1,4 +1,4 @@
-"""What the report opens with: the verdicts in one sentence, and one figure of all algorithms in all studies."""
+"""What the report opens with: the claims in one sentence, and one figure of all algorithms in all studies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from kfopc_filterpy.plot import curve_style
 
-from .items import OF_THE_PAPER, FigureItem, StudyReport, jsonable
+from .study_report import OF_THE_PAPER, FigureItem, StudyReport, jsonable
 
 # Words of a claim, and what a claim that has them is about.
 SUBJECTS = {
@@ -27,14 +27,14 @@ GLANCE = "at-a-glance"
 
 
 @dataclass(frozen=True)
-class _Claim:
+class _Labelled:
     text: str
     holds: bool
     subjects: frozenset[str]
     conditions: frozenset[str]
 
 
-def verdict_sentence(studies: Sequence[StudyReport]) -> str:
+def claims_sentence(studies: Sequence[StudyReport]) -> str:
     """Return how many claims hold, and what those that do not hold have in common, as a sentence.
 
     The subjects of a claim are found by its words, its conditions are those of its study. A subject or condition is named
@@ -48,29 +48,29 @@ def verdict_sentence(studies: Sequence[StudyReport]) -> str:
     Returns
     -------
     str
-        One sentence for the paper's claims, one for the others; empty if there are no verdicts.
+        One sentence for the paper's claims, one for the others; empty if there are no claims.
 
     Examples
     --------
-    >>> from kfopc_filterpy.bench import StudyReport, Verdict, verdict_sentence
-    >>> def study(name, conditions, *verdicts):
-    ...     return StudyReport(name, name, "", 16000, 1.0, {}, {}, verdicts=verdicts, conditions=conditions)
-    >>> kept, fast = Verdict("It keeps the rated power", True, ""), Verdict("It converges faster", True, "")
-    >>> over = Verdict("It keeps the rated power", False, "")
-    >>> verdict_sentence([study("a", ["a tone"], kept, fast), study("b", ["noise"], over, fast, over)])
+    >>> from kfopc_filterpy.bench import StudyReport, Claim, claims_sentence
+    >>> def study(name, conditions, *claims):
+    ...     return StudyReport(name, name, "", 16000, 1.0, {}, {}, claims=claims, conditions=conditions)
+    >>> kept, fast = Claim("It keeps the rated power", True, ""), Claim("It converges faster", True, "")
+    >>> over = Claim("It keeps the rated power", False, "")
+    >>> claims_sentence([study("a", ["a tone"], kept, fast), study("b", ["noise"], over, fast, over)])
     '3 of the 5 claims of the paper were reproduced; both exceptions concern the output power, with noise.'
     """
-    kinds: dict[bool, list[_Claim]] = {True: [], False: []}
+    kinds: dict[bool, list[_Labelled]] = {True: [], False: []}
     for study in studies:
-        for verdict in study.verdicts:
-            words = verdict.claim.lower()
+        for claim in study.claims:
+            words = claim.text.lower()
             subjects = frozenset(subject for word, subject in SUBJECTS.items() if word in words)
-            claim = _Claim(verdict.claim, bool(verdict.reproduced), subjects, frozenset(study.conditions))
-            kinds[study.claims == OF_THE_PAPER].append(claim)
+            labelled = _Labelled(claim.text, bool(claim.holds), subjects, frozenset(study.conditions))
+            kinds[study.claims_heading == OF_THE_PAPER].append(labelled)
     return " ".join(_sentence(claims, of_paper) for of_paper, claims in kinds.items() if claims)
 
 
-def _sentence(claims: list[_Claim], of_paper: bool) -> str:
+def _sentence(claims: list[_Labelled], of_paper: bool) -> str:
     what, done = ("claims of the paper", "reproduced") if of_paper else ("aims of the studies", "met")
     exceptions = [claim for claim in claims if not claim.holds]
     if len(claims) == 1:
@@ -83,7 +83,7 @@ def _sentence(claims: list[_Claim], of_paper: bool) -> str:
     return f"{held} of the {len(claims)} {what} {'was' if held == 1 else 'were'} {done}; {_exceptions(claims)}."
 
 
-def _exceptions(claims: list[_Claim]) -> str:
+def _exceptions(claims: list[_Labelled]) -> str:
     """Return what the exceptions, two at least, have in common; one is quoted."""
     exceptions = [claim for claim in claims if not claim.holds]
     if len(exceptions) == 1:

@@ -1,19 +1,19 @@
-"""What the report opens with: the verdicts in a sentence, made from hand-made verdicts, and the figure of all studies."""
+"""What the report opens with: the claims in a sentence, from claims made by hand, and the figure of all studies."""
 
 import numpy as np
 import pytest
 from helpers.reports import study
 
-from kfopc_filterpy.bench import Verdict, verdict_sentence
-from kfopc_filterpy.bench.summary import GLANCE, glance
+from kfopc_filterpy.bench import Claim, claims_sentence
+from kfopc_filterpy.bench.opening import GLANCE, glance
 
 POWER, SPEED, CLEAN = "It keeps the Rated Power", "It converges faster", "It has no harmonics"
 
 
 def made(name, conditions, *claims, **changes):
-    """Return a study with a verdict for each pair of a claim and whether it holds."""
-    verdicts = [Verdict(text, holds, "") for text, holds in claims]
-    return study(name, conditions=conditions, verdicts=verdicts, **changes)
+    """Return a study with these claims, each a text and whether it holds."""
+    claims = [Claim(text, holds, "") for text, holds in claims]
+    return study(name, conditions=conditions, claims=claims, **changes)
 
 
 @pytest.mark.parametrize(
@@ -25,22 +25,22 @@ def made(name, conditions, *claims, **changes):
     ids=["all", "none"],
 )
 def test_all_or_none(holds, sentence):
-    assert verdict_sentence([made("a", ["a tone"], (POWER, holds), (SPEED, holds), (CLEAN, holds))]) == sentence
+    assert claims_sentence([made("a", ["a tone"], (POWER, holds), (SPEED, holds), (CLEAN, holds))]) == sentence
 
 
-def test_without_verdicts_there_is_nothing_to_say():
-    assert verdict_sentence([made("a", ["a tone"])]) == ""
+def test_without_claims_there_is_nothing_to_say():
+    assert claims_sentence([made("a", ["a tone"])]) == ""
 
 
 @pytest.mark.parametrize(("holds", "word"), [(True, "was"), (False, "was not")], ids=["holds", "fails"])
 def test_one_claim(holds, word):
-    assert verdict_sentence([made("a", [], (POWER, holds))]) == f"The one claim of the paper {word} reproduced."
+    assert claims_sentence([made("a", [], (POWER, holds))]) == f"The one claim of the paper {word} reproduced."
 
 
 def test_one_exception_is_named():
     studies = [made("a", ["a tone"], (POWER, True), (SPEED, False))]
     assert (
-        verdict_sentence(studies)
+        claims_sentence(studies)
         == "1 of the 2 claims of the paper was reproduced; the exception is “It converges faster”."
     )
 
@@ -49,11 +49,11 @@ def test_what_all_exceptions_share_is_named():
     flat = made("flat", ["a flat path"], (POWER, True), (SPEED, True))
     duct = made("duct", ["a duct"], (POWER, False), (SPEED, True))
     other = made("other", ["a duct"], (POWER, False), (CLEAN, True))
-    assert verdict_sentence([flat, duct, other]) == (
+    assert claims_sentence([flat, duct, other]) == (
         "4 of the 6 claims of the paper were reproduced; both exceptions concern the output power, with a duct."
     )
     third = made("third", ["a flat path"], (POWER, False))
-    assert verdict_sentence([flat, duct, other, third]).endswith("; all 3 exceptions concern the output power.")
+    assert claims_sentence([flat, duct, other, third]).endswith("; all 3 exceptions concern the output power.")
 
 
 def test_what_most_exceptions_share_is_named_with_its_count():
@@ -61,7 +61,7 @@ def test_what_most_exceptions_share_is_named_with_its_count():
         made("a", ["a tone"], (POWER, False), (SPEED, True), (CLEAN, True)),
         made("b", ["noise"], (POWER, False), (SPEED, False), (CLEAN, True), (SPEED, True)),
     ]
-    assert verdict_sentence(studies).endswith("; 2 of the 3 exceptions concern the output power.")
+    assert claims_sentence(studies).endswith("; 2 of the 3 exceptions concern the output power.")
 
 
 def test_a_condition_alone():
@@ -69,7 +69,7 @@ def test_a_condition_alone():
         made("a", ["a tone"], (POWER, True), (SPEED, True)),
         made("b", ["noise"], (POWER, False), (SPEED, False)),
     ]
-    assert verdict_sentence(studies).endswith("; both exceptions occurred with noise.")
+    assert claims_sentence(studies).endswith("; both exceptions occurred with noise.")
 
 
 def test_nothing_in_common():
@@ -77,18 +77,18 @@ def test_nothing_in_common():
         made("a", ["a tone"], (POWER, False), (SPEED, True), (CLEAN, True)),
         made("b", ["noise"], (POWER, True), (SPEED, False), (CLEAN, True)),
     ]
-    assert verdict_sentence(studies).endswith("; the 2 exceptions have neither a subject nor a condition in common.")
+    assert claims_sentence(studies).endswith("; the 2 exceptions have neither a subject nor a condition in common.")
 
 
 def test_what_every_claim_has_says_nothing_of_the_exceptions():
     studies = [made("a", ["a tone"], (POWER, False), (POWER, False), (POWER, True))]
-    assert verdict_sentence(studies).endswith("have neither a subject nor a condition in common.")
+    assert claims_sentence(studies).endswith("have neither a subject nor a condition in common.")
 
 
 def test_aims_are_counted_apart_from_the_papers_claims():
-    ours = made("ours", [], (POWER, True), (SPEED, True), claims="Aims")
+    ours = made("ours", [], (POWER, True), (SPEED, True), claims_heading="Aims")
     paper = made("paper", [], (POWER, False), (SPEED, False))
-    assert verdict_sentence([ours, paper]) == (
+    assert claims_sentence([ours, paper]) == (
         "None of the 2 claims of the paper was reproduced. All 2 aims of the studies were met."
     )
 

@@ -1,4 +1,4 @@
-"""Verdicts on the paper's Fig. 5 from figures made by hand: on both sides of every threshold."""
+"""Claims on the paper's Fig. 5 from figures made by hand: on both sides of every threshold."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from helpers.results import single_result
 
 from comparisons.studies import tonal
-from comparisons.studies.tonal import Growth, growth_of, growth_verdict
+from comparisons.studies.tonal import Growth, growth_claim, growth_of
 
 LIMIT = np.sqrt(2.0)
 LINE = Growth(over_optimal=600.0, over_half=2.0, of_quarters=1.0)
@@ -30,14 +30,14 @@ STILL = Growth(over_optimal=0.7, over_half=1.0, of_quarters=0.0)
     ],
 )
 def test_harmonics(anc_db: float, opc_db: float, held: bool) -> None:
-    assert tonal.harmonics_verdict(anc_db, opc_db).reproduced is held
+    assert tonal.harmonics_claim(anc_db, opc_db).holds is held
 
 
 @pytest.mark.parametrize(
     ("share", "held"), [(0.9, True), (1.009, True), (1.011, False), (20.0, False), (np.nan, False)]
 )
 def test_peak(share: float, held: bool) -> None:
-    assert tonal.peak_verdict(share * LIMIT, LIMIT).reproduced is held
+    assert tonal.peak_claim(share * LIMIT, LIMIT).holds is held
 
 
 @pytest.mark.parametrize(
@@ -45,17 +45,17 @@ def test_peak(share: float, held: bool) -> None:
 )
 def test_power(power: float, held: bool) -> None:
     """Not a constraint but an equality: too little is as wrong as too much."""
-    assert tonal.power_verdict(power).reproduced is held
+    assert tonal.power_claim(power).holds is held
 
 
 @pytest.mark.parametrize(
     ("anc_db", "opc_db", "held"), [(8.1, 10.7, True), (10.6, 10.7, True), (10.8, 10.7, False), (10.7, np.nan, False)]
 )
 def test_reduction(anc_db: float, opc_db: float, held: bool) -> None:
-    verdict = tonal.reduction_verdict(anc_db, opc_db, [1.2, 4.6])
-    assert verdict.reproduced is held
-    assert "the order flips at 1.2 dB and 4.6 dB of overdrive" in verdict.figure
-    assert "the same at every overdrive" in tonal.reduction_verdict(anc_db, opc_db, []).figure
+    claim = tonal.reduction_claim(anc_db, opc_db, [1.2, 4.6])
+    assert claim.holds is held
+    assert "the order flips at 1.2 dB and 4.6 dB of overdrive" in claim.measured
+    assert "the same at every overdrive" in tonal.reduction_claim(anc_db, opc_db, []).measured
 
 
 @pytest.mark.parametrize(
@@ -78,16 +78,16 @@ def test_reduction(anc_db: float, opc_db: float, held: bool) -> None:
     ],
 )
 def test_growth(anc: Growth, opc: Growth, held: bool) -> None:
-    assert growth_verdict({1e-8: (anc, opc)}).reproduced is held
-    assert growth_verdict({1e-8: (LINE, STILL), 1e-4: (anc, opc)}).reproduced is held  # at every state noise
-    assert growth_verdict({1e-8: (anc, opc), 1e-4: (LINE, STILL)}).reproduced is held
+    assert growth_claim({1e-8: (anc, opc)}).holds is held
+    assert growth_claim({1e-8: (LINE, STILL), 1e-4: (anc, opc)}).holds is held  # at every state noise
+    assert growth_claim({1e-8: (anc, opc), 1e-4: (LINE, STILL)}).holds is held
 
 
 def test_growth_of_nothing_is_not_held_and_a_divergence_is_said() -> None:
-    assert not growth_verdict({}).reproduced
-    assert "the numbers do not overflow" in growth_verdict({1e-8: (LINE, STILL)}).figure
+    assert not growth_claim({}).holds
+    assert "the numbers do not overflow" in growth_claim({1e-8: (LINE, STILL)}).measured
     diverged = Growth(600.0, 2.0, 1.0, diverged_at_s=3.14)
-    assert growth_verdict({1e-8: (diverged, STILL)}).figure.endswith("diverged after 3.1 s")
+    assert growth_claim({1e-8: (diverged, STILL)}).measured.endswith("diverged after 3.1 s")
 
 
 def of_weights(largest: Any) -> Any:

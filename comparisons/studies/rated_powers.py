@@ -11,6 +11,7 @@ import numpy as np
 
 from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.bench import (
+    Claim,
     FigureItem,
     Parameter,
     Runs,
@@ -18,7 +19,6 @@ from kfopc_filterpy.bench import (
     StudyReport,
     Table,
     Tuned,
-    Verdict,
     algorithms,
     run_setting,
     try_settings,
@@ -39,7 +39,7 @@ from .cases import (
     paths,
     record_bound_db,
 )
-from .parts import MARK, case_parameters, new_figure, tried
+from .report_parts import MARK, case_parameters, new_figure, tried
 
 SHARES_DB = (-20.0, -15.0, -12.0, -9.0, -6.0, -3.0, 0.0)  # rated power over the unconstrained control power
 DURATION_S = 8.0
@@ -101,7 +101,7 @@ def main(runs: Runs) -> StudyReport:
         tuned[case] = _tune(runs, joined)
         rows += _measure(runs, case, scenes, joined, tuned[case])
     return StudyReport(
-        name="power-budget",
+        name="rated-powers",
         title="What a rated power buys",
         summary=(
             "Noise reduction and output power of every algorithm, each at its best setting for each rated power, and of "
@@ -114,11 +114,11 @@ def main(runs: Runs) -> StudyReport:
         parameters=_parameters(tuned),
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
-        verdicts=_claims(rows),
+        claims=_claims(rows),
         figures=budget_figures(rows),
         notes=_notes(rows, tuned),
         tables=[_budget_table(rows), _sizing_table(rows), _tuning_table(tuned)],
-        claims="Aims",
+        claims_heading="Aims",
     )
 
 
@@ -225,7 +225,7 @@ def mean_rows(rows: Sequence[BudgetRow]) -> dict[tuple[Case, str], list[BudgetRo
     }
 
 
-def _claims(rows: Sequence[BudgetRow]) -> list[Verdict]:
+def _claims(rows: Sequence[BudgetRow]) -> list[Claim]:
     means = mean_rows(rows)
     bound = {(row.case, row.share_db): row.noise_reduction_db for row in _all_of(means, BOUND)}
     kept = _all_of(means, "KF-PB")
@@ -242,17 +242,17 @@ def _claims(rows: Sequence[BudgetRow]) -> list[Verdict]:
         ]
         ahead.append(row.noise_reduction_db - max(others, default=-np.inf))
     return [
-        Verdict(
+        Claim(
             "KF-PB keeps the rated power to 2 %, mean over seeds, at every rated power and in every case",
             bool(np.max(powers) <= Tuned.BUDGET),
             f"{np.min(powers):.3f} to {np.max(powers):.3f} of it",
         ),
-        Verdict(
+        Claim(
             "KF-PB reaches the bound to within 1 dB at every rated power and in every case",
             bool(np.max(losses) <= 1.0),
             f"{np.mean(losses):.2f} dB below it on average, {np.max(losses):.2f} dB at worst ({_where(kept[int(np.argmax(losses))])})",
         ),
-        Verdict(
+        Claim(
             "No other method that keeps the budget reduces the noise by more than 0.3 dB more than KF-PB",
             bool(np.min(ahead) >= -0.3),
             f"KF-PB is {np.mean(ahead):+.2f} dB ahead of the best other on average, {np.min(ahead):+.2f} dB at worst "
