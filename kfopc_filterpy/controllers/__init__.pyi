@@ -5,9 +5,9 @@ from .direct import DirectKalman as DirectKalman
 from .feedback import FeedbackNeutralizer as FeedbackNeutralizer
 from .leaky import leak_factor as leak_factor
 from .mov import penalty_factor as penalty_factor
-from .verified import PathEvent as PathEvent
-from .verified import VerifiedController as VerifiedController
 from .power_budget import PowerBudgetController as PowerBudgetController
 from .processing import RefusedUpdate as RefusedUpdate
+from .verified import PathEvent as PathEvent
+from .verified import VerifiedController as VerifiedController
 from .virtual import KalmanObserver as KalmanObserver
 from .virtual import VirtualMicrophones as VirtualMicrophones

@@ -133,7 +133,9 @@ class VerifiedController(WrappedController):
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
         super().__init__(controller)
-        if hasattr(controller, "physical") or not (hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")):
+        if hasattr(controller, "physical") or not (
+            hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
+        ):
             raise TypeError(
                 f"controller must have secondary_path and n_taps, as the built-in ones have, got {controller!r}; "
                 "virtual microphones have other paths than those that are heard"
@@ -145,7 +147,7 @@ class VerifiedController(WrappedController):
         self.name = f"{getattr(controller, 'name', type(controller).__name__)} with a verified path"
         self.events: list[PathEvent] = []
         path = self._paths()
-        K, J, M = path.shape
+        J, M = path.shape[1:]
         n_references = getattr(controller, "n_references", 1)
         self._amplifiers = amplifier_functions(amplifier, J)
         uncertainty = getattr(controller, "secondary_path_uncertainty", None)
@@ -171,7 +173,10 @@ class VerifiedController(WrappedController):
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
         self._error = self._disturbance = self._alone = 0.0  # powers over AVERAGE_S; `alone`: at full volume
         self._excess = 0.0  # power of noise that is not p * x, found in silence
-        self._sums, self._silent_for = np.zeros(3), 0  # energies and number of samples at this volume; samples of silence
+        self._sums, self._silent_for = (
+            np.zeros(3),
+            0,
+        )  # energies and number of samples at this volume; samples of silence
         self._use_posterior()
 
     def __repr__(self) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from kfopc_filterpy.controllers.divergence import LOWEST_GAIN, DivergenceGuard
 
 FRAME, SHARE = 10, 4.0

@@ -19,11 +19,11 @@ from helpers.changing_plant import (
     run,
     run_several,
 )
+from kfopc_filterpy.controllers.path_tracker import Evidence, JointFit, block_sums, common_ratio
 from scipy.special import stdtr
 
 from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, OutputLimiter, kf_anc, kf_pb, simulate
 from kfopc_filterpy.controllers import PathTracker
-from kfopc_filterpy.controllers.path_tracker import Evidence, JointFit, block_sums, common_ratio
 from kfopc_filterpy.paths import identify_secondary_path
 
 L = 64

@@ -23,12 +23,12 @@ from kfopc_filterpy import FxLMS, controllers, kf_anc, simulate
 from kfopc_filterpy.bench import algorithms, make_controller, make_scene
 from kfopc_filterpy.checkpoint import Checkpointed
 from kfopc_filterpy.controllers import MonitoredController, PathTracker, VirtualMicrophones
-from kfopc_filterpy.controllers.base import FilteredReferenceController, WrappedController
+from kfopc_filterpy.controllers.base import WrappedController
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.controllers.lms import LMSController
 
 BASES = {
-    FilteredReferenceController,
+    CoreController,
     CoreController,
     WrappedController,
     LMSController,

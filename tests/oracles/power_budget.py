@@ -303,7 +303,9 @@ class PowerBudget(Controller):
         if asked is not None:
             self.book = np.concatenate([[asked / self.rated_power], self.book[:-1]])
         if e is not None and self.heard >= self.N:
-            self.alarms += self.plant.learn(self.x_past, self.y_past, e, self.heard / B * (1 - self.plant.forget) >= KNOWN)
+            self.alarms += self.plant.learn(
+                self.x_past, self.y_past, e, self.heard / B * (1 - self.plant.forget) >= KNOWN
+            )
         self.heard += B
         if self.plant.fits:
             self.solve()
