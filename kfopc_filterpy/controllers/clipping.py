@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 
 
-class ClippingFxLMS(LMSController):
+class ClippingFxLMS(CoreController):
     r"""Clipping FxLMS: the control signal is clipped to the limit, the weights adapt as in `FxLMS`.
 
     With several loudspeakers, each control signal is clipped to its own limit.
@@ -48,6 +48,8 @@ class ClippingFxLMS(LMSController):
 
     name = "clipping FxLMS"
     algorithm = "clipping"
+    step_size = setting("Step size mu.")
+    amplitude_limit = setting("Amplitude limit A of the control signal; with several channels (J,), a copy.")
 
     def __init__(
         self,
@@ -61,8 +63,3 @@ class ClippingFxLMS(LMSController):
     ) -> None:
         settings = {"step_size": step_size, "amplitude_limit": amplitude_limit}
         super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
-
-    @property
-    def amplitude_limit(self) -> Any:
-        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
-        return self._of_setting("amplitude_limit")

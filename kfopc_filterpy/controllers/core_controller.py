@@ -1,30 +1,69 @@
-"""Controllers of the core: their signals, weights and powers are in one block of memory."""
+"""The base class of the built-in controllers: their signals, weights and powers are in one block of the core's memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from typing import Any, ClassVar
 
 import numpy as np
 
-from .._validate import as_number, as_positive, per_channel
+from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_channel, per_loudspeaker
+from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
-from ..core.run_loop import Steps
+from ..core.run_loop import REFUSED_REFERENCE, Steps, process
+from ..paths.models import is_system, path_taps, sampling_rate
+from ..paths.path_matrix import is_path_matrix, secondary_paths
+from ..paths.uncertainty import as_uncertainty, guard_filter
 from ..power.amplifiers import Amplifier, amplifier_models
-from ..power.constraint import NUMBERS
+from ..power.constraint import NUMBERS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import LONGEST_CALL, FilteredReferenceController, Looped, calls_of, refused_while_listening
+from .base import Looped, calls_of, listed, require_rates
 from .channel_samples import channel_sample
+from .processing import (
+    BlockProcessing,
+    RefusedUpdate,
+    adapt_flags,
+    block_signal,
+    output_array,
+    require_channels,
+    require_one_length,
+)
 
+NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
+OVERFLOW = (
+    "the disturbance estimate, the reference and the filtered reference must have finite squares, and one overflows: "
+    "nothing was changed; scale the signals, or use a smaller step"
+)
+LONGEST_CALL = 1600  # samples between two opportunities to interrupt a block: 0.1 s at 16 kHz
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}
 
 Limiters = OutputLimiter | Sequence[OutputLimiter] | None
+Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
 
-class CoreController(FilteredReferenceController):
-    """Base class of the controllers whose algorithm is in the core, for one channel and several.
+class setting:
+    """An attribute of a controller that is the algorithm's setting of the same name, documented here."""
+
+    def __init__(self, doc: str, *, assignable: bool = False) -> None:
+        self.__doc__, self.assignable = doc, assignable
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, controller: Any, kind: type) -> Any:
+        return self if controller is None else controller._of_setting(self.name)
+
+    def __set__(self, controller: Any, value: Any) -> None:
+        if not self.assignable:
+            raise AttributeError(f"{self.name} cannot be assigned: make a new controller")
+        controller._opened().fields[self.name][:] = controller._checked_setting(self.name, value)
+
+
+class CoreController(BlockProcessing, Checkpointed):
+    """Base class of the built-in controllers: channels, paths, limiter, constraint, and an algorithm of the core.
 
     A subclass names its `algorithm` in C, the `checks` of its settings, and hands these over by their names in C. For an
     algorithm of your own see `load_algorithm`.
@@ -82,9 +121,12 @@ class CoreController(FilteredReferenceController):
     0.2
     """
 
+    name = "controller"
     algorithm: str | Algorithm
     checks: ClassVar[Mapping[str, Callable[[Any, str], float]]] = {}  # of settings that need not be positive
+    takes_guard: ClassVar[bool] = True  # whether the step takes account of an uncertain secondary path
     _block: Block | None = None
+    _uncertainty: Any = None  # as it was assigned
 
     def __init__(
         self,
@@ -99,41 +141,138 @@ class CoreController(FilteredReferenceController):
         limiter: Limiters = None,
     ) -> None:
         self._settings = dict(settings)
-        super().__init__(
-            n_taps,
-            secondary_path,
-            n_references=n_references,
-            multichannel=multichannel,
-            amplifier=amplifier,
-            constraint=constraint,
-            limiter=limiter,
-        )
-
-    def _begin(self, secondary: np.ndarray, amplifier: Any) -> None:
+        self.n_taps = as_count(n_taps, "n_taps")
+        secondary = self._read_paths(secondary_path, n_references, multichannel)
+        self._limiter = self._checked_limiter(limiter)
+        self._constrained = constraint is not None
+        self._own_constraint = self._checked_constraint(constraint)
         models = amplifier_models(amplifier, self.n_loudspeakers)
         algorithm = self._algorithm()
         block = Block(
             algorithm,
             self._needed_shape(secondary.shape[-1], guard_taps=0),
             path=secondary.reshape(self.n_microphones, self.n_loudspeakers, -1),
-            settings=self._checked_settings({one.name: one.each for one in algorithm.settings}),
+            settings=self._checked_settings(),
         )
         block.fields["amplifier"][0, 0] = models.view(np.float64).reshape(self.n_loudspeakers, -1)
         self._use_block(block)
 
-    def _checked_settings(self, each: Mapping[str, str]) -> dict[str, Any]:
-        """Return the settings, checked; `each` says which of them every loudspeaker or microphone has."""
-        if set(self._settings) != set(each):
-            raise TypeError(f"{self.name} has the settings {sorted(each)}, got {sorted(self._settings)}")
-        checked: dict[str, Any] = {}
-        for name, value in self._settings.items():
-            check = self.checks.get(name, as_positive)
-            if each[name] and self.multichannel:
-                count = getattr(self, f"n_{each[name]}")
-                checked[name] = per_channel(value, count, each[name], name, check)
-            else:
-                checked[name] = check(value, name)
-        return checked
+    # Channels: numbers with one, arrays with several.
+
+    def _read_paths(self, paths: Any, n_references: int | None, multichannel: bool | None) -> np.ndarray:
+        """Set the numbers of channels and return the taps of the secondary path."""
+        several = is_path_matrix(paths)
+        if several and n_references is None:
+            raise ValueError(
+                f"{type(self).__name__} takes one channel: secondary_path must be one-dimensional, (taps,), or a system "
+                "of one input and one output. Controllers with the setting n_references take several channels, for "
+                "example kf_anc, kf_opc, kf_pb and FxLMS"
+            )
+        self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
+        self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
+        self.n_microphones, self.n_loudspeakers = 1, 1
+        if self.multichannel:
+            secondary, self._path_fs = secondary_paths(paths)
+            self.n_microphones, self.n_loudspeakers, _ = secondary.shape
+            return secondary
+        secondary = path_taps(paths, name="secondary_path")
+        self._path_fs = sampling_rate(paths, name="secondary_path") if is_system(paths) else None
+        return secondary
+
+    def _sample(self, value: Any, name: str, what: str) -> Any:
+        """Return a checked sample: a number, or with several channels an array of them; `what` says of which channels."""
+        if self.multichannel:
+            return channel_sample(value, getattr(self, f"n_{what}"), name, what)
+        return as_number(value, name)
+
+    def _shaped(self, values: np.ndarray) -> Any:
+        """Return what the core has of each channel: a number, or with several channels a copy."""
+        return values.copy() if self.multichannel else float(values[0])
+
+    def _each_loudspeaker(self, value: Any, name: str, check: Callable[[Any, str], float] = as_positive) -> Any:
+        """Return a checked number; with several channels (J,), from one number or one for each loudspeaker."""
+        return per_loudspeaker(value, self.n_loudspeakers, name, check) if self.multichannel else check(value, name)
+
+    # Checks of what the user gives.
+
+    def _checked_settings(self) -> dict[str, Any]:
+        """Return the settings, checked."""
+        wanted = {one.name for one in self._algorithm().settings}
+        if set(self._settings) != wanted:
+            raise TypeError(f"{self.name} has the settings {sorted(wanted)}, got {sorted(self._settings)}")
+        return {name: self._checked_setting(name, value) for name, value in self._settings.items()}
+
+    def _checked_setting(self, name: str, value: Any) -> Any:
+        """Return a setting: a number, or an array where with several channels each has its own."""
+        check = self.checks.get(name, as_positive)
+        each = self._who_has(name)
+        return per_channel(value, getattr(self, f"n_{each}"), each, name, check) if each else check(value, name)
+
+    def _who_has(self, name: str) -> str:
+        """Return the channels each of which has a setting of its own; "" if it is one for all, as with one channel."""
+        each = next(one.each for one in self._algorithm().settings if one.name == name)
+        return each if self.multichannel else ""
+
+    def _checked_limiter(self, limiter: Any) -> Any:
+        """Return None, a limiter, or a tuple of limiters."""
+        if limiter is None or (not self.multichannel and isinstance(limiter, OutputLimiter)):
+            return limiter
+        if not self.multichannel:
+            raise TypeError(f"limiter must be an OutputLimiter or None, got {limiter!r}")
+        limiters = tuple(limiter) if isinstance(limiter, Sequence) else ()
+        different = len(limiters) == self.n_loudspeakers == len({id(one) for one in limiters})
+        if not different or not all(isinstance(one, OutputLimiter) for one in limiters):
+            raise TypeError(
+                f"limiter must be {self.n_loudspeakers} different OutputLimiters, one for each loudspeaker, got {limiter!r}"
+            )
+        return limiters
+
+    def _checked_constraint(self, constraint: Constraints | None) -> Any:
+        """Return a constraint, or a tuple of them; without one given, its factor is fixed at 1."""
+        own: Any = constraint
+        if constraint is None:
+            own = OutputPowerConstraint(1.0)
+            own.factor = 1.0
+        if not self.multichannel:
+            if isinstance(own, tuple):
+                raise ValueError(f"rated power and constraint must be one for one loudspeaker, got {len(own)}")
+            return own
+        each = own if isinstance(own, tuple) else tuple(deepcopy(own) for _ in range(self.n_loudspeakers))
+        if len(each) != self.n_loudspeakers:
+            raise ValueError(
+                f"rated power and constraint must be one, or one for each of the {self.n_loudspeakers} loudspeakers, "
+                f"got {len(each)}"
+            )
+        return each
+
+    def _estimated_path(self) -> np.ndarray:
+        """Return the estimated secondary path where the steps find it: what is written into it, they use."""
+        path = self._opened().fields["secondary_path"][0]
+        return path if self.multichannel else path[0, 0]
+
+    def _checked_estimate(self, path: Any) -> np.ndarray:
+        """Return the taps of a new estimate, filled with zeros to the length of the present one."""
+        present = self._estimated_path().shape
+        if self.multichannel:
+            taps, rate = secondary_paths(path, name="secondary_path")
+        else:
+            taps = path_taps(path, name="secondary_path")
+            rate = sampling_rate(path, name="secondary_path") if is_system(path) else None
+        if taps.shape[:-1] != present[:-1]:
+            raise ValueError(
+                f"secondary_path must have the channels (microphones, loudspeakers) = {present[:-1]} of the present "
+                f"estimate, got {taps.shape[:-1]}: make a new controller for other channels"
+            )
+        if taps.shape[-1] > present[-1]:
+            raise ValueError(
+                f"secondary_path must have at most the {present[-1]} taps of the present estimate, got "
+                f"{taps.shape[-1]}: make the controller with an estimate filled with zeros to the longest path"
+            )
+        if self._path_fs is not None:
+            require_rates(self._path_fs, {"new secondary path": rate})
+        return np.pad(taps, [(0, 0)] * (taps.ndim - 1) + [(0, present[-1] - taps.shape[-1])])
+
+    # The block.
 
     def _algorithm(self) -> Algorithm:
         return Algorithm(self.algorithm) if isinstance(self.algorithm, str) else self.algorithm
@@ -177,23 +316,27 @@ class CoreController(FilteredReferenceController):
         """Return the attributes for a copy or a file: the memory and the shape stand for the block."""
         return {name: value for name, value in vars(self).items() if name != "_block"}
 
+    def _of_setting(self, name: str) -> Any:
+        """Return a setting: a number, or with several channels (J,) or (K,) where each has its own."""
+        values = self._opened().fields[name].ravel()
+        return values.copy() if self._who_has(name) else float(values[0])
+
     # Assignments.
 
-    def _estimated_path(self) -> np.ndarray:
-        path = self._opened().fields["secondary_path"][0]
-        return path if self.multichannel else path[0, 0]
+    @property
+    def limiter(self) -> Any:
+        """Limiter of the control signal, or None; can be assigned, but not shared with another controller.
 
-    def _filter_again(self) -> None:
-        self._opened().refilter()
+        With several channels it is a tuple, one for each loudspeaker. The disturbance is estimated from the output of
+        the limiter, so the adaptation stays correct.
+        """
+        self._opened()
+        return self._limiter
 
-    def _use_guard(self, taps: np.ndarray | None) -> None:
-        self._use_block(self._opened().with_guard(taps))
-
-    def _takes_guard(self) -> bool:
-        return True
-
-    def _use_limiter(self, before: Any) -> None:
+    @limiter.setter
+    def limiter(self, value: OutputLimiter | Sequence[OutputLimiter] | None) -> None:
         block = self._opened()
+        before, self._limiter = self._limiter, self._checked_limiter(value)
         for limiter in self._each(before):
             limiter.move_out()
         guard = block.fields["guard"].ravel()
@@ -201,13 +344,92 @@ class CoreController(FilteredReferenceController):
             block.remade(self._needed_shape(block.shape.path_taps, guard.size), guard if guard.size else None)
         )
 
-    # What is used and seen.
+    @property
+    def secondary_path(self) -> np.ndarray:
+        """Estimated secondary path s^, (n_path,), or with several channels (K, J, n_path); a copy.
 
-    def _of_setting(self, name: str) -> Any:
-        """Return a setting: a number, or with several channels (J,) or (K,) where each has its own."""
-        values = self._opened().fields[name].ravel()
-        each = any(one.each for one in self._algorithm().settings if one.name == name)
-        return values.copy() if each and self.multichannel else float(values[0])
+        A new estimate can be assigned between two samples, also during a run: taps or an FIR system, or paths with the
+        same channels, no longer than the present estimate. The stored references are filtered again with it, so the
+        next update knows only the new path. The weights stay, and the control signal does not jump. A Kalman filter's
+        covariance grows, because its weights belong to the old path. Running powers forget the old path within their
+        memory. KF-PB begins to learn the plant anew, around the new path.
+        """
+        return self._estimated_path().copy()
+
+    @secondary_path.setter
+    def secondary_path(self, path: Any) -> None:
+        before, after = self.secondary_path, self._checked_estimate(path)
+        guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
+        self._estimated_path()[:] = after
+        if self._uncertainty is None or not self.takes_guard:
+            self._filter_again()
+        else:  # measured paths, for example, have another distance from the new path
+            self.secondary_path_uncertainty = self._uncertainty
+        self._after_new_path(before)
+
+    def _filter_again(self) -> None:
+        """Filter the stored references with the present estimate, and the results with the guard."""
+        self._opened().refilter()
+
+    def _after_new_path(self, before: np.ndarray) -> None:
+        """Adapt what the algorithm knows to the new estimate; `before` is the last one, of the same shape."""
+
+    def _variance_by_new_path(self, before: np.ndarray) -> float:
+        """Return the variance of each weight after a new path: they are wrong by the share by which the path changed."""
+        after, w = self._estimated_path(), self.weights
+        energy = max(np.sum(before**2), np.sum(after**2))
+        return float(np.sum((after - before) ** 2) / energy * np.mean(w**2)) if energy > 0.0 else 0.0
+
+    @property
+    def secondary_path_uncertainty(self) -> Any:
+        """Uncertainty of the secondary path as it was stated; None: the path is exact.
+
+        Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
+        :math:`E[(d - w^T x')^2] + E[(w^T x'')^2]` with :math:`x'' = W * x'` and the filter W of `paths.guard_filter`: an
+        LMS algorithm gets a leak shaped in frequency, which also limits its step size, and a Kalman filter gets a
+        second observation. An uncertainty can be assigned for KF-ANC, KF-OPC, the diagonal Kalman filter and the LMS
+        family, with one channel or several; not for the fast-array filter, which takes one observation. `kf_pb` takes
+        it as a setting, which cannot be changed, and learns the path.
+        """
+        return deepcopy(self._uncertainty)
+
+    @secondary_path_uncertainty.setter
+    def secondary_path_uncertainty(self, value: Any) -> None:
+        if not self.takes_guard:
+            raise ValueError(
+                f"no secondary_path_uncertainty can be assigned to {self.name}: make it with "
+                "kf_pb(..., secondary_path_uncertainty=...), or use KF-ANC, KF-OPC, the diagonal Kalman filter or an LMS "
+                "algorithm"
+            )
+        taps = guard_filter(value, self._estimated_path())
+        self._uncertainty = as_uncertainty(value)
+        self._use_block(self._opened().with_guard(taps))
+
+    @property
+    def rated_power(self) -> Any:
+        """Rated output power of the controller, or of each loudspeaker, (J,); None if it has none.
+
+        A controller that has a rated power takes another one at any time.
+        """
+        return self._read_rated_power()
+
+    @rated_power.setter
+    def rated_power(self, value: Any) -> None:
+        if self.rated_power is None:
+            raise ValueError(
+                f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
+            )
+        self._take_rated_power(self._each_loudspeaker(value, "rated_power"))
+
+    def _read_rated_power(self) -> Any:
+        return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
+
+    def _take_rated_power(self, value: Any) -> None:
+        """Use another rated power, a number or (J,)."""
+        for constraint, power in zip(np.atleast_1d(self._own_constraint), np.atleast_1d(value), strict=True):
+            constraint.rated_power = power
+
+    # What is seen.
 
     @property
     def weights(self) -> np.ndarray:
@@ -219,6 +441,11 @@ class CoreController(FilteredReferenceController):
         return weights if self.multichannel else weights[0, 0]
 
     @property
+    def control_filter(self) -> np.ndarray:
+        """Control filter that generates y, of the shape of `weights`; a copy."""
+        return self.weights
+
+    @property
     def constraint(self) -> Any:
         """Constraint that computes the powers and the factor; without a rated power its factor is fixed at 1.
 
@@ -228,14 +455,49 @@ class CoreController(FilteredReferenceController):
         return self._own_constraint
 
     @property
-    def limiter(self) -> Any:
-        """Limiter of the control signal, or None, see `FilteredReferenceController.limiter`."""
-        self._opened()
-        return self._limiter
+    def constraint_factor(self) -> Any:
+        """Constraint factor of the last sample; with several channels (J,)."""
+        return self._of_constraint("factor")
 
-    @limiter.setter
-    def limiter(self, value: Any) -> None:
-        FilteredReferenceController.limiter.fset(self, value)  # type: ignore[attr-defined]
+    @property
+    def disturbance_power(self) -> Any:
+        """Running power of the disturbance estimate (eq. 10); with several channels (J,), summed over microphones."""
+        return self._of_constraint("disturbance_power")
+
+    @property
+    def secondary_path_gain(self) -> Any:
+        """Running secondary-path gain (eq. 11); NaN until the reference has energy.
+
+        With several channels (J,): E[x'^2] summed over microphones and references, over E[x^2] summed over references.
+        """
+        gain = self._of_constraint("secondary_path_gain")
+        return np.array(gain, dtype=np.float64) if self.multichannel else np.nan if gain is None else gain
+
+    def _of_constraint(self, name: str, constraint: Any = None) -> Any:
+        """Return a number of the constraint, or of each of them, (J,)."""
+        own = self.constraint if constraint is None else constraint
+        return np.array([getattr(one, name) for one in own]) if isinstance(own, tuple) else getattr(own, name)
+
+    def __repr__(self) -> str:
+        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
+        parts = [
+            *(self._channel_counts() if self.multichannel else []),
+            f"{self.n_taps} taps",
+            *([] if self.rated_power is None else [f"rated power {listed(self.rated_power, 'g')}"]),
+            f"constraint factor {listed(self.constraint_factor, '.3g')}",
+            *([f"limiter of rated power {listed([one.rated_power for one in limiters], 'g')}"] if limiters else []),
+        ]
+        return f"<{self.name}: {', '.join(parts)}>"
+
+    def _channel_counts(self) -> list[str]:
+        counts = {
+            "microphone": self.n_microphones,
+            "loudspeaker": self.n_loudspeakers,
+            "reference": self.n_references,
+        }
+        return [f"{count} {what}{'s' if count > 1 else ''}" for what, count in counts.items()]
+
+    # Samples.
 
     def control_signal(self, reference: Any) -> Any:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample.
@@ -243,23 +505,85 @@ class CoreController(FilteredReferenceController):
         With several channels, x(n) is (I,) and y(n) is (J,).
         """
         block = self._opened()
-        if self.multichannel:
-            block.reference[:] = channel_sample(reference, self.n_references, "reference", "references")
-        else:
-            block.reference[0] = as_number(reference, "reference")
+        block.reference[:] = self._sample(reference, "reference", "references")
         if answer := block.emit():
             raise ValueError(f"{reason_of(answer)}; nothing was changed")
-        return block.control_signal.copy() if self.multichannel else float(block.control_signal[0])
+        return self._shaped(block.control_signal)
 
     def update(self, error: Any) -> None:
         """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
         block = self._opened()
-        if self.multichannel:
-            block.error[:] = channel_sample(error, self.n_microphones, "error", "microphones")
-        else:
-            block.error[0] = as_number(error, "error")
+        block.error[:] = self._sample(error, "error", "microphones")
         if answer := block.update():
             raise ValueError(f"{reason_of(answer)}; nothing was changed")
+
+    def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
+        looped = self.looped()
+        if looped is None:
+            return super().process(references, errors, adapt=adapt, out=out)
+        x = self._block_signal(references, "references", self.n_references)
+        e = self._block_signal(errors, "errors", self.n_microphones)
+        require_one_length(x, e)
+        n_samples = x.shape[-1]
+        flags = adapt_flags(adapt, n_samples)
+        y = output_array(out, (self.n_loudspeakers, n_samples) if self.multichannel else x.shape)
+        rows = [np.atleast_2d(signal) for signal in (x, e, y)]
+        done = 0
+        while done < n_samples:
+            end = min(done + LONGEST_CALL, n_samples)
+            with looped.in_use:
+                status, done = process(looped.steps, rows[0], rows[1], rows[2], flags, done, end)
+            if done < end:
+                self._raise_refusal(x[..., done], e[..., done], done, status)
+        return y
+
+    def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
+        """Return a block of samples, (n_samples,) or (n_channels, n_samples)."""
+        signal = block_signal(value, name)
+        require_channels(signal, name, self.multichannel, n_channels)
+        return np.ascontiguousarray(signal)
+
+    def _raise_refusal(self, reference: Any, error: Any, sample: int, status: int) -> None:
+        """Raise `RefusedUpdate` with the reason that the step gives when it is called again: it has changed nothing."""
+        try:
+            if status == REFUSED_REFERENCE:
+                self.control_signal(reference)
+            self.update(error)
+        except ValueError as reason:
+            raise RefusedUpdate(str(reason), sample) from reason
+        raise RefusedUpdate(NO_SOLUTION, sample)
+
+    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
+        """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
+
+        Parameters
+        ----------
+        references : ndarray, shape (n_samples,) or (I, n_samples)
+            Reference.
+        errors : ndarray, shape (n_samples,) or (K, n_samples)
+            Signals of the error microphones while the loudspeakers are silent.
+        adapt : bool or ndarray of shape (n_samples,), default True
+            Whether to follow a sample; the others only enter the delay lines.
+        """
+        if self.multichannel:
+            x, e = self._channel_signals(references, errors)
+        else:
+            x = as_signal(references, "references")
+            e = as_signal(errors, "errors", length=x.size)
+        taken = self._listen(x, e, adapt_flags(adapt, len(x)))
+        if taken < len(x):
+            raise refused_while_listening(OVERFLOW, taken)
+
+    def _channel_signals(self, references: Any, errors: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return references and errors with a sample in each row."""
+        x, e = np.atleast_2d(as_channels(references, "references")), np.atleast_2d(as_channels(errors, "errors"))
+        if (len(x), len(e)) != (self.n_references, self.n_microphones) or x.shape[1] != e.shape[1]:
+            raise ValueError(
+                f"references must be (I, n_samples) and errors (K microphones, n_samples) with I = {self.n_references}, "
+                f"K = {self.n_microphones}, got {x.shape} and {e.shape}"
+            )
+        return np.ascontiguousarray(x.T), np.ascontiguousarray(e.T)
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         block = self._opened()
@@ -285,7 +609,32 @@ class CoreController(FilteredReferenceController):
             owner=block,
         )
 
+    @property
+    def _powers_fs(self) -> float:
+        """Sample rate in Hz of the power estimates."""
+        return np.ravel(self.constraint)[0].fs
+
+    def require_sample_rate(self, fs: float) -> None:
+        """Raise ValueError if the secondary path, power estimates or limiter are for another rate than `fs` in Hz."""
+        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
+        named = {f"limiter {j}" if self.multichannel else "limiter": one.fs for j, one in enumerate(limiters)}
+        require_rates(
+            fs,
+            {
+                "secondary path": self._path_fs,
+                "power memory": None if self.rated_power is None else self._powers_fs,
+            }
+            | named,
+        )
+
 
 def _rows(room: np.ndarray, length: int) -> np.ndarray:
     """Return three rows of a length at the start of the room for three of the longest."""
     return room.reshape(-1)[: 3 * length].reshape(3, length)
+
+
+def refused_while_listening(reason: str, sample: int) -> ValueError:
+    """Return the error of a sample that was refused before the control was switched on."""
+    refused = ValueError(reason)
+    refused.add_note(f"in sample {sample} of those listened to")
+    return refused

@@ -12,7 +12,7 @@ from .._validate import as_nonnegative
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from .base import constraint_or_none
-from .core_controller import CoreController, Limiters
+from .core_controller import CoreController, Limiters, setting
 
 
 class DiagonalKalman(CoreController):
@@ -74,6 +74,8 @@ class DiagonalKalman(CoreController):
     name = "diagonal KF"
     algorithm = "diagonal"
     checks = MappingProxyType(dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative))
+    state_noise = setting("State noise variance r.")
+    measurement_noise = setting("Measurement noise variance q.")
 
     def __init__(
         self,
@@ -105,16 +107,6 @@ class DiagonalKalman(CoreController):
         )
         if own is not None:
             self.name = "diagonal KF-OPC"
-
-    @property
-    def state_noise(self) -> float:
-        """State noise variance r."""
-        return self._of_setting("state_noise")
-
-    @property
-    def measurement_noise(self) -> float:
-        """Measurement noise variance q."""
-        return self._of_setting("measurement_noise")
 
     @property
     def variances(self) -> np.ndarray:

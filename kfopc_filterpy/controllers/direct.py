@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from .._validate import as_nonnegative, per_channel
+from .._validate import as_nonnegative
 from ..core.triangle import OWED, full_covariance
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from .base import constraint_or_none
-from .core_controller import CoreController, Limiters
+from .core_controller import CoreController, Limiters, setting
 
 
 class DirectKalman(CoreController):
@@ -91,6 +91,11 @@ class DirectKalman(CoreController):
 
     algorithm = "kalman"
     checks = dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative)
+    state_noise = setting("State noise variance r; can be assigned.", assignable=True)
+    measurement_noise = setting(
+        "Measurement noise variance q, or with several channels that of each microphone, (K,); can be assigned.",
+        assignable=True,
+    )
 
     def __init__(
         self,
@@ -128,40 +133,17 @@ class DirectKalman(CoreController):
         self.name = name or ("KF-ANC" if own is None else "KF-OPC")
 
     @property
-    def state_noise(self) -> float:
-        """State noise variance r; can be assigned."""
-        return self._of_setting("state_noise")
-
-    @state_noise.setter
-    def state_noise(self, value: float) -> None:
-        self._opened().fields["state_noise"][:] = as_nonnegative(value, "state_noise")
-
-    @property
-    def measurement_noise(self) -> Any:
-        """Measurement noise variance q, or with several channels that of each microphone, (K,); can be assigned."""
-        return self._of_setting("measurement_noise")
-
-    @measurement_noise.setter
-    def measurement_noise(self, value: Any) -> None:
-        noise = per_channel(value, self.n_microphones, "microphones", "measurement_noise", as_nonnegative)
-        self._opened().fields["measurement_noise"][:] = noise
-
-    @property
     def innovation(self) -> Any:
         """Innovation alpha d^ - w'x' of the last update; with several channels that of each microphone, (K,).
 
         The microphones are measured one after the other, each with the weights that those before it have corrected.
         """
-        return self._of_microphones("innovation")
+        return self._shaped(self._opened().fields["innovation"].ravel())
 
     @property
     def innovation_variance(self) -> Any:
         """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
-        return self._of_microphones("innovation_variance")
-
-    def _of_microphones(self, name: str) -> Any:
-        values = self._opened().fields[name].ravel()
-        return values.copy() if self.multichannel else float(values[0])
+        return self._shaped(self._opened().fields["innovation_variance"].ravel())
 
     @property
     def covariance(self) -> np.ndarray:

@@ -123,6 +123,7 @@ class FastArrayKalman(CoreController):
 
     name = "fast-array KF"
     algorithm = "fast_array"
+    takes_guard = False
 
     def __init__(
         self,
@@ -188,9 +189,6 @@ class FastArrayKalman(CoreController):
     def arrays_lost(self) -> int:
         """Number of arrays that a finite memory has restarted before their time, because rounding had spoilt them."""
         return int(self._opened().fields["turns"].flat[LOST]) if self.algorithm == "finite_memory" else 0
-
-    def _takes_guard(self) -> bool:
-        return False
 
     def _filter_again(self) -> None:
         """Keep the filtered reference: the array needs each row to be the last one, shifted by a sample."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 
 
-class FxLMS(LMSController):
+class FxLMS(CoreController):
     r"""Filtered-reference LMS, :math:`w(n+1) = w(n) + \mu e(n) x'(n)`, without a constraint.
 
     With K microphones, J loudspeakers and I references it is the multiple-error LMS (MEFxLMS), which descends the
@@ -73,6 +73,7 @@ class FxLMS(LMSController):
 
     name = "FxLMS"
     algorithm = "fxlms"
+    step_size = setting("Step size mu.")
 
     def __init__(
         self,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 
 
-class FxNLMS(LMSController):
+class FxNLMS(CoreController):
     r"""Normalised FxLMS: the step is divided by the energy of the filtered reference, without a constraint.
 
     .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
@@ -52,6 +52,8 @@ class FxNLMS(LMSController):
 
     name = "FxNLMS"
     algorithm = "fxnlms"
+    step_size = setting("Step size mu.")
+    regularization = setting("Regularization epsilon.")
 
     def __init__(
         self,
@@ -70,8 +72,3 @@ class FxNLMS(LMSController):
             n_references=n_references,
             limiter=limiter,
         )
-
-    @property
-    def regularization(self) -> float:
-        """Regularization epsilon."""
-        return self._of_setting("regularization")

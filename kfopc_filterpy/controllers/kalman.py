@@ -58,6 +58,7 @@ class KalmanController(CoreController):
     """
 
     algorithm = "signals_alone"
+    takes_guard = False  # the estimator gets one measurement in a sample
 
     def __init__(
         self,
@@ -80,9 +81,6 @@ class KalmanController(CoreController):
             estimator.dim_x, secondary_path, settings={}, n_references=None, amplifier=amplifier, limiter=limiter
         )
         self.name = name or ("KF-ANC" if self.rated_power is None else "KF-OPC")
-
-    def _takes_guard(self) -> bool:
-        return False  # the estimator gets one measurement in a sample
 
     def _read_rated_power(self) -> float | None:
         return getattr(self.estimator, "rated_power", None)

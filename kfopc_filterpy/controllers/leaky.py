@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -12,7 +12,7 @@ from .._validate import as_nonnegative
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from .base import constraint_for
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 from .mov import penalty_factor
 
 
@@ -57,7 +57,7 @@ def leak_factor(
     return as_nonnegative(reference_power, "reference_power") * gamma
 
 
-class LeakyFxLMS(LMSController):
+class LeakyFxLMS(CoreController):
     r"""Leaky FxLMS, :math:`w(n+1) = (1 - \mu\gamma) w(n) + \mu e(n) x'(n)`, with a fixed leak.
 
     The weights settle at about :math:`(R_{x'} + \gamma I) w = r`, which minimises :math:`E[e^2] + \gamma w^T w`. With
@@ -96,6 +96,8 @@ class LeakyFxLMS(LMSController):
 
     name = "leaky FxLMS"
     algorithm = "leaky"
+    step_size = setting("Step size mu.")
+    leak = setting("Leak gamma; with several channels (J,), a copy.")
     checks = MappingProxyType({"leak": as_nonnegative})
 
     def __init__(
@@ -116,8 +118,8 @@ class LeakyFxLMS(LMSController):
             limiter=limiter,
         )
 
-    def _checked_settings(self, each: Mapping[str, str]) -> dict[str, Any]:
-        settings = super()._checked_settings(each)
+    def _checked_settings(self) -> dict[str, Any]:
+        settings = super()._checked_settings()
         most = float(np.max(settings["step_size"] * settings["leak"]))
         if most > 1.0:
             raise ValueError(
@@ -125,13 +127,8 @@ class LeakyFxLMS(LMSController):
             )
         return settings
 
-    @property
-    def leak(self) -> Any:
-        """Leak gamma; with several channels (J,), a copy."""
-        return self._of_setting("leak")
 
-
-class OptimalLeakyFxLMS(LMSController):
+class OptimalLeakyFxLMS(CoreController):
     r"""Leaky FxLMS with the leak for a rated power, computed online.
 
     .. math:: \gamma(n) = E[x^2] \max\{\sqrt{G_s \delta_d^2 / \rho_o} - G_s,\ 0\}
@@ -173,6 +170,7 @@ class OptimalLeakyFxLMS(LMSController):
 
     name = "optimal leaky FxLMS"
     algorithm = "optimal_leaky"
+    step_size = setting("Step size mu.")
 
     def __init__(
         self,

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from ..power.limiter import OutputLimiter
-from .base import Controller, FilteredReferenceController, WrappedController, listening
+from .base import Controller, WrappedController, listening
+from .core_controller import CoreController
 
 
 class LimitedController(WrappedController):
@@ -44,7 +45,7 @@ class LimitedController(WrappedController):
     """
 
     def __init__(self, controller: Controller, limiter: OutputLimiter) -> None:
-        if isinstance(controller, FilteredReferenceController):
+        if isinstance(controller, CoreController):
             raise ValueError("this controller has a limiter of its own: set controller.limiter, or pass limiter=")
         super().__init__(controller)
         self.limiter = limiter

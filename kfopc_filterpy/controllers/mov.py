@@ -13,7 +13,7 @@ from .._validate import as_nonnegative, as_positive
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from .base import constraint_for
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
@@ -60,7 +60,7 @@ def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_pa
     return max(math.sqrt(gain) * math.sqrt(power / rated_power) - gain, 0.0)
 
 
-class MOVFxLMS(LMSController):
+class MOVFxLMS(CoreController):
     r"""Minimum-output-variance FxLMS: FxLMS with a penalty that keeps the control power within the rated power.
 
     .. math:: w(n+1) = w(n) + \mu [e(n) x'(n) - \gamma y(n) x(n)], \qquad
@@ -119,6 +119,7 @@ class MOVFxLMS(LMSController):
 
     name = "MOV-FxLMS"
     algorithm = "mov"
+    step_size = setting("Step size mu.")
     checks = MappingProxyType({"penalty_factor": as_nonnegative, "modified": as_nonnegative})
 
     def __init__(

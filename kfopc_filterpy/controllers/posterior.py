@@ -39,6 +39,7 @@ class PosteriorController(CoreController):
     """Base class: what is known of the plant, from the fields of `plant.c`."""
 
     checks = MappingProxyType({"spread": as_nonnegative})
+    takes_guard = False  # the posterior knows how far the path may be off
 
     @property
     def alarms(self) -> int:
@@ -66,8 +67,7 @@ class PosteriorController(CoreController):
         return self._per_channel("noise")
 
     def _per_channel(self, name: str) -> Any:
-        values = self._opened().fields[name].ravel()
-        return values.copy() if self.multichannel else float(values[0])
+        return self._shaped(self._opened().fields[name].ravel())
 
     def _heard_references(self) -> int:
         """Return the number of references I."""
@@ -80,9 +80,6 @@ class PosteriorController(CoreController):
         n = n_references * (self.n_taps + given.shape[-1] - 1)
         primary = theta[:, :n].reshape(self.n_microphones, n_references, -1)
         return primary, theta[:, n:].reshape(given.shape) if theta.shape[1] > n else given
-
-    def _takes_guard(self) -> bool:
-        return False  # the posterior knows how far the path may be off
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 
 
-class RescalingFxLMS(LMSController):
+class RescalingFxLMS(CoreController):
     r"""Re-scaling FxLMS: a control signal beyond the limit is clipped, and the weights are scaled by the same ratio.
 
     .. math:: \text{if } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
@@ -48,6 +48,8 @@ class RescalingFxLMS(LMSController):
 
     name = "re-scaling FxLMS"
     algorithm = "rescaling"
+    step_size = setting("Step size mu.")
+    amplitude_limit = setting("Amplitude limit A of the control signal; with several channels (J,), a copy.")
 
     def __init__(
         self,
@@ -61,8 +63,3 @@ class RescalingFxLMS(LMSController):
     ) -> None:
         settings = {"step_size": step_size, "amplitude_limit": amplitude_limit}
         super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
-
-    @property
-    def amplitude_limit(self) -> Any:
-        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
-        return self._of_setting("amplitude_limit")

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .lms import Limiters, LMSController
+from .core_controller import CoreController, Limiters, setting
 
 
-class TwoGradientFxLMS(LMSController):
+class TwoGradientFxLMS(CoreController):
     r"""Two-gradient-direction FxLMS: it reduces the error within the limit and the control power beyond it.
 
     .. math:: w(n+1) = w(n) + \begin{cases} \mu\, e(n)\, x'(n) & |y(n)| \le A \\
@@ -54,6 +54,9 @@ class TwoGradientFxLMS(LMSController):
 
     name = "two-gradient FxLMS"
     algorithm = "two_gradient"
+    step_size = setting("Step size mu.")
+    amplitude_limit = setting("Amplitude limit A of the control signal; with several channels (J,), a copy.")
+    output_step_size = setting("Step size of the second direction.")
 
     def __init__(
         self,
@@ -72,13 +75,3 @@ class TwoGradientFxLMS(LMSController):
             "output_step_size": step_size if output_step_size is None else output_step_size,
         }
         super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
-
-    @property
-    def amplitude_limit(self) -> Any:
-        """Amplitude limit A of the control signal; with several channels (J,), a copy."""
-        return self._of_setting("amplitude_limit")
-
-    @property
-    def output_step_size(self) -> float:
-        """Step size of the second direction."""
-        return self._of_setting("output_step_size")

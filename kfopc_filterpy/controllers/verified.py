@@ -12,7 +12,7 @@ import numpy as np
 from .._validate import as_channels, as_number, as_positive
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController, listening
-from .channels import amplifier_functions, channel_sample
+from .channel_samples import amplifier_functions, channel_sample
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
 AVERAGE_S = 0.1  # of the powers that are compared

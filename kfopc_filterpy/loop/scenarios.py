@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_positive, as_signal
-from ..controllers.base import FilteredReferenceController
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
 from ..controllers.power_budget import PowerBudgetController
@@ -127,7 +126,7 @@ def simulate_scenarios(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     x = as_signal(reference, "reference").copy()  # the results keep it, read-only
-    if isinstance(controllers, FilteredReferenceController):
+    if isinstance(controllers, CoreController):
         raise TypeError("controllers must be a sequence of controllers: [controller] for one")
     controllers = list(controllers)
     blocks = _blocks_that_share(controllers, fs)

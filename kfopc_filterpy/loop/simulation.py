@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
-from ..controllers.base import NO_SOLUTION, Controller, FilteredReferenceController, Looped
+from ..controllers.base import Controller, Looped
+from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps
 from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
@@ -168,7 +169,7 @@ def simulate(
     recorded = {name: np.full((J, n_samples), np.nan) for name in wanted}
     run = _Run(controller, plant, signals, recorded, weights, every or 1, functions, several, progress)
     looped = None
-    if compiled and isinstance(controller, FilteredReferenceController) and not any(functions):
+    if compiled and isinstance(controller, CoreController) and not any(functions):
         looped = controller.looped()
     diverged, end = run.steps(x) if looped is None else run.loop(looped)
     for signal in (*results, *recorded.values()):
@@ -281,7 +282,7 @@ class _Run:
 
 def is_multichannel(controller: Any, reference: Any, secondary_path: Any, disturbance: Any) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
-    own = isinstance(controller, FilteredReferenceController) and controller.multichannel
+    own = isinstance(controller, CoreController) and controller.multichannel
     return own or np.ndim(reference) == 2 or np.ndim(disturbance) == 2 or is_path_matrix(secondary_path)
 
 
@@ -350,7 +351,7 @@ def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.nd
 
 def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_microphones: int, several: bool) -> None:
     """Raise ValueError if a built-in controller is made for other numbers of channels."""
-    if not several or not isinstance(controller, FilteredReferenceController):
+    if not several or not isinstance(controller, CoreController):
         return
     if not controller.multichannel:
         raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")

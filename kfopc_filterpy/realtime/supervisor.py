@@ -12,7 +12,8 @@ import numpy as np
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..controllers.base import Controller, FilteredReferenceController
+from ..controllers.base import Controller
+from ..controllers.core_controller import CoreController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.constraint import DEFAULT_FS
@@ -375,7 +376,7 @@ class Supervisor(Checkpointed):
             self.controller, self._replacement_due = deepcopy(self._fresh), False
         signals = [self._shaped(block) for block in (x, e)]
         try:
-            if isinstance(self.controller, FilteredReferenceController):
+            if isinstance(self.controller, CoreController):
                 self.controller.listen(*signals, adapt=usable)
             elif np.all(usable) and hasattr(self.controller, "listen"):
                 self.controller.listen(*signals)

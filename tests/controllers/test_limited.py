@@ -29,7 +29,7 @@ from kfopc_filterpy import (
     simulate,
     simulate_scenarios,
 )
-from kfopc_filterpy.controllers.base import FilteredReferenceController
+from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.paths import path_taps, perturbed_path
 
 N_TAPS, N = 10, 500
@@ -43,7 +43,7 @@ def limiter(rated_power: float = LIMITED_POWER, **options: Any) -> OutputLimiter
     return OutputLimiter(rated_power, **{"fs": FS, "window_s": WINDOW / FS} | options)
 
 
-def controller(name: str, path: Any = S, **options: Any) -> FilteredReferenceController:
+def controller(name: str, path: Any = S, **options: Any) -> CoreController:
     """A controller; the estimated path is the true one unless another is given."""
     if name == "FxLMS":
         return FxLMS(N_TAPS, path, step_size=MU, **options)

@@ -23,16 +23,13 @@ from kfopc_filterpy import FxLMS, controllers, simulate
 from kfopc_filterpy.bench import algorithms, make_controller, make_scene
 from kfopc_filterpy.checkpoint import Checkpointed
 from kfopc_filterpy.controllers import VerifiedController, VirtualMicrophones
-from kfopc_filterpy.controllers.base import FilteredReferenceController, WrappedController
+from kfopc_filterpy.controllers.base import WrappedController
 from kfopc_filterpy.controllers.core_controller import CoreController
-from kfopc_filterpy.controllers.lms import LMSController
 from kfopc_filterpy.controllers.posterior import PathObserver, PosteriorController
 
 BASES = {
-    FilteredReferenceController,
     CoreController,
     WrappedController,
-    LMSController,
     PosteriorController,
     PathObserver,  # a part of VerifiedController
 }

@@ -103,7 +103,7 @@ def with_everything(name):
         settings["n_references"] = 2
     limiters = [limiter(), limiter(0.3)] if two else limiter()
     controller = kind(L, S_TWO_HAT if two else S_HAT, limiter=limiters, **settings)
-    if controller._takes_guard():
+    if controller.takes_guard:
         controller.secondary_path_uncertainty = 0.2
     return controller
 
