@@ -23,7 +23,7 @@ UNSTABLE = 8.0  # times the disturbance: what the controller would hear if it pl
 HOLD_S = 0.25  # after an alarm
 LEARN_S = 2.0  # after the error was last near the disturbance
 LEAST_VOLUME, STEP_S = 0.05, 0.1  # of a new start, and the time until it is doubled
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 32.0
+FIRST_PAUSE_S, LONGEST_PAUSE_S, FORGIVEN_S = 0.5, 32.0, 60.0
 LEAST_CHANGE, LARGE_CHANGE = 1e-4, 0.25  # of the energy of the path: not passed on; tried in silence first
 LOUDEST = 1e50  # of what can be learnt from, see `plant.h`
 
@@ -64,9 +64,12 @@ class VerifiedController(WrappedController):
 
     If the error is 3 dB louder than :math:`p * x` in the mean over 0.1 s (0.75 dB after an alarm), the loudspeakers are
     silent at once, and a fresh copy of the controller takes over. It adapts in silence to :math:`e - \hat s * y`, what it
-    would hear at full volume. After half a second, it plays at a twentieth of its volume. The volume is doubled every
-    0.25 s, unless the noise is 0.75 dB louder than without control. Each failure doubles the pause before the next start,
-    up to 32 s. The copy also takes over if the path has changed by a quarter of its energy without an alarm.
+    would hear at full volume. After half a second it starts. Each failure doubles this pause, up to 32 s; after a minute
+    without one, the pauses begin with half a second again. A copy also takes over if the path has changed by a quarter of
+    its energy without an alarm.
+
+    Every start is soft, the first one too. The loudspeakers begin at a twentieth of the volume, which is doubled every
+    0.1 s, unless the noise is 0.75 dB louder than without control.
 
     In silence, p is learned, and so is how much louder or softer the noise is than :math:`p * x`: a noise that no
     reference hears is expected from then on. This ratio fades within the memory.
@@ -175,7 +178,8 @@ class VerifiedController(WrappedController):
         self._withheld = np.zeros((J, M - 1 + self._block))
         self._n = self._samples = 0  # of this block, and of all
         self._awaits_error = False
-        self.volume, self._pause_s = 0.0, 0.0
+        self.volume, self._pause_s = 0.0, 0.0  # no pause before the first failure
+        self._stopped_at = 0  # sample of the last stop
         self._wait = 0  # samples until the volume is next changed
         self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples since the last one
         self._doubts = False  # whether the controller must not adapt, for the path is not known
@@ -274,6 +278,8 @@ class VerifiedController(WrappedController):
             self._push(sample, silence, silence)
             self._take(heard, heard)
         self._wait = wait
+        if self._known and self.volume == 0.0 and not self._pause_s:
+            self._turn_up()
 
     def _channels(self, value: Any, count: int, name: str, what: str) -> np.ndarray:
         """Return a checked sample, of which the observer refuses none."""
@@ -347,7 +353,7 @@ class VerifiedController(WrappedController):
             new, old = self._observer.identified_path, self._paths()
             change = np.sum((new - old) ** 2) / max(np.sum(old**2), np.finfo(float).tiny)
             if change > LEAST_CHANGE:
-                if change > LARGE_CHANGE and self.volume > 0.0 and self._since_alarm > self.fs:
+                if change > LARGE_CHANGE and self.volume == 1.0 and self._since_alarm > self.fs:
                     self._stop("another path")
                 self.controller.secondary_path = self._shaped_path(new)
         self._since_alarm += self._block
@@ -370,7 +376,7 @@ class VerifiedController(WrappedController):
         if self.volume == 0.0 and error > 0.0 and expected > 0.0:
             self._ratio *= float(error / expected)
         self.volume, self._wait = min(max(2.0 * self.volume, LEAST_VOLUME), 1.0), round(STEP_S * self.fs)
-        if self.volume == 1.0:
+        if self.volume == 1.0 and self._pause_s:
             self._note("full volume")
 
     def _stop(self, what: str) -> None:
@@ -381,7 +387,10 @@ class VerifiedController(WrappedController):
         self.controller.secondary_path = before.secondary_path
         if hasattr(before, "limiter"):
             self.controller.limiter = before.limiter
-        if self.volume > 0.0 or not self._pause_s:
+        if self._samples - self._stopped_at > FORGIVEN_S * self.fs:
+            self._pause_s = 0.0
+        self._stopped_at = self._samples
+        if not self._pause_s or (self.volume > 0.0 and what != "another path"):  # a failure that was heard
             self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
         self._deaf_for = max(self._deaf_for, self._p.shape[-1])  # it has no past: first it hears the references
