@@ -457,6 +457,9 @@ def _further() -> Iterator[Quote]:
     )
 
 
+PRIMARY = ("primary path, polarity", "primary path, five samples late")
+
+
 def _kf_pb() -> Iterator[Quote]:
     """The tables of the page on KF-PB."""
 
@@ -470,8 +473,18 @@ def _kf_pb() -> Iterator[Quote]:
             "-0.5 dB | {:.1f} dB |",
             lambda r, kind=kind: _class_line(r, kind),
         )
-    for fault in ("two samples late", "two samples early", "3 dB louder", "3 dB softer", "polarity", "another phase"):
-        for begins, words in (("start", "the start"), ("jump", "a jump")):
+    for fault in (
+        "two samples late",
+        "two samples early",
+        "3 dB louder",
+        "3 dB softer",
+        "polarity",
+        "another phase",
+        *PRIMARY,
+    ):
+        for begins, words in (
+            (("start", "the start"), ("jump", "a jump")) if "primary" not in fault else (("jump", "a jump"),)
+        ):
             yield quote(
                 "kf-pb",
                 f"| {fault} | {words} | {{:.1f}} dB | {{:.2f}}, {{:.2f}} dB | {{:.0f}} to {{:.0f}} |",

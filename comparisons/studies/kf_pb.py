@@ -36,6 +36,10 @@ FAULTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "polarity": lambda s: -s,
     "another phase": lambda s: path_taps(perturbed_path(s, fs=FS, phase_deg=120.0))[: s.size],
 }
+PRIMARY: dict[str, Callable[[np.ndarray], np.ndarray]] = {  # what becomes of the disturbance
+    "primary path, polarity": lambda d: -d,
+    "primary path, five samples late": lambda d: np.concatenate([np.zeros(5), d[:-5]]),
+}
 JUMPS = {  # dB, from and to s after switch-on
     "12 dB louder from 8 s on": (12.0, 8.0, DURATION_S),
     "12 dB softer from 8 s on": (-12.0, 8.0, DURATION_S),
@@ -234,41 +238,43 @@ def fault_rows(pairs: dict[str, Pair], job: tuple[str, str]) -> list[FaultRow]:
     """Run KF-PB with every fault, from the start and as a jump."""
     path, noise = job
     case = make_rated(pairs[path], noises()[noise][1](), SHARES[0])
-    right = case.secondary
-    reference, _ = run_with_jump(case, right, right)
+    right, same = case.secondary, case.disturbance
+    reference, _ = run_with_jump(case, right, right, same)
+    runs = [(fault, "start", change(right), right, same) for fault, change in FAULTS.items()]
+    runs += [(fault, "jump", right, change(right), same) for fault, change in FAULTS.items()]
+    runs += [(fault, "jump", right, right, change(same)) for fault, change in PRIMARY.items()]
     rows = []
-    for fault, change in FAULTS.items():
-        for begins in ("start", "jump"):
-            at_start = begins == "start"
-            error, alarms = run_with_jump(
-                case, change(right) if at_start else right, right if at_start else change(right)
+    for fault, begins, estimate, later, disturbance in runs:
+        error, alarms = run_with_jump(case, estimate, later, disturbance)
+        after = 2.0 if begins == "start" else JUMP_S + 2.0
+        rows.append(
+            FaultRow(
+                path,
+                noise,
+                fault,
+                begins,
+                alarms,
+                worst_second_db=float(np.min(case.seconds_db(error))),
+                lost_db=case.reduction_db(reference, after) - case.reduction_db(error, after),
             )
-            after = 2.0 if at_start else JUMP_S + 2.0
-            rows.append(
-                FaultRow(
-                    path,
-                    noise,
-                    fault,
-                    begins,
-                    alarms,
-                    worst_second_db=float(np.min(case.seconds_db(error))),
-                    lost_db=case.reduction_db(reference, after) - case.reduction_db(error, after),
-                )
-            )
+        )
     return rows
 
 
-def run_with_jump(case: Rated, estimate: np.ndarray, later: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the error and the alarms of a run in which the secondary path becomes `later` at `JUMP_S`."""
+def run_with_jump(
+    case: Rated, estimate: np.ndarray, later: np.ndarray, disturbance: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Return the error and the alarms of a run whose secondary path and disturbance become others at `JUMP_S`."""
     controller = kf_pb(N_TAPS, estimate, rated_power=case.rated_power, fs=FS)
     on, jump = round(SILENT_S * FS), round((SILENT_S + JUMP_S) * FS)
     controller.listen(case.reference[:on], case.disturbance[:on])
     line = np.zeros(case.secondary.size)
     errors = np.empty(case.reference.size - on)
     for n in range(on, case.reference.size):
+        path, d = (case.secondary, case.disturbance[n]) if n < jump else (later, disturbance[n])
         line[1:] = line[:-1]
         line[0] = controller.control_signal(case.reference[n])
-        errors[n - on] = case.disturbance[n] - (case.secondary if n < jump else later) @ line
+        errors[n - on] = d - path @ line
         controller.update(errors[n - on])
     return errors, controller.alarms
 
@@ -413,8 +419,8 @@ def case_table(rows: Sequence[ClassRow]) -> Table:
 def fault_table(rows: Sequence[FaultRow]) -> Table:
     """Return a line for each fault, over all cases."""
     lines = []
-    for fault in FAULTS:
-        for begins in ("start", "jump"):
+    for fault in (*FAULTS, *PRIMARY):
+        for begins in ("start", "jump") if fault in FAULTS else ("jump",):
             own = [row for row in rows if (row.fault, row.begins) == (fault, begins)]
             lost = [row.lost_db for row in own]
             lines.append(

@@ -43,7 +43,7 @@ class PosteriorController(CoreController):
 
     @property
     def alarms(self) -> int:
-        """Number of times so far that the errors contradicted the secondary path."""
+        """Number of times so far that the errors contradicted the paths."""
         return int(self._opened().fields["alarms"].item())
 
     @property

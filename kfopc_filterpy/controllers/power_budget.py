@@ -37,7 +37,8 @@ class PowerBudgetController(PosteriorController):
     whole rating of it would save less than half of the measurement noise.
 
     The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to the given
-    path with a large uncertainty. The loudspeakers play little until the path has been learned again. A new
+    path with a large uncertainty. The loudspeakers play little until the path has been learned again. If no secondary path
+    explains the errors half a second later, the primary path has changed, and both are learned anew. A new
     `secondary_path` that is assigned begins the posterior anew, also that of the primary paths; the control filter stays
     until the first solution, and so does the account.
 

@@ -2,9 +2,10 @@
 #include <string.h>
 
 static const real UNKNOWN = 2;                          /* after an alarm: rms error of a secondary path, over the path */
-static const real KEPT = 4;                             /* after an alarm: the data of p count as so many samples a tap */
+static const real KEPT = 4, FORGOTTEN = (real)0.0625;   /* after an alarm: samples a tap that the data of p count as; if p has changed */
+enum { FROM = 9, TO = 16, MANY = 4 };                   /* blocks after an alarm, and how many of them show that p has changed */
 static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
-enum { QUIET = 31 };                                    /* blocks from one alarm to the next, at least */
+enum { QUIET = 31 };                                    /* blocks from the first fit after an alarm to the next alarm, at least */
 static const real KNOWN = (real)0.05;                    /* no alarm before as much of the memory was heard */
 static const double WORK = 67108864;                    /* operations of a factorisation in a block, 2^26 */
 
@@ -336,28 +337,39 @@ static void explain(const plant *f, const real *theta, real *d, real *z)
     }
 }
 
-/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known. */
+/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known; note that limit. */
 static int is_alarm(const plant *f, real unexplained, real d2, real q)
 {
     const plant_numbers *known = f->numbers;
-    if (f->counts[AGE] <= (*f->alarms ? QUIET : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
+    if (f->counts[AGE] <= (*f->alarms ? QUIET + f->delay : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
     const real limit = SURPRISE * q + larger(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
     if (unexplained <= limit) return 0;
     real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
-    for (int32_t draw = 0; draw < DRAWS; draw++) {
+    for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) {
         explain(f, f->draws + times(draw, f->n), d, z);
         add_scaled(d, -1, z, f->B);
         doubt += dot(d, d, f->B) / (real)f->B;
     }
-    return unexplained > limit + SURPRISE * (doubt / DRAWS);
+    if (unexplained <= limit + SURPRISE * (doubt / DRAWS)) return 0;
+    f->numbers->limit = limit, f->numbers->before = q, f->counts[WRONG] = 0;
+    return 1;
 }
 
-/* The secondary paths have changed: they return to their prior; of the primary paths, a share is kept. */
-static void begin_anew(plant *f)
+/* Return whether other secondary paths do not explain the errors after an alarm: the primary ones have changed. */
+static int is_wrong(plant *f, real unexplained)
+{
+    const int32_t fitted_for = f->counts[AGE] - f->delay; /* blocks; a fit takes `delay` */
+    if (f->exact || !(f->numbers->limit > 0) || fitted_for < FROM || fitted_for > TO) return 0;
+    f->counts[WRONG] += unexplained > f->numbers->limit;
+    return fitted_for == TO && f->counts[WRONG] >= MANY;
+}
+
+/* The secondary paths have changed: they return to their prior; of the primary paths, some samples a tap are kept. */
+static void begin_anew(plant *f, real samples)
 {
     const int32_t n = f->n, split = f->I * f->N;
     plant_numbers *known = f->numbers;
-    const real kept = KEPT * (real)n < known->samples ? KEPT * (real)n / known->samples : 1;
+    const real kept = samples * (real)n < known->samples ? samples * (real)n / known->samples : 1;
     for (int32_t k = 0; k < f->K; k++) {
         real *r = f->r + times(k, n);
         for (int32_t i = split; i < n; i++) { /* as if s had been known until now */
@@ -377,9 +389,10 @@ static void begin_anew(plant *f)
         for (int32_t i = 0; i < split; i++) energy -= theta[i] * (2 * dot(row_of_data(f, i), theta, i) + row_of_data(f, i)[i] * theta[i]);
         f->ee[k] = energy;
     }
-    known->spread = UNKNOWN, known->fitted = 0;
+    known->fitted = 0;
+    if (!f->exact) known->spread = UNKNOWN;
     f->counts[AGE] = f->counts[IDLE] = f->counts[PENDING] = 0, f->counts[DOUBTFUL] = f->counts[STALE] = 1;
-    memset(f->draws, 0, sizeof(real) * times(DRAWS, n));
+    if (!f->exact) memset(f->draws, 0, sizeof(real) * times(DRAWS, n));
     return_to_prior(f);
 }
 
@@ -455,7 +468,14 @@ static void learn_heard(plant *f, real forget)
         for (int32_t t = 0; t < B + f->M - 1; t++) loud |= history_of(f, f->I + j)[t] != 0;
     count_up(f->counts + AGE), count_up(f->counts + IDLE);
     if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
-    if (known && loud && !f->exact && is_alarm(f, unexplained, d2, q)) count_up(f->alarms), begin_anew(f);
+    if (known && loud && is_alarm(f, unexplained, d2, q)) {
+        count_up(f->alarms);
+        begin_anew(f, f->exact ? FORGOTTEN : KEPT);
+    } else if (is_wrong(f, unexplained)) {
+        begin_anew(f, FORGOTTEN);
+        for (int32_t k = 0; k < f->K; k++) f->q[k] = numbers->before;
+        numbers->limit = 0; /* once for an alarm */
+    }
     else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
         const real share = unexplained < d2 ? unexplained / d2 : 1;
         numbers->misfit = forget * forget * numbers->misfit + share * share;

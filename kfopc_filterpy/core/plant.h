@@ -12,13 +12,14 @@ typedef struct {
     real samples, fitted;      /* that the data stand for, and those of the last fit; both fade */
     real spread, prior;        /* rms error of s^ over the path; precision of a tap of p, 0: not known yet */
     real misfit, seen;         /* mean of (unexplained / d^2)^2, and its weight */
+    real limit, before;        /* of the last alarm: what was exceeded; the noise */
     real set_aside;            /* samples of the pending factorisation */
 } plant_numbers;
 
-enum { AGE, IDLE, SOUNDS, DOUBTFUL, STALE, RANDOM, PENDING, GROUPS, PLANT_COUNTS };
+enum { AGE, IDLE, SOUNDS, DOUBTFUL, STALE, RANDOM, PENDING, GROUPS, WRONG, PLANT_COUNTS };
 /* AGE: blocks since the loudspeakers sound, or since an alarm; IDLE: since the last fit began; DOUBTFUL: no fit since the
  * alarm; STALE: the correlations are not those of the posterior; PENDING: 1 + blocks until the fit ends, 0: none; GROUPS:
- * those of its rows that are factorised. */
+ * those of its rows that are factorised; WRONG: blocks since the alarm that exceed its limit. */
 enum { FILLED, MISSING, HEARD, AWAITED, BLOCK_COUNTS };
 /* FILLED, MISSING: samples of this block, and whether an error of it is; HEARD: samples of all blocks; AWAITED: the error of
  * the last control signal is still to come. */

@@ -20,7 +20,9 @@ from oracles.signals import Controller
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_toeplitz, solve_triangular, toeplitz
 
 UNKNOWN = 2.0  # after an alarm: root mean square of the error of a secondary path, over the path
-KEPT = 4  # after an alarm: what is known of the primary paths counts as so many samples for each tap
+KEPT = 4.0  # after an alarm: what is known of the primary paths counts as so many samples for each tap
+FORGOTTEN = 1 / 16  # ... if they have changed
+JUDGED, WRONG = (9, 16), 4  # blocks after an alarm, and how many of them show that the primary paths have changed
 DRAWS = 8  # of the posterior, that stand for its covariance
 SURPRISE, MISFIT, USUAL = (
     4.0,
@@ -33,7 +35,7 @@ WINDOW = 8  # the filter is solved for the references of an exponential window o
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
 SCALES = (100, 40, 4)  # t: windows of the averaging time over these; besides, the last block and the window above
-QUIET = 31  # blocks from one alarm to the next, at least
+QUIET = 31  # blocks from the first fit after an alarm to the next alarm, at least
 KNOWN = 0.05  # no alarm before as much of the memory was heard
 WORK = 2.0**26  # operations of a factorisation in a block
 
@@ -86,6 +88,11 @@ class Plant:
         self.alarms = 0
         self.sounds = self.doubtful = False  # doubtful: no fit since the alarm
         self.misfit, self.seen = 0.0, 0.0  # mean of (res / d^2)^2, and its weight
+        self.limit, self.before, self.wrong = (
+            0.0,
+            0.0,
+            0,
+        )  # of the last alarm: what was exceeded, noise; blocks since that do
 
     @property
     def p(self):
@@ -116,10 +123,13 @@ class Plant:
         self.idle += 1
         if loud and not self.sounds:
             self.sounds, self.age = True, 1
-        alarm = self.is_alarm(unexplained, d2, q, x, y) if known and loud and not self.exact else False
+        alarm = self.is_alarm(unexplained, d2, q, x, y) if known and loud else False
         if alarm:
             self.alarms += 1
-            self.begin_anew()
+            self.begin_anew(FORGOTTEN if self.exact else KEPT)
+        elif self.is_wrong(unexplained):
+            self.begin_anew(FORGOTTEN)
+            self.q[:], self.limit = self.before, 0.0  # once for an alarm
         elif known and self.fits and d2 > 0 and not self.doubtful:
             self.misfit = self.forget**2 * self.misfit + min(unexplained / d2, 1.0) ** 2
             self.seen = self.forget**2 * self.seen + 1.0
@@ -135,28 +145,41 @@ class Plant:
 
     def is_alarm(self, unexplained, d2, q, x, y):
         """Return whether the error is beyond its noise, the usual misfit of the model, and what is not known."""
-        if self.age <= (QUIET if self.alarms else 1) or self.doubtful or not self.seen:
+        if self.age <= (QUIET + self.delay if self.alarms else 1) or self.doubtful or not self.seen:
             return False
         usual = max(MISFIT, USUAL * math.sqrt(self.misfit / self.seen))
         limit = SURPRISE * q + usual * d2
         if unexplained <= limit:
             return False
-        doubt = np.mean([np.mean(np.subtract(*self.explain(draw, x, y)) ** 2) for draw in self.draws])
-        return unexplained > limit + SURPRISE * doubt
+        draws = [] if self.exact else self.draws
+        doubt = sum(np.mean(np.subtract(*self.explain(draw, x, y)) ** 2) for draw in draws) / DRAWS
+        if unexplained <= limit + SURPRISE * doubt:
+            return False
+        self.limit, self.before, self.wrong = limit, q, 0
+        return True
 
-    def begin_anew(self):
-        """The secondary paths have changed: they return to their prior; of the primary paths, a share is kept."""
+    def is_wrong(self, unexplained):
+        """Return whether other secondary paths do not explain the errors after an alarm: the primary ones have changed."""
+        fitted_for = self.age - self.delay  # blocks; a fit takes `delay`
+        if self.exact or not self.limit or not JUDGED[0] <= fitted_for <= JUDGED[1]:
+            return False
+        self.wrong += unexplained > self.limit
+        return fitted_for == JUDGED[1] and self.wrong >= WRONG
+
+    def begin_anew(self, kept):
+        """The secondary paths have changed: they return to their prior; of the primary paths, some samples a tap are kept."""
         p, n = self.primary, self.primary.stop
         self.r[:, p] -= self.theta[:, n:] @ self.G[n:, p]  # as if s had been known until now
         self.r[:, n:] = self.G[n:] = self.G[:, n:] = 0.0
-        kept = min(KEPT * self.n / self.count, 1.0)
+        kept = min(kept * self.n / self.count, 1.0)
         self.G, self.r, self.count = kept * self.G, kept * self.r, kept * self.count
         theta = self.theta[:, p]
         self.ee = self.count * self.q + 2 * np.sum(theta * self.r[:, p], axis=1)
         self.ee -= np.sum(theta @ self.G[p, p] * theta, axis=1)
-        self.spread, self.pending, self.fitted, self.age, self.idle, self.doubtful = UNKNOWN, None, 0.0, 0, 0, True
-        self.s, self.draws[:] = self.s_hat.copy(), 0.0
-        self.theta[:, n:] = self.s.reshape(len(theta), -1)
+        self.pending, self.fitted, self.age, self.idle, self.doubtful = None, 0.0, 0, 0, True
+        if not self.exact:
+            self.spread, self.s, self.draws[:] = UNKNOWN, self.s_hat.copy(), 0.0
+            self.theta[:, n:] = self.s.reshape(len(theta), -1)
 
     def add(self, x, y, e):
         """Add the block to the data."""

@@ -1,0 +1,69 @@
+"""The study of KF-PB on a small scale: a report that is complete, and rows that say what a run of one's own says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from comparisons import __main__ as command
+from comparisons.studies import kf_pb as study
+from comparisons.studies.cases import FS, measured_data
+from kfopc_filterpy import kf_pb, noise_reduction_db, simulate
+from kfopc_filterpy.bench import Runs, StudyReport
+
+PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
+SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "JUMP_S": 2.0, "SHARES": (0.25,)}
+
+
+@pytest.fixture(scope="module")
+def small() -> Any:
+    """Few taps, short runs, one pair of short paths, one setting of MOV-FxLMS, no measured data."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KFOPC_DATA", "/no/such/folder")
+        measured_data.cache_clear()
+        study.recordings.cache_clear()
+        for name, value in SMALL.items():
+            patch.setattr(study, name, value)
+        patch.setattr(study, "JUMPS", {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)})
+        patch.setattr(study, "STEPS", np.array([0.01]))
+        patch.setattr(study, "PENALTIES", np.array([1.0]))
+        patch.setattr(study, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
+        runs = Runs()
+        yield study.main(runs), runs.done, study.planned_runs()
+    measured_data.cache_clear()
+    study.recordings.cache_clear()
+
+
+def test_the_report_is_complete(small: Any) -> None:
+    report, done, planned = small
+    assert isinstance(report, StudyReport)
+    assert done == planned
+    assert {row["kind"] for row in report.extra["rows"]} == {study.STEADY, study.CHANGING}
+    faults = {(row["fault"], row["begins"]) for row in report.extra["faults"]}
+    expected = {(fault, begins) for fault in study.FAULTS for begins in ("start", "jump")}
+    assert faults == expected | {(fault, "jump") for fault in study.PRIMARY}
+    assert [table.stem for table in report.tables] == ["classes", "cases", "faults"]
+    assert len(report.claims) == 8
+    assert command.FURTHER["kf_pb"] == (study.main, study.planned_runs)
+
+
+def test_a_row_is_what_a_run_of_ones_own_says(small: Any) -> None:
+    row = next(row for row in small[0].extra["rows"] if row["noise"] == "band noise")
+    case = study.make_rated((PRIMARY, SECONDARY), study.noises()["band noise"][1](), 0.25)
+    controller = kf_pb(16, SECONDARY, rated_power=case.rated_power, fs=FS)
+    result = simulate(
+        controller, case.reference, disturbance=case.disturbance, secondary_path=SECONDARY, fs=FS, switch_on_s=1.0
+    )
+    late = slice(round(FS), round(5.0 * FS))
+    expected = noise_reduction_db(result.error[late], result.disturbance[late], steady=1.0)
+    assert row["noise_reduction_db"] == pytest.approx(expected)
+    assert row["noise_reduction_db"] > 3.0
+
+
+def test_every_fault_is_overcome(small: Any) -> None:
+    """From two seconds after the fault on. A softer path needs more power, and a phase of five taps is another path."""
+    for row in small[0].extra["faults"]:
+        if row["fault"] not in ("3 dB softer", "another phase"):
+            assert row["lost_db"] < 1.0, row
