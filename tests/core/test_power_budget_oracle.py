@@ -155,6 +155,16 @@ def test_a_path_that_flips_its_polarity() -> None:
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_a_primary_path_that_flips_its_polarity(spread: float) -> None:
+    s, x, d, _ = scene(2, 1, 1, 1, 12.0)
+    d[:, round(6.0 * FS) :] *= -1.0
+    oracle, core = pair(s, 24, 1, np.array([0.25 * np.mean(d**2)]), spread, 2.0)
+    compare(oracle, core, x, d, lambda n: s)
+    assert oracle.alarms == 1
+    assert spread == 0.0 or oracle.plant.wrong >= 4  # the data were forgotten, in both
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_several_channels(spread: float) -> None:
     s, x, d, _ = scene(3, 2, 2, 2, 5.0)
     oracle, core = pair(s, 12, 2, np.array([0.25, 0.1]) * np.mean(d**2), spread, 2.0)
