@@ -446,6 +446,38 @@ def _further() -> Iterator[Quote]:
         *(0, 1),
     )
     yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
+    yield Quote(
+        "studies.md",
+        "by {:.1f} dB on the built-in duct if the sign changes (KF-OPC: {:.1f} dB), and by {:.1f} dB on the measured one ({:.1f} dB)",
+        ("tracking",),
+        lambda r: [_tracked(r, "sign", path, name) for path in DUCT_PAIR for name in ("KF-PB", "KF-OPC")],
+        "python -m comparisons tracking",
+    )
+    yield Quote(
+        "studies.md",
+        "makes this noise up to {:.1f} dB louder, while KF-OPC reduces it by {:.1f} to {:.1f} dB. If the sweep recurs, KF-PB reduces "
+        "it by {:.1f} and {:.1f} dB",
+        ("tracking",),
+        lambda r: [
+            max(-_tracked(r, "one sweep", path, "KF-PB") for path in DUCT_PAIR),
+            *sorted(_tracked(r, "one sweep", path, "KF-OPC") for path in DUCT_PAIR),
+            *(_tracked(r, "sweeps", path, "KF-PB") for path in DUCT_PAIR),
+        ],
+        "python -m comparisons tracking",
+    )
+    claim = "With its default uncertainty"
+    yield quote(
+        "uncertain-path", "in any of {:.0f} runs; the least noise reduction of a second is {:.1f} dB", claim, 1, 2
+    )
+    yield quote("uncertain-path", "it is louder in {:.0f} of {:.0f} runs, by {:.1f} dB at most", claim, -3, -2, -1)
+    claim = "With an exact path the default uncertainty costs at most 0.5 dB, noises"
+    yield quote("uncertain-path", "costs {:.2f} dB on average and {:.2f} dB at most", claim, 0, 1)
+    claim = "On steady noise KF-PB reaches"
+    yield quote(
+        "multichannel", "KF-PB is {:.2f} dB below the bound on average. The worst case is {:.2f} dB", claim, 0, 1
+    )
+    yield quote("multichannel", "takes more than {:.3f} of its rating", "Steady noise: every loudspeaker", 2)
+    yield quote("multichannel", "the best of them is {:.2f} dB behind on average", "No method of another kind", 0)
     yield quote("amplifier", "its reduction is at best {:.1f} dB larger", "KF-OPC reduces the noise more", 0)
     yield quote("amplifier", "it is {:.1f} dB smaller", "KF-OPC reduces the noise more", 1)
     yield quote(
@@ -515,6 +547,19 @@ def _losses(results: Results, path: str) -> list[float]:
     rows = [[40.0, *row["reduction_db"]] for row in results.extra("loss-map", "rows") if row["path"] == path]
     mean = [sum(stage) / len(rows) for stage in zip(*rows, strict=True)]
     return [*(before - after for before, after in pairwise(mean)), mean[-1]]
+
+
+DUCT_PAIR = ("duct", "measured duct")
+
+
+def _tracked(results: Results, event: str, path: str, algorithm: str) -> float:
+    """Return the noise reduction over the whole run in the study of tracking."""
+    rows = results.extra("tracking", "rows")
+    return next(
+        row["noise_reduction_db"]
+        for row in rows
+        if (row["event"], row["path"], row["algorithm"]) == (event, path, algorithm)
+    )
 
 
 QUOTES: tuple[Quote, ...] = (
