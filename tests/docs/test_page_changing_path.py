@@ -17,7 +17,7 @@ def test_the_figures_say_what_the_page_says(capsys: pytest.CaptureFixture[str]) 
         assert np.isnan(errors["alone"]).any()  # it diverges
         anew = v.reduction_db(errors["made anew at 2 s"], 11, 12)
         assert v.reduction_db(errors["verified"], 11, 12) > anew - 1.0
-        assert v.tenths_db(errors["verified"]).max() < 0.0  # no louder than without control
+        assert v.tenths_db(errors["verified"]).max() < 1.5  # hardly louder than without control
         assert f"{name}: [PathEvent(time_s=2.0" in said  # at once
     assert v.tenths_db(v.after_door["KF-PB"]["alone"]).max() < 0.0
     v = page.run(until="If the secondary path does not change")
@@ -25,22 +25,18 @@ def test_the_figures_say_what_the_page_says(capsys: pytest.CaptureFixture[str]) 
     for name, make in v.makers.items():
         assert np.isnan(v.drift_errors[name]).any()
         anew = v.reduction_db(v.made_anew(make, 12, 22), 21, 22)
-        for label in (f"{name} verified, memory 20 s", f"{name} verified, memory 4 s"):
-            assert v.reduction_db(v.drift_errors[label], 21, 22) > anew - 1.5  # nearly as good
-            assert v.tenths_db(v.drift_errors[label]).max() < 3.0
-            assert 5.0 < during[label] < during["KF-PB"] - 1.0  # KF-PB reduces the noise most
-        short, long = (during[f"{name} verified, memory {memory_s} s"] for memory_s in (4, 20))
-        assert short < long + 2.0  # a short memory does not help much
+        verified = v.drift_errors[f"{name} verified"]
+        assert v.reduction_db(verified, 21, 22) > anew - 1.5  # nearly as good
+        assert v.tenths_db(verified).max() < 1.0
+        assert 5.0 < during[f"{name} verified"] < during["KF-PB"] - 1.0  # KF-PB reduces the noise most
     v = page.run(until="Sound that returns to the reference microphone")
     assert not v.checked.events
     assert abs(v.loss) < 0.05
     during = {label: v.reduction_db(error, 2, 12) for label, error in v.moved_errors.items()}
     for name in v.makers:
-        assert during[f"{name} verified, memory 20 s"] < during[name] - 5.0  # the price of having no probe
+        assert abs(during[f"{name} verified"] - during[name]) < 0.5
     assert during["KF-PB"] < during["KF-ANC"] - 5.0
-    said = capsys.readouterr().out.split("nothing changes")[1]
-    assert said.split("KF-ANC verified")[1].split("FxLMS")[0].count("louder at") == 1  # KF-ANC is stopped
-    assert "louder at" not in said.split("FxLMS verified")[1]
+    assert " at " not in capsys.readouterr().out.split("nothing changes")[1]  # no event
     for error in v.moved_errors.values():
         assert v.reduction_db(error, 21, 22) > 28.0
     v = page.run()
