@@ -60,7 +60,7 @@ class VerifiedController(WrappedController):
     error is within 6 dB of the noise without control, which the posterior expects to be :math:`p * x`: then the
     controller gets the posterior's secondary path, and keeps its weights. If the errors contradict the posterior, this is
     an alarm. The secondary path returns to the first one, now with a large uncertainty, and is learned again. The
-    controller does not adapt for 0.25 s.
+    controller does not adapt until 0.25 s have been heard.
 
     If the error is 3 dB louder than :math:`p * x` in the mean over 0.1 s (0.75 dB after an alarm), the loudspeakers are
     silent at once, and a fresh copy of the controller takes over. It adapts in silence to :math:`e - \hat s * y`, what it
@@ -181,7 +181,7 @@ class VerifiedController(WrappedController):
         self.volume, self._pause_s = 0.0, 0.0  # no pause before the first failure
         self._stopped_at = 0  # sample of the last stop
         self._wait = 0  # samples until the volume is next changed
-        self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples since the last one
+        self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples played since the last one
         self._doubts = False  # whether the controller must not adapt, for the path is not known
         self._deaf_for = 0  # samples until a fresh controller may adapt
         self._learns_for = 0  # samples for which the controller still gets the posterior's path
@@ -346,9 +346,9 @@ class VerifiedController(WrappedController):
         if self._observer.alarms > self._alarms:
             self._alarms, self._since_alarm = self._observer.alarms, 0
         is_new = self._since_alarm < HOLD_S * self.fs  # the posterior knows little of the path
-        if is_new and is_near and not self._doubts:
+        if is_new and is_near and not self._doubts and self.volume == 1.0:
             self._note("alarm")
-        self._doubts = is_new and is_near
+        self._doubts = is_new and is_near and self.volume == 1.0  # softly, the controller plays by the path that it had
         if self._known and self._learns_for and not is_new:
             new, old = self._observer.identified_path, self._paths()
             change = np.sum((new - old) ** 2) / max(np.sum(old**2), np.finfo(float).tiny)
@@ -356,12 +356,13 @@ class VerifiedController(WrappedController):
                 if change > LARGE_CHANGE and self.volume == 1.0 and self._since_alarm > self.fs:
                     self._stop("another path")
                 self.controller.secondary_path = self._shaped_path(new)
-        self._since_alarm += self._block
+        if self.volume > 0.0:  # silence says nothing of the path
+            self._since_alarm += self._block
         self._use_posterior()
         self._ratio **= math.exp(-self._block / (self.memory_s * self.fs))
         if self.volume < 1.0 and self._known:
             self._wait -= self._block
-            if self._wait <= 0:
+            if self._wait <= 0 and not (is_new and self.volume > 0.0):
                 self._turn_up()
 
     def _shaped_path(self, path: np.ndarray) -> np.ndarray:
@@ -384,7 +385,10 @@ class VerifiedController(WrappedController):
         if self.volume > 0.0 or not self.events or self.events[-1].what != what:  # else as before, in the same silence
             self._note(what)
         before, self.controller = self.controller, deepcopy(self._fresh)
-        self.controller.secondary_path = before.secondary_path
+        if what == "unstable":  # by a path of which too little was heard: it plays by the first one until more is known
+            self._since_alarm = 0
+        else:
+            self.controller.secondary_path = before.secondary_path
         if hasattr(before, "limiter"):
             self.controller.limiter = before.limiter
         if self._samples - self._stopped_at > FORGIVEN_S * self.fs:
