@@ -347,7 +347,7 @@ def _constraint() -> Iterator[Quote]:
     def quote(words: str, numbers: Callable[[Results], Sequence[float]], page: str = "constraint.md") -> Quote:
         return Quote(page, words, ("constraint",), numbers, CONSTRAINT)
 
-    for name in ("KF-OPC", "KF-OPC repaired"):
+    for name in ("KF-OPC", "KF-OPC repaired", "KF-PB"):
         line = "{:.2f}-{:.2f} | {:.2f} ({:.2f}) dB | {:.2f}-{:.2f} | {:.2f} ({:.2f}) dB | {:.1f} |"
         yield quote(f"| {name} | {line}", lambda r, name=name: r.summary(name))
     db = "| {:.1f} dB | {:.1f} dB | {:.1f} dB | {:.1f} dB |"
