@@ -469,14 +469,16 @@ def _further() -> Iterator[Quote]:
     yield quote(
         "uncertain-path", "in any of {:.0f} runs; the least noise reduction of a second is {:.1f} dB", claim, 1, 2
     )
-    yield quote("uncertain-path", "it is louder in {:.0f} of {:.0f} runs, by {:.1f} dB at most", claim, -3, -2, -1)
+    yield quote(
+        "uncertain-path", "a second is louder in {:.0f} of {:.0f} runs, by {:.1f} dB at most", claim, -3, -2, -1
+    )
     claim = "With an exact path the default uncertainty costs at most 0.5 dB, noises"
     yield quote("uncertain-path", "costs {:.2f} dB on average and {:.2f} dB at most", claim, 0, 1)
     claim = "On steady noise KF-PB reaches"
     yield quote(
         "multichannel", "KF-PB is {:.2f} dB below the bound on average. The worst case is {:.2f} dB", claim, 0, 1
     )
-    yield quote("multichannel", "takes more than {:.3f} of its rating", "Steady noise: every loudspeaker", 2)
+    yield quote("multichannel", "takes more than {:.3f} times its rating", "Steady noise: every loudspeaker", 2)
     yield quote("multichannel", "the best of them is {:.2f} dB behind on average", "No method of another kind", 0)
     yield quote("amplifier", "its reduction is at best {:.1f} dB larger", "KF-OPC reduces the noise more", 0)
     yield quote("amplifier", "it is {:.1f} dB smaller", "KF-OPC reduces the noise more", 1)

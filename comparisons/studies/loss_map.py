@@ -21,10 +21,10 @@ LONG = 4 * N_TAPS  # taps that stand for a filter of any length
 FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
 STAGES = {  # what each stage adds to the one before
     "causality": f"a causal filter of {LONG} taps, with any power",
-    "length": f"one of {N_TAPS} taps",
-    "price": "within the rated power in every second, each second with its own filter",
+    "length": f"a filter of {N_TAPS} taps",
+    "price": "the rated power is kept in every second, and each second has its own filter",
     "adaptation": "KF-PB with the exact path, within the rated power over 10 s",
-    "path": f"KF-PB with an estimate {FAULT}, which it verifies",
+    "path": f"KF-PB with an estimate that is {FAULT}, which it verifies",
     "limiter": "the same behind a limiter that keeps the rated power in every 100 ms",
 }
 
@@ -40,7 +40,7 @@ class LossRow:
 
     @property
     def losses_db(self) -> np.ndarray:
-        """What each stage loses, the first one against the sensor noise; negative: a gain."""
+        """Loss of each stage, that of the first relative to the sensor noise; a negative loss is a gain."""
         return -np.diff([-SENSOR_NOISE_DB, *self.reduction_db])
 
 
@@ -75,9 +75,8 @@ def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
 def free_error(case: Rated, n_taps: int) -> np.ndarray:
     """Return the error of the best fixed filter of a length, with any power."""
     ridge = 1e-4 * np.var(fftconvolve(case.reference, case.secondary)[: case.reference.size])
-    with (
-        warnings.catch_warnings()
-    ):  # in directions without energy, larger weights would do better: no controller has them
+    # In directions without energy, larger weights would do better, but no controller reaches them.
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", np.exceptions.RankWarning)
         solution = power_constrained_wiener(
             *(case.reference, case.disturbance, case.secondary, n_taps),
@@ -97,7 +96,7 @@ def jobs() -> list[tuple[str, str]]:
 
 
 def planned_runs() -> int:
-    """Return the number of cases, each of which makes several runs."""
+    """Return the number of cases, each of which takes several runs."""
     return len(jobs())
 
 
@@ -109,7 +108,7 @@ def main(runs: Runs) -> StudyReport:
         name="loss-map",
         title="Where the noise reduction is lost",
         summary=(
-            f"The sensor noise would allow {-SENSOR_NOISE_DB:g} dB. Each stage is one step nearer to a controller that runs: "
+            f"The sensor noise would allow {-SENSOR_NOISE_DB:g} dB. Each stage is a step towards a real controller: "
             + "; ".join(f"{name}: {what}" for name, what in STAGES.items())
             + "."
         ),
@@ -119,7 +118,7 @@ def main(runs: Runs) -> StudyReport:
             "n_taps": Parameter(N_TAPS, "of the control filter"),
             "duration_s": Parameter([SILENT_S, DURATION_S], "before and after the control is switched on"),
             "rated_share": Parameter(SHARES[0], "of the power that full control needs"),
-            "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "over the disturbance"),
+            "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "relative to the disturbance"),
             "seed": Parameter(SEED, "of noise and sensor noise"),
         },
         algorithms={},
@@ -137,7 +136,7 @@ def loss_table(rows: Sequence[LossRow]) -> Table:
     headings = ["path", "noise", *(f"{name}, dB" for name in STAGES), "left, dB", "bound with windows of 100 ms, dB"]
     return Table(
         "losses",
-        "Noise reduction lost at each stage, in dB; below zero: a gain",
+        "Noise reduction lost at each stage, in dB; a negative loss is a gain",
         headings,
         [[row.path, row.noise, *row.losses_db, row.reduction_db[-1], row.window_bound_db] for row in rows],
     )

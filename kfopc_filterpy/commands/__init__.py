@@ -1,7 +1,7 @@
 """The command `kfopc`, which is also `python -m kfopc_filterpy`: a file for each subcommand.
 
-Exit codes: 0 done, and for a verdict "enough"; 1 the verdict "not enough", or a run that a fault ended; 2 wrong input,
-said in one line; 130 interrupted.
+Exit codes: 0 if the command is done, or the verdict is "enough"; 1 if the verdict is "not enough", or a fault stopped a
+run; 2 for wrong input, with a message of one line; 130 if it was interrupted.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{options.prog}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
         return WRONG_INPUT
     except KeyboardInterrupt:
-        print(f"{options.prog}: interrupted; nothing of it was written", file=sys.stderr)
+        print(f"{options.prog}: interrupted; nothing was written", file=sys.stderr)
         return 130
 
 

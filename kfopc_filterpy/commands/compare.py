@@ -1,4 +1,4 @@
-"""`kfopc compare`: the algorithms on one's own recordings."""
+"""`kfopc compare`: the algorithms on your own recordings."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ def add_to(commands: Any) -> None:
     """Add the subcommand."""
     parser = add_command(commands, "compare", compare, "tune and compare the algorithms on your own data", EXAMPLES)
     add_recorded_scene(parser)
-    add_count(parser, "--taps", help="taps of the control filters (default: found, at most 256, and 1024 in all)")
+    about = "taps of the control filters (default: chosen for the recordings, at most 256, and 1024 in all)"
+    add_count(parser, "--taps", help=about)
     about = "algorithms to compare (default: all; with several channels those that are fast enough)"
     parser.add_argument("--algorithm", metavar="NAME,...", help=about)
-    about = "of the record that is used, from its start (default: 10)"
+    about = "seconds of the recording that are used, from its start (default: 10)"
     add_number(parser, "--seconds", "s", default=10.0, help=about)
     about = "folder for the report, figures, sounds and results.json"
     add_output(parser, about, "print the figures of merit as JSON")

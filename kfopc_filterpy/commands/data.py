@@ -19,11 +19,11 @@ EXAMPLES = """examples:
 
 def add_to(commands: Any) -> None:
     """Add the subcommand."""
-    about = "list or fetch the public measured data, or say where they are"
+    about = "list or fetch the public measured data, or print their folder"
     parser = add_command(commands, "data", data, about, EXAMPLES)
     parser.add_argument("action", choices=("list", "fetch", "where"), help="what to do")
     parser.add_argument("name", nargs="*", help="data sets to list or fetch (default: all)")
-    parser.add_argument("--folder", metavar="FOLDER", help="in place of KFOPC_DATA or the cache")
+    parser.add_argument("--folder", metavar="FOLDER", help="folder of the data, in place of KFOPC_DATA or the cache")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -59,6 +59,6 @@ def data(options: argparse.Namespace) -> int:
         print(json.dumps(facts, indent=2))
         return DONE
     for name, fact in facts.items():
-        here = f"in {folder}" if fact["here"] else "not here: kfopc data fetch"
+        here = f"in {folder}" if fact["here"] else "not there: run kfopc data fetch"
         print(f"{name}: {fact['title']}, {fact['fs']:g} Hz; licence: {fact['licence']}; {here}")
     return DONE

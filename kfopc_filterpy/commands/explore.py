@@ -20,8 +20,8 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--primary", metavar="FILE", help="impulse response, reference to error microphone")
     parser.add_argument("--secondary", metavar="FILE", help="impulse response, control signal to error microphone")
     add_number(parser, "--fs", "Hz", help="resample everything to this rate")
-    add_count(parser, "--channel", 0, help="channel of files with several, from 0")
-    add_count(parser, "--port", 0, default=5006, help="port; 0 is any free one (default: 5006)")
+    add_count(parser, "--channel", 0, help="channel to read from files with several, counted from 0")
+    add_count(parser, "--port", 0, default=5006, help="port; 0 takes any free one (default: 5006)")
 
 
 def explore(options: argparse.Namespace) -> int:

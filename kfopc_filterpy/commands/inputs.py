@@ -1,4 +1,4 @@
-"""What options name: files with signals and paths, ratings, tolerances, calibrations."""
+"""Reading what the options name: files with signals and paths, ratings, tolerances, calibrations."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Files:
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
         self.fs = 0.0  # of the files that were read; 0 before the first
-        self.remarks: list[str] = []  # what resampling hides of the recordings that were read
+        self.remarks: list[str] = []  # on flaws of the recordings that resampling hides
         self._first = ""
 
     def recording(self, path: str) -> np.ndarray:
@@ -47,7 +47,7 @@ class Files:
         return channels
 
     def noise_paths(self, paths: Sequence[str], option: str, noise: np.ndarray) -> np.ndarray:
-        """Return a matrix of paths that are to go with a noise: shorter than it, and not silent."""
+        """Return a matrix of paths for a noise; they must be shorter than it, and not silent."""
         from ..paths.file_checks import require_shorter, require_sound
 
         matrix = self.matrix(paths, option, self.options.microphones)
@@ -80,7 +80,7 @@ class Files:
 
         with _file(path) as source:
             read = self._chosen(path, source, is_path, self.options.fs)
-            if not is_path and read.file_fs not in (None, read.fs):  # resampling hides that samples are equal
+            if not is_path and read.file_fs not in (None, read.fs):  # resampling would hide clipping
                 self.remarks += clipping_remarks(self._chosen(path, source, is_path, None).samples, path)
         if is_path and read.samples.shape[-1] > LONG_PATH_S * read.fs:
             seconds = read.samples.shape[-1] / read.fs
@@ -102,7 +102,7 @@ class Files:
 
 
 def _with_channel(read: Recording, path: str, channel: int | None) -> Recording:
-    """Return the channel that is chosen of a file; a file with one channel stays as it is."""
+    """Return the chosen channel of a recording; one with a single channel stays as it is."""
     from ..signals.recordings import as_channel
 
     if channel is None or read.samples.ndim == 1:
@@ -121,7 +121,7 @@ def _only_channel(read: Recording, path: str) -> np.ndarray:
 
 @contextmanager
 def _file(path: str) -> Iterator[str]:
-    """Give the name of a file, for "-" of a copy of the standard input."""
+    """Yield the name of a file, or for "-" the name of a copy of the standard input."""
     if path != STANDARD_INPUT:
         yield path
         return
@@ -246,7 +246,7 @@ def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Any:
-    """Return how far the secondary path may be wrong: by other measurements, by tolerances, or as `assess` has it."""
+    """Return how far the secondary path may be wrong: from other measurements, from tolerances, or by default."""
     from ..controllers.power_budget import DEFAULT_UNCERTAINTY
     from ..paths import PathTolerance
     from ..paths.uncertainty import as_gain_error

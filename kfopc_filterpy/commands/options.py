@@ -1,4 +1,4 @@
-"""Options as subcommands declare them: numbers that are checked by the option's name, and what several share."""
+"""Functions that declare options: numbers whose errors name the option, and options that several subcommands share."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def sentence(about: str) -> str:
 
 
 def add_command(commands: Any, name: str, run: Callable[[Any], int], about: str, examples: str) -> Parser:
-    """Add a subcommand that `run` does, and return its parser."""
+    """Add a subcommand that calls `run`, and return its parser."""
     parser = commands.add_parser(
         name,
         help=about,
@@ -37,7 +37,7 @@ def add_command(commands: Any, name: str, run: Callable[[Any], int], about: str,
 
 
 def add_number(group: Any, option: str, unit: str, check: Callable[..., float] = as_positive, **more: Any) -> None:
-    """Add an option that takes a number, which `check` of `_validate` refuses by the option's name."""
+    """Add an option that takes a number; errors of `check`, a function of `_validate`, name the option."""
     group.add_argument(option, type=_checked(float, option, check, unit=unit), **{"metavar": unit.upper()} | more)
 
 
@@ -54,25 +54,26 @@ def _checked(kind: Callable[[str], Any], option: str, check: Callable[..., Any],
             value = text  # which the check refuses
         try:
             return check(value, option, **more)
-        except (ValueError, TypeError) as error:  # argparse would replace their message by one of its own
+        except (ValueError, TypeError) as error:  # argparse would replace their message with its own
             raise argparse.ArgumentError(None, str(error)) from error
 
     return read
 
 
 def add_reading(parser: Any, about_fs: str = "resample everything to this rate", **of_fs: Any) -> None:
-    """Add the options of how files are read."""
+    """Add the options for reading files."""
     add_number(parser, "--fs", "Hz", help=about_fs, **of_fs)
-    add_count(parser, "--channel", 0, help="channel of files with several, from 0")
-    parser.add_argument("--variable", metavar="NAME", help="variable of files with several")
+    add_count(parser, "--channel", 0, help="channel to read from files with several, counted from 0")
+    parser.add_argument("--variable", metavar="NAME", help="variable to read from files with several")
 
 
 def add_scene(parser: Any, *, required: bool) -> None:
-    """Add the options of paths and disturbance."""
+    """Add the options for paths and disturbance."""
     path: dict[str, Any] = {"action": "append", "metavar": "FILE"}
     about = "impulse response, reference to error microphone; repeated for several references"
     parser.add_argument("--primary", help=about, **path)
-    parser.add_argument("--disturbance", metavar="FILE", help="recording of the error microphone, made with the noise")
+    about = "recording of the error microphone, made together with that of the noise"
+    parser.add_argument("--disturbance", metavar="FILE", help=about)
     about = "impulse response, control signal to error microphone; repeated for several loudspeakers"
     parser.add_argument("--secondary", help=about, required=required, **path)
     about = "number of error microphones (default: the channels of the first --secondary)"
@@ -81,36 +82,37 @@ def add_scene(parser: Any, *, required: bool) -> None:
 
 
 def add_recorded_scene(parser: Any) -> None:
-    """Add the options of a recorded noise, the paths and the rating."""
-    parser.add_argument("noise", help="recording of the reference microphone, loudspeaker silent; - is standard input")
+    """Add the options for a recorded noise, the paths and the rating."""
+    about = "recording of the reference microphone, made while the loudspeaker is silent; - is standard input"
+    parser.add_argument("noise", help=about)
     add_scene(parser, required=True)
     rating = parser.add_argument_group(
         "rating",
-        "of the amplifier: --watt and --ohm, or --rated-power; numbers and curves once for all loudspeakers, or once for each",
+        "--watt and --ohm of the amplifier, or --rated-power; each option once for all loudspeakers, or once for each",
     )
     each: dict[str, Any] = {"action": "append"}
     add_number(rating, "--watt", "W", help="rated power of the amplifier", **each)
-    add_number(rating, "--ohm", "ohm", help="into this resistance", **each)
+    add_number(rating, "--ohm", "ohm", help="load of these watts, or a loudspeaker's nominal impedance", **each)
     rating.add_argument(
         "--rating",
         choices=("sine", "noise"),
         default="sine",
-        help="what the watts were measured with (default: sine, the safe side)",
+        help="signal with which the watts were measured (default: sine, which is on the safe side)",
     )
     add_number(rating, "--peak-volts", "V", help="voltage at which the amplifier clips", **each)
     add_number(rating, "--volts-per-unit", "V", help="volts for a control signal of 1 (default: 1)", **each)
     add_number(rating, "--rated-power", "", metavar="P", help="rated power as mean square, in place of watts", **each)
-    about = "the loudspeaker's impedance, whose least value counts: Hz, ohm (default: --ohm)"
+    about = "the loudspeaker's impedance, whose smallest value counts, in columns of Hz and ohm (default: --ohm)"
     rating.add_argument("--impedance", metavar="CSV", help=about, **each)
     add_number(rating, "--loudspeaker-watt", "W", help="rated noise power of the loudspeaker", **each)
-    add_number(rating, "--programme-watt", "W", help="its programme power, in place of that", **each)
+    add_number(rating, "--programme-watt", "W", help="its programme power, in place of --loudspeaker-watt", **each)
     add_number(rating, "--x-max-mm", "mm", help="its largest excursion, one way", **each)
-    about = "its excursion per volt: a column of Hz, a column of mm/V, and commas"
+    about = "its excursion per volt, in columns of Hz and mm/V"
     rating.add_argument("--displacement", metavar="CSV", help=about, **each)
 
 
 def add_output(parser: Any, about: str, about_json: str) -> None:
-    """Add the options of what is written and printed."""
+    """Add the options for what is written and printed."""
     parser.add_argument("-o", "--output", metavar="FOLDER", help=about)
     parser.add_argument("--json", action="store_true", help=about_json)
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

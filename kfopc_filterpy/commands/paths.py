@@ -15,8 +15,8 @@ from .options import DONE, add_command, add_count, add_reading, sentence
 from .printing import warn
 
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
-UNRELATED, CHANCE = 0.02, 3.0  # share of a response that a path must explain, and times what chance explains
-POOR_DB = -20.0  # of the response that is left unexplained: more is too much
+UNRELATED, CHANCE = 0.02, 3.0  # a path must explain this share of a response, and this many times what chance explains
+POOR_DB = -20.0  # a warning is printed if more of the response is left unexplained
 
 
 def add_to(commands: Any) -> None:
@@ -36,7 +36,7 @@ def add_to(commands: Any) -> None:
     own.add_argument("-o", "--output", metavar="FILE", required=True, help=f"file to write: {', '.join(WRITTEN)}")
     own.add_argument("--json", action="store_true", help="print JSON")
     add_reading(own)
-    own = add("inspect", inspect, "say what an impulse response does", "S.wav --primary P.wav")
+    own = add("inspect", inspect, "describe an impulse response", "S.wav --primary P.wav")
     own.add_argument("path", help="the impulse response; - is standard input")
     about = "impulse response of the primary path, for the causality margin"
     own.add_argument("--primary", metavar="FILE", help=about)
@@ -57,7 +57,7 @@ def add_to(commands: Any) -> None:
 def _add_written(parser: Any) -> None:
     parser.add_argument("path", help="the impulse response; - is standard input")
     parser.add_argument("to", nargs="?", metavar="output", help=f"file to write: {', '.join(WRITTEN)}")
-    parser.add_argument("-o", "--output", metavar="FILE", help="the same")
+    parser.add_argument("-o", "--output", metavar="FILE", help="the same file, as an option")
 
 
 def identify(options: argparse.Namespace) -> int:
@@ -82,7 +82,7 @@ def identify(options: argparse.Namespace) -> int:
 
 
 def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float, n_samples: int) -> None:
-    """Raise ValueError if a fit explains hardly more of a response than chance would, warn if it explains little."""
+    """Raise ValueError if a fit explains hardly more of a response than chance would; warn if it explains little."""
     share = 1.0 - 10 ** (residual_db / 10)
     explained = f"explains {100 * max(share, 0.0):.1f} % of {options.response}"
     if share < max(UNRELATED, CHANCE * options.taps / n_samples):
@@ -100,7 +100,7 @@ def _judge_residual(options: argparse.Namespace, residual_db: float, fs: float, 
 
 
 def inspect(options: argparse.Namespace) -> int:
-    """Print what an impulse response does."""
+    """Print a description of an impulse response."""
     from ..paths import causality_margin
     from ..paths.file_checks import require_sound
 
@@ -141,7 +141,7 @@ def inspect(options: argparse.Namespace) -> int:
 
 
 def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
-    """Return what a path does; no band and no onset if it is silent."""
+    """Return the properties of a path; a silent one has no band and no onset."""
     from ..paths import achieved_band, causality_margin, secondary_path_gain
 
     facts: dict[str, Any] = {"n_taps": taps.size, "fs": fs, "duration_s": taps.size / fs}
@@ -157,7 +157,7 @@ def _facts(taps: np.ndarray, fs: float) -> dict[str, Any]:
 
 
 def _described(facts: dict[str, Any]) -> str:
-    """Return what a path does in two lines."""
+    """Return the properties of a path as two lines of text."""
     seconds = facts["duration_s"]
     duration = f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
     length = f"{facts['n_taps']} taps at {facts['fs']:g} Hz, {duration}"
@@ -183,7 +183,7 @@ def convert(options: argparse.Namespace) -> int:
 
 
 def _write_path(output: str, taps: np.ndarray, fs: float) -> None:
-    """Write taps in the format of the file's suffix: text has a column of times in s."""
+    """Write taps in the format that the file's suffix names; text also gets a column of times in s."""
     from ..signals import write_wav
 
     suffix = Path(output).suffix.lower()

@@ -1,4 +1,4 @@
-"""What subcommands print beside their results: warnings, notes, a progress bar."""
+"""What subcommands print besides their results: warnings, notes, a progress bar."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ EXTRA = 'install the extra `studies`: python -m pip install "kfopc-filterpy[stud
 
 
 def warn(options: argparse.Namespace, message: str, kind: str = "warning") -> None:
-    """Print a warning or a note of one line to the standard error."""
+    """Print a warning or a note to standard error, in one line."""
     print(f"{options.prog}: {kind}: {message}", file=sys.stderr)
 
 
@@ -27,7 +27,7 @@ def tell(options: argparse.Namespace, result: str, notes: Sequence[str], written
 
 @contextmanager
 def progress_bar(options: argparse.Namespace, unit: str) -> Iterator[Any]:
-    """Give a progress bar on a terminal."""
+    """Yield a progress bar, which is shown on a terminal only."""
     try:
         from tqdm import tqdm
     except ModuleNotFoundError as error:

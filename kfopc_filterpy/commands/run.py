@@ -26,9 +26,9 @@ EXAMPLES = """examples:
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --clock real --block 32
   kfopc run --device 3 --references 0 --errors 1 --outputs 0 --rated-power 0.01 --amplitude-limit 0.5
 
-With a recording, the plant is simulated; several channels are given as to kfopc verdict. With --device, --references and
---errors, it is real, at --fs or 16000 Hz: begin with a small --amplitude-limit.
-Ctrl-C fades the control out. exit code: 0 ended as asked, 1 stopped by a fault, 2 wrong input"""
+With a recording, the plant is simulated; give several channels as for kfopc verdict. With --references and --errors, it
+is real, behind a sound card at --fs or 16000 Hz: begin with a small --amplitude-limit.
+Ctrl-C fades the control out. exit code: 0 ended as requested, 1 stopped by a fault, 2 wrong input"""
 
 
 def add_to(commands: Any) -> None:
@@ -40,12 +40,12 @@ def add_to(commands: Any) -> None:
     about = "simulate as fast as possible, or in real time"
     parser.add_argument("--clock", choices=("free", "real"), default="free", help=about)
     add_count(parser, "--latency", help="samples from writing to playing (default: two blocks)")
-    parser.add_argument("--device", help="sound card, as `python -m sounddevice` lists it; default is the system's")
+    parser.add_argument("--device", help="sound card, as `python -m sounddevice` lists it (default: the system's)")
     several: dict[str, Any] = {"minimum": 0, "nargs": "+"}
-    add_count(parser, "--references", help="inputs of the reference microphones, from 0", **several)
-    add_count(parser, "--errors", help="inputs of the error microphones, from 0", **several)
-    add_count(parser, "--outputs", default=[0], help="outputs (default: 0)", **several)
-    add_count(parser, "--block", default=64, help="samples of a block (default: 64)")
+    add_count(parser, "--references", help="inputs of the reference microphones, counted from 0", **several)
+    add_count(parser, "--errors", help="inputs of the error microphones, counted from 0", **several)
+    add_count(parser, "--outputs", default=[0], help="outputs to the loudspeakers (default: 0)", **several)
+    add_count(parser, "--block", default=64, help="samples in a block (default: 64)")
     about = "rated power, a mean square"
     add_number(parser, "--rated-power", "", metavar="P", required=True, help=about)
     about = "largest control signal (default: 4 sqrt(P))"
@@ -53,13 +53,15 @@ def add_to(commands: Any) -> None:
     add_count(parser, "--taps", default=256, help="taps of the control filter (default: 256)")
     about = "seconds of control (default: until the recording ends, or Ctrl-C)"
     add_number(parser, "--seconds", "s", help=about)
-    add_number(parser, "--listen", "s", as_nonnegative, default=2.0, help="silence before (default: 2)")
-    add_number(parser, "--identify", "s", default=5.0, help="noise that is played (default: 5)")
+    about = "seconds of silence before the identification (default: 2)"
+    add_number(parser, "--listen", "s", as_nonnegative, default=2.0, help=about)
+    about = "seconds of noise played to identify the paths (default: 5)"
+    add_number(parser, "--identify", "s", default=5.0, help=about)
     parser.add_argument("--quiet", action="store_true", help="print only the result")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run, and print the result; return 1 if a fault ended it."""
+    """Run the control and print the result; return 1 if a fault stopped it."""
     from ..realtime import FaultError
     from ..realtime import run as run_supervised
 
@@ -132,7 +134,7 @@ def _simulated(options: argparse.Namespace) -> SimulatedInterface:
 
 
 def _judge_length(options: argparse.Namespace, lasts: float) -> None:
-    """Raise ValueError if a recording ends before the control begins, warn if it ends before the seconds asked."""
+    """Raise ValueError if a recording ends before the control begins, and warn if it lasts less than `--seconds`."""
     left = lasts - options.listen - options.identify
     text = (
         f"{options.noise} lasts {lasts:.3g} s, of which listening takes {options.listen:g} s and identifying "
@@ -146,7 +148,7 @@ def _judge_length(options: argparse.Namespace, lasts: float) -> None:
 
 
 def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
-    """Return KF-PB behind its limiter for what was identified."""
+    """Return KF-PB behind a limiter, for the plant that was identified."""
     from .. import OutputLimiter, kf_pb
 
     several = np.ndim(plant.taps) == 3
@@ -164,7 +166,7 @@ def _controller(plant: Any, options: argparse.Namespace, limit: float) -> Any:
 
 
 def _screen(stream: TextIO) -> Callable[[RunStatus], None]:
-    """Return what shows the status of a run: in one line of a terminal, or in a line of a file every five seconds."""
+    """Return a function that shows the status of a run: in one line on a terminal, or in a file every five seconds."""
     calls = count(1)
 
     def show(status: RunStatus) -> None:
@@ -212,7 +214,7 @@ def _summary(report: RunReport, fs: float, block: int) -> str:
     reductions = ", ".join(f"{r:.1f}" for r in report.reduction_db)
     faults = [f"{event.time_s:.2f} s: {event.what} {event.channel}".rstrip() for event in report.health.events]
     lines += [
-        f"noise reduction {reductions} dB over the second half, against the silence before",
+        f"noise reduction {reductions} dB over the second half, relative to the silence before",
         f"output power {_powers(report, ' of the rated power')}",
         f"{report.overruns} of {report.blocks} blocks took longer than their duration, the longest {100 * report.load:.0f} % "
         f"of it; {report.lost} samples lost, {report.underflows} blocks too late for the output",

@@ -21,12 +21,12 @@ EXAMPLES = """examples:
   kfopc verdict noise.wav --disturbance errors.wav --secondary S1.wav --secondary S2.wav --watt 20 --watt 10 --ohm 8
 
 several channels: those of the noise are the references, those of the disturbance the microphones. Each --secondary is one
-loudspeaker and each --primary one reference; the channels of these files are the microphones. With files of one channel,
-say how many microphones there are, and give the files source after source, for each source its microphones in order:
+loudspeaker and each --primary one reference; the channels of these files are the microphones. If each file has one
+channel, state the number of --microphones, and give the files source by source, the microphones of each in order:
   kfopc verdict noise.wav --microphones 2 --primary P11.wav --primary P21.wav \\
     --secondary S11.wav --secondary S21.wav --secondary S12.wav --secondary S22.wav --rated-power 1.6
 where S21 is loudspeaker 1 at microphone 2. An array (microphones, loudspeakers, taps) in a .npy, .mat or .sofa file holds
-all. Options of the rating are given once for all loudspeakers, or once for each, in their order.
+all of them. Give each option of the rating once for all loudspeakers, or once for each, in their order.
 
 exit code: 0 enough, 1 not enough, 2 wrong input"""
 
@@ -36,24 +36,24 @@ def add_to(commands: Any) -> None:
     parser = add_command(commands, "verdict", verdict, "say whether an amplifier is enough, and what limits", EXAMPLES)
     add_recorded_scene(parser)
     add_number(parser, "--want-db", "dB", as_nonnegative, default=6.0, help="noise reduction wanted (default: 6)")
-    about = "KF-PB (default), KF-OPC or FxLMS, behind a limiter; the others beside it"
+    about = "algorithm of the verdict, behind a limiter: KF-PB (default), KF-OPC or FxLMS; the others run beside it"
     parser.add_argument("--algorithm", default="KF-PB", help=about)
-    add_count(parser, "--taps", help="taps of the control filter (default: found, at most 256)")
-    about = "memory of KF-OPC; a length that is found suits it too (default: 0.25 s, several channels 1 s)"
+    add_count(parser, "--taps", help="taps of the control filter (default: chosen for the recordings, at most 256)")
+    about = "memory of KF-OPC; a filter length that is chosen suits it too (default: 0.25 s, with several channels 1 s)"
     add_number(parser, "--memory", "s", help=about)
     path = parser.add_argument_group(
         "secondary path",
-        "how far it may be wrong, for KF-PB, which learns it as it controls (default: a relative rms error of 0.3); "
-        "errors that are stated add up",
+        "how wrong it may be, for KF-PB, which learns it while it controls (default: a relative rms error of 0.3); "
+        "stated errors add up",
     )
     add_number(path, "--path-error-samples", "", as_nonnegative, metavar="N", help="error of its delay")
     add_number(path, "--path-error-deg", "deg", as_nonnegative, help="error of its phase")
     add_number(path, "--path-error-db", "dB", as_nonnegative, help="error of its gain")
-    about = "another measurement of it, which tells how far it may be wrong; may be repeated"
+    about = "another measurement of it, which shows how wrong it may be; can be repeated"
     path.add_argument("--secondary-again", action="append", metavar="FILE", help=about)
     about = "calibration of the error microphone, for levels in dBA; once for all microphones, or once for each"
     add_number(parser, "--pascal-per-unit", "Pa", action="append", help=about)
-    about = "recording of a sound calibrator by the error microphone, in place of that"
+    about = "recording of a sound calibrator by the error microphone, in place of --pascal-per-unit"
     parser.add_argument("--calibrator", action="append", metavar="FILE", help=about)
     add_number(parser, "--calibrator-db", "dB", as_number, default=94.0, help="its sound pressure level (default: 94)")
     add_output(parser, "folder for the page, figures, sounds and verdict.json", "print verdict.json in place of text")
@@ -61,7 +61,7 @@ def add_to(commands: Any) -> None:
 
 def verdict(options: argparse.Namespace) -> int:
     """Print a verdict, and write its page if a folder is given."""
-    if options.output is not None:  # better before the run than after it
+    if options.output is not None:  # errors come before the run, not after it
         import matplotlib
 
         from ..bench.assessment_page import require_page

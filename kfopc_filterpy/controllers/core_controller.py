@@ -45,7 +45,7 @@ Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
 
 class setting:
-    """An attribute of a controller that is the algorithm's setting of the same name, documented here."""
+    """An attribute of a controller for the algorithm's setting of the same name, with its docstring."""
 
     def __init__(self, doc: str, *, assignable: bool = False) -> None:
         self.__doc__, self.assignable = doc, assignable
@@ -65,8 +65,8 @@ class setting:
 class CoreController(BlockProcessing, Checkpointed):
     """Base class of the built-in controllers: channels, paths, limiter, constraint, and an algorithm of the core.
 
-    A subclass names its `algorithm` in C, the `checks` of its settings, and hands these over by their names in C. For an
-    algorithm of your own see `load_algorithm`.
+    A subclass names its `algorithm` in C and the `checks` of its settings, and passes the settings by their names in C.
+    For an algorithm of your own, see `load_algorithm`.
 
     Parameters
     ----------
@@ -180,13 +180,13 @@ class CoreController(BlockProcessing, Checkpointed):
         return secondary
 
     def _sample(self, value: Any, name: str, what: str) -> Any:
-        """Return a checked sample: a number, or with several channels an array of them; `what` says of which channels."""
+        """Return a checked sample: a number, or with several channels an array of them; `what` names the channels."""
         if self.multichannel:
             return channel_sample(value, getattr(self, f"n_{what}"), name, what)
         return as_number(value, name)
 
     def _shaped(self, values: np.ndarray) -> Any:
-        """Return what the core has of each channel: a number, or with several channels a copy."""
+        """Return the core's value of each channel: a number, or with several channels a copy."""
         return values.copy() if self.multichannel else float(values[0])
 
     def _each_loudspeaker(self, value: Any, name: str, check: Callable[[Any, str], float] = as_positive) -> Any:
@@ -203,13 +203,13 @@ class CoreController(BlockProcessing, Checkpointed):
         return {name: self._checked_setting(name, value) for name, value in self._settings.items()}
 
     def _checked_setting(self, name: str, value: Any) -> Any:
-        """Return a setting: a number, or an array where with several channels each has its own."""
+        """Return a checked setting: a number, or an array if each of several channels has its own."""
         check = self.checks.get(name, as_positive)
         each = self._who_has(name)
         return per_channel(value, getattr(self, f"n_{each}"), each, name, check) if each else check(value, name)
 
     def _who_has(self, name: str) -> str:
-        """Return the channels each of which has a setting of its own; "" if it is one for all, as with one channel."""
+        """Return which channels have a setting each, "loudspeakers" or "microphones"; "" if all share one."""
         each = next(one.each for one in self._algorithm().settings if one.name == name)
         return each if self.multichannel else ""
 
@@ -228,7 +228,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return limiters
 
     def _checked_constraint(self, constraint: Constraints | None) -> Any:
-        """Return a constraint, or a tuple of them; without one given, its factor is fixed at 1."""
+        """Return a constraint, or a tuple of them; if none is given, one whose factor is fixed at 1."""
         own: Any = constraint
         if constraint is None:
             own = OutputPowerConstraint(1.0)
@@ -246,7 +246,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return each
 
     def _estimated_path(self) -> np.ndarray:
-        """Return the estimated secondary path where the steps find it: what is written into it, they use."""
+        """Return the estimated secondary path in the core's memory: the steps use what is written into it."""
         path = self._opened().fields["secondary_path"][0]
         return path if self.multichannel else path[0, 0]
 
@@ -375,7 +375,7 @@ class CoreController(BlockProcessing, Checkpointed):
         """Adapt what the algorithm knows to the new estimate; `before` is the last one, of the same shape."""
 
     def _variance_by_new_path(self, before: np.ndarray) -> float:
-        """Return the variance of each weight after a new path: they are wrong by the share by which the path changed."""
+        """Return the variance of each weight after a new path: relatively, the weights are as wrong as the old path."""
         after, w = self._estimated_path(), self.weights
         energy = max(np.sum(before**2), np.sum(after**2))
         return float(np.sum((after - before) ** 2) / energy * np.mean(w**2)) if energy > 0.0 else 0.0
@@ -409,7 +409,7 @@ class CoreController(BlockProcessing, Checkpointed):
     def rated_power(self) -> Any:
         """Rated output power of the controller, or of each loudspeaker, (J,); None if it has none.
 
-        A controller that has a rated power takes another one at any time.
+        If the controller has a rated power, another one can be assigned at any time.
         """
         return self._read_rated_power()
 
@@ -429,7 +429,7 @@ class CoreController(BlockProcessing, Checkpointed):
         for constraint, power in zip(np.atleast_1d(self._own_constraint), np.atleast_1d(value), strict=True):
             constraint.rated_power = power
 
-    # What is seen.
+    # What can be read.
 
     @property
     def weights(self) -> np.ndarray:
@@ -545,7 +545,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return np.ascontiguousarray(signal)
 
     def _raise_refusal(self, reference: Any, error: Any, sample: int, status: int) -> None:
-        """Raise `RefusedUpdate` with the reason that the step gives when it is called again: it has changed nothing."""
+        """Call a refused step again, which changes nothing, and raise `RefusedUpdate` with its reason."""
         try:
             if status == REFUSED_REFERENCE:
                 self.control_signal(reference)

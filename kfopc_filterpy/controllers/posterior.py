@@ -15,7 +15,7 @@ from .core_controller import CoreController
 DEFAULT_UNCERTAINTY = 0.3  # relative rms error of a secondary path
 LEAST_SPREAD, MOST_SPREAD = 1e-4, 1e3  # of a path that is not exact
 BLOCK_S = 0.032  # from one posterior to the next, at least
-# What is known of the plant: fields of `plant.c`.
+# What is known about the plant: fields of `plant.c`.
 POSTERIOR = (
     *("plant", "plant_counts", "fits", "theta", "noise", "draws", "data", "data_of_errors", "error_energy", "factor"),
     *("inverse_diagonal", "set_aside_of_errors", "set_aside_energy", "path_correlation", "cross_correlation"),
@@ -36,7 +36,7 @@ def relative_spread(uncertainty: Any, secondary_path: Any) -> float:
 
 
 class PosteriorController(CoreController):
-    """Base class: what is known of the plant, from the fields of `plant.c`."""
+    """Base class of these controllers: what is known about the plant, read from the fields of `plant.c`."""
 
     checks = MappingProxyType({"spread": as_nonnegative})
     takes_guard = False  # the posterior knows how far the path may be off
@@ -54,13 +54,13 @@ class PosteriorController(CoreController):
 
     @property
     def identified_path(self) -> np.ndarray:
-        """Posterior mean of the secondary path, of the shape of `secondary_path`; that itself if it is exact."""
+        """Posterior mean of the secondary path, of the shape of `secondary_path`; the given path if it is exact."""
         paths = self._means()[1].copy()
         return paths if self.multichannel else paths[0, 0]
 
     @property
     def measurement_noise(self) -> Any:
-        """Power of what the plant's model does not explain, or with several channels that at each microphone, (K,).
+        """Power that the plant's model does not explain, or with several channels that at each microphone, (K,).
 
         It is 0 before the first posterior.
         """
@@ -74,7 +74,7 @@ class PosteriorController(CoreController):
         return self.n_references
 
     def _means(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the posterior means where the core has them, (K, I, N) and (K, J, M)."""
+        """Return the posterior means as the core has them, (K, I, N) and (K, J, M)."""
         block, n_references = self._opened(), self._heard_references()
         theta, given = block.fields["theta"].reshape(self.n_microphones, -1), block.fields["secondary_path"][0]
         n = n_references * (self.n_taps + given.shape[-1] - 1)
@@ -93,7 +93,7 @@ class PosteriorController(CoreController):
 
 
 class PathObserver(PosteriorController):
-    """The posterior alone: as references it takes those of the controller, and then what the loudspeakers play.
+    """The posterior alone. Its references are those of the controller, followed by what the loudspeakers play.
 
     Parameters
     ----------

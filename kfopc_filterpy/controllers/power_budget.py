@@ -31,16 +31,15 @@ class PowerBudgetController(PosteriorController):
 
     .. math:: \min_v E[(p * x - s * v * x)^2] + \lambda E[(v * x)^2]
 
-    where the expectation includes what is not known of p and s. The price follows from an account: over any
-    `averaging_s`, the mean power is kept to the rated power, and what a quiet time has left can be spent in a louder
-    one. Power is not spent where a
-    whole rating of it would save less than half of the measurement noise.
+    where the expectation includes the uncertainty of p and s. The price follows from an account: over any
+    `averaging_s`, the mean power is kept to the rated power, and what is left over in a quiet time can be spent in a
+    louder one. Power is not spent where a whole rating of it would save less than half of the measurement noise.
 
-    The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to the given
-    path with a large uncertainty. The loudspeakers play little until the path has been learned again. If no secondary path
-    explains the errors half a second later, the primary path has changed, and both are learned anew. A new
-    `secondary_path` that is assigned begins the posterior anew, also that of the primary paths; the control filter stays
-    until the first solution, and so does the account.
+    The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to the
+    given path with a large uncertainty. The loudspeakers play little until the path has been learned again. If no
+    secondary path explains the errors half a second later, the primary path has changed, and both are learned anew. If
+    a new `secondary_path` is assigned, the whole posterior begins anew, including that of the primary paths. The
+    account stays, and the control filter stays until the first solution.
 
     `kf_pb` makes it, with the same parameters, and takes suggested settings too.
 
@@ -79,9 +78,10 @@ class PowerBudgetController(PosteriorController):
 
     Notes
     -----
-    The posterior is computed again when an eighth of the data is new, or earlier if the error is large, in :math:`O((IN + JM)^3)` operations, which
-    are spread over as many blocks as they need; M are the taps of a secondary path and N = L + M - 1 those of a primary
-    one. It forgets over twice `averaging_s`. `listen` learns the primary paths before the control is switched on.
+    The posterior is computed again when an eighth of the data is new, or earlier if the error is large. This takes
+    :math:`O((IN + JM)^3)` operations, which are spread over as many blocks as they need; a secondary path has M taps,
+    and a primary one N = L + M - 1. The posterior forgets over twice `averaging_s`. `listen` learns the primary paths
+    before the control is switched on.
 
     References
     ----------
@@ -145,7 +145,7 @@ class PowerBudgetController(PosteriorController):
         return self._of_setting("rated_power")
 
     def _take_rated_power(self, value: Any) -> None:
-        """Use another rated power; what was spent before counts against the one of its time."""
+        """Use another rated power; what was spent before still counts relative to the old one."""
         self._opened().fields["rated_power"].ravel()[:] = value
 
     @property
@@ -179,8 +179,8 @@ def kf_pb(
 ) -> PowerBudgetController:
     """Return KF-PB, the Kalman filter with a power budget, which has the least error within the rated power.
 
-    It has no step size and no noise variances to tune. With one channel or several, it learns the primary and secondary paths while
-    it controls; see `controllers.PowerBudgetController`.
+    It has no step size and no noise variances to tune. With one channel or several, it learns the primary and secondary
+    paths while it controls; see `controllers.PowerBudgetController`.
 
     Parameters
     ----------

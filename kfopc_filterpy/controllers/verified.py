@@ -1,4 +1,4 @@
-"""A controller whose secondary path is verified while it is used, and which is turned down if it makes the noise louder."""
+"""A wrapper that verifies the secondary path of a controller, and silences it if it makes the noise louder."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative
 AVERAGE_S = 0.1  # of the powers that are compared
 LOUD = 10**0.3  # times the disturbance that is expected: the error is too loud
 SUSPECT = 10**0.075  # ... while the path is not known, or the control signal is turned down
-NEAR = 0.25  # ... so near to it that the path in use may be wrong
-UNSTABLE = 8.0  # times the disturbance: what the controller would hear if it played at full volume
+NEAR = 0.25  # ... so close to it that the path in use may be wrong
+UNSTABLE = 8.0  # ... of the error that is computed for full volume
 HOLD_S = 0.25  # after an alarm
-LEARN_S = 2.0  # after the error was last near the disturbance
+LEARN_S = 2.0  # after the error was last so close to the disturbance
 LEAST_VOLUME, STEP_S = 0.05, 0.1  # of a new start, and the time until it is doubled
 FIRST_PAUSE_S, LONGEST_PAUSE_S, FORGIVEN_S = 0.5, 32.0, 60.0
-LEAST_CHANGE, LARGE_CHANGE = 1e-4, 0.25  # of the energy of the path: not passed on; tried in silence first
-LOUDEST = 1e50  # of what can be learnt from, see `plant.h`
+LEAST_CHANGE, LARGE_CHANGE = 1e-4, 0.25  # of the path's energy: less is not passed on; more is tried in silence first
+LOUDEST = 1e50  # of the samples that can be learned from, see `plant.h`
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PathEvent:
         Time since the first sample, in s.
     what : str
         "alarm": the errors contradict the secondary path, which is learned anew; "full volume": the control signal is
-        no longer turned down. The others stop the control. "louder": the noise is louder than it would be without
+        no longer turned down. The other events stop the control. "louder": the noise is louder than it would be without
         control; "another path": the secondary path has drifted far; "unstable": the adaptation diverges while the control
         signal is turned down; "not finite": the control signal is NaN, Inf or above 1e50.
     """
@@ -55,26 +55,26 @@ class VerifiedController(WrappedController):
 
     .. math:: e = p * x - s * y + \text{noise}
 
-    There is no probe: the control signal itself tells what the secondary path is, as long as the primary path stays. A
-    primary path that drifts can be taken for a secondary path that changes. So the posterior counts only while the
-    error is within 6 dB of the noise without control, which the posterior expects to be :math:`p * x`: then the
-    controller gets the posterior's secondary path, and keeps its weights. If the errors contradict the posterior, this is
-    an alarm. The secondary path returns to the first one, now with a large uncertainty, and is learned again. The
-    controller does not adapt until 0.25 s have been heard.
+    There is no probe: the control signal itself reveals the secondary path, as long as the primary path does not
+    change. A drift of the primary path can be mistaken for a change of the secondary path. So the posterior is used
+    only while the error is within 6 dB of the noise without control, which the posterior expects to be :math:`p * x`.
+    The controller then gets the posterior's secondary path, and keeps its weights. If the errors contradict the
+    posterior, an alarm is raised. The secondary path returns to the first one, now with a large uncertainty, and is
+    learned again. The controller does not adapt until 0.25 s have been heard.
 
-    If the error is 3 dB louder than :math:`p * x` in the mean over 0.1 s (0.75 dB after an alarm), the loudspeakers are
-    silent at once, and a fresh copy of the controller takes over. It adapts in silence to :math:`e - \hat s * y`, what it
-    would hear at full volume. After half a second it starts. Each failure doubles this pause, up to 32 s; after a minute
-    without one, the pauses begin with half a second again. A copy also takes over if the path has changed by a quarter of
-    its energy without an alarm.
+    If the mean power of the error over 0.1 s is 3 dB above that of :math:`p * x` (0.75 dB after an alarm), the
+    loudspeakers are silenced at once, and a fresh copy of the controller takes over. In silence, it adapts to
+    :math:`e - \hat s * y`, the error that it would hear at full volume. After half a second it starts. Each failure
+    doubles this pause, up to 32 s; after a minute without one, the pauses begin with half a second again. A copy also
+    takes over if the path has changed by a quarter of its energy without an alarm.
 
-    Every start is soft, the first one too. The loudspeakers begin at a twentieth of the volume, which is doubled every
-    0.1 s, unless the noise is 0.75 dB louder than without control.
+    Every start is soft, including the first. The loudspeakers begin at a twentieth of the volume, which is doubled
+    every 0.1 s, unless the noise is 0.75 dB louder than without control.
 
-    In silence, p is learned, and so is how much louder or softer the noise is than :math:`p * x`: a noise that no
-    reference hears is expected from then on. This ratio fades within the memory.
+    In silence, p is learned, and so is the ratio of the noise to :math:`p * x`. So noise that no reference hears is
+    expected from then on. This ratio fades with the memory.
 
-    The loudspeakers are silent until there is a first posterior. `listen` gives it before the control is switched on.
+    The loudspeakers are silent until there is a first posterior. `listen` provides it before the control begins.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class VerifiedController(WrappedController):
     fs : float, default 16000
         Sample rate in Hz.
     memory_s : float, default 20
-        Memory of the posterior in s. A shorter one forgets an old path sooner, and knows a path that stays less exactly.
+        Memory of the posterior in s. A shorter one forgets an old path sooner, and learns a constant path less exactly.
     amplifier : callable or sequence of J of them, optional
         Known amplifiers, functions of a sample, as for the controller.
 
@@ -108,12 +108,12 @@ class VerifiedController(WrappedController):
 
     Notes
     -----
-    At the start, the estimated path may be wrong by the controller's `secondary_path_uncertainty`, or by 0.3 of its rms if
-    that is not set. What is learned has as many taps as the controller's path. So make the controller with a path that is
-    filled with zeros to the length of the longest path that may occur.
+    At the start, the estimated path is taken to be wrong by the controller's `secondary_path_uncertainty`, or by 0.3 of
+    its rms if that is not set. What is learned has as many taps as the controller's path. So make the controller with a
+    path that is filled with zeros to the length of the longest path that may occur.
 
-    A new start keeps the limiter, and the uncertainty and the rated power that were assigned. What was changed inside the
-    controller is lost.
+    A new start keeps the limiter, and the uncertainty and the rated power that were assigned. Other changes to the
+    controller are lost.
 
     `simulate` calls it from Python sample by sample. The core computes the posterior, as for
     `controllers.PowerBudgetController`.
@@ -171,8 +171,8 @@ class VerifiedController(WrappedController):
             memory_s=self.memory_s,
         )
         self._fresh = deepcopy(controller)
-        # The samples of a block and those before it, of which the paths have the oldest first: x, and what the controller
-        # asks for but does not get.
+        # The samples of this block and those before it, the oldest first: x, and the part of the control signal that is
+        # not played.
         self._block = self._observer.block
         self._x = np.zeros((n_references, self._observer.primary_path.shape[-1] - 1 + self._block))
         self._withheld = np.zeros((J, M - 1 + self._block))
@@ -182,11 +182,11 @@ class VerifiedController(WrappedController):
         self._stopped_at = 0  # sample of the last stop
         self._wait = 0  # samples until the volume is next changed
         self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples played since the last one
-        self._doubts = False  # whether the controller must not adapt, for the path is not known
+        self._doubts = False  # whether the controller must not adapt, because the path is not known
         self._deaf_for = 0  # samples until a fresh controller may adapt
         self._learns_for = 0  # samples for which the controller still gets the posterior's path
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
-        # Powers over AVERAGE_S: of the error; without control, as expected; of the error at full volume.
+        # Mean powers over AVERAGE_S: the error, the expected noise without control, and the error at full volume.
         self._error = self._expected = self._alone = 0.0
         self._ratio = 1.0  # of the noise to what the posterior expects, found in the last pause
         self._sums = np.zeros(2)  # energies of error and expected noise at this volume
@@ -213,10 +213,10 @@ class VerifiedController(WrappedController):
         return path if self.multichannel else path.reshape(1, 1, -1)
 
     def _use_posterior(self) -> None:
-        """Set the paths by which samples are judged, the oldest sample first."""
+        """Set the paths by which samples are judged, the tap of the oldest sample first."""
         self._s = self._paths()[..., ::-1].copy()
         self._known = self._observer.fits > 0
-        # Only in silence: what the control plays on an unknown path could be taken for a louder primary path.
+        # Only in silence: sound that is played over an unknown path could be mistaken for a louder primary path.
         if self.volume == 0.0 or self._silent_for >= self._s.shape[-1] + self._block:
             self._p = self._observer.primary_path[..., ::-1].copy()
             self._noise = float(np.sum(self._observer.measurement_noise))
@@ -236,7 +236,7 @@ class VerifiedController(WrappedController):
     # ---- Samples
 
     def control_signal(self, reference: Any) -> Any:
-        """Return the control signal y(n), turned down if it must be, for the newest reference sample x(n).
+        """Return the control signal y(n), turned down if necessary, for the newest reference sample x(n).
 
         With several channels, x(n) is (I,), and the control signal is (J,).
         """
@@ -294,7 +294,7 @@ class VerifiedController(WrappedController):
         return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
 
     def _push(self, x: np.ndarray, y: np.ndarray, withheld: np.ndarray) -> None:
-        """Take the signals of a sample whose error is still to come; y and what is withheld of it: after the amplifiers."""
+        """Take the signals of a sample whose error is still to come; `y` and `withheld` are amplifier outputs."""
         self._x[:, self._x.shape[1] - self._block + self._n] = x
         self._withheld[:, self._withheld.shape[1] - self._block + self._n] = withheld
         self._silent_for = 0 if y.any() else self._silent_for + 1
@@ -318,7 +318,7 @@ class VerifiedController(WrappedController):
     # ---- Decisions
 
     def _judge(self, error: float, expected: float, alone: float) -> None:
-        """Compare powers: silence follows at once if the control makes the noise louder."""
+        """Compare powers, and stop at once if the control makes the noise louder."""
         if not self._known:
             if self.volume > 0.0:  # another path was assigned while it plays
                 return
@@ -340,7 +340,8 @@ class VerifiedController(WrappedController):
         for line in (self._x, self._withheld):
             line[:, : -self._block] = line[:, self._block :].copy()
         self._n = 0
-        # A good result needs no other path: the posterior may have taken a primary path that drifts for a secondary one.
+        # While the noise is reduced well, the path is kept: the posterior may have mistaken a drift of the primary path
+        # for one of the secondary path.
         is_near = self.volume < 1.0 or self._error > NEAR * self._expected
         self._learns_for = round(LEARN_S * self.fs) if is_near else max(self._learns_for - self._block, 0)
         if self._observer.alarms > self._alarms:
@@ -348,7 +349,7 @@ class VerifiedController(WrappedController):
         is_new = self._since_alarm < HOLD_S * self.fs  # the posterior knows little of the path
         if is_new and is_near and not self._doubts and self.volume == 1.0:
             self._note("alarm")
-        self._doubts = is_new and is_near and self.volume == 1.0  # softly, the controller plays by the path that it had
+        self._doubts = is_new and is_near and self.volume == 1.0  # turned down, it adapts with the path that it had
         if self._known and self._learns_for and not is_new:
             new, old = self._observer.identified_path, self._paths()
             change = np.sum((new - old) ** 2) / max(np.sum(old**2), np.finfo(float).tiny)
@@ -356,7 +357,7 @@ class VerifiedController(WrappedController):
                 if change > LARGE_CHANGE and self.volume == 1.0 and self._since_alarm > self.fs:
                     self._stop("another path")
                 self.controller.secondary_path = self._shaped_path(new)
-        if self.volume > 0.0:  # silence says nothing of the path
+        if self.volume > 0.0:  # silence says nothing about the path
             self._since_alarm += self._block
         self._use_posterior()
         self._ratio **= math.exp(-self._block / (self.memory_s * self.fs))
@@ -381,11 +382,11 @@ class VerifiedController(WrappedController):
             self._note("full volume")
 
     def _stop(self, what: str) -> None:
-        """Be silent, and let a fresh controller adapt in silence, with the path and the limiter in use."""
-        if self.volume > 0.0 or not self.events or self.events[-1].what != what:  # else as before, in the same silence
+        """Silence the loudspeakers, and let a fresh controller adapt, with the path and the limiter in use."""
+        if self.volume > 0.0 or not self.events or self.events[-1].what != what:  # else it repeats the last event
             self._note(what)
         before, self.controller = self.controller, deepcopy(self._fresh)
-        if what == "unstable":  # by a path of which too little was heard: it plays by the first one until more is known
+        if what == "unstable":  # with a path learned from too little: the first one is used until more is known
             self._since_alarm = 0
         else:
             self.controller.secondary_path = before.secondary_path
@@ -397,7 +398,7 @@ class VerifiedController(WrappedController):
         if not self._pause_s or (self.volume > 0.0 and what != "another path"):  # a failure that was heard
             self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
-        self._deaf_for = max(self._deaf_for, self._p.shape[-1])  # it has no past: first it hears the references
+        self._deaf_for = max(self._deaf_for, self._p.shape[-1])  # it has no past: first it only hears references
         self._error = self._alone = self._expected
         self._sums = np.zeros(2)
 
