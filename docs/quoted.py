@@ -448,7 +448,7 @@ def _further() -> Iterator[Quote]:
     yield quote("tracking", "by {:.1f} dB on average. Just after", "The mean NSE over the whole run", 0)
     yield Quote(
         "studies.md",
-        "by {:.1f} dB on the built-in duct if the sign changes (KF-OPC: {:.1f} dB), and by {:.1f} dB on the measured one ({:.1f} dB)",
+        "by {:.1f} dB on the built-in duct if its sign changes (KF-OPC: {:.1f} dB), and by {:.1f} dB on the measured one ({:.1f} dB)",
         ("tracking",),
         lambda r: [_tracked(r, "sign", path, name) for path in DUCT_PAIR for name in ("KF-PB", "KF-OPC")],
         "python -m comparisons tracking",

@@ -57,7 +57,8 @@ class VerifiedController(WrappedController):
 
     There is no probe: the control signal itself reveals the secondary path, as long as the primary path does not
     change. A drift of the primary path can be mistaken for a change of the secondary path. So the posterior is used
-    only while the error is within 6 dB of the noise without control, which the posterior expects to be :math:`p * x`.
+    only while the error is within 6 dB of the noise without control, which the posterior expects to be :math:`p * x`,
+    and for two seconds after that.
     The controller then gets the posterior's secondary path, and keeps its weights. If the errors contradict the
     posterior, an alarm is raised. The secondary path returns to the first one, now with a large uncertainty, and is
     learned again. The controller does not adapt until 0.25 s have been heard.

@@ -1,5 +1,5 @@
-/* The posterior of the plant alone, beside a controller of any kind: its references are x, and then what the loudspeakers
- * play. It plays nothing itself. */
+/* The posterior of the plant alone, used beside any controller. Its references are x, followed by what the loudspeakers play.
+ * It plays nothing itself. */
 #include "plant.h"
 
 enum { BLOCK, WINDOW, SPREAD };
@@ -36,7 +36,7 @@ static void start_observer(anc_view *view, const anc_plan *plan, const anc_setti
     start_posterior(&f->plant, *f->s.setting[SPREAD]);
 }
 
-/* Note a sample; at the end of a block, learn. */
+/* Take a sample; at the end of a block, learn. */
 static int note(anc_view *view, const real *error)
 {
     observer *f = (observer *)view;

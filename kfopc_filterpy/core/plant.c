@@ -2,11 +2,11 @@
 #include <string.h>
 
 static const real UNKNOWN = 2;                          /* after an alarm: rms error of a secondary path, over the path */
-static const real KEPT = 4, FORGOTTEN = (real)0.0625;   /* after an alarm: samples a tap that the data of p count as; if p has changed */
-enum { FROM = 9, TO = 16, MANY = 4 };                   /* blocks after an alarm, and how many of them show that p has changed */
+static const real KEPT = 4, FORGOTTEN = (real)0.0625;   /* samples per tap that the data of p count as: after an alarm; if p has changed too */
+enum { FROM = 9, TO = 16, MANY = 4 };                   /* blocks after an alarm that are judged, and how many must exceed its limit to show that p has changed */
 static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
-enum { QUIET = 31 };                                    /* blocks from the first fit after an alarm to the next alarm, at least */
-static const real KNOWN = (real)0.05;                    /* no alarm before as much of the memory was heard */
+enum { QUIET = 31 };                                    /* blocks, at least, from the first fit after an alarm to the next alarm */
+static const real KNOWN = (real)0.05;                    /* no alarm until this share of the memory has been heard */
 static const double WORK = 67108864;                    /* operations of a factorisation in a block, 2^26 */
 
 /* Correlations. Every sum is in the order of k, whatever the number of sums that are formed at once. */
@@ -123,7 +123,7 @@ static real precision_of(const plant *f, int32_t i, real size)
     return i < f->I * f->N ? f->numbers->prior : (real)f->M / (f->numbers->spread * f->numbers->spread * size);
 }
 
-/* Set aside the data of now for a factorisation. */
+/* Set aside the present data for a factorisation. */
 static void begin_fit(plant *f)
 {
     const int32_t split = f->I * f->N, n = f->n;
@@ -294,7 +294,7 @@ static void end_fit(plant *f, real q, real size)
     f->counts[DOUBTFUL] = 0, f->counts[STALE] = 1;
 }
 
-/* Do a block's part of the factorisation, about as much as in any other block. */
+/* Do this block's part of the factorisation; every block does about as much. */
 static void go_on_fitting(plant *f)
 {
     const real q = mean_noise(f), size = size_of_path(f);
@@ -337,7 +337,7 @@ static void explain(const plant *f, const real *theta, real *d, real *z)
     }
 }
 
-/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known; note that limit. */
+/* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known yet. If so, note the limit. */
 static int is_alarm(const plant *f, real unexplained, real d2, real q)
 {
     const plant_numbers *known = f->numbers;
@@ -355,7 +355,7 @@ static int is_alarm(const plant *f, real unexplained, real d2, real q)
     return 1;
 }
 
-/* Return whether other secondary paths do not explain the errors after an alarm: the primary ones have changed. */
+/* Return whether no secondary path explains the errors after an alarm: then the primary paths have changed. */
 static int is_wrong(plant *f, real unexplained)
 {
     const int32_t fitted_for = f->counts[AGE] - f->delay; /* blocks; a fit takes `delay` */
@@ -364,7 +364,8 @@ static int is_wrong(plant *f, real unexplained)
     return fitted_for == TO && f->counts[WRONG] >= MANY;
 }
 
-/* The secondary paths have changed: they return to their prior; of the primary paths, some samples a tap are kept. */
+/* Begin anew after a change: the secondary paths return to their prior; of the data of the primary paths, some samples per tap
+ * are kept. */
 static void begin_anew(plant *f, real samples)
 {
     const int32_t n = f->n, split = f->I * f->N;
@@ -445,7 +446,7 @@ static void add_block(plant *f, real forget)
     }
 }
 
-/* Learn from a block whose errors are all known, after as many as a primary path has taps. */
+/* Learn from a block whose errors are all known; at least as many samples as a primary path has taps have been heard. */
 static void learn_heard(plant *f, real forget)
 {
     const int32_t B = f->B;
@@ -455,7 +456,7 @@ static void learn_heard(plant *f, real forget)
     plant_numbers *numbers = f->numbers;
     for (int32_t k = 0; k < f->K; k++) {
         real *error = f->errors + times(k, B);
-        for (int32_t j = 0; f->exact && j < f->J; j++) /* s^ is right: what it plays is no news */
+        for (int32_t j = 0; f->exact && j < f->J; j++) /* s^ is exact: what is played teaches nothing */
             correlate(part, f->path + times(k * f->J + j, f->M), f->M, history_of(f, f->I + j), B), add_to(error, part, B);
         explain(f, f->theta + times(k, f->n), d, z);
         d2 += dot(d, d, B);
@@ -474,7 +475,7 @@ static void learn_heard(plant *f, real forget)
     } else if (is_wrong(f, unexplained)) {
         begin_anew(f, FORGOTTEN);
         for (int32_t k = 0; k < f->K; k++) f->q[k] = numbers->before;
-        numbers->limit = 0; /* once for an alarm */
+        numbers->limit = 0; /* only once per alarm */
     }
     else if (known && *f->fits && d2 > 0 && !f->counts[DOUBTFUL]) {
         const real share = unexplained < d2 ? unexplained / d2 : 1;

@@ -12,7 +12,7 @@ typedef struct {
     real samples, fitted;      /* that the data stand for, and those of the last fit; both fade */
     real spread, prior;        /* rms error of s^ over the path; precision of a tap of p, 0: not known yet */
     real misfit, seen;         /* mean of (unexplained / d^2)^2, and its weight */
-    real limit, before;        /* of the last alarm: what was exceeded; the noise */
+    real limit, before;        /* at the last alarm: the limit that was exceeded; the noise before it */
     real set_aside;            /* samples of the pending factorisation */
 } plant_numbers;
 
@@ -47,9 +47,9 @@ void start_posterior(plant *f, real spread);
 static inline real *history_of(const plant *f, int32_t signal) { return f->z + times(signal, f->history); } /* x, then y */
 /* Return where the newest sample of x or y belongs. */
 static inline real *place_of(const plant *f, int32_t signal) { return history_of(f, signal) + (f->B - 1 - f->heard[FILLED]); }
-/* Take the errors of the newest samples, NULL: they were not heard. Return whether the block is complete. */
+/* Take the errors of the newest samples; NULL if they were not heard. Return whether the block is complete. */
 int complete_sample(plant *f, const real *error);
-/* Learn from a complete block, whose errors are overwritten. `forget` is the window of the data for a block. */
+/* Learn from a complete block, whose errors are overwritten. `forget` is the factor by which the data fade in a block. */
 void learn(plant *f, real forget);
 void begin_block(plant *f);
 /* Set ss and ps to those of the posterior, summed over microphones: with a ~ b for sum_m a(m + u) b(m), ss_ja is
@@ -74,7 +74,7 @@ static inline real faded(real sum, real forget, real more)
     return next < NEARLY_ZERO && next > -NEARLY_ZERO ? 0 : next;
 }
 
-/* No sample that is learnt from is louder, neither x and e nor what is played, so no sum of products overflows. */
+/* No sample that is learned from is louder than this, whether x, e or what is played, so no sum of products overflows. */
 #ifdef ANC_FLOAT
 static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f;
 #else
