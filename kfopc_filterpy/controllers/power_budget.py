@@ -32,7 +32,7 @@ class PowerBudgetController(PosteriorController):
     .. math:: \min_v E[(p * x - s * v * x)^2] + \lambda E[(v * x)^2]
 
     where the expectation includes the uncertainty of p and s. The price follows from an account: over any
-    `averaging_s`, the mean power is kept to the rated power, and what is left over in a quiet time can be spent in a
+    `averaging_s`, the mean power is kept to the rated power (what goes beyond 1.04 times is clipped), and what is left over in a quiet time can be spent in a
     louder one. Power is not spent where a whole rating of it would save less than half of the measurement noise.
 
     The secondary path is verified while it is used. If the errors contradict the posterior, an alarm resets it to the

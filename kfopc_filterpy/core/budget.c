@@ -19,6 +19,7 @@ static const real ACCOUNT = 0.25f;    /* the price falls to (1 - ACCOUNT)^16 = 0
 static const real WORTHWHILE = 0.5f; /* a rating of power must save at least this share of the noise */
 static const real NEAR = (real)0.005;/* of the power that a price is to yield */
 static const real LEAST_SHARE = (real)0.02; /* of the account, that a filter may always spend */
+static const real MOST = (real)1.04; /* of the account, that is never exceeded: what goes beyond it is clipped */
 enum { SCALES = 3, TWICE = 2 };       /* what lasted t may go on for twice as long */
 enum { SHORTEST = 20 };               /* ... and for a twentieth of the averaging time */
 /* t: exponential windows of the averaging time over these. The filter is solved for the references of the first. */
@@ -36,7 +37,7 @@ typedef struct {
     signals s;
     plant plant;
     int32_t T, lags;             /* blocks of the account */
-    real *asked;                 /* (2, J) now; sum of squares of the block */
+    real *asked;                 /* (3, J) now; sum of squares of the block; the most that this sum may become */
     int32_t *controlled;         /* whether control was on in the block */
     real *R, *short_R;           /* (I, I, lags), (SCALES, I, I, L) windowed sums of x_i(t) x_a(t - l) */
     real *weight;                /* (1 + SCALES) of these windows */
@@ -86,7 +87,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     layout_posterior(&f->plant, s, (int32_t)block, !own || own[SPREAD - 1] == 0, at);
     const int32_t I = s->I, L = s->L, N = f->plant.N, lags = L + N;
     f->T = (int32_t)averaging, f->lags = lags, f->width = 2 * lags + f->plant.B;
-    f->asked = reals(at, "asked", ANC_STATE, 1, 1, 2, J);
+    f->asked = reals(at, "asked", ANC_STATE, 1, 1, 3, J);
     f->controlled = int32s(at, "controlled", ANC_STATE, 1);
     f->R = reals(at, "reference_correlation", ANC_STATE, 1, I, I, lags);
     f->short_R = reals(at, "short_correlations", ANC_STATE, SCALES, I, I, L);
@@ -105,12 +106,24 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, WORKS, f->width);
 }
 
+/* Set what each loudspeaker may spend in the next block, whatever its filter asks for. */
+static void set_room(budget *f)
+{
+    const int32_t J = f->s.J;
+    for (int32_t j = 0; j < J; j++) {
+        real spent = 0;
+        for (int32_t t = 0; t < f->T; t++) spent += f->book[times(t, J) + (size_t)j];
+        f->asked[2 * J + j] = larger(MOST * (real)f->T - spent, 0) * (real)f->plant.B * f->s.setting[RATED_POWER][j];
+    }
+}
+
 static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings)
 {
     budget *f = (budget *)view;
     start_signals(&f->s, plan, settings);
     start_posterior(&f->plant, *f->s.setting[SPREAD]);
     for (size_t n = 0; n < times(f->T, f->s.J); n++) f->book[n] = 1; /* spent before the start */
+    set_room(f);
 }
 
 static real *work_row(const budget *f, int32_t row) { return f->work + times(row, f->width); }
@@ -474,6 +487,7 @@ static void end_block(budget *f)
     if (*f->plant.fits) solve_all(f);
     *f->controlled = 0;
     memset(f->asked + J, 0, sizeof(real) * (size_t)J);
+    set_room(f);
     begin_block(&f->plant);
 }
 
@@ -506,7 +520,8 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
     if (f->plant.heard[AWAITED]) note(f, NULL, 1); /* that error never came */
     const int refused = take_reference(s, reference);
     for (int32_t j = 0; !refused && j < s->J; j++) {
-        f->asked[j] = filter_output(s, j);
+        const real y = filter_output(s, j), left = larger(f->asked[2 * s->J + j] - f->asked[s->J + j], 0);
+        f->asked[j] = y * y <= left ? y : y < 0 ? -root(left) : root(left);
         emit(s, j, f->asked[j]);
         control[j] = s->control[j];
     }

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from helpers.channels import random_paths
 from helpers.comparing import assert_same_run
+from scipy.signal import butter, lfilter
 
 from kfopc_filterpy import (
     HardClipAmplifier,
@@ -319,6 +320,17 @@ def test_a_primary_path_that_flips_is_learnt_again(uncertainty: float | None) ->
     reductions = [noise_reduction_db(r.error[last], r.disturbance[last], steady=1.0) for r in (before, after)]
     assert controller.alarms == 1
     assert reductions[1] > reductions[0] - 1.0
+
+
+def test_the_account_has_a_hard_end() -> None:
+    """A noise with new frequencies, thirty times as loud, meets a filter that was made for low ones."""
+    low = lfilter(*butter(4, 0.1), noise(12.0, 3))
+    x = np.concatenate([low / np.std(low), 30.0 * noise(6.0, 4)])
+    controller = made(rated_power=0.02)
+    result = run(controller, x)
+    assert worst_mean(result.control_signal) > 1.0 * 0.02
+    assert worst_mean(result.control_signal) < 1.04 * 0.02 * (1 + 1e-9)
+    assert np.any(result.control_signal[-round(FS) :])
 
 
 def test_a_path_that_stays_raises_none() -> None:

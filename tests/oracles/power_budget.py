@@ -31,6 +31,7 @@ SURPRISE, MISFIT, USUAL = (
 )  # alarm: times the noise and the doubt; least share of the disturbance; times the usual misfit
 ACCOUNT = 4.0  # the price falls to (1 - 4/16)^16 = 0.01 of itself if nothing of the account is spent
 WORTHWHILE = 0.5  # a rating of power must save at least this share of the measurement noise
+MOST = 1.04  # of the account, that is never exceeded: what goes beyond it is clipped
 WINDOW = 8  # the filter is solved for the references of an exponential window of the averaging time over this
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
@@ -286,16 +287,19 @@ class PowerBudget(Controller):
         self.book = np.ones(
             (self.blocks, J)
         )  # power of each block over the rating, newest first; spent before the start
+        self.set_room()
         self.price, self.steady_price, self.held_price = np.zeros(J), np.zeros(J), np.zeros(J)
         self.alarms = 0
 
     def output(self):
         """Return y_j = sum_i v_ji * x_i, and note what is asked."""
-        self.asked = super().output()
+        y, left = super().output(), np.maximum(self.room - self.sum, 0.0)
+        self.asked = np.where(y**2 <= left, y, np.copysign(np.sqrt(left), y))
         return self.asked
 
     def adapt(self, e):
         """Note the sample; `e` None: it was not heard."""
+        self.sum = self.sum + self.asked**2
         self.note(e, self.asked**2)
 
     def follow(self):
@@ -325,6 +329,7 @@ class PowerBudget(Controller):
         self.take_references()
         if asked is not None:
             self.book = np.concatenate([[asked / self.rated_power], self.book[:-1]])
+        self.set_room()
         if e is not None and self.heard >= self.N:
             self.alarms += self.plant.learn(
                 self.x_past, self.y_past, e, self.heard / B * (1 - self.plant.forget) >= KNOWN
@@ -332,6 +337,11 @@ class PowerBudget(Controller):
         self.heard += B
         if self.plant.fits:
             self.solve()
+
+    def set_room(self):
+        """Set what each loudspeaker may spend in the next block, whatever its filter asks for."""
+        left = np.maximum(MOST * self.blocks - np.sum(self.book, axis=0), 0.0)
+        self.room, self.sum = left * self.B * self.rated_power, np.zeros(len(left))
 
     def take_references(self):
         """Add the block to the windows of the references; x is zero before the first, so they are positive definite."""
