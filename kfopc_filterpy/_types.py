@@ -17,7 +17,8 @@ FloatArray: TypeAlias = NDArray[np.float64]  # what functions return: float64, o
 NumberOrArray: TypeAlias = Any
 PerLoudspeaker: TypeAlias = float | ArrayLike  # one number for all loudspeakers, or one for each, (J,)
 PerMicrophone: TypeAlias = float | ArrayLike  # one number for all microphones, or one for each, (K,)
-Seed: TypeAlias = int | Sequence[int] | np.random.SeedSequence | np.random.Generator  # what rng= takes
+# What rng= takes; in quotes, because numpy imports numpy.random when it is first used.
+Seed: TypeAlias = "int | Sequence[int] | np.random.SeedSequence | np.random.Generator"
 
 # One path: its taps, (n_taps,), or a discrete-time system of python-control.
 System: TypeAlias = "control.TransferFunction | control.StateSpace"

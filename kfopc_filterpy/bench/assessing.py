@@ -22,7 +22,7 @@ from kfopc_filterpy._validate import (
     per_channel,
 )
 from kfopc_filterpy.bounds import coherence_bound
-from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
+from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,

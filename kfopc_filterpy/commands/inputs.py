@@ -249,7 +249,7 @@ def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
 
 def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Uncertainty:
     """Return how far the secondary path may be wrong: from other measurements, from tolerances, or by default."""
-    from ..controllers.power_budget import DEFAULT_UNCERTAINTY
+    from ..controllers.posterior import DEFAULT_UNCERTAINTY
     from ..paths import PathTolerance
     from ..paths.uncertainty import as_gain_error
 
