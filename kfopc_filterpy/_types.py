@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 if TYPE_CHECKING:
     import control
+    import numpy as np
 
-FloatArray: TypeAlias = NDArray[np.float64]  # what functions return: float64, of any shape
 # A float with one channel, with several an array with a number for each, (n,). As with numpy's own functions that return
 # a number or an array, it is Any: with a union, a type checker would have every caller check which of them came.
 NumberOrArray: TypeAlias = Any
 PerLoudspeaker: TypeAlias = float | ArrayLike  # one number for all loudspeakers, or one for each, (J,)
 PerMicrophone: TypeAlias = float | ArrayLike  # one number for all microphones, or one for each, (K,)
-# What rng= takes; in quotes, because numpy imports numpy.random when it is first used.
+# What rng= takes; in quotes, because numpy imports numpy.random only when it is first used.
 Seed: TypeAlias = "int | Sequence[int] | np.random.SeedSequence | np.random.Generator"
 
 # One path: its taps, (n_taps,), or a discrete-time system of python-control.

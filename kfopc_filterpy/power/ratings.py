@@ -385,7 +385,7 @@ def _limits(rating: Any) -> OutputLimits:
     raise TypeError(f"rating must be a rated power, an AmplifierRating or a LoudspeakerRating, got {rating!r}")
 
 
-def as_curve(value: float | Sequence[ArrayLike], name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
+def as_curve(value: float | Sequence[ArrayLike] | np.ndarray, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve's frequencies and values; one number holds at all frequencies."""
     if not isinstance(value, list | tuple | np.ndarray):
         return np.array([0.0]), np.array([as_positive(value, name, unit=unit)])
