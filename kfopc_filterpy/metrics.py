@@ -23,7 +23,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from ._types import NumberOrArray, PerLoudspeaker
 from ._validate import (
     as_band,
     as_choice,
@@ -59,7 +61,9 @@ SOUND_PRESSURE = 2e-5  # Pa, the reference of sound pressure levels
 _LOBE_BINS = 4
 
 
-def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005, *, runs: bool = False) -> np.ndarray:
+def nse_db(
+    error: ArrayLike, disturbance: ArrayLike, fs: float, window_s: float = 0.005, *, runs: bool = False
+) -> np.ndarray:
     """Return the normalised squared error, 10 log10(sum e² / sum d²) over a sliding window.
 
     Sample n looks at the window that ends with n, so it never sees the future. The first samples look at the samples
@@ -101,7 +105,7 @@ def nse_db(error: Any, disturbance: Any, fs: float, window_s: float = 0.005, *, 
     return _ratio_db(_sliding_sum(_energy(e), width), _sliding_sum(_energy(d), width))
 
 
-def noise_reduction_db(error: Any, disturbance: Any, *, steady: float = 0.5, runs: bool = False) -> float:
+def noise_reduction_db(error: ArrayLike, disturbance: ArrayLike, *, steady: float = 0.5, runs: bool = False) -> float:
     """Return the noise reduction, -10 log10(sum e² / sum d²) over the steady portion.
 
     Parameters
@@ -132,7 +136,7 @@ def noise_reduction_db(error: Any, disturbance: Any, *, steady: float = 0.5, run
     return -float(_ratio_db(np.sum(_steady_part(e, steady) ** 2), np.sum(_steady_part(d, steady) ** 2)))
 
 
-def output_power(control_signal: Any, *, steady: float = 0.5, runs: bool = False) -> Any:
+def output_power(control_signal: ArrayLike, *, steady: float = 0.5, runs: bool = False) -> NumberOrArray:
     """Return the output power, the mean square of the control signal before the amplifier, over the steady portion.
 
     Parameters
@@ -160,7 +164,7 @@ def output_power(control_signal: Any, *, steady: float = 0.5, runs: bool = False
     return _figure(np.mean(y**2, axis=(0, -1)))
 
 
-def short_time_power(signal: Any, fs: float, window_s: float, *, runs: bool = False) -> np.ndarray:
+def short_time_power(signal: ArrayLike, fs: float, window_s: float, *, runs: bool = False) -> np.ndarray:
     """Return the mean square of a signal over a sliding window.
 
     Sample n looks at the window that ends with n. The first samples look at the samples there are, without padding.
@@ -196,7 +200,9 @@ def short_time_power(signal: Any, fs: float, window_s: float, *, runs: bool = Fa
     return _sliding_sum(power, width) / np.minimum(np.arange(1, power.shape[-1] + 1), width)
 
 
-def overshoot(control_signal: Any, rated_power: Any, fs: float, *, window_s: float = 0.05, runs: bool = False) -> Any:
+def overshoot(
+    control_signal: ArrayLike, rated_power: PerLoudspeaker, fs: float, *, window_s: float = 0.05, runs: bool = False
+) -> NumberOrArray:
     """Return the peak of the short-time output power over the whole run, divided by the rated power.
 
     Parameters
@@ -235,7 +241,9 @@ def overshoot(control_signal: Any, rated_power: Any, fs: float, *, window_s: flo
     return _figure(peak / rated)
 
 
-def clipped_fraction(control_signal: Any, limit: Any, *, steady: float = 0.5, runs: bool = False) -> Any:
+def clipped_fraction(
+    control_signal: ArrayLike, limit: float | ArrayLike, *, steady: float = 0.5, runs: bool = False
+) -> NumberOrArray:
     """Return the share of the samples of the control signal beyond the amplifier's limit, in the steady portion.
 
     Parameters
@@ -269,7 +277,7 @@ def clipped_fraction(control_signal: Any, limit: Any, *, steady: float = 0.5, ru
     return _figure(np.mean(np.where(np.isnan(y), np.nan, beyond), axis=(0, -1)))
 
 
-def peak_control_signal(control_signal: Any, *, steady: float = 0.5, runs: bool = False) -> Any:
+def peak_control_signal(control_signal: ArrayLike, *, steady: float = 0.5, runs: bool = False) -> NumberOrArray:
     """Return the largest magnitude of the control signal in the steady portion.
 
     Parameters
@@ -296,8 +304,8 @@ def peak_control_signal(control_signal: Any, *, steady: float = 0.5, runs: bool 
 
 
 def convergence_time_s(
-    error: Any,
-    disturbance: Any,
+    error: ArrayLike,
+    disturbance: ArrayLike,
     fs: float,
     *,
     window_s: float = 0.005,
@@ -365,7 +373,13 @@ def convergence_time_s(
 
 
 def harmonics_db(
-    error: Any, disturbance: Any, fundamental_hz: float, fs: float, *, steady: float = 0.5, runs: bool = False
+    error: ArrayLike,
+    disturbance: ArrayLike,
+    fundamental_hz: float,
+    fs: float,
+    *,
+    steady: float = 0.5,
+    runs: bool = False,
 ) -> float:
     """Return the error's power at 2 to 10 times the fundamental over the disturbance's power at the fundamental.
 
@@ -441,8 +455,8 @@ class CoherenceAndGain(NamedTuple):
 
 
 def coherence_and_gain(
-    disturbance: Any,
-    anti_noise: Any,
+    disturbance: ArrayLike,
+    anti_noise: ArrayLike,
     fs: float,
     band: tuple[float, float],
     *,
@@ -517,7 +531,7 @@ def coherence_and_gain(
 
 
 def power_spectrum_db(
-    signal: Any,
+    signal: ArrayLike,
     fs: float,
     *,
     steady: float = 0.5,
@@ -572,7 +586,7 @@ def power_spectrum_db(
     return frequencies, _ratio_db(power.mean(axis=0), 1.0)
 
 
-def a_weighting_db(frequencies_hz: Any) -> np.ndarray:
+def a_weighting_db(frequencies_hz: ArrayLike) -> np.ndarray:
     r"""Return the frequency weighting A in dB, 0 dB at 1 kHz.
 
     It is the formula of IEC 61672-1 with the poles at 20.6, 107.7, 737.9 and 12194 Hz:
@@ -621,7 +635,9 @@ def _a_response(f: np.ndarray) -> np.ndarray:
     )
 
 
-def a_weighted_level_db(signal: Any, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5) -> Any:
+def a_weighted_level_db(
+    signal: ArrayLike, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5
+) -> NumberOrArray:
     """Return the A-weighted level, in dBA if the signal is a sound pressure in Pa.
 
     It is the equivalent level of the steady portion. The weighting is applied to the spectrum.
@@ -655,7 +671,7 @@ def a_weighted_level_db(signal: Any, fs: float, *, reference: float = SOUND_PRES
 
 
 def third_octave_levels_db(
-    signal: Any, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5
+    signal: ArrayLike, fs: float, *, reference: float = SOUND_PRESSURE, steady: float = 0.5
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the levels in third-octave bands from 25 Hz on.
 

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from kfopc_filterpy import KFOPC
+
 from . import variants
 
 if TYPE_CHECKING:
@@ -134,7 +136,7 @@ def worst_sample(taps: int, samples: int = WORST_SAMPLES) -> dict[str, float]:
 
 def first_samples_us(taps: int) -> float:
     """Return the usual time of an update after a large P(0|0), here 1 with q = 1e-3, which is computed carefully."""
-    kf = variants.KFOPC.random_walk(taps, state_noise=variants.R, measurement_noise=1e-3)
+    kf = KFOPC.random_walk(taps, state_noise=variants.R, measurement_noise=1e-3)
     x = variants.signal(taps, 60)
     times = []
     for k in range(60):

@@ -12,6 +12,7 @@ import numpy as np
 from kfopc_filterpy import FxLMS, OutputPowerConstraint, SimulationResult, kf_opc, kf_pb, simulate
 from kfopc_filterpy.bounds import SuggestedSettings
 
+from .._types import ProgressBar
 from .limits import ChannelLimits, Limits, amplifiers, clipping_limits, each_of, scaled
 from .registry import REGISTRY
 from .scene import Runs, Scene
@@ -151,7 +152,7 @@ def recorded_scene(
     )
 
 
-def announce(bar: Any, samples: int, description: str) -> None:
+def announce(bar: ProgressBar | None, samples: int, description: str) -> None:
     """Add samples to a bar's total, and say what begins."""
     if bar is not None:
         bar.total = (bar.total or 0) + samples

@@ -5,9 +5,10 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.signal import welch
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power, suggest_settings
@@ -21,7 +22,7 @@ from kfopc_filterpy._validate import (
     per_channel,
 )
 from kfopc_filterpy.bounds import coherence_bound
-from kfopc_filterpy.controllers.power_budget import DEFAULT_UNCERTAINTY
+from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import (
     a_weighted_level_db,
@@ -36,11 +37,16 @@ from kfopc_filterpy.paths.file_checks import require_heard, require_sound
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
+from .._types import PathModels, ProgressBar
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
 from .fixed_filters import FixedFilters, longest_filter
 from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
 from .scene import Runs, one_blas_thread
+
+if TYPE_CHECKING:
+    from ..bench.limits import Ratings
+    from ..paths.uncertainty import Uncertainty
 
 MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
@@ -50,22 +56,22 @@ NEARLY_FREE = 1e6  # times the rated power: an amplifier without limits
 
 @one_blas_thread()
 def assess(
-    noise: Any,
-    primary: Any,
-    secondary: Any,
+    noise: ArrayLike,
+    primary: PathModels,
+    secondary: PathModels,
     *,
-    rating: Any,
+    rating: Ratings,
     fs: float,
-    disturbance: Any = None,
+    disturbance: ArrayLike | None = None,
     want_db: float = 6.0,
     algorithm: str = "KF-PB",
     beside: Sequence[str] | None = None,
     n_taps: int | None = None,
     memory_s: float | None = None,
-    secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY,
-    pascal_per_unit: Any = None,
+    secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
+    pascal_per_unit: ArrayLike | None = None,
     switch_on_s: float | None = None,
-    bar: Any = None,
+    bar: ProgressBar | None = None,
 ) -> Assessment:
     """Return the verdict on an amplifier: whether it buys a noise reduction, what limits, and what to change.
 
@@ -260,7 +266,9 @@ def assess(
     return replace(assessment, advice=tuple(advice_on(assessment)))
 
 
-def recorded_signals(noise: Any, primary: Any, secondary: Any, disturbance: Any, fs: float) -> tuple[np.ndarray, ...]:
+def recorded_signals(
+    noise: ArrayLike, primary: PathModels, secondary: PathModels, disturbance: ArrayLike | None, fs: float
+) -> tuple[np.ndarray, ...]:
     """Return references, disturbances and secondary paths, checked, the recordings without their offsets.
 
     One channel of everything comes without channel axes.

@@ -36,6 +36,7 @@ from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.bounds import SuggestedSettings
 from kfopc_filterpy.controllers.base import listed
 
+from .._types import NumberOrArray
 from .fixed_filters import longest_filter
 from .limits import Limits
 from .study_report import jsonable
@@ -244,7 +245,7 @@ class Assessment:
             "rated": self.power(self.limits.rated_power),
         }
 
-    def power(self, rated_power: Any) -> str:
+    def power(self, rated_power: NumberOrArray) -> str:
         """Return a `rated_power` in words: in W if the impedance is known, else in squared units."""
         if self.watt_per_power is None:
             return f"a rated power of {_each(rated_power, '.3g')}"
@@ -253,7 +254,7 @@ class Assessment:
         )
 
     @property
-    def watt_per_power(self) -> Any:
+    def watt_per_power(self) -> NumberOrArray | None:
         """Watts of a mean square of 1, of each of several loudspeakers; None if the impedance is not known."""
         return None if self.ohm is None or self.volts_per_unit is None else self.volts_per_unit**2 / self.ohm
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kfopc_filterpy import SimulationResult, output_power, suggest_settings
 from kfopc_filterpy._validate import as_choice, as_count, as_positive
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
+from .._types import PathModels, ProgressBar
 from .assessed_runs import recorded_scene
 from .assessing import recorded_signals, switch_on_sample
 from .fixed_filters import longest_filter
@@ -20,6 +22,9 @@ from .registry import REGISTRY, algorithms
 from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution
 from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
+
+if TYPE_CHECKING:
+    from ..bench.limits import Ratings
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
 OF_SEVERAL_CHANNELS = ("KF-PB", "MOV-FxLMS", "FxLMS")
@@ -31,17 +36,17 @@ SCALED = (
 
 @one_blas_thread()
 def compare_recordings(
-    noise: Any,
-    primary: Any,
-    secondary: Any,
+    noise: ArrayLike,
+    primary: PathModels,
+    secondary: PathModels,
     *,
-    rating: Any,
+    rating: Ratings,
     fs: float,
-    disturbance: Any = None,
+    disturbance: ArrayLike | None = None,
     names: Sequence[str] | None = None,
     n_taps: int | None = None,
     seconds: float | None = None,
-    bar: Any = None,
+    bar: ProgressBar | None = None,
 ) -> StudyReport:
     """Return a comparison of algorithms on recordings, each tuned by the rule of the studies.
 

@@ -12,6 +12,8 @@ from kfopc_filterpy.bounds.channel_bound import ChannelStretch, full_channel_str
 from kfopc_filterpy.bounds.power_constrained import weights_within
 from kfopc_filterpy.bounds.wiener import Stretch, full_stretch, loss_db, reduction_db, warn_of_loss
 
+from .._types import NumberOrArray
+
 LOOK_AHEAD = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of the taps
 CURVE = 2.0 ** np.arange(-6.0, 3.01, 0.125)  # rated powers of the figure, over the one that full control needs
 NEARLY_FULL = 1.0 - 2.0 ** -np.arange(4.0, 9.0)  # there the curve turns sharply into the horizontal
@@ -70,12 +72,12 @@ class FixedFilters:
         """Return the shortest look-ahead, of those tried, that reaches a noise reduction; None if none does."""
         return next((samples / self.fs for samples, reached in self.ahead.items() if reached >= want_db), None)
 
-    def limited(self, rated_power: Any) -> tuple[np.ndarray, float]:
+    def limited(self, rated_power: NumberOrArray) -> tuple[np.ndarray, float]:
         """Return the filter within the rated power, and its noise reduction in dB."""
         weights, _ = weights_within(self.stretch, self.correlations, rated_power)
         return weights, self.stretch.solution(weights).noise_reduction_db
 
-    def within(self, rated_power: Any) -> float:
+    def within(self, rated_power: NumberOrArray) -> float:
         """Return the bound within the rated power, as a noise reduction in dB; warn if larger weights could do better.
 
         Of several channels that is not known.
@@ -87,7 +89,7 @@ class FixedFilters:
             warn_of_loss(max(losses))
         return self.stretch.solution(weights).noise_reduction_db
 
-    def needed(self, noise_reduction_db: float, rated_power: Any) -> Any:
+    def needed(self, noise_reduction_db: float, rated_power: NumberOrArray) -> NumberOrArray:
         """Return the rated power with which the bound reaches a noise reduction; Inf if none does, 0 below 0 dB.
 
         Of several loudspeakers, the powers are in proportion to `rated_power`, (J,).
@@ -106,7 +108,7 @@ class FixedFilters:
         ).rated_power
         return found if self.several else float(found)
 
-    def curve(self, rated_power: Any) -> tuple[np.ndarray, np.ndarray]:
+    def curve(self, rated_power: NumberOrArray) -> tuple[np.ndarray, np.ndarray]:
         """Return rated powers about the given one and the one that full control needs, and the bound for each.
 
         With several loudspeakers, they are multiples of all ratings.

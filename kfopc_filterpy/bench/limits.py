@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
@@ -12,13 +12,17 @@ from kfopc_filterpy import HardClipAmplifier, LinearAmplifier, SimulationResult
 from kfopc_filterpy.metrics import overshoot, peak_control_signal
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
 
+from .._types import NumberOrArray
+from ..power.ratings import Rating
+
 if TYPE_CHECKING:
+    from ..power.amplifiers import Amplifier
     from .fixed_filters import FixedFilters
 
 EXCURSION = "loudspeaker's excursion"
 SWEEPS = 3  # over the loudspeakers: what one gives up, others may take over
 
-Rating = Any  # a number, an AmplifierRating, a LoudspeakerRating or OutputLimits
+Ratings: TypeAlias = Rating | Sequence[Rating | Sequence[Rating]]  # of one loudspeaker, or of each
 
 
 @dataclass(frozen=True)
@@ -61,7 +65,7 @@ class ChannelLimits:
 Limits = OutputLimits | ChannelLimits
 
 
-def ratings_of_each(rating: Any, n_loudspeakers: int) -> list[list[Rating]]:
+def ratings_of_each(rating: Ratings, n_loudspeakers: int) -> list[list[Rating]]:
     """Return the ratings of each loudspeaker, which hold together.
 
     One rating counts for all loudspeakers. A sequence has an entry for each of several loudspeakers: a rating, or a
@@ -74,7 +78,7 @@ def ratings_of_each(rating: Any, n_loudspeakers: int) -> list[list[Rating]]:
         for which loudspeaker is not clear.
     """
     if not _is_sequence(rating):
-        return [[rating]] * n_loudspeakers
+        return [[cast(Rating, rating)]] * n_loudspeakers
     entries = list(rating)
     if n_loudspeakers == 1 and not any(_is_sequence(one) for one in entries):
         return [entries]
@@ -85,10 +89,10 @@ def ratings_of_each(rating: Any, n_loudspeakers: int) -> list[list[Rating]]:
             f"{len(entries)} ratings{' of amplifiers and of loudspeakers' if len(kinds) > 1 else ''}; an amplifier and a "
             f"loudspeaker that belong together are one entry: [[amplifier, loudspeaker]] * {n_loudspeakers}"
         )
-    return [list(one) if _is_sequence(one) else [one] for one in entries]
+    return [list(one) if _is_sequence(one) else [cast(Rating, one)] for one in entries]
 
 
-def _is_sequence(value: Any) -> bool:
+def _is_sequence(value: object) -> TypeGuard[Sequence[Any]]:
     return isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0)
 
 
@@ -127,7 +131,7 @@ def scaled(limits: Limits, share: float) -> Limits:
     )
 
 
-def amplifiers(limits: Limits) -> Any:
+def amplifiers(limits: Limits) -> Amplifier | Sequence[Amplifier]:
     """Return the amplifier that clips at the limit, or a list with one for each loudspeaker."""
     each = [
         LinearAmplifier() if one.amplitude_limit is None else HardClipAmplifier(one.amplitude_limit)
@@ -136,7 +140,7 @@ def amplifiers(limits: Limits) -> Any:
     return each if isinstance(limits, ChannelLimits) else each[0]
 
 
-def clipping_limits(limits: Limits) -> Any:
+def clipping_limits(limits: Limits) -> NumberOrArray:
     """Return the limit at which the amplifier clips, or one for each loudspeaker; a huge one if it does not."""
     never = np.sqrt(np.finfo(float).max)
     each = [never if one.amplitude_limit is None else one.amplitude_limit for one in each_of(limits)]
@@ -206,13 +210,13 @@ def excursion_mm(ratings: Sequence[Sequence[Rating]], run: SimulationResult) -> 
     return max(moved, default=None)
 
 
-def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> Any:
+def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> NumberOrArray | None:
     """Return the watts of a mean square of 1, of several loudspeakers as (J,); None if a rating does not tell them."""
     volts, ohm = (scale_of(ratings, name, several) for name in ("volts_per_unit", "ohm"))
     return None if volts is None or ohm is None else volts**2 / ohm
 
 
-def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> Any:
+def scale_of(ratings: Sequence[Sequence[Rating]], name: str, several: bool) -> NumberOrArray | None:
     """Return `volts_per_unit` or `ohm` of the first rating that has volts; of several loudspeakers as (J,).
 
     None if a loudspeaker has no such rating, or a curve instead of a number.

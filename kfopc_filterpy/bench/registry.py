@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -81,7 +81,7 @@ class Algorithm:
         Whether the studies of one channel, or of several channels, compare it.
     """
 
-    make: Callable[[Scene, float, float, Amplifier | None], Controller]
+    make: Callable[[Scene, float, float, Amplifier | Sequence[Amplifier] | None], Controller]
     symbol: str
     kind: str
     first: tuple[float, ...]
@@ -137,7 +137,7 @@ def _references(scene: Scene) -> dict[str, Any]:
 def _kalman(make: Any, *, free: bool = False) -> Callable[..., Controller]:
     """Return a function that makes Kalman filters: with a constraint, or `free` of one."""
 
-    def made(scene: Scene, r: float, _: float, amplifier: Amplifier | None) -> Controller:
+    def made(scene: Scene, r: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
         settings: dict[str, Any] = {
             "state_noise": r,
             "measurement_noise": scene.measurement_noise,
@@ -152,7 +152,9 @@ def _kalman(make: Any, *, free: bool = False) -> Callable[..., Controller]:
     return made
 
 
-def _power_budget(scene: Scene, averaging_s: float, _: float, amplifier: Amplifier | None) -> Controller:
+def _power_budget(
+    scene: Scene, averaging_s: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None
+) -> Controller:
     return kf_pb(
         scene.n_taps,
         scene.known_secondary,
@@ -166,7 +168,7 @@ def _power_budget(scene: Scene, averaging_s: float, _: float, amplifier: Amplifi
 
 
 def _rated(kind: Any, **more: Any) -> Callable[..., Controller]:
-    def made(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
+    def made(scene: Scene, mu: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
         own: dict[str, Any] = {"constraint": _constraint(scene), "amplifier": amplifier, **_references(scene), **more}
         return kind(scene.n_taps, scene.known_secondary, step_size=mu, **own)
 
@@ -177,22 +179,24 @@ def _plain(kind: Any) -> Callable[..., Controller]:
     return lambda scene, mu, _, amplifier: kind(scene.n_taps, scene.known_secondary, step_size=mu, **_references(scene))
 
 
-def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
+def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
     energy = scene.n_taps * scene.filtered_power  # mu compares with FxLMS; the ridge is for the start-up
     settings: dict[str, Any] = {"step_size": mu * energy, "regularization": 0.01 * energy, **_references(scene)}
     return FxNLMS(scene.n_taps, scene.known_secondary, **settings)
 
 
-def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
+def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
     leak = min(price * scene.filtered_power, 1.0 / mu)
     return LeakyFxLMS(scene.n_taps, scene.known_secondary, step_size=mu, leak=leak, **_references(scene))
 
 
-def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | None) -> Controller:
+def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
     return _mov(scene, mu, price * scene.secondary_gain, amplifier, "MOV-FxLMS fixed")
 
 
-def _mov_by_variance(scene: Scene, mu: float, _: float, amplifier: Amplifier | None) -> Controller:
+def _mov_by_variance(
+    scene: Scene, mu: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None
+) -> Controller:
     """Take the penalty from the variance of the whole disturbance, as the public code of its authors does.
 
     They use the secondary path's gain for the disturbance, from an inverse model of the path; here the gain is that of
@@ -203,7 +207,9 @@ def _mov_by_variance(scene: Scene, mu: float, _: float, amplifier: Amplifier | N
     return _mov(scene, mu, gamma, amplifier, "MOV-FxLMS by variance")
 
 
-def _mov(scene: Scene, mu: float, gamma: float, amplifier: Amplifier | None, name: str) -> Controller:
+def _mov(
+    scene: Scene, mu: float, gamma: float, amplifier: Amplifier | Sequence[Amplifier] | None, name: str
+) -> Controller:
     """Return an MOV-FxLMS with a fixed penalty, named differently from the one whose penalty follows the powers."""
     controller = MOVFxLMS(
         scene.n_taps,
@@ -219,7 +225,7 @@ def _mov(scene: Scene, mu: float, gamma: float, amplifier: Amplifier | None, nam
 
 
 def _peak(kind: Any) -> Callable[..., Controller]:
-    def made(scene: Scene, mu: float, share: float, amplifier: Amplifier | None) -> Controller:
+    def made(scene: Scene, mu: float, share: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
         limit = np.sqrt(share * scene.unconstrained_power)
         more: dict[str, Any] = {"output_step_size": mu * scene.secondary_gain} if kind is TwoGradientFxLMS else {}
         return kind(
@@ -229,13 +235,13 @@ def _peak(kind: Any) -> Callable[..., Controller]:
     return made
 
 
-def _rls(scene: Scene, forgetting: float, _: float, amplifier: Amplifier | None) -> Controller:
+def _rls(scene: Scene, forgetting: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
     return fx_rls(
         scene.n_taps,
         scene.known_secondary,
         forgetting=1.0 - forgetting,
         initial_variance=scene.initial_variance / scene.measurement_noise,
-        amplifier=amplifier,
+        amplifier=cast("Amplifier | None", amplifier),
     )
 
 
@@ -325,7 +331,9 @@ def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
     return MappingProxyType({name: own for name, own in REGISTRY.items() if getattr(own, wanted)})
 
 
-def make_controller(scene: Scene, algorithm: str, setting: Setting, *, amplifier: Amplifier | None = None) -> Any:
+def make_controller(
+    scene: Scene, algorithm: str, setting: Setting, *, amplifier: Amplifier | Sequence[Amplifier] | None = None
+) -> Any:
     """Return a fresh controller for a scene.
 
     Parameters

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -37,6 +37,11 @@ from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
+
+from .._types import Counter, NumberOrArray, PathModels
+
+if TYPE_CHECKING:
+    from ..controllers.base import Controller
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed
 CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy need weights that no controller reaches
@@ -78,7 +83,7 @@ class Runs:
     ([1, 4, 9], 3)
     """
 
-    def __init__(self, bar: Any = None) -> None:
+    def __init__(self, bar: Counter | None = None) -> None:
         self.bar = bar
         self.done = 0
         self._pool = ThreadPoolExecutor(max_workers=os.cpu_count())
@@ -160,7 +165,7 @@ class Scene:
     sensor_noise_std: float
     switch_on_s: float
     nse_window_s: float
-    amplifier: Amplifier | None = None
+    amplifier: Amplifier | Sequence[Amplifier] | None = None
     measurement_noise: float = 0.0
     initial_variance: float = 0.0
     unconstrained_power: Any = 1.0
@@ -169,7 +174,7 @@ class Scene:
     seeds: list[int] = field(default_factory=list)
     secondary_estimate: np.ndarray | None = None
     secondary_path_uncertainty: Any = None
-    known_amplifier: Amplifier | None = None
+    known_amplifier: Amplifier | Sequence[Amplifier] | None = None
     power_memory_s: float = 0.5
     clips_at: Any = None
 
@@ -179,7 +184,7 @@ class Scene:
         return [SENSOR_NOISE_SEED + seed for seed in self.seeds]
 
     @property
-    def amplitude_limit(self) -> Any:
+    def amplitude_limit(self) -> NumberOrArray:
         """Limit of the clipping amplifiers, or of each: `clips_at`, by default the peak of a sine at rated power."""
         limit = np.sqrt(2 * self.rated_power) if self.clips_at is None else self.clips_at
         return limit if np.ndim(limit) else float(limit)
@@ -211,7 +216,7 @@ class Scene:
         """Power gain G_s of the known secondary path for the reference (eq. 11)."""
         return self.filtered_power / _power(self.references[0])
 
-    def run(self, controller: Any, seed_index: int = 0, **options: Any) -> SimulationResult:
+    def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
         return simulate(
             controller, self.references[seed_index], amplifier=self.amplifier, **self._options(seed_index), **options
@@ -241,8 +246,8 @@ class Scene:
 
 def make_scene(
     references: Mapping[int, np.ndarray],
-    primary: Any,
-    secondary: Any,
+    primary: PathModels,
+    secondary: PathModels,
     *,
     fs: float,
     rated_power: float,

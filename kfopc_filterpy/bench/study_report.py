@@ -307,7 +307,7 @@ class StudyReport:
         return jsonable(values, f"study {self.name!r}")
 
 
-def jsonable(value: Any, where: str = "value") -> Any:
+def jsonable(value: object, where: str = "value") -> Any:
     """Return `value` in strict JSON's types: arrays as lists, numpy's scalars as numbers, NaN and Inf as None.
 
     Examples

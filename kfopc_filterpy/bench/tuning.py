@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_
 
 from .registry import REGISTRY, Setting, make_controller
 from .scene import Outcome, Runs, Scene
+
+if TYPE_CHECKING:
+    from ..controllers.base import Controller
 
 BUDGET = 1.02  # a constrained method keeps its budget if its power is at most this multiple of the rated power
 RULE = (
@@ -85,7 +88,7 @@ class Tuned:
 
 
 def run_setting(
-    scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0, *, controller: Any = None
+    scene: Scene, algorithm: str, setting: Setting, seed_index: int = 0, *, controller: Controller | None = None
 ) -> SimulationResult | None:
     """Run an algorithm in a scene.
 

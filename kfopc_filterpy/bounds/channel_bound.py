@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.signal import correlate, fftconvolve
 
+from .._types import PathModels
 from .._validate import as_channels, as_count
 from ..paths.path_matrix import secondary_paths
 from .wiener import WienerSolution, mean_square, reduction_db, require_sound
@@ -210,7 +212,9 @@ def block_correlation(signals: np.ndarray, n_taps: int) -> np.ndarray:
     return blocks.swapaxes(1, 2).reshape(n_signals * n_taps, -1)
 
 
-def channel_record(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, fs: float) -> ChannelStretch:
+def channel_record(
+    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, fs: float
+) -> ChannelStretch:
     """Check the signals of several channels and return them with silence before the first sample."""
     x = np.atleast_2d(as_channels(reference, "reference"))
     d = np.atleast_2d(as_channels(disturbance, "disturbance"))
@@ -226,7 +230,7 @@ def channel_record(reference: Any, disturbance: Any, secondary_path: Any, n_taps
 
 
 def full_channel_stretch(
-    reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, fs: float
+    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, fs: float
 ) -> ChannelStretch:
     """Check the signals and return the samples at which all delay lines are full."""
     secondary, _ = secondary_paths(secondary_path, fs=fs)

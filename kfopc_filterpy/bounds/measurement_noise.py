@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModels
 from .._validate import as_count, as_signal
 from ..paths.models import path_taps
 from .wiener import full_stretch, loss_db, warn_of_loss
 
 
-def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> float:
+def measurement_noise_from_run(
+    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int
+) -> float:
     r"""Estimate the measurement noise variance from a run without control.
 
     With the loudspeaker silent, the error microphone records the disturbance d. The part of it that no control filter of
@@ -74,7 +76,7 @@ def measurement_noise_from_run(reference: Any, disturbance: Any, secondary_path:
     return measurement_noise_from_residual((d - explained)[transient:], n_fitted=n_taps)
 
 
-def measurement_noise_from_residual(residual: Any, *, n_fitted: int = 0) -> float:
+def measurement_noise_from_residual(residual: ArrayLike, *, n_fitted: int = 0) -> float:
     """Estimate the measurement noise variance from the residual of a batch fit.
 
     Parameters

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal, per_loudspeaker
 from ..metrics import overshoot
 from ..paths.models import path_taps
@@ -246,11 +248,11 @@ class PowerConstrainedWiener:
 
 
 def power_constrained_wiener(
-    reference: Any,
-    disturbance: Any,
-    secondary_path: Any,
+    reference: ArrayLike,
+    disturbance: ArrayLike,
+    secondary_path: PathModels,
     n_taps: int,
-    rated_power: Any,
+    rated_power: PerLoudspeaker,
     *,
     fs: float,
     segment_s: float = 1.0,
@@ -398,7 +400,7 @@ def power_constrained_wiener(
 
 
 def power_constrained_solution(
-    reference: Any, disturbance: Any, secondary_path: Any, n_taps: int, rated_power: float
+    reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, rated_power: float
 ) -> WienerSolution:
     """Return the least-squares control filter whose control power does not exceed the rated power.
 
@@ -475,7 +477,9 @@ def _losses_db(
     ]
 
 
-def weights_within(stretch: Stretch | ChannelStretch, correlations: Any, rated_power: Any) -> tuple[np.ndarray, Any]:
+def weights_within(
+    stretch: Stretch | ChannelStretch, correlations: Any, rated_power: NumberOrArray
+) -> tuple[np.ndarray, NumberOrArray]:
     """Return the weights of the least error within the power of each loudspeaker, and their λ."""
     if isinstance(stretch, ChannelStretch):
         return correlations.constrained_weights(rated_power)

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModels
 from .._validate import as_choice, as_positive, as_real_array, per_loudspeaker, require_finite
 from ..paths.path_matrix import is_path_matrix
 from .channel_bound import ChannelCorrelations, channel_record
@@ -60,11 +62,11 @@ class BudgetedRatedPower:
 
 
 def required_rated_power(
-    noise_reduction_db: Any,
+    noise_reduction_db: ArrayLike,
     *,
     disturbance_power: float,
     antinoise_power: float,
-    control_power: Any,
+    control_power: ArrayLike,
     beyond: str = "raise",
 ) -> RatedPower:
     r"""Return the rated power that KF-OPC needs to reach a noise reduction.
@@ -160,14 +162,14 @@ def _wanted(noise_reduction_db: Any) -> np.ndarray:
 
 
 def budgeted_rated_power(
-    noise_reduction_db: Any,
-    reference: Any,
-    disturbance: Any,
-    secondary_path: Any,
+    noise_reduction_db: ArrayLike,
+    reference: ArrayLike,
+    disturbance: ArrayLike,
+    secondary_path: PathModels,
     n_taps: int,
     *,
     fs: float,
-    proportions: Any = None,
+    proportions: ArrayLike | None = None,
     beyond: str = "raise",
 ) -> BudgetedRatedPower:
     """Return the rated power needed for a noise reduction if the power is spent in the best way.

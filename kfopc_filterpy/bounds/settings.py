@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModels
 from .._validate import as_channels, as_count, as_positive
 from ..paths.least_squares import RANK_TOLERANCE
 from ..paths.models import path_taps
@@ -78,9 +80,9 @@ class SuggestedSettings:
 
 
 def suggest_settings(
-    reference: Any,
-    disturbance: Any,
-    secondary_path: Any,
+    reference: ArrayLike,
+    disturbance: ArrayLike,
+    secondary_path: PathModels,
     *,
     fs: float = DEFAULT_FS,
     memory_s: float = DEFAULT_MEMORY_S,
@@ -207,7 +209,13 @@ class _Fits:
     """Fixed filters of 1, 2, ... taps, fitted to one record."""
 
     def __init__(
-        self, reference: Any, disturbance: Any, secondary_path: Any, fs: float, n_taps: int | None, max_taps: int
+        self,
+        reference: ArrayLike,
+        disturbance: ArrayLike,
+        secondary_path: PathModels,
+        fs: float,
+        n_taps: int | None,
+        max_taps: int,
     ) -> None:
         x = as_channels(reference, "reference")
         self.stretch: Stretch | ChannelStretch

@@ -9,10 +9,12 @@ import math
 import warnings
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModels
 from .._validate import as_channels, as_count, as_nonnegative, as_positive, as_signal
 from ..paths.least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
 from ..paths.models import path_taps
@@ -59,9 +61,9 @@ class WienerSolution:
 
 
 def wiener_solution(
-    reference: Any,
-    disturbance: Any,
-    secondary_path: Any,
+    reference: ArrayLike,
+    disturbance: ArrayLike,
+    secondary_path: PathModels,
     n_taps: int,
     *,
     regularization: float = 0.0,
@@ -155,7 +157,7 @@ class CoherenceBound:
     overall_db: float
 
 
-def coherence_bound(reference: Any, disturbance: Any, fs: float, *, segment: int = 1024) -> CoherenceBound:
+def coherence_bound(reference: ArrayLike, disturbance: ArrayLike, fs: float, *, segment: int = 1024) -> CoherenceBound:
     """Return the noise reduction of a non-causal filter of any length, ``-10 log10(1 - coherence)``.
 
     No control filter can cancel the part of the disturbance that the reference does not contain, such as a second
@@ -331,7 +333,7 @@ class Stretch:
         )
 
 
-def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: int) -> Stretch:
+def full_stretch(reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int) -> Stretch:
     """Check the signals and return the samples at which the delay lines of w and s are full."""
     from scipy.signal import lfilter
 
@@ -349,7 +351,19 @@ def full_stretch(reference: Any, disturbance: Any, secondary_path: Any, n_taps: 
     return require_sound(Stretch(x[past:], lfilter(taps, 1.0, x)[past:], d[start:], n_taps))
 
 
-def require_sound(stretch: Any) -> Any:
+class _Excited(Protocol):
+    """A record of a reference through the secondary path, and of a disturbance."""
+
+    @property
+    def d(self) -> np.ndarray: ...
+    @property
+    def filtered_power(self) -> float: ...
+
+
+_Stretch = TypeVar("_Stretch", bound=_Excited)
+
+
+def require_sound(stretch: _Stretch) -> _Stretch:
     """Return the stretch, or raise ValueError if x' or d is silent."""
     filtered_power = stretch.filtered_power
     if filtered_power == 0 or mean_square(stretch.d) == 0:

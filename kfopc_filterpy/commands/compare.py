@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import Any
+from typing import TYPE_CHECKING
 
 from .._validate import as_choice
 from .inputs import Files, ratings_of, scene_of
 from .options import DONE, add_command, add_count, add_number, add_output, add_recorded_scene
 from .printing import progress_bar, tell
 
+if TYPE_CHECKING:
+    from ..commands.options import Parser
+
 EXAMPLES = """example:
   kfopc compare noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --algorithm KF-PB,KF-OPC,FxLMS -o out"""
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     parser = add_command(commands, "compare", compare, "tune and compare the algorithms on your own data", EXAMPLES)
     add_recorded_scene(parser)

@@ -6,10 +6,13 @@ import argparse
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from .options import DONE, add_command
 from .printing import warn
+
+if TYPE_CHECKING:
+    from ..commands.options import Parser
 
 EXAMPLES = """examples:
   kfopc data list
@@ -17,7 +20,7 @@ EXAMPLES = """examples:
   kfopc data where"""
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     about = "list or fetch the public measured data, or print their folder"
     parser = add_command(commands, "data", data, about, EXAMPLES)

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING
 
 from .options import DONE, add_command, add_count, add_number
+
+if TYPE_CHECKING:
+    from ..commands.options import Parser
 
 EXAMPLES = """examples:
   kfopc explore
   kfopc explore noise.wav --primary P.wav --secondary S.wav"""
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     about = "open a page with sliders for rating, noise, paths and algorithm"
     parser = add_command(commands, "explore", explore, about, EXAMPLES)

@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .printing import warn
 
 if TYPE_CHECKING:
+    from ..paths.uncertainty import Uncertainty
     from ..signals import Recording
 
 STANDARD_INPUT = "-"
@@ -245,9 +247,9 @@ def _curve(path: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
     return as_curve((columns[:, 0], columns[:, 1]), path, unit)
 
 
-def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Any:
+def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndarray) -> Uncertainty:
     """Return how far the secondary path may be wrong: from other measurements, from tolerances, or by default."""
-    from ..controllers.power_budget import DEFAULT_UNCERTAINTY
+    from ..controllers.posterior import DEFAULT_UNCERTAINTY
     from ..paths import PathTolerance
     from ..paths.uncertainty import as_gain_error
 
@@ -270,7 +272,7 @@ def uncertainty_of(options: argparse.Namespace, files: Files, secondary: np.ndar
     return np.concatenate(every, axis=1).reshape(K, -1, J, longest).swapaxes(0, 1)
 
 
-def calibration_of(options: argparse.Namespace, n_microphones: int) -> Any:
+def calibration_of(options: argparse.Namespace, n_microphones: int) -> ArrayLike | None:
     """Return the pascals per unit of the error microphones, of all or of each; None if the options give none."""
     from ..signals import calibration_factor, read_recording
 

@@ -23,7 +23,9 @@ def sentence(about: str) -> str:
     return about[0].upper() + about[1:] + "."
 
 
-def add_command(commands: Any, name: str, run: Callable[[Any], int], about: str, examples: str) -> Parser:
+def add_command(
+    commands: argparse._SubParsersAction[Parser], name: str, run: Callable[[Any], int], about: str, examples: str
+) -> Parser:
     """Add a subcommand that calls `run`, and return its parser."""
     parser = commands.add_parser(
         name,
@@ -36,12 +38,14 @@ def add_command(commands: Any, name: str, run: Callable[[Any], int], about: str,
     return parser
 
 
-def add_number(group: Any, option: str, unit: str, check: Callable[..., float] = as_positive, **more: Any) -> None:
+def add_number(
+    group: argparse._ActionsContainer, option: str, unit: str, check: Callable[..., float] = as_positive, **more: Any
+) -> None:
     """Add an option that takes a number; errors of `check`, a function of `_validate`, name the option."""
     group.add_argument(option, type=_checked(float, option, check, unit=unit), **{"metavar": unit.upper()} | more)
 
 
-def add_count(group: Any, option: str, minimum: int = 1, **more: Any) -> None:
+def add_count(group: argparse._ActionsContainer, option: str, minimum: int = 1, **more: Any) -> None:
     """Add an option that takes a whole number of at least `minimum`."""
     group.add_argument(option, type=_checked(int, option, as_count, minimum=minimum), **{"metavar": "N"} | more)
 
@@ -60,14 +64,16 @@ def _checked(kind: Callable[[str], Any], option: str, check: Callable[..., Any],
     return read
 
 
-def add_reading(parser: Any, about_fs: str = "resample everything to this rate", **of_fs: Any) -> None:
+def add_reading(
+    parser: argparse._ActionsContainer, about_fs: str = "resample everything to this rate", **of_fs: Any
+) -> None:
     """Add the options for reading files."""
     add_number(parser, "--fs", "Hz", help=about_fs, **of_fs)
     add_count(parser, "--channel", 0, help="channel to read from files with several, counted from 0")
     parser.add_argument("--variable", metavar="NAME", help="variable to read from files with several")
 
 
-def add_scene(parser: Any, *, required: bool) -> None:
+def add_scene(parser: argparse._ActionsContainer, *, required: bool) -> None:
     """Add the options for paths and disturbance."""
     path: dict[str, Any] = {"action": "append", "metavar": "FILE"}
     about = "impulse response, reference to error microphone; repeated for several references"
@@ -81,7 +87,7 @@ def add_scene(parser: Any, *, required: bool) -> None:
     add_reading(parser)
 
 
-def add_recorded_scene(parser: Any) -> None:
+def add_recorded_scene(parser: argparse._ActionsContainer) -> None:
     """Add the options for a recorded noise, the paths and the rating."""
     about = "recording of the reference microphone, made while the loudspeaker is silent; - is standard input"
     parser.add_argument("noise", help=about)
@@ -111,7 +117,7 @@ def add_recorded_scene(parser: Any) -> None:
     rating.add_argument("--displacement", metavar="CSV", help=about, **each)
 
 
-def add_output(parser: Any, about: str, about_json: str) -> None:
+def add_output(parser: argparse._ActionsContainer, about: str, about_json: str) -> None:
     """Add the options for what is written and printed."""
     parser.add_argument("-o", "--output", metavar="FOLDER", help=about)
     parser.add_argument("--json", action="store_true", help=about_json)

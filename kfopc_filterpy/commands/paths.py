@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,12 +14,15 @@ from .inputs import Files
 from .options import DONE, add_command, add_count, add_reading, sentence
 from .printing import warn
 
+if TYPE_CHECKING:
+    from ..commands.options import Parser
+
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
 UNRELATED, CHANCE = 0.02, 3.0  # a path must explain this share of a response, and this many times what chance explains
 POOR_DB = -20.0  # a warning is printed if more of the response is left unexplained
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand, which has actions of its own."""
     about = "identify, inspect, convert, resample and plot impulse responses"
     parser = commands.add_parser("paths", help=about, description=sentence(about))

@@ -16,6 +16,7 @@ from .options import DONE, add_command, add_count, add_number, add_scene
 from .printing import warn
 
 if TYPE_CHECKING:
+    from ..commands.options import Parser
     from ..realtime import Interface, RunReport, RunStatus, SimulatedInterface
 
 FAULT = 1
@@ -31,7 +32,7 @@ is real, behind a sound card at --fs or 16000 Hz: begin with a small --amplitude
 Ctrl-C fades the control out. exit code: 0 ended as requested, 1 stopped by a fault, 2 wrong input"""
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     about = "control noise in real time, with a sound card or a simulated plant"
     parser = add_command(commands, "run", run, about, EXAMPLES)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 from .._validate import as_choice, as_nonnegative, as_number
 from .inputs import Files, calibration_of, ratings_of, scene_of, uncertainty_of
 from .options import DONE, add_command, add_count, add_number, add_output, add_recorded_scene
 from .printing import progress_bar, tell
+
+if TYPE_CHECKING:
+    from ..commands.options import Parser
 
 NOT_ENOUGH = 1
 
@@ -31,7 +34,7 @@ all of them. Give each option of the rating once for all loudspeakers, or once f
 exit code: 0 enough, 1 not enough, 2 wrong input"""
 
 
-def add_to(commands: Any) -> None:
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
     """Add the subcommand."""
     parser = add_command(commands, "verdict", verdict, "say whether an amplifier is enough, and what limits", EXAMPLES)
     add_recorded_scene(parser)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray, PerLoudspeaker
 from ..checkpoint import Checkpointed
 from ..core.run_loop import Steps
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
@@ -24,16 +26,20 @@ class Controller(Protocol):
     control is switched on.
     """
 
-    def control_signal(self, reference: float) -> float:
+    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
         ...
 
-    def update(self, error: float) -> None:
+    def update(self, error: NumberOrArray) -> None:
         """Adapt to the error e(n) = d(n) - (s * y_amp)(n) that this control signal left."""
         ...
 
 
-def constraint_for(rated_power: Any, constraint: Any, fs: float = DEFAULT_FS) -> Any:
+def constraint_for(
+    rated_power: PerLoudspeaker | None,
+    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None,
+    fs: float = DEFAULT_FS,
+) -> Any:
     """Return a new constraint for a controller: a copy of the one given, or one with default settings for the rate `fs`.
 
     Several rated powers or constraints, one for each loudspeaker, give a tuple.
@@ -43,15 +49,18 @@ def constraint_for(rated_power: Any, constraint: Any, fs: float = DEFAULT_FS) ->
     if isinstance(constraint, list | tuple):
         return tuple(constraint_for(None, one) for one in constraint)
     if constraint is None:
-        if np.ndim(rated_power) == 1:
-            return tuple(OutputPowerConstraint(power, fs=fs) for power in rated_power)
-        return OutputPowerConstraint(rated_power, fs=fs)
+        powers: Any = rated_power
+        if np.ndim(powers) == 1:
+            return tuple(OutputPowerConstraint(power, fs=fs) for power in powers)
+        return OutputPowerConstraint(powers, fs=fs)
     if not isinstance(constraint, OutputPowerConstraint):
         raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {constraint!r}")
     return deepcopy(constraint)
 
 
-def constraint_or_none(rated_power: Any, constraint: Any) -> Any:
+def constraint_or_none(
+    rated_power: PerLoudspeaker | None, constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None
+) -> Any:
     """Return `constraint_for`, or None if neither a rated power nor a constraint is given."""
     return None if rated_power is None and constraint is None else constraint_for(rated_power, constraint)
 
@@ -65,7 +74,7 @@ def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
             )
 
 
-def listening(controller: Any) -> Any:
+def listening(controller: object) -> Any:
     """Return a controller, or raise ValueError if it cannot follow the noise before the control is switched on."""
     if not hasattr(controller, "listen"):
         raise ValueError("switch_on_s needs a controller with a method listen(references, errors)")
@@ -138,6 +147,6 @@ def calls_of(kind: type) -> tuple[Any, Any]:
     return kind.control_signal, kind.update  # type: ignore[attr-defined]
 
 
-def listed(values: Any, form: str) -> str:
+def listed(values: ArrayLike, form: str) -> str:
     """Return a number, or several after each other, as text."""
     return ", ".join(format(value, form) for value in np.ravel(values))

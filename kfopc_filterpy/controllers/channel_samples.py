@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_real_array
 
+if TYPE_CHECKING:
+    from ..power.amplifiers import Amplifier
 
-def channel_sample(value: Any, size: int, name: str, what: str) -> np.ndarray:
+
+def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:
     """Return a sample of each channel, (size,), finite; `what` names the channels in an error."""
     sample = as_real_array(value, name).reshape(-1)
     if sample.size != size:
@@ -20,7 +24,7 @@ def channel_sample(value: Any, size: int, name: str, what: str) -> np.ndarray:
     return np.ascontiguousarray(sample)
 
 
-def amplifier_functions(amplifier: Any, n_loudspeakers: int) -> list[Any] | None:
+def amplifier_functions(amplifier: Amplifier | Sequence[Amplifier] | None, n_loudspeakers: int) -> list[Any] | None:
     """Return the functions of a sample that stand for the amplifiers, one for each loudspeaker; None without any."""
     if amplifier is None:
         return None

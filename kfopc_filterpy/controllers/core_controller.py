@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, Shape, reason_of
@@ -30,6 +32,9 @@ from .processing import (
     require_channels,
     require_one_length,
 )
+
+if TYPE_CHECKING:
+    from ..paths.uncertainty import Uncertainty
 
 NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
 OVERFLOW = (
@@ -131,13 +136,13 @@ class CoreController(BlockProcessing, Checkpointed):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         settings: Mapping[str, Any],
         n_references: int | None = 1,
         multichannel: bool | None = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
-        constraint: Any = None,
+        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
         limiter: Limiters = None,
     ) -> None:
         self._settings = dict(settings)
@@ -227,7 +232,7 @@ class CoreController(BlockProcessing, Checkpointed):
             )
         return limiters
 
-    def _checked_constraint(self, constraint: Constraints | None) -> Any:
+    def _checked_constraint(self, constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None) -> Any:
         """Return a constraint, or a tuple of them; if none is given, one whose factor is fixed at 1."""
         own: Any = constraint
         if constraint is None:
@@ -357,7 +362,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return self._estimated_path().copy()
 
     @secondary_path.setter
-    def secondary_path(self, path: Any) -> None:
+    def secondary_path(self, path: PathModels) -> None:
         before, after = self.secondary_path, self._checked_estimate(path)
         guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
         self._estimated_path()[:] = after
@@ -381,7 +386,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return float(np.sum((after - before) ** 2) / energy * np.mean(w**2)) if energy > 0.0 else 0.0
 
     @property
-    def secondary_path_uncertainty(self) -> Any:
+    def secondary_path_uncertainty(self) -> Uncertainty | None:
         """Uncertainty of the secondary path as it was stated; None: the path is exact.
 
         Whatever `paths.path_uncertainty` takes can be assigned. The weights then minimise
@@ -394,7 +399,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return deepcopy(self._uncertainty)
 
     @secondary_path_uncertainty.setter
-    def secondary_path_uncertainty(self, value: Any) -> None:
+    def secondary_path_uncertainty(self, value: Uncertainty | None) -> None:
         if not self.takes_guard:
             raise ValueError(
                 f"no secondary_path_uncertainty can be assigned to {self.name}: make it with "
@@ -406,7 +411,7 @@ class CoreController(BlockProcessing, Checkpointed):
         self._use_block(self._opened().with_guard(taps))
 
     @property
-    def rated_power(self) -> Any:
+    def rated_power(self) -> NumberOrArray | None:
         """Rated output power of the controller, or of each loudspeaker, (J,); None if it has none.
 
         If the controller has a rated power, another one can be assigned at any time.
@@ -414,7 +419,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return self._read_rated_power()
 
     @rated_power.setter
-    def rated_power(self, value: Any) -> None:
+    def rated_power(self, value: PerLoudspeaker) -> None:
         if self.rated_power is None:
             raise ValueError(
                 f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
@@ -455,17 +460,17 @@ class CoreController(BlockProcessing, Checkpointed):
         return self._own_constraint
 
     @property
-    def constraint_factor(self) -> Any:
+    def constraint_factor(self) -> NumberOrArray:
         """Constraint factor of the last sample; with several channels (J,)."""
         return self._of_constraint("factor")
 
     @property
-    def disturbance_power(self) -> Any:
+    def disturbance_power(self) -> NumberOrArray:
         """Running power of the disturbance estimate (eq. 10); with several channels (J,), summed over microphones."""
         return self._of_constraint("disturbance_power")
 
     @property
-    def secondary_path_gain(self) -> Any:
+    def secondary_path_gain(self) -> NumberOrArray:
         """Running secondary-path gain (eq. 11); NaN until the reference has energy.
 
         With several channels (J,): E[x'^2] summed over microphones and references, over E[x^2] summed over references.
@@ -499,7 +504,7 @@ class CoreController(BlockProcessing, Checkpointed):
 
     # Samples.
 
-    def control_signal(self, reference: Any) -> Any:
+    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample.
 
         With several channels, x(n) is (I,) and y(n) is (J,).
@@ -510,14 +515,16 @@ class CoreController(BlockProcessing, Checkpointed):
             raise ValueError(f"{reason_of(answer)}; nothing was changed")
         return self._shaped(block.control_signal)
 
-    def update(self, error: Any) -> None:
+    def update(self, error: NumberOrArray) -> None:
         """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
         block = self._opened()
         block.error[:] = self._sample(error, "error", "microphones")
         if answer := block.update():
             raise ValueError(f"{reason_of(answer)}; nothing was changed")
 
-    def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
+    def process(
+        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors; see `BlockProcessing.process`."""
         looped = self.looped()
         if looped is None:
@@ -554,7 +561,7 @@ class CoreController(BlockProcessing, Checkpointed):
             raise RefusedUpdate(str(reason), sample) from reason
         raise RefusedUpdate(NO_SOLUTION, sample)
 
-    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: Any = True) -> None:
+    def listen(self, references: np.ndarray, errors: np.ndarray, *, adapt: bool | ArrayLike = True) -> None:
         """Follow the noise before the control is switched on: delay lines and powers advance, the weights stay.
 
         Parameters

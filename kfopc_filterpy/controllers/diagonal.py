@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 
+from .._types import PathModels
 from .._validate import as_nonnegative
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
@@ -80,7 +80,7 @@ class DiagonalKalman(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         state_noise: float,
         measurement_noise: float,

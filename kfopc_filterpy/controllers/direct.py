@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from .._types import NumberOrArray, PathModels, PerLoudspeaker, PerMicrophone
 from .._validate import as_nonnegative
 from ..core.triangle import OWED, full_covariance
 from ..power.amplifiers import Amplifier
@@ -100,14 +100,14 @@ class DirectKalman(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         state_noise: float,
-        measurement_noise: Any,
+        measurement_noise: PerMicrophone,
         initial_variance: float = 1.0,
         fading: float = 1.0,
         n_references: int | None = 1,
-        rated_power: Any = None,
+        rated_power: PerLoudspeaker | None = None,
         constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Limiters = None,
@@ -133,7 +133,7 @@ class DirectKalman(CoreController):
         self.name = name or ("KF-ANC" if own is None else "KF-OPC")
 
     @property
-    def innovation(self) -> Any:
+    def innovation(self) -> NumberOrArray:
         """Innovation alpha d^ - w'x' of the last update; with several channels that of each microphone, (K,).
 
         The microphones are measured one after the other, each with the weights that those before it have corrected.
@@ -141,7 +141,7 @@ class DirectKalman(CoreController):
         return self._shaped(self._opened().fields["innovation"].ravel())
 
     @property
-    def innovation_variance(self) -> Any:
+    def innovation_variance(self) -> NumberOrArray:
         """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
         return self._shaped(self._opened().fields["innovation_variance"].ravel())
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from .._types import PathModels
 from .._validate import as_count, as_positive
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
@@ -128,7 +127,7 @@ class FastArrayKalman(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         measurement_noise: float,
         initial_variance: float = 1.0,

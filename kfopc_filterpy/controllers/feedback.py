@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray, PathModels
 from .._validate import as_channels, as_number
 from ..paths.models import is_system, path_taps, sampling_rate
 from ..paths.path_matrix import is_path_matrix, path_matrix
 from .base import Controller, WrappedController, listening
 from .channel_samples import amplifier_functions, channel_sample, push_sample
+
+if TYPE_CHECKING:
+    from ..power.amplifiers import Amplifier
 
 
 class FeedbackNeutralizer(WrappedController):
@@ -65,7 +71,13 @@ class FeedbackNeutralizer(WrappedController):
     True
     """
 
-    def __init__(self, controller: Controller, feedback_path: Any, *, amplifier: Any = None) -> None:
+    def __init__(
+        self,
+        controller: Controller,
+        feedback_path: PathModels,
+        *,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    ) -> None:
         super().__init__(controller)
         self._several = is_path_matrix(feedback_path)
         if self._several:
@@ -100,7 +112,7 @@ class FeedbackNeutralizer(WrappedController):
     def __repr__(self) -> str:
         return f"<{self.name}: {self._played.size // self._n_loudspeakers + 1} taps, {self.controller!r}>"
 
-    def control_signal(self, reference: Any) -> Any:
+    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n), or (J,), for the newest sample x(n), or (I,), of the reference microphones."""
         if self._several:
             x = channel_sample(reference, self._n_references, "reference", "references")
@@ -117,11 +129,11 @@ class FeedbackNeutralizer(WrappedController):
             y = np.array([amplifier(value) for amplifier, value in zip(self._amplifiers, y, strict=True)])
         push_sample(self._played, y)
 
-    def update(self, error: Any) -> None:
+    def update(self, error: NumberOrArray) -> None:
         """Pass the error to the controller's `update`."""
         self.controller.update(error)
 
-    def listen(self, references: Any, errors: Any) -> None:
+    def listen(self, references: ArrayLike, errors: ArrayLike) -> None:
         """Let the controller follow `references` and `errors` while the loudspeakers are silent.
 
         What the loudspeakers played before is still subtracted.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from .._types import PathModels
 from .core_controller import CoreController, Limiters, setting
 
 
@@ -78,7 +77,7 @@ class FxLMS(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         step_size: float,
         n_references: int = 1,

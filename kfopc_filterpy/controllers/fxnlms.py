@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from .._types import PathModels
 from .core_controller import CoreController, Limiters, setting
 
 
@@ -58,7 +57,7 @@ class FxNLMS(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         step_size: float,
         regularization: float = 1e-10,

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from .._types import PathModels
 from .._validate import as_positive
 from ..paths.path_matrix import is_path_matrix
 from ..power.amplifiers import Amplifier
@@ -13,7 +12,7 @@ from .direct import DirectKalman
 
 def fx_rls(
     n_taps: int,
-    secondary_path: Any,
+    secondary_path: PathModels,
     *,
     forgetting: float = 0.9999,
     initial_variance: float = 1.0,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from .._types import PathModels, PerLoudspeaker, PerMicrophone
 from ..bounds.settings import SuggestedSettings
 from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
@@ -16,6 +18,12 @@ from ..power.limiter import OutputLimiter
 from .base import constraint_for
 from .core_controller import CoreController
 from .direct import DirectKalman
+
+if TYPE_CHECKING:
+    from ..controllers.core_controller import Limiters
+
+
+_Made = TypeVar("_Made", bound=CoreController)
 
 
 class KalmanController(CoreController):
@@ -63,7 +71,7 @@ class KalmanController(CoreController):
     def __init__(
         self,
         estimator: KalmanFilter,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         amplifier: Amplifier | None = None,
         name: str | None = None,
@@ -154,14 +162,14 @@ class KalmanController(CoreController):
 
 def kf_anc(
     n_taps: int | SuggestedSettings,
-    secondary_path: Any,
+    secondary_path: PathModels,
     *,
     state_noise: float | None = None,
-    measurement_noise: Any = None,
+    measurement_noise: PerMicrophone | None = None,
     initial_variance: float | None = None,
     n_references: int = 1,
-    amplifier: Any = None,
-    limiter: Any = None,
+    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    limiter: Limiters = None,
 ) -> DirectKalman:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
 
@@ -223,16 +231,16 @@ def kf_anc(
 
 def kf_opc(
     n_taps: int | SuggestedSettings,
-    secondary_path: Any,
+    secondary_path: PathModels,
     *,
-    rated_power: Any = None,
-    constraint: Any = None,
+    rated_power: PerLoudspeaker | None = None,
+    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
     state_noise: float | None = None,
-    measurement_noise: Any = None,
+    measurement_noise: PerMicrophone | None = None,
     initial_variance: float | None = None,
     n_references: int = 1,
-    amplifier: Any = None,
-    limiter: Any = None,
+    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    limiter: Limiters = None,
 ) -> DirectKalman:
     """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
 
@@ -298,14 +306,14 @@ def _kalman(
     return at_suggested_rate(controller, n_taps)
 
 
-def with_suggested(n_taps: Any, settings: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+def with_suggested(n_taps: int | SuggestedSettings, settings: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Return the taps and the settings; the suggested ones, if there are any, replace those that are None.
 
     A noise that is still missing raises TypeError; the message says how to find it.
     """
     suggested: dict[str, Any] = {"initial_variance": 1.0}
     if isinstance(n_taps, SuggestedSettings):
-        n_taps, suggested = n_taps.n_taps, n_taps.settings
+        suggested, n_taps = n_taps.settings, n_taps.n_taps
     settings = suggested | {name: value for name, value in settings.items() if value is not None}
     if not {"state_noise", "measurement_noise"} <= settings.keys():
         raise TypeError(
@@ -315,14 +323,18 @@ def with_suggested(n_taps: Any, settings: dict[str, Any]) -> tuple[Any, dict[str
     return n_taps, settings
 
 
-def suggested_constraint(n_taps: Any, rated_power: Any, constraint: Any) -> Any:
+def suggested_constraint(
+    n_taps: int | SuggestedSettings,
+    rated_power: PerLoudspeaker | None,
+    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None,
+) -> Any:
     """Return `constraint_for`, for the sample rate of suggested settings if `n_taps` are such."""
     if not isinstance(n_taps, SuggestedSettings):
         return constraint_for(rated_power, constraint)
     return constraint_for(rated_power, constraint, n_taps.fs)
 
 
-def at_suggested_rate(controller: Any, n_taps: Any) -> Any:
+def at_suggested_rate(controller: _Made, n_taps: int | SuggestedSettings) -> _Made:
     """Return the controller, or raise ValueError if a part of it has another sample rate than suggested settings."""
     if isinstance(n_taps, SuggestedSettings):
         try:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from .._types import PathModels
 from .._validate import as_nonnegative
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
@@ -103,7 +104,7 @@ class LeakyFxLMS(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         step_size: float,
         leak: float | Sequence[float] | np.ndarray,
@@ -175,7 +176,7 @@ class OptimalLeakyFxLMS(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         step_size: float,
         rated_power: float | Sequence[float] | np.ndarray | None = None,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ..power.limiter import OutputLimiter
@@ -83,7 +81,7 @@ class LimitedController(WrappedController):
         """Pass the error e(n) to the controller's `update`."""
         self.controller.update(error)
 
-    def listen(self, references: Any, errors: Any) -> None:
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Let the controller follow `references` and `errors` before the control is switched on, with silent output."""
         listening(self.controller).listen(references, errors)
         self.limiter.process(np.zeros(len(references)))

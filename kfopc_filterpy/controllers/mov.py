@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._types import NumberOrArray, PathModels
 from .._validate import as_nonnegative, as_positive
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
@@ -125,7 +126,7 @@ class MOVFxLMS(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         step_size: float,
         rated_power: float | Sequence[float] | np.ndarray | None = None,
@@ -159,6 +160,6 @@ class MOVFxLMS(CoreController):
         return bool(self._of_setting("modified"))
 
     @property
-    def penalty_factor(self) -> Any:
+    def penalty_factor(self) -> NumberOrArray:
         """Fixed penalty factor gamma, with several channels (J,); None if it follows the running powers."""
         return self._of_setting("penalty_factor") if self.algorithm == "mov_fixed" else None

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_positive
 from ..bounds.settings import SuggestedSettings
 from ..paths.uncertainty import as_uncertainty
@@ -15,6 +16,9 @@ from .base import Looped
 from .core_controller import Limiters
 from .kalman import at_suggested_rate
 from .posterior import DEFAULT_UNCERTAINTY, PosteriorController, block_of, relative_spread
+
+if TYPE_CHECKING:
+    from ..paths.uncertainty import Uncertainty
 
 DEFAULT_AVERAGING_S = 10.0
 LEAST_BLOCKS, MOST_BLOCKS = 20, 100_000  # in the averaging time
@@ -110,13 +114,13 @@ class PowerBudgetController(PosteriorController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
-        rated_power: Any,
+        rated_power: PerLoudspeaker,
         n_references: int = 1,
         amplifier: Amplifier | Sequence[Amplifier] | None = None,
         limiter: Limiters = None,
-        secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY,
+        secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
         fs: float = DEFAULT_FS,
         averaging_s: float = DEFAULT_AVERAGING_S,
     ) -> None:
@@ -153,7 +157,7 @@ class PowerBudgetController(PosteriorController):
         return self._fs
 
     @property
-    def power_weight(self) -> Any:
+    def power_weight(self) -> NumberOrArray:
         """Price of power of the last block, or with several channels that of each loudspeaker, (J,)."""
         return self._per_channel("price")
 
@@ -167,13 +171,13 @@ class PowerBudgetController(PosteriorController):
 
 def kf_pb(
     n_taps: int | SuggestedSettings,
-    secondary_path: Any,
+    secondary_path: PathModels,
     *,
-    rated_power: Any,
+    rated_power: PerLoudspeaker,
     n_references: int = 1,
-    amplifier: Any = None,
-    limiter: Any = None,
-    secondary_path_uncertainty: Any = DEFAULT_UNCERTAINTY,
+    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    limiter: Limiters = None,
+    secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
     fs: float | None = None,
     averaging_s: float = DEFAULT_AVERAGING_S,
 ) -> PowerBudgetController:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_real_array, require_finite
+
+if TYPE_CHECKING:
+    pass
 
 
 class RefusedUpdate(ValueError):
@@ -30,7 +34,9 @@ class RefusedUpdate(ValueError):
 class BlockProcessing:
     """Gives a controller `process`, by its two methods per sample."""
 
-    def process(self, references: Any, errors: Any, *, adapt: Any = True, out: np.ndarray | None = None) -> np.ndarray:
+    def process(
+        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return the control signals of a block of samples, and adapt to its errors.
 
         This is `control_signal` and `update` for each sample in turn, so the results do not depend on how a recording is
@@ -80,7 +86,9 @@ class BlockProcessing:
         return process_steps(self, references, errors, adapt=adapt, out=out)
 
 
-def process_steps(controller: Any, references: Any, errors: Any, *, adapt: Any, out: np.ndarray | None) -> np.ndarray:
+def process_steps(
+    controller: Any, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike, out: np.ndarray | None
+) -> np.ndarray:
     """Do what `BlockProcessing.process` says for any controller, by its two methods per sample."""
     x, e = block_signal(references, "references"), block_signal(errors, "errors")
     require_one_length(x, e)
@@ -104,7 +112,7 @@ def process_steps(controller: Any, references: Any, errors: Any, *, adapt: Any, 
     return y
 
 
-def block_signal(value: Any, name: str) -> np.ndarray:
+def block_signal(value: ArrayLike, name: str) -> np.ndarray:
     """Return a block of finite samples, (n_samples,) or (n_channels, n_samples), with at least one sample."""
     signal = as_real_array(value, name)
     if signal.ndim not in (1, 2) or signal.size == 0:
@@ -126,7 +134,7 @@ def require_one_length(references: np.ndarray, errors: np.ndarray) -> None:
         )
 
 
-def adapt_flags(adapt: Any, n_samples: int) -> np.ndarray:
+def adapt_flags(adapt: bool | ArrayLike, n_samples: int) -> np.ndarray:
     """Return for each sample whether to adapt to it, (n_samples,) of bool."""
     flags = np.asarray(adapt)
     if flags.dtype != bool or flags.shape not in ((), (n_samples,)):
@@ -144,7 +152,7 @@ def require_channels(signal: np.ndarray, name: str, multichannel: bool, n_channe
         raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
 
 
-def output_array(out: Any, shape: tuple[int, ...]) -> np.ndarray:
+def output_array(out: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
     """Return `out`, or a new array if it is None; raise ValueError if control signals of a shape do not fit into it."""
     if out is None:
         return np.empty(shape)

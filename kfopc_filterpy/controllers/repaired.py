@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from .._types import PathModels
 from .._validate import as_choice, as_nonnegative, as_positive
 from ..bounds.settings import SuggestedSettings
 from ..power.amplifiers import Amplifier
@@ -57,7 +58,7 @@ class RepairedKFOPC(DirectKalman):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         constraint: OutputPowerConstraint,
         gain_of: str = "control",
@@ -83,7 +84,7 @@ class RepairedKFOPC(DirectKalman):
 
 def kf_opc_repaired(
     n_taps: int | SuggestedSettings,
-    secondary_path: Any,
+    secondary_path: PathModels,
     *,
     rated_power: float | None = None,
     constraint: OutputPowerConstraint | None = None,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from .._types import PathModels
 from .core_controller import CoreController, Limiters, setting
 
 
@@ -61,7 +61,7 @@ class TwoGradientFxLMS(CoreController):
     def __init__(
         self,
         n_taps: int,
-        secondary_path: Any,
+        secondary_path: PathModels,
         *,
         step_size: float,
         amplitude_limit: float | Sequence[float] | np.ndarray,

@@ -7,7 +7,9 @@ from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray, PathModels, PerMicrophone
 from .._validate import as_channels, as_count, as_positive, as_real_array, require_finite
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
@@ -16,6 +18,8 @@ from .channel_samples import amplifier_functions, push_sample
 
 if TYPE_CHECKING:
     import control
+
+    from ..power.amplifiers import Amplifier
 
 
 class Observer(Protocol):
@@ -123,7 +127,12 @@ class KalmanObserver:
     """
 
     def __init__(
-        self, model: control.StateSpace, n_physical: int, *, sensor_noise_std: Any, source_power: Any = 1.0
+        self,
+        model: control.StateSpace,
+        n_physical: int,
+        *,
+        sensor_noise_std: PerMicrophone,
+        source_power: float | ArrayLike = 1.0,
     ) -> None:
         from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
@@ -266,12 +275,12 @@ class VirtualMicrophones(WrappedController):
     def __init__(
         self,
         controller: Controller,
-        secondary_path: Any,
-        observer: Any,
+        secondary_path: PathModels,
+        observer: KalmanObserver | ArrayLike,
         *,
         physical: Sequence[int],
         virtual: Sequence[int] | None = None,
-        amplifier: Any = None,
+        amplifier: Amplifier | Sequence[Amplifier] | None = None,
     ) -> None:
         super().__init__(controller)
         secondary, self._path_fs = secondary_paths(secondary_path)
@@ -343,7 +352,7 @@ class VirtualMicrophones(WrappedController):
             )
         super()._pass_on(name, value)
 
-    def control_signal(self, reference: Any) -> Any:
+    def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n), (J,), for the newest reference sample x(n), (I,)."""
         y = np.asarray(self.controller.control_signal(reference), dtype=np.float64).reshape(-1)
         if y.size != self.n_loudspeakers:
@@ -356,7 +365,7 @@ class VirtualMicrophones(WrappedController):
             y = np.array([amplifier(value) for amplifier, value in zip(self._amplifiers, y, strict=True)])
         push_sample(self._played, y)
 
-    def update(self, error: Any) -> None:
+    def update(self, error: NumberOrArray) -> None:
         """Let the controller adapt to the errors that the last control signal leaves at the virtual microphones.
 
         `error` is (K,), of all microphones; only the values of the physical ones are used.
@@ -369,7 +378,7 @@ class VirtualMicrophones(WrappedController):
         for k in self.physical[~np.isfinite(heard[self.physical])]:
             raise ValueError(f"error must be finite, but that of microphone {k} is {heard[k]}")
         disturbance, virtual_error = self._estimate(heard)
-        self.controller.update(virtual_error)  # type: ignore[arg-type]  # several channels: arrays
+        self.controller.update(virtual_error)
         self.observer.advance(disturbance)
         self._virtual_error = virtual_error
 
@@ -379,7 +388,7 @@ class VirtualMicrophones(WrappedController):
         disturbance = heard[self.physical] + anti_noise[self.physical]
         return disturbance, self.observer.estimate(disturbance) - anti_noise[self.virtual]
 
-    def listen(self, references: Any, errors: Any) -> None:
+    def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Let the controller follow the noise before the control is switched on, while the loudspeakers are silent.
 
         Parameters
@@ -399,7 +408,9 @@ class VirtualMicrophones(WrappedController):
                 f"errors must be (K microphones, n_samples) with K = {self.n_microphones}, as many samples as references, "
                 f"got {np.shape(errors)} and {np.shape(references)}"
             )
-        heard = np.zeros(np.shape(errors))  # what the virtual microphones hear is not used, so it may be anything
+        heard: np.ndarray = np.zeros(
+            np.shape(errors)
+        )  # what the virtual microphones hear is not used, so it may be anything
         heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
         before = deepcopy(self._followed())
         virtual_errors = np.empty((self.virtual.size, heard.shape[1]))

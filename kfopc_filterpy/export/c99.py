@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from ..controllers.base import calls_of
 from ..controllers.core_controller import CoreController
 from ..core.block import Block
 from .source import Exported
+
+if TYPE_CHECKING:
+    from ..controllers.limited import LimitedController
 
 EXPORTED = (
     "export_c takes the controllers whose algorithm is in the package's core. It takes no wrapper (export the inner "
@@ -67,7 +72,13 @@ class CExport:
         )
 
 
-def export_c(controller: Any, path: Any, *, name: str | None = None, dtype: Any = "float64") -> CExport:
+def export_c(
+    controller: CoreController | LimitedController,
+    path: str | os.PathLike[str],
+    *,
+    name: str | None = None,
+    dtype: DTypeLike = "float64",
+) -> CExport:
     """Write a controller as a C99 source file and its header, to continue from its present state.
 
     The files need only ``string.h`` and ``math.h``. They allocate nothing: a struct of fixed size holds the state.

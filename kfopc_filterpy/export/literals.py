@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 
 WIDTH = 120
 
 
-def number(value: Any, name: str, precision: np.dtype) -> str:
+def number(value: float, name: str, precision: np.dtype) -> str:
     """Return a number as C writes it; the precision must be able to hold it."""
     if isinstance(value, int | np.integer):
         return str(value)

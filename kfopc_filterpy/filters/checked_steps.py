@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import ArrayLike
 
 from .._validate import as_real_array, require_finite
 
@@ -88,7 +89,9 @@ def _require_sound(kf: KalmanFilter) -> None:
             )
 
 
-def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, Any, np.ndarray | None]:
+def checked_measurement(
+    kf: KalmanFilter, z: ArrayLike, R: ArrayLike | None, H: ArrayLike | None
+) -> tuple[ArrayLike, ArrayLike | None, np.ndarray | None]:
     """Return z, R and H as filterpy handles them, or raise a clear error."""
     n = kf.dim_x
     given = kf.H if H is None else H
@@ -114,7 +117,7 @@ def checked_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> tuple[Any, 
     return np.reshape(z, wanted), R, H
 
 
-def require_observation(kf: KalmanFilter, H: Any, name: str = "H") -> None:
+def require_observation(kf: KalmanFilter, H: ArrayLike, name: str = "H") -> None:
     """Raise ValueError if H is the array of zeros that filterpy makes and nothing was written into it."""
     if H is getattr(kf, "_default_H", None) and not np.any(H):
         raise ValueError(
@@ -123,7 +126,7 @@ def require_observation(kf: KalmanFilter, H: Any, name: str = "H") -> None:
         )
 
 
-def require_measurement(z: Any, rows: int) -> None:
+def require_measurement(z: ArrayLike, rows: int) -> None:
     """Raise an error unless z holds finite numbers, one per row of H, in a shape that converts to (rows, 1)."""
     if np.ma.is_masked(z):  # numpy would use the value behind the mask
         raise ValueError("z must not be masked: pass None for a missed sample")
@@ -138,14 +141,14 @@ def require_measurement(z: Any, rows: int) -> None:
     require_finite(values, "z")
 
 
-def require_matrix(value: Any, shape: tuple[int, ...], name: str) -> None:
+def require_matrix(value: ArrayLike, shape: tuple[int, ...], name: str) -> None:
     """Raise ValueError unless `value` is finite and has this shape."""
     if np.shape(value) != shape:
         raise ValueError(f"{name} must have shape {shape}, got {np.shape(value)}")
     require_finite(as_real_array(value, name), name)
 
 
-def require_variance(value: Any, size: int, name: str) -> None:
+def require_variance(value: ArrayLike, size: int, name: str) -> None:
     """Raise ValueError unless `value` is a finite variance: a number, or (size, size) with no negative diagonal."""
     if np.ndim(value) > 0 and np.size(value) > 1:
         require_matrix(value, (size, size), name)
@@ -155,7 +158,7 @@ def require_variance(value: Any, size: int, name: str) -> None:
         raise ValueError(f"{name} must not be negative: it is a variance, got {value!r}")
 
 
-def require_semidefinite(value: Any, name: str, limit: float = INDEFINITE_LIMIT) -> None:
+def require_semidefinite(value: ArrayLike, name: str, limit: float = INDEFINITE_LIMIT) -> None:
     """Raise ValueError if the covariance `value` has an eigenvalue below -`limit` times its largest element.
 
     NaN, Inf and wrong shapes pass: the step that uses them refuses them.

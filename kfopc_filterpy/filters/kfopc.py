@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_signal, require_finite
 from ..checkpoint import Checkpointed
 from .checked_steps import (
@@ -167,7 +169,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         dim_z: int = 1,
         dim_u: int = 0,
         *,
-        rated_power: Any = None,
+        rated_power: PerLoudspeaker | None = None,
         constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
     ) -> None:
         self._constraint: Any = None
@@ -246,13 +248,14 @@ class KFOPC(KalmanFilter, Checkpointed):
     # The constraint: its values can be read, or supplied by the caller.
 
     @property
-    def rated_power(self) -> Any:
+    def rated_power(self) -> NumberOrArray | None:
         """Rated output power, or that of each loudspeaker, (J,); assign another, or None to lift the constraint."""
         return None if self._constraint is None else self._constraint.rated_power
 
     @rated_power.setter
-    def rated_power(self, value: Any) -> None:
-        one = np.ndim(value) == 0
+    def rated_power(self, value: PerLoudspeaker | None) -> None:
+        powers: Any = value
+        one = np.ndim(powers) == 0
         if value is None:
             self._lifted, self._constraint = self._constraint or self._lifted, None
         elif self._constraint is not None and (one or isinstance(self._constraint, tuple)):
@@ -262,7 +265,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
             settings = self._constraint or self._lifted or OutputPowerConstraint(1.0)
             together = one or isinstance(settings, tuple)
-            self.constraint = settings.fresh(value) if together else [settings.fresh(power) for power in value]
+            self.constraint = settings.fresh(powers) if together else [settings.fresh(power) for power in powers]
 
     @property
     def constraint(self) -> Any:
@@ -273,7 +276,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         return self._constraint
 
     @constraint.setter
-    def constraint(self, value: Any) -> None:
+    def constraint(self, value: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None) -> None:
         if value is None:
             self.rated_power = None
         else:
@@ -310,21 +313,21 @@ class KFOPC(KalmanFilter, Checkpointed):
             self._unconstrained_factor = 1.0 if value is None else as_nonnegative(value, "constraint_factor")
 
     @property
-    def disturbance_power(self) -> Any:
+    def disturbance_power(self) -> NumberOrArray | None:
         """Disturbance power delta_d^2 last used (eq. 10), None without a rated power; can be supplied."""
         return None if self._constraint is None else self._constraint.disturbance_power
 
     @disturbance_power.setter
-    def disturbance_power(self, value: Any) -> None:
+    def disturbance_power(self, value: PerLoudspeaker) -> None:
         self._require_constraint("disturbance_power").disturbance_power = value
 
     @property
-    def secondary_path_gain(self) -> Any:
+    def secondary_path_gain(self) -> NumberOrArray | None:
         """Secondary-path power gain G_s last used (eq. 11), None before any is known; can be supplied."""
         return None if self._constraint is None else self._constraint.secondary_path_gain
 
     @secondary_path_gain.setter
-    def secondary_path_gain(self, value: Any) -> None:
+    def secondary_path_gain(self, value: PerLoudspeaker) -> None:
         self._require_constraint("secondary_path_gain").secondary_path_gain = value
 
     def _require_constraint(self, name: str) -> Any:
@@ -334,7 +337,13 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     # filterpy's steps.
 
-    def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
+    def predict(
+        self,
+        u: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        F: ArrayLike | None = None,
+        Q: ArrayLike | None = None,
+    ) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
         n = self.dim_x
         F = _as_matrix(F, "F")
@@ -347,12 +356,19 @@ class KFOPC(KalmanFilter, Checkpointed):
         with self._all_or_nothing("predict", u=u, B=used_B):
             super().predict(u, B, F, Q)
 
-    def predict_steadystate(self, u: Any = 0, B: Any = None) -> None:
+    def predict_steadystate(self, u: ArrayLike = 0, B: ArrayLike | None = None) -> None:
         """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
         with self._all_or_nothing("predict_steadystate", u=u, B=self.B if B is None else B):
             super().predict_steadystate(u, B)
 
-    def update(self, z: Any, R: Any = None, H: Any = None, *, reference: Any = None) -> None:
+    def update(
+        self,
+        z: ArrayLike | None,
+        R: ArrayLike | None = None,
+        H: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
+    ) -> None:
         """Correct the state with a measurement, scaled by the constraint factor (eq. 9).
 
         Parameters
@@ -385,7 +401,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         z, R, H = checked_measurement(self, z, R, H)
         self._scaled_step("update", lambda scaled: KalmanFilter.update(self, scaled, R, H), z, H, reference)
 
-    def update_steadystate(self, z: Any, *, reference: Any = None) -> None:
+    def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
         """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
         if z is None:
             super().update_steadystate(None)
@@ -395,7 +411,14 @@ class KFOPC(KalmanFilter, Checkpointed):
         step = super().update_steadystate
         self._scaled_step("update_steadystate", step, z, None, reference)
 
-    def update_correlated(self, z: Any, R: Any = None, H: Any = None, *, reference: Any = None) -> None:
+    def update_correlated(
+        self,
+        z: ArrayLike | None,
+        R: ArrayLike | None = None,
+        H: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
+    ) -> None:
         """Run filterpy's `update_correlated` with the measurement scaled; see `update`."""
         if z is None:
             super().update_correlated(None)
@@ -406,7 +429,13 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._scaled_step("update_correlated", lambda scaled: step(scaled, R, H), z, H, reference)
 
     def update_sequential(
-        self, start: int, z_i: Any, R_i: Any = None, H_i: Any = None, *, reference: Any = None
+        self,
+        start: int,
+        z_i: ArrayLike,
+        R_i: ArrayLike | None = None,
+        H_i: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
     ) -> None:
         """Run filterpy's `update_sequential` (filterpy 2.0.0) with the measurement scaled; see `update`."""
         if not hasattr(KalmanFilter, "update_sequential"):
@@ -435,17 +464,17 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def batch_filter(
         self,
-        zs: Sequence[Any],
-        Fs: Any = None,
-        Qs: Any = None,
-        Hs: Any = None,
-        Rs: Any = None,
-        Bs: Any = None,
-        us: Any = None,
+        zs: Sequence[Any] | np.ndarray,
+        Fs: Sequence[Any] | np.ndarray | None = None,
+        Qs: Sequence[Any] | np.ndarray | None = None,
+        Hs: Sequence[Any] | np.ndarray | None = None,
+        Rs: Sequence[Any] | np.ndarray | None = None,
+        Bs: Sequence[Any] | np.ndarray | None = None,
+        us: Sequence[Any] | np.ndarray | None = None,
         update_first: bool = False,
         saver: Any = None,
         *,
-        references: Any = None,
+        references: ArrayLike | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Run filterpy's `batch_filter`, with the newest reference sample of each step in `references`.
 
@@ -479,13 +508,14 @@ class KFOPC(KalmanFilter, Checkpointed):
         >>> kf.batch_filter(zs)[0].ravel().round(2)  # the second sample is missing
         array([0.67, 0.67, 0.91])
         """
+        batch: BatchReferences | None = None
         if references is not None:
-            references = BatchReferences(self._checked_references(references, len(zs)))
+            batch = BatchReferences(self._checked_references(references, len(zs)))
         for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
             if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
                 raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
         before = self._snapshot()
-        self._batch_references = references
+        self._batch_references = batch
         try:
             result = super().batch_filter(_with_none_for_masked(zs), Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
         except BaseException:
@@ -494,15 +524,15 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._batch_references = None
         return result
 
-    def get_update(self, z: Any = None) -> tuple[np.ndarray, np.ndarray]:
+    def get_update(self, z: ArrayLike | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Return filterpy's `get_update` of the measurement scaled by the present factor; nothing changes."""
         return super().get_update(None if z is None else self._presently_scaled(z))
 
-    def residual_of(self, z: Any) -> np.ndarray:
+    def residual_of(self, z: ArrayLike) -> np.ndarray:
         """Return the residual of the measurement scaled by the present factor; nothing changes."""
         return super().residual_of(self._presently_scaled(z))
 
-    def log_likelihood_of(self, z: Any) -> float:
+    def log_likelihood_of(self, z: ArrayLike | None) -> float:
         """Return the log-likelihood of the measurement scaled by the present factor; nothing changes."""
         return super().log_likelihood_of(None if z is None else self._presently_scaled(z))
 
@@ -659,7 +689,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         return all_or_nothing(self, name, **arguments)
 
 
-def _with_none_for_masked(zs: Sequence[Any]) -> np.ndarray:
+def _with_none_for_masked(zs: Sequence[Any] | np.ndarray) -> np.ndarray:
     """Return the samples, None for each that is masked in whole or in part.
 
     In an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None.

@@ -8,6 +8,7 @@ from math import isfinite, log, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..core.block import LOUD_STEP, NO_SOLUTION
@@ -164,7 +165,7 @@ class RandomWalkKFOPC(KFOPC):
         return self._view("F", 1.0) if self._F is None else self._F
 
     @F.setter
-    def F(self, value: Any) -> None:
+    def F(self, value: ArrayLike) -> None:
         F = self._matrix(value, "F")
         self._F = None if np.array_equal(F, np.eye(self.dim_x)) else F
 
@@ -174,7 +175,7 @@ class RandomWalkKFOPC(KFOPC):
         return self._view("Q", self._numbers["state_noise"][0]) if self._Q is None else self._Q
 
     @Q.setter
-    def Q(self, value: Any) -> None:
+    def Q(self, value: ArrayLike) -> None:
         if np.ndim(value) == 0:
             self.state_noise = as_nonnegative(value, "Q")
             return
@@ -192,7 +193,7 @@ class RandomWalkKFOPC(KFOPC):
         return self._view("R", self._numbers["measurement_noise"][0], size=1)
 
     @R.setter
-    def R(self, value: Any) -> None:
+    def R(self, value: ArrayLike) -> None:
         if np.size(value) != 1:
             raise ValueError(f"R must be one variance, got shape {np.shape(value)}")
         self.measurement_noise = as_nonnegative(value, "R")
@@ -220,9 +221,10 @@ class RandomWalkKFOPC(KFOPC):
         return self._covariance.show()
 
     @P.setter
-    def P(self, value: Any) -> None:
+    def P(self, value: ArrayLike) -> None:
         # as in filterpy's equations, a number is the variance of every state
-        P = self._matrix(value * np.eye(self.dim_x) if np.ndim(value) == 0 else value, "P")
+        given: Any = value
+        P = self._matrix(given * np.eye(self.dim_x) if np.ndim(given) == 0 else given, "P")
         if not self._delegating:  # the rounding of filterpy's own equations need not be small beside P
             require_covariance(P)
         self._replace_covariance(P)
@@ -299,7 +301,13 @@ class RandomWalkKFOPC(KFOPC):
             yield
             self._delegating = False
 
-    def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
+    def predict(
+        self,
+        u: ArrayLike | None = None,
+        B: ArrayLike | None = None,
+        F: ArrayLike | None = None,
+        Q: ArrayLike | None = None,
+    ) -> None:
         """Apply eq. 2 and 4; a full F or Q, or B with u, uses filterpy's own equations. See `KFOPC.predict`."""
         # batch_filter passes F and Q as they are read
         F = self._F if F is None or F is self._views.get("F") else F
@@ -314,9 +322,17 @@ class RandomWalkKFOPC(KFOPC):
         self._covariance.predict(self._alpha_sq, state_noise)
         self.x, self.x_prior = x, x.copy()
 
-    def update(self, z: Any, R: Any = None, H: Any = None, *, reference: float | None = None) -> None:
+    def update(
+        self,
+        z: ArrayLike | None,
+        R: ArrayLike | None = None,
+        H: ArrayLike | None = None,
+        *,
+        reference: ArrayLike | None = None,
+    ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
-        row = self.H if H is None else H
+        row: Any = self.H if H is None else H
+        measurement: Any
         own_inverse = self.inv is not np.linalg.inv
         if z is not None and (own_inverse or np.size(row) != self.dim_x):
             super().update(z, R, H, reference=reference)
@@ -347,7 +363,7 @@ class RandomWalkKFOPC(KFOPC):
         noise = self.measurement_noise if R is None else as_nonnegative(R, "R")
         return float(np.asarray(z).reshape(())), noise, np.array(row, dtype=np.float64).reshape(-1)
 
-    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: float | None) -> np.ndarray:
+    def _corrected(self, z: float, noise: float, h: np.ndarray, reference: Any) -> np.ndarray:
         """Apply eq. 5-9; return the new weights. A refused update raises before anything changes."""
         constraint, covariance = self._constraint, self._covariance
         seen = covariance.seen

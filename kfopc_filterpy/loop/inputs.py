@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.signal import fftconvolve
 
+from .._types import PathModels, Seed
 from .._validate import as_channels, as_generator, as_nonnegative, as_signal
 from ..controllers.base import listening
 from ..paths.models import path_taps
@@ -17,7 +18,9 @@ from ..paths.path_matrix import primary_paths
 DIVERGENCE_LIMIT = 1e6  # a run stops if the control signal exceeds this multiple of sqrt(rated power)
 
 
-def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float) -> np.ndarray:
+def disturbance_at_microphone(
+    x: np.ndarray, primary_path: PathModels | None, disturbance: ArrayLike | None, fs: float
+) -> np.ndarray:
     """Return the disturbance d, (n_samples,), as given or as p*x."""
     require_one_source(primary_path, disturbance)
     if disturbance is not None:
@@ -26,7 +29,7 @@ def disturbance_at_microphone(x: np.ndarray, primary_path: Any, disturbance: Any
 
 
 def channel_disturbances(
-    x: np.ndarray, primary_path: Any, disturbance: Any, fs: float, n_microphones: int
+    x: np.ndarray, primary_path: PathModels | None, disturbance: ArrayLike | None, fs: float, n_microphones: int
 ) -> np.ndarray:
     """Return the disturbances, (K, n_samples), as given or as the sum of p_ki * x_i."""
     require_one_source(primary_path, disturbance)
@@ -46,13 +49,13 @@ def channel_disturbances(
     return d
 
 
-def require_one_source(primary_path: Any, disturbance: Any) -> None:
+def require_one_source(primary_path: PathModels | None, disturbance: ArrayLike | None) -> None:
     """Raise ValueError unless exactly one of the two is given."""
     if (primary_path is None) == (disturbance is None):
         raise ValueError("give either primary_path= or disturbance=, not both and not neither")
 
 
-def listen_first(controller: Any, references: np.ndarray, errors: np.ndarray) -> None:
+def listen_first(controller: object, references: np.ndarray, errors: np.ndarray) -> None:
     """Let the controller follow the noise before it is switched on."""
     listening(controller).listen(references, errors)
 
@@ -60,7 +63,7 @@ def listen_first(controller: Any, references: np.ndarray, errors: np.ndarray) ->
 class SensorNoise:
     """White noise, drawn stretch by stretch."""
 
-    def __init__(self, std: float, rng: Any) -> None:
+    def __init__(self, std: float, rng: Seed | None) -> None:
         self.std = as_nonnegative(std, "sensor_noise_std")
         self.rng = as_generator(rng) if self.std > 0 else None
 

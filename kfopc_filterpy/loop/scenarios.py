@@ -7,7 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModels, Seed
 from .._validate import as_positive, as_signal
 from ..controllers.core_controller import RECORDED as IN_CONSTRAINT
 from ..controllers.core_controller import CoreController
@@ -41,16 +43,16 @@ IN_WORDS = {  # by the names of fields
 
 def simulate_scenarios(
     controllers: Sequence[Any],
-    reference: Any,
+    reference: ArrayLike,
     *,
-    secondary_path: Any,
-    primary_path: Any = None,
-    disturbance: Any = None,
+    secondary_path: PathModels,
+    primary_path: PathModels | None = None,
+    disturbance: ArrayLike | None = None,
     fs: float = DEFAULT_FS,
     amplifier: Amplifier | Sequence[Amplifier | None] | None = None,
     rated_power: float | None = None,
     sensor_noise_std: float | Sequence[float] = 0.0,
-    rng: Any = None,
+    rng: Seed | None = None,
     switch_on_s: float = 0.0,
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,

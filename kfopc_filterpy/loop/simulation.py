@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModels, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
 from ..controllers.base import Controller, Looped
 from ..controllers.core_controller import NO_SOLUTION, CoreController
@@ -34,18 +36,18 @@ POWERS = ("disturbance_power", "secondary_path_gain", "power_weight")  # recorde
 
 def simulate(
     controller: Controller,
-    reference: Any,
+    reference: ArrayLike,
     *,
-    secondary_path: Any,
-    primary_path: Any = None,
-    disturbance: Any = None,
+    secondary_path: PathModels,
+    primary_path: PathModels | None = None,
+    disturbance: ArrayLike | None = None,
     fs: float = DEFAULT_FS,
-    amplifier: Amplifier | None = None,
-    rated_power: Any = None,
+    amplifier: Amplifier | Sequence[Amplifier | None] | None = None,
+    rated_power: PerLoudspeaker | None = None,
     sensor_noise_std: float = 0.0,
-    rng: Any = None,
+    rng: Seed | None = None,
     switch_on_s: float = 0.0,
-    feedback_path: Any = None,
+    feedback_path: PathModels | None = None,
     record_weights_every: int | None = None,
     record_powers: bool = False,
     progress: Callable[[int], Any] | None = None,
@@ -280,13 +282,16 @@ class _Run:
         return amplified
 
 
-def is_multichannel(controller: Any, reference: Any, secondary_path: Any, disturbance: Any) -> bool:
+def is_multichannel(
+    controller: object, reference: ArrayLike, secondary_path: PathModels, disturbance: ArrayLike | None
+) -> bool:
     """Return whether a run has several channels: its controller, one of its signals or its secondary paths say so."""
     own = isinstance(controller, CoreController) and controller.multichannel
-    return own or np.ndim(reference) == 2 or np.ndim(disturbance) == 2 or is_path_matrix(secondary_path)
+    heard: Any = disturbance
+    return own or np.ndim(reference) == 2 or np.ndim(heard) == 2 or is_path_matrix(secondary_path)
 
 
-def filters_of(controller: Any) -> Any:
+def filters_of(controller: object) -> Any:
     """Return the control filters of a controller."""
     return getattr(controller, "control_filter", getattr(controller, "weights", None))
 
@@ -344,7 +349,7 @@ def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.nd
             else "a function of a sample, or None"
         )
         raise TypeError(f"amplifier must be {one.format(J=J)}, got {amplifier!r}")
-    functions = [one if one is not None and compiled_model(one) is None else None for one in each]
+    functions: list[Any] = [one if one is not None and compiled_model(one) is None else None for one in each]
     models = amplifier_models([None if function else one for one, function in zip(each, functions, strict=True)], J)
     return functions, models.view(np.float64).reshape(J, -1)
 

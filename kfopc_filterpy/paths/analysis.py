@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModel
 from .._validate import as_band, as_number, as_positive, as_signal
 from .models import finite_taps, is_system, path_taps, sampling_rate
 from .path_matrix import PRIMARY_AXES, SECONDARY_AXES, is_path_matrix, sampled_path_matrix
@@ -16,7 +18,7 @@ STABILITY_BOUND_DEG = 90.0
 """Phase error of the estimate beyond which filtered-reference adaptation diverges, in degrees."""
 
 
-def frequency_response(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
+def frequency_response(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None) -> np.ndarray:
     """Return the complex frequency response of a path.
 
     Parameters
@@ -78,7 +80,7 @@ def _frequencies(frequencies_hz: Any, fs: float) -> np.ndarray:
     return frequencies
 
 
-def group_delay(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
+def group_delay(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None) -> np.ndarray:
     """Return the group delay of a path, ``-d(phase)/d(omega)``, in seconds.
 
     Parameters
@@ -121,7 +123,11 @@ def group_delay(path: Any, frequencies_hz: Any, *, fs: float | None = None) -> n
 
 
 def secondary_path_gain(
-    path: Any, *, band: tuple[float, float] | None = None, reference: Any = None, fs: float | None = None
+    path: PathModel,
+    *,
+    band: tuple[float, float] | None = None,
+    reference: ArrayLike | None = None,
+    fs: float | None = None,
 ) -> float:
     """Return the secondary-path gain ``G_s = E[x'^2] / E[x^2]`` (eq. 11), a power gain.
 
@@ -214,7 +220,9 @@ class PhaseError:
         return np.abs(self.error_deg) < self.bound_deg
 
 
-def phase_error(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> PhaseError:
+def phase_error(
+    path: PathModel, estimate: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None
+) -> PhaseError:
     """Return the phase error of a secondary-path estimate, with the 90 degree stability bound.
 
     Parameters
@@ -278,7 +286,7 @@ class AchievedBand:
     level_db: float
 
 
-def achieved_band(path: Any, level_db: float = -3.0, *, fs: float | None = None) -> AchievedBand:
+def achieved_band(path: PathModel, level_db: float = -3.0, *, fs: float | None = None) -> AchievedBand:
     """Return the band within which the response of a path stays above a level: what its taps really pass.
 
     Parameters
@@ -425,8 +433,8 @@ def energy_onset(taps: np.ndarray, share: float = 0.01) -> int:
 
 
 def causality_margin(
-    primary: Any,
-    secondary: Any,
+    primary: PathModel,
+    secondary: PathModel,
     *,
     fs: float | None = None,
     band: tuple[float, float] | None = None,

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._types import PathModel
 from .._validate import as_positive
 from .models import path_taps, sampling_rate
 from .path_matrix import is_path_matrix
@@ -58,7 +59,11 @@ class FeedbackMargin:
 
 
 def feedback_margin(
-    control_filter: Any, feedback_path: Any, feedback_estimate: Any = None, *, fs: float | None = None
+    control_filter: PathModel,
+    feedback_path: PathModel,
+    feedback_estimate: PathModel | None = None,
+    *,
+    fs: float | None = None,
 ) -> FeedbackMargin:
     r"""Return whether acoustic feedback through a control filter is stable, and with what margin.
 

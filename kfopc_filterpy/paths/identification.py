@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModel, PathModels, Seed
 from .._validate import (
     as_channels,
     as_choice,
@@ -92,7 +94,7 @@ class IdentificationResult(PathEstimate):
 
 
 def estimate_path(
-    excitation: Any, response: Any, n_taps: int, fs: float, *, regularization: float = 1e-5
+    excitation: ArrayLike, response: ArrayLike, n_taps: int, fs: float, *, regularization: float = 1e-5
 ) -> PathEstimate:
     """Fit impulse responses to recorded excitations and responses by least squares.
 
@@ -340,18 +342,18 @@ def _system(taps: np.ndarray, fs: float) -> control.TransferFunction:
 
 
 def identify_secondary_path(
-    secondary_path: Any,
+    secondary_path: PathModels,
     *,
     n_taps: int,
     duration_s: float,
-    rng: Any,
+    rng: Seed,
     fs: float | None = None,
     excitation: str = "white",
     level: float = 1.0,
     amplifier: Callable[[np.ndarray], np.ndarray] | Sequence[Callable[[np.ndarray], np.ndarray] | None] | None = None,
     sensor_noise_std: float = 0.0,
     regularization: float = 1e-5,
-    frequencies_hz: Any = None,
+    frequencies_hz: ArrayLike | None = None,
     loudspeakers: str = "in turn",
 ) -> IdentificationResult:
     """Simulate the identification of secondary paths, as it is done before the control starts.
@@ -504,7 +506,9 @@ def _through(sent: np.ndarray, amplifiers: list[Any], paths: np.ndarray) -> np.n
     return received
 
 
-def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: float | None = None) -> np.ndarray:
+def modelling_error_db(
+    path: PathModel, estimate: PathModel, frequencies_hz: ArrayLike, *, fs: float | None = None
+) -> np.ndarray:
     """Return the modelling error of an estimate over frequency, ``20 log10(|S_est - S| / |S|)``.
 
     Parameters
@@ -540,7 +544,7 @@ def modelling_error_db(path: Any, estimate: Any, frequencies_hz: Any, *, fs: flo
     return np.clip(20 * np.log10(np.maximum(ratio, tiny)), -300.0, 300.0)
 
 
-def misalignment_db(path: Any, estimate: Any) -> float:
+def misalignment_db(path: PathModel, estimate: PathModel) -> float:
     """Return the error of a whole impulse response, ``10 log10(sum (s_est - s)^2 / sum s^2)``.
 
     Parameters

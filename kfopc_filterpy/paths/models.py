@@ -6,10 +6,12 @@ the finite impulse response that a sample-by-sample loop runs. Tap arrays are ac
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PathModel, System
 from .._validate import as_band, as_count, as_number, as_positive, as_signal
 
 if TYPE_CHECKING:
@@ -24,7 +26,7 @@ def bandpass_path(
     band: tuple[float, float] = (20.0, 5000.0),
     *,
     fs: float = 16000.0,
-    window: Any = "hamming",
+    window: str | float | tuple[str, float] | tuple[str, float, float] = "hamming",
 ) -> control.TransferFunction:
     """Design a linear-phase band-pass path, the path model of the paper's simulations.
 
@@ -79,7 +81,7 @@ def bandpass_path(
     return fir_path(taps, fs)
 
 
-def fir_path(taps: Any, fs: float, name: str | None = None) -> control.TransferFunction:
+def fir_path(taps: ArrayLike, fs: float, name: str | None = None) -> control.TransferFunction:
     """Make a python-control system from an impulse response.
 
     Parameters
@@ -118,12 +120,12 @@ def fir_path(taps: Any, fs: float, name: str | None = None) -> control.TransferF
     return TransferFunction(taps, denominator, 1 / fs, **({} if name is None else {"name": name}))
 
 
-def is_system(path: Any) -> bool:
+def is_system(path: object) -> TypeGuard[System]:
     """Tell whether `path` is a python-control system, by its attributes, so that control need not be imported."""
     return hasattr(path, "dt") and hasattr(path, "ninputs")
 
 
-def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> float:
+def sampling_rate(path: PathModel, fs: float | None = None, *, name: str = "path") -> float:
     """Return the sampling rate of a path in Hz: a system's own, or `fs` for a tap array.
 
     Parameters
@@ -172,7 +174,7 @@ def sampling_rate(path: Any, fs: float | None = None, *, name: str = "path") -> 
     return rate if fs is None else fs
 
 
-def finite_taps(system: Any) -> np.ndarray | None:
+def finite_taps(system: System) -> np.ndarray | None:
     """Return the exact taps of a transfer function with a finite impulse response, or None for other systems."""
     if not hasattr(system, "num_array"):
         return None
@@ -183,7 +185,7 @@ def finite_taps(system: Any) -> np.ndarray | None:
     return np.concatenate([np.zeros(denominator.size - numerator.size), numerator / denominator[0]])
 
 
-def path_taps(path: Any, *, fs: float | None = None, n_taps: int | None = None, name: str = "path") -> np.ndarray:
+def path_taps(path: PathModel, *, fs: float | None = None, n_taps: int | None = None, name: str = "path") -> np.ndarray:
     """Return the impulse response of a path as an array, for running it sample by sample.
 
     Parameters
@@ -274,7 +276,7 @@ def _infinite_response(system: Any, length: int, name: str) -> np.ndarray:
 
 
 def perturbed_path(
-    path: Any,
+    path: PathModel,
     *,
     gain_db: float = 0.0,
     phase_deg: float = 0.0,

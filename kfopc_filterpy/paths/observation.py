@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_channels, as_count, as_nonnegative
 from .identification import fit_paths, require_audible, require_length
@@ -26,7 +26,7 @@ class ObservationFilters:
     taps: np.ndarray
     residual_db: np.ndarray
 
-    def predict(self, physical: Any) -> np.ndarray:
+    def predict(self, physical: ArrayLike) -> np.ndarray:
         """Predict the signals at the virtual microphones, (K_v, n_samples), from a recording at the physical ones.
 
         Parameters
@@ -59,7 +59,7 @@ class ObservationFilters:
 
 
 def identify_observation_filters(
-    physical: Any, virtual: Any, n_taps: int, *, regularization: float = 1e-4
+    physical: ArrayLike, virtual: ArrayLike, n_taps: int, *, regularization: float = 1e-4
 ) -> ObservationFilters:
     r"""Fit the filters that predict the noise at virtual microphones from that at physical ones, by least squares.
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from .._types import PathModels
 from .._validate import as_real_array, require_finite
 from .models import is_system, path_taps, sampling_rate
 
@@ -14,20 +15,20 @@ PRIMARY_AXES = "(K microphones, I references, taps)"
 
 
 def secondary_paths(
-    paths: Any, *, fs: float | None = None, name: str = "secondary_path"
+    paths: PathModels, *, fs: float | None = None, name: str = "secondary_path"
 ) -> tuple[np.ndarray, float | None]:
     """Return secondary paths as taps (K, J, n_taps), and their sampling rate in Hz if systems tell it."""
     return path_matrix(paths, fs=fs, name=name, axes=SECONDARY_AXES)
 
 
 def primary_paths(
-    paths: Any, *, fs: float | None = None, name: str = "primary_path"
+    paths: PathModels, *, fs: float | None = None, name: str = "primary_path"
 ) -> tuple[np.ndarray, float | None]:
     """Return primary paths as taps (K, I, n_taps), and their sampling rate in Hz if systems tell it."""
     return path_matrix(paths, fs=fs, name=name, axes=PRIMARY_AXES)
 
 
-def is_path_matrix(paths: Any) -> bool:
+def is_path_matrix(paths: PathModels) -> bool:
     """Return whether paths are given as a matrix (outputs, inputs, taps), be it one by one, or as a matrix of systems."""
     if is_system(paths):
         return (paths.noutputs, paths.ninputs) != (1, 1)
@@ -35,7 +36,7 @@ def is_path_matrix(paths: Any) -> bool:
 
 
 def path_matrix(
-    paths: Any, *, fs: float | None, name: str, axes: str = "(outputs, inputs, taps)"
+    paths: PathModels, *, fs: float | None, name: str, axes: str = "(outputs, inputs, taps)"
 ) -> tuple[np.ndarray, float | None]:
     """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz if systems tell it."""
     if is_system(paths):
@@ -64,7 +65,7 @@ def _entries(system: Any) -> list[list[Any]]:
     return [[system[k, j] for j in range(system.ninputs)] for k in range(system.noutputs)]
 
 
-def sampled_path_matrix(paths: Any, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
+def sampled_path_matrix(paths: PathModels, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
     """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz: the systems' own, or `fs`."""
     taps, rate = path_matrix(paths, fs=fs, name=name, axes=axes)
     return taps, sampling_rate(taps, fs, name=name) if rate is None else rate

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._types import PathModels
 from .._validate import as_count
 from .path_matrix import sampled_path_matrix
 
@@ -36,7 +37,7 @@ class PathRealization:
         return self.system.nstates
 
 
-def realize_paths(paths: Any, order: int, *, fs: float | None = None) -> PathRealization:
+def realize_paths(paths: PathModels, order: int, *, fs: float | None = None) -> PathRealization:
     """Return a state-space model of a given order whose impulse responses are close to those of the paths.
 
     It is the eigensystem realization of Ho, Kalman, Juang and Pappa, as python-control computes it. Because the impulse

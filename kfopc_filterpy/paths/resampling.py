@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .._types import PathModel
 from .._validate import as_positive, as_rate_ratio
 from .models import fir_path, is_system, path_taps, sampling_rate
 
@@ -17,7 +18,7 @@ _FILTER_REACH = 10  # samples of the lower rate to each side: the filter that `s
 _LOST_AT_START = 1e-4  # share of the energy, -40 dB
 
 
-def resample_path(path: Any, new_fs: float, *, fs: float | None = None) -> np.ndarray | control.TransferFunction:
+def resample_path(path: PathModel, new_fs: float, *, fs: float | None = None) -> np.ndarray | control.TransferFunction:
     """Return a path at another sampling rate, with the same frequency response and the same delay in seconds.
 
     An impulse response is no recording. Resampled like one, it would keep its height, and its frequency response, a sum

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_count, as_number, as_positive, as_real_array, require_finite
 
@@ -73,7 +74,7 @@ class RoomPaths:
             return -np.inf
         return -60.0 * self.primary.shape[2] / (self.fs * self.reverberation_time_s)
 
-    def at(self, microphones_m: Any) -> RoomPaths:
+    def at(self, microphones_m: ArrayLike) -> RoomPaths:
         """Return the paths from the same sources and loudspeakers to other microphones in the same room.
 
         Parameters
@@ -105,11 +106,11 @@ class RoomPaths:
 
 
 def room_paths(
-    size_m: Any,
+    size_m: ArrayLike,
     *,
-    loudspeakers_m: Any,
-    sources_m: Any,
-    microphones_m: Any,
+    loudspeakers_m: ArrayLike,
+    sources_m: ArrayLike,
+    microphones_m: ArrayLike,
     reverberation_time_s: float | None = None,
     absorption: float | Mapping[str, float] | None = None,
     fs: float = 16000.0,
@@ -215,7 +216,7 @@ def room_paths(
     )
 
 
-def horizontal_plane(size_m: Any, height_m: float, *, spacing_m: float = 0.1) -> np.ndarray:
+def horizontal_plane(size_m: ArrayLike, height_m: float, *, spacing_m: float = 0.1) -> np.ndarray:
     """Return the positions of microphones on a horizontal grid in a room, for a map of the sound level.
 
     Parameters

@@ -24,11 +24,13 @@ A controller gets this g from a penalty on the control signal through the filter
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias, TypeGuard
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.signal import minimum_phase, windows
 
+from .._types import PathModels
 from .._validate import as_nonnegative, as_real_array, require_finite
 from .path_matrix import secondary_paths
 
@@ -48,7 +50,7 @@ LARGEST_PHASE_OF_SEVERAL_DEG = 90.0  # with several loudspeakers, whose errors c
 WIDEST_GAIN_DB = 20.0  # of a tolerance; with more, even the least share could make the noise much louder
 
 
-def as_gain_error(value: Any, name: str) -> float:
+def as_gain_error(value: float, name: str) -> float:
     """Return the largest error of a path's gain in dB, checked."""
     gain_db = as_nonnegative(value, name)
     if gain_db > WIDEST_GAIN_DB:
@@ -124,8 +126,11 @@ class PathTolerance:
 
 ONE_SAMPLE = PathTolerance(delay_samples=1.0)  # what a careful identification may leave
 
+# Tolerances; a relative error for all frequencies, or one for each of several from 0 to fs/2; or measured paths.
+Uncertainty: TypeAlias = PathTolerance | float | ArrayLike
 
-def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
+
+def path_uncertainty(uncertainty: Uncertainty | None, secondary_path: PathModels) -> np.ndarray:
     """Return the largest relative error of a secondary path over frequency.
 
     Parameters
@@ -173,7 +178,7 @@ def path_uncertainty(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     return error
 
 
-def rms_relative_error(uncertainty: Any, secondary_path: Any) -> float:
+def rms_relative_error(uncertainty: Uncertainty | None, secondary_path: PathModels) -> float:
     """Return the root mean square of the relative error over the spectrum of a secondary path; 0 if it is exact."""
     stated = as_uncertainty(uncertainty)
     if stated is None or isinstance(stated, float):
@@ -185,7 +190,7 @@ def rms_relative_error(uncertainty: Any, secondary_path: Any) -> float:
     return float(np.sqrt(np.average(path_uncertainty(stated, secondary_path) ** 2, weights=weights)))
 
 
-def as_uncertainty(value: Any) -> PathTolerance | float | np.ndarray | None:
+def as_uncertainty(value: Uncertainty | None) -> PathTolerance | float | np.ndarray | None:
     """Return an uncertainty as it is stated, checked, and an array as a copy."""
     if value is None or isinstance(value, PathTolerance):
         return value
@@ -247,7 +252,7 @@ def _response(paths: np.ndarray) -> np.ndarray:
     return np.moveaxis(paths @ waves.T, -1, -3)
 
 
-def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
+def guard_filter(uncertainty: Uncertainty | None, secondary_path: PathModels) -> np.ndarray | None:
     """Return the filter W that guards a controller against an uncertainty, or None if it needs no guard.
 
     Parameters
@@ -280,7 +285,8 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     array([1.  , 0.66, 0.56, 0.03])
     """
     share = allowed_share(uncertainty, secondary_path)
-    if np.all(share == 1.0) and np.ndim(uncertainty) < 2:  # measured paths may differ from a later estimate
+    stated: Any = uncertainty
+    if np.all(share == 1.0) and np.ndim(stated) < 2:  # measured paths may differ from a later estimate
         return None
     largest = np.minimum(path_uncertainty(uncertainty, secondary_path), LARGEST_ERROR)
     share = np.maximum(share, np.minimum(LEAST_SHARE, LEAST_LOOP_GAIN / np.maximum(largest, 1.0)))
@@ -289,7 +295,7 @@ def guard_filter(uncertainty: Any, secondary_path: Any) -> np.ndarray | None:
     return _short_filter(penalty, largest / loop_gain - 1.0)
 
 
-def allowed_share(uncertainty: Any, secondary_path: Any) -> np.ndarray:
+def allowed_share(uncertainty: Uncertainty | None, secondary_path: PathModels) -> np.ndarray:
     """Return the part g of the control filter that an uncertainty allows, (257,), at evenly spaced frequencies to fs/2."""
     paths, _ = secondary_paths(secondary_path)
     if _knows_phase(uncertainty, secondary_path):
@@ -298,7 +304,7 @@ def allowed_share(uncertainty: Any, secondary_path: Any) -> np.ndarray:
     return 1.0 - np.minimum(path_uncertainty(uncertainty, secondary_path), 1.0) ** SHARPNESS
 
 
-def _knows_phase(uncertainty: Any, secondary_path: Any) -> bool:
+def _knows_phase(uncertainty: Any, secondary_path: PathModels) -> TypeGuard[PathTolerance]:
     """Return whether the phase of the error is limited, and errors at one microphone do not disturb another one."""
     n_microphones, n_loudspeakers = secondary_paths(secondary_path)[0].shape[:2]
     return isinstance(uncertainty, PathTolerance) and n_microphones <= n_loudspeakers

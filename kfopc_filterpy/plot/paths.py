@@ -6,11 +6,13 @@ sampling rate, or arrays of taps, which need `fs`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
+from .._types import PathModel
 from .._validate import as_positive, as_signal
 from ..bounds.rated_power import required_rated_power
 from ..bounds.wiener import WienerSolution
@@ -52,7 +54,13 @@ def _grid(frequencies_hz: Any, paths: Mapping[str, Any], fs: float | None) -> np
     return np.geomspace(min(20.0, nyquist / 400), 0.999 * nyquist, 2000)
 
 
-def plot_bode(paths: Any, *, frequencies_hz: Any = None, fs: float | None = None, ax: Any = None) -> Any:
+def plot_bode(
+    paths: PathModel | Mapping[str, PathModel],
+    *,
+    frequencies_hz: ArrayLike | None = None,
+    fs: float | None = None,
+    ax: Sequence[Axes] | None = None,
+) -> NDArray[Any]:
     """Draw the magnitude and phase of paths over frequency in Hz.
 
     The phase is unwrapped. The delay of each path (its energy onset, stated in the legend of the phase) is removed,
@@ -118,7 +126,9 @@ def _onset_s(path: Any, fs: float | None) -> float:
     return 0.0 if taps is None else energy_onset(taps) / sampling_rate(path, fs)
 
 
-def plot_impulse_responses(paths: Any, *, fs: float | None = None, ax: Axes | None = None) -> Axes:
+def plot_impulse_responses(
+    paths: PathModel | Mapping[str, PathModel], *, fs: float | None = None, ax: Axes | None = None
+) -> Axes:
     """Draw the impulse responses of paths over time in ms.
 
     Parameters
@@ -162,7 +172,11 @@ def plot_impulse_responses(paths: Any, *, fs: float | None = None, ax: Axes | No
 
 
 def plot_group_delay(
-    paths: Any, *, frequencies_hz: Any = None, fs: float | None = None, ax: Axes | None = None
+    paths: PathModel | Mapping[str, PathModel],
+    *,
+    frequencies_hz: ArrayLike | None = None,
+    fs: float | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the group delay of paths in ms over frequency in Hz, where they are within 40 dB of their peak.
 
@@ -206,7 +220,9 @@ def plot_group_delay(
     return ax
 
 
-def plot_causality_margin(primary: Any, secondary: Any, *, fs: float | None = None, ax: Axes | None = None) -> Axes:
+def plot_causality_margin(
+    primary: PathModel, secondary: PathModel, *, fs: float | None = None, ax: Axes | None = None
+) -> Axes:
     """Draw the impulse responses of both paths, with their energy onsets and the margin between them.
 
     With several channels, draw the margin of each microphone and loudspeaker as a table. A frame marks the pair that
@@ -302,11 +318,11 @@ def _draw_margins(margin: CausalityMargin, ax: Axes) -> None:
 
 
 def plot_secondary_path_gain(
-    path: Any,
+    path: PathModel,
     *,
     band: tuple[float, float] | None = None,
-    reference: Any = None,
-    frequencies_hz: Any = None,
+    reference: ArrayLike | None = None,
+    frequencies_hz: ArrayLike | None = None,
     fs: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -364,10 +380,10 @@ def plot_secondary_path_gain(
 
 
 def plot_phase_error(
-    path: Any,
-    estimates: Any,
+    path: PathModel,
+    estimates: PathModel | Mapping[str, PathModel],
     *,
-    frequencies_hz: Any = None,
+    frequencies_hz: ArrayLike | None = None,
     fs: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
@@ -490,7 +506,9 @@ def plot_required_rated_power(
     return ax
 
 
-def plot_modelling_error(results: Any, *, ax: Axes | None = None) -> Axes:
+def plot_modelling_error(
+    results: IdentificationResult | Mapping[str, IdentificationResult], *, ax: Axes | None = None
+) -> Axes:
     """Draw the modelling error of one or several identifications over frequency.
 
     Parameters

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -99,7 +99,13 @@ def _others() -> list[dict[str, Any]]:
     ]
 
 
-def curves(results: Any, *, single: bool = False) -> list[Curve]:
+# Runs to be drawn together: one, several, or by name one or several.
+Results: TypeAlias = (
+    SimulationResult | Sequence[SimulationResult] | Mapping[str, SimulationResult | Sequence[SimulationResult]]
+)
+
+
+def curves(results: Results, *, single: bool = False) -> list[Curve]:
     """Return results as curves; they come as one result, a sequence, or a mapping of name to one or several."""
     named = _grouped(results)
     if not named or not all(named.values()):
@@ -144,7 +150,7 @@ def require_common_disturbance(shown: list[Curve]) -> None:
             )
 
 
-def span_of(run: SimulationResult, span_s: Any) -> slice:
+def span_of(run: SimulationResult, span_s: tuple[float, float]) -> slice:
     """Return the samples of a run between two times in seconds."""
     duration = run.n_samples / run.fs
     try:
@@ -157,7 +163,7 @@ def span_of(run: SimulationResult, span_s: Any) -> slice:
     return part
 
 
-def span_axis(ax: Axes, span_s: Any) -> float:
+def span_axis(ax: Axes, span_s: tuple[float, float]) -> float:
     """Set the time axis to a span, in ms if it is short; return its units in a second."""
     start, end = span_s
     per_second, unit = (1e3, "ms") if end - start < 0.5 else (1.0, "s")

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
 from ..metrics import nse_db, short_time_power
@@ -34,8 +35,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ..plot.results import Results
 
-def plot_weight_history(results: Any, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:
+
+def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:
     """Draw the history of one weight of each control filter (the paper's Fig. 5 d).
 
     If one curve grows to more than 100 times the smallest, the axis is logarithmic beyond the smallest.
@@ -102,7 +105,7 @@ def plot_weight_history(results: Any, *, tap: int | tuple[int, int, int], ax: Ax
 
 
 def plot_nse(
-    results: Any,
+    results: Results,
     *,
     window_s: float | None = None,
     time_axis: str = "linear",
@@ -188,7 +191,7 @@ def readable_window_s(duration_s: float) -> float:
 
 
 def plot_output_power(
-    results: Any,
+    results: Results,
     *,
     rated_power: float | None = None,
     window_s: float = 0.25,
@@ -269,7 +272,7 @@ def plot_output_power(
     return ax
 
 
-def plot_constraint_factor(results: Any, *, channel: int | None = None, ax: Axes | None = None) -> Axes:
+def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: Axes | None = None) -> Axes:
     """Draw the constraint factor over time; 1 is no constraint.
 
     Parameters
@@ -321,7 +324,11 @@ def plot_constraint_factor(results: Any, *, channel: int | None = None, ax: Axes
 
 
 def plot_noise_reduction_against_overdrive(
-    overdrive_db: Any, noise_reduction_db: Mapping[str, Any], *, flip_db: Any = None, ax: Axes | None = None
+    overdrive_db: ArrayLike,
+    noise_reduction_db: Mapping[str, Any],
+    *,
+    flip_db: ArrayLike | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the noise reduction over the overdrive, the power that full control needs over the rated power.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_band, as_positive, per_channel
 from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
@@ -18,20 +19,21 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from ..loop.result import SimulationResult
+    from ..plot.results import Results
 
 _DEPTH_DB = 120.0  # largest range of a spectrum's axis: numerical floors beneath would take all the room
 _VISIBLE = 0.005  # difference of waveforms, over their peak, that a line's width does not hide
 
 
 def plot_error_spectra(
-    results: Any,
+    results: Results,
     *,
     band: tuple[float, float] | None = None,
     span_s: tuple[float, float] | None = None,
     segment_s: float = 0.128,
     scaling: str = "density",
     channel: int | None = None,
-    pascal_per_unit: Any = None,
+    pascal_per_unit: ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the power spectra of the disturbance and of each error (the paper's Fig. 5 a, 6 b, 7 b).
@@ -118,7 +120,7 @@ def _over_20_micropascal(pascal_per_unit: Any, run: SimulationResult, channel: i
 
 
 def plot_anti_noise(
-    results: Any, *, span_s: tuple[float, float], channel: int | None = None, ax: Axes | None = None
+    results: Results, *, span_s: tuple[float, float], channel: int | None = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the waveforms of the disturbance and of each anti-noise (the paper's Fig. 5 b).
 
@@ -171,7 +173,7 @@ def plot_anti_noise(
 
 
 def plot_amplifier_output(
-    results: Any,
+    results: Results,
     *,
     span_s: tuple[float, float],
     limit: float | None = None,
@@ -244,7 +246,7 @@ def plot_amplifier_output(
 
 
 def plot_disturbance_and_anti_noise(
-    result: Any,
+    result: SimulationResult,
     *,
     span_s: tuple[float, float],
     band: tuple[float, float],

@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from .._types import NumberOrArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,6 +136,6 @@ def audible(response: np.ndarray) -> np.ndarray:
     return magnitude > 0.01 * magnitude.max()
 
 
-def decibels(power: Any) -> Any:
+def decibels(power: ArrayLike) -> NumberOrArray:
     """Return a power in dB, at least -300 dB."""
     return 10 * np.log10(np.maximum(power, 1e-30))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_positive
 from ..core.calls import amplify_all
@@ -34,7 +35,7 @@ class _Amplifier:
         limit, sharpness = getattr(self, "limit", math.inf), getattr(self, "sharpness", 1.0)
         return np.array([(self.kind, limit, sharpness)], MODEL)
 
-    def __call__(self, signal: Any) -> Any:
+    def __call__(self, signal: ArrayLike) -> Any:
         """Return the output for `signal`, a number or an array of any shape."""
         array = np.asarray(signal, dtype=np.float64, order="C")
         model, out = self.model, np.empty(array.shape)
@@ -123,7 +124,7 @@ def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
     return amplifier.model if isinstance(amplifier, models) and type(amplifier) in models else None
 
 
-def amplifier_models(amplifier: Any, n_loudspeakers: int) -> np.ndarray:
+def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n_loudspeakers: int) -> np.ndarray:
     """Return the records of the amplifier models of all loudspeakers, (J, 1)."""
     each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
     models = [compiled_model(LinearAmplifier() if one is None else one) for one in each]

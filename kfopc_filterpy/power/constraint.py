@@ -6,6 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_nonnegative, as_number, as_positive
 from ..core.calls import commit, preview
@@ -233,7 +234,7 @@ class OutputPowerConstraint:
         self._state.numbers[f"supplied_{name}"] = math.nan if value is None else value
 
 
-def squared(value: Any, name: str) -> float:
+def squared(value: ArrayLike, name: str) -> float:
     """Return the square of a number; it must be finite: an infinite power would never be forgotten."""
     number = as_number(value, name)
     square = number * number

@@ -8,9 +8,10 @@ energy of a window is the sum over this lap plus the part of the last lap that i
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_number, as_positive, as_signal
 from ..core.calls import limit, limit_all
@@ -169,7 +170,7 @@ class OutputLimiter:
         """Return the output for the next input sample `u`."""
         return limit(*self._places(), as_number(u, "u"))
 
-    def process(self, signal: Any) -> np.ndarray:
+    def process(self, signal: ArrayLike) -> np.ndarray:
         """Return the output (n,) for a `signal` (n,), or for its next piece; the same bits as sample by sample."""
         signal = as_signal(signal, "signal", min_length=0)
         out = np.empty(signal.size)

@@ -32,11 +32,14 @@ could not be read for this page: it rests on what data sheets and textbooks say 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import NumberOrArray
 from .._validate import as_positive, as_real_array, as_signal, require_finite
 from .limiter import DEFAULT_WINDOW_S, OutputLimiter
 
@@ -146,7 +149,7 @@ class AmplifierRating:
         """Limits of the control signal; the mean power counts over windows of 100 ms."""
         return OutputLimits(self.rated_power, self.amplitude_limit, DEFAULT_WINDOW_S, "amplifier")
 
-    def watt(self, power: Any) -> Any:
+    def watt(self, power: NumberOrArray) -> NumberOrArray:
         """Return the watts of a mean square `power` of the control signal."""
         return power * self.volts_per_unit**2 / self.ohm
 
@@ -275,11 +278,11 @@ class LoudspeakerRating:
         """Limits of the control signal without the excursion; the mean power counts over `thermal_window_s`."""
         return OutputLimits(self.rated_power, self.amplitude_limit, self.thermal_window_s, "loudspeaker's power")
 
-    def watt(self, power: Any) -> Any:
+    def watt(self, power: NumberOrArray) -> NumberOrArray:
         """Return the watts of a mean square `power` of the control signal."""
         return power * self.volts_per_unit**2 / self.ohm
 
-    def displacement_mm(self, control_signal: Any, fs: float) -> np.ndarray:
+    def displacement_mm(self, control_signal: ArrayLike, fs: float) -> np.ndarray:
         """Return the displacement h * y of the cone in mm, (n_samples,), at a sample rate `fs` in Hz.
 
         The response of zero phase is applied to the whole `control_signal`, (n_samples,), as if it repeated: rms values
@@ -292,7 +295,7 @@ class LoudspeakerRating:
         response = np.interp(frequencies, *self._curve) * self.volts_per_unit
         return np.fft.irfft(np.fft.rfft(y) * response, y.size)
 
-    def excursion_rated_power(self, control_signal: Any, fs: float) -> float:
+    def excursion_rated_power(self, control_signal: ArrayLike, fs: float) -> float:
         """Return the largest mean square that a signal of this spectrum may have for the excursion; Inf without a limit.
 
         The mean square of h * y is then that of a displacement that peaks at `x_max_mm` with `excursion_crest_factor`.
@@ -314,7 +317,10 @@ class LoudspeakerRating:
         return power * (self.x_max_mm / self.excursion_crest_factor) ** 2 / moved
 
 
-def output_limits(rating: Any) -> OutputLimits:
+Rating: TypeAlias = float | AmplifierRating | LoudspeakerRating | OutputLimits  # a number is a rated power
+
+
+def output_limits(rating: Rating | Sequence[Rating]) -> OutputLimits:
     """Return what a rating, or several together, allow a control signal: the strictest of each limit.
 
     The shortest window counts. A signal whose mean power keeps to a limit in every short window does so in long ones.
@@ -379,7 +385,7 @@ def _limits(rating: Any) -> OutputLimits:
     raise TypeError(f"rating must be a rated power, an AmplifierRating or a LoudspeakerRating, got {rating!r}")
 
 
-def as_curve(value: Any, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
+def as_curve(value: float | Sequence[ArrayLike] | np.ndarray, name: str, unit: str) -> tuple[np.ndarray, np.ndarray]:
     """Return a curve's frequencies and values; one number holds at all frequencies."""
     if not isinstance(value, list | tuple | np.ndarray):
         return np.array([0.0]), np.array([as_positive(value, name, unit=unit)])

@@ -7,7 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PerLoudspeaker
 from .._validate import as_nonnegative, as_positive, as_signal, per_loudspeaker
 from .constraint import OutputPowerConstraint
 
@@ -30,7 +32,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         return self._of_each("rated_power")
 
     @rated_power.setter
-    def rated_power(self, value: Any) -> None:
+    def rated_power(self, value: PerLoudspeaker) -> None:
         self._assign("rated_power", value, as_positive)
 
     @property
@@ -48,7 +50,7 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         return self._of_each("disturbance_power")
 
     @disturbance_power.setter
-    def disturbance_power(self, value: Any) -> None:
+    def disturbance_power(self, value: PerLoudspeaker) -> None:
         self._assign("disturbance_power", value, as_nonnegative)
 
     @property
@@ -57,19 +59,23 @@ class SharedConstraint(tuple[OutputPowerConstraint, ...]):
         return self._of_each("secondary_path_gain")
 
     @secondary_path_gain.setter
-    def secondary_path_gain(self, value: Any) -> None:
+    def secondary_path_gain(self, value: PerLoudspeaker) -> None:
         self._assign("secondary_path_gain", value, as_positive)
 
-    def fresh(self, rated_power: Any) -> SharedConstraint:
+    def fresh(self, rated_power: PerLoudspeaker) -> SharedConstraint:
         """Return constraints with the same settings, without samples, for other rated powers."""
         powers = per_loudspeaker(rated_power, len(self), "rated_power")
         return SharedConstraint(one.fresh(power) for one, power in zip(self, powers, strict=True))
 
-    def preview(self, disturbance: Any, filtered_reference: Any, reference: Any = None) -> float:
+    def preview(
+        self, disturbance: ArrayLike, filtered_reference: ArrayLike, reference: ArrayLike | None = None
+    ) -> float:
         """Return the factor that `advance` would return for this sample; nothing is changed."""
         return self._preview(*self._sums(disturbance, filtered_reference, reference))
 
-    def advance(self, disturbance: Any, filtered_reference: Any, reference: Any = None) -> float:
+    def advance(
+        self, disturbance: ArrayLike, filtered_reference: ArrayLike, reference: ArrayLike | None = None
+    ) -> float:
         """Add one sample to the powers and return the factor.
 
         Parameters

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.signal import lfilter
 
@@ -77,7 +75,7 @@ class Inspector:
         return equal
 
 
-def is_repeated(block: Any, last: Any) -> bool:
+def is_repeated(block: np.ndarray, last: np.ndarray | None) -> bool:
     """Return whether a block has exactly the samples of the last one, as after a fault of a sound driver.
 
     A block of equal samples says nothing about that.

@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
+from .._types import PathModels, Seed
 from .._validate import as_channels, as_choice, as_count, as_generator, as_nonnegative, as_positive
 from ..controllers.channel_samples import amplifier_functions
 from ..paths.models import path_taps
@@ -129,18 +131,18 @@ class SimulatedInterface:
 
     def __init__(
         self,
-        reference: Any,
-        secondary_path: Any,
+        reference: ArrayLike,
+        secondary_path: PathModels,
         *,
-        primary_path: Any = None,
-        disturbance: Any = None,
+        primary_path: PathModels | None = None,
+        disturbance: ArrayLike | None = None,
         fs: float = 16000.0,
         block: int = 64,
         latency: int | None = None,
         amplifier: Callable[..., Any] | Sequence[Callable[..., Any]] | None = None,
-        feedback_path: Any = None,
+        feedback_path: PathModels | None = None,
         sensor_noise_std: float = 0.0,
-        rng: Any = None,
+        rng: Seed | None = None,
         clock: str = "free",
     ) -> None:
         self.fs = as_positive(fs, "fs", unit="Hz")

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .._types import PerLoudspeaker, Seed
 from .._validate import as_count, as_generator, as_nonnegative, as_positive, per_loudspeaker
 from ..bounds.power_constrained import power_constrained_wiener
 from ..bounds.settings import SuggestedSettings, suggest_settings
@@ -266,7 +267,7 @@ def _finite(signals: np.ndarray) -> np.ndarray:
 
 
 def measure_round_trip(
-    interface: Interface, *, level: float, seconds: float = 1.0, longest: int = 4096, rng: Any = 0
+    interface: Interface, *, level: float, seconds: float = 1.0, longest: int = 4096, rng: Seed = 0
 ) -> int:
     """Return the number of samples from a control signal to its first arrival at an error microphone.
 
@@ -348,7 +349,7 @@ def run(
     controller: Controller | Callable[[IdentifiedPlant], Controller],
     interface: Interface,
     *,
-    amplitude_limit: Any,
+    amplitude_limit: PerLoudspeaker,
     seconds: float | None = None,
     listen_s: float = 2.0,
     identify_s: float = 5.0,
@@ -358,7 +359,7 @@ def run(
     on_report: Callable[[RunStatus], Any] | None = None,
     report_every_s: float = 0.25,
     should_stop: Callable[[], bool] | None = None,
-    rng: Any = 0,
+    rng: Seed = 0,
     **supervision: Any,
 ) -> RunReport:
     """Control noise in real time, from the identification of the plant to the fade-out at the end.

@@ -66,7 +66,7 @@ class SoundDevice:
         *,
         fs: float = 16000.0,
         block: int = 64,
-        device: Any = None,
+        device: int | str | tuple[int | str | None, int | str | None] | None = None,
         latency: float | str = "low",
         ahead: int = 2,
     ) -> None:

@@ -9,7 +9,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .._types import PerLoudspeaker
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..controllers.base import Controller
@@ -135,7 +137,7 @@ class Supervisor(Checkpointed):
         controller: Controller,
         *,
         fs: float = DEFAULT_FS,
-        amplitude_limit: Any,
+        amplitude_limit: PerLoudspeaker,
         full_scale: float | None = None,
         stuck_s: float = 0.01,
         fade_s: float = 0.05,
@@ -233,7 +235,7 @@ class Supervisor(Checkpointed):
         """
         self._note(what, n_samples=as_count(n_samples, "n_samples"))
 
-    def process(self, references: Any, errors: Any, *, lost: int = 0) -> np.ndarray:
+    def process(self, references: ArrayLike, errors: ArrayLike, *, lost: int = 0) -> np.ndarray:
         """Return the control signals of a block.
 
         Parameters

@@ -8,9 +8,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from types import ModuleType
 
 _LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
 _LARGEST_EXPANSION = 100  # bytes of float64 samples for each byte of a larger file
@@ -67,7 +70,7 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
         raise ValueError(f"{path} cannot be read as {what}: {error or type(error).__name__}") from error
 
 
-def optional_module(name: str, path: str | os.PathLike[str], what: str) -> Any:
+def optional_module(name: str, path: str | os.PathLike[str], what: str) -> ModuleType:
     """Return a module of the extra `formats`, or say how to install it."""
     try:
         return import_module(name)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from .._types import Seed
 from .._validate import (
     as_band,
     as_count,
@@ -78,7 +79,7 @@ def tone(
 
 
 def band_limited_noise(
-    band: tuple[float, float], duration_s: float, *, fs: float, power: float = 1.0, rng: Any
+    band: tuple[float, float], duration_s: float, *, fs: float, power: float = 1.0, rng: Seed
 ) -> np.ndarray:
     """Make Gaussian noise with a flat spectrum inside `band` and none outside, the paper's broadband noise.
 
@@ -187,7 +188,7 @@ class Compressor:
 
 
 def compressor_noise(
-    duration_s: float, machine: Compressor | None = None, *, fs: float, rng: Any, power: float = 1.0
+    duration_s: float, machine: Compressor | None = None, *, fs: float, rng: Seed, power: float = 1.0
 ) -> np.ndarray:
     """Make compressor-like noise: harmonics of a slowly wandering shaft speed, and broadband flow noise.
 
@@ -289,7 +290,7 @@ class Bursts:
 
 
 def bursty_noise(
-    duration_s: float, bursts: Bursts | None = None, *, fs: float, rng: Any, power: float = 1.0
+    duration_s: float, bursts: Bursts | None = None, *, fs: float, rng: Seed, power: float = 1.0
 ) -> np.ndarray:
     """Make impulsive noise, as of presses or rivets: bursts at random times that die away, over a steady background.
 

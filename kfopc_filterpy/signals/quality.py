@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 SHORT_S = 5.0
 CLIPPED_SHARE = 1e-4  # of the samples; fewer hardly matter
 STEPS = 2.0  # smallest steps of the numbers: what clips comes from further away
 
 
-def recording_remarks(samples: Any, fs: float, name: str) -> list[str]:
+def recording_remarks(samples: ArrayLike, fs: float, name: str) -> list[str]:
     """Return remarks on a recording, (n_samples,) or (n_channels, n_samples): that it is short, or clipped."""
     channels = np.atleast_2d(samples)
     remarks = clipping_remarks(channels, name)
@@ -23,7 +22,7 @@ def recording_remarks(samples: Any, fs: float, name: str) -> list[str]:
     return remarks
 
 
-def clipping_remarks(samples: Any, name: str) -> list[str]:
+def clipping_remarks(samples: ArrayLike, name: str) -> list[str]:
     """Return a remark on each channel of a recording that is clipped."""
     channels = np.atleast_2d(samples)
     remarks = []

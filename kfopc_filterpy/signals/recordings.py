@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_channels, as_count, as_number, as_positive, as_rate_ratio, as_real_array, require_finite
 from .arrays import read_npy, read_npz
@@ -370,7 +371,7 @@ def _resampled(path: str | os.PathLike[str], samples: np.ndarray, fs: float, new
     return resample_poly(samples, up, down, axis=-1)
 
 
-def write_wav(path: str | os.PathLike[str], signal: Any, fs: float, *, peak: float | None = None) -> None:
+def write_wav(path: str | os.PathLike[str], signal: ArrayLike, fs: float, *, peak: float | None = None) -> None:
     """Write a signal as a WAV file, by default unscaled in 32-bit floating point.
 
     Files that are to be compared by ear need one scale: pass the same `peak`, the largest magnitude among all of them,

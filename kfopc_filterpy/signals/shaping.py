@@ -6,16 +6,15 @@ Each function returns a new float64 array and leaves its input as it is. Signals
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .._validate import as_channels, as_nonnegative, as_number, as_positive, as_sample_count
 
 _FADE_S = 0.05  # cross-fade where a recording begins again
 
 
-def scaled_to_power(signal: Any, power: float) -> np.ndarray:
+def scaled_to_power(signal: ArrayLike, power: float) -> np.ndarray:
     """Scale a signal so that its mean square is `power`.
 
     Parameters
@@ -50,7 +49,7 @@ def scaled_to_power(signal: Any, power: float) -> np.ndarray:
     return unit * np.sqrt(wanted / np.mean(unit**2))
 
 
-def level_jump(signal: Any, at_s: float, gain_db: float, *, fs: float) -> np.ndarray:
+def level_jump(signal: ArrayLike, at_s: float, gain_db: float, *, fs: float) -> np.ndarray:
     """Make a signal louder or softer by `gain_db` from the time `at_s` on.
 
     Parameters
@@ -91,7 +90,7 @@ def level_jump(signal: Any, at_s: float, gain_db: float, *, fs: float) -> np.nda
 
 
 def swelling(
-    signal: Any, *, fs: float, swing_db: float = 6.0, period_s: float = 4.0, phase_rad: float = 0.0
+    signal: ArrayLike, *, fs: float, swing_db: float = 6.0, period_s: float = 4.0, phase_rad: float = 0.0
 ) -> np.ndarray:
     """Let the level of a signal in dB swing up and down as a sine, and keep its mean power.
 
@@ -135,7 +134,7 @@ def swelling(
     return scaled_to_power(samples * 10 ** (level_db / 20), float(np.mean(samples**2)))
 
 
-def looped(recording: Any, duration_s: float, *, fs: float, start_s: float = 0.0) -> np.ndarray:
+def looped(recording: ArrayLike, duration_s: float, *, fs: float, start_s: float = 0.0) -> np.ndarray:
     """Repeat a recording to fill a duration, with a cross-fade of 50 ms where it begins again.
 
     Parameters
