@@ -53,7 +53,7 @@ typedef struct {
     anc_each each;
 } anc_setting;
 
-typedef struct { void *place[96]; } anc_view; /* room for any algorithm's */
+typedef struct { void *place[128]; } anc_view; /* room for any algorithm's */
 
 typedef enum { ANC_STATE, ANC_SETTING, ANC_SCRATCH } anc_role; /* scratch: nothing that a next sample needs */
 typedef enum { ANC_IS_REAL, ANC_IS_INT32 } anc_type;

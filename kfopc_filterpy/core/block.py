@@ -17,7 +17,7 @@ from .library import Library, load
 ALIGNMENT = 64  # bytes; wide vectors are fastest there
 _STATE, _SETTING, _SCRATCH = range(3)
 _KINDS = (np.dtype(np.float64), np.dtype(np.int32))
-_VIEW_PLACES = 96
+_VIEW_PLACES = 128
 SLACK = 64  # of delay lines, see signals.c
 _EACH = ("", "loudspeakers", "microphones")
 _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
