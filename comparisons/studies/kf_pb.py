@@ -183,14 +183,24 @@ def make_rated(pair: Pair, noise: np.ndarray, share: float) -> Rated:
     x = noise / np.std(noise)
     d = fftconvolve(x, primary)[: x.size]
     d += 10 ** (SENSOR_NOISE_DB / 20) * np.std(d) * np.random.default_rng(SEED).standard_normal(d.size)
+    needed = with_any_power(x, d, secondary, N_TAPS).control_power
+    bound = fixed_filters(x, d, secondary, N_TAPS, rated_power=share * needed).per_second.error
+    return Rated(x, d, secondary, share * needed, bound)
+
+
+def with_any_power(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int) -> Any:
+    """Return the best fixed filter of a length for a reference and a disturbance, whatever power it takes."""
     ridge = 1e-4 * np.var(fftconvolve(x, secondary)[: x.size])
-    solve = partial(power_constrained_wiener, x, d, secondary, N_TAPS, fs=FS, switch_on_s=SILENT_S)
+    solutions = fixed_filters(x, d, secondary, n_taps, rated_power=1e12, segment_s=DURATION_S, ridge=ridge)
+    return solutions.unconstrained
+
+
+def fixed_filters(x: np.ndarray, d: np.ndarray, secondary: np.ndarray, n_taps: int, **settings: float) -> Any:
+    """Return the power-constrained Wiener solutions."""
     with warnings.catch_warnings():
         # In directions without energy very large weights would do better, and no controller reaches them.
         warnings.simplefilter("ignore", np.exceptions.RankWarning)
-        needed = solve(rated_power=1e12, segment_s=DURATION_S, ridge=ridge).unconstrained.control_power
-        bound = solve(rated_power=share * needed).per_second.error
-    return Rated(x, d, secondary, share * needed, bound)
+        return power_constrained_wiener(x, d, secondary, n_taps, fs=FS, switch_on_s=SILENT_S, **settings)
 
 
 # ---- Runs

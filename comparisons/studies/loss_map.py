@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
-from scipy.signal import fftconvolve
 
-from kfopc_filterpy import OutputLimiter, kf_pb, power_constrained_wiener
+from kfopc_filterpy import OutputLimiter, kf_pb
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table
 
 from .cases import FS, SENSOR_NOISE_DB, Pair
-from .kf_pb import DURATION_S, FAULTS, N_TAPS, SEED, SHARES, SILENT_S, STEADY, Rated, all_paths, make_rated, noises
+from .kf_pb import (
+    DURATION_S,
+    FAULTS,
+    N_TAPS,
+    SEED,
+    SHARES,
+    SILENT_S,
+    STEADY,
+    all_paths,
+    fixed_filters,
+    make_rated,
+    noises,
+    with_any_power,
+)
 from .report_parts import new_figure, without_measured
 
 LONG = 4 * N_TAPS  # taps that stand for a filter of any length
@@ -56,37 +67,13 @@ def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
         make(secondary_path=wrong),
         make(secondary_path=wrong, limiter=limiter),
     ]
-    errors = [free_error(case, LONG), free_error(case, N_TAPS), case.bound_error]
+    plant = (case.reference, case.disturbance, case.secondary)
+    errors = [*(with_any_power(*plant, n_taps).error for n_taps in (LONG, N_TAPS)), case.bound_error]
     errors += [case.run(controller).error for controller in controllers]
-    bound = power_constrained_wiener(
-        case.reference,
-        case.disturbance,
-        case.secondary,
-        N_TAPS,
-        rated_power=case.rated_power,
-        fs=FS,
-        switch_on_s=SILENT_S,
-    )
+    bound = fixed_filters(*plant, N_TAPS, rated_power=case.rated_power)
     return LossRow(
         path, noise, [case.reduction_db(error) for error in errors], case.reduction_db(bound.within_windows().error)
     )
-
-
-def free_error(case: Rated, n_taps: int) -> np.ndarray:
-    """Return the error of the best fixed filter of a length, with any power."""
-    ridge = 1e-4 * np.var(fftconvolve(case.reference, case.secondary)[: case.reference.size])
-    # In directions without energy, larger weights would do better, but no controller reaches them.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", np.exceptions.RankWarning)
-        solution = power_constrained_wiener(
-            *(case.reference, case.disturbance, case.secondary, n_taps),
-            rated_power=1e12,
-            fs=FS,
-            switch_on_s=SILENT_S,
-            segment_s=DURATION_S,
-            ridge=ridge,
-        )
-    return solution.unconstrained.error
 
 
 def jobs() -> list[tuple[str, str]]:

@@ -46,7 +46,6 @@ LONGEST_CALL = 1600  # samples between two opportunities to interrupt a block: 0
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}
 
 Limiters = OutputLimiter | Sequence[OutputLimiter] | None
-Constraints = OutputPowerConstraint | tuple[OutputPowerConstraint, ...]
 
 
 class setting:

@@ -199,14 +199,13 @@ class VerifiedController(WrappedController):
 
     @property
     def alarms(self) -> int:
-        """Number of times so far that the errors contradicted the secondary path."""
+        """Number of times so far that the errors contradicted the paths."""
         return self._observer.alarms
 
     @property
     def primary_path(self) -> np.ndarray:
         """Posterior mean of the primary path, (N,), or with several channels (K, I, N); N = L + M - 1."""
-        paths = self._observer.primary_path
-        return paths if self.multichannel else paths[0, 0]
+        return self._shaped_path(self._observer.primary_path)
 
     def _paths(self) -> np.ndarray:
         """Return the secondary paths in use, (K, J, M)."""
@@ -399,7 +398,7 @@ class VerifiedController(WrappedController):
         if not self._pause_s or (self.volume > 0.0 and what != "another path"):  # a failure that was heard
             self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
-        self._deaf_for = max(self._deaf_for, self._p.shape[-1])  # it has no past: first it only hears references
+        self._deaf_for = self._p.shape[-1]  # it has no past: first it only hears references
         self._error = self._alone = self._expected
         self._sums = np.zeros(2)
 

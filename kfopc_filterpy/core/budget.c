@@ -77,7 +77,7 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     signals *s = &f->s;
     const int32_t J = plan->loudspeakers;
     const real *own = plan->settings ? plan->settings + J : NULL; /* after the rated powers */
-    const real block = own ? own[BLOCK - 1] : 1, averaging = own ? own[AVERAGING - 1] : SHORTEST;
+    const real block = own ? own[BLOCK - 1] : 1, averaging = own ? own[AVERAGING - 1] : (real)SHORTEST;
     (void)sizeof(fits_into_a_view);
     if (!takes(plan, block, averaging)) {
         at->size = SIZE_MAX;
@@ -106,15 +106,20 @@ static void layout_budget(anc_view *view, const anc_plan *plan, const anc_settin
     f->work = reals(at, "budget_work", ANC_SCRATCH, 1, 1, WORKS, f->width);
 }
 
+/* Return what loudspeaker j has spent in the blocks of the account, in blocks of the rating. */
+static real spent_by(const budget *f, int32_t j)
+{
+    real spent = 0;
+    for (int32_t t = 0; t < f->T; t++) spent += f->book[times(t, f->s.J) + (size_t)j];
+    return spent;
+}
+
 /* Set what each loudspeaker may spend in the next block, whatever its filter asks for. */
 static void set_room(budget *f)
 {
     const int32_t J = f->s.J;
-    for (int32_t j = 0; j < J; j++) {
-        real spent = 0;
-        for (int32_t t = 0; t < f->T; t++) spent += f->book[times(t, J) + (size_t)j];
-        f->asked[2 * J + j] = larger(MOST * (real)f->T - spent, 0) * (real)f->plant.B * f->s.setting[RATED_POWER][j];
-    }
+    for (int32_t j = 0; j < J; j++)
+        f->asked[2 * J + j] = larger(MOST * (real)f->T - spent_by(f, j), 0) * (real)f->plant.B * f->s.setting[RATED_POWER][j];
 }
 
 static void start_budget(anc_view *view, const anc_plan *plan, const anc_setting *settings)
@@ -460,9 +465,7 @@ static void solve_all(budget *f)
     correlate_references(f);
     correlate_filtered(f);
     for (int32_t j = 0; j < J; j++) {
-        real left = 0;
-        for (int32_t t = 0; t < f->T; t++) left += f->book[times(t, J) + (size_t)j];
-        left = 1 - left / (real)f->T;
+        const real left = 1 - spent_by(f, j) / (real)f->T;
         memcpy(rest, f->b + times(j, n), sizeof(real) * (size_t)n);
         for (int32_t a = 0; a < J; a++) {
             if (a == j) continue;
@@ -515,8 +518,7 @@ static int control_signal_budget(anc_view *view, const real *reference, real *co
 {
     budget *f = (budget *)view;
     signals *s = &f->s;
-    for (int32_t i = 0; i < s->I; i++)
-        if (!within(reference[i], LOUDEST_LEARNT) || !within(reference[i], *s->loudest)) return ANC_LOUD_REFERENCE;
+    if (is_too_loud(s, reference)) return ANC_LOUD_REFERENCE;
     if (f->plant.heard[AWAITED]) note(f, NULL, 1); /* that error never came */
     const int refused = take_reference(s, reference);
     for (int32_t j = 0; !refused && j < s->J; j++) {

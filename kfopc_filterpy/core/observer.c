@@ -53,11 +53,12 @@ static int note(anc_view *view, const real *error)
 static int take_signals(anc_view *view, const real *reference, real *control)
 {
     observer *f = (observer *)view;
-    for (int32_t i = 0; i < f->s.I; i++)
-        if (!within(reference[i], LOUDEST_LEARNT)) return ANC_LOUD_REFERENCE;
+    if (is_too_loud(&f->s, reference)) return ANC_LOUD_REFERENCE;
     if (f->plant.heard[AWAITED]) note(view, NULL); /* that error never came */
     for (int32_t j = 0; j < f->s.J; j++) control[j] = 0;
-    return f->plant.heard[AWAITED] = 1, take_reference(&f->s, reference);
+    const int refused = take_reference(&f->s, reference);
+    f->plant.heard[AWAITED] = !refused;
+    return refused;
 }
 
 const anc_algorithm anc_observer = {"observer", observer_settings, layout_observer, start_observer, take_signals, note, note};

@@ -81,6 +81,13 @@ static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f;
 static const real LOUDEST_LEARNT = 1e50, LOUDEST_PLAYED = 1e100;
 #endif
 
+static inline int is_too_loud(const signals *s, const real *reference)
+{
+    for (int32_t i = 0; i < s->I; i++)
+        if (!within(reference[i], LOUDEST_LEARNT) || !within(reference[i], *s->loudest)) return 1;
+    return 0;
+}
+
 static inline real larger(real a, real b) { return a > b ? a : b; }
 static inline real raised(real g, int32_t n) /* g^n */
 {

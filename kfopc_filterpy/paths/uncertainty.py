@@ -124,8 +124,6 @@ class PathTolerance:
         return float(10.0 ** (self.gain_db / 20.0))
 
 
-ONE_SAMPLE = PathTolerance(delay_samples=1.0)  # what a careful identification may leave
-
 # Tolerances; a relative error for all frequencies, or one for each of several from 0 to fs/2; or measured paths.
 Uncertainty: TypeAlias = PathTolerance | float | ArrayLike
 
