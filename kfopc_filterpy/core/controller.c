@@ -32,8 +32,8 @@ static int shape_accepted(const anc_plan *p)
     if (S * J * I * L > most || S * K > most || S * J * (4 * M + 64) > most) return 0;
     for (int32_t sj = 0; sj < p->scenarios * p->loudspeakers; sj++) {
         const double power = p->power_windows ? p->power_windows[sj] : 0, limiter = p->limited ? p->limiter_windows[sj] : 1;
-        if (power < 0 || power > LONGEST || S * J * power * ANC_POWERS > most) return 0;
-        if (limiter < 1 || limiter > LONGEST || S * J * limiter * 3 > most) return 0;
+        if (power < 0 || power > (double)LONGEST || S * J * power * (double)ANC_POWERS > most) return 0;
+        if (limiter < 1 || limiter > (double)LONGEST || S * J * limiter * 3 > most) return 0;
     }
     return K * J * I * (4 * L + 4 * ANC_GUARD_TAPS + 64) <= most && (I + K * J) * (4 * (L + M) + 8 * ANC_GUARD_TAPS + 64) <= most;
 }

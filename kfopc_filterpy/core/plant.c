@@ -350,7 +350,7 @@ static int is_alarm(const plant *f, real unexplained, real d2, real q)
         add_scaled(d, -1, z, f->B);
         doubt += dot(d, d, f->B) / (real)f->B;
     }
-    if (unexplained <= limit + SURPRISE * (doubt / DRAWS)) return 0;
+    if (unexplained <= limit + SURPRISE * (doubt / (real)DRAWS)) return 0;
     f->numbers->limit = limit, f->numbers->before = q, f->counts[WRONG] = 0;
     return 1;
 }
@@ -545,7 +545,7 @@ void expect(plant *f)
         } else expect_also(f, p, 1);
     }
     for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) /* of the mean noise */
-        expect_also(f, f->draws + times(draw, f->n), (real)f->K / DRAWS);
+        expect_also(f, f->draws + times(draw, f->n), (real)f->K / (real)DRAWS);
     const real doubt = (real)f->K * UNKNOWN * UNKNOWN * size_of_path(f);
     for (int32_t j = 0; j < J; j++) {
         for (int32_t a = 0; a < j; a++) reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
