@@ -2,6 +2,7 @@
 #include <string.h>
 
 static const real UNKNOWN = 2;                          /* after an alarm: rms error of a secondary path, over the path */
+static const real DOUBT = 16;                           /* until it is fitted again: mean square error of it, over that of the path */
 static const real KEPT = 4, FORGOTTEN = (real)0.0625;   /* samples per tap that the data of p count as: after an alarm; if p has changed too */
 enum { FROM = 9, TO = 16, MANY = 4 };                   /* blocks after an alarm that are judged, and how many must exceed its limit to show that p has changed */
 static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
@@ -337,11 +338,17 @@ static void explain(const plant *f, const real *theta, real *d, real *z)
     }
 }
 
+/* Data for the first fit after an alarm are collected for half as many blocks as a fit takes. */
+static int32_t collected(const plant *f) { return f->delay / 2 + 1; }
+
+/* Return the blocks from an alarm to the end of the first fit. */
+static int32_t first_fit(const plant *f) { return collected(f) + f->delay; }
+
 /* Return whether the error is beyond its noise, the usual misfit of the model, and what is not known yet. If so, note the limit. */
 static int is_alarm(const plant *f, real unexplained, real d2, real q)
 {
     const plant_numbers *known = f->numbers;
-    if (f->counts[AGE] <= (*f->alarms ? QUIET + f->delay : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
+    if (f->counts[AGE] <= (*f->alarms ? QUIET + first_fit(f) : 1) || f->counts[DOUBTFUL] || !(known->seen > 0)) return 0;
     const real limit = SURPRISE * q + larger(MISFIT, USUAL * root(known->misfit / known->seen)) * d2;
     if (unexplained <= limit) return 0;
     real *d = work_of(f, 1), *z = work_of(f, 2), doubt = 0;
@@ -358,7 +365,7 @@ static int is_alarm(const plant *f, real unexplained, real d2, real q)
 /* Return whether no secondary path explains the errors after an alarm: then the primary paths have changed. */
 static int is_wrong(plant *f, real unexplained)
 {
-    const int32_t fitted_for = f->counts[AGE] - f->delay; /* blocks; a fit takes `delay` */
+    const int32_t fitted_for = f->counts[AGE] - first_fit(f);
     if (f->exact || !(f->numbers->limit > 0) || fitted_for < FROM || fitted_for > TO) return 0;
     f->counts[WRONG] += unexplained > f->numbers->limit;
     return fitted_for == TO && f->counts[WRONG] >= MANY;
@@ -469,7 +476,8 @@ static void learn_heard(plant *f, real forget)
         for (int32_t t = 0; t < B + f->M - 1; t++) loud |= history_of(f, f->I + j)[t] != 0;
     count_up(f->counts + AGE), count_up(f->counts + IDLE);
     if (loud && !f->counts[SOUNDS]) f->counts[SOUNDS] = f->counts[AGE] = 1;
-    if (known && loud && is_alarm(f, unexplained, d2, q)) {
+    const int alarm = known && loud && is_alarm(f, unexplained, d2, q);
+    if (alarm) {
         count_up(f->alarms);
         begin_anew(f, f->exact ? FORGOTTEN : KEPT);
     } else if (is_wrong(f, unexplained)) {
@@ -482,9 +490,10 @@ static void learn_heard(plant *f, real forget)
         numbers->misfit = forget * forget * numbers->misfit + share * share;
         numbers->seen = forget * forget * numbers->seen + 1;
     }
-    add_block(f, forget);
+    if (!alarm) add_block(f, forget); /* the block of a change is of two plants */
+    const int due = !f->counts[PENDING] && (!f->counts[DOUBTFUL] || f->counts[AGE] >= collected(f));
     const int news = numbers->samples - numbers->fitted > numbers->samples / 8 || (f->counts[SOUNDS] && f->counts[AGE] <= 16);
-    if (!f->counts[PENDING] && (news || (unexplained > 2 * q && f->counts[IDLE] >= 8))) begin_fit(f);
+    if (due && (news || (unexplained > 2 * q && f->counts[IDLE] >= 8))) begin_fit(f);
     if (f->counts[PENDING]) go_on_fitting(f);
 }
 
@@ -546,7 +555,7 @@ void expect(plant *f)
     }
     for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) /* of the mean noise */
         expect_also(f, f->draws + times(draw, f->n), (real)f->K / (real)DRAWS);
-    const real doubt = (real)f->K * UNKNOWN * UNKNOWN * size_of_path(f);
+    const real doubt = (real)f->K * DOUBT * size_of_path(f);
     for (int32_t j = 0; j < J; j++) {
         for (int32_t a = 0; a < j; a++) reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
         /* Not yet verified: anything may be wrong, even the polarity. */

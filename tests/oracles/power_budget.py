@@ -36,6 +36,7 @@ WINDOW = 8  # the filter is solved for the references of an exponential window o
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
 SCALES = (100, 40, 4)  # t: windows of the averaging time over these; besides, the last block and the window above
+DOUBT = 16.0  # until it is fitted again: mean square of that error, over the path's
 QUIET = 31  # blocks from the first fit after an alarm to the next alarm, at least
 KNOWN = 0.05  # no alarm before as much of the memory was heard
 WORK = 2.0**26  # operations of a factorisation in a block
@@ -84,6 +85,8 @@ class Plant:
         self.draws = np.zeros((DRAWS, n))  # of theta less its mean, for the mean noise; none yet
         self.random = 1
         self.delay = int(n**3 / 3 / WORK)  # blocks that a factorisation takes
+        self.collected = self.delay // 2 + 1  # blocks of data for the first fit after an alarm
+        self.first_fit = self.collected + self.delay  # blocks from an alarm to its end
         self.pending, self.fitted, self.fits = None, 0.0, 0
         self.age = self.idle = 0  # blocks since the loudspeakers sound or an alarm; since the last fit began
         self.alarms = 0
@@ -134,9 +137,11 @@ class Plant:
         elif known and self.fits and d2 > 0 and not self.doubtful:
             self.misfit = self.forget**2 * self.misfit + min(unexplained / d2, 1.0) ** 2
             self.seen = self.forget**2 * self.seen + 1.0
-        self.add(x, y, e)
+        if not alarm:  # the block of a change is of two plants
+            self.add(x, y, e)
+        due = self.pending is None and (not self.doubtful or self.age >= self.collected)
         news = self.count - self.fitted > self.count / 8 or (self.sounds and self.age <= 16)
-        if self.pending is None and (news or (unexplained > 2 * q and self.idle >= 8)):
+        if due and (news or (unexplained > 2 * q and self.idle >= 8)):
             self.begin_fit()
         if self.pending is not None:
             self.pending[0] -= 1
@@ -146,7 +151,7 @@ class Plant:
 
     def is_alarm(self, unexplained, d2, q, x, y):
         """Return whether the error is beyond its noise, the usual misfit of the model, and what is not known."""
-        if self.age <= (QUIET + self.delay if self.alarms else 1) or self.doubtful or not self.seen:
+        if self.age <= (QUIET + self.first_fit if self.alarms else 1) or self.doubtful or not self.seen:
             return False
         usual = max(MISFIT, USUAL * math.sqrt(self.misfit / self.seen))
         limit = SURPRISE * q + usual * d2
@@ -161,7 +166,7 @@ class Plant:
 
     def is_wrong(self, unexplained):
         """Return whether other secondary paths do not explain the errors after an alarm: the primary ones have changed."""
-        fitted_for = self.age - self.delay  # blocks; a fit takes `delay`
+        fitted_for = self.age - self.first_fit
         if self.exact or not self.limit or not JUDGED[0] <= fitted_for <= JUDGED[1]:
             return False
         self.wrong += unexplained > self.limit
@@ -253,7 +258,7 @@ class Plant:
                 for i in range(I):
                     ps[i, j] += weight * np.correlate(p[i], s[j], "full")
         if not self.exact and self.doubtful:  # not yet verified: anything may be wrong, even the polarity
-            ss[range(J), range(J), M - 1] += K * UNKNOWN**2 * self.size
+            ss[range(J), range(J), M - 1] += K * DOUBT * self.size
         return ss, ps
 
 
