@@ -27,12 +27,7 @@ from kfopc_filterpy.bench import (
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
-from kfopc_filterpy.plot import (
-    plot_constraint_factor,
-    plot_error_spectra,
-    plot_nse,
-    plot_output_power,
-)
+from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
 from .cases import FS, PAPER, SEED, grid_runs
