@@ -8,16 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    KalmanController,
-    SimulationResult,
-    bandpass_path,
-    noise_reduction_db,
-    output_power,
-)
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, noise_reduction_db, output_power
 from kfopc_filterpy.bench import (
     Claim,
     FigureItem,
@@ -56,7 +48,6 @@ N_TAPS = 128
 OVERDRIVES_DB = np.arange(0.0, 10.5, 1.0)
 UNFORGETTING = 1e-10  # so little state noise that a filter hardly forgets in a run
 FORGETFUL = max(algorithms()["KF-ANC"].grid)  # most state noise of the grid: the fastest forgetting
-FILTERPY_SAMPLES = 4000
 WEIGHTS_EVERY = 160
 
 # Criteria of the claims
@@ -92,7 +83,6 @@ def main(runs: Runs) -> StudyReport:
     growths = {setting: [growth_of(pair[name], optimal_weight) for name in KALMAN] for setting, pair in pairs.items()}
     sweep = _overdrive_sweep(runs, scene, tuned)
     crossings = crossings_db(OVERDRIVES_DB, sweep["KF-OPC"] - sweep["KF-ANC"])
-    rounding = difference_from_filterpy(scene, tuned["KF-ANC"].setting, results["KF-ANC"])
     return StudyReport(
         name="tonal",
         conditions=("a tone", "band-pass paths", "an amplifier that clips"),
@@ -123,7 +113,6 @@ def main(runs: Runs) -> StudyReport:
             "with_most_state_noise": {name: _extremes(result, optimal_weight) for name, result in forgetful.items()},
             "largest_optimal_weight": optimal_weight,
             "largest_weight_over_optimal": growth_of(results["KF-ANC"], optimal_weight).over_optimal,
-            "filterpy_largest_difference": rounding,
         },
         claims=claims(merits, peak_control_signal(results["KF-OPC"].control_signal, steady=1.0), growths, crossings),
         figures=[
@@ -134,13 +123,7 @@ def main(runs: Runs) -> StudyReport:
             ),
         ],
         sounds=sounds(results),
-        notes=[
-            *tuning_note(tuned),
-            ceiling_note(scene),
-            f"KF-ANC run by filterpy's own KalmanFilter over the first {FILTERPY_SAMPLES} samples: the largest "
-            f"difference from the O(L^2) filter is {rounding['error']:.1e} in the error signal and "
-            f"{rounding['weights']:.1e} in the weights, which is rounding.",
-        ],
+        notes=[*tuning_note(tuned), ceiling_note(scene)],
     )
 
 
@@ -200,28 +183,6 @@ def crossings_db(levels: np.ndarray, lead: np.ndarray) -> list[float]:
     """Return the overdrives at which `lead` changes sign, by linear interpolation."""
     k = np.flatnonzero(lead[:-1] * lead[1:] < 0)
     return [float(x) for x in levels[k] + (levels[k + 1] - levels[k]) * lead[k] / (lead[k] - lead[k + 1])]
-
-
-def difference_from_filterpy(scene: Scene, setting: Setting, ours: SimulationResult) -> dict[str, float]:
-    """Return the largest difference of a run of KF-ANC from that of filterpy's own KalmanFilter, over its first part."""
-    fast = make_controller(scene, "KF-ANC", setting)
-    estimator = KalmanFilter(dim_x=scene.n_taps, dim_z=1)
-    estimator.P *= scene.initial_variance
-    estimator.Q *= fast.state_noise
-    estimator.R *= fast.measurement_noise
-    end = int(scene.switch_on_s * scene.fs) + FILTERPY_SAMPLES
-    short = dataclasses.replace(
-        scene, references=[scene.references[0][:end]], disturbances=[scene.disturbances[0][:end]]
-    )
-    controller = KalmanController(estimator, scene.secondary, name="KF-ANC, filterpy")
-    theirs = short.run(controller, record_weights_every=WEIGHTS_EVERY)
-    assert ours.weights is not None
-    assert theirs.weights is not None
-    return {
-        "samples": theirs.error.size,
-        "error": float(np.abs(theirs.error - ours.error[: theirs.error.size]).max()),
-        "weights": float(np.abs(theirs.weights - ours.weights[: len(theirs.weights)]).max()),
-    }
 
 
 # ---- Claims
