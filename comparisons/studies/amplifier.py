@@ -342,7 +342,7 @@ def amplifier_figures(rows: Sequence[AmplifierRow]) -> list[FigureItem]:
         legend_of(figure, [axes[0, 0]])
         caption = (
             f"{', '.join(case).capitalize()}. Above: the disturbance estimate does not know the amplifier; below: it does, if "
-            "it can. Black crosses: the filter overruns; on the axis: it diverged. Output power is before the amplifier. "
+            "it can. Black crosses: the filter overruns. A gap: it diverged. Output power is before the amplifier. "
             f"Noise reductions above {TOP_DB:g} dB, at 0 dB of overdrive, are off the scale."
         )
         items.append(FigureItem("-".join(case).replace(" ", "-"), caption, figure))
@@ -356,8 +356,5 @@ def _draw(ax: Any, rows: Sequence[AmplifierRow], figure: str) -> None:
     levels = np.array([row.overdrive_db for row in rows])
     values = np.array([getattr(row, figure) for row in rows])
     ax.plot(levels, values, label=rows[0].algorithm, linewidth=1.3, markersize=4.5, **curve_style(rows[0].algorithm))
-    over = np.array([row.overruns and row.diverged_at_s is None for row in rows])
+    over = np.array([row.overruns for row in rows])
     ax.plot(levels[over], values[over], "x", color="black", markersize=7, markeredgewidth=0.9)
-    lost = levels[[row.diverged_at_s is not None for row in rows]]
-    if lost.size:  # an empty line would have no place, which the layout cannot bear
-        ax.plot(lost, np.zeros(lost.size), "x", color="black", transform=ax.get_xaxis_transform(), clip_on=False)

@@ -68,15 +68,17 @@ def planned_runs() -> int:
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
     primary, secondary = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
-    scene = _scene(primary, secondary, POWER_MULTIPLE)
+    scene = _scene(primary, secondary)
     tuned = tune(runs, scene)
 
-    def recorded(jobs: Mapping[str, Setting]) -> dict[str, SimulationResult]:
-        done = runs.map(lambda job: _recorded(scene, *job), jobs.items())
-        return dict(zip(jobs, done, strict=True))
+    def run(job: tuple[str, Setting]) -> SimulationResult:
+        return scene.run(make_controller(scene, *job), record_weights_every=WEIGHTS_EVERY)
 
-    results = recorded({name: best.setting for name, best in tuned.items()})
-    forgetful, unforgetting = (recorded(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))
+    def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
+        return dict(zip(settings, runs.map(run, settings.items()), strict=True))
+
+    results = run_all({name: best.setting for name, best in tuned.items()})
+    forgetful, unforgetting = (run_all(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))
     merits = {name: _figures(result, scene) for name, result in results.items()}
     optimal_weight = float(np.abs(wiener_solution(*scene.settled, scene.secondary, scene.n_taps).weights).max())
     pairs = {tuned["KF-ANC"].setting: results, FORGETFUL: forgetful}
@@ -127,21 +129,17 @@ def main(runs: Runs) -> StudyReport:
     )
 
 
-def _scene(primary: Any, secondary: Any, power_multiple: float) -> Scene:
+def _scene(primary: Any, secondary: Any) -> Scene:
     scene = make_scene(
         {0: tone(TONE_HZ, DURATION_S, fs=FS)},
         primary,
         secondary,
         fs=FS,
         rated_power=RATED_POWER,
-        power_multiple=power_multiple,
+        power_multiple=POWER_MULTIPLE,
         n_taps=N_TAPS,
     )
     return dataclasses.replace(scene, amplifier=HardClipAmplifier(LIMIT))
-
-
-def _recorded(scene: Scene, name: str, setting: Setting) -> SimulationResult:
-    return scene.run(make_controller(scene, name, setting), record_weights_every=WEIGHTS_EVERY)
 
 
 def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:

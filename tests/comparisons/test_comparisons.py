@@ -109,7 +109,7 @@ def test_tuning_takes_the_lowest_error_that_keeps_the_budget():
     over = _best(trials[:2], 0.5)
     assert (over.setting, over.within_budget) == (2.0, False)
     assert _best(trials[:1], 0.5) is None
-    scene = tonal._scene(bandpass_path(128), bandpass_path(32), 2.0)
+    scene = tonal._scene(bandpass_path(128), bandpass_path(32))
     with pytest.raises(RuntimeError, match="KF-OPC diverged at every setting"):
         tune(Runs(), scene, ["KF-OPC"], trials={"KF-OPC": trials[:1]})
 
@@ -134,7 +134,7 @@ def test_overdrives_where_the_order_flips():
 
 
 def test_wiener_multiple_of_a_tone_is_its_overdrive():
-    scene = tonal._scene(bandpass_path(128), bandpass_path(32), 2.0)
+    scene = tonal._scene(bandpass_path(128), bandpass_path(32))
     x = scene.references[0]
     gain = abs(np.exp(-2j * np.pi * 400 / 16000 * np.arange(32)) @ path_taps(bandpass_path(32))) ** 2
     d = scene.disturbances[0][8000:]
