@@ -296,7 +296,7 @@ def _limited_claim(rows: Sequence[ConstraintRow]) -> Claim:
 
 def _convergence_claim(settled: Settled) -> Claim:
     ours, theirs = (np.array([own[name] for own in settled.values()]) for name in ("KF-PB", "KF-ANC"))
-    told = "; ".join(f"{case} {own['KF-PB']:.2f} against {own['KF-ANC']:.2f} s" for case, own in settled.items())
+    told = "; ".join(f"{case} {own['KF-PB']:.3f} against {own['KF-ANC']:.3f} s" for case, own in settled.items())
     return Claim(
         "KF-PB converges no slower than 1.5 times KF-ANC's time",
         bool(np.all(ours <= 1.5 * np.nan_to_num(theirs, nan=np.inf))),  # what does not settle is slower

@@ -30,8 +30,17 @@ from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
 from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
-from .cases import FS, PAPER, SEED, grid_runs
-from .report_parts import ceiling_note, common_parameters, draw, draw_paths, milliseconds, sounds, tuning_note
+from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain
+from .report_parts import (
+    ceiling_note,
+    common_parameters,
+    draw,
+    draw_paths,
+    first_second_db,
+    milliseconds,
+    sounds,
+    tuning_note,
+)
 
 DURATION_S = 10.5
 RATED_POWER = 0.5
@@ -126,6 +135,7 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
             f"{name} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "
             f"({shorten(str(error), 120, placeholder=' ...')})"
         )
+    primary, secondary = of_unit_gain(data)
     parameters = {
         "noise": Parameter(f"recorded {noise} noise, mean removed", chosen),
         "primary_path": Parameter(f"measured duct, {data.primary.size} taps", "as published, scale arbitrary"),
@@ -133,8 +143,6 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
             f"measured duct, {data.secondary.size} taps, scaled to unit gain for white noise", "scale arbitrary"
         ),
     }
-    # The scale of the measured paths is arbitrary: both are divided by the secondary path's gain over white noise.
-    scale = float(np.sqrt(np.sum(data.secondary**2)))
     summary = (
         f"A measured duct and recorded {noise} noise ({chosen}); rated power and multiple as with the modelled duct."
     )
@@ -144,7 +152,7 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
         f"Recorded {noise} noise in a measured duct",
         summary,
         data.noise - data.noise.mean(),
-        (fir_path(data.primary / scale, data.fs), fir_path(data.secondary / scale, data.fs)),
+        (fir_path(primary, data.fs), fir_path(secondary, data.fs)),
         parameters,
     )
 
@@ -265,10 +273,10 @@ def start_under_constraint(scene: Scene, tuned: Mapping[str, Tuned], factor: np.
     equal_time, mov_equal_time = times_to_a_common_level(equal, results["MOV-FxLMS"])
     return Start(
         at_s=float(at_s),
-        noise_reduction_db={algorithm: _reduction_db(r) for algorithm, r in results.items()},
+        noise_reduction_db={algorithm: first_second_db(r) for algorithm, r in results.items()},
         power={algorithm: own / RATED_POWER for algorithm, own in power.items()},
         equal_power=float(np.mean(equal.control_signal**2)) / RATED_POWER,
-        equal_power_db=_reduction_db(equal),
+        equal_power_db=first_second_db(equal),
         time_s=time,
         mov_time_s=mov_time,
         equal_time_s=equal_time,
@@ -285,11 +293,6 @@ def times_to_a_common_level(one: SimulationResult, other: SimulationResult) -> t
         return float(np.argmax(below)) / FS if below.any() else np.inf
 
     return first(one), first(other)
-
-
-def _reduction_db(result: SimulationResult) -> float:
-    """Return the noise reduction over the whole of a short run."""
-    return noise_reduction_db(result.error, result.disturbance, steady=1.0)
 
 
 # ---- Claims

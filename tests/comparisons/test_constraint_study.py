@@ -290,7 +290,7 @@ def test_claim_on_convergence(ours: float, theirs: float, held: bool) -> None:
     for settled in ({"this": this, "other": other}, {"other": other, "this": this}):
         assert constraint._convergence_claim(settled).holds is held
     told = constraint._convergence_claim({"other": other}).measured
-    assert told == "other 0.25 against 0.50 s; NSE over 50 ms, pooled over seeds"
+    assert told == "other 0.250 against 0.500 s; NSE over 50 ms, pooled over seeds"
 
 
 def test_a_diverged_run_is_told_in_the_table_of_amplifiers() -> None:
