@@ -97,19 +97,14 @@ def main(runs: Runs) -> StudyReport:
     duct = duct_paths(fs=FS)
     noise = compressor_noise(DURATION_S, fs=FS, rng=SEED)
     parameters = {
-        "noise": Parameter("compressor-like: shaft harmonics that fluctuate, and broadband noise", "seeded stand-in"),
+        "noise": Parameter("fluctuating shaft harmonics and broadband noise, as of a compressor", "seeded stand-in"),
         "primary_path": Parameter(f"modelled duct, {duct.model.length_m:g} m", "defaults of duct_paths"),
         "secondary_path": Parameter(
             f"modelled duct, loudspeaker at {duct.model.loudspeaker_m:g} m", "defaults of duct_paths"
         ),
     }
-    summary = (
-        f"Compressor-like noise in a modelled duct needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}; "
-        "linear amplifier."
-    )
-    return _study(
-        runs, "duct", "Machine noise in a modelled duct", summary, noise, (duct.primary, duct.secondary), parameters
-    )
+    title = "Machine noise in a modelled duct"
+    return _study(runs, "duct", title, noise, (duct.primary, duct.secondary), parameters)
 
 
 def main_measured(runs: Runs) -> StudyReport | str:
@@ -143,14 +138,10 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
             f"measured duct, {data.secondary.size} taps, scaled to unit gain for white noise", "scale arbitrary"
         ),
     }
-    summary = (
-        f"A measured duct and recorded {noise} noise ({chosen}); rated power and multiple as with the modelled duct."
-    )
     return _study(
         runs,
         name,
         f"Recorded {noise} noise in a measured duct",
-        summary,
         data.noise - data.noise.mean(),
         (fir_path(primary, data.fs), fir_path(secondary, data.fs)),
         parameters,
@@ -161,7 +152,6 @@ def _study(
     runs: Runs,
     name: str,
     title: str,
-    summary: str,
     noise: np.ndarray,
     paths: tuple[Any, Any],
     parameters: dict[str, Parameter],
@@ -178,14 +168,13 @@ def _study(
     tuned = tune(runs, scene, ALGORITHMS)
     smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
 
-    def run(job: tuple[Scene, str]) -> SimulationResult:
-        at, algorithm = job
-        return at.run(make_controller(at, algorithm, tuned[algorithm].setting), record_powers=True)
+    def run_all(at: Scene, names: Sequence[str]) -> dict[str, SimulationResult]:
+        def run(algorithm: str) -> SimulationResult:
+            return at.run(make_controller(at, algorithm, tuned[algorithm].setting), record_powers=True)
 
-    jobs = [(scene, algorithm) for algorithm in ALGORITHMS] + [(smaller, algorithm) for algorithm in RATED]
-    done = runs.map(run, jobs)
-    results = dict(zip(ALGORITHMS, done[: len(ALGORITHMS)], strict=True))
-    of_smaller = dict(zip(RATED, done[len(ALGORITHMS) :], strict=True))
+        return dict(zip(names, runs.map(run, names), strict=True))
+
+    results, of_smaller = run_all(scene, ALGORITHMS), run_all(smaller, RATED)
     figures = {algorithm: figures_of(result, RATED_POWER) for algorithm, result in results.items()}
     at_smaller = {algorithm: figures_of(result, smaller.rated_power) for algorithm, result in of_smaller.items()}
     start = start_under_constraint(scene, tuned, results["KF-OPC"].constraint_factor)
@@ -195,7 +184,10 @@ def _study(
         name=name,
         conditions=("machine noise in a duct",),
         title=title,
-        summary=summary,
+        summary=(
+            f"The noise needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}, which a linear amplifier puts out. "
+            f"The noise: {parameters['noise'].value} ({parameters['noise'].chosen})."
+        ),
         fs=FS,
         rated_power=RATED_POWER,
         parameters=common_parameters(scene, tuned)
