@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from textwrap import fill
 
 from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
 
@@ -120,13 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     reports[-1].notes.extend(left_out)  # the page would not show otherwise that something is missing
     page = write_report(reports, options.output)
     print(results_table(reports))
-    for report in reports:
-        print(
-            f"\n{report.name}: notes",
-            *(fill(note, 110, initial_indent="- ", subsequent_indent="  ") for note in report.notes),
-            sep="\n",
-        )
-    print(f"\n{page} and results.json written in {time.perf_counter() - began:.0f} s")
+    print(f"\n{page}, with notes and all tables, and results.json written in {time.perf_counter() - began:.0f} s")
     return 0
 
 

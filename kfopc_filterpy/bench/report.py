@@ -47,6 +47,8 @@ __all__ = [
     "write_whole",
 ]
 
+SCREEN_ROWS = 30  # of a table that fits a screen, with the claims above it
+
 
 def prepare_folder(folder: str | os.PathLike[str]) -> Path:
     """Make a folder unless it is there, and check that it can be written: better before the studies than after.
@@ -146,7 +148,10 @@ def write_files(study: StudyReport, path: Path) -> None:
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
-    """Return the studies' figures of merit, claims and tables as text for a terminal.
+    """Return the studies' results as text for a terminal: the claims and one table, so that a study fits a screen.
+
+    The table is that of the figures of merit or, without them, the first that fits. All tables are in the report. What has
+    no claims shows all its tables that fit.
 
     Parameters
     ----------
@@ -187,10 +192,18 @@ def results_table(studies: Sequence[StudyReport]) -> str:
             mark = study.marks[0 if claim.holds else 1].upper()
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
-        for table in study.tables:
-            lines += ["", table.caption, *_aligned(table)]
+        for table in _on_a_screen(study):
+            lines += ["", *textwrap.wrap(table.caption, 116), *_aligned(table)]
         lines.append("")
     return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
+
+
+def _on_a_screen(study: StudyReport) -> list[Table]:
+    """Return the tables that a terminal shows beside the figures of merit and the claims."""
+    fitting = [table for table in study.tables if len(table.rows) <= SCREEN_ROWS]
+    if not study.claims:
+        return fitting
+    return [] if study.algorithms else fitting[:1]
 
 
 def _aligned(table: Table) -> list[str]:
