@@ -27,7 +27,7 @@ from .studies import (
 )
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
-SPEED, SWEEP, SOAK, AGAINST = "speed", "sweep", "soak", "against"
+SPEED, SWEEP, SOAK = "speed", "sweep", "soak"
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -59,10 +59,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from .soak import study as soak_study
 
         return soak_study.main(arguments[1:])
-    if arguments[:1] == [AGAINST]:
-        from .against import command as against_command
-
-        return against_command.main(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
@@ -71,15 +67,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter against others; sweep, which runs a grid; soak, which runs controllers for very "
-        "long; or against, which compares all controllers with an earlier version; the last three have options of their "
-        "own (sweep --help)",
+        "speed, which times the filter against others; sweep, which runs a grid; or soak, which runs controllers for very "
+        "long; the last two have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK, AGAINST)
-    for name in (SWEEP, SOAK, AGAINST):
+    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK)
+    for name in (SWEEP, SOAK):
         if name in options.studies:
             parser.error(f"{name} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]
