@@ -41,26 +41,25 @@ def plan(pending: Pending, workers: int) -> list[Pending]:
 
 def jobs_of(pending: Pending, scenario: Scenario | None, tuning_seed: int, workers: int) -> list[Job]:
     """Return the jobs of the runs; an own scenario has one for each."""
-    if scenario is not None:
-        return [partial(own_job, scenario, number, values) for number, values in pending.items()]
-    return [partial(built_in_job, runs, tuning_seed) for runs in plan(pending, workers)]
+    alone = [{number: values} for number, values in pending.items()]
+    return [partial(do_job, runs, scenario, tuning_seed) for runs in (alone if scenario else plan(pending, workers))]
 
 
 @one_blas_thread()  # each core has a job, and the sums of several threads differ
-def built_in_job(runs: Pending, tuning_seed: int) -> Outcomes:
-    """Run scenarios of one group."""
-    return dict(zip(runs, run_group(list(runs.values()), tuning_seed), strict=True))
-
-
-@one_blas_thread()
-def own_job(scenario: Scenario, number: int, values: Values) -> Outcomes:
-    """Call the user's scenario function."""
-    with naming(values):
-        figures = as_figures(scenario(dict(values)))
-        clash = [name for name in figures if name in values]
-        if clash:
-            raise ValueError(f"the figure {clash[0]!r} has the name of an axis or the seed: call it something else")
-        return {number: figures}
+def do_job(runs: Pending, scenario: Scenario | None, tuning_seed: int) -> Outcomes:
+    """Return the figures of runs of one group, or of the user's scenario function."""
+    if scenario is None:
+        return dict(zip(runs, run_group(list(runs.values()), tuning_seed), strict=True))
+    outcomes = {}
+    for number, values in runs.items():
+        with naming(values):
+            outcomes[number] = as_figures(scenario(dict(values)))
+            clash = set(outcomes[number]) & set(values)
+            if clash:
+                raise ValueError(
+                    f"the figure {min(clash)!r} has the name of an axis or the seed: call it something else"
+                )
+    return outcomes
 
 
 def as_figures(returned: Any) -> Figures:
@@ -76,7 +75,7 @@ def as_figures(returned: Any) -> Figures:
     return figures | {"diverged": bool(returned.get("diverged", False))}
 
 
-def outcomes(
+def job_outcomes(
     pending: Pending, scenario: Scenario | None, tuning_seed: int, jobs: int | None, scheduler: str | None
 ) -> Generator[Outcomes, None, None]:
     """Yield the outcomes of each job as it ends; closing the iterator stops what still runs."""

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from kfopc_filterpy.plot import save_figure
 
 from .grid import built_in_grid, own_grid
-from .jobs import Scenario, outcomes
+from .jobs import Scenario, job_outcomes
 from .results import FORMATS, LABELS, Record, cell_rows, figure_names, sweep_figure, swept_axis, write_table
 from .store import keep, kept, sweep_folder
 
@@ -121,7 +121,7 @@ def run_sweep(
     pending = {number: values for number, values in enumerate(made.runs()) if number not in done}
     with (
         tqdm(total=len(done) + len(pending), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
-        closing(outcomes(pending, scenario, made.seeds[0], jobs, scheduler)) as ended,
+        closing(job_outcomes(pending, scenario, made.seeds[0], jobs, scheduler)) as ended,
     ):
         for own in ended if pending else ():
             keep(path, own)

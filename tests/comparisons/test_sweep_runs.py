@@ -14,7 +14,7 @@ from comparisons.__main__ import main
 from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, measured_data, noises, paths
 from comparisons.sweep import scenario as sweep_scenario
 from comparisons.sweep.grid import built_in_grid
-from comparisons.sweep.jobs import built_in_job, plan
+from comparisons.sweep.jobs import do_job, plan
 from comparisons.sweep.run import run_sweep
 from comparisons.sweep.scenario import ScenarioError, group_of, most_together, run_group, scene_of
 from kfopc_filterpy import (
@@ -169,7 +169,7 @@ def test_results_do_not_depend_on_what_runs_together():
         1,
     )
     pending = dict(enumerate(grid.runs()))
-    few, many = ({k: v for job in plan(pending, n) for k, v in built_in_job(job, 1).items()} for n in (1, 7))
+    few, many = ({k: v for job in plan(pending, n) for k, v in do_job(job, None, 1).items()} for n in (1, 7))
     assert len(few) == 88
     np.testing.assert_equal(few, many)  # to the last bit
     sweep_scenario._noise_scene.cache_clear()
