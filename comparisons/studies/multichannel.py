@@ -264,8 +264,8 @@ def _rivals_claim(rows: Sequence[ChannelRow]) -> Claim:
     return Claim(
         text,
         most <= 0.3,
-        f"KF-PB is {-np.mean(list(behind.values())):+.2f} dB ahead of the best other on average, "
-        f"{-most:+.2f} dB at worst ({where}), {-np.min(list(behind.values())):+.2f} dB at best{alone}",
+        f"KF-PB is {-np.mean(list(behind.values())):+z.2f} dB ahead of the best other on average, "
+        f"{-most:+z.2f} dB at worst ({where}), {-np.min(list(behind.values())):+z.2f} dB at best{alone}",
     )
 
 
