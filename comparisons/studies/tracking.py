@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, convergence_time_s, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy import convergence_time_s, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import (
     Claim,
     FigureItem,
     Parameter,
     Runs,
     Scene,
-    Sound,
     StudyReport,
     Table,
     Tuned,
@@ -70,7 +69,6 @@ SEEDS = (SEED, 2, 3)  # the first is tuned on
 NSE_WINDOW_S = 0.05
 SWEEP_NSE_S = 0.01
 POINTS_A_SECOND = 200  # of the curves that are kept
-HEARD = {"sign": ("KF-ANC", "KF-PB", "FxLMS"), "sweeps": ("KF-ANC", "KF-PB", "FxLMS")}
 POWERS = (0.02, 500.0)  # of the figures
 NSE_DB = (-25.0, 12.0)
 
@@ -120,18 +118,16 @@ def main(runs: Runs) -> StudyReport:
     pairs = ducts()
     rows: list[TrackingRow] = []
     courses: dict[str, dict[str, dict[str, Course]]] = {}  # by event, path and algorithm
-    tuned, sounds, first = {}, [], {}
+    tuned, first = {}, {}
     for event, path in jobs(pairs):
         scenes = scenes_of(event, pairs[path])
         best = tune_all(runs, scenes[0], grids(ALGORITHMS))  # on the first seed
         outcomes = runs.map(partial(run_event, event, path, scenes, best), ALGORITHMS)
-        rows += [row for row, _, _ in outcomes]
-        own = {row.algorithm: course for row, course, _ in outcomes if course is not None}
+        rows += [row for row, _ in outcomes]
+        own = {row.algorithm: course for row, course in outcomes if course is not None}
         courses.setdefault(event.name, {})[path] = own
         first[f"{event.name}, {path}"] = scenes[0]
         tuned[f"{event.name}, {path}"] = tuned_in_words(best)
-        if path == next(iter(pairs)):
-            sounds += sounds_of(event, {row.algorithm: result for row, _, result in outcomes if result is not None})
     return StudyReport(
         name="tracking",
         title="Noises and paths that change",
@@ -161,7 +157,7 @@ def main(runs: Runs) -> StudyReport:
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(event, courses[event.name]) for event in events()],
-        sounds=sounds,
+        sounds=[],
         notes=[
             *without_measured(pairs),
             "An algorithm that reduces the noise by little is soon back within 3 dB of its steady NSE: compare settling "
@@ -247,14 +243,14 @@ def _longer_duct() -> np.ndarray:
 
 def run_event(
     event: Event, path: str, scenes: Sequence[Scene], tuned: Mapping[str, Tuned | None], algorithm: str
-) -> tuple[TrackingRow, Course | None, SimulationResult | None]:
-    """Run the best setting of an algorithm on every seed; the signals of the first seed are kept for listening."""
+) -> tuple[TrackingRow, Course | None]:
+    """Run the best setting of an algorithm on every seed."""
     best = tuned[algorithm]
     place: dict[str, Any] = {"path": path, "noise": event.noise, "event": event.name, "algorithm": algorithm}
     results = [] if best is None else [run_setting(scene, algorithm, best.setting) for scene in scenes]
     kept = [result for result in results if result is not None]
     if best is None or len(kept) < len(scenes):
-        return TrackingRow(**place, settled_s=dict.fromkeys(event.stretches), diverged_at_s=0.0), None, None
+        return TrackingRow(**place, settled_s=dict.fromkeys(event.stretches), diverged_at_s=0.0), None
     e, d, y = (np.array([getattr(r, name) for r in kept]) for name in ("error", "disturbance", "control_signal"))
     rated = scenes[0].rated_power
     parts = {name: slice(*(round(t * FS) for t in span)) for name, span in event.stretches.items()}
@@ -268,7 +264,7 @@ def run_event(
         settled_s={name: _settled(e[:, part], d[:, part], event.nse_window_s) for name, part in parts.items()},
         diverged_at_s=min((r.diverged_at_s for r in kept if r.diverged_at_s is not None), default=None),
     )
-    return row, _course(e, d, y, rated, event), kept[0]
+    return row, _course(e, d, y, rated, event)
 
 
 def _settled(e: np.ndarray, d: np.ndarray, window_s: float) -> float | None:
@@ -282,26 +278,6 @@ def _course(e: np.ndarray, d: np.ndarray, y: np.ndarray, rated_power: float, eve
     power = short_time_power(y, FS, min(WINDOW_S, 0.1 * e.shape[1] / FS), runs=True) / rated_power
     points = np.arange(every - 1, nse.size, every)
     return Course((points + 1) / FS, nse[points], power[points])
-
-
-def sounds_of(event: Event, results: Mapping[str, SimulationResult]) -> list[Sound]:
-    """Return the disturbance and the residuals of the events worth hearing."""
-    heard = [name for name in HEARD.get(event.name, ()) if name in results]
-    if not heard:
-        return []
-    signals = {"disturbance": results[heard[0]].disturbance} | {name: results[name].error for name in heard}
-    # A second before the event, so that the excerpt has the event in it.
-    begin = max(0.0, min((start for start, _ in event.stretches.values()), default=0.0) - 1.0)
-    return [
-        Sound(
-            f"{event.name}-{name.lower()}".replace(" ", "-"),
-            "Control off" if name == "disturbance" else name,
-            signal,
-            event.name,
-            begin,
-        )
-        for name, signal in signals.items()
-    ]
 
 
 # ---- Claims
