@@ -232,10 +232,10 @@ def _power_claim(
     """Judge the powers, above all of loudspeakers that their rating limits."""
     powers = np.concatenate([own.powers for own, _ in pairs])
     binding = powers[np.concatenate([bound.limited for _, bound in pairs])]
-    least, most = np.min(binding, initial=np.inf), np.max(binding, initial=-np.inf)
+    least, most = (np.min(binding), np.max(binding)) if binding.size else (np.nan, np.nan)
     return Claim(
         f"{what}: every loudspeaker's power is {aim} of its rating if that limits it, and never more",
-        bool(binding.size and least >= span[0] and np.max(powers) <= span[1]),
+        bool(least >= span[0] and np.max(powers) <= span[1]),
         f"{least:.3f} to {most:.3f} if the rating limits, {np.max(powers):.3f} at most of all",
     )
 

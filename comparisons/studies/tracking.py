@@ -10,17 +10,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Table,
-    Tuned,
-    run_setting,
-)
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from kfopc_filterpy.metrics import overshoot, short_time_power
 from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 

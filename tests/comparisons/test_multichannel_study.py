@@ -256,6 +256,12 @@ def test_without_recordings_there_is_no_claim_on_them() -> None:
     assert len(claims([row for row in rows_of() if row.path != MEASURED])) == 3
 
 
+def test_without_a_rating_that_limits_there_is_no_power_to_judge() -> None:
+    claim = claims([replace(row, limited=[False] * len(row.limited)) for row in rows_of()])[0]
+    assert not claim.holds
+    assert claim.measured.startswith("nan to nan if the rating limits, 1.000 at most")
+
+
 def test_direct_forms_run_in_small_systems_only() -> None:
     big = Place("8 x 8", 4000.0, 128, np.zeros((8, 1, 256)), np.zeros((8, 8, 256)), {})
     small = Place("2 x 2", 4000.0, 128, np.zeros((2, 1, 256)), np.zeros((2, 2, 256)), {})
