@@ -255,9 +255,9 @@ def _gain(rows: Sequence[MismatchRow]) -> Claim:
     largest = max(abs(amount) for amount in AMOUNTS["gain"])
     return Claim(
         f"A gain up to {largest:g} dB off costs KF-ANC and KF-PB at most {GAIN_LOSS_DB:g} dB without tuning again",
-        max(losses["KF-ANC"], losses["KF-PB"]) <= GAIN_LOSS_DB,
+        all(losses[name] <= GAIN_LOSS_DB for name in ("KF-ANC", "KF-PB")),
         "largest loss: "
-        + ", ".join(f"{name} {'diverges' if np.isinf(loss) else f'{loss:.1f} dB'}" for name, loss in losses.items()),
+        + ", ".join(f"{name} {f'{loss:.1f} dB' if np.isfinite(loss) else 'diverges'}" for name, loss in losses.items()),
     )
 
 
