@@ -26,12 +26,7 @@ from kfopc_filterpy.bench import (
     with_clipping,
 )
 from kfopc_filterpy.metrics import coherence_and_gain, peak_control_signal
-from kfopc_filterpy.plot import (
-    plot_disturbance_and_anti_noise,
-    plot_error_spectra,
-    plot_nse,
-    plot_output_power,
-)
+from kfopc_filterpy.plot import plot_disturbance_and_anti_noise, plot_error_spectra, plot_nse
 from kfopc_filterpy.signals import band_limited_noise
 
 from .cases import PAPER, grid_runs
@@ -141,7 +136,7 @@ def main(runs: Runs) -> StudyReport:
         ],
         figures=_figures_of(results, weight_errors, clipped, clipped_scene),
         sounds=sounds({name: rows[0] for name, rows in results.items()}),
-        notes=[*tuning_note(tuned), ceiling_note(scene), *_notes(merits, clipped_figures, other)],
+        notes=[*tuning_note(tuned), ceiling_note(scene), _length_note(times, other)],
     )
 
 
@@ -359,32 +354,12 @@ def _or_never(time_s: float | None) -> float:
 # ---- Notes and figures
 
 
-def _notes(
-    merits: Mapping[str, dict[str, Any]], clipped: Mapping[str, dict[str, Any]], other: dict[str, float | None]
-) -> list[str]:
-    rows = "; ".join(
-        f"{name} {_decibels(figures)}, output power {_power(figures)}" for name, figures in clipped.items()
-    )
-    times = "; ".join(f"{name} {milliseconds(t)}" for name, t in other.items())
-    here = "; ".join(f"{name} {milliseconds(f['convergence_time_s'])}" for name, f in merits.items())
-    return [
-        f"With an amplifier that clips at sqrt(2 rated power), same settings, means over {len(SEEDS)} seeds, steady half: "
-        f"{rows}.",
-        "q with the clipping contains what the amplifier clips off and no control filter explains; the one without it is "
-        "right only for a linear amplifier, or one that the disturbance estimate knows.",
+def _length_note(times_s: Mapping[str, float | None], other_s: Mapping[str, float | None]) -> str:
+    here, there = ("; ".join(f"{name} {milliseconds(t)}" for name, t in own.items()) for own in (times_s, other_s))
+    return (
         f"Convergence of the NSE depends on the length of the control filter. {N_TAPS} taps: {here}. {OTHER_N_TAPS} taps, tuned "
-        f"again: {times}.",
-    ]
-
-
-def _decibels(figures: dict[str, Any]) -> str:
-    if figures["diverged_at_s"] is not None:
-        return f"diverged after {figures['diverged_at_s']:.2f} s"
-    return f"{figures['noise_reduction_db']:.1f} dB"
-
-
-def _power(figures: dict[str, Any]) -> str:
-    return "undefined" if not np.isfinite(figures["output_power"]) else f"{figures['output_power']:.3g}"
+        f"again: {there}."
+    )
 
 
 def _draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray]) -> None:
@@ -400,9 +375,7 @@ def _draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray]) -> None:
 def _figures_of(
     results: Results, weight_errors: Mapping[str, np.ndarray], clipped: Results, clipped_scene: Scene
 ) -> list[FigureItem]:
-    def firsts(group: Results) -> Sequence[SimulationResult]:
-        return [rows[0] for rows in group.values()]
-
+    firsts = [rows[0] for rows in results.values()]
     return [
         draw(
             "a-nse",
@@ -418,17 +391,12 @@ def _figures_of(
         draw(
             "b-error-spectra",
             "Power spectra of disturbance and error signals over the steady half (Fig. 6 b).",
-            lambda ax: plot_error_spectra(firsts(results), band=(0, 4000), ax=ax),
+            lambda ax: plot_error_spectra(firsts, band=(0, 4000), ax=ax),
         ),
         draw(
             "c-waveform",
             "Disturbance and KF-OPC's anti-noise, with their coherence and gain (Fig. 6 c).",
             lambda ax: plot_disturbance_and_anti_noise(results["KF-OPC"][0], span_s=(9.0, 9.02), band=BAND, ax=ax),
-        ),
-        draw(
-            "output-power",
-            "Output power over 0.25 s, first seed. KF-OPC and MOV-FxLMS coincide, as KF-ANC and FxLMS do.",
-            lambda ax: plot_output_power(firsts(results), rated_power=RATED_POWER, ax=ax),
         ),
         draw(
             "clipped-nse",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,16 +16,15 @@ from kfopc_filterpy.bench import (
     Scene,
     StudyReport,
     Table,
-    Trial,
     Tuned,
     algorithms,
     best_setting,
     try_settings,
 )
-from kfopc_filterpy.paths import frequency_response, group_delay, path_taps, perturbed_path
+from kfopc_filterpy.paths import frequency_response, path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
-from .cases import BAND_HZ, FS, TONE_HZ, Case, Pair, Row, driven_case, ducts, grid_runs, grids, noise_of
+from .cases import BAND_HZ, FS, Case, Pair, Row, driven_case, ducts, grid_runs, grids, noise_of
 from .report_parts import (
     MARK,
     by_algorithm,
@@ -37,6 +36,7 @@ from .report_parts import (
     tuned_in_words,
     without_measured,
 )
+from .worst_cases import worst
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 UNCONSTRAINED = ("KF-ANC", "FxRLS", "FxLMS")
@@ -52,6 +52,7 @@ UNITS = {"phase": "degrees", "gain": "dB", "delay": "samples"}
 ARGUMENTS = {"phase": "phase_deg", "gain": "gain_db", "delay": "delay_samples"}
 EXACT, WRONG = "exact path", "wrong path"  # what an algorithm was tuned with
 GAIN_LOSS_DB = 1.0
+KEPT = (0.97, 1.02)  # output power over the rated one
 BOTTOM_DB = -7.0  # of the figures
 POWERS = (0.05, 20.0)
 
@@ -65,7 +66,19 @@ class MismatchRow(Row):
     kind: str
     amount: float
     tuned_with: str
-    within_budget: bool
+
+    def __str__(self) -> str:
+        return f"{self.algorithm}, {self.case}, {self.point}"
+
+    @property
+    def point(self) -> str:
+        """What is wrong with the path, in words."""
+        return f"{self.kind} {self.amount:+g} {UNITS[self.kind]}"
+
+    @property
+    def loss_db(self) -> float:
+        """How much louder the noise gets; infinite if the filter diverged."""
+        return np.inf if self.diverged_at_s is not None else -self.noise_reduction_db
 
 
 def planned_runs() -> int:
@@ -109,18 +122,20 @@ def main(runs: Runs) -> StudyReport:
         algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
-        figures=mismatch_figures(rows),
-        notes=[*_notes(pairs, rows, accuracy), ceilings_note(scenes)],
+        figures=[_figure(rows, case) for case in dict.fromkeys(row.case for row in rows)],
+        notes=[
+            *without_measured(pairs),
+            "A tone can stay in control somewhat past 90 degrees, which is the bound of small step sizes.",
+            f"A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, one of "
+            f"{FS / (4 * BAND_HZ[1]):.0f} its upper edge.",
+            "There is one seed and one record for each case: differences of some tenths of a dB between algorithms mean "
+            "nothing.",
+            ceilings_note(scenes),
+        ],
         tables=[
-            _table("exact", f"{_CAPTION}, at the settings that are best with the exact path", rows, EXACT),
-            _table("wrong", f"{_CAPTION}, at the settings that are best with the wrong path", rows, WRONG),
-            _table(
-                "power",
-                "Output power over the rated one, at the settings that are best with the exact path",
-                rows,
-                EXACT,
-                "power",
-            ),
+            _table("exact", "Noise reduction over the steady half in dB", rows, EXACT, "noise_reduction_db"),
+            _table("wrong", "Noise reduction over the steady half in dB", rows, WRONG, "noise_reduction_db"),
+            _table("power", "Output power over the rated one", rows, EXACT, "power"),
         ],
         claims_heading="Findings",
     )
@@ -185,254 +200,141 @@ def run_case(
         point: {name: best_setting(scene, name, trials) for name, trials in own.items()} for point, own in tried.items()
     }
     rows = []
-    for kind, amounts in AMOUNTS.items():
-        for amount in amounts:
-            point = (kind, amount) if amount else ("phase", 0.0)
-            for name in ALGORITHMS:
-                trials = {trial.setting: trial for trial in tried[point][name]}
-                for tuned_with, tuned in ((EXACT, best["phase", 0.0][name]), (WRONG, best[point][name])):
-                    # If it diverged at every setting, any of them will do.
-                    trial = trials[tuned.setting if tuned else algorithms()[name].grid[0]]
-                    place = {"kind": kind, "amount": amount, "algorithm": name, "tuned_with": tuned_with}
-                    within = tuned is not None and tuned.within_budget
-                    rows.append(_row(case, scene.rated_power, trial, within_budget=within, **place))
+    for kind, amount in [(kind, amount) for kind, amounts in AMOUNTS.items() for amount in amounts]:
+        point = (kind, amount) if amount else ("phase", 0.0)
+        for name in ALGORITHMS:
+            trials = {trial.setting: trial for trial in tried[point][name]}
+            for tuned_with, tuned in ((EXACT, best["phase", 0.0][name]), (WRONG, best[point][name])):
+                # If it diverged at every setting, any of them will do.
+                trial = trials[tuned.setting if tuned else algorithms()[name].grid[0]]
+                rows.append(
+                    MismatchRow(
+                        path=case.path,
+                        noise=case.noise,
+                        kind=kind,
+                        amount=amount,
+                        algorithm=name,
+                        tuned_with=tuned_with,
+                        setting=trial.setting,
+                        noise_reduction_db=trial.noise_reduction_db,
+                        power=np.nan if trial.diverged else trial.output_power / scene.rated_power,
+                        diverged_at_s=trial.diverged_at_s,
+                    )
+                )
     return rows, best
 
 
-def _row(case: Case, rated_power: float, trial: Trial, **place: Any) -> MismatchRow:
-    return MismatchRow(
-        path=case.path,
-        noise=case.noise,
-        setting=trial.setting,
-        noise_reduction_db=trial.noise_reduction_db,
-        power=np.nan if trial.diverged else trial.output_power / rated_power,
-        diverged_at_s=trial.diverged_at_s,
-        **place,
-    )
-
-
-# ---- Claims and notes
+# ---- Claims
 
 
 def claims(rows: Sequence[MismatchRow]) -> list[Claim]:
     """Return the findings, each on all cases."""
-    return [
-        *(_quarter_turn(rows, name) for name in ("FxLMS", "KF-ANC")),
-        _gain(rows),
-        _bounded(rows),
-        _power(rows),
-    ]
+    return [_quarter_turn(rows, "FxLMS"), _quarter_turn(rows, "KF-ANC"), _gain(rows), _bounded(rows), _power(rows)]
 
 
-def _quarter_turn(rows: Iterable[MismatchRow], name: str) -> Claim:
-    own = [
-        row
-        for row in rows
-        if (row.kind, row.noise, row.algorithm, row.tuned_with) == ("phase", "band noise", name, WRONG)
-    ]
-    below, above = [r for r in own if r.amount < 90.0], [r for r in own if r.amount > 90.0]
-    lost, left = [r for r in below if r.unstable], [r for r in above if not r.unstable]
-    worst, best = min(below, key=_value), max(above, key=_value)
+def _quarter_turn(rows: Sequence[MismatchRow], name: str) -> Claim:
+    phases = [row for row in rows if (row.kind, row.noise, row.algorithm) == ("phase", "band noise", name)]
+    own = [row for row in phases if row.tuned_with == WRONG]
+    below, above = [row for row in own if row.amount < 90.0], [row for row in own if row.amount > 90.0]
+    reduced, left = ([row for row in some if not row.unstable] for some in (below, above))
+    least, most = max(below, key=lambda row: row.loss_db), min(above, key=lambda row: row.loss_db)
     return Claim(
         f"{name} tuned with the wrong path reduces band noise at every phase error below 90 degrees, and at none above",
-        not lost and not left,
-        f"{len(below) - len(lost)} of {len(below)} runs below reduce it, the least by {_value(worst):.1f} dB "
-        f"({_where(worst)}); {len(left)} of {len(above)} above, the best of which is {_value(best):.1f} dB ({_where(best)})",
+        len(reduced) == len(below) and not left,
+        f"{len(reduced)} of {len(below)} runs below reduce it, the least by {-least.loss_db:.1f} dB ({least}); "
+        f"{len(left)} of {len(above)} above, the best of which is {-most.loss_db:.1f} dB ({most})",
     )
-
-
-def _value(row: MismatchRow) -> float:
-    return -np.inf if row.diverged_at_s is not None else row.noise_reduction_db
-
-
-def _where(row: MismatchRow) -> str:
-    return f"{row.algorithm}, {row.path}, {row.noise}, {row.kind} {row.amount:+g} {UNITS[row.kind]}"
 
 
 def _gain(rows: Sequence[MismatchRow]) -> Claim:
     losses = {}
     for name in ("KF-ANC", "KF-PB", "FxLMS", "MOV-FxLMS"):
-        own = [row for row in rows if row.kind == "gain" and row.algorithm == name and row.tuned_with == EXACT]
-        exact = {(row.path, row.noise): _value(row) for row in own if row.amount == 0.0}
-        losses[name] = max(exact[row.path, row.noise] - _value(row) for row in own)
-    largest = max(abs(a) for a in AMOUNTS["gain"])
+        own = [row for row in rows if (row.kind, row.algorithm, row.tuned_with) == ("gain", name, EXACT)]
+        exact = {row.case: row.loss_db for row in own if row.amount == 0.0}
+        _, losses[name] = worst({row: row.loss_db - exact[row.case] for row in own})
+    largest = max(abs(amount) for amount in AMOUNTS["gain"])
     return Claim(
         f"A gain up to {largest:g} dB off costs KF-ANC and KF-PB at most {GAIN_LOSS_DB:g} dB without tuning again",
-        max(losses["KF-ANC"], losses["KF-PB"]) <= GAIN_LOSS_DB,
-        "largest loss: " + ", ".join(f"{name} {_loss(loss)}" for name, loss in losses.items()),
+        all(losses[name] <= GAIN_LOSS_DB for name in ("KF-ANC", "KF-PB")),
+        "largest loss: "
+        + ", ".join(f"{name} {f'{loss:.1f} dB' if np.isfinite(loss) else 'diverges'}" for name, loss in losses.items()),
     )
-
-
-def _loss(loss_db: float) -> str:
-    return "diverges" if np.isinf(loss_db) else f"{loss_db:.1f} dB"
 
 
 def _bounded(rows: Sequence[MismatchRow]) -> Claim:
     own = [row for row in rows if row.algorithm in KEEPS_POWER]
-    away = [row for row in own if row.diverged_at_s is not None]
     others = [row for row in rows if row.algorithm in UNCONSTRAINED and row.tuned_with == EXACT]
-    worst = min(own, key=_value)
+    away, others_away = ([row for row in some if row.diverged_at_s is not None] for some in (own, others))
+    loudest, gain_db = worst({row: row.loss_db for row in own})
     return Claim(
         f"{', '.join(KEEPS_POWER[:-1])} and {KEEPS_POWER[-1]} never diverge, whatever the mismatch and the tuning",
         not away,
-        f"{len(away)} of {len(own)} runs diverged; the loudest left {-_value(worst):.1f} dB more than the noise "
-        f"({_where(worst)}). Of the unconstrained algorithms tuned with the exact path "
-        f"{sum(row.diverged_at_s is not None for row in others)} of {len(others)} diverged",
+        f"{len(away)} of {len(own)} runs diverged; the loudest left {gain_db:.1f} dB more than the noise ({loudest}). Of the "
+        f"unconstrained algorithms tuned with the exact path {len(others_away)} of {len(others)} diverged",
     )
 
 
 def _power(rows: Sequence[MismatchRow]) -> Claim:
-    powers = {
-        name: [row.power for row in rows if row.algorithm == name and row.tuned_with == EXACT and row.kind == "gain"]
-        for name in KEEPS_POWER
-    }
-    ours = powers["KF-PB"]
+    gains = [row for row in rows if row.kind == "gain" and row.tuned_with == EXACT]
+    powers = {name: np.array([row.power for row in gains if row.algorithm == name]) for name in KEEPS_POWER}
+    kept = {name: bool(np.all((own >= KEPT[0]) & (own <= KEPT[1]))) for name, own in powers.items()}
     return Claim(
-        "With a wrong gain KF-PB keeps 0.97 to 1.02 of its rated power, and KF-OPC does not",
-        bool(np.min(ours) >= 0.97 and np.max(ours) <= 1.02)
-        and not bool(np.min(powers["KF-OPC"]) >= 0.97 and np.max(powers["KF-OPC"]) <= 1.02),
+        f"With a wrong gain KF-PB keeps {KEPT[0]:g} to {KEPT[1]:g} of its rated power, and KF-OPC does not",
+        kept["KF-PB"] and not kept["KF-OPC"],
         "output power over the rated one: "
         + ", ".join(f"{name} {np.nanmin(own):.2f} to {np.nanmax(own):.2f}" for name, own in powers.items()),
     )
 
 
-def _notes(pairs: Mapping[str, Pair], rows: Sequence[MismatchRow], accuracy: Mapping[str, float]) -> list[str]:
-    anc = [row for row in rows if row.algorithm == "KF-ANC" and row.tuned_with == EXACT and row.kind == "phase"]
-    late = [row.diverged_at_s for row in anc if row.diverged_at_s is not None]
-    times = f"after {min(late):.1f} s at the earliest" if late else "at none of the phase errors within the run"
-    over = [
-        f"{row.algorithm} ({row.path}, {row.noise}: {row.power:.2f})"
-        for row in rows
-        if (row.kind, row.amount, row.tuned_with) == ("phase", 0.0, EXACT) and not row.within_budget
-    ]
-    kept = [f"Over its budget with the exact path too, at every setting tried: {', '.join(over)}."] if over else []
-    return [
-        *without_measured(pairs),
-        *kept,
-        "The Kalman filters have the bound of 90 degrees too because they trust d^ = e + s^*y, which is off by (s^ - s)*y. "
-        "Filter weights that change slowly still settle where E[x' e] = 0, as those of FxLMS do, and move there along "
-        "R_x'^-1 E[x' e], per frequency at a rate of s/s^: the gain no longer matters, the sign of its real part does.",
-        f"Past 90 degrees KF-ANC runs away as FxLMS does; it passed 1e6 times the rated amplitude {times}. Before that "
-        "it is already louder than the noise. Other settings hardly help: the best for FxLMS is its smallest step size, with "
-        "which it grows too, only slowly.",
-        *_tone_note(pairs),
-        "An output constraint works as a leak: per frequency the error is d / (1 + s conj(s^)/lambda), which stays bounded "
-        "while the real part of s conj(s^) is above -lambda, and below the noise somewhat past 90 degrees.",
-        "Constant phase errors are fitted by causal filters: off by at most "
-        + ", ".join(f"{value:.1f} degrees ({name})" for name, value in accuracy.items())
-        + f" over the band. A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, "
-        f"one of {FS / (4 * BAND_HZ[1]):.0f} its upper edge.",
-        "There is one seed and one record for each case: figures of one algorithm at neighbouring mismatches can be "
-        "compared, differences of some tenths of a dB between algorithms cannot.",
-    ]
-
-
-def _tone_note(pairs: Mapping[str, Pair]) -> list[str]:
-    """Return what sets a tone apart if the secondary path's phase rises with frequency there."""
-    path = next(iter(pairs))
-    delay = float(group_delay(pairs[path][1], [TONE_HZ], fs=FS)[0]) * FS
-    if delay >= 0.0:
-        return []
-    return [
-        f"A tone can stay in control somewhat past 90 degrees ({path}): 90 degrees is the bound of small step sizes. At "
-        f"{TONE_HZ:g} Hz the path has an anti-resonance and a group delay of {delay:.0f} samples; weights that move fast "
-        "shift the frequency of the error a little, and there the path's phase helps. At small step sizes the tone grows "
-        "past 90 degrees as theory has it (a test of the study runs it on a pure delay)."
-    ]
-
-
 # ---- Tables and figures
 
 
-_CAPTION = "Noise reduction over the steady half in dB"
+def _table(stem: str, caption: str, rows: Sequence[MismatchRow], tuned_with: str, figure: str) -> Table:
+    own = [row for row in rows if row.tuned_with == tuned_with]
+    cells = (((row.path, row.noise, row.point), row.algorithm, cell(row, figure)) for row in own)
+    whole = f"{caption}, at the settings that are best with the {tuned_with}"
+    return by_algorithm(stem, whole, ["paths", "noise", "mismatch"], ALGORITHMS, cells)
 
 
-def _table(
-    stem: str, caption: str, rows: Sequence[MismatchRow], tuned_with: str, figure: str = "noise_reduction_db"
-) -> Table:
-    def cells() -> Iterator[tuple[tuple[str, ...], str, Any]]:
-        for row in rows:
-            if row.tuned_with == tuned_with:
-                amount = f"{row.kind} {row.amount:+g} {UNITS[row.kind]}"
-                yield (row.path, row.noise, amount), row.algorithm, cell(row, figure)
-
-    return by_algorithm(stem, caption, ["paths", "noise", "mismatch"], ALGORITHMS, cells())
-
-
-def mismatch_figures(rows: Sequence[MismatchRow]) -> list[FigureItem]:
-    """Return figures of the noise reduction and of the output power of each case."""
-    items = []
-    for path, noise in dict.fromkeys((row.path, row.noise) for row in rows):
-        own = [row for row in rows if (row.path, row.noise) == (path, noise)]
-        stem = f"{path} {noise}".replace(" ", "-")
-        items.append(
-            FigureItem(
-                f"reduction-{stem}",
-                f"Noise reduction against what is wrong with the secondary path known to the controllers ({path}, {noise}). "
-                f"Above: settings tuned with the exact path; below: with the wrong one. Crosses: diverged, or below {BOTTOM_DB:g} dB.",
-                _reductions(own),
-            )
-        )
-        items.append(
-            FigureItem(
-                f"power-{stem}",
-                f"Output power over the rated one, settings tuned with the exact path ({path}, {noise}). Crosses: "
-                f"diverged, or above {POWERS[1]:g} times.",
-                _powers(own),
-            )
-        )
-    return items
-
-
-def _reductions(rows: Sequence[MismatchRow]) -> Any:
-    figure, axes = new_figure((10.5, 6.4), 2, len(AMOUNTS), sharey=True, sharex="col")
-    top = 1.05 * max(row.noise_reduction_db for row in rows if row.diverged_at_s is None) + 1.0
-    for line, tuned_with in zip(axes, (EXACT, WRONG), strict=True):
+def _figure(rows: Sequence[MismatchRow], case: Case) -> FigureItem:
+    """Return a figure with a column for each kind of mismatch: noise reduction for both tunings, output power."""
+    own = [row for row in rows if row.case == case]
+    figure, axes = new_figure((10.5, 9.0), 3, len(AMOUNTS), sharex="col", sharey="row")
+    top = 1.05 * max(row.noise_reduction_db for row in own if row.diverged_at_s is None) + 1.0
+    lines = (("noise_reduction_db", EXACT), ("noise_reduction_db", WRONG), ("power", EXACT))
+    for line, (measure, tuned_with) in zip(axes, lines, strict=True):
         for ax, kind in zip(line, AMOUNTS, strict=True):
-            own = [row for row in rows if (row.kind, row.tuned_with) == (kind, tuned_with)]
             for k, name in enumerate(ALGORITHMS):
-                _draw(ax, [row for row in own if row.algorithm == name], "noise_reduction_db", k)
-            ax.axhline(0.0, color=MARK, linewidth=1)
-            ax.set_ylim(BOTTOM_DB - 3.5, top)
-            _mismatch_axis(ax, kind)
-        line[0].set_ylabel(f"Noise reduction (dB)\ntuned with the {tuned_with}")
-    for ax in axes[0]:
-        ax.set_xlabel("")
-    legend_of(figure, axes.flat)
-    return figure
-
-
-def _powers(rows: Sequence[MismatchRow]) -> Any:
-    figure, axes = new_figure((10.5, 4.0), 1, len(AMOUNTS), sharey=True)
-    for ax, kind in zip(axes[0], AMOUNTS, strict=True):
-        own = [row for row in rows if (row.kind, row.tuned_with) == (kind, EXACT)]
-        for k, name in enumerate(ALGORITHMS):
-            _draw(ax, [row for row in own if row.algorithm == name], "power", k)
-        ax.axhline(1.0, color=MARK, linewidth=1)
-        ax.set_yscale("log")
-        ax.set_ylim(POWERS[0], 4 * POWERS[1])
-        _mismatch_axis(ax, kind)
-    axes[0, 0].set_ylabel("Output power / rated power")
+                curve = [row for row in own if (row.kind, row.algorithm, row.tuned_with) == (kind, name, tuned_with)]
+                _draw(ax, curve, measure, k)
+            ax.axhline(1.0 if measure == "power" else 0.0, color=MARK, linewidth=1)
+            if kind == "phase":
+                ax.axvline(90.0, color=MARK, linewidth=1, linestyle=":")
+            ax.set_xticks(AMOUNTS[kind])
+            ax.tick_params(axis="x", labelsize="small")
+            ax.grid(True, alpha=0.3)
+        words = "Output power / rated power" if measure == "power" else "Noise reduction (dB)"
+        line[0].set_ylabel(f"{words}\ntuned with the {tuned_with}")
+    axes[0, 0].set_ylim(BOTTOM_DB - 3.5, top)
+    axes[1, 0].set_ylim(BOTTOM_DB - 3.5, top)
+    axes[2, 0].set_yscale("log")
+    axes[2, 0].set_ylim(POWERS[0], 4 * POWERS[1])
+    for ax, kind in zip(axes[2], AMOUNTS, strict=True):
+        ax.set_xlabel(f"{kind.capitalize()} error ({UNITS[kind]})")
     legend_of(figure, axes[0])
-    return figure
+    caption = (
+        "Noise reduction and output power over the rated one against what is wrong with the secondary path known to the "
+        f"controllers ({case}). Crosses: diverged, below {BOTTOM_DB:g} dB, or above {POWERS[1]:g} times the rated power."
+    )
+    return FigureItem(f"{case.path} {case.noise}".replace(" ", "-"), caption, figure)
 
 
-def _draw(ax: Any, rows: Sequence[MismatchRow], figure: str, k: int) -> None:
+def _draw(ax: Any, rows: Sequence[MismatchRow], measure: str, k: int) -> None:
     """Draw a curve as far as it lies on the scale, and a cross at the edge for each amount at which it does not."""
     amounts = np.array([row.amount for row in rows])
-    values = np.array([getattr(row, figure) for row in rows], dtype=np.float64)
-    inside = values >= BOTTOM_DB if figure == "noise_reduction_db" else values <= POWERS[1]  # NaN is outside
-    own = curve_style(rows[0].algorithm)
-    ax.plot(amounts, np.where(inside, values, np.nan), label=rows[0].algorithm, linewidth=1.4, markersize=4.5, **own)
-    edge = BOTTOM_DB - 0.45 * (k + 1) if figure == "noise_reduction_db" else POWERS[1] * 1.2 ** (k + 1)
-    ax.plot(amounts[~inside], np.full(int(np.sum(~inside)), edge), "x", color=own["color"], markersize=5)
-
-
-def _mismatch_axis(ax: Any, kind: str) -> None:
-    labels = {"phase": "Phase error", "gain": "Gain error", "delay": "Delay error"}
-    ax.set_xticks(AMOUNTS[kind])
-    ax.tick_params(axis="x", labelsize="small")
-    ax.set_xlabel(f"{labels[kind]} ({UNITS[kind]})")
-    if kind == "phase":
-        ax.axvline(90.0, color=MARK, linewidth=1, linestyle=":")
-    ax.grid(True, alpha=0.3)
+    values = np.array([getattr(row, measure) for row in rows])
+    inside = values <= POWERS[1] if measure == "power" else values >= BOTTOM_DB  # NaN is outside
+    style = curve_style(rows[0].algorithm)
+    ax.plot(amounts, np.where(inside, values, np.nan), label=rows[0].algorithm, linewidth=1.4, markersize=4.5, **style)
+    edge = POWERS[1] * 1.2 ** (k + 1) if measure == "power" else BOTTOM_DB - 0.45 * (k + 1)
+    ax.plot(amounts[~inside], np.full(int(np.sum(~inside)), edge), "x", color=style["color"], markersize=5)

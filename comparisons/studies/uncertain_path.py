@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
@@ -41,6 +41,7 @@ from .report_parts import (
     tuned_in_words,
     without_measured,
 )
+from .worst_cases import worst
 
 ALGORITHM = "KF-PB"
 N_TAPS = 128
@@ -48,7 +49,7 @@ DURATION_S = 5.0
 RATED_SHARE = 0.25  # of the unconstrained control power
 WIDE_HZ, HIGH_TONE_HZ = (100.0, 6000.0), 4000.0
 LOW = ("compressor", "band noise", "motor")  # their power lies below a sixth of the sample rate
-BEYOND = ("white",)  # its power reaches beyond three eighths of the sample rate
+BEYOND = "white"  # its power reaches beyond three eighths of the sample rate
 ERRORS: dict[str, dict[str, float]] = {  # of the estimate
     "a sample late": {"delay_samples": 1.0},
     "a sample early": {"delay_samples": -1.0},
@@ -73,6 +74,11 @@ class AllowanceRow(WindowRow):
     error: str
     allowance: str
     worst_second_db: float = np.nan  # least noise reduction over a second after the first
+
+    @property
+    def louder_db(self) -> float:
+        """How much louder the worst second is than without control; infinite if the filter diverged."""
+        return np.inf if self.diverged_at_s is not None else -self.worst_second_db
 
 
 def planned_runs() -> int:
@@ -118,7 +124,7 @@ def main(runs: Runs) -> StudyReport:
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(rows)],
-        notes=_notes(pairs, rows),
+        notes=[*without_measured(pairs), _power_note(rows), "There is one seed and one record for each case."],
         tables=[
             _table("worst", "Least noise reduction in dB over any second after the first", rows, "worst_second_db"),
             _table("steady", "Noise reduction in dB over the steady half", rows, "noise_reduction_db"),
@@ -134,7 +140,7 @@ def study_noises() -> dict[str, Noise]:
     """Return the noises by name: those at hand that are steady or recorded, and some that reach high frequencies."""
     return {name: noise for name, noise in noises().items() if name in LOW} | {
         "wide band": lambda duration, seed: band_limited_noise(WIDE_HZ, duration, fs=FS, rng=seed),
-        "white": lambda duration, seed: np.random.default_rng(seed).standard_normal(round(duration * FS)),
+        BEYOND: lambda duration, seed: np.random.default_rng(seed).standard_normal(round(duration * FS)),
         "high tone": lambda duration, seed: tone(HIGH_TONE_HZ, duration, fs=FS, phase_rad=float(seed)),
     }
 
@@ -169,21 +175,15 @@ def run_job(
 ) -> AllowanceRow:
     """Run KF-PB with an estimate and an allowance."""
     error, allowance = job
-    place: dict[str, Any] = {
-        "path": path,
-        "noise": noise,
-        "algorithm": ALGORITHM,
-        "error": error,
-        "allowance": allowance,
-    }
+    place: dict[str, Any] = {"path": path, "noise": noise, "algorithm": ALGORITHM}
     estimate, uncertainty = estimates[error]
     allowed = {NOTHING: None, DEFAULT: DEFAULT_UNCERTAINTY, STATED: uncertainty}[allowance]
     known = replace(scene, secondary_estimate=estimate, secondary_path_uncertainty=allowed)
     result = None if best is None else run_setting(known, ALGORITHM, best.setting)
-    row = AllowanceRow(**place, **figures_of(result, scene.rated_power))
-    if result is None or row.diverged_at_s is not None:
-        return row
-    return replace(row, worst_second_db=min(seconds_db(result)[1:]))
+    figures = figures_of(result, scene.rated_power)
+    if result is not None and result.diverged_at_s is None:
+        figures["worst_second_db"] = min(seconds_db(result)[1:])
+    return AllowanceRow(**place, error=error, allowance=allowance, **figures)
 
 
 def stated(error: str) -> PathTolerance:
@@ -204,89 +204,63 @@ def seconds_db(result: SimulationResult) -> list[float]:
 
 def claims(rows: Sequence[AllowanceRow]) -> list[Claim]:
     """Return the findings, each on all cases."""
+    louder = "KF-PB makes the noise louder in no second after the first"
+    cost = f"With an exact path the default uncertainty costs at most {COST_DB:g} dB"
+    low, beyond = ([row for row in rows if (row.noise == BEYOND) == high] for high in (False, True))
     return [
-        *(_never_louder(rows, allowance) for allowance in (DEFAULT, STATED)),
-        _cost(rows, False),
-        _cost(rows, True),
-        _cost_identified(rows),
+        _never_louder(rows, DEFAULT, f"With its default uncertainty {louder}"),
+        _never_louder(rows, STATED, f"With the error stated as a tolerance {louder}"),
+        _cost(low, EXACT, DEFAULT, f"{cost}, noises below three eighths of the sample rate"),
+        _cost(beyond, EXACT, DEFAULT, f"{cost}, white noise"),
+        _cost(
+            rows,
+            IDENTIFIED,
+            STATED,
+            f"With a path that was identified and the uncertainty that came with it, at most {COST_DB:g} dB are lost",
+        ),
     ]
 
 
-def _value(row: AllowanceRow) -> float:
-    return -np.inf if row.diverged_at_s is not None else row.worst_second_db
-
-
-def _where(row: AllowanceRow) -> str:
-    return f"{row.path}, {row.noise}, {row.error}"
-
-
-def _never_louder(rows: Iterable[AllowanceRow], allowance: str) -> Claim:
-    words = {
-        DEFAULT: "With its default uncertainty KF-PB makes the noise louder in no second after the first",
-        STATED: "With the error stated as a tolerance KF-PB makes the noise louder in no second after the first",
-    }
+def _never_louder(rows: Iterable[AllowanceRow], allowance: str, text: str) -> Claim:
     wrong = [row for row in rows if row.error != EXACT]
-    own, bare = ([row for row in wrong if row.allowance == one] for one in (allowance, NOTHING))
-    louder, bare_louder = ([row for row in some if not _value(row) >= 0.0] for some in (own, bare))
-    worst, bare_worst = min(own, key=_value), min(bare, key=_value)
+    own, bare = (
+        {f"{row.case}, {row.error}": row.louder_db for row in wrong if row.allowance == one}
+        for one in (allowance, NOTHING)
+    )
+    louder, bare_louder = (sum(not louder_db <= 0.0 for louder_db in some.values()) for some in (own, bare))
+    (where, most), (bare_where, bare_most) = worst(own), worst(bare)
     return Claim(
-        words[allowance],
-        not louder,
-        f"{len(louder)} of {len(own)} runs do, the worst second is {_value(worst):.1f} dB ({_where(worst)}); if "
-        f"nothing is allowed for {len(bare_louder)} of {len(bare)} do, the worst second is {_value(bare_worst):.1f} dB "
-        f"({_where(bare_worst)})",
+        text,
+        louder == 0,
+        f"{louder} of {len(own)} runs do, the worst second is {-most:.1f} dB ({where}); if nothing is allowed for "
+        f"{bare_louder} of {len(bare)} do, the worst second is {-bare_most:.1f} dB ({bare_where})",
     )
 
 
-def _cost(rows: Sequence[AllowanceRow], beyond: bool) -> Claim:
-    some = [row for row in rows if (row.noise in BEYOND) == beyond]
-    noise = "white noise" if beyond else "noises below three eighths of the sample rate"
-    return _cost_of(
-        some, EXACT, DEFAULT, f"With an exact path the default uncertainty costs at most {COST_DB:g} dB, {noise}"
-    )
-
-
-def _cost_identified(rows: Iterable[AllowanceRow]) -> Claim:
-    words = f"With a path that was identified and the uncertainty that came with it, at most {COST_DB:g} dB are lost"
-    return _cost_of(rows, IDENTIFIED, STATED, words)
-
-
-def _cost_of(rows: Iterable[AllowanceRow], error: str, allowance: str, words: str) -> Claim:
+def _cost(rows: Iterable[AllowanceRow], error: str, allowance: str, text: str) -> Claim:
     """Return a claim about what is lost in comparison with an exact path that is taken for exact."""
     reduction = {(row.case, row.error, row.allowance): row.noise_reduction_db for row in rows}
-    cases = {case: None for case, *_ in reduction}
+    cases = dict.fromkeys(case for case, *_ in reduction)
     costs = {str(case): reduction[case, EXACT, NOTHING] - reduction[case, error, allowance] for case in cases}
-    where = max(costs, key=lambda case: costs[case])
-    return Claim(
-        words,
-        bool(np.max(list(costs.values())) <= COST_DB),  # NaN, of a run that diverged, counts as the largest
-        f"{np.mean(list(costs.values())):z.2f} dB on average, {costs[where]:z.2f} dB at most ({where})",
-    )
+    where, most = worst(costs)
+    mean = np.mean(list(costs.values()))
+    return Claim(text, most <= COST_DB, f"{mean:z.2f} dB on average, {most:z.2f} dB at most ({where})")
 
 
-def _notes(pairs: Mapping[str, Any], rows: Sequence[AllowanceRow]) -> list[str]:
+def _power_note(rows: Sequence[AllowanceRow]) -> str:
     powers = [row.power for row in rows if row.diverged_at_s is None and row.allowance == DEFAULT]
-    return [
-        *without_measured(pairs),
+    return (
         f"With its default uncertainty KF-PB spends {min(powers):.2f} to {max(powers):.2f} of its rated power over the steady "
-        "half, whatever is wrong with the estimate.",
-        "KF-PB learns the path while it controls: what is allowed for counts until it has been learned.",
-        f"The identification hears {IDENTIFICATION_S:g} s of white noise, {-SENSOR_NOISE_DB:g} dB above the microphone's noise.",
-        "A constant phase error cannot be had at all frequencies with a causal estimate; it is fitted from 0.01 to 0.45 "
-        "of the sample rate.",
-        "There is one seed and one record for each case.",
-    ]
+        "half, whatever is wrong with the estimate."
+    )
 
 
 # ---- Tables and figures
 
 
 def _table(stem: str, caption: str, rows: Sequence[AllowanceRow], figure: str) -> Table:
-    def cells() -> Iterator[tuple[tuple[str, ...], str, Any]]:
-        for row in rows:
-            yield (row.path, row.noise, row.error), row.allowance, cell(row, figure)
-
-    return by_algorithm(stem, caption, ["paths", "noise", "estimate"], ALLOWANCES, cells())
+    cells = (((row.path, row.noise, row.error), row.allowance, cell(row, figure)) for row in rows)
+    return by_algorithm(stem, caption, ["paths", "noise", "estimate"], ALLOWANCES, cells)
 
 
 def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:
@@ -294,21 +268,14 @@ def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:
     names, estimates = list(dict.fromkeys(row.path for row in rows)), [EXACT, IDENTIFIED, *ERRORS]
     figure, axes = new_figure((10.5, 4.2), 1, len(names), sharey=True)
     markers = {NOTHING: ("x", "C3"), DEFAULT: ("o", "C0"), STATED: ("^", "C2")}
-    bottom = max(BOTTOM_DB, min(_value(row) for row in rows))
+    bottom = max(BOTTOM_DB, min(-row.louder_db for row in rows))
     for ax, path in zip(axes[0], names, strict=True):
         for place, allowance in enumerate(ALLOWANCES):
             own = [row for row in rows if (row.path, row.allowance) == (path, allowance)]
             x = [estimates.index(row.error) + 0.25 * (place - 1) for row in own]
+            y = [max(-row.louder_db, bottom) for row in own]
             marker, colour = markers[allowance]
-            ax.plot(
-                x,
-                [max(_value(row), bottom) for row in own],
-                marker,
-                color=colour,
-                markersize=5,
-                alpha=0.8,
-                label=allowance,
-            )
+            ax.plot(x, y, marker, color=colour, markersize=5, alpha=0.8, label=allowance)
         ax.axhline(0.0, color=MARK, linewidth=1)
         ax.set_xticks(range(len(estimates)), estimates, rotation=40, ha="right", fontsize="small")
         ax.set_title(path)

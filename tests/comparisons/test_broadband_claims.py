@@ -132,11 +132,6 @@ def test_clipped(own: dict[str, list[float]], held: bool) -> None:
     assert claim.measured.count("4.7 to 4.8 dB, control signal up to 3.9 to 4.7") >= 2
 
 
-def test_the_power_of_a_run_that_diverged_is_undefined() -> None:
-    assert broadband._power({"output_power": 0.81234}) == "0.812"
-    assert broadband._power({"output_power": np.nan}) == broadband._power({"output_power": np.inf}) == "undefined"
-
-
 def test_the_first_second_is_a_whole_second_and_no_more() -> None:
     """Silent from 0.5 s on: 3 dB over the first second, 0 over its first half, 6 over the two seconds of the run."""
     fs = 1000.0

@@ -60,7 +60,7 @@ def test_report_has_every_algorithm_in_every_place(small: Any, tmp_path: Any) ->
     assert {(row["algorithm"], row["noise"]) for row in rows} == expected
     write_report([report], tmp_path)
     assert {path.stem for path in (tmp_path / "figures").glob("*.png")} == {
-        f"multichannel-{stem}" for stem in ("reduction", "course", "powers", "map")
+        f"multichannel-{stem}" for stem in ("reduction", "course", "map")
     }
 
 
@@ -168,13 +168,8 @@ def rows_of(
             for name, db in bound.items()
         ]
         for name, db, own in ((KF_PB, 8.0 - loss_db, power), ("MOV-FxLMS", rival_db, rival_power)):
-            kept = own <= 1.02
-            rows.append(
-                ChannelRow(
-                    path=path, noise=noise, algorithm=name, noise_reduction_db=db, powers=[own, 0.4], power=own,
-                    within_budget=kept,
-                )
-            )  # fmt: skip
+            figures = {"noise_reduction_db": db, "powers": [own, 0.4], "power": own}
+            rows.append(ChannelRow(path=path, noise=noise, algorithm=name, **figures))
     return rows
 
 
@@ -243,10 +238,12 @@ def test_the_rival_is_the_best_of_those_that_keep_every_rating() -> None:
 def test_a_kf_pb_that_diverges_meets_nothing(place: int) -> None:
     rows = rows_of()
     at = [k for k, row in enumerate(rows) if row.algorithm == KF_PB][place]
-    rows[at] = replace(rows[at], diverged_at_s=1.0, noise_reduction_db=np.nan, power=np.nan, powers=[])
+    rows[at] = replace(rows[at], diverged_at_s=1.0, noise_reduction_db=np.nan, power=np.nan, powers=[np.nan, np.nan])
     expected = [place == 1] * 2 + [place == 0] * 2 + [False]
     assert [claim.holds for claim in claims(rows)] == expected
-    assert sum("diverged" in claim.measured for claim in claims(rows)) == 3
+    assert sum("nan" in claim.measured for claim in claims(rows)) == 3
+    lost = ("4 x 4, tones", f"{MEASURED}, recorded motor")[place]
+    assert f"nan dB at worst ({lost}" in claims(rows)[-1].measured
 
 
 def test_without_a_rival_there_is_no_lead() -> None:
@@ -257,6 +254,12 @@ def test_without_a_rival_there_is_no_lead() -> None:
 
 def test_without_recordings_there_is_no_claim_on_them() -> None:
     assert len(claims([row for row in rows_of() if row.path != MEASURED])) == 3
+
+
+def test_without_a_rating_that_limits_there_is_no_power_to_judge() -> None:
+    claim = claims([replace(row, limited=[False] * len(row.limited)) for row in rows_of()])[0]
+    assert not claim.holds
+    assert claim.measured.startswith("nan to nan if the rating limits, 1.000 at most")
 
 
 def test_direct_forms_run_in_small_systems_only() -> None:

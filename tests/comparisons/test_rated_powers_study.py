@@ -17,8 +17,6 @@ from comparisons.studies.rated_powers import (
     SCALED,
     BudgetRow,
     _claims,
-    _needed,
-    _sizing_table,
     mean_rows,
 )
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener
@@ -59,11 +57,8 @@ def small() -> Any:
             seeds=[1, 2],
         )
         outcome = rated_powers.main(runs), runs.done, rated_powers.planned_runs()
-        settings = {cells[3]: cells for cells in outcome[0].tables[2].rows if cells[2] == -10.0}
-        again = {}
-        for name in ("KF-OPC", "leaky FxLMS", "FxLMS"):
-            one, two = settings[name][4:6]
-            again[name] = run_setting(rated, name, one if np.isnan(two) else (one, two), 1)
+        settings = {row["algorithm"]: row["setting"] for row in outcome[0].extra["rows"] if row["share_db"] == -10.0}
+        again = {name: run_setting(rated, name, settings[name], 1) for name in ("KF-OPC", "leaky FxLMS", "FxLMS")}
         bound = power_constrained_wiener(
             scene.references[0],
             scene.disturbances[0],
@@ -92,8 +87,9 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
             noise_reduction_db(result.error, result.disturbance), rel=1e-9
         )
         assert row["power"] == pytest.approx(output_power(result.control_signal) / 0.1, rel=1e-9)
-    assert rows[BOUND, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["whole"], rel=1e-9)
-    assert rows[SCALED, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["scaled"], rel=1e-9)
+    # Outside its band the noise has no energy: there rounding decides about the weights.
+    assert rows[BOUND, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["whole"], rel=1e-6)
+    assert rows[SCALED, -10.0]["noise_reduction_db"] == pytest.approx(small[4]["scaled"], rel=1e-6)
     assert set(rows) == {
         (name, share) for name in (*algorithms.algorithms(), BOUND, RECORD, SCALED) for share in SHARES
     }
@@ -103,14 +99,13 @@ def test_rows_are_what_plain_runs_give(small: Any) -> None:
 
 def test_the_report_is_complete(small: Any, tmp_path: Any) -> None:
     report: StudyReport = small[0]
-    assert [table.stem for table in report.tables] == ["reduction", "sizing", "tuning"]
+    assert [table.stem for table in report.tables] == ["reduction"]
     assert len(report.tables[0].rows) == len(algorithms.algorithms()) + 3
-    assert len(report.tables[2].rows) == len(algorithms.algorithms()) * len(SHARES)
     assert [figure.stem for figure in report.figures] == ["duct-band-noise"]
     assert len(report.claims) == 3
     assert report.notes[0].startswith("The measured duct was not at hand")
     write_report([report], tmp_path)
-    assert (tmp_path / "tables" / "rated-powers-sizing.csv").stat().st_size > 0
+    assert (tmp_path / "tables" / "rated-powers-reduction.csv").stat().st_size > 0
     assert (tmp_path / "figures" / "rated-powers-duct-band-noise.png").stat().st_size > 10_000
 
 
@@ -128,17 +123,6 @@ def rows_of(name: str, reductions: Any, powers: Any = (1.0, 1.0), seed: int = 1)
         )
         for share, reduction, power in zip(SHARES, reductions, powers, strict=True)
     ]
-
-
-def test_what_a_noise_reduction_needs_is_read_between_rated_powers() -> None:
-    rows = rows_of("KF-PB", (2.0, 12.0))
-    assert _needed(rows, 6.0) == pytest.approx(-6.0)
-    assert _needed(rows, 1.0) == "below -10"  # the least rated power of the study
-    assert _needed(rows, 13.0) == "not reached"
-    assert _needed(rows_of("KF-PB", (2.0, 12.0), (1.0, 1.03)), 6.0) == "not reached"  # its power is not kept there
-    assert _needed(rows_of("KF-PB", (np.nan, 12.0)), 6.0) == "not reached"
-    table = _sizing_table([*rows, *rows_of("FxLMS", (2.0, 12.0))])  # no constraint: no rated power to buy
-    assert [cells[2] for cells in table.rows] == ["KF-PB"]
 
 
 def test_means_are_over_seeds_and_the_worst_window_is_the_worst() -> None:
@@ -179,4 +163,4 @@ def test_claims(own: Any, powers: Any, other: Any, other_powers: Any, expected: 
     for name, algorithm in algorithms.algorithms().items():
         if name != "KF-PB" and algorithm.keeps_budget:
             rows += rows_of(name, other, other_powers)
-    assert [claim.holds for claim in _claims(rows)] == expected
+    assert [claim.holds for claim in _claims(mean_rows(rows))] == expected
