@@ -108,8 +108,7 @@ def plot_error_spectra(
     ax.set_xlabel("Frequency (Hz)")
     ax.set_ylabel(f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})")
     ax.grid(True, alpha=0.3)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def _over_20_micropascal(pascal_per_unit: Any, run: SimulationResult, channel: int | None) -> np.ndarray:
@@ -168,8 +167,7 @@ def plot_anti_noise(
     for curve, wave in zip(shown, waves, strict=True):
         ax.plot(time, wave[part], **curve.line())
     ax.set_ylabel("Sound at the error microphone")
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_amplifier_output(
@@ -241,8 +239,7 @@ def plot_amplifier_output(
     if top > 0:
         ax.set_ylim(-top, top)
     ax.set_ylabel("Amplifier output")
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_disturbance_and_anti_noise(
@@ -315,8 +312,7 @@ def plot_disturbance_and_anti_noise(
     line = shown[0].line()
     ax.plot(time, anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
     ax.set_ylabel("Sound at the error microphone")
-    legend_above(ax)
-    legend = ax.get_legend()
+    legend = legend_above(ax).get_legend()
     assert legend is not None
     legend.set_title(text, prop=FontProperties(size="small"))
     return ax
