@@ -290,8 +290,6 @@ def plot_disturbance_and_anti_noise(
     'Anti-noise over disturbance, 200 to 2000 Hz: coherence 1.0000, gain 1.000'
     >>> plt.close(ax.figure)
     """
-    from matplotlib.font_manager import FontProperties
-
     shown = curves(result, single=True)
     if len(shown) > 1:
         raise ValueError(f"result must be one run, got {len(shown)}")
@@ -312,10 +310,7 @@ def plot_disturbance_and_anti_noise(
     line = shown[0].line()
     ax.plot(time, anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
     ax.set_ylabel("Sound at the error microphone")
-    legend = legend_above(ax).get_legend()
-    assert legend is not None
-    legend.set_title(text, prop=FontProperties(size="small"))
-    return ax
+    return legend_above(ax, text)
 
 
 def _listed(powers: Any, form: str) -> str:
