@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,18 +35,15 @@ from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_heard, require_sound
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
+from kfopc_filterpy.paths.uncertainty import Uncertainty
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .._types import PathModels, ProgressBar
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
 from .fixed_filters import FixedFilters, longest_filter
-from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
+from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
 from .scene import Runs, one_blas_thread
-
-if TYPE_CHECKING:
-    from ..bench.limits import Ratings
-    from ..paths.uncertainty import Uncertainty
 
 MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0

@@ -5,19 +5,17 @@ from __future__ import annotations
 import os
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
 
+from .assessment import Assessment
 from .page import images, players, rendered
 from .report import prepare_folder, write_files, write_whole
 from .study_report import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
-
-if TYPE_CHECKING:
-    from .assessment import Assessment
 
 TEMPLATE = "verdict.html.jinja"
 NEEDED = ("jinja2", "latex2mathml", "matplotlib", "PIL")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,14 +17,11 @@ from .._types import PathModels, ProgressBar
 from .assessed_runs import recorded_scene
 from .assessing import recorded_signals, switch_on_sample
 from .fixed_filters import longest_filter
-from .limits import ChannelLimits, limits_of, ratings_of_each, watt_per_power
+from .limits import ChannelLimits, Ratings, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
 from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution
 from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
-
-if TYPE_CHECKING:
-    from ..bench.limits import Ratings
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
 OF_SEVERAL_CHANNELS = ("KF-PB", "MOV-FxLMS", "FxLMS")

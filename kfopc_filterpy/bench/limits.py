@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
+from typing import Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
@@ -13,11 +13,9 @@ from kfopc_filterpy.metrics import overshoot, peak_control_signal
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
 
 from .._types import NumberOrArray
+from ..power.amplifiers import Amplifier
 from ..power.ratings import Rating
-
-if TYPE_CHECKING:
-    from ..power.amplifiers import Amplifier
-    from .fixed_filters import FixedFilters
+from .fixed_filters import FixedFilters
 
 EXCURSION = "loudspeaker's excursion"
 SWEEPS = 3  # over the loudspeakers: what one gives up, others may take over

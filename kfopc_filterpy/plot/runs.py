@@ -28,14 +28,12 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
 from ..metrics import nse_db, short_time_power
-from .results import DISTURBANCE, RATED, Curve, curves, named_styles, one_channel, thinned
+from .results import DISTURBANCE, RATED, Curve, Results, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from ..plot.results import Results
 
 
 def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:

@@ -11,15 +11,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_band, as_positive, per_channel
+from ..loop.result import SimulationResult
 from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
-from .results import DISTURBANCE, RATED, curves, one_channel, require_common_disturbance, span_axis, span_of, times
+from .results import (
+    DISTURBANCE,
+    RATED,
+    Results,
+    curves,
+    one_channel,
+    require_common_disturbance,
+    span_axis,
+    span_of,
+    times,
+)
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ..loop.result import SimulationResult
-    from ..plot.results import Results
 
 _DEPTH_DB = 120.0  # largest range of a spectrum's axis: numerical floors beneath would take all the room
 _VISIBLE = 0.005  # difference of waveforms, over their peak, that a line's width does not hide
