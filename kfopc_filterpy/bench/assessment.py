@@ -264,8 +264,7 @@ class Assessment:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict in strict JSON's types, as `verdict.schema.json` describes it."""
-        loudspeaker = {"volts_per_unit": self.volts_per_unit, "ohm": self.ohm}
-        levels = None if self.levels is None else vars(self.levels)
+        counts = ("references", "loudspeakers", "microphones")
         return jsonable(
             {
                 "schema_version": SCHEMA_VERSION,
@@ -273,17 +272,18 @@ class Assessment:
                 "verdict": self.verdict,
                 "limited_by": self.limited_by,
                 "reason": self.reason,
-                "advice": list(self.advice),
-                "notes": list(self.notes),
+                "advice": self.advice,
+                "notes": self.notes,
                 "want_db": self.want_db,
                 "noise_reduction_db": self.noise_reduction_db,
                 "algorithm": self.algorithm,
                 "rating": {
                     "rated_power": self.limits.rated_power,
-                    "amplitude_limit": _plain(self.limits.amplitude_limit),
+                    "amplitude_limit": self.limits.amplitude_limit,
                     "window_s": self.limits.window_s,
-                    "decided_by": _plain(self.limits.decided_by),
-                    **loudspeaker,
+                    "decided_by": self.limits.decided_by,
+                    "volts_per_unit": self.volts_per_unit,
+                    "ohm": self.ohm,
                 },
                 "ceilings": vars(self.ceilings),
                 "bound_db": self.bound_db,
@@ -293,22 +293,15 @@ class Assessment:
                 "causality_margin_s": self.causality_margin_s,
                 "helpful_delay_s": self.helpful_delay_s,
                 "band": vars(self.band),
-                "levels": levels,
+                "levels": self.levels and vars(self.levels),
                 "excursion_mm": self.excursion_mm,
                 "settings": {"n_taps": self.settings.n_taps, **self.settings.settings},
                 "algorithms": self.figures,
                 "fs": self.fs,
             }
-            | self._channels,
+            | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {}),
             "verdict",
         )
-
-    @property
-    def _channels(self) -> dict[str, Any]:
-        """The numbers of channels for JSON; nothing if there is one of each."""
-        if self.channels is None:
-            return {}
-        return {"channels": dict(zip(("references", "loudspeakers", "microphones"), self.channels, strict=True))}
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write verdict.html, verdict.json, figures and sounds into a `folder`, and return the path of the page.
@@ -343,10 +336,6 @@ def _each(values: Any, form: str, unit: str = "", all_the_same: str = " each") -
 def _db(value: float) -> str:
     """Return a level as text, without a minus sign before zero."""
     return f"{round(value, 1) + 0.0:.1f} dB"
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 _REASONS = {

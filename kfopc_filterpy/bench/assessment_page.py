@@ -96,7 +96,8 @@ def _figures(verdict: Assessment) -> Any:
     begin = SWITCHED_ON.format(verdict.switch_on_s)
     caption = "Error power over that of the disturbance; below 0 dB it is quieter than without control."
     yield FigureItem("nse", f"{caption}{together} {begin}", figure)
-    figure, axes = _rows_of_axes(n_loudspeakers(verdict), (6.4, 4))
+    _, n_loudspeakers, n_microphones = verdict.channels or (1, 1, 1)
+    figure, axes = _rows_of_axes(n_loudspeakers, (6.4, 4))
     watts = verdict.watt_per_power
     for j, ax in enumerate(axes):
         watt = None if watts is None else np.ravel(watts)[j]
@@ -106,19 +107,11 @@ def _figures(verdict: Assessment) -> Any:
     yield FigureItem("power", f"Mean power of the control signal, and the rated power. {begin}", figure)
     if verdict.levels is not None:
         levels = verdict.levels
-        figure, axes = _rows_of_axes(n_microphones(verdict), (9, 3.6))
+        figure, axes = _rows_of_axes(n_microphones, (9, 3.6))
         for k, ax in enumerate(axes):
             _draw_bands(levels.centres_hz, np.atleast_2d(levels.before_db)[k], np.atleast_2d(levels.after_db)[k], ax)
         _number_rows(axes, "Microphone")
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
-
-
-def n_loudspeakers(verdict: Assessment) -> int:
-    return 1 if verdict.channels is None else verdict.channels[1]
-
-
-def n_microphones(verdict: Assessment) -> int:
-    return 1 if verdict.channels is None else verdict.channels[2]
 
 
 def _rows_of_axes(count: int, size: tuple[float, float]) -> tuple[Any, Any]:
@@ -243,7 +236,7 @@ def _tables(verdict: Assessment) -> Any:
         yield Table(
             "microphones",
             "Noise reduction at each microphone (dB)",
-            ["Controller", *(f"Microphone {k + 1}" for k in range(n_microphones(verdict)))],
+            ["Controller", *(f"Microphone {k + 1}" for k in range(verdict.channels[2]))],
             [
                 [name, *(_number(one) for one in own["noise_reduction_by_microphone_db"])]
                 for name, own in verdict.figures.items()

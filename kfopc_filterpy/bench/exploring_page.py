@@ -19,6 +19,7 @@ from kfopc_filterpy.plot.style import decibels
 from .exploring import ALGORITHMS, AcousticSetup, ExploreResult, ExploreSettings, explore, explore_setups
 from .page import data_uri, flac
 from .registry import REGISTRY
+from .study_report import HEADROOM
 
 ADDRESS = "127.0.0.1"
 PORT = 5006
@@ -26,7 +27,6 @@ LOWEST_HZ = 50.0
 WAVE_S = 0.03  # of the control signal that is drawn
 BELOW_PEAK_DB = 70.0  # that a spectrum shows
 QUIETEST_DB = -60.0  # re rated power that is drawn
-HEADROOM = 4.0  # a sound may have this many times the disturbance's peak; beyond it is cut off
 WIDTH, HEIGHT, SIDE = 470, 285, 290
 BLUE, GREEN, ORANGE, GREY = "#0072B2", "#009E73", "#D55E00", "#777777"
 RELATIVE, ABSOLUTE = 0, 1

@@ -16,36 +16,7 @@ from kfopc_filterpy.signals import write_wav
 
 from .opening import claims_sentence, glance
 from .page import page
-from .study_report import (
-    FIGURES_OF_MERIT,
-    Claim,
-    FigureItem,
-    Parameter,
-    Sound,
-    StudyReport,
-    Table,
-    cells,
-    columns,
-    figure_file,
-    loudness,
-    require_different,
-    sound_file,
-    table_file,
-)
-
-__all__ = [
-    "FIGURES_OF_MERIT",
-    "Claim",
-    "FigureItem",
-    "Parameter",
-    "Sound",
-    "StudyReport",
-    "Table",
-    "prepare_folder",
-    "results_table",
-    "write_report",
-    "write_whole",
-]
+from .study_report import StudyReport, Table, file_of, loudness, merit_table, require_different
 
 
 def prepare_folder(folder: str | os.PathLike[str]) -> Path:
@@ -137,12 +108,12 @@ def write_files(study: StudyReport, path: Path) -> None:
     for kind in ("figures", "audio"):
         prepare_folder(path / kind)
     for item in study.figures:
-        save_figure(item.figure, figure_file(path, study, item))
+        save_figure(item.figure, file_of(path, study, item))
     for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
-        write_wav(sound_file(path, study, sound), clipped, study.fs, peak=peak)
+        write_wav(file_of(path, study, sound), clipped, study.fs, peak=peak)
     for table in study.tables:
         prepare_folder(path / "tables")
-        _write_csv(table_file(path, study, table), table)
+        _write_csv(file_of(path, study, table), table)
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
@@ -178,11 +149,12 @@ def results_table(studies: Sequence[StudyReport]) -> str:
     lines = []
     for study in studies:
         lines.append(f"{study.name}: {study.title} (rated power {study.rating})")
-        rows = [list(head) for head in zip(*columns(study), strict=True)]
-        rows += [cells(study, figures) for figures in study.algorithms.values()]
-        names = ["", "", *study.algorithms]
         if study.algorithms:
-            lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})
+            columns, rows = merit_table(study)
+            names = ["", "", *study.algorithms]
+            lines += _columns(
+                [[name, *row] for name, row in zip(names, [*zip(*columns, strict=True), *rows], strict=True)], {0}
+            )
         for claim in study.claims:
             mark = study.marks[0 if claim.holds else 1].upper()
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")

@@ -215,9 +215,7 @@ class Scene:
 
     def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
-        return simulate(
-            controller, self.references[seed_index], amplifier=self.amplifier, **self._options(seed_index), **options
-        )
+        return simulate(controller, self.references[seed_index], **self._options(seed_index) | options)
 
     def run_together(
         self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
@@ -226,8 +224,7 @@ class Scene:
 
         `options` go to `simulate_scenarios`.
         """
-        options = {"amplifier": self.amplifier} | self._options(seed_index) | options
-        return simulate_scenarios(controllers, self.references[seed_index], **options)
+        return simulate_scenarios(controllers, self.references[seed_index], **self._options(seed_index) | options)
 
     def _options(self, seed_index: int) -> dict[str, Any]:
         return {
@@ -235,6 +232,7 @@ class Scene:
             "secondary_path": self.secondary,
             "fs": self.fs,
             "rated_power": self.rated_power,
+            "amplifier": self.amplifier,
             "sensor_noise_std": self.sensor_noise_std,
             "rng": self.sensor_noise_seeds[seed_index],
             "switch_on_s": self.switch_on_s,
