@@ -167,28 +167,18 @@ def _figures(
     results: dict[str, SimulationResult], rated_powers: np.ndarray, watts: Any, switch_on_s: float
 ) -> list[FigureItem]:
     """Return the figures of the runs: the error, and the power of each loudspeaker."""
-    import matplotlib.pyplot as plt
+    from kfopc_filterpy.plot import plot_output_power
 
-    from kfopc_filterpy.plot import plot_error_spectra, plot_nse, plot_output_power
+    from .assessment_page import error_figures
 
-    begin = SWITCHED_ON.format(switch_on_s)
-    drawn: list[tuple[str, Any, str, dict[str, Any]]] = [
-        ("nse", plot_nse, f"Error power over that of the disturbance. {begin}", {}),
-        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half.", {}),
-    ]
+    items = list(error_figures(results, switch_on_s))
     for j, rated in enumerate(rated_powers):
-        which = f" of loudspeaker {j + 1}" if rated_powers.size > 1 else ""
-        caption = f"Mean power of the control signal{which}, and its rated power. {begin}"
+        which, end = (f" of loudspeaker {j + 1}", f"-{j + 1}") if rated_powers.size > 1 else ("", "")
         watt = None if watts is None else np.ravel(watts)[j]
-        stem = f"power-{j + 1}" if rated_powers.size > 1 else "power"
-        drawn.append((stem, plot_output_power, caption, {"channel": j, "rated_power": rated, "watt_per_power": watt}))
-    items = []
-    for stem, draw, caption, options in drawn:
-        figure, ax = plt.subplots(figsize=(7, 4.5), layout="constrained")
-        draw(results, ax=ax, **options)
-        if draw is not plot_error_spectra:
-            ax.set_xlabel(SINCE_SWITCH_ON)
-        items.append(FigureItem(stem, caption, figure))
+        ax: Any = plot_output_power(results, channel=j, rated_power=rated, watt_per_power=watt)
+        ax.set_xlabel(SINCE_SWITCH_ON)
+        caption = f"Mean power of the control signal{which}, and its rated power. {SWITCHED_ON.format(switch_on_s)}"
+        items.append(FigureItem(f"power{end}", caption, ax.figure))
     return items
 
 
