@@ -219,29 +219,18 @@ def _tables(verdict: Assessment) -> Any:
     rows.append([f"The run of {verdict.algorithm}", f"{verdict.noise_reduction_db:.1f} dB", adapting])
     rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
     yield Table("ceilings", "What limits", ["Ceiling", "Noise reduction", ""], rows)
-    yield Table(
-        "algorithms",
-        "The controllers",
-        [
-            "Controller",
-            "Noise reduction (dB)",
-            _power_label(verdict),
-            "Power / rated power",
-            "Worst window",
-            "Highest peak" if volts is None else "Highest peak (V)",
-        ],
-        [
-            [
-                name if name == verdict.algorithm else f"{name}, as published",
-                _number(own["noise_reduction_db"]),
-                _number(own["output_power"], verdict.watt_per_power),
-                _number(own["of_rated_power"]),
-                _number(own["worst_window"]),
-                _number(own["peak_control_signal"], volts),
-            ]
-            for name, own in verdict.figures.items()
-        ],
-    )
+    columns = [
+        ("Noise reduction (dB)", "noise_reduction_db", None),
+        (_power_label(verdict), "output_power", verdict.watt_per_power),
+        ("Power / rated power", "of_rated_power", None),
+        ("Worst window", "worst_window", None),
+        ("Highest peak" if volts is None else "Highest peak (V)", "peak_control_signal", volts),
+    ]
+    rows = []
+    for name, own in verdict.figures.items():
+        label = name if name == verdict.algorithm else f"{name}, as published"
+        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns)])
+    yield Table("algorithms", "The controllers", ["Controller", *(heading for heading, *_ in columns)], rows)
     if verdict.channels is not None:
         yield Table(
             "microphones",
@@ -260,14 +249,15 @@ def _level_rows(verdict: Assessment) -> tuple[list[str], list[list[str | float]]
     """Return the headings and rows of the third-octave bands, of all microphones."""
     levels = verdict.levels
     assert levels is not None
-    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
-    rows: list[list[str | float]] = []
+    numbered = verdict.channels is not None
     pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
-    for k, (before_db, after_db) in enumerate(pairs, 1):
-        first: list[str | float] = [] if verdict.channels is None else [str(k)]
-        for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True):
-            rows.append([*first, _nominal(centre), float(before), float(after), float(before - after)])
-    return headings if verdict.channels is None else ["Microphone", *headings], rows
+    rows: list[list[str | float]] = [
+        [*[str(k)] * numbered, _nominal(centre), float(before), float(after), float(before - after)]
+        for k, (before_db, after_db) in enumerate(pairs, 1)
+        for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True)
+    ]
+    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
+    return ["Microphone"] * numbered + headings, rows
 
 
 def _number(value: Any, scale: Any = None) -> Any:
