@@ -26,7 +26,6 @@ import os
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -227,23 +226,15 @@ class Assessment:
     @property
     def reason(self) -> str:
         """What limits, as one sentence; empty if the rating is enough."""
-        return _REASONS[self.limited_by].format(**self._words) if self.limited_by else ""
-
-    @cached_property
-    def _words(self) -> dict[str, str]:
-        c = self.ceilings
-        numbers = {
-            "want": self.want_db,
-            "reached": self.noise_reduction_db,
-            "coherence": np.nan if c.coherence_db is None else c.coherence_db,
-            "time": c.time_db,
-            "filter": c.filter_db,
-            "power": c.power_db,
-        }
-        return {name: _db(value) for name, value in numbers.items()} | {
-            "taps": str(self.settings.n_taps),
-            "rated": self.power(self.limits.rated_power),
-        }
+        if self.limited_by is None:
+            return ""
+        ceilings = {name: "" if value is None else _db(value) for name, value in vars(self.ceilings).items()}
+        return _REASONS[self.limited_by].format(
+            **ceilings,
+            reached=_db(self.noise_reduction_db),
+            taps=self.settings.n_taps,
+            rated=self.power(self.limits.rated_power),
+        )
 
     def power(self, rated_power: NumberOrArray) -> str:
         """Return a `rated_power` in words: in W if the impedance is known, else in squared units."""
@@ -339,13 +330,13 @@ def _db(value: float) -> str:
 
 
 _REASONS = {
-    "coherence": "Coherence limits: the reference explains {coherence} of the disturbance at most, whatever the "
+    "coherence": "Coherence limits: the reference explains {coherence_db} of the disturbance at most, whatever the "
     "controller and the amplifier.",
-    "causality": "Causality limits: with more time a filter of {taps} taps reaches {time}, in time only {filter}, "
+    "causality": "Causality limits: with more time a filter of {taps} taps reaches {time_db}, in time only {filter_db}, "
     "with any power.",
-    "filter": "The filter limits: {taps} taps reach {filter} with any power, and more time does not help.",
-    "amplifier": "The amplifier limits: with any power {filter} are in reach, with {rated} {power} for a fixed filter.",
-    "adaptation": "The adaptation limits: a fixed filter reaches {power} within the rated power, the controller {reached}, "
+    "filter": "The filter limits: {taps} taps reach {filter_db} with any power, and more time does not help.",
+    "amplifier": "The amplifier limits: with any power {filter_db} are in reach, with {rated} {power_db} for a fixed filter.",
+    "adaptation": "The adaptation limits: a fixed filter reaches {power_db} within the rated power, the controller {reached}, "
     "and more power does not help it.",
 }
 

@@ -97,12 +97,10 @@ def _is_sequence(value: object) -> TypeGuard[Sequence[Any]]:
 def limits_of(ratings: Sequence[Sequence[Rating]], several: bool) -> Limits:
     """Return what ratings allow: `OutputLimits` with one channel, `ChannelLimits` with several."""
     each = tuple(output_limits(list(one)) for one in ratings)
-    return ChannelLimits(_with_one_window(each)) if several else each[0]
-
-
-def _with_one_window(each: Sequence[OutputLimits]) -> tuple[OutputLimits, ...]:
+    if not several:
+        return each[0]
     window = min(one.window_s for one in each)
-    return tuple(replace(one, window_s=window) for one in each)
+    return ChannelLimits(tuple(replace(one, window_s=window) for one in each))
 
 
 def each_of(limits: Limits) -> tuple[OutputLimits, ...]:

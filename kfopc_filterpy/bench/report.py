@@ -160,14 +160,10 @@ def results_table(studies: Sequence[StudyReport]) -> str:
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
         for table in study.tables:
-            lines += ["", table.caption, *_aligned(table)]
+            left = set(range(len(table.headings))) - table.numbers
+            lines += ["", table.caption, *_columns([table.headings, *table.cells], left)]
         lines.append("")
     return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
-
-
-def _aligned(table: Table) -> list[str]:
-    """Return the lines of a table for a terminal."""
-    return _columns([list(table.headings), *table.cells], set(range(len(table.headings))) - table.numbers)
 
 
 def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -466,13 +467,11 @@ def run(
             identified = _identified(session, silence, level, limits, identify_s, n_path, as_generator(rng))
     made = controller if isinstance(controller, Controller) else controller(identified)  # type: ignore[arg-type]
 
-    def supervised(controller: Any) -> Supervisor:
-        known = {"full_scale": None, "blocks_can_repeat": True}
-        settings: dict[str, Any] = {
-            name: getattr(interface, name, value) for name, value in known.items()
-        } | supervision
-        return Supervisor(controller, fs=interface.fs, amplitude_limit=amplitude_limit, **settings)
-
+    known = {"full_scale": None, "blocks_can_repeat": True}
+    settings: dict[str, Any] = {name: getattr(interface, name, value) for name, value in known.items()} | supervision
+    supervised: Callable[[Any], Supervisor] = partial(
+        Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings
+    )
     supervisor = supervised(made)
     _require_fit(supervisor, interface)
     possible_db = _possible_db(silence, made, interface.fs) if check_causality else np.nan
