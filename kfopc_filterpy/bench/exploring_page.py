@@ -48,10 +48,7 @@ CURVES = {  # of each plot: the curve's key, its legend, colour and dash
 
 
 def serve_explore(
-    setups: Sequence[AcousticSetup] | None = None,
-    *,
-    port: int = PORT,
-    announce: Callable[[str], Any] = print,
+    setups: Sequence[AcousticSetup] | None = None, *, port: int = PORT, announce: Callable[[str], Any] = print
 ) -> None:
     """Serve the page to browsers on this machine until it is interrupted with Ctrl+C.
 

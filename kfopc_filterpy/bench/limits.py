@@ -157,12 +157,7 @@ def share_taken(run: SimulationResult, limits: Limits) -> float:
 
 def with_excursion(limits: Limits, ratings: Sequence[Sequence[Rating]], bounds: FixedFilters) -> Limits:
     """Return limits with the largest rated powers at which the best filters keep the excursion of every loudspeaker."""
-    moving = [
-        (j, one)
-        for j, own in enumerate(ratings)
-        for one in own
-        if isinstance(one, LoudspeakerRating) and one.x_max_mm is not None
-    ]
+    moving = _moving(ratings)
     for _ in range(1 if len(ratings) == 1 else SWEEPS):
         before = limits
         for j, one in moving:
@@ -197,13 +192,14 @@ def _keeping(limits: Limits, j: int, rating: LoudspeakerRating, bounds: FixedFil
 def excursion_mm(ratings: Sequence[Sequence[Rating]], run: SimulationResult) -> float | None:
     """Return the largest excursion of a run, of any loudspeaker whose rating knows it."""
     played = np.atleast_2d(np.nan_to_num(run.amplifier_output))
-    moved = [
-        float(np.abs(one.displacement_mm(played[j], run.fs)).max())
-        for j, own in enumerate(ratings)
-        for one in own
-        if isinstance(one, LoudspeakerRating) and one.x_max_mm is not None
-    ]
+    moved = [float(np.abs(one.displacement_mm(played[j], run.fs)).max()) for j, one in _moving(ratings)]
     return max(moved, default=None)
+
+
+def _moving(ratings: Sequence[Sequence[Rating]]) -> list[tuple[int, LoudspeakerRating]]:
+    """Return the numbers of the loudspeakers whose largest excursion is known, with the ratings that state it."""
+    loudspeakers = [(j, one) for j, own in enumerate(ratings) for one in own if isinstance(one, LoudspeakerRating)]
+    return [(j, one) for j, one in loudspeakers if one.x_max_mm is not None]
 
 
 def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> NumberOrArray | None:

@@ -128,11 +128,7 @@ class Algorithm:
 
 
 def _random_walk(scene: Scene, r: float, _: float) -> dict[str, Any]:
-    return {
-        "state_noise": r,
-        "measurement_noise": scene.measurement_noise,
-        "initial_variance": scene.initial_variance,
-    }
+    return {"state_noise": r, "measurement_noise": scene.measurement_noise, "initial_variance": scene.initial_variance}
 
 
 def _power_budget(scene: Scene, averaging_s: float, _: float) -> dict[str, Any]:
@@ -145,10 +141,7 @@ def _power_budget(scene: Scene, averaging_s: float, _: float) -> dict[str, Any]:
 
 
 def _forgetting(scene: Scene, forgotten: float, _: float) -> dict[str, Any]:
-    return {
-        "forgetting": 1.0 - forgotten,
-        "initial_variance": scene.initial_variance / scene.measurement_noise,
-    }
+    return {"forgetting": 1.0 - forgotten, "initial_variance": scene.initial_variance / scene.measurement_noise}
 
 
 def _step(scene: Scene, mu: float, _: float) -> dict[str, Any]:

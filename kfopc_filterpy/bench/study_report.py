@@ -147,11 +147,8 @@ class FigureItem:
             text for ax in self.figure.axes for text in ax.get_legend_handles_labels()[1] if not text.startswith("_")
         )
         drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
-        return (
-            _plain("Plot of " + "; ".join(drawn) + (f". Curves: {'; '.join(names)}." if names else "."))
-            if drawn
-            else ""
-        )
+        curves = f". Curves: {'; '.join(names)}." if names else "."
+        return _plain(f"Plot of {'; '.join(drawn)}{curves}") if drawn else ""
 
 
 def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
