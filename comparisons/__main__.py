@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from textwrap import fill
 
 from kfopc_filterpy.bench import Runs, StudyReport, prepare_folder, results_table, write_report
 
@@ -28,7 +27,7 @@ from .studies import (
 )
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
-SPEED, SWEEP, SOAK, AGAINST = "speed", "sweep", "soak", "against"
+SPEED, SWEEP, SOAK = "speed", "sweep", "soak"
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -60,10 +59,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from .soak import study as soak_study
 
         return soak_study.main(arguments[1:])
-    if arguments[:1] == [AGAINST]:
-        from .against import command as against_command
-
-        return against_command.main(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
@@ -72,15 +67,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter against others; sweep, which runs a grid; soak, which runs controllers for very "
-        "long; or against, which compares all controllers with an earlier version; the last three have options of their "
-        "own (sweep --help)",
+        "speed, which times the filter against others; sweep, which runs a grid; or soak, which runs controllers for very "
+        "long; the last two have options of their own (sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK, AGAINST)
-    for name in (SWEEP, SOAK, AGAINST):
+    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK)
+    for name in (SWEEP, SOAK):
         if name in options.studies:
             parser.error(f"{name} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]
@@ -120,13 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     reports[-1].notes.extend(left_out)  # the page would not show otherwise that something is missing
     page = write_report(reports, options.output)
     print(results_table(reports))
-    for report in reports:
-        print(
-            f"\n{report.name}: notes",
-            *(fill(note, 110, initial_indent="- ", subsequent_indent="  ") for note in report.notes),
-            sep="\n",
-        )
-    print(f"\n{page} and results.json written in {time.perf_counter() - began:.0f} s")
+    print(f"\n{page}, with notes and all tables, and results.json written in {time.perf_counter() - began:.0f} s")
     return 0
 
 

@@ -23,6 +23,7 @@ from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import (
     DataUnavailableError,
+    MeasuredDuct,
     band_limited_noise,
     bursty_noise,
     compressor_noise,
@@ -129,9 +130,14 @@ def paths() -> dict[str, Pair]:
     pairs = modelled_paths()
     measured = measured_data()
     if measured is not None:
-        scale = np.sqrt(np.sum(measured.secondary**2))  # its scale is arbitrary: unit gain for white noise
-        pairs["measured duct"] = (measured.primary / scale, measured.secondary / scale)
+        pairs["measured duct"] = of_unit_gain(measured)
     return pairs
+
+
+def of_unit_gain(measured: MeasuredDuct) -> Pair:
+    """Return the taps of a measured duct, whose scale is arbitrary, with a secondary path of gain 1 for white noise."""
+    scale = np.sqrt(np.sum(measured.secondary**2))
+    return measured.primary / scale, measured.secondary / scale
 
 
 def ducts() -> dict[str, Pair]:
@@ -169,7 +175,7 @@ def noises() -> dict[str, Noise]:
 
 
 @cache
-def measured_data() -> Any:
+def measured_data() -> MeasuredDuct | None:
     """Return the measured duct and the motor recording, or None if they cannot be had."""
     try:
         return load_measured_duct(noise="motor", allow_download=True)

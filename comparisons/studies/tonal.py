@@ -8,16 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
-from kfopc_filterpy import (
-    HardClipAmplifier,
-    KalmanController,
-    SimulationResult,
-    bandpass_path,
-    noise_reduction_db,
-    output_power,
-)
+from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, noise_reduction_db, output_power
 from kfopc_filterpy.bench import (
     Claim,
     FigureItem,
@@ -33,8 +25,7 @@ from kfopc_filterpy.bench import (
     tune,
 )
 from kfopc_filterpy.bounds import wiener_solution
-from kfopc_filterpy.metrics import harmonics_db
-from kfopc_filterpy.paths import achieved_band, frequency_response
+from kfopc_filterpy.metrics import harmonics_db, peak_control_signal
 from kfopc_filterpy.plot import (
     plot_amplifier_output,
     plot_anti_noise,
@@ -44,20 +35,19 @@ from kfopc_filterpy.plot import (
 )
 from kfopc_filterpy.signals import tone
 
-from .cases import PAPER, Setting, grid_runs
+from .cases import FS, PAPER, Setting, grid_runs
 from .report_parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
 
-FS = 16000.0
 KALMAN = ("KF-ANC", "KF-OPC")
 TONE_HZ = 400.0
 DURATION_S = 10.5
 RATED_POWER = 1.0
+LIMIT = float(np.sqrt(2 * RATED_POWER))  # of the amplifier: the peak of a sine at rated power
 POWER_MULTIPLE = 2.0
 N_TAPS = 128
 OVERDRIVES_DB = np.arange(0.0, 10.5, 1.0)
-UNFORGETTING = (1e-10, 1e-12)
+UNFORGETTING = 1e-10  # so little state noise that a filter hardly forgets in a run
 FORGETFUL = max(algorithms()["KF-ANC"].grid)  # most state noise of the grid: the fastest forgetting
-FILTERPY_SAMPLES = 4000
 WEIGHTS_EVERY = 160
 
 # Criteria of the claims
@@ -72,29 +62,29 @@ CONSTANT_TOLERANCE = 0.01
 
 def planned_runs() -> int:
     """Return the number of runs of the study."""
-    return grid_runs(PAPER) + len(PAPER) + len(KALMAN) * (len(OVERDRIVES_DB) + len(UNFORGETTING) + 1)
+    return grid_runs(PAPER) + len(PAPER) + len(KALMAN) * (len(OVERDRIVES_DB) + 2)
 
 
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
     primary, secondary = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
-    scene = _scene(primary, secondary, POWER_MULTIPLE)
+    scene = _scene(primary, secondary)
     tuned = tune(runs, scene)
 
-    recorded = runs.map(lambda name: _recorded(scene, name, tuned[name].setting), tuned)
-    results = dict(zip(tuned, recorded, strict=True))
+    def run(job: tuple[str, Setting]) -> SimulationResult:
+        return scene.run(make_controller(scene, *job), record_weights_every=WEIGHTS_EVERY)
+
+    def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
+        return dict(zip(settings, runs.map(run, settings.items()), strict=True))
+
+    results = run_all({name: best.setting for name, best in tuned.items()})
+    forgetful, unforgetting = (run_all(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))
     merits = {name: _figures(result, scene) for name, result in results.items()}
-    forgetful = dict(zip(KALMAN, runs.map(lambda name: _recorded(scene, name, FORGETFUL), KALMAN), strict=True))
-    optimal = wiener_solution(*scene.settled, scene.secondary, scene.n_taps)
-    optimal_weight = float(np.abs(optimal.weights).max())
+    optimal_weight = float(np.abs(wiener_solution(*scene.settled, scene.secondary, scene.n_taps).weights).max())
     pairs = {tuned["KF-ANC"].setting: results, FORGETFUL: forgetful}
     growths = {setting: [growth_of(pair[name], optimal_weight) for name in KALMAN] for setting, pair in pairs.items()}
     sweep = _overdrive_sweep(runs, scene, tuned)
     crossings = crossings_db(OVERDRIVES_DB, sweep["KF-OPC"] - sweep["KF-ANC"])
-    unforgetting = _without_forgetting(runs, scene)
-    theirs = _by_filterpy(scene, tuned["KF-ANC"].setting)
-    oracle = _largest_difference(theirs, results["KF-ANC"])
-    band = achieved_band(secondary, fs=FS)
     return StudyReport(
         name="tonal",
         conditions=("a tone", "band-pass paths", "an amplifier that clips"),
@@ -109,7 +99,7 @@ def main(runs: Runs) -> StudyReport:
         | {
             "noise": Parameter(f"sine, {TONE_HZ:g} Hz", "the paper's"),
             "duration_s": Parameter(DURATION_S - scene.switch_on_s, "long enough for the weights of KF-ANC to grow"),
-            "amplifier": Parameter(f"hard clip at {scene.amplitude_limit:.4f}", "the paper's, sqrt(2 rated power)"),
+            "amplifier": Parameter(f"hard clip at {LIMIT:.4f}", "the paper's, sqrt(2 rated power)"),
             "amplitude": Parameter(float(np.abs(scene.references[0]).max()), "follows from the control power"),
         }
         | BANDPASS_PATHS,
@@ -118,71 +108,55 @@ def main(runs: Runs) -> StudyReport:
             "overdrive_db": OVERDRIVES_DB,
             "noise_reduction_db_over_overdrive": sweep,
             "ordering_flips_at_overdrive_db": crossings,
-            "with_less_state_noise": unforgetting,
-            "with_most_state_noise": {name: _overflow(result, optimal_weight) for name, result in forgetful.items()},
+            "with_less_state_noise": {
+                f"{name} at {UNFORGETTING:g}": _extremes(result, optimal_weight)
+                for name, result in unforgetting.items()
+            },
+            "with_most_state_noise": {name: _extremes(result, optimal_weight) for name, result in forgetful.items()},
             "largest_optimal_weight": optimal_weight,
             "largest_weight_over_optimal": growth_of(results["KF-ANC"], optimal_weight).over_optimal,
-            "filterpy_largest_difference": oracle,
         },
-        claims=[
-            harmonics_claim(_number(merits["KF-ANC"], "harmonics_db"), _number(merits["KF-OPC"], "harmonics_db")),
-            peak_claim(float(np.abs(results["KF-OPC"].control_signal).max()), scene.amplitude_limit),
-            power_claim(_number(merits["KF-OPC"], "output_power") / RATED_POWER),
-            growth_claim(growths),
-            reduction_claim(
-                _number(merits["KF-ANC"], "noise_reduction_db"),
-                _number(merits["KF-OPC"], "noise_reduction_db"),
-                crossings,
+        claims=claims(merits, peak_control_signal(results["KF-OPC"].control_signal, steady=1.0), growths, crossings),
+        figures=[
+            *_figures_of(pairs, sweep, crossings),
+            draw_paths(
+                "The band-pass paths: what 128 and 32 taps realise of 20-5000 Hz.",
+                {"primary path, 128 taps": primary, "secondary path, 32 taps": secondary},
             ),
         ],
-        figures=_figures_of(
-            results, forgetful, tuned["KF-ANC"].setting, scene, sweep, crossings, theirs, primary, secondary
-        ),
         sounds=sounds(results),
-        notes=[
-            *tuning_note(tuned),
-            ceiling_note(scene),
-            f"KF-ANC run by filterpy's own KalmanFilter over the first {FILTERPY_SAMPLES} samples: the largest "
-            f"difference from the O(L^2) filter is {oracle['error']:.1e} in the error signal and "
-            f"{oracle['weights']:.1e} in the weights. That is rounding: S/R starts near "
-            f"{_first_S_over_R(scene):.0e}, which costs each that many times 1e-16.",
-            "State noise below the grid, which all but stops the forgetting: "
-            + "; ".join(
-                f"{name}: {row['noise_reduction_db']:.1f} dB, largest weight grew {row['weight_growth']:.2f} times"
-                for name, row in unforgetting.items()
-            )
-            + ". KF-ANC's weights then grow more slowly, and it gains on KF-OPC.",
-            *_overflow_note(forgetful, optimal_weight, merits),
-            f"A path of 32 taps cannot realise a band edge of 20 Hz: the secondary path passes "
-            f"{band.low_hz:.0f} to {band.high_hz:.0f} Hz at -3 dB, with {_level_db(secondary, 20.0):.1f} dB at 20 Hz.",
-        ],
+        notes=[*tuning_note(tuned), ceiling_note(scene)],
     )
 
 
-def _scene(primary: Any, secondary: Any, power_multiple: float) -> Scene:
+def _scene(primary: Any, secondary: Any) -> Scene:
     scene = make_scene(
         {0: tone(TONE_HZ, DURATION_S, fs=FS)},
         primary,
         secondary,
         fs=FS,
         rated_power=RATED_POWER,
-        power_multiple=power_multiple,
+        power_multiple=POWER_MULTIPLE,
         n_taps=N_TAPS,
     )
-    return dataclasses.replace(scene, amplifier=HardClipAmplifier(scene.amplitude_limit))
-
-
-def _recorded(scene: Scene, name: str, setting: Setting) -> SimulationResult:
-    return scene.run(make_controller(scene, name, setting), record_weights_every=WEIGHTS_EVERY)
-
-
-def _level_db(path: Any, frequency_hz: float) -> float:
-    return float(20 * np.log10(abs(frequency_response(path, [frequency_hz])[0])))
+    return dataclasses.replace(scene, amplifier=HardClipAmplifier(LIMIT))
 
 
 def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
     harmonics = harmonics_db(result.error, result.disturbance, TONE_HZ, FS)
     return figures_of_merit([result], scene) | {"harmonics_db": harmonics}
+
+
+def _extremes(result: SimulationResult, optimal_weight: float) -> dict[str, float]:
+    """Return how far a run goes with its weights, which Fig. 5 d leaves out."""
+    growth = growth_of(result, optimal_weight)
+    return {
+        "largest_weight_over_optimal": growth.over_optimal,
+        "weight_growth": growth.over_half,
+        "peak_control_signal": peak_control_signal(result.control_signal, steady=1.0),
+        "output_power": output_power(result.control_signal),
+        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
+    }
 
 
 def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[str, np.ndarray]:
@@ -209,78 +183,7 @@ def crossings_db(levels: np.ndarray, lead: np.ndarray) -> list[float]:
     return [float(x) for x in levels[k] + (levels[k + 1] - levels[k]) * lead[k] / (lead[k] - lead[k + 1])]
 
 
-def _without_forgetting(runs: Runs, scene: Scene) -> dict[str, dict[str, float]]:
-    """Run both Kalman filters with so little state noise that they hardly forget in a run."""
-    jobs = [(name, setting) for setting in UNFORGETTING for name in KALMAN]
-
-    def run(job: tuple[str, float]) -> dict[str, float]:
-        result = _recorded(scene, *job)
-        reduction = noise_reduction_db(result.error, result.disturbance)
-        return {"noise_reduction_db": reduction, "weight_growth": weight_growth(result)}
-
-    return {f"{name} at {setting:g}": row for (name, setting), row in zip(jobs, runs.map(run, jobs), strict=True)}
-
-
-def _by_filterpy(scene: Scene, setting: Setting) -> SimulationResult:
-    """Run the first part of the study with filterpy's own KalmanFilter as the estimator of KF-ANC."""
-    fast = make_controller(scene, "KF-ANC", setting)
-    estimator = KalmanFilter(dim_x=scene.n_taps, dim_z=1)
-    estimator.P *= scene.initial_variance
-    estimator.Q *= fast.state_noise
-    estimator.R *= fast.measurement_noise
-    start = slice(0, int(scene.switch_on_s * scene.fs) + FILTERPY_SAMPLES)
-    short = dataclasses.replace(
-        scene, references=[scene.references[0][start]], disturbances=[scene.disturbances[0][start]]
-    )
-    controller = KalmanController(estimator, scene.secondary, name="KF-ANC, filterpy")
-    return short.run(controller, record_weights_every=WEIGHTS_EVERY)
-
-
-def _first_S_over_R(scene: Scene) -> float:
-    return scene.initial_variance * scene.n_taps * scene.filtered_power / scene.measurement_noise
-
-
-def _largest_difference(theirs: SimulationResult, ours: SimulationResult) -> dict[str, float]:
-    """Return the largest difference from filterpy's run in the error signal and the weights, over its samples."""
-    n = theirs.error.size
-    assert ours.weights is not None
-    assert theirs.weights is not None
-    return {
-        "samples": n,
-        "error": float(np.abs(theirs.error - ours.error[:n]).max()),
-        "weights": float(np.abs(theirs.weights - ours.weights[: len(theirs.weights)]).max()),
-    }
-
-
-# ---- Claims, of plain figures
-
-
-def harmonics_claim(anc_db: float, opc_db: float) -> Claim:
-    """Return the claim about Fig. 5 a and b from the harmonics of both filters, in dB over the disturbance."""
-    return Claim(
-        "KF-ANC produces harmonics, KF-OPC does not",
-        bool(anc_db >= HARMONICS_DB and opc_db <= CLEAN_DB),
-        f"harmonics over the disturbance: KF-ANC {anc_db:.1f} dB, KF-OPC {opc_db:.1f} dB, the sensor noise as a whole "
-        f"{CLEAN_DB:.0f} dB",
-    )
-
-
-def peak_claim(peak: float, limit: float) -> Claim:
-    """Return the claim about Fig. 5 c from the largest control signal of KF-OPC and the amplifier's limit."""
-    return Claim(
-        "The control signal of KF-OPC stays within what the amplifier can put out",
-        bool(peak <= PEAK_SHARE * limit),
-        f"largest control signal of the whole run {peak:.4f}, limit {limit:.4f}, kept to {100 * (PEAK_SHARE - 1):.0f} %",
-    )
-
-
-def power_claim(over_rated: float) -> Claim:
-    """Return the claim about the output power of KF-OPC, given over the rated power."""
-    return Claim(
-        "The output power of KF-OPC is the rated power",
-        bool(abs(over_rated - 1.0) <= POWER_TOLERANCE),
-        f"output power {over_rated * RATED_POWER:.4f}, rated power {RATED_POWER:g}",
-    )
+# ---- Claims
 
 
 @dataclass(frozen=True)
@@ -303,9 +206,57 @@ class Growth:
         return abs(self.over_half - 1.0) <= CONSTANT_TOLERANCE
 
 
-def growth_claim(growths: Mapping[Setting, Sequence[Growth]]) -> Claim:
-    """Return the claim about Fig. 5 d from the growth of KF-ANC and of KF-OPC at each state noise."""
-    held = [anc.linear_without_bound and opc.none for anc, opc in growths.values()]
+def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
+    """Return how the largest weight of a run went on."""
+    assert result.weights is not None
+    largest = np.abs(result.weights).max(axis=1)
+    quarter, half, three, end = (float(largest[k * (largest.size - 1) // 4]) for k in (1, 2, 3, 4))
+    gained = (end - three) / (half - quarter) if half != quarter else np.inf
+    return Growth(end / optimal_weight, end / half, gained, result.diverged_at_s)
+
+
+def claims(
+    merits: Mapping[str, Mapping[str, float | None]],
+    peak: float,
+    growths: Mapping[Setting, Sequence[Growth]],
+    crossings: Sequence[float],
+) -> list[Claim]:
+    """Return the claims of Fig. 5; a figure that is None or NaN, of a run that diverged, meets none.
+
+    They are judged by the figures of merit, the largest control signal of KF-OPC, the growth of KF-ANC's and KF-OPC's
+    weights at each state noise, and the overdrives at which the order of the two flips.
+    """
+    anc, opc = ({key: np.nan if own is None else own for key, own in merits[name].items()} for name in KALMAN)
+    flips = " and ".join(f"{level:.1f} dB" for level in crossings)
+    order = f"the order flips at {flips} of overdrive" if crossings else "the order is the same at every overdrive"
+    return [
+        Claim(
+            "KF-ANC produces harmonics, KF-OPC does not",
+            bool(anc["harmonics_db"] >= HARMONICS_DB and opc["harmonics_db"] <= CLEAN_DB),
+            f"harmonics over the disturbance: KF-ANC {anc['harmonics_db']:.1f} dB, KF-OPC {opc['harmonics_db']:.1f} dB, the "
+            f"sensor noise as a whole {CLEAN_DB:.0f} dB",
+        ),
+        Claim(
+            "The control signal of KF-OPC stays within what the amplifier can put out",
+            bool(peak <= PEAK_SHARE * LIMIT),
+            f"largest control signal of the whole run {peak:.4f}, limit {LIMIT:.4f}, kept to {100 * (PEAK_SHARE - 1):.0f} %",
+        ),
+        Claim(
+            "The output power of KF-OPC is the rated power",
+            bool(abs(opc["output_power"] / RATED_POWER - 1.0) <= POWER_TOLERANCE),
+            f"output power {opc['output_power']:.4f}, rated power {RATED_POWER:g}",
+        ),
+        _growth_claim(growths),
+        Claim(
+            "KF-OPC reduces the noise more than KF-ANC",
+            bool(opc["noise_reduction_db"] > anc["noise_reduction_db"]),
+            f"{opc['noise_reduction_db']:.1f} against {anc['noise_reduction_db']:.1f} dB at "
+            f"{10 * np.log10(POWER_MULTIPLE):.0f} dB of overdrive; {order}, see the figure",
+        ),
+    ]
+
+
+def _growth_claim(growths: Mapping[Setting, Sequence[Growth]]) -> Claim:
     said = "; ".join(
         f"with r E[x'^2]/q = {setting:g} its largest weight is {anc.over_optimal:.0f} times the optimal one at the end, "
         f"{anc.over_half:.2f} times that at half of the run, that of KF-OPC {opc.over_half:.2f} times"
@@ -315,105 +266,31 @@ def growth_claim(growths: Mapping[Setting, Sequence[Growth]]) -> Claim:
     number = f"diverged after {min(times):.1f} s" if times else "the numbers do not overflow"
     return Claim(
         "The control filter of KF-ANC grows without bound, that of KF-OPC does not",
-        bool(held) and all(held),
+        all(anc.linear_without_bound and opc.none for anc, opc in growths.values()),
         f"{said}. The growth is a straight line; {number}",
     )
 
 
-def reduction_claim(anc_db: float, opc_db: float, crossings: Sequence[float]) -> Claim:
-    """Return the claim about the noise reduction of both filters, with the overdrives at which the order flips."""
-    flips = " and ".join(f"{level:.1f} dB" for level in crossings)
-    order = f"the order flips at {flips} of overdrive" if crossings else "the order is the same at every overdrive"
-    return Claim(
-        "KF-OPC reduces the noise more than KF-ANC",
-        bool(opc_db > anc_db),
-        f"{opc_db:.1f} against {anc_db:.1f} dB at {10 * np.log10(POWER_MULTIPLE):.0f} dB of overdrive; {order}, see the "
-        "figure",
-    )
-
-
-# ---- Figures of the weights
-
-
-def growth_of(result: SimulationResult, optimal_weight: float) -> Growth:
-    """Return how the largest weight of a run went on."""
-    largest = _largest_weights(result)
-    quarter, half, three, end = (float(largest[k * (largest.size - 1) // 4]) for k in (1, 2, 3, 4))
-    gained = (end - three) / (half - quarter) if half != quarter else np.inf
-    return Growth(end / optimal_weight, end / half, gained, result.diverged_at_s)
-
-
-def weight_growth(result: SimulationResult) -> float:
-    """Return the largest weight at the end of a run over the largest at half of it."""
-    return growth_of(result, 1.0).over_half
-
-
-def _largest_weights(result: SimulationResult) -> np.ndarray:
-    assert result.weights is not None
-    return np.abs(result.weights).max(axis=1)
-
-
-def _overflow(result: SimulationResult, optimal_weight: float) -> dict[str, float]:
-    """Return what Fig. 5 d leaves out: how far the control signal goes with the weights."""
-    largest = float(_largest_weights(result)[-1])
-    return {
-        "setting": FORGETFUL,
-        "largest_weight": largest,
-        "largest_weight_over_optimal": largest / optimal_weight,
-        "peak_control_signal": float(np.abs(result.control_signal).max()),
-        "output_power": output_power(result.control_signal),
-        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
-    }
-
-
-def _overflow_note(
-    forgetful: dict[str, SimulationResult], optimal_weight: float, merits: dict[str, dict[str, float | None]]
-) -> list[str]:
-    anc, opc = (_overflow(forgetful[name], optimal_weight) for name in KALMAN)
-    return [
-        f"The rule of tuning takes the least state noise, with which KF-ANC's weights grow most slowly. With the most of the "
-        f"grid, r E[x'^2]/q = {FORGETFUL:g}, its largest weight ends at {anc['largest_weight']:.1f}, the optimum's is "
-        f"{optimal_weight:.3f}; its control signal goes up to {anc['peak_control_signal']:.0f}, its output power is "
-        f"{anc['output_power'] / RATED_POWER:.0f} times the rated one and its noise reduction "
-        f"{anc['noise_reduction_db']:.2f} dB ({_number(merits['KF-ANC'], 'noise_reduction_db'):.2f} dB as tuned). KF-OPC's "
-        f"control signal goes up to {opc['peak_control_signal']:.2f}, and it reduces the noise by "
-        f"{opc['noise_reduction_db']:.2f} dB, as before.",
-    ]
-
-
-def _number(figures: dict[str, float | None], key: str) -> float:
-    value = figures[key]
-    return np.nan if value is None else value
+# ---- Figures
 
 
 def _figures_of(
-    results: dict[str, SimulationResult],
-    forgetful: dict[str, SimulationResult],
-    setting: Setting,
-    scene: Scene,
-    sweep: dict[str, np.ndarray],
-    crossings: list[float],
-    theirs: SimulationResult,
-    primary: Any,
-    secondary: Any,
+    pairs: Mapping[Setting, Mapping[str, SimulationResult]],
+    sweep: Mapping[str, np.ndarray],
+    crossings: Sequence[float],
 ) -> list[FigureItem]:
-    pair = [results[name] for name in KALMAN]
-    end = pair[0].time_s[-1]
-    span = (end - 0.02, end)
+    """Return the figures of both Kalman filters, whose runs are given for each state noise, the tuned one first."""
+    groups = {setting: [results[name] for name in KALMAN] for setting, results in pairs.items()}
+    pair = next(iter(groups.values()))
+    span = (pair[0].time_s[-1] - 0.02, pair[0].time_s[-1])
     assert pair[0].weights is not None
     tap = int(np.argmax(np.abs(pair[0].weights[-1])))
-    assert theirs.weights is not None
-    as_long = {name: getattr(pair[0], name)[: len(theirs.weights)] for name in ("weights", "weights_time_s")}
-    laid_over = {"KF-ANC": dataclasses.replace(pair[0], **as_long), "KF-ANC, filterpy": theirs}
 
-    def amplifier(ax: Any, from_s: float = span[0]) -> None:
-        plot_amplifier_output(pair, span_s=(from_s, end), limit=scene.amplitude_limit, ax=ax)
-
-    def weights(group: Sequence[SimulationResult], noise: Setting) -> Callable[[Any], None]:
+    def weights(setting: Setting, group: Sequence[SimulationResult]) -> Callable[[Any], None]:
         def panel(ax: Any) -> None:
             plot_weight_history(group, tap=tap, ax=ax).set_yscale("linear")  # a straight line is the point
             ax.autoscale(axis="y")
-            ax.set_title(f"$r\\,E[x'^2]/q$ = {noise:g}", pad=22, fontsize="medium")  # above the legend
+            ax.set_title(f"$r\\,E[x'^2]/q$ = {setting:g}", pad=22, fontsize="medium")  # above the legend
 
         return panel
 
@@ -436,35 +313,18 @@ def _figures_of(
         draw(
             "c-amplifier-output",
             "Amplifier output, last 20 ms; dotted: the control signal it was asked for (Fig. 5 c).",
-            amplifier,
+            lambda ax: plot_amplifier_output(pair, span_s=span, limit=LIMIT, ax=ax),
         ),
         draw(
             "d-weight-history",
             f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d). Left: with the state noise r that "
             "KF-ANC is tuned to; right: with the most of the grid. KF-OPC is the same in both.",
-            weights(pair, setting),
-            weights(list(forgetful.values()), FORGETFUL),
+            *(weights(*own) for own in groups.items()),
         ),
         draw(
             "overdrive",
             f"Noise reduction over the overdrive: the paper's ordering holds where KF-OPC lies above. At 0 dB, off the "
             f"scale, KF-ANC reaches {sweep['KF-ANC'][0]:.0f} and KF-OPC {sweep['KF-OPC'][0]:.0f} dB.",
             overdrive,
-        ),
-        draw(
-            "filterpy",
-            f"Weight {tap} of KF-ANC by filterpy's own KalmanFilter over the first {FILTERPY_SAMPLES} samples, laid "
-            "over the O(L^2) filter's.",
-            lambda ax: plot_weight_history(laid_over, tap=tap, ax=ax).set_xlim(0, FILTERPY_SAMPLES / FS),
-        ),
-        draw(
-            "overview",
-            "Amplifier output and noise reduction over the overdrive, in one.",
-            lambda ax: amplifier(ax, end - 0.006),
-            overdrive,
-        ),
-        draw_paths(
-            "The band-pass paths: what 128 and 32 taps realise of 20-5000 Hz.",
-            {"primary path, 128 taps": primary, "secondary path, 32 taps": secondary},
         ),
     ]

@@ -9,19 +9,18 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 from kfopc_filterpy.plot import save_figure
 
-from .figures import BUILT_IN_FIGURES, sweep_figures, swept_axis
-from .grid import Grid, Run, built_in_grid, own_grid
-from .jobs import Pool, Scenario, Sent, cluster, jobs_of, local
-from .scenario import FIGURES, ScenarioError
-from .store import SweepFolder
-from .table import Record, cell_rows, figure_names, require_format, run_rows, write_table
-
-__all__ = ["ScenarioError", "Sweep", "run_sweep"]
+from .grid import built_in_grid, own_grid
+from .jobs import Scenario, job_outcomes
+from .results import FORMATS, LABELS, Record, cell_rows, figure_names, sweep_figure, swept_axis, write_table
+from .store import keep, kept, sweep_folder
 
 
 @dataclass(frozen=True)
@@ -30,8 +29,6 @@ class Sweep:
 
     Attributes
     ----------
-    grid : Grid
-        Values of each axis, and the seeds.
     cells : list of dict
         One for each combination: the axes, `runs`, `diverged`, and ``<figure>_mean``, ``_low``, ``_high`` and ``_n``.
     runs : list of dict
@@ -40,15 +37,9 @@ class Sweep:
         The tables and figures written.
     """
 
-    grid: Grid
     cells: list[Record]
     runs: list[Record]
     files: list[Path]
-
-    @property
-    def diverged(self) -> int:
-        """Number of runs that diverged."""
-        return sum(row["diverged"] for row in self.runs)
 
 
 def run_sweep(
@@ -60,8 +51,6 @@ def run_sweep(
     jobs: int | None = None,
     scheduler: str | None = None,
     format: str = "csv",
-    x: str | None = None,
-    figures: Sequence[str] | None = None,
     quiet: bool = False,
 ) -> Sweep:
     """Run every combination of a grid with every seed; write tables and figures of means and intervals.
@@ -86,13 +75,9 @@ def run_sweep(
         Processes on this machine, all cores by default.
     scheduler : str, optional
         Address of a Dask scheduler, such as ``"tcp://host:8786"``, whose workers do the runs instead. They need the
-        package installed, and a clone (and the scenario function's module) on their path.
+        package installed, and a clone on their path. The scenario function's module is sent to them.
     format : {"csv", "parquet"}, default "csv"
         Of the tables. Parquet needs the extra `parquet`.
-    x : str, optional
-        Axis that the figures are drawn against; by default the one of numbers with most values.
-    figures : sequence of str, optional
-        Figures of merit that are drawn; by default noise reduction and output power, or all of an own scenario.
     quiet : bool, default False
         No progress bar.
 
@@ -103,12 +88,9 @@ def run_sweep(
 
     Raises
     ------
-    ValueError, TypeError
-        An axis, name, number or format that is not as described; a folder of another sweep; no such figure.
-    ModuleNotFoundError
-        An extra is missing.
-    OSError
-        The folder cannot be written, or no scheduler answers.
+    ValueError, TypeError, ModuleNotFoundError, OSError
+        An argument that is not as described, a folder of another sweep or that cannot be written, an extra that is
+        missing, or no scheduler that answers. The message says what to change.
     ScenarioError
         A scenario raised an exception; the message says which. Finished runs are kept.
 
@@ -123,59 +105,31 @@ def run_sweep(
     >>> [cell["square_mean"] for cell in sweep.cells]
     [3.0, 11.0]
     """
-    made = built_in_grid(grid, seeds) if scenario is None else own_grid(grid, seeds)
-    if scenario is not None and not callable(scenario):
+    if format not in FORMATS:
+        raise ValueError(f"format must be one of {', '.join(FORMATS)}, got {format!r}")
+    if format == "parquet" and find_spec("pyarrow") is None:
+        raise ModuleNotFoundError(
+            'Parquet needs the extra parquet: python -m pip install -c constraints.txt -e ".[parquet]"; or take csv'
+        )
+    if not (scenario is None or callable(scenario)):
         raise TypeError(f"scenario must be a function of a dict, got {scenario!r}")
     if scheduler is not None and jobs is not None:
         raise ValueError("give either jobs or scheduler: a cluster's workers are as many as it has")
-    require_format(format)
-    against = swept_axis(made, x)
-    if scenario is None and figures is not None:
-        _drawn(figures, FIGURES, True)  # better refused before the runs than after
-    store = SweepFolder(folder, made, scenario)
-    done = store.done()
-    pending = [run for run in made.runs() if run.index not in done]
-    if pending:
-        pool = local(jobs) if scheduler is None else cluster(scheduler)
-        _work_off(made, pending, store, done, Sent(scenario) if scenario and scheduler else scenario, pool, quiet)
-    cells, runs = cell_rows(made, done), run_rows(made, done)
-    files = [write_table(cells, store.path / "cells", format), write_table(runs, store.path / "runs", format)]
-    names = _drawn(figures, figure_names(done), scenario is None)
-    for name, figure in sweep_figures(made, cells, names, against).items():
-        files += save_figure(figure, store.path / "figures" / name)
-    return Sweep(made, cells, runs, files)
-
-
-def _work_off(
-    grid: Grid,
-    pending: Sequence[Run],
-    store: SweepFolder,
-    done: dict[int, dict[str, Any]],
-    scenario: Scenario | None,
-    pool: Pool,
-    quiet: bool,
-) -> None:
-    """Do the pending runs, and keep each job's as it ends."""
-    from tqdm import tqdm
-
-    diverged = sum(figures["diverged"] for figures in done.values())
+    made = built_in_grid(grid, seeds) if scenario is None else own_grid(grid, seeds)
+    path = sweep_folder(folder, made, scenario)
+    done = kept(path)
+    pending = {number: values for number, values in enumerate(made.runs()) if number not in done}
     with (
-        pool as (workers, run),
-        tqdm(total=len(grid), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
-        closing(run(jobs_of(grid, pending, workers, scenario))) as outcomes,
+        tqdm(total=len(done) + len(pending), initial=len(done), unit="run", disable=quiet, dynamic_ncols=True) as bar,
+        closing(job_outcomes(pending, scenario, made.seeds[0], jobs, scheduler)) as ended,
     ):
-        for own in outcomes:
-            store.keep(own)
-            done |= dict(own)
+        for own in ended if pending else ():
+            keep(path, own)
+            done |= own
             bar.update(len(own))
-            diverged += sum(figures["diverged"] for _, figures in own)
-            bar.set_postfix(diverged=diverged, refresh=False)
-
-
-def _drawn(chosen: Sequence[str] | None, present: Sequence[str], built_in: bool) -> list[str]:
-    if chosen is None:
-        return list(BUILT_IN_FIGURES) if built_in else list(present)
-    unknown = [name for name in chosen if name not in present]
-    if unknown:
-        raise ValueError(f"no figure called {', '.join(unknown)}; there are {', '.join(present)}")
-    return list(chosen)
+    figures = [done[number] for number in sorted(done)]
+    cells, runs = cell_rows(made, figures), [run | own for run, own in zip(made.runs(), figures, strict=True)]
+    files = [write_table(cells, path / "cells", format), write_table(runs, path / "runs", format)]
+    drawn = list(LABELS) if scenario is None else figure_names(figures)
+    files += save_figure(sweep_figure(made, cells, drawn), path / "figures" / swept_axis(made))
+    return Sweep(cells, runs, files)

@@ -18,6 +18,8 @@ from .opening import claims_sentence, glance
 from .page import page
 from .study_report import StudyReport, Table, file_of, loudness, merit_table, require_different
 
+SCREEN_ROWS = 30  # of a table that fits a screen, with the claims above it
+
 
 def prepare_folder(folder: str | os.PathLike[str]) -> Path:
     """Make a folder unless it is there, and check that it can be written: better before the studies than after.
@@ -117,7 +119,10 @@ def write_files(study: StudyReport, path: Path) -> None:
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
-    """Return the studies' figures of merit, claims and tables as text for a terminal.
+    """Return the studies' results as text for a terminal: the claims and one table, so that a study fits a screen.
+
+    The table is that of the figures of merit or, without them, the first that fits. All tables are in the report. What has
+    no claims shows all its tables that fit.
 
     Parameters
     ----------
@@ -151,19 +156,26 @@ def results_table(studies: Sequence[StudyReport]) -> str:
         lines.append(f"{study.name}: {study.title} (rated power {study.rating})")
         if study.algorithms:
             columns, rows = merit_table(study)
-            names = ["", "", *study.algorithms]
-            lines += _columns(
-                [[name, *row] for name, row in zip(names, [*zip(*columns, strict=True), *rows], strict=True)], {0}
-            )
+            heads = [["", *head] for head in zip(*columns, strict=True)]
+            named = [[name, *row] for name, row in zip(study.algorithms, rows, strict=True)]
+            lines += _columns([*heads, *named], {0})
         for claim in study.claims:
             mark = study.marks[0 if claim.holds else 1].upper()
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
-        for table in study.tables:
+        for table in _on_a_screen(study):
             left = set(range(len(table.headings))) - table.numbers
-            lines += ["", table.caption, *_columns([table.headings, *table.cells], left)]
+            lines += ["", *textwrap.wrap(table.caption, 116), *_columns([table.headings, *table.cells], left)]
         lines.append("")
     return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
+
+
+def _on_a_screen(study: StudyReport) -> list[Table]:
+    """Return the tables that a terminal shows beside the figures of merit and the claims."""
+    fitting = [table for table in study.tables if len(table.rows) <= SCREEN_ROWS]
+    if not study.claims:
+        return fitting
+    return [] if study.algorithms else fitting[:1]
 
 
 def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:

@@ -1,8 +1,7 @@
 #include "plant.h"
 #include <string.h>
 
-static const real UNKNOWN = 2;                          /* after an alarm: rms error of a secondary path, over the path */
-static const real DOUBT = 16;                           /* until it is fitted again: mean square error of it, over that of the path */
+static const real UNKNOWN = 4;                          /* after an alarm: rms error of a secondary path, over the path */
 static const real KEPT = 4, FORGOTTEN = (real)0.0625;   /* samples per tap that the data of p count as: after an alarm; if p has changed too */
 enum { FROM = 9, TO = 16, MANY = 4 };                   /* blocks after an alarm that are judged, and how many must exceed its limit to show that p has changed */
 static const real SURPRISE = 4, MISFIT = (real)0.03, USUAL = 5; /* alarm: beyond the noise; of d^2; of the usual misfit */
@@ -555,7 +554,7 @@ void expect(plant *f)
     }
     for (int32_t draw = 0; !f->exact && draw < DRAWS; draw++) /* of the mean noise */
         expect_also(f, f->draws + times(draw, f->n), (real)f->K / (real)DRAWS);
-    const real doubt = (real)f->K * DOUBT * size_of_path(f);
+    const real doubt = (real)f->K * UNKNOWN * UNKNOWN * size_of_path(f);
     for (int32_t j = 0; j < J; j++) {
         for (int32_t a = 0; a < j; a++) reverse(f->ss + times(a * J + j, lags), f->ss + times(j * J + a, lags), lags);
         /* Not yet verified: anything may be wrong, even the polarity. */

@@ -301,7 +301,7 @@ def test_a_table_on_the_page(tmp_path):
 
 
 def test_a_table_for_the_terminal():
-    lines = results_table([study(tables=[POWERS])]).splitlines()
+    lines = results_table([study(algorithms={}, tables=[POWERS, EMPTY])]).splitlines()
     begin = lines.index(POWERS.caption)
     assert lines[begin - 1] == ""
     assert lines[begin + 1 : begin + 5] == [  # text to the left, columns with a number in them to the right
@@ -311,6 +311,20 @@ def test_a_table_for_the_terminal():
         "duct                      7       3",
     ]
     assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the exception is")
+
+
+def test_the_terminal_shows_one_table_beside_the_claims():
+    """The first that fits a screen, unless there are figures of merit; what claims nothing shows all that fit."""
+    long = Table("long", "Too long", ["power"], [[1.0]] * 31)
+    tables = [long, POWERS, EMPTY]
+
+    def shown(**changes):
+        printed = results_table([study(tables=tables, **changes)])
+        return [table.stem for table in tables if table.caption in printed]
+
+    assert shown() == []
+    assert shown(algorithms={}) == ["powers"]
+    assert shown(claims=[]) == ["powers", "none"]
 
 
 def test_a_table_as_a_file_has_all_digits(tmp_path):
@@ -358,6 +372,8 @@ def test_refusals_say_what_was_wrong(tmp_path):
         study(tables=[POWERS, EMPTY, POWERS])
     with pytest.raises(ValueError, match=r"stem must be lower-case letters.*got '../powers'"):
         Table("../powers", "", [], [])
+    with pytest.raises(ValueError, match="rows must have 2 cells, one for each heading, got 1"):
+        Table("powers", "", ["x", "y"], [[1.0]])
     with pytest.raises(ValueError, match=r"algorithms\['KF-ANC'\] holds unknown figures of merit \['loudness'\]"):
         study(algorithms={"KF-ANC": {"loudness": 1.0}})
     with pytest.raises(TypeError, match=r"study 'tonal', 'extra', 'path' must hold numbers.*got PosixPath|WindowsPath"):

@@ -14,8 +14,9 @@ from comparisons.__main__ import main
 from comparisons.studies.cases import FS, SWITCH_ON_S, make_case, measured_data, noises, paths
 from comparisons.sweep import scenario as sweep_scenario
 from comparisons.sweep.grid import built_in_grid
-from comparisons.sweep.run import ScenarioError, run_sweep
-from comparisons.sweep.scenario import middle, run_group, scene_of
+from comparisons.sweep.jobs import do_job, plan
+from comparisons.sweep.run import run_sweep
+from comparisons.sweep.scenario import ScenarioError, group_of, most_together, run_group, scene_of
 from kfopc_filterpy import (
     HardClipAmplifier,
     SoftSaturationAmplifier,
@@ -32,6 +33,16 @@ SMALL = {"duration_s": 0.5, "n_taps": 24}
 
 def swept(folder, grid, **options):
     return run_sweep(SMALL | grid, folder, **({"seeds": 2, "jobs": 1, "quiet": True} | options))
+
+
+def scenario_of(axes):
+    (scenario,) = built_in_grid(SMALL | axes, 1).runs()
+    return scenario
+
+
+def middle(algorithm):
+    settings = sorted(algorithms()[algorithm].first)
+    return settings[len(settings) // 2]
 
 
 def plain_run(values, seed):
@@ -79,7 +90,7 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
         "path_gain_db": 2.0,
         "path_delay": 1,
         "sensor_noise_db": -30.0,
-        "setting": middle(algorithms()[algorithm].first),
+        "setting": middle(algorithm),
     }
     sweep = swept(tmp_path, grid)
     assert len(sweep.runs) == 4
@@ -89,14 +100,13 @@ def test_runs_are_those_of_simulate(tmp_path, algorithm, amplifier):
         expected = noise_reduction_db(result.error, result.disturbance)
         assert run["noise_reduction_db"] == pytest.approx(expected, rel=1e-6, abs=1e-6)
         power = output_power(result.control_signal)
-        assert run["output_power"] == pytest.approx(power, rel=1e-6)
         assert run["output_power_db"] == pytest.approx(10 * math.log10(power), abs=1e-5)
         assert run["power_over_rated"] == pytest.approx(power / 10 ** (run["rated_power_db"] / 10), rel=1e-6)
 
 
 def test_an_algorithm_of_two_settings_is_tuned_in_both(tmp_path):
     (run,) = swept(tmp_path, {"algorithm": "leaky FxLMS", "setting": "tuned"}, seeds=1).runs
-    scene = replace(scene_of("duct", "band noise", 0.5, 24, -40.0, 1), rated_power=0.1)
+    scene = scene_of(scenario_of({}))
     best = tune(Runs(), scene, ["leaky FxLMS"])["leaky FxLMS"].setting
     assert (run["setting_used"], run["second_setting_used"]) == best
 
@@ -107,8 +117,7 @@ def test_where_every_setting_diverges_the_run_counts_as_diverged(monkeypatch):
 
     monkeypatch.setattr(sweep_scenario, "tune", diverged)
     sweep_scenario._tuned.cache_clear()
-    scenario = built_in_grid(SMALL | {"algorithm": "FxLMS", "setting": "tuned"}, 1).cells()[0] | {"seed": 1}
-    (figures,) = run_group([scenario], 1)
+    (figures,) = run_group([scenario_of({"algorithm": "FxLMS", "setting": "tuned"})], 1)
     sweep_scenario._tuned.cache_clear()
     assert figures["diverged"]
     assert math.isnan(figures["setting_used"])
@@ -126,15 +135,15 @@ def test_a_filter_that_refuses_to_go_on_counts_as_diverged(tmp_path, monkeypatch
         raise error
 
     monkeypatch.setattr(Scene, "run", refuse)
-    scenario = built_in_grid(SMALL | {"algorithm": "FxRLS"}, 1).cells()[0] | {"seed": 1}
-    (figures,) = run_group([scenario], 1)
+    (figures,) = run_group([scenario_of({"algorithm": "FxRLS"})], 1)
     assert figures["diverged"]
     assert math.isnan(figures["diverged_at_s"])
     assert math.isnan(figures["noise_reduction_db"])
 
 
 def test_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
-    scene = scene_of("duct", "band noise", 1.0, 32, -40.0, 3)
+    (scenario,) = built_in_grid({"duration_s": 1.0, "n_taps": 32}, [3]).runs()
+    scene = scene_of(scenario)
     ridge = scene.measurement_noise / (scene.settled[0].size * scene.initial_variance)
     bound = power_constrained_wiener(
         scene.references[0],
@@ -149,11 +158,6 @@ def test_rated_power_is_relative_to_what_the_unconstrained_filter_needs():
     assert bound.unconstrained.control_power == pytest.approx(1.0, rel=1e-6)  # least squares of 16000 samples
 
 
-def figures_alone(scenarios):
-    sweep_scenario.scene_of.cache_clear()
-    return [run_group([scenario], scenarios[0]["seed"])[0] for scenario in scenarios]
-
-
 def test_results_do_not_depend_on_what_runs_together():
     grid = built_in_grid(
         SMALL
@@ -164,17 +168,18 @@ def test_results_do_not_depend_on_what_runs_together():
         },
         1,
     )
-    scenarios = [run.scenario for run in grid.runs()]
-    together = run_group(scenarios, 1)
-    assert len(together) == 88
-    np.testing.assert_equal(together, figures_alone(scenarios))  # to the last bit
-    np.testing.assert_equal(together[::-1], run_group(scenarios[::-1], 1))
+    pending = dict(enumerate(grid.runs()))
+    few, many = ({k: v for job in plan(pending, n) for k, v in do_job(job, None, 1).items()} for n in (1, 7))
+    assert len(few) == 88
+    np.testing.assert_equal(few, many)  # to the last bit
+    sweep_scenario._noise_scene.cache_clear()
+    np.testing.assert_equal(few, {number: run_group([values], 1)[0] for number, values in pending.items()})
 
 
 def test_more_of_the_axes_change_what_they_should(tmp_path):
     def power(**values):
         (run,) = swept(tmp_path / str(values), values, seeds=1).runs
-        return run["output_power"], run["noise_reduction_db"]
+        return run["power_over_rated"], run["noise_reduction_db"]
 
     usual = power()
     for change in (
@@ -215,9 +220,9 @@ def test_a_diverged_run_leaves_those_it_shares_gains_with_alone(tmp_path):
 
 def test_setting_tuned_is_the_winner_of_the_studies_rule(tmp_path):
     (run, other) = swept(tmp_path, {"algorithm": "FxLMS", "setting": "tuned", "noise": "tone"}).runs
-    scene = replace(scene_of("duct", "tone", 0.5, 24, -40.0, 1), rated_power=0.1)
+    scene = scene_of(scenario_of({"noise": "tone"}))
     assert run["setting_used"] == tune(Runs(), scene, ["FxLMS"])["FxLMS"].setting
-    assert run["setting_used"] != middle(algorithms()["FxLMS"].first)  # else this test says nothing
+    assert run["setting_used"] != middle("FxLMS")  # else this test says nothing
     assert other["setting_used"] == run["setting_used"]  # of the first seed, for all
 
 
@@ -229,7 +234,7 @@ def test_exception_names_the_scenario(tmp_path, algorithm):
 
 
 def test_shared_run_that_fails_is_found(monkeypatch):
-    scenarios = [run.scenario for run in built_in_grid(SMALL | {"rated_power_db": [-20, -10, -5]}, 1).runs()]
+    scenarios = built_in_grid(SMALL | {"rated_power_db": [-20, -10, -5]}, 1).runs()
     make = sweep_scenario.make_controller
 
     def spoilt(bad, scene, *rest):
@@ -253,7 +258,7 @@ def test_measured_paths_where_they_are_at_hand(tmp_path, shared_data, monkeypatc
 
 def test_measured_paths_are_refused_where_they_are_not(monkeypatch):
     monkeypatch.setattr("comparisons.sweep.grid.measured_data", lambda: None)
-    with pytest.raises(ValueError, match="path 'measured duct' needs the measured data: set KFOPC_DATA"):
+    with pytest.raises(ValueError, match="measured duct and motor need the measured data: set KFOPC_DATA"):
         built_in_grid({"path": "measured-duct"}, 1)
 
 
@@ -262,7 +267,7 @@ def test_command_end_to_end_and_the_same_in_one_process(tmp_path, capsys):
     out = tmp_path / "two"
     assert main([*command.split(), "--output", str(out), "--quiet"]) == 0
     printed = capsys.readouterr()
-    assert "8 runs, 4 cells" in printed.out
+    assert "8 runs, 0 of them diverged, 4 cells" in printed.out
     assert printed.err == ""  # no bar
     with open(out / "cells.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -279,3 +284,47 @@ def test_command_end_to_end_and_the_same_in_one_process(tmp_path, capsys):
     swept(tmp_path / "one", {"algorithm": ["KF-OPC", "FxLMS"], "rated_power_db": [-20, -10]}, jobs=1)
     for table in ("cells.csv", "runs.csv"):
         assert (out / table).read_bytes() == (tmp_path / "one" / table).read_bytes()
+
+
+# Jobs.
+
+
+def runs_of(axes, seeds):
+    return dict(enumerate(built_in_grid(axes, seeds).runs()))
+
+
+def test_jobs_hold_each_run_once_and_only_what_shares():
+    pending = runs_of({"rated_power_db": list(range(-20, 0)), "algorithm": ["KF-ANC", "KF-OPC", "FxLMS"]}, 3)
+    jobs = plan(pending, 2)
+    assert sorted(number for job in jobs for number in job) == list(pending)
+    for job in jobs:
+        assert len({group_of(run) for run in job.values()}) == 1
+        assert len(job) <= min(most_together(run) for run in job.values())
+    # KF-ANC and KF-OPC of one noise: 40 runs of one gain sequence.
+    assert max(len(job) for job in jobs) == 40
+
+
+def test_one_gain_sequence_is_spread_over_all_cores():
+    pending = runs_of({"rated_power_db": list(range(-20, 0))}, 1)
+    assert [len(job) for job in plan(pending, 1)] == [20]
+    assert [len(job) for job in plan(pending, 2)] == [10, 10]
+    assert [len(job) for job in plan(pending, 3)] == [7, 7, 6]
+
+
+@pytest.mark.parametrize(
+    "axis", ["path", "noise", "duration_s", "n_taps", "sensor_noise_db", "path_gain_db", "path_delay", "setting"]
+)
+def test_runs_that_differ_in_reference_path_or_setting_do_not_share(axis):
+    values = {"path": ["duct", "band-pass"], "noise": ["tone", "bursts"], "n_taps": [32, 64]}.get(axis, [1.0, 2.0])
+    one, other = runs_of({axis: values}, 1).values()
+    assert group_of(one) != group_of(other)
+
+
+def test_long_runs_are_fewer_together_so_that_memory_is_bounded():
+    def signals_of(run):
+        return most_together(run) * 8 * 5 * 16000 * run["duration_s"]
+
+    short, long, longest = runs_of({"duration_s": [4.0, 60.0, 3600.0]}, 1).values()
+    assert most_together(short) == 64
+    assert most_together(longest) == 1
+    assert signals_of(long) <= 256e6

@@ -19,7 +19,7 @@ import numpy as np
 from oracles.signals import Controller
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_toeplitz, solve_triangular, toeplitz
 
-UNKNOWN = 2.0  # after an alarm: root mean square of the error of a secondary path, over the path
+UNKNOWN = 4.0  # after an alarm: root mean square of the error of a secondary path, over the path
 KEPT = 4.0  # after an alarm: what is known of the primary paths counts as so many samples for each tap
 FORGOTTEN = 1 / 16  # ... if they have changed
 JUDGED, WRONG = (9, 16), 4  # blocks after an alarm, and how many of them show that the primary paths have changed
@@ -36,7 +36,6 @@ WINDOW = 8  # the filter is solved for the references of an exponential window o
 TWICE = 2.0  # what lasted t may go on for twice as long
 SHORTEST = 20  # ... and for a twentieth of the averaging time
 SCALES = (100, 40, 4)  # t: windows of the averaging time over these; besides, the last block and the window above
-DOUBT = 16.0  # until it is fitted again: mean square of that error, over the path's
 QUIET = 31  # blocks from the first fit after an alarm to the next alarm, at least
 KNOWN = 0.05  # no alarm before as much of the memory was heard
 WORK = 2.0**26  # operations of a factorisation in a block
@@ -258,7 +257,7 @@ class Plant:
                 for i in range(I):
                     ps[i, j] += weight * np.correlate(p[i], s[j], "full")
         if not self.exact and self.doubtful:  # not yet verified: anything may be wrong, even the polarity
-            ss[range(J), range(J), M - 1] += K * DOUBT * self.size
+            ss[range(J), range(J), M - 1] += K * UNKNOWN**2 * self.size
         return ss, ps
 
 

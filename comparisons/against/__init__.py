@@ -1,1 +1,0 @@
-"""The comparison of the package with an earlier version of itself."""
