@@ -29,9 +29,9 @@ from typing import Any, Self
 import numpy as np
 
 from . import _pickles
+from ._pickles import LINE
 
 FORMAT = 2
-LINE = 64  # bytes in a cache line
 DIGEST = 64  # hexadecimal digits of SHA-256
 ABANDONED_S = 3600.0  # an unfinished file as old as this belongs to a process that was killed
 

@@ -132,8 +132,8 @@ def noise_reduction_db(error: ArrayLike, disturbance: ArrayLike, *, steady: floa
     >>> round(noise_reduction_db([[0.0, 0.0], [1.0, 1.0]], [[1.0, 1.0], [1.0, 1.0]]), 2)
     3.01
     """
-    e, d = _as_pair(error, "error", disturbance, "disturbance", runs)
-    return -float(_ratio_db(np.sum(_steady_part(e, steady) ** 2), np.sum(_steady_part(d, steady) ** 2)))
+    e, d = _as_pair(error, "error", disturbance, "disturbance", runs, steady)
+    return -float(_ratio_db(np.sum(e**2), np.sum(d**2)))
 
 
 def output_power(control_signal: ArrayLike, *, steady: float = 0.5, runs: bool = False) -> NumberOrArray:
@@ -424,8 +424,7 @@ def harmonics_db(
     >>> round(level, 6)
     -40.0
     """
-    e, d = _as_pair(error, "error", disturbance, "disturbance", runs)
-    e, d = _steady_part(e, steady), _steady_part(d, steady)
+    e, d = _as_pair(error, "error", disturbance, "disturbance", runs, steady)
     n_samples, rate = e.shape[-1], as_positive(fs, "fs", unit="Hz")
     bins_per_harmonic = as_positive(fundamental_hz, "fundamental_hz", unit="Hz") * n_samples / rate
     if bins_per_harmonic < 16:
@@ -506,8 +505,7 @@ def coherence_and_gain(
     """
     from scipy.signal import csd
 
-    d, a = _as_pair(disturbance, "disturbance", anti_noise, "anti_noise", runs)
-    d, a = _steady_part(d, steady), _steady_part(a, steady)
+    d, a = _as_pair(disturbance, "disturbance", anti_noise, "anti_noise", runs, steady)
     segment = as_sample_count(segment_s, fs, "segment_s")
     if d.shape[-1] < 8 * segment:
         raise ValueError(
@@ -757,13 +755,15 @@ def _as_runs(value: Any, name: str, runs: bool) -> np.ndarray:
     return array if runs else array[None]
 
 
-def _as_pair(first: Any, first_name: str, second: Any, second_name: str, runs: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return two signals of the same runs as `_as_runs` does, checked to have one shape."""
+def _as_pair(
+    first: Any, first_name: str, second: Any, second_name: str, runs: bool, steady: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steady part of two signals of the same runs as `_as_runs` does, checked to have one shape."""
     one, two = _as_runs(first, first_name, runs), _as_runs(second, second_name, runs)
     if one.shape != two.shape:
         shapes = f"{np.shape(first)} and {np.shape(second)}"
         raise ValueError(f"{first_name} and {second_name} must have one shape, got {shapes}")
-    return one, two
+    return _steady_part(one, steady), _steady_part(two, steady)
 
 
 def _as_limits(value: Any, name: str, signal: np.ndarray) -> np.ndarray:

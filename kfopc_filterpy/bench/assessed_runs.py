@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -108,18 +109,9 @@ class Plan:
         scene = recorded_scene(
             self.x[..., excerpt], self.d[..., excerpt], self.s, self.fs, self.start, self.limits, self.settings
         )
-        runs = Runs(None if self.bar is None else _TuningBar(self))
+        in_samples: Any = SimpleNamespace(update=lambda runs: self.advance(runs * self.tuning_samples))
+        runs = Runs(None if self.bar is None else in_samples)
         return REGISTRY["FxLMS"].value(scene, tune(runs, scene, ["FxLMS"])["FxLMS"].setting)
-
-
-@dataclass
-class _TuningBar:
-    """The bar of a plan, for runs of the tuning: it counts samples."""
-
-    plan: Plan
-
-    def update(self, runs: int) -> None:
-        self.plan.advance(runs * self.plan.tuning_samples)
 
 
 def recorded_scene(

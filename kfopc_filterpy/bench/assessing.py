@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,18 +35,15 @@ from kfopc_filterpy.paths import causality_margin, frequency_response
 from kfopc_filterpy.paths.analysis import energy_onset
 from kfopc_filterpy.paths.file_checks import require_heard, require_sound
 from kfopc_filterpy.paths.path_matrix import primary_paths, secondary_paths
+from kfopc_filterpy.paths.uncertainty import Uncertainty
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .._types import PathModels, ProgressBar
 from .assessed_runs import ALGORITHMS, NSE_WINDOW_S, Plan, announce
 from .assessment import Assessment, Band, Ceilings, SoundLevels, advice_on
 from .fixed_filters import FixedFilters, longest_filter
-from .limits import Limits, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
+from .limits import Limits, Ratings, excursion_mm, limits_of, ratings_of_each, scale_of, share_taken, with_excursion
 from .scene import Runs, one_blas_thread
-
-if TYPE_CHECKING:
-    from ..bench.limits import Ratings
-    from ..paths.uncertainty import Uncertainty
 
 MOST_DIRECT_WEIGHTS = 256  # from which KF-OPC runs beside KF-PB only if asked: a sample takes K (J I L)^2 operations
 MEMORY_S, CHANNEL_MEMORY_S = 0.25, 1.0
@@ -163,6 +160,7 @@ def assess(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     x, d, s = recorded_signals(noise, primary, secondary, disturbance, fs)
+    p = None if primary is None else primary_paths(primary, fs=fs, name="primary")[0]
     several = s.ndim == 3
     K, J, n_references = (*s.shape[:2], len(x)) if several else (1, 1, 1)
     want_db = as_nonnegative(want_db, "want_db", unit="dB")
@@ -246,7 +244,7 @@ def assess(
         unlimited_power=bounds.free.control_power,
         required_rated_power=required,
         expected_rated_power=required * _price(share_taken(run, limits), bound_share),
-        causality_margin_s=None if primary is None else _margin_s(primary, s, fs),
+        causality_margin_s=None if p is None else causality_margin(p if several else p[0, 0], s, fs=fs).margin_s,
         helpful_delay_s=bounds.helpful_delay_s(want_db) if bounds.filter_db < want_db else None,
         band=_band(bounds.d, s, fs),
         levels=None if pascals is None else _levels(run, pascals),
@@ -261,7 +259,7 @@ def assess(
         channels=(n_references, J, K) if several else None,
         pascal_per_unit=pascal_per_unit,
         switch_on_s=start / fs,
-        response_s=None if primary is None else _response_s(primary, s, want_db, fs),
+        response_s=None if p is None else _response_s(p, s, want_db, fs),
     )
     return replace(assessment, advice=tuple(advice_on(assessment)))
 
@@ -315,18 +313,12 @@ def _pascals(value: Any, n_microphones: int) -> Any:
     return per_channel(value, n_microphones, "microphones", "pascal_per_unit")[:, np.newaxis]
 
 
-def _margin_s(primary: Any, s: np.ndarray, fs: float) -> float:
-    p, _ = primary_paths(primary, fs=fs, name="primary")
-    return causality_margin(p if s.ndim == 3 else p[0, 0], s, fs=fs).margin_s
-
-
-def _response_s(primary: Any, s: np.ndarray, want_db: float, fs: float) -> float:
+def _response_s(p: np.ndarray, s: np.ndarray, want_db: float, fs: float) -> float:
     """Return how long a control filter must be to treat enough of the primary path's energy, in s.
 
     It is the time from the first sound of a loudspeaker until the share of the energy has come that must be removed, at
     the microphone where this takes longest.
     """
-    p, _ = primary_paths(primary, fs=fs, name="primary")
     s = s.reshape(len(p), -1, s.shape[-1])
     share = 1.0 - 10 ** (-want_db / 10)
     lasting = [

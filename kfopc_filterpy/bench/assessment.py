@@ -26,7 +26,6 @@ import os
 import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -227,23 +226,15 @@ class Assessment:
     @property
     def reason(self) -> str:
         """What limits, as one sentence; empty if the rating is enough."""
-        return _REASONS[self.limited_by].format(**self._words) if self.limited_by else ""
-
-    @cached_property
-    def _words(self) -> dict[str, str]:
-        c = self.ceilings
-        numbers = {
-            "want": self.want_db,
-            "reached": self.noise_reduction_db,
-            "coherence": np.nan if c.coherence_db is None else c.coherence_db,
-            "time": c.time_db,
-            "filter": c.filter_db,
-            "power": c.power_db,
-        }
-        return {name: _db(value) for name, value in numbers.items()} | {
-            "taps": str(self.settings.n_taps),
-            "rated": self.power(self.limits.rated_power),
-        }
+        if self.limited_by is None:
+            return ""
+        ceilings = {name: "" if value is None else _db(value) for name, value in vars(self.ceilings).items()}
+        return _REASONS[self.limited_by].format(
+            **ceilings,
+            reached=_db(self.noise_reduction_db),
+            taps=self.settings.n_taps,
+            rated=self.power(self.limits.rated_power),
+        )
 
     def power(self, rated_power: NumberOrArray) -> str:
         """Return a `rated_power` in words: in W if the impedance is known, else in squared units."""
@@ -264,8 +255,7 @@ class Assessment:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict in strict JSON's types, as `verdict.schema.json` describes it."""
-        loudspeaker = {"volts_per_unit": self.volts_per_unit, "ohm": self.ohm}
-        levels = None if self.levels is None else vars(self.levels)
+        counts = ("references", "loudspeakers", "microphones")
         return jsonable(
             {
                 "schema_version": SCHEMA_VERSION,
@@ -273,17 +263,18 @@ class Assessment:
                 "verdict": self.verdict,
                 "limited_by": self.limited_by,
                 "reason": self.reason,
-                "advice": list(self.advice),
-                "notes": list(self.notes),
+                "advice": self.advice,
+                "notes": self.notes,
                 "want_db": self.want_db,
                 "noise_reduction_db": self.noise_reduction_db,
                 "algorithm": self.algorithm,
                 "rating": {
                     "rated_power": self.limits.rated_power,
-                    "amplitude_limit": _plain(self.limits.amplitude_limit),
+                    "amplitude_limit": self.limits.amplitude_limit,
                     "window_s": self.limits.window_s,
-                    "decided_by": _plain(self.limits.decided_by),
-                    **loudspeaker,
+                    "decided_by": self.limits.decided_by,
+                    "volts_per_unit": self.volts_per_unit,
+                    "ohm": self.ohm,
                 },
                 "ceilings": vars(self.ceilings),
                 "bound_db": self.bound_db,
@@ -293,22 +284,15 @@ class Assessment:
                 "causality_margin_s": self.causality_margin_s,
                 "helpful_delay_s": self.helpful_delay_s,
                 "band": vars(self.band),
-                "levels": levels,
+                "levels": self.levels and vars(self.levels),
                 "excursion_mm": self.excursion_mm,
                 "settings": {"n_taps": self.settings.n_taps, **self.settings.settings},
                 "algorithms": self.figures,
                 "fs": self.fs,
             }
-            | self._channels,
+            | ({"channels": dict(zip(counts, self.channels, strict=True))} if self.channels else {}),
             "verdict",
         )
-
-    @property
-    def _channels(self) -> dict[str, Any]:
-        """The numbers of channels for JSON; nothing if there is one of each."""
-        if self.channels is None:
-            return {}
-        return {"channels": dict(zip(("references", "loudspeakers", "microphones"), self.channels, strict=True))}
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """Write verdict.html, verdict.json, figures and sounds into a `folder`, and return the path of the page.
@@ -345,18 +329,14 @@ def _db(value: float) -> str:
     return f"{round(value, 1) + 0.0:.1f} dB"
 
 
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
 _REASONS = {
-    "coherence": "Coherence limits: the reference explains {coherence} of the disturbance at most, whatever the "
+    "coherence": "Coherence limits: the reference explains {coherence_db} of the disturbance at most, whatever the "
     "controller and the amplifier.",
-    "causality": "Causality limits: with more time a filter of {taps} taps reaches {time}, in time only {filter}, "
+    "causality": "Causality limits: with more time a filter of {taps} taps reaches {time_db}, in time only {filter_db}, "
     "with any power.",
-    "filter": "The filter limits: {taps} taps reach {filter} with any power, and more time does not help.",
-    "amplifier": "The amplifier limits: with any power {filter} are in reach, with {rated} {power} for a fixed filter.",
-    "adaptation": "The adaptation limits: a fixed filter reaches {power} within the rated power, the controller {reached}, "
+    "filter": "The filter limits: {taps} taps reach {filter_db} with any power, and more time does not help.",
+    "amplifier": "The amplifier limits: with any power {filter_db} are in reach, with {rated} {power_db} for a fixed filter.",
+    "adaptation": "The adaptation limits: a fixed filter reaches {power_db} within the rated power, the controller {reached}, "
     "and more power does not help it.",
 }
 

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from kfopc_filterpy import SimulationResult
 from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.plot import curve_style, plot_error_spectra, plot_nse, plot_output_power
+from kfopc_filterpy.plot.style import new_axes
 
+from .assessment import Assessment
 from .page import images, players, rendered
 from .report import prepare_folder, write_files, write_whole
 from .study_report import EXCERPT_S, HEADROOM, SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Sound, StudyReport, Table
-
-if TYPE_CHECKING:
-    from .assessment import Assessment
 
 TEMPLATE = "verdict.html.jinja"
 NEEDED = ("jinja2", "latex2mathml", "matplotlib", "PIL")
@@ -75,52 +76,50 @@ def write_assessment(verdict: Assessment, folder: str | os.PathLike[str]) -> Pat
     return path / "verdict.html"
 
 
-def _figures(verdict: Assessment) -> Any:
+def _figures(verdict: Assessment) -> Iterator[FigureItem]:
     """Yield the figures: the bound, spectra, noise reduction and power over time, bands."""
-    import matplotlib.pyplot as plt
-
-    figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-    _draw_bound(verdict, ax)
     each = "the run of each algorithm at the power it took"
     if verdict.channels is not None:
         each += ", relative to its rating, of the loudspeaker that took most"
-    yield FigureItem(
-        "bound", f"What a rated power buys: the least error of any fixed filter of this length, with {each}.", figure
+    caption = f"What a rated power buys: the least error of any fixed filter of this length, with {each}."
+    yield FigureItem("bound", caption, _bound(verdict).figure)
+    yield from error_figures(
+        verdict.runs,
+        verdict.switch_on_s,
+        together="" if verdict.channels is None else " All microphones together.",
+        pascal_per_unit=verdict.pascal_per_unit,
     )
-    runs = dict(verdict.runs)
-    together = "" if verdict.channels is None else " All microphones together."
-    figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-    plot_error_spectra(runs, pascal_per_unit=verdict.pascal_per_unit, ax=ax)
-    caption = f"Spectra without control and of the errors, over the steady half.{together}"
-    yield FigureItem("spectra", caption, figure)
-    figure, ax = plt.subplots(figsize=(6.4, 4), layout="constrained")
-    plot_nse(runs, ax=ax).set_xlabel(SINCE_SWITCH_ON)
-    begin = SWITCHED_ON.format(verdict.switch_on_s)
-    caption = "Error power over that of the disturbance; below 0 dB it is quieter than without control."
-    yield FigureItem("nse", f"{caption}{together} {begin}", figure)
-    figure, axes = _rows_of_axes(n_loudspeakers(verdict), (6.4, 4))
+    _, n_loudspeakers, n_microphones = verdict.channels or (1, 1, 1)
+    figure, axes = _rows_of_axes(n_loudspeakers, (6.4, 4))
     watts = verdict.watt_per_power
     for j, ax in enumerate(axes):
         watt = None if watts is None else np.ravel(watts)[j]
         rated = np.ravel(verdict.limits.rated_power)[j]
-        plot_output_power(runs, channel=j, rated_power=rated, watt_per_power=watt, ax=ax).set_xlabel(SINCE_SWITCH_ON)
+        plot_output_power(verdict.runs, channel=j, rated_power=rated, watt_per_power=watt, ax=ax)
+        ax.set_xlabel(SINCE_SWITCH_ON)
     _number_rows(axes, "Loudspeaker")
+    begin = SWITCHED_ON.format(verdict.switch_on_s)
     yield FigureItem("power", f"Mean power of the control signal, and the rated power. {begin}", figure)
     if verdict.levels is not None:
         levels = verdict.levels
-        figure, axes = _rows_of_axes(n_microphones(verdict), (9, 3.6))
+        figure, axes = _rows_of_axes(n_microphones, (9, 3.6))
         for k, ax in enumerate(axes):
             _draw_bands(levels.centres_hz, np.atleast_2d(levels.before_db)[k], np.atleast_2d(levels.after_db)[k], ax)
         _number_rows(axes, "Microphone")
         yield FigureItem("third-octaves", f"Third-octave bands without control and with {verdict.algorithm}.", figure)
 
 
-def n_loudspeakers(verdict: Assessment) -> int:
-    return 1 if verdict.channels is None else verdict.channels[1]
-
-
-def n_microphones(verdict: Assessment) -> int:
-    return 1 if verdict.channels is None else verdict.channels[2]
+def error_figures(
+    runs: Mapping[str, SimulationResult], switch_on_s: float, *, together: str = "", pascal_per_unit: Any = None
+) -> Iterator[FigureItem]:
+    """Yield the spectra of the errors, and their power over time; `together` is added to both captions."""
+    ax: Any = plot_error_spectra(runs, pascal_per_unit=pascal_per_unit)
+    caption = f"Spectra without control and of the errors, over the steady half.{together}"
+    yield FigureItem("spectra", caption, ax.figure)
+    ax = plot_nse(runs)
+    ax.set_xlabel(SINCE_SWITCH_ON)
+    caption = "Error power over that of the disturbance; below 0 dB it is quieter than without control."
+    yield FigureItem("nse", f"{caption}{together} {SWITCHED_ON.format(switch_on_s)}", ax.figure)
 
 
 def _rows_of_axes(count: int, size: tuple[float, float]) -> tuple[Any, Any]:
@@ -139,8 +138,9 @@ def _number_rows(axes: Any, what: str) -> None:
             ax.set_ylabel(f"{what} {number}\n{ax.get_ylabel()}")
 
 
-def _draw_bound(verdict: Assessment, ax: Any) -> None:
-    """Draw the bound against the rated power, with what is wanted, the rating and the runs."""
+def _bound(verdict: Assessment) -> Any:
+    """Return axes with the bound against the rated power, with what is wanted, the rating and the runs."""
+    ax = new_axes(None)
     several = verdict.channels is not None  # then the powers are multiples of all ratings
     scale = 1.0 if several else verdict.watt_per_power or 1.0
     powers, reached = verdict.curve
@@ -166,6 +166,7 @@ def _draw_bound(verdict: Assessment, ax: Any) -> None:
     ax.set_ylabel("Noise reduction (dB)")
     ax.grid(True, which="both", alpha=0.25)
     ax.legend(fontsize="small")
+    return ax
 
 
 def _draw_bands(centres_hz: np.ndarray, before_db: np.ndarray, after_db: np.ndarray, ax: Any) -> None:
@@ -218,34 +219,23 @@ def _tables(verdict: Assessment) -> Any:
     rows.append([f"The run of {verdict.algorithm}", f"{verdict.noise_reduction_db:.1f} dB", adapting])
     rows.append(["Wanted", f"{verdict.want_db:.1f} dB", ""])
     yield Table("ceilings", "What limits", ["Ceiling", "Noise reduction", ""], rows)
-    yield Table(
-        "algorithms",
-        "The controllers",
-        [
-            "Controller",
-            "Noise reduction (dB)",
-            _power_label(verdict),
-            "Power / rated power",
-            "Worst window",
-            "Highest peak" if volts is None else "Highest peak (V)",
-        ],
-        [
-            [
-                name if name == verdict.algorithm else f"{name}, as published",
-                _number(own["noise_reduction_db"]),
-                _number(own["output_power"], verdict.watt_per_power),
-                _number(own["of_rated_power"]),
-                _number(own["worst_window"]),
-                _number(own["peak_control_signal"], volts),
-            ]
-            for name, own in verdict.figures.items()
-        ],
-    )
+    columns = [
+        ("Noise reduction (dB)", "noise_reduction_db", None),
+        (_power_label(verdict), "output_power", verdict.watt_per_power),
+        ("Power / rated power", "of_rated_power", None),
+        ("Worst window", "worst_window", None),
+        ("Highest peak" if volts is None else "Highest peak (V)", "peak_control_signal", volts),
+    ]
+    rows = []
+    for name, own in verdict.figures.items():
+        label = name if name == verdict.algorithm else f"{name}, as published"
+        rows.append([label, *(_number(own[key], scale) for _, key, scale in columns)])
+    yield Table("algorithms", "The controllers", ["Controller", *(heading for heading, *_ in columns)], rows)
     if verdict.channels is not None:
         yield Table(
             "microphones",
             "Noise reduction at each microphone (dB)",
-            ["Controller", *(f"Microphone {k + 1}" for k in range(n_microphones(verdict)))],
+            ["Controller", *(f"Microphone {k + 1}" for k in range(verdict.channels[2]))],
             [
                 [name, *(_number(one) for one in own["noise_reduction_by_microphone_db"])]
                 for name, own in verdict.figures.items()
@@ -259,14 +249,15 @@ def _level_rows(verdict: Assessment) -> tuple[list[str], list[list[str | float]]
     """Return the headings and rows of the third-octave bands, of all microphones."""
     levels = verdict.levels
     assert levels is not None
-    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
-    rows: list[list[str | float]] = []
+    numbered = verdict.channels is not None
     pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
-    for k, (before_db, after_db) in enumerate(pairs, 1):
-        first: list[str | float] = [] if verdict.channels is None else [str(k)]
-        for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True):
-            rows.append([*first, _nominal(centre), float(before), float(after), float(before - after)])
-    return headings if verdict.channels is None else ["Microphone", *headings], rows
+    rows: list[list[str | float]] = [
+        [*[str(k)] * numbered, _nominal(centre), float(before), float(after), float(before - after)]
+        for k, (before_db, after_db) in enumerate(pairs, 1)
+        for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True)
+    ]
+    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
+    return ["Microphone"] * numbered + headings, rows
 
 
 def _number(value: Any, scale: Any = None) -> Any:

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from kfopc_filterpy import SimulationResult, output_power, suggest_settings
 from kfopc_filterpy._validate import as_choice, as_count, as_positive
+from kfopc_filterpy.controllers.base import listed
 from kfopc_filterpy.signals.quality import clipping_remarks, recording_remarks
 
 from .._types import PathModels, ProgressBar
 from .assessed_runs import recorded_scene
 from .assessing import recorded_signals, switch_on_sample
 from .fixed_filters import longest_filter
-from .limits import ChannelLimits, limits_of, ratings_of_each, watt_per_power
+from .limits import ChannelLimits, Ratings, limits_of, ratings_of_each, watt_per_power
 from .registry import REGISTRY, algorithms
-from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution
+from .scene import Runs, Scene, figures_of_merit, one_blas_thread, reachable_solution, reachable_weights
 from .study_report import SINCE_SWITCH_ON, SWITCHED_ON, FigureItem, Parameter, Sound, StudyReport, Table
 from .tuning import RULE, AllDivergedError, run_setting, tune
-
-if TYPE_CHECKING:
-    from ..bench.limits import Ratings
 
 OF_ONE_CHANNEL = ("KF-PB", "KF-OPC", "MOV-FxLMS", "FxLMS")
 OF_SEVERAL_CHANNELS = ("KF-PB", "MOV-FxLMS", "FxLMS")
 SCALED = (
-    " The rated powers are {}{}. Powers are relative to the rated power, and peaks to its square root, of the loudspeaker "
+    " The rated powers are {}. Powers are relative to the rated power, and peaks to its square root, of the loudspeaker "
     "for which they are largest."
 )
 
@@ -107,8 +104,7 @@ def compare_recordings(
     limits, watts = limits_of(ratings, several), watt_per_power(ratings, several)
     start = switch_on_sample(None, fs, x.shape[-1])
     taps = None if n_taps is None else as_count(n_taps, "n_taps")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", np.exceptions.RankWarning)  # about weights that no controller reaches
+    with reachable_weights():
         settings = suggest_settings(
             x[..., start:], d[..., start:], s, fs=fs, n_taps=taps, max_taps=longest_filter(n_filters)
         )
@@ -146,9 +142,9 @@ def compare_recordings(
         "own-data",
         "Your recordings",
         f"{x.shape[-1] / fs:.3g} s of the recordings, {settings.n_taps} taps; full control would take "
-        f"{_listed(free.control_power / limits.rated_power)} times the rated power."
+        f"{listed(free.control_power / limits.rated_power, '.3g')} times the rated power."
         + _clipping(limits.amplitude_limit)
-        + (SCALED.format(*_powers(limits.rated_power, watts)) if several else ""),
+        + (SCALED.format(_powers(limits.rated_power, watts)) if several else ""),
         fs,
         1.0 if isinstance(limits, ChannelLimits) else limits.rated_power,
         {"n_taps": Parameter(settings.n_taps, settings.reasons["n_taps"]), **parameters},
@@ -171,28 +167,18 @@ def _figures(
     results: dict[str, SimulationResult], rated_powers: np.ndarray, watts: Any, switch_on_s: float
 ) -> list[FigureItem]:
     """Return the figures of the runs: the error, and the power of each loudspeaker."""
-    import matplotlib.pyplot as plt
+    from kfopc_filterpy.plot import plot_output_power
 
-    from kfopc_filterpy.plot import plot_error_spectra, plot_nse, plot_output_power
+    from .assessment_page import error_figures
 
-    begin = SWITCHED_ON.format(switch_on_s)
-    drawn: list[tuple[str, Any, str, dict[str, Any]]] = [
-        ("nse", plot_nse, f"Error power over that of the disturbance. {begin}", {}),
-        ("spectra", plot_error_spectra, "Spectra without control and of the errors, over the steady half.", {}),
-    ]
+    items = list(error_figures(results, switch_on_s))
     for j, rated in enumerate(rated_powers):
-        which = f" of loudspeaker {j + 1}" if rated_powers.size > 1 else ""
-        caption = f"Mean power of the control signal{which}, and its rated power. {begin}"
+        which, end = (f" of loudspeaker {j + 1}", f"-{j + 1}") if rated_powers.size > 1 else ("", "")
         watt = None if watts is None else np.ravel(watts)[j]
-        stem = f"power-{j + 1}" if rated_powers.size > 1 else "power"
-        drawn.append((stem, plot_output_power, caption, {"channel": j, "rated_power": rated, "watt_per_power": watt}))
-    items = []
-    for stem, draw, caption, options in drawn:
-        figure, ax = plt.subplots(figsize=(7, 4.5), layout="constrained")
-        draw(results, ax=ax, **options)
-        if draw is not plot_error_spectra:
-            ax.set_xlabel(SINCE_SWITCH_ON)
-        items.append(FigureItem(stem, caption, figure))
+        ax: Any = plot_output_power(results, channel=j, rated_power=rated, watt_per_power=watt)
+        ax.set_xlabel(SINCE_SWITCH_ON)
+        caption = f"Mean power of the control signal{which}, and its rated power. {SWITCHED_ON.format(switch_on_s)}"
+        items.append(FigureItem(f"power{end}", caption, ax.figure))
     return items
 
 
@@ -210,7 +196,7 @@ def _edge(name: str, setting: Any) -> str:
     advice = "a setting beyond it may do better: try one in Python, with simulate"
     if own.symbol == "r" and setting == min(own.first):
         advice = "the noise is so steady that the filter hardly has to forget, and nothing is to be done"
-    return f"{name}: the best setting, {kinds} = {_listed(setting)}, is at the edge of those tried; {advice}."
+    return f"{name}: the best setting, {kinds} = {listed(setting, '.3g')}, is at the edge of those tried; {advice}."
 
 
 def _clipping(limit: Any) -> str:
@@ -222,13 +208,9 @@ def _clipping(limit: Any) -> str:
     return f" The amplifiers clip beyond: {', '.join('never' if one is None else f'±{one:.3g}' for one in limit)}."
 
 
-def _powers(rated_powers: Any, watts: Any) -> tuple[str, str]:
-    """Return rated powers in words, and their unit, which is W if that is known."""
-    return (_listed(rated_powers), "") if watts is None else (_listed(rated_powers * watts), " W")
-
-
-def _listed(values: Any) -> str:
-    return ", ".join(f"{value:.3g}" for value in np.atleast_1d(values))
+def _powers(rated_powers: Any, watts: Any) -> str:
+    """Return rated powers in words, in W if that is known."""
+    return listed(rated_powers, ".3g") if watts is None else f"{listed(rated_powers * watts, '.3g')} W"
 
 
 _FILE = str.maketrans({" ": "-", "(": None, ")": None})

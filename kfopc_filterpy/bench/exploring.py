@@ -9,12 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import (
-    bandpass_path,
-    clipped_fraction,
-    noise_reduction_db,
-    output_power,
-)
+from kfopc_filterpy import bandpass_path, clipped_fraction, noise_reduction_db, output_power
 from kfopc_filterpy._validate import as_band, as_choice, as_nonnegative, as_number, as_positive, as_signal
 from kfopc_filterpy.bounds import power_constrained_solution
 from kfopc_filterpy.metrics import power_spectrum_db, short_time_power

@@ -19,6 +19,7 @@ from kfopc_filterpy.plot.style import decibels
 from .exploring import ALGORITHMS, AcousticSetup, ExploreResult, ExploreSettings, explore, explore_setups
 from .page import data_uri, flac
 from .registry import REGISTRY
+from .study_report import HEADROOM
 
 ADDRESS = "127.0.0.1"
 PORT = 5006
@@ -26,7 +27,6 @@ LOWEST_HZ = 50.0
 WAVE_S = 0.03  # of the control signal that is drawn
 BELOW_PEAK_DB = 70.0  # that a spectrum shows
 QUIETEST_DB = -60.0  # re rated power that is drawn
-HEADROOM = 4.0  # a sound may have this many times the disturbance's peak; beyond it is cut off
 WIDTH, HEIGHT, SIDE = 470, 285, 290
 BLUE, GREEN, ORANGE, GREY = "#0072B2", "#009E73", "#D55E00", "#777777"
 RELATIVE, ABSOLUTE = 0, 1
@@ -48,10 +48,7 @@ CURVES = {  # of each plot: the curve's key, its legend, colour and dash
 
 
 def serve_explore(
-    setups: Sequence[AcousticSetup] | None = None,
-    *,
-    port: int = PORT,
-    announce: Callable[[str], Any] = print,
+    setups: Sequence[AcousticSetup] | None = None, *, port: int = PORT, announce: Callable[[str], Any] = print
 ) -> None:
     """Serve the page to browsers on this machine until it is interrupted with Ctrl+C.
 
@@ -239,9 +236,8 @@ class _Page:
         for name, data in curves(result).items():
             self.sources[name].data = data
         self._fill_ratings(result)
-        top = np.nanmax(result.disturbance_spectrum_db)
-        errors = result.error_spectrum_db[np.isfinite(result.error_spectrum_db)]
-        top = max(top, errors.max(initial=top))
+        levels = np.concatenate([result.disturbance_spectrum_db, result.error_spectrum_db])
+        top = np.max(levels, where=np.isfinite(levels), initial=-np.inf)
         self.plots["spectrum"].y_range.update(start=float(top - BELOW_PEAK_DB), end=float(top + 5))
         self.plots["spectrum"].x_range.end = result.fs / 2
         asked = self.sources["wave"].data["asked"]
@@ -304,49 +300,33 @@ def _controls(setups: list[AcousticSetup]) -> dict[str, Any]:
     """Return the controls, from the top of the page to its bottom."""
     from bokeh.models import CheckboxGroup, CustomJSTickFormatter, RadioButtonGroup, RangeSlider, Select, Slider
 
-    power_of_ten = CustomJSTickFormatter(code="return Math.pow(10, tick).toExponential(1)")
-    power_of_two = CustomJSTickFormatter(code="return Math.pow(2, tick).toPrecision(2)")
+    controls: dict[str, Any] = {}
 
-    def slider(name: str, title: str, start: float, end: float, value: float, step: float, **more: Any) -> Any:
-        return Slider(name=name, title=title, start=start, end=end, value=value, step=step, width=SIDE, **more)
+    def add(kind: Any, name: str, **options: Any) -> None:
+        controls[name] = kind(name=name, width=SIDE, **options)
 
+    def slide(name: str, title: str, start: float, end: float, value: Any, step: float, **more: Any) -> None:
+        kind = RangeSlider if np.ndim(value) else Slider
+        add(kind, name, title=title, start=start, end=end, value=value, step=step, **more)
+
+    powers_of_ten = CustomJSTickFormatter(code="return Math.pow(10, tick).toExponential(1)")
+    powers_of_two = CustomJSTickFormatter(code="return Math.pow(2, tick).toPrecision(2)")
     names = [(str(i), setup.name) for i, setup in enumerate(setups)]
-    default = ExploreSettings()
-    return {
-        "setup": Select(name="setup", title="Paths and noise", options=names, value="0", width=SIDE),
-        "algorithm": Select(
-            name="algorithm", title="Algorithm", options=list(ALGORITHMS), value=default.algorithm, width=SIDE
-        ),
-        "rating_kind": RadioButtonGroup(
-            name="rating_kind", labels=["rating follows the noise", "rating is fixed"], active=RELATIVE, width=SIDE
-        ),
-        "relative_rating": slider(
-            "relative_rating", "Rated power over that of full control (dB)", -30, 10, default.rating_db, 0.5
-        ),
-        "absolute_rating": slider("absolute_rating", "Rated power (dB re 1)", -40, 20, 0, 0.5),
-        "clips": CheckboxGroup(name="clips", labels=["amplifier clips at its rating"], active=[0], width=SIDE),
-        "level": slider("level", "Noise at the error microphone (dB re 1)", -30, 30, 0, 1),
-        "band": RangeSlider(
-            name="band",
-            title="Band of the noise (Hz)",
-            start=LOWEST_HZ,
-            end=8000,
-            value=default.band,
-            step=50,
-            format="0",
-            width=SIDE,
-        ),
-        "path_error": slider("path_error", "True path later than the known path (samples)", 0, 4, 0, 0.5),
-        "tolerance": slider(
-            "tolerance", "Path error that KF-PB allows for (samples)", 0, 4, default.path_tolerance_samples, 0.25
-        ),
-        "state_noise": slider(
-            "state_noise", "State noise r E[x'²]/q", -9, -3, np.log10(default.state_noise), 0.5, format=power_of_ten
-        ),
-        "step_size": slider(
-            "step_size", "Step size µ L E[x'²]", -14, 0, np.log2(default.step_size), 1, format=power_of_two
-        ),
-    }
+    own = ExploreSettings()
+    state_noise, step_size = np.log10(own.state_noise), np.log2(own.step_size)
+    add(Select, "setup", title="Paths and noise", options=names, value="0")
+    add(Select, "algorithm", title="Algorithm", options=list(ALGORITHMS), value=own.algorithm)
+    add(RadioButtonGroup, "rating_kind", labels=["rating follows the noise", "rating is fixed"], active=RELATIVE)
+    slide("relative_rating", "Rated power over that of full control (dB)", -30, 10, own.rating_db, 0.5)
+    slide("absolute_rating", "Rated power (dB re 1)", -40, 20, 0, 0.5)
+    add(CheckboxGroup, "clips", labels=["amplifier clips at its rating"], active=[0])
+    slide("level", "Noise at the error microphone (dB re 1)", -30, 30, 0, 1)
+    slide("band", "Band of the noise (Hz)", LOWEST_HZ, 8000, own.band, 50, format="0")
+    slide("path_error", "True path later than the known path (samples)", 0, 4, 0, 0.5)
+    slide("tolerance", "Path error that KF-PB allows for (samples)", 0, 4, own.path_tolerance_samples, 0.25)
+    slide("state_noise", "State noise r E[x'²]/q", -9, -3, state_noise, 0.5, format=powers_of_ten)
+    slide("step_size", "Step size µ L E[x'²]", -14, 0, step_size, 1, format=powers_of_two)
+    return controls
 
 
 def _figures() -> tuple[dict[str, Any], dict[str, Any]]:
@@ -364,23 +344,22 @@ def _figures() -> tuple[dict[str, Any], dict[str, Any]]:
     for name, (title, x_label, y_label) in titles.items():
         own = CURVES[name]
         source = ColumnDataSource({key: [] for key in ("x", *(curve for curve, *_ in own))}, name=f"{name} curves")
-        options: dict[str, Any] = {"x_axis_type": "log"} if name == "spectrum" else {}
         plot = figure(
             name=f"{name} plot",
             title=title,
             x_axis_label=x_label,
             y_axis_label=y_label,
+            x_axis_type="log" if name == "spectrum" else "auto",
             width=WIDTH,
             height=HEIGHT,
             tools="pan,box_zoom,wheel_zoom,reset,save",
             active_scroll=None,
-            **options,
         )
         for curve, legend, colour, dash in own:
             plot.line("x", curve, source=source, legend_label=legend, color=colour, line_dash=dash, line_width=1.5)
         legend = plot.legend[0]
-        legend.update(orientation="horizontal", border_line_color=None, padding=0, margin=0, label_text_font_size="9pt")
-        legend.update(spacing=12, glyph_width=20)
+        legend.update(orientation="horizontal", border_line_color=None, label_text_font_size="9pt")
+        legend.update(padding=0, margin=0, spacing=12, glyph_width=20)
         plot.add_layout(legend, "above")  # it would cover curves inside
         sources[name], plots[name] = source, plot
     plots["spectrum"].x_range = Range1d(LOWEST_HZ, 8000)
@@ -394,12 +373,12 @@ def _figures() -> tuple[dict[str, Any], dict[str, Any]]:
 def _texts() -> dict[str, Any]:
     from bokeh.models import Div
 
-    width = 2 * WIDTH
-    return {
-        "status": Div(name="status", text="", width=width, styles={"color": "#555555"}),
-        "summary": Div(name="summary", text="", width=width, min_height=66),
-        "sounds": Div(name="sounds", text="", width=width),
+    options: dict[str, dict[str, Any]] = {
+        "status": {"styles": {"color": "#555555"}},
+        "summary": {"min_height": 66},
+        "sounds": {},
     }
+    return {name: Div(name=name, text="", width=2 * WIDTH, **own) for name, own in options.items()}
 
 
 def _players(result: ExploreResult) -> str:

@@ -113,11 +113,9 @@ class FixedFilters:
 
         With several loudspeakers, they are multiples of all ratings.
         """
-        own, given = self.correlations, 1.0 if self.several else rated_power
-        full = np.max(self.free.control_power / rated_power) if self.several else self.free.control_power
-        steps = CHANNEL_CURVE if self.several else CURVE
+        unit, given, steps = (rated_power, 1.0, CHANNEL_CURVE) if self.several else (1.0, rated_power, CURVE)
+        own, full = self.correlations, np.max(self.free.control_power / unit)
         powers = np.unique([*steps * full, *NEARLY_FULL * full, given, given / 2, given * 2])
-        unit = rated_power if self.several else 1.0
         removed = np.array([own.antinoise(weights_within(self.stretch, own, one * unit)[0]) for one in powers])
         microphones = len(np.atleast_2d(self.d))
         left = self.free.disturbance_power - removed / microphones

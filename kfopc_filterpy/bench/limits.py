@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
+from typing import Any, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
@@ -13,11 +13,9 @@ from kfopc_filterpy.metrics import overshoot, peak_control_signal
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating, OutputLimits, output_limits
 
 from .._types import NumberOrArray
+from ..power.amplifiers import Amplifier
 from ..power.ratings import Rating
-
-if TYPE_CHECKING:
-    from ..power.amplifiers import Amplifier
-    from .fixed_filters import FixedFilters
+from .fixed_filters import FixedFilters
 
 EXCURSION = "loudspeaker's excursion"
 SWEEPS = 3  # over the loudspeakers: what one gives up, others may take over
@@ -99,12 +97,10 @@ def _is_sequence(value: object) -> TypeGuard[Sequence[Any]]:
 def limits_of(ratings: Sequence[Sequence[Rating]], several: bool) -> Limits:
     """Return what ratings allow: `OutputLimits` with one channel, `ChannelLimits` with several."""
     each = tuple(output_limits(list(one)) for one in ratings)
-    return ChannelLimits(_with_one_window(each)) if several else each[0]
-
-
-def _with_one_window(each: Sequence[OutputLimits]) -> tuple[OutputLimits, ...]:
+    if not several:
+        return each[0]
     window = min(one.window_s for one in each)
-    return tuple(replace(one, window_s=window) for one in each)
+    return ChannelLimits(tuple(replace(one, window_s=window) for one in each))
 
 
 def each_of(limits: Limits) -> tuple[OutputLimits, ...]:
@@ -161,12 +157,7 @@ def share_taken(run: SimulationResult, limits: Limits) -> float:
 
 def with_excursion(limits: Limits, ratings: Sequence[Sequence[Rating]], bounds: FixedFilters) -> Limits:
     """Return limits with the largest rated powers at which the best filters keep the excursion of every loudspeaker."""
-    moving = [
-        (j, one)
-        for j, own in enumerate(ratings)
-        for one in own
-        if isinstance(one, LoudspeakerRating) and one.x_max_mm is not None
-    ]
+    moving = _moving(ratings)
     for _ in range(1 if len(ratings) == 1 else SWEEPS):
         before = limits
         for j, one in moving:
@@ -201,13 +192,14 @@ def _keeping(limits: Limits, j: int, rating: LoudspeakerRating, bounds: FixedFil
 def excursion_mm(ratings: Sequence[Sequence[Rating]], run: SimulationResult) -> float | None:
     """Return the largest excursion of a run, of any loudspeaker whose rating knows it."""
     played = np.atleast_2d(np.nan_to_num(run.amplifier_output))
-    moved = [
-        float(np.abs(one.displacement_mm(played[j], run.fs)).max())
-        for j, own in enumerate(ratings)
-        for one in own
-        if isinstance(one, LoudspeakerRating) and one.x_max_mm is not None
-    ]
+    moved = [float(np.abs(one.displacement_mm(played[j], run.fs)).max()) for j, one in _moving(ratings)]
     return max(moved, default=None)
+
+
+def _moving(ratings: Sequence[Sequence[Rating]]) -> list[tuple[int, LoudspeakerRating]]:
+    """Return the numbers of the loudspeakers whose largest excursion is known, with the ratings that state it."""
+    loudspeakers = [(j, one) for j, own in enumerate(ratings) for one in own if isinstance(one, LoudspeakerRating)]
+    return [(j, one) for j, one in loudspeakers if one.x_max_mm is not None]
 
 
 def watt_per_power(ratings: Sequence[Sequence[Rating]], several: bool) -> NumberOrArray | None:

@@ -24,7 +24,6 @@ FORMULAS = {
 }
 # Parameters by their names in results.json: symbol as TeX, "" if there is none, and meaning.
 PARAMETERS = {
-    "amplifier": ("", "amplifier"),
     "amplitude": ("", "amplitude of the reference"),
     "amplitude_limits": (r"A^2", "limits of the peak-limited algorithms, squared, over the amplifier's"),
     "averaging time in s": (r"T", "time over which the power is averaged in s"),
@@ -42,7 +41,6 @@ PARAMETERS = {
     "mu": (r"\mu", "step size"),
     "mu L E[x'^2]": (r"\mu L E[x'^2]", "step size, without units"),
     "n_taps": (r"L", "taps of the control filter"),
-    "noise": ("", "noise"),
     "nse_window_s": ("", "window of the normalised squared error (NSE) in s"),
     "penalty factor over G_s": (r"\beta / G_s", "penalty factor, without units"),
     "phase_accuracy_deg": ("", "accuracy of the phase in degrees"),

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from kfopc_filterpy.plot import curve_style
 
-from .study_report import OF_THE_PAPER, FigureItem, StudyReport, jsonable
+from .study_report import OF_THE_PAPER, Claim, FigureItem, StudyReport, jsonable
 
 # Words of a claim, and what a claim that has them is about.
 SUBJECTS = {
@@ -26,12 +25,8 @@ SUBJECTS = {
 GLANCE = "at-a-glance"
 
 
-@dataclass(frozen=True)
-class _Labelled:
-    text: str
-    holds: bool
-    subjects: frozenset[str]
-    conditions: frozenset[str]
+# A claim, and the conditions of its study.
+_Stated = tuple[Claim, Sequence[str]]
 
 
 def claims_sentence(studies: Sequence[StudyReport]) -> str:
@@ -60,19 +55,15 @@ def claims_sentence(studies: Sequence[StudyReport]) -> str:
     >>> claims_sentence([study("a", ["a tone"], kept, fast), study("b", ["noise"], over, fast, over)])
     '3 of the 5 claims of the paper were reproduced; both exceptions concern the output power, with noise.'
     """
-    kinds: dict[bool, list[_Labelled]] = {True: [], False: []}
+    kinds: dict[bool, list[_Stated]] = {True: [], False: []}
     for study in studies:
-        for claim in study.claims:
-            words = claim.text.lower()
-            subjects = frozenset(subject for word, subject in SUBJECTS.items() if word in words)
-            labelled = _Labelled(claim.text, bool(claim.holds), subjects, frozenset(study.conditions))
-            kinds[study.claims_heading == OF_THE_PAPER].append(labelled)
+        kinds[study.claims_heading == OF_THE_PAPER] += [(claim, study.conditions) for claim in study.claims]
     return " ".join(_sentence(claims, of_paper) for of_paper, claims in kinds.items() if claims)
 
 
-def _sentence(claims: list[_Labelled], of_paper: bool) -> str:
+def _sentence(claims: list[_Stated], of_paper: bool) -> str:
     what, done = ("claims of the paper", "reproduced") if of_paper else ("aims of the studies", "met")
-    exceptions = [claim for claim in claims if not claim.holds]
+    exceptions = [claim for claim, _ in claims if not claim.holds]
     if len(claims) == 1:
         return f"The one {what.replace('s of', ' of', 1)} was {'not ' if exceptions else ''}{done}."
     if not exceptions:
@@ -83,13 +74,13 @@ def _sentence(claims: list[_Labelled], of_paper: bool) -> str:
     return f"{held} of the {len(claims)} {what} {'was' if held == 1 else 'were'} {done}; {_exceptions(claims)}."
 
 
-def _exceptions(claims: list[_Labelled]) -> str:
+def _exceptions(claims: list[_Stated]) -> str:
     """Return what the exceptions, two at least, have in common; one is quoted."""
-    exceptions = [claim for claim in claims if not claim.holds]
+    exceptions = [claim for claim, _ in claims if not claim.holds]
     if len(exceptions) == 1:
         return f"the exception is “{exceptions[0].text}”"
-    subjects = _in_common([(claim.holds, claim.subjects) for claim in claims])
-    conditions = _in_common([(claim.holds, claim.conditions) for claim in claims])
+    subjects = _in_common([(claim.holds, _subjects(claim)) for claim, _ in claims])
+    conditions = _in_common([(claim.holds, set(of_study)) for claim, of_study in claims])
     if not subjects and not conditions:
         return f"the {len(exceptions)} exceptions have neither a subject nor a condition in common"
     most = max([*subjects.values(), *conditions.values()], key=len)  # the same exceptions for both
@@ -102,7 +93,12 @@ def _exceptions(claims: list[_Labelled]) -> str:
     return f"{whom} concern {about}" + (f", with {under}" if under else "")
 
 
-def _in_common(claims: Sequence[tuple[bool, frozenset[str]]]) -> dict[str, list[int]]:
+def _subjects(claim: Claim) -> set[str]:
+    words = claim.text.lower()
+    return {subject for word, subject in SUBJECTS.items() if word in words}
+
+
+def _in_common(claims: Sequence[tuple[bool, set[str]]]) -> dict[str, list[int]]:
     """Return the labels that most exceptions have, and claims that hold have less often, with these exceptions."""
     exceptions = [own for holds, own in claims if not holds]
     having = {

@@ -21,12 +21,10 @@ from .study_report import (
     Parameter,
     Sound,
     StudyReport,
-    cells,
-    columns,
-    figure_file,
+    file_of,
     jsonable,
     loudness,
-    sound_file,
+    merit_table,
 )
 
 TITLE = "Kalman filter with output power constraint"
@@ -81,7 +79,7 @@ def rendered(template: str, **values: Any) -> str:
 
 def images(study: StudyReport, folder: Path) -> list[dict[str, Any]]:
     """Return the figures of a study, whose files lie in `folder`, as they are inlined."""
-    return [_image(item, figure_file(folder, study, item)) for item in study.figures]
+    return [_image(item, file_of(folder, study, item)) for item in study.figures]
 
 
 def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> dict[str, Any]:
@@ -100,8 +98,8 @@ def _part(study: StudyReport, figures: list[dict[str, Any]], folder: Path) -> di
 
 def _merit(study: StudyReport) -> tuple[list[str], list[list[str]]]:
     """Return the headings and rows of the figures of merit, without the columns that say nothing."""
-    headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in columns(study)]
-    rows = [cells(study, figures) for figures in study.algorithms.values()]
+    columns, rows = merit_table(study)
+    headings = [heading.capitalize() + (f" ({unit})" if unit else "") for heading, unit in columns]
     kept = [i for i in range(len(headings)) if any(row[i] != "-" for row in rows)]
     shown = [
         [name, *("–" if row[i] == "-" else row[i] for i in kept)]
@@ -159,7 +157,7 @@ def players(study: StudyReport, folder: Path, first_heard: str = "KF-OPC") -> It
                 "label": sound.label,
                 "caveat": _caveat(sound, clipped),
                 "source": data_uri(flac(sound.excerpt(clipped / peak, study.fs), study.fs), "audio/flac"),
-                "file": sound_file(folder, study, sound).relative_to(folder).as_posix(),
+                "file": file_of(folder, study, sound).relative_to(folder).as_posix(),
             }
             for sound, (clipped, peak) in members
         ]

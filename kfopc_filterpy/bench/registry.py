@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -44,6 +45,7 @@ PRICE_GRID = tuple((10.0 ** np.arange(-2.0, 3.1, 0.5)).tolist())  # a finer grid
 PEAK_GRID = tuple((2.0 ** np.arange(-14.0, 4.1, 2.0)).tolist())
 
 Setting = float | tuple[float, float]
+Settings = Callable[[Scene, float, float], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,10 @@ class Algorithm:
     Parameters
     ----------
     make : callable
-        Function of a scene, the first setting in the scene's units, the second setting, and the amplifier known to the
-        disturbance estimate. It returns a fresh controller.
+        Controller's class, or a function that makes one: of the number of taps, the secondary path and keyword arguments.
+    settings : callable
+        Function of a scene, the first setting in the scene's units, and the second setting, which returns these keyword
+        arguments; those that all algorithms share are left out.
     symbol : str
         Parameter that the first setting sets: "r", "mu", "1 - lambda" or "averaging_s".
     kind : str
@@ -81,7 +85,8 @@ class Algorithm:
         Whether the studies of one channel, or of several channels, compare it.
     """
 
-    make: Callable[[Scene, float, float, Amplifier | Sequence[Amplifier] | None], Controller]
+    make: Callable[..., Controller]
+    settings: Settings
     symbol: str
     kind: str
     first: tuple[float, ...]
@@ -122,81 +127,41 @@ class Algorithm:
         return first / (scene.n_taps * scene.filtered_power) if self.symbol == "mu" else first
 
 
-def _constraint(scene: Scene) -> Any:
-    """Return the constraint of the scene, or one for each loudspeaker."""
-    if np.ndim(scene.rated_power):
-        return [OutputPowerConstraint(p, fs=scene.fs, memory_s=scene.power_memory_s) for p in scene.rated_power]
-    return OutputPowerConstraint(scene.rated_power, fs=scene.fs, memory_s=scene.power_memory_s)
+def _random_walk(scene: Scene, r: float, _: float) -> dict[str, Any]:
+    return {"state_noise": r, "measurement_noise": scene.measurement_noise, "initial_variance": scene.initial_variance}
 
 
-def _references(scene: Scene) -> dict[str, Any]:
-    """Return the number of references as a keyword argument if there are several channels, else none."""
-    return {"n_references": len(scene.references[0])} if scene.secondary.ndim == 3 else {}
+def _power_budget(scene: Scene, averaging_s: float, _: float) -> dict[str, Any]:
+    return {
+        "rated_power": scene.rated_power,
+        "secondary_path_uncertainty": scene.secondary_path_uncertainty,
+        "fs": scene.fs,
+        "averaging_s": averaging_s,
+    }
 
 
-def _kalman(make: Any, *, free: bool = False) -> Callable[..., Controller]:
-    """Return a function that makes Kalman filters: with a constraint, or `free` of one."""
-
-    def made(scene: Scene, r: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
-        settings: dict[str, Any] = {
-            "state_noise": r,
-            "measurement_noise": scene.measurement_noise,
-            "initial_variance": scene.initial_variance,
-            "amplifier": amplifier,
-            **_references(scene),
-        }
-        if not free:
-            settings |= {"constraint": _constraint(scene)}
-        return make(scene.n_taps, scene.known_secondary, **settings)
-
-    return made
+def _forgetting(scene: Scene, forgotten: float, _: float) -> dict[str, Any]:
+    return {"forgetting": 1.0 - forgotten, "initial_variance": scene.initial_variance / scene.measurement_noise}
 
 
-def _power_budget(
-    scene: Scene, averaging_s: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None
-) -> Controller:
-    return kf_pb(
-        scene.n_taps,
-        scene.known_secondary,
-        rated_power=scene.rated_power,
-        secondary_path_uncertainty=scene.secondary_path_uncertainty,
-        fs=scene.fs,
-        averaging_s=averaging_s,
-        amplifier=amplifier,
-        **_references(scene),
-    )
+def _step(scene: Scene, mu: float, _: float) -> dict[str, Any]:
+    return {"step_size": mu}
 
 
-def _rated(kind: Any, **more: Any) -> Callable[..., Controller]:
-    def made(scene: Scene, mu: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
-        own: dict[str, Any] = {"constraint": _constraint(scene), "amplifier": amplifier, **_references(scene), **more}
-        return kind(scene.n_taps, scene.known_secondary, step_size=mu, **own)
-
-    return made
-
-
-def _plain(kind: Any) -> Callable[..., Controller]:
-    return lambda scene, mu, _, amplifier: kind(scene.n_taps, scene.known_secondary, step_size=mu, **_references(scene))
-
-
-def _normalised(scene: Scene, mu: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
+def _normalised(scene: Scene, mu: float, _: float) -> dict[str, Any]:
     energy = scene.n_taps * scene.filtered_power  # mu compares with FxLMS; the ridge is for the start-up
-    settings: dict[str, Any] = {"step_size": mu * energy, "regularization": 0.01 * energy, **_references(scene)}
-    return FxNLMS(scene.n_taps, scene.known_secondary, **settings)
+    return {"step_size": mu * energy, "regularization": 0.01 * energy}
 
 
-def _leaky(scene: Scene, mu: float, price: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
-    leak = min(price * scene.filtered_power, 1.0 / mu)
-    return LeakyFxLMS(scene.n_taps, scene.known_secondary, step_size=mu, leak=leak, **_references(scene))
+def _leak(scene: Scene, mu: float, price: float) -> dict[str, Any]:
+    return {"step_size": mu, "leak": min(price * scene.filtered_power, 1.0 / mu)}
 
 
-def _mov_fixed(scene: Scene, mu: float, price: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
-    return _mov(scene, mu, price * scene.secondary_gain, amplifier, "MOV-FxLMS fixed")
+def _penalty(scene: Scene, mu: float, price: float) -> dict[str, Any]:
+    return {"step_size": mu, "penalty_factor": price * scene.secondary_gain}
 
 
-def _mov_by_variance(
-    scene: Scene, mu: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None
-) -> Controller:
+def _penalty_by_variance(scene: Scene, mu: float, _: float) -> dict[str, Any]:
     """Take the penalty from the variance of the whole disturbance, as the public code of its authors does.
 
     They use the secondary path's gain for the disturbance, from an inverse model of the path; here the gain is that of
@@ -204,45 +169,28 @@ def _mov_by_variance(
     """
     variance = float(np.var(scene.settled[1]))
     gamma = penalty_factor(scene.rated_power, disturbance_power=variance, secondary_path_gain=scene.secondary_gain)
-    return _mov(scene, mu, gamma, amplifier, "MOV-FxLMS by variance")
+    return {"step_size": mu, "penalty_factor": gamma}
 
 
-def _mov(
-    scene: Scene, mu: float, gamma: float, amplifier: Amplifier | Sequence[Amplifier] | None, name: str
-) -> Controller:
-    """Return an MOV-FxLMS with a fixed penalty, named differently from the one whose penalty follows the powers."""
-    controller = MOVFxLMS(
-        scene.n_taps,
-        scene.known_secondary,
-        step_size=mu,
-        constraint=_constraint(scene),
-        penalty_factor=gamma,
-        amplifier=amplifier,
-        **_references(scene),
-    )
-    controller.name = name
-    return controller
+def _peak(scene: Scene, mu: float, share: float) -> dict[str, Any]:
+    return {"step_size": mu, "amplitude_limit": np.sqrt(share * scene.unconstrained_power)}
 
 
-def _peak(kind: Any) -> Callable[..., Controller]:
-    def made(scene: Scene, mu: float, share: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
-        limit = np.sqrt(share * scene.unconstrained_power)
-        more: dict[str, Any] = {"output_step_size": mu * scene.secondary_gain} if kind is TwoGradientFxLMS else {}
-        return kind(
-            scene.n_taps, scene.known_secondary, step_size=mu, amplitude_limit=limit, **_references(scene), **more
-        )
-
-    return made
+def _two_gradients(scene: Scene, mu: float, share: float) -> dict[str, Any]:
+    return _peak(scene, mu, share) | {"output_step_size": mu * scene.secondary_gain}
 
 
-def _rls(scene: Scene, forgetting: float, _: float, amplifier: Amplifier | Sequence[Amplifier] | None) -> Controller:
-    return fx_rls(
-        scene.n_taps,
-        scene.known_secondary,
-        forgetting=1.0 - forgetting,
-        initial_variance=scene.initial_variance / scene.measurement_noise,
-        amplifier=cast("Amplifier | None", amplifier),
-    )
+def _constrained(settings: Settings) -> Settings:
+    """Return a function that adds the scene's constraint, or one for each loudspeaker, to `settings`."""
+
+    def constrained(scene: Scene, first: float, second: float) -> dict[str, Any]:
+        each = [
+            OutputPowerConstraint(power, fs=scene.fs, memory_s=scene.power_memory_s)
+            for power in np.ravel(scene.rated_power)
+        ]
+        return settings(scene, first, second) | {"constraint": each if np.ndim(scene.rated_power) else each[0]}
+
+    return constrained
 
 
 _RANDOM_WALK: dict[str, Any] = {
@@ -254,52 +202,39 @@ _RANDOM_WALK: dict[str, Any] = {
 _DIAGONAL = _RANDOM_WALK | {"first": DIAGONAL_GRID}
 _STEP: dict[str, Any] = {"symbol": "mu", "kind": "mu L E[x'^2]", "first": STEP_SIZE_GRID}
 _LEAST_FORGOTTEN: dict[str, Any] = {"symbol": "1 - lambda", "kind": "1 - lambda", "first": FORGETTING_GRID}
-_PEAK: dict[str, Any] = _STEP | {
-    "second_kind": "A^2 over the unconstrained power",
-    "second": PEAK_GRID,
-    "sees_budget": False,
+_LEAK = _STEP | {"second_kind": "leak over E[x'^2]", "second": PRICE_GRID, "sees_budget": False}
+_PENALTY = _STEP | {"second_kind": "penalty factor over G_s", "second": PRICE_GRID, "sees_budget": False}
+_PEAK = _STEP | {"second_kind": "A^2 over the unconstrained power", "second": PEAK_GRID, "sees_budget": False}
+_BUDGET: dict[str, Any] = {
+    "symbol": "averaging_s",
+    "kind": "averaging time in s",
+    "first": (DEFAULT_AVERAGING_S,),
+    "knows_amplifier": True,
 }
 _FREE: dict[str, Any] = {"keeps_budget": False, "sees_budget": False}
 _KNOWS: dict[str, Any] = {"knows_amplifier": True}
 _CHANNELS: dict[str, Any] = {"several_channels": True}
 REGISTRY: dict[str, Algorithm] = {
-    "KF-ANC": Algorithm(
-        _kalman(kf_anc, free=True), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE, **_CHANNELS
+    "KF-ANC": Algorithm(kf_anc, _random_walk, of_paper=True, shares_gains=True, **_RANDOM_WALK, **_FREE, **_CHANNELS),
+    "KF-OPC": Algorithm(
+        kf_opc, _constrained(_random_walk), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS
     ),
-    "KF-OPC": Algorithm(_kalman(kf_opc), of_paper=True, shares_gains=True, **_RANDOM_WALK, **_CHANNELS),
-    "KF-OPC repaired": Algorithm(_kalman(kf_opc_repaired), **_RANDOM_WALK),
-    "KF-PB": Algorithm(
-        _power_budget,
-        symbol="averaging_s",
-        kind="averaging time in s",
-        first=(DEFAULT_AVERAGING_S,),
-        **_KNOWS,
-        **_CHANNELS,
-    ),
-    "diagonal KF": Algorithm(_kalman(DiagonalKalman, free=True), **_DIAGONAL, **_FREE),
-    "diagonal KF-OPC": Algorithm(_kalman(DiagonalKalman), **_DIAGONAL),
-    "FxRLS": Algorithm(_rls, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
-    "FxLMS": Algorithm(_plain(FxLMS), of_paper=True, **_STEP, **_FREE, **_CHANNELS),
-    "FxNLMS": Algorithm(_normalised, **_STEP, **_FREE, **_CHANNELS),
-    "leaky FxLMS": Algorithm(
-        _leaky, **_STEP, second_kind="leak over E[x'^2]", second=PRICE_GRID, sees_budget=False, **_CHANNELS
-    ),
-    "optimal leaky FxLMS": Algorithm(_rated(OptimalLeakyFxLMS), **_STEP, **_KNOWS, **_CHANNELS),
-    "MOV-FxLMS fixed": Algorithm(
-        _mov_fixed,
-        **_STEP,
-        second_kind="penalty factor over G_s",
-        second=PRICE_GRID,
-        sees_budget=False,
-        **_KNOWS,
-        **_CHANNELS,
-    ),
-    "MOV-FxLMS by variance": Algorithm(_mov_by_variance, **_STEP, **_KNOWS),
-    "MOV-FxLMS": Algorithm(_rated(MOVFxLMS), of_paper=True, **_STEP, **_KNOWS, **_CHANNELS),
-    "MOV-MFxLMS": Algorithm(_rated(MOVFxLMS, modified=True), **_STEP, **_KNOWS, **_CHANNELS),
-    "two-gradient FxLMS": Algorithm(_peak(TwoGradientFxLMS), **_PEAK, **_CHANNELS),
-    "re-scaling FxLMS": Algorithm(_peak(RescalingFxLMS), **_PEAK, **_CHANNELS),
-    "clipping FxLMS": Algorithm(_peak(ClippingFxLMS), **_PEAK, **_CHANNELS),
+    "KF-OPC repaired": Algorithm(kf_opc_repaired, _constrained(_random_walk), **_RANDOM_WALK),
+    "KF-PB": Algorithm(kf_pb, _power_budget, **_BUDGET, **_CHANNELS),
+    "diagonal KF": Algorithm(DiagonalKalman, _random_walk, **_DIAGONAL, **_FREE),
+    "diagonal KF-OPC": Algorithm(DiagonalKalman, _constrained(_random_walk), **_DIAGONAL),
+    "FxRLS": Algorithm(fx_rls, _forgetting, may_refuse=True, **_LEAST_FORGOTTEN, **_FREE, **_KNOWS),
+    "FxLMS": Algorithm(FxLMS, _step, of_paper=True, **_STEP, **_FREE, **_CHANNELS),
+    "FxNLMS": Algorithm(FxNLMS, _normalised, **_STEP, **_FREE, **_CHANNELS),
+    "leaky FxLMS": Algorithm(LeakyFxLMS, _leak, **_LEAK, **_CHANNELS),
+    "optimal leaky FxLMS": Algorithm(OptimalLeakyFxLMS, _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
+    "MOV-FxLMS fixed": Algorithm(MOVFxLMS, _constrained(_penalty), **_PENALTY, **_KNOWS, **_CHANNELS),
+    "MOV-FxLMS by variance": Algorithm(MOVFxLMS, _constrained(_penalty_by_variance), **_STEP, **_KNOWS),
+    "MOV-FxLMS": Algorithm(MOVFxLMS, _constrained(_step), of_paper=True, **_STEP, **_KNOWS, **_CHANNELS),
+    "MOV-MFxLMS": Algorithm(partial(MOVFxLMS, modified=True), _constrained(_step), **_STEP, **_KNOWS, **_CHANNELS),
+    "two-gradient FxLMS": Algorithm(TwoGradientFxLMS, _two_gradients, **_PEAK, **_CHANNELS),
+    "re-scaling FxLMS": Algorithm(RescalingFxLMS, _peak, **_PEAK, **_CHANNELS),
+    "clipping FxLMS": Algorithm(ClippingFxLMS, _peak, **_PEAK, **_CHANNELS),
 }
 
 
@@ -365,7 +300,12 @@ def make_controller(
     if algorithm not in algorithms(several_channels=several):
         channels = "several channels" if several else "one channel"
         raise ValueError(f"{algorithm} is not compared with {channels}: see algorithms(several_channels={several})")
-    second = setting[1] if isinstance(setting, tuple) else np.nan
-    amplifier = scene.known_amplifier if amplifier is None else amplifier
-    own = REGISTRY[algorithm]
-    return own.make(scene, own.value(scene, setting), second, amplifier)
+    own, second = REGISTRY[algorithm], setting[1] if isinstance(setting, tuple) else np.nan
+    settings = own.settings(scene, own.value(scene, setting), second)
+    if own.knows_amplifier:
+        settings["amplifier"] = scene.known_amplifier if amplifier is None else amplifier
+    if several:
+        settings["n_references"] = len(scene.references[0])
+    controller: Any = own.make(scene.n_taps, scene.known_secondary, **settings)
+    controller.name = algorithm  # the registry tells apart what one class does with different settings
+    return controller

@@ -16,36 +16,7 @@ from kfopc_filterpy.signals import write_wav
 
 from .opening import claims_sentence, glance
 from .page import page
-from .study_report import (
-    FIGURES_OF_MERIT,
-    Claim,
-    FigureItem,
-    Parameter,
-    Sound,
-    StudyReport,
-    Table,
-    cells,
-    columns,
-    figure_file,
-    loudness,
-    require_different,
-    sound_file,
-    table_file,
-)
-
-__all__ = [
-    "FIGURES_OF_MERIT",
-    "Claim",
-    "FigureItem",
-    "Parameter",
-    "Sound",
-    "StudyReport",
-    "Table",
-    "prepare_folder",
-    "results_table",
-    "write_report",
-    "write_whole",
-]
+from .study_report import StudyReport, Table, file_of, loudness, merit_table, require_different
 
 SCREEN_ROWS = 30  # of a table that fits a screen, with the claims above it
 
@@ -139,12 +110,12 @@ def write_files(study: StudyReport, path: Path) -> None:
     for kind in ("figures", "audio"):
         prepare_folder(path / kind)
     for item in study.figures:
-        save_figure(item.figure, figure_file(path, study, item))
+        save_figure(item.figure, file_of(path, study, item))
     for sound, (clipped, peak) in zip(study.sounds, loudness(study), strict=True):
-        write_wav(sound_file(path, study, sound), clipped, study.fs, peak=peak)
+        write_wav(file_of(path, study, sound), clipped, study.fs, peak=peak)
     for table in study.tables:
         prepare_folder(path / "tables")
-        _write_csv(table_file(path, study, table), table)
+        _write_csv(file_of(path, study, table), table)
 
 
 def results_table(studies: Sequence[StudyReport]) -> str:
@@ -183,17 +154,18 @@ def results_table(studies: Sequence[StudyReport]) -> str:
     lines = []
     for study in studies:
         lines.append(f"{study.name}: {study.title} (rated power {study.rating})")
-        rows = [list(head) for head in zip(*columns(study), strict=True)]
-        rows += [cells(study, figures) for figures in study.algorithms.values()]
-        names = ["", "", *study.algorithms]
         if study.algorithms:
-            lines += _columns([[name, *row] for name, row in zip(names, rows, strict=True)], {0})
+            columns, rows = merit_table(study)
+            heads = [["", *head] for head in zip(*columns, strict=True)]
+            named = [[name, *row] for name, row in zip(study.algorithms, rows, strict=True)]
+            lines += _columns([*heads, *named], {0})
         for claim in study.claims:
             mark = study.marks[0 if claim.holds else 1].upper()
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
         for table in _on_a_screen(study):
-            lines += ["", *textwrap.wrap(table.caption, 116), *_aligned(table)]
+            left = set(range(len(table.headings))) - table.numbers
+            lines += ["", *textwrap.wrap(table.caption, 116), *_columns([table.headings, *table.cells], left)]
         lines.append("")
     return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
 
@@ -204,11 +176,6 @@ def _on_a_screen(study: StudyReport) -> list[Table]:
     if not study.claims:
         return fitting
     return [] if study.algorithms else fitting[:1]
-
-
-def _aligned(table: Table) -> list[str]:
-    """Return the lines of a table for a terminal."""
-    return _columns([list(table.headings), *table.cells], set(range(len(table.headings))) - table.numbers)
 
 
 def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -31,7 +31,7 @@ from kfopc_filterpy.bounds import (
     wiener_solution,
 )
 from kfopc_filterpy.bounds.channel_bound import full_channel_stretch
-from kfopc_filterpy.controllers import CoreController
+from kfopc_filterpy.controllers import Controller, CoreController
 from kfopc_filterpy.loop.inputs import channel_disturbances
 from kfopc_filterpy.metrics import peak_control_signal
 from kfopc_filterpy.paths import path_taps
@@ -39,9 +39,6 @@ from kfopc_filterpy.paths.path_matrix import is_path_matrix, secondary_paths
 from kfopc_filterpy.power.amplifiers import Amplifier
 
 from .._types import Counter, NumberOrArray, PathModels
-
-if TYPE_CHECKING:
-    from ..controllers.base import Controller
 
 SENSOR_NOISE_SEED = 1000  # added to the noise's seed
 CHANNEL_RIDGE = 1e-6  # over the filtered power: directions with less energy need weights that no controller reaches
@@ -218,9 +215,7 @@ class Scene:
 
     def run(self, controller: Controller, seed_index: int = 0, **options: Any) -> SimulationResult:
         """Run a `controller` on the noise of one seed, of index `seed_index`; `options` go to `simulate`."""
-        return simulate(
-            controller, self.references[seed_index], amplifier=self.amplifier, **self._options(seed_index), **options
-        )
+        return simulate(controller, self.references[seed_index], **self._options(seed_index) | options)
 
     def run_together(
         self, controllers: Sequence[CoreController], seed_index: int = 0, **options: Any
@@ -229,8 +224,7 @@ class Scene:
 
         `options` go to `simulate_scenarios`.
         """
-        options = {"amplifier": self.amplifier} | self._options(seed_index) | options
-        return simulate_scenarios(controllers, self.references[seed_index], **options)
+        return simulate_scenarios(controllers, self.references[seed_index], **self._options(seed_index) | options)
 
     def _options(self, seed_index: int) -> dict[str, Any]:
         return {
@@ -238,6 +232,7 @@ class Scene:
             "secondary_path": self.secondary,
             "fs": self.fs,
             "rated_power": self.rated_power,
+            "amplifier": self.amplifier,
             "sensor_noise_std": self.sensor_noise_std,
             "rng": self.sensor_noise_seeds[seed_index],
             "switch_on_s": self.switch_on_s,

@@ -147,11 +147,8 @@ class FigureItem:
             text for ax in self.figure.axes for text in ax.get_legend_handles_labels()[1] if not text.startswith("_")
         )
         drawn = dict.fromkeys(filter(None, (_axes_in_words(ax, self.figure.axes) for ax in self.figure.axes)))
-        return (
-            _plain("Plot of " + "; ".join(drawn) + (f". Curves: {'; '.join(names)}." if names else "."))
-            if drawn
-            else ""
-        )
+        curves = f". Curves: {'; '.join(names)}." if names else "."
+        return _plain(f"Plot of {'; '.join(drawn)}{curves}") if drawn else ""
 
 
 def _axes_in_words(ax: Axes, others: Sequence[Axes]) -> str:
@@ -329,52 +326,34 @@ def jsonable(value: object, where: str = "value") -> Any:
     raise TypeError(f"{where} must hold numbers, text, arrays, lists or mappings, got {type(value).__name__}")
 
 
-def columns(study: StudyReport) -> list[tuple[str, str]]:
-    """Return the headings and units of the table of figures of merit."""
-    return [
-        ("noise reduction", "dB"),
-        ("output power", "" if study.watt_per_power is None else "W"),
-        ("of rated power", "times"),
-        ("peak control signal", ""),
-        ("clipped", "%"),
-        ("harmonics", "dB"),
-        ("converged", "s"),
-        ("diverged", "s"),
+def merit_table(study: StudyReport) -> tuple[list[tuple[str, str]], list[list[str]]]:
+    """Return the headings and units of the figures of merit, and the cells of each algorithm, "-" if there is no figure."""
+    watt = study.watt_per_power
+    columns = [
+        ("noise reduction", "dB", "noise_reduction_db", ".1f", 1.0),
+        ("output power", "" if watt is None else "W", "output_power", ".5g", watt or 1.0),
+        ("of rated power", "times", "output_power", ".4g", 1 / study.rated_power),
+        ("peak control signal", "", "peak_control_signal", ".4g", 1.0),
+        ("clipped", "%", "clipped_fraction", ".2f", 100.0),
+        ("harmonics", "dB", "harmonics_db", ".1f", 1.0),
+        ("converged", "s", "convergence_time_s", ".4g", 1.0),
+        ("diverged", "s", "diverged_at_s", ".4g", 1.0),
     ]
 
-
-def cells(study: StudyReport, figures: Mapping[str, float | None]) -> list[str]:
-    """Return the figures of merit of one of a study's algorithms as the table's cells, "-" if there is none."""
-
-    def cell(key: str, form: str, scale: float = 1.0) -> str:
-        value = jsonable(figures.get(key))
+    def cell(value: float | None, form: str, scale: float) -> str:
         return "-" if value is None else f"{value * scale:{form}}"
 
-    return [
-        cell("noise_reduction_db", ".1f"),
-        cell("output_power", ".5g", study.watt_per_power or 1.0),
-        cell("output_power", ".4g", 1 / study.rated_power),
-        cell("peak_control_signal", ".4g"),
-        cell("clipped_fraction", ".2f", 100.0),
-        cell("harmonics_db", ".1f"),
-        cell("convergence_time_s", ".4g"),
-        cell("diverged_at_s", ".4g"),
+    rows = [
+        [cell(jsonable(figures.get(key)), form, scale) for _, _, key, form, scale in columns]
+        for figures in study.algorithms.values()
     ]
+    return [(heading, unit) for heading, unit, *_ in columns], rows
 
 
-def figure_file(folder: Path, study: StudyReport, item: FigureItem) -> Path:
-    """Return the path of a figure, without its suffix."""
-    return folder / "figures" / f"{study.name}-{item.stem}"
-
-
-def table_file(folder: Path, study: StudyReport, table: Table) -> Path:
-    """Return the path of a table."""
-    return folder / "tables" / f"{study.name}-{table.stem}.csv"
-
-
-def sound_file(folder: Path, study: StudyReport, sound: Sound) -> Path:
-    """Return the path of a sound."""
-    return folder / "audio" / f"{study.name}-{sound.stem}.wav"
+def file_of(folder: Path, study: StudyReport, item: FigureItem | Sound | Table) -> Path:
+    """Return the path of a sound, of a table, or of a figure, that one without its suffix."""
+    kind, suffix = {FigureItem: ("figures", ""), Sound: ("audio", ".wav"), Table: ("tables", ".csv")}[type(item)]
+    return folder / kind / f"{study.name}-{item.stem}{suffix}"
 
 
 def loudness(study: StudyReport) -> list[tuple[np.ndarray, float]]:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy.controllers import Controller
 
 from .registry import REGISTRY, Setting, make_controller
 from .scene import Outcome, Runs, Scene
-
-if TYPE_CHECKING:
-    from ..controllers.base import Controller
 
 BUDGET = 1.02  # a constrained method keeps its budget if its power is at most this multiple of the rated power
 RULE = (

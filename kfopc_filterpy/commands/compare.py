@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING
 
 from .._validate import as_choice
 from .inputs import Files, ratings_of, scene_of
-from .options import DONE, add_command, add_count, add_number, add_output, add_recorded_scene
+from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene
 from .printing import progress_bar, tell
-
-if TYPE_CHECKING:
-    from ..commands.options import Parser
 
 EXAMPLES = """example:
   kfopc compare noise.wav --primary P.wav --secondary S.wav --watt 20 --ohm 8 --algorithm KF-PB,KF-OPC,FxLMS -o out"""

@@ -6,13 +6,9 @@ import argparse
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from .options import DONE, add_command
+from .options import DONE, Parser, add_command
 from .printing import warn
-
-if TYPE_CHECKING:
-    from ..commands.options import Parser
 
 EXAMPLES = """examples:
   kfopc data list

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
-from .options import DONE, add_command, add_count, add_number
-
-if TYPE_CHECKING:
-    from ..commands.options import Parser
+from .options import DONE, Parser, add_command, add_count, add_number
 
 EXAMPLES = """examples:
   kfopc explore

@@ -6,16 +6,13 @@ import argparse
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from .inputs import Files
-from .options import DONE, add_command, add_count, add_reading, sentence
+from .options import DONE, Parser, add_command, add_count, add_reading, sentence
 from .printing import warn
-
-if TYPE_CHECKING:
-    from ..commands.options import Parser
 
 WRITTEN = (".wav", ".npy", ".csv", ".txt")
 UNRELATED, CHANCE = 0.02, 3.0  # a path must explain this share of a response, and this many times what chance explains

@@ -12,11 +12,10 @@ import numpy as np
 
 from .._validate import as_nonnegative
 from .inputs import Files, scene_of
-from .options import DONE, add_command, add_count, add_number, add_scene
+from .options import DONE, Parser, add_command, add_count, add_number, add_scene
 from .printing import warn
 
 if TYPE_CHECKING:
-    from ..commands.options import Parser
     from ..realtime import Interface, RunReport, RunStatus, SimulatedInterface
 
 FAULT = 1

@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from .._validate import as_choice, as_nonnegative, as_number
 from .inputs import Files, calibration_of, ratings_of, scene_of, uncertainty_of
-from .options import DONE, add_command, add_count, add_number, add_output, add_recorded_scene
+from .options import DONE, Parser, add_command, add_count, add_number, add_output, add_recorded_scene
 from .printing import progress_bar, tell
-
-if TYPE_CHECKING:
-    from ..commands.options import Parser
 
 NOT_ENOUGH = 1
 

@@ -34,13 +34,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def _named(paths: Any) -> dict[str, Any]:
-    """Return paths by name; a single one is called "path"."""
+def _named(paths: Any, single: str = "path") -> dict[str, Any]:
+    """Return paths, or what belongs to paths, by name; a `single` one is called so."""
     if isinstance(paths, Mapping):
         if not paths:
             raise ValueError("paths must name at least one path, got an empty mapping")
         return dict(paths)
-    return {"path": paths}
+    return {single: paths}
 
 
 def _grid(frequencies_hz: Any, paths: Mapping[str, Any], fs: float | None) -> np.ndarray:
@@ -167,8 +167,7 @@ def plot_impulse_responses(
     ax.set(xlabel="Time (ms)", ylabel="Impulse response")
     ax.margins(x=0)
     ax.grid(True, alpha=0.3)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_group_delay(
@@ -216,8 +215,7 @@ def plot_group_delay(
         ax.plot(frequencies, 1e3 * delay, label=label, **line_style(i))
     ax.set_ylabel("Group delay (ms)")
     frequency_axis(ax, frequencies)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_causality_margin(
@@ -375,8 +373,7 @@ def plot_secondary_path_gain(
         ax.axvspan(*ends, color=line_style(1)["color"], alpha=0.08, linewidth=0, label="Band of the white noise")
     level_axis(ax, [power], "Power gain (dB)")
     frequency_axis(ax, frequencies)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_phase_error(
@@ -424,10 +421,9 @@ def plot_phase_error(
     >>> plt.close(ax.figure)
     """
     frequencies = _grid(frequencies_hz, {"path": path}, fs)
-    named = estimates if isinstance(estimates, Mapping) else {"Estimate": estimates}
     silent = ~audible(frequency_response(path, frequencies, fs=fs))
     ax = new_axes(ax)
-    for i, (label, estimate) in enumerate(_named(named).items()):
+    for i, (label, estimate) in enumerate(_named(estimates, "Estimate").items()):
         error = phase_error(path, estimate, frequencies, fs=fs).error_deg
         # Break the curve where it wraps from 180 to -180 degrees, and where the path is silent.
         wrapped = np.append(np.abs(np.diff(error)) > 180, False)
@@ -439,8 +435,7 @@ def plot_phase_error(
     ax.set_ylim(-180, 180)
     phase_axis(ax, "Phase error (degrees)")
     frequency_axis(ax, frequencies)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_required_rated_power(
@@ -502,8 +497,7 @@ def plot_required_rated_power(
     ax.set(xlabel="Noise reduction (dB)", ylabel="Rated power needed (mean square)")
     ax.set_xlim(0, 1.05 * shown)
     ax.grid(True, which="major", alpha=0.3)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_modelling_error(
@@ -539,9 +533,9 @@ def plot_modelling_error(
     'Modelling error (dB)'
     >>> plt.close(ax.figure)
     """
-    named = results if isinstance(results, Mapping) else {"Estimate": results}
+    named = _named(results, "Estimate")
     ax = new_axes(ax)
-    for i, (label, result) in enumerate(_named(named).items()):
+    for i, (label, result) in enumerate(named.items()):
         if not isinstance(result, IdentificationResult):
             raise TypeError(f"results must hold IdentificationResult, got {type(result).__name__} for {label!r}")
         overall = np.ravel(result.misalignment_db)
@@ -553,5 +547,4 @@ def plot_modelling_error(
             ax.plot(result.frequencies_hz, error, label=None if n else text, **line_style(i))
     ax.set_ylabel("Modelling error (dB)")
     frequency_axis(ax, np.concatenate([result.frequencies_hz for result in named.values()]))
-    legend_above(ax)
-    return ax
+    return legend_above(ax)

@@ -28,14 +28,12 @@ from numpy.typing import ArrayLike
 
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, as_signal
 from ..metrics import nse_db, short_time_power
-from .results import DISTURBANCE, RATED, Curve, curves, named_styles, one_channel, thinned
+from .results import DISTURBANCE, RATED, Curve, Results, curves, named_styles, one_channel, thinned
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from ..plot.results import Results
 
 
 def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax: Axes | None = None) -> Axes:
@@ -98,10 +96,7 @@ def plot_weight_history(results: Results, *, tap: int | tuple[int, int, int], ax
     smallest = min((peak for peak in peaks if peak > 0), default=0.0)
     if max(peaks) > 100 * smallest:
         ax.set_yscale("symlog", linthresh=smallest)
-    _whole_time_axis(ax, shown)
-    ax.set_ylabel(f"Weight {tap} of the control filter")
-    legend_above(ax)
-    return ax
+    return _over_time(ax, shown, f"Weight {tap} of the control filter")
 
 
 def plot_nse(
@@ -171,12 +166,10 @@ def plot_nse(
             rows = np.unique(np.geomspace(1, nse.size, 2000).astype(int)) - 1
         curve.draw(ax, (rows + 1) / curve.run.fs, nse[rows], i)
     ax.axhline(0.0, color=DISTURBANCE["color"], linewidth=1.0, zorder=1.5)
-    _whole_time_axis(ax, shown)
+    _over_time(ax, shown, f"Normalised squared error (dB)\nover {_window_in_words(window_s)}")
     if scale == "log":
         ax.set_xscale("log")
         ax.set_xlim(left=window_s / 5)  # before the first sound has come through the paths
-    ax.set_ylabel(f"Normalised squared error (dB)\nover {_window_in_words(window_s)}")
-    legend_above(ax)
     return ax
 
 
@@ -266,10 +259,8 @@ def plot_output_power(
         ax.set_ylim(min(rated[0], highest) / 10, 2 * max(rated[-1], highest))
     else:
         ax.set_ylim(0, 1.08 * max([highest, *rated]) or 1.0)
-    _whole_time_axis(ax, shown)
-    ax.set_ylabel(f"Output power ({unit.strip() or 'mean square'})\nover {_window_in_words(window_s)}")
-    legend_above(ax)
-    return ax
+    quantity = f"Output power ({unit.strip() or 'mean square'})"
+    return _over_time(ax, shown, f"{quantity}\nover {_window_in_words(window_s)}")
 
 
 def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: Axes | None = None) -> Axes:
@@ -317,10 +308,7 @@ def plot_constraint_factor(results: Results, *, channel: int | None = None, ax: 
         rows = thinned(curve.run.n_samples)
         curve.draw(ax, (rows + 1) / curve.run.fs, factor[..., rows], i)
     ax.set_ylim(0, 1.05)
-    _whole_time_axis(ax, shown)
-    ax.set_ylabel("Constraint factor α")
-    legend_above(ax)
-    return ax
+    return _over_time(ax, shown, "Constraint factor α")
 
 
 def plot_noise_reduction_against_overdrive(
@@ -379,11 +367,9 @@ def plot_noise_reduction_against_overdrive(
         ax.axvline(flip, **RATED)
     if flips:
         ax.get_lines()[-1].set_label(f"Order flips at {', '.join(f'{flip:.1f}' for flip in flips)} dB")
-    ax.set_xlabel("Overdrive (dB)")
-    ax.set_ylabel("Noise reduction (dB)")
+    ax.set(xlabel="Overdrive (dB)", ylabel="Noise reduction (dB)")
     ax.grid(True, alpha=0.3)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def save_figure(figure: Figure, path_without_suffix: str | os.PathLike[str]) -> tuple[Path, Path]:
@@ -435,7 +421,9 @@ def _window_in_words(window_s: float) -> str:
     return f"{window_s:g} s" if window_s >= 1 else f"{1e3 * window_s:g} ms"
 
 
-def _whole_time_axis(ax: Axes, shown: list[Curve]) -> None:
+def _over_time(ax: Axes, shown: list[Curve], label: str) -> Axes:
+    """Label axes with a quantity over the time of whole runs, and return them."""
     ax.set_xlim(0, max(curve.run.n_samples / curve.run.fs for curve in shown))
-    ax.set_xlabel("Time (s)")
+    ax.set(xlabel="Time (s)", ylabel=label)
     ax.grid(True, alpha=0.3)
+    return legend_above(ax)

@@ -11,15 +11,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_band, as_positive, per_channel
+from ..loop.result import SimulationResult
 from ..metrics import SOUND_PRESSURE, coherence_and_gain, output_power, power_spectrum_db
-from .results import DISTURBANCE, RATED, curves, one_channel, require_common_disturbance, span_axis, span_of, times
+from .results import (
+    DISTURBANCE,
+    RATED,
+    Results,
+    curves,
+    one_channel,
+    require_common_disturbance,
+    span_axis,
+    span_of,
+    times,
+)
 from .style import legend_above, new_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from ..loop.result import SimulationResult
-    from ..plot.results import Results
 
 _DEPTH_DB = 120.0  # largest range of a spectrum's axis: numerical floors beneath would take all the room
 _VISIBLE = 0.005  # difference of waveforms, over their peak, that a line's width does not hide
@@ -108,8 +117,7 @@ def plot_error_spectra(
     ax.set_xlabel("Frequency (Hz)")
     ax.set_ylabel(f"Power per Hz (dB re {unit}/Hz)" if scaling == "density" else f"Power (dB re {unit})")
     ax.grid(True, alpha=0.3)
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def _over_20_micropascal(pascal_per_unit: Any, run: SimulationResult, channel: int | None) -> np.ndarray:
@@ -168,8 +176,7 @@ def plot_anti_noise(
     for curve, wave in zip(shown, waves, strict=True):
         ax.plot(time, wave[part], **curve.line())
     ax.set_ylabel("Sound at the error microphone")
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_amplifier_output(
@@ -241,8 +248,7 @@ def plot_amplifier_output(
     if top > 0:
         ax.set_ylim(-top, top)
     ax.set_ylabel("Amplifier output")
-    legend_above(ax)
-    return ax
+    return legend_above(ax)
 
 
 def plot_disturbance_and_anti_noise(
@@ -293,8 +299,6 @@ def plot_disturbance_and_anti_noise(
     'Anti-noise over disturbance, 200 to 2000 Hz: coherence 1.0000, gain 1.000'
     >>> plt.close(ax.figure)
     """
-    from matplotlib.font_manager import FontProperties
-
     shown = curves(result, single=True)
     if len(shown) > 1:
         raise ValueError(f"result must be one run, got {len(shown)}")
@@ -315,11 +319,7 @@ def plot_disturbance_and_anti_noise(
     line = shown[0].line()
     ax.plot(time, anti_noise[part], **{**line, "label": f"Anti-noise, {line['label']}"})
     ax.set_ylabel("Sound at the error microphone")
-    legend_above(ax)
-    legend = ax.get_legend()
-    assert legend is not None
-    legend.set_title(text, prop=FontProperties(size="small"))
-    return ax
+    return legend_above(ax, text)
 
 
 def _listed(powers: Any, form: str) -> str:

@@ -114,13 +114,15 @@ def phase_axis(ax: Axes, label: str) -> None:
     ax.set_ylabel(label)
 
 
-def legend_above(ax: Axes) -> None:
-    """Draw the legend above the axes, where it covers no curve."""
+def legend_above(ax: Axes, title: str | None = None) -> Axes:
+    """Draw the legend above the axes, where it covers no curve, and return the axes."""
     labels = ax.get_legend_handles_labels()[1]
     # One row where it fits the width, for a longer one would squeeze the axes.
     width = sum(len(label) + 6 for label in labels)
     columns = len(labels) if width <= 75 else 2
-    ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False, fontsize="small")
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": columns}
+    ax.legend(**place, frameon=False, fontsize="small", title=title, title_fontsize="small")
+    return ax
 
 
 def level_axis(ax: Axes, powers: list[np.ndarray], label: str) -> None:

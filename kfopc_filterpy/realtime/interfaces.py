@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 from scipy.signal import lfilter
 
 from .._types import PathModels, Seed
-from .._validate import as_channels, as_choice, as_count, as_generator, as_nonnegative, as_positive
+from .._validate import as_channels, as_choice, as_count, as_positive
 from ..controllers.channel_samples import amplifier_functions
-from ..paths.models import path_taps
-from ..paths.path_matrix import is_path_matrix, path_matrix, primary_paths, secondary_paths
+from ..loop.inputs import SensorNoise, channel_disturbances
+from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
 
 
 class Block(NamedTuple):
@@ -151,47 +151,31 @@ class SimulatedInterface:
         if self.latency < self.block:
             raise ValueError(f"latency must be at least a block, {self.block} samples, got {self.latency}")
         self.clock = as_choice(clock, "clock", ("free", "real"))
-        self._noise_std = as_nonnegative(sensor_noise_std, "sensor_noise_std")
-        self._rng = as_generator(rng) if self._noise_std > 0 else None
+        self._sensor_noise = SensorNoise(sensor_noise_std, rng)
         self._x = np.atleast_2d(as_channels(reference, "reference"))
-        several = is_path_matrix(secondary_path)
-        secondary = _matrix(secondary_path, several, self.fs, "secondary_path", secondary_paths)
+        secondary, _ = secondary_paths(secondary_path, fs=self.fs)
         self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         self.n_references = len(self._x)
         zeros = np.zeros((*secondary.shape[:2], self.latency))
         total = np.concatenate((zeros, secondary), axis=2)
-        self.total_secondary_path = total if several else total[0, 0]
-        self.disturbance = self._disturbances(primary_path, disturbance)
+        self.total_secondary_path = total if is_path_matrix(secondary_path) else total[0, 0]
+        if (primary_path is None) == (disturbance is None):
+            raise ValueError("give exactly one of primary_path= and disturbance=")
+        self.disturbance = channel_disturbances(self._x, primary_path, disturbance, self.fs, self.n_microphones)
         self._amplifiers = amplifier_functions(amplifier, self.n_loudspeakers)
         self._secondary = _Paths(secondary)
-        feedback = None
+        self._feedback = None
         if feedback_path is not None:
-            feedback = _matrix(feedback_path, several or self.n_references > 1, self.fs, "feedback_path", path_matrix)
+            feedback, _ = path_matrix(feedback_path, fs=self.fs, name="feedback_path")
             if feedback.shape[:2] != (self.n_references, self.n_loudspeakers):
                 raise ValueError(
                     f"feedback_path must lead from the {self.n_loudspeakers} loudspeakers to the {self.n_references} "
                     f"references, got paths {feedback.shape}"
                 )
-        self._feedback = None if feedback is None else _Paths(feedback)
+            self._feedback = _Paths(feedback)
         self._queue = np.zeros((self.n_loudspeakers, self.latency))  # written, not yet played
         self._done, self._began = 0, 0.0
         self.blocks_can_repeat = False  # simulated noise may be exactly periodic
-
-    def _disturbances(self, primary_path: Any, disturbance: Any) -> np.ndarray:
-        if (primary_path is None) == (disturbance is None):
-            raise ValueError("give exactly one of primary_path= and disturbance=")
-        if disturbance is not None:
-            d = np.atleast_2d(as_channels(disturbance, "disturbance"))
-            if d.shape != (self.n_microphones, self._x.shape[1]):
-                raise ValueError(f"disturbance must be {(self.n_microphones, self._x.shape[1])}, got {d.shape}")
-            return d
-        primary = _matrix(primary_path, is_path_matrix(primary_path), self.fs, "primary_path", primary_paths)
-        if primary.shape[:2] != (self.n_microphones, self.n_references):
-            raise ValueError(
-                f"primary_path must lead from the {self.n_references} references to the {self.n_microphones} "
-                f"microphones, got paths {primary.shape}"
-            )
-        return _Paths(primary)(self._x)
 
     @property
     def n_samples(self) -> int:
@@ -224,8 +208,7 @@ class SimulatedInterface:
         if self._amplifiers is not None:
             y = np.array([amplifier(signal) for amplifier, signal in zip(self._amplifiers, y, strict=True)])
         e = self.disturbance[:, now] - self._secondary(y)
-        if self._rng is not None:
-            e += self._noise_std * self._rng.standard_normal(e.shape)
+        e += self._sensor_noise.take(*e.shape)
         x = self._x[:, now] + (0.0 if self._feedback is None else self._feedback(y))
         self._queue = np.concatenate((self._queue[:, self.block :], np.zeros((len(y), self.block))), axis=1)
         self._done = now.stop
@@ -256,12 +239,3 @@ class _Paths:
                 y, self._states[k, j] = lfilter(taps, [1.0], signals[j], zi=self._states[k, j])
                 outputs[k] += y
         return outputs
-
-
-def _matrix(path: Any, several: bool, fs: float, name: str, read: Callable[..., Any]) -> np.ndarray:
-    """Return paths (outputs, inputs, taps) of a matrix, or of one path."""
-    if several:
-        options = {"name": name} if read is path_matrix else {}
-        taps: np.ndarray = read(path, fs=fs, **options)[0]
-        return taps
-    return path_taps(path, fs=fs, name=name)[np.newaxis, np.newaxis]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -310,23 +311,36 @@ def measure_round_trip(
     n = round(as_positive(seconds, "seconds", unit="s") * interface.fs) + longest
     if n < 2 * longest:
         raise ValueError(f"seconds must be at least longest / fs, {longest / interface.fs:.3g} s, got {seconds:g} s")
-    noise = level * as_generator(rng).standard_normal(n)
-    interface.start()
-    try:
+    noises = np.tile(level * as_generator(rng).standard_normal(n), (interface.n_loudspeakers, 1))
+    with _open(interface):
         session = _Session(interface)
-        arrivals = []
         with session.without_gaps("the round trip was measured"):
-            for j in range(interface.n_loudspeakers):
-                signal = np.zeros((interface.n_loudspeakers, n))
-                signal[j] = noise
-                heard = session.play(signal)
-                arrivals += [_arrival(heard.y[j], e, longest) for e in heard.e]
-    finally:
-        interface.stop()
+            recordings = _recorded(session, noises)
+    return _round_trip(recordings, longest, "the level")
+
+
+def _recorded(session: _Session, noises: np.ndarray, rest: int = 0) -> list[_Heard]:
+    """Play noises (J, n), one from each loudspeaker in turn, and return what was heard meanwhile.
+
+    After each, `rest` samples of silence let it die away.
+    """
+    recordings = []
+    for j, noise in enumerate(noises):
+        signal = np.zeros_like(noises)
+        signal[j] = noise
+        recordings.append(session.play(signal))
+        if rest:
+            session.play(np.zeros((len(noises), rest)))
+    return recordings
+
+
+def _round_trip(recordings: list[_Heard], longest: int, what: str) -> int:
+    """Return the first lag at which a loudspeaker is heard; `what` to raise if none is."""
+    arrivals = [_arrival(own.y[j], e, longest) for j, own in enumerate(recordings) for e in own.e]
     clear = [arrival for arrival in arrivals if arrival is not None]
     if not clear:
         raise FaultError(
-            "no loudspeaker is heard by any error microphone: check the cables and the channels, or raise the level"
+            f"no loudspeaker is heard by any error microphone: check the cables and the channels, or raise {what}"
         )
     return min(clear)
 
@@ -453,13 +467,11 @@ def run(
             identified = _identified(session, silence, level, limits, identify_s, n_path, as_generator(rng))
     made = controller if isinstance(controller, Controller) else controller(identified)  # type: ignore[arg-type]
 
-    def supervised(controller: Any) -> Supervisor:
-        known = {"full_scale": None, "blocks_can_repeat": True}
-        settings: dict[str, Any] = {
-            name: getattr(interface, name, value) for name, value in known.items()
-        } | supervision
-        return Supervisor(controller, fs=interface.fs, amplitude_limit=amplitude_limit, **settings)
-
+    known = {"full_scale": None, "blocks_can_repeat": True}
+    settings: dict[str, Any] = {name: getattr(interface, name, value) for name, value in known.items()} | supervision
+    supervised: Callable[[Any], Supervisor] = partial(
+        Supervisor, fs=interface.fs, amplitude_limit=amplitude_limit, **settings
+    )
     supervisor = supervised(made)
     _require_fit(supervisor, interface)
     possible_db = _possible_db(silence, made, interface.fs) if check_causality else np.nan
@@ -484,14 +496,12 @@ def _open(interface: Interface) -> Iterator[None]:
 
 def _warm_up(supervisor: Supervisor, block: int) -> None:
     """Process blocks with a copy of the controller, so that all that it uses is loaded before the first real one."""
-    x, e = 1e-3 * np.random.default_rng(0).standard_normal(
-        (2, supervisor.n_references + supervisor.n_microphones, block)
-    )
-    x, e = x[: supervisor.n_references], e[: supervisor.n_microphones]
+    rng, shapes = np.random.default_rng(0), ((supervisor.n_references, block), (supervisor.n_microphones, block))
+    signals = [1e-3 * rng.standard_normal(shape if supervisor.multichannel else block) for shape in shapes]
     for _ in range(2 * max(WARM_UP // block, 1)):
-        supervisor.process(*((x, e) if supervisor.multichannel else (x[0], e[0])))
+        supervisor.process(*signals)
     supervisor.start_silent()
-    supervisor.process(*((x, e) if supervisor.multichannel else (x[0], e[0])))
+    supervisor.process(*signals)
 
 
 def _control(
@@ -502,7 +512,7 @@ def _control(
     should_stop: Callable[[], bool] | None,
 ) -> str:
     """Control until the end; return what ended it. Whatever that is, the loudspeakers fade out."""
-    last = np.inf if seconds is None else as_positive(seconds, "seconds", unit="s") * supervisor.fs
+    last = np.inf if seconds is None else seconds * supervisor.fs
     done, stopped_by, divergences = 0, "", supervisor.divergence_times_s
     try:
         while not stopped_by:
@@ -546,92 +556,75 @@ class _Watch:
         on_report: Callable[[RunStatus], Any] | None,
     ) -> None:
         self._session, self._supervisor, self._on_report = session, supervisor, on_report
-        self._every = max(round(as_positive(every_s, "report_every_s", unit="s") * supervisor.fs), 1)
-        self._counts = (supervisor.n_references, supervisor.n_microphones, supervisor.n_loudspeakers)
+        self._every = max(round(every_s * supervisor.fs), 1)
+        counts = (supervisor.n_references, supervisor.n_microphones, supervisor.n_loudspeakers)
+        self._ends = np.cumsum(counts[:2])  # of the references and of the errors, behind the number of samples
         self._before = np.mean(silence.e**2, axis=1)
-        self._parts: list[tuple[Any, ...]] = []  # samples, energies of e and of y
-        self._part = supervisor.fs  # samples of a part
+        self._parts: list[np.ndarray] = []  # each as `_new`
+        self._part_samples = supervisor.fs
         self._samples = 0
-        self._new_sums()
-        self._second = self._no_energy()  # of the present part
-
-    def _no_energy(self) -> list[Any]:
-        _, n_microphones, n_loudspeakers = self._counts
-        return [0, np.zeros(n_microphones), np.zeros(n_loudspeakers)]
-
-    def _new_sums(self) -> None:
-        self._n = 0
-        self._x, self._e, self._y = (np.zeros(n) for n in self._counts)
-        self._session.load_since_report = 0.0
+        self._nothing = np.zeros(1 + sum(counts))  # samples, energies of x, of e and of y
+        self._new = self._present = self._nothing  # since the last report, and of the present part
 
     def add(self, block: Any, y: np.ndarray) -> None:
         """Add a block, and report if it is time."""
-        n = y.shape[1]
-        energies = [np.sum(np.square(_finite(signals)), axis=1) for signals in (block.references, block.errors, y)]
-        self._n, self._samples = self._n + n, self._samples + n + block.lost
-        self._x, self._e, self._y = (
-            total + energy for total, energy in zip((self._x, self._e, self._y), energies, strict=True)
-        )
-        self._second[0] += n
-        self._second[1] = self._second[1] + energies[1]
-        self._second[2] = self._second[2] + energies[2]
-        if self._second[0] >= self._part:
-            self._parts.append(tuple(self._second))
-            self._second = self._no_energy()
+        signals = (block.references, block.errors, y)
+        sums = np.concatenate([[y.shape[1]], *(np.sum(np.square(_finite(one)), axis=1) for one in signals)])
+        self._samples += y.shape[1] + block.lost
+        self._new, self._present = self._new + sums, self._present + sums
+        if self._present[0] >= self._part_samples:
+            self._parts.append(self._present)
+            self._present = self._nothing
             if len(self._parts) == MOST_PARTS:
-                self._part *= 2
-                self._parts = [
-                    tuple(a + b for a, b in zip(one, other, strict=True))
-                    for one, other in zip(self._parts[::2], self._parts[1::2], strict=True)
-                ]
-        if self._n >= self._every:
+                self._part_samples *= 2
+                self._parts = [a + b for a, b in zip(self._parts[::2], self._parts[1::2], strict=True)]
+        if self._new[0] >= self._every:
             if self._on_report is not None:
                 self._on_report(self._status())
-            self._new_sums()
+            self._new, self._session.load_since_report = self._nothing, 0.0
+
+    def _powers(self, sums: np.ndarray) -> list[np.ndarray]:
+        """Return the powers of the references, of the errors and of the control signals."""
+        return np.split(sums[1:] / max(sums[0], 1), self._ends)
+
+    def _figures(self, e: np.ndarray, y: np.ndarray) -> dict[str, Any]:
+        """Return what both reports state, of the powers of errors and control signals."""
+        rated = getattr(self._supervisor.controller, "rated_power", None)
+        return {
+            "reduction_db": _db(self._before, e),
+            "powers": y,
+            "rated_power": None if rated is None else np.atleast_1d(rated),
+            "overruns": self._session.overruns,
+            "lost": self._session.lost,
+            "underflows": self._session.underflows,
+            "health": self._supervisor.health,
+        }
 
     def _status(self) -> RunStatus:
-        e, x, y = self._e / self._n, self._x / self._n, self._y / self._n
+        x, e, y = self._powers(self._new)
         return RunStatus(
             time_s=self._samples / self._supervisor.fs,
-            reduction_db=_db(self._before, e),
             reference_level_db=_db(x, np.ones_like(x)),
             error_level_db=_db(e, np.ones_like(e)),
-            powers=y,
-            rated_power=self._rated(),
             load=self._session.load_since_report,
-            overruns=self._session.overruns,
-            lost=self._session.lost,
-            underflows=self._session.underflows,
-            health=self._supervisor.health,
+            **self._figures(e, y),
         )
-
-    def _rated(self) -> np.ndarray | None:
-        rated = getattr(self._supervisor.controller, "rated_power", None)
-        return None if rated is None else np.atleast_1d(rated)
 
     def report(self, stopped_by: str, identified: IdentifiedPlant | None, possible_db: float) -> RunReport:
         """Return the report of the whole run; its figures are those of the second half."""
-        if self._second[0]:
-            self._parts.append(tuple(self._second))
-        half = self._parts[len(self._parts) // 2 :]
-        n = max(sum(part[0] for part in half), 1)
-        e, y = (np.sum([part[i] for part in half] or [self._no_energy()[i]], axis=0) / n for i in (1, 2))
+        if self._present[0] or not self._parts:
+            self._parts.append(self._present)
+        _, e, y = self._powers(np.sum(self._parts[len(self._parts) // 2 :], axis=0))
         return RunReport(
             seconds=self._samples / self._supervisor.fs,
             stopped_by=stopped_by,
-            reduction_db=_db(self._before, e),
-            powers=y,
-            rated_power=self._rated(),
             round_trip_samples=None if identified is None else identified.round_trip_samples,
             secondary_path=None if identified is None else identified.path,
             possible_db=possible_db,
-            overruns=self._session.overruns,
             blocks=self._session.blocks,
-            lost=self._session.lost,
-            underflows=self._session.underflows,
             load=self._session.load,
-            health=self._supervisor.health,
             controller=self._supervisor.controller,
+            **self._figures(e, y),
         )
 
 
@@ -653,33 +646,23 @@ def _identified(
 ) -> IdentifiedPlant:
     """Play noise from each loudspeaker in turn, and return what this tells about the plant."""
     interface = session.interface
-    n, recordings = round(identify_s * interface.fs), []
+    fs, n = interface.fs, round(identify_s * interface.fs)
+    noises = level * rng.standard_normal((interface.n_loudspeakers, n))
     with session.without_gaps("the path was identified"):
-        for j in range(interface.n_loudspeakers):
-            signal = np.zeros((interface.n_loudspeakers, n))
-            signal[j] = np.clip(level * rng.standard_normal(n), -limits[j], limits[j])
-            recordings.append(session.play(signal))
-            session.play(np.zeros((interface.n_loudspeakers, round(0.1 * interface.fs))))  # let it die away
-    longest = n // 4
-    arrivals = [_arrival(r.y[j], e, longest) for j, r in enumerate(recordings) for e in r.e]
-    clear = [arrival for arrival in arrivals if arrival is not None]
-    if not clear:
-        raise FaultError(
-            "no loudspeaker is heard by any error microphone: check the cables and the channels, or raise excitation"
-        )
-    taps = min(clear) + round(0.016 * interface.fs) if n_path is None else as_count(n_path, "n_path")
-    if taps <= min(clear):
-        raise ValueError(f"n_path must exceed the round trip, {min(clear)} samples, got {n_path}")
-    length = min(r.y.shape[1] for r in recordings)
-    fs = interface.fs
+        limited = np.clip(noises, -limits[:, np.newaxis], limits[:, np.newaxis])
+        recordings = _recorded(session, limited, rest=round(0.1 * fs))
+    round_trip = _round_trip(recordings, n // 4, "excitation")
+    taps = round_trip + round(0.016 * fs) if n_path is None else as_count(n_path, "n_path")
+    if taps <= round_trip:
+        raise ValueError(f"n_path must exceed the round trip, {round_trip} samples, got {n_path}")
     left = [-_without_noise(r.y[j : j + 1], r.x, r.e, taps, fs) for j, r in enumerate(recordings)]  # e = d - s * y
     if interface.n_loudspeakers == interface.n_microphones == interface.n_references == 1:
         path = estimate_path(recordings[0].y[0], left[0][0], taps, fs)
-        return IdentifiedPlant(path, min(clear), silence.x[0], silence.e[0], fs)
+        return IdentifiedPlant(path, round_trip, silence.x[0], silence.e[0], fs)
     length = min(e.shape[1] for e in left)
     sent = np.array([r.y[j, :length] for j, r in enumerate(recordings)])
     path = estimate_path(sent, np.array([e[:, :length] for e in left]), taps, fs)
-    return IdentifiedPlant(path, min(clear), silence.x, silence.e, fs)
+    return IdentifiedPlant(path, round_trip, silence.x, silence.e, fs)
 
 
 def _without_noise(y: np.ndarray, x: np.ndarray, e: np.ndarray, n_taps: int, fs: float) -> np.ndarray:

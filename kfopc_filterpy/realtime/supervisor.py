@@ -279,37 +279,26 @@ class Supervisor(Checkpointed):
         """Return copies of references (I, n) and errors (K, n); what is missing is NaN."""
         if references is None and errors is None:
             raise ValueError("references or errors must be given: without both, the length of the block is not known")
-        given = [
-            None if value is None else _channels(value, n, name)
-            for value, n, name in (
-                (references, self.n_references, "references"),
-                (errors, self.n_microphones, "errors"),
-            )
-        ]
-        lengths = {block.shape[1] for block in given if block is not None}
+        x = None if references is None else _channels(references, self.n_references, "references")
+        e = None if errors is None else _channels(errors, self.n_microphones, "errors")
+        lengths = {block.shape[1] for block in (x, e) if block is not None}
         if len(lengths) != 1 or 0 in lengths:
             raise ValueError(
                 "references and errors must have the same number of samples, at least 1, got "
                 f"{' and '.join(str(length) for length in sorted(lengths))}"
             )
-        (n,) = lengths
-        x, e = (
-            np.full((channels, n), np.nan) if block is None else block
-            for block, channels in zip(given, (self.n_references, self.n_microphones), strict=True)
-        )
-        return x, e
+        n = lengths.pop()
+        missing_x, missing_e = (np.full((channels, n), np.nan) for channels in (self.n_references, self.n_microphones))
+        return missing_x if x is None else x, missing_e if e is None else e
 
     def _usable(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
         """Return which samples can be learned from, (n,); bad ones are replaced in place and noted."""
-        repeated = (
-            self.blocks_can_repeat and is_repeated(x, self._last_blocks[0]) and is_repeated(e, self._last_blocks[1])
-        )
+        repeated = self.blocks_can_repeat and all(map(is_repeated, (x, e), self._last_blocks))
         self._last_blocks = (x.copy(), e.copy())
         kinds = [inspector(block) for inspector, block in zip(self._inspectors, (x, e), strict=True)]
-        if repeated:
-            for kind in kinds:
-                kind[kind == GOOD] = REPEATED
         for name, kind in zip(("reference", "error"), kinds, strict=True):
+            if repeated:
+                kind[kind == GOOD] = REPEATED
             self._note_kinds(name, kind)
         bad_x, bad_e = (np.any(kind != GOOD, axis=0) for kind in kinds)
         since, self._since_bad_reference = _samples_since(bad_x, self._since_bad_reference)
@@ -320,17 +309,10 @@ class Supervisor(Checkpointed):
     def _note_kinds(self, name: str, kinds: np.ndarray) -> None:
         """Record the bad samples of a block."""
         for channel in np.flatnonzero(np.any(kinds != GOOD, axis=1)):
-            for kind in range(1, len(KINDS)):
+            for kind in sorted(set(kinds[channel].tolist()) - {GOOD}):
                 where = np.flatnonzero(kinds[channel] == kind)
-                if where.size:
-                    begin, end = ((self._samples + int(n)) / self.fs for n in where[[0, -1]])
-                    self.health.note(
-                        KINDS[kind],
-                        f"{name} {channel}",
-                        time_s=begin,
-                        n_samples=where.size,
-                        until_s=end + 1 / self.fs,
-                    )
+                begin, end = ((self._samples + int(n)) / self.fs for n in (where[0], where[-1] + 1))
+                self.health.note(KINDS[kind], f"{name} {channel}", time_s=begin, n_samples=where.size, until_s=end)
 
     def _count_unusable(self, usable: np.ndarray) -> None:
         """Fade out if nothing was usable for long, and in again afterwards."""
@@ -433,13 +415,12 @@ class Supervisor(Checkpointed):
 
     def _limit(self, y: np.ndarray) -> None:
         """Clip the control signals to their limits."""
-        for j, limit in enumerate(self.amplitude_limit):
-            over = np.abs(y[j]) > limit
-            count = int(np.count_nonzero(over))
-            if count:
-                np.clip(y[j], -limit, limit, out=y[j])
-                self._limited[j] += count
-                self._note("limited", f"loudspeaker {j}", n_samples=count)
+        limit = self.amplitude_limit[:, np.newaxis]
+        counts = np.count_nonzero(np.abs(y) > limit, axis=1)
+        self._limited += counts
+        np.clip(y, -limit, limit, out=y)
+        for j in np.flatnonzero(counts):
+            self._note("limited", f"loudspeaker {j}", n_samples=int(counts[j]))
 
     # ---- The divergence monitor
 

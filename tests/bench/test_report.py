@@ -19,7 +19,8 @@ from kfopc_filterpy.bench import page as page_module
 from kfopc_filterpy.bench import report
 from kfopc_filterpy.bench.descriptions import DESCRIPTIONS
 from kfopc_filterpy.bench.registry import REGISTRY
-from kfopc_filterpy.bench.report import FigureItem, Sound, Table, results_table, write_report
+from kfopc_filterpy.bench.report import results_table, write_report
+from kfopc_filterpy.bench.study_report import FigureItem, Sound, Table
 from kfopc_filterpy.signals import read_recording
 
 
