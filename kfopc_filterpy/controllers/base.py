@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PerLoudspeaker
+from .._types import Constraints, NumberOrArray, PerLoudspeaker
 from ..checkpoint import Checkpointed
 from ..core.run_loop import Steps
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
@@ -35,11 +35,7 @@ class Controller(Protocol):
         ...
 
 
-def constraint_for(
-    rated_power: PerLoudspeaker | None,
-    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None,
-    fs: float = DEFAULT_FS,
-) -> Any:
+def constraint_for(rated_power: PerLoudspeaker | None, constraint: Constraints, fs: float = DEFAULT_FS) -> Any:
     """Return a new constraint for a controller: a copy of the one given, or one with default settings for the rate `fs`.
 
     Several rated powers or constraints, one for each loudspeaker, give a tuple.
@@ -56,13 +52,6 @@ def constraint_for(
     if not isinstance(constraint, OutputPowerConstraint):
         raise TypeError(f"constraint must be an OutputPowerConstraint or None, got {constraint!r}")
     return deepcopy(constraint)
-
-
-def constraint_or_none(
-    rated_power: PerLoudspeaker | None, constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None
-) -> Any:
-    """Return `constraint_for`, or None if neither a rated power nor a constraint is given."""
-    return None if rated_power is None and constraint is None else constraint_for(rated_power, constraint)
 
 
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:

@@ -9,7 +9,6 @@ from .._validate import as_count, as_positive
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import constraint_or_none
 from .core_controller import CoreController
 
 ENERGY, LOST = 1, 4  # places in the records `array_numbers` and `turns` of fast_array.c
@@ -153,19 +152,17 @@ class FastArrayKalman(CoreController):
             settings["memory"] = memory
         else:
             settings["forgetting"] = forgetting
-        own = constraint_or_none(rated_power, constraint)
         super().__init__(
             n_taps,
             secondary_path,
             settings=settings,
             n_references=None,
             amplifier=amplifier,
-            constraint=own,
+            rated_power=rated_power,
+            constraint=constraint,
             limiter=limiter,
         )
-        self.name = ("" if memory is None else "finite-memory ") + (
-            "fast-array KF" if own is None else "fast-array KF-OPC"
-        )
+        self.name = ("" if memory is None else "finite-memory ") + self.name + ("-OPC" if self._constrained else "")
 
     @property
     def forgetting(self) -> float:

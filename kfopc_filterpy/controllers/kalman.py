@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._types import PathModels, PerLoudspeaker, PerMicrophone
+from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker, PerMicrophone
 from ..bounds.settings import SuggestedSettings
 from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
 from ..power.amplifiers import Amplifier
-from ..power.constraint import OutputPowerConstraint
+from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import constraint_for
 from .core_controller import CoreController
 from .direct import DirectKalman
-
-if TYPE_CHECKING:
-    from ..controllers.core_controller import Limiters
-
 
 _Made = TypeVar("_Made", bound=CoreController)
 
@@ -124,7 +119,7 @@ class KalmanController(CoreController):
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        self._weights()[:] = np.reshape(self.estimator.x, -1)
+        self._by_channel("weights")[:] = np.reshape(self.estimator.x, -1)
         return super().control_signal(reference)
 
     def update(self, error: float) -> None:
@@ -168,7 +163,7 @@ def kf_anc(
     measurement_noise: PerMicrophone | None = None,
     initial_variance: float | None = None,
     n_references: int = 1,
-    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    amplifier: Amplifiers = None,
     limiter: Limiters = None,
 ) -> DirectKalman:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
@@ -234,12 +229,12 @@ def kf_opc(
     secondary_path: PathModels,
     *,
     rated_power: PerLoudspeaker | None = None,
-    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
+    constraint: Constraints = None,
     state_noise: float | None = None,
     measurement_noise: PerMicrophone | None = None,
     initial_variance: float | None = None,
     n_references: int = 1,
-    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    amplifier: Amplifiers = None,
     limiter: Limiters = None,
 ) -> DirectKalman:
     """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
@@ -324,14 +319,11 @@ def with_suggested(n_taps: int | SuggestedSettings, settings: dict[str, Any]) ->
 
 
 def suggested_constraint(
-    n_taps: int | SuggestedSettings,
-    rated_power: PerLoudspeaker | None,
-    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None,
+    n_taps: int | SuggestedSettings, rated_power: PerLoudspeaker | None, constraint: Constraints
 ) -> Any:
     """Return `constraint_for`, for the sample rate of suggested settings if `n_taps` are such."""
-    if not isinstance(n_taps, SuggestedSettings):
-        return constraint_for(rated_power, constraint)
-    return constraint_for(rated_power, constraint, n_taps.fs)
+    fs = n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
+    return constraint_for(rated_power, constraint, fs)
 
 
 def at_suggested_rate(controller: _Made, n_taps: int | SuggestedSettings) -> _Made:
