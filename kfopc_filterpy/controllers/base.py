@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -54,6 +54,21 @@ def constraint_for(rated_power: PerLoudspeaker | None, constraint: Constraints, 
     return deepcopy(constraint)
 
 
+def checked_controller(controller: Any) -> Any:
+    """Return a controller, or raise TypeError if it is none."""
+    if isinstance(controller, type) or not isinstance(controller, Controller):
+        raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    return controller
+
+
+def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]]:
+    """Yield the numbers of channels that a controller states, by name, and that differ from these."""
+    for name, count in counts.items():
+        own = getattr(controller, name, count)
+        if own != count:
+            yield name, own
+
+
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
     """Raise ValueError if a named part of a controller has another sample rate than the run's `fs` in Hz."""
     for name, rate in rates.items():
@@ -92,10 +107,9 @@ class WrappedController(BlockProcessing, Checkpointed):
     rated_power = passed_on("rated_power", "Rated power of the inner controller; can be assigned if that has one.")
     limiter = passed_on("limiter", "Limiter of the inner controller; can be assigned if the inner controller's can.")
 
-    def __init__(self, controller: Controller) -> None:
-        if isinstance(controller, type) or not isinstance(controller, Controller):
-            raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
-        self.controller = controller
+    def __init__(self, controller: Controller, what: str) -> None:
+        self.controller = checked_controller(controller)
+        self.name = f"{getattr(controller, 'name', type(controller).__name__)} {what}"
 
     def __getattr__(self, name: str) -> Any:
         """Return any other attribute of the inner controller, except special methods such as those for copies."""

@@ -45,9 +45,8 @@ class LimitedController(WrappedController):
     def __init__(self, controller: Controller, limiter: OutputLimiter) -> None:
         if isinstance(controller, CoreController):
             raise ValueError("this controller has a limiter of its own: set controller.limiter, or pass limiter=")
-        super().__init__(controller)
+        super().__init__(controller, "limited")
         self.limiter = limiter
-        self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
 
     @property
     def limiter(self) -> OutputLimiter:

@@ -12,7 +12,7 @@ import numpy as np
 from .._validate import as_channels, as_number, as_positive
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController, listening
-from .channel_samples import amplifier_functions, channel_sample
+from .channel_samples import amplified, amplifier_functions, channel_sample
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
 AVERAGE_S = 0.1  # of the powers that are compared
@@ -144,7 +144,7 @@ class VerifiedController(WrappedController):
     def __init__(
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
-        super().__init__(controller)
+        super().__init__(controller, "with a verified path")
         if hasattr(controller, "physical") or not (
             hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
         ):
@@ -156,7 +156,6 @@ class VerifiedController(WrappedController):
             raise ValueError(f"{controller!r} verifies its path itself")
         self.fs, self.memory_s = as_positive(fs, "fs", unit="Hz"), as_positive(memory_s, "memory_s", unit="s")
         self.multichannel = bool(getattr(controller, "multichannel", False))
-        self.name = f"{getattr(controller, 'name', type(controller).__name__)} with a verified path"
         self.events: list[PathEvent] = []
         path = self._paths()
         J, M = path.shape[1:]
@@ -249,8 +248,8 @@ class VerifiedController(WrappedController):
                 self._stop("not finite")
             own = np.zeros(len(self._withheld))
         y = self.volume * own
-        played = self._played(y)
-        self._push(x, played, self._played(own) - played)
+        played = amplified(self._amplifiers, y)
+        self._push(x, played, amplified(self._amplifiers, own) - played)
         return self._shaped(y)
 
     def update(self, error: Any) -> None:
@@ -286,12 +285,6 @@ class VerifiedController(WrappedController):
         sample = channel_sample(value, count, name, what) if self.multichannel else np.array([as_number(value, name)])
         _require_moderate(sample, name)
         return sample
-
-    def _played(self, y: np.ndarray) -> np.ndarray:
-        """Return what the amplifiers, as far as they are known, make of the control signals."""
-        if self._amplifiers is None:
-            return y
-        return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
 
     def _push(self, x: np.ndarray, y: np.ndarray, withheld: np.ndarray) -> None:
         """Take the signals of a sample whose error is still to come; `y` and `withheld` are amplifier outputs."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModels, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
-from ..controllers.base import Controller, Looped
+from ..controllers.base import Controller, Looped, checked_controller
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps
@@ -130,8 +130,7 @@ def simulate(
     >>> bool(np.mean(result.control_signal[8000:] ** 2) < 1.02 * 0.25)  # unconstrained it would be 1
     True
     """
-    if isinstance(controller, type) or not isinstance(controller, Controller):
-        raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    checked_controller(controller)
     fs = as_positive(fs, "fs", unit="Hz")
     several = is_multichannel(controller, reference, secondary_path, disturbance)
     x, d, secondary = _read_signals(reference, primary_path, disturbance, secondary_path, fs, several)
