@@ -28,6 +28,22 @@ def primary_paths(
     return path_matrix(paths, fs=fs, name=name, axes=PRIMARY_AXES)
 
 
+def single_path(path: PathModels, name: str, fs: float | None = None) -> tuple[np.ndarray, float | None]:
+    """Return one path as taps, (n_taps,), and its sampling rate in Hz if a system tells it."""
+    return path_taps(path, fs=fs, name=name), sampling_rate(path, fs, name=name) if is_system(path) else None
+
+
+def feedback_paths(paths: PathModels, several: bool, fs: float | None = None) -> tuple[np.ndarray, float | None]:
+    """Return the paths from the loudspeakers to the reference microphones as taps (I, J, n_taps), and their sampling rate."""
+    name = "feedback_path"
+    taps, rate = path_matrix(paths, fs=fs, name=name) if several else single_path(paths, name, fs)
+    taps = taps if several else taps.reshape(1, 1, -1)
+    for first in taps[..., 0].flat:
+        if first != 0.0:
+            raise ValueError(f"{name} must have a delay of a sample at least: a first tap is {first:g}, not 0")
+    return taps, rate
+
+
 def is_path_matrix(paths: PathModels) -> bool:
     """Return whether paths are given as a matrix (outputs, inputs, taps), be it one by one, or as a matrix of systems."""
     if is_system(paths):
