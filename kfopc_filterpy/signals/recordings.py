@@ -326,7 +326,7 @@ def _kind_of(path: str | os.PathLike[str]) -> str:
         head = file.read(600)
     for beginning, kind in _BEGINNINGS.items():
         if head.startswith(beginning):
-            return "a MAT file" if head.startswith(b"MATLAB") else kind
+            return kind
     if head[512:516] == b"\x89HDF":
         return "a MAT file"
     lines = head.split(b"\n", 2)
