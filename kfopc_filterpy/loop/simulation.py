@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModels, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
-from ..controllers.base import Controller, Looped, checked_controller
+from ..controllers.base import Controller, Looped, checked_controller, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps
-from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
+from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
 from ..power.amplifiers import Amplifier, amplifier_models, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .inputs import (
@@ -23,7 +23,6 @@ from .inputs import (
     SensorNoise,
     channel_disturbances,
     disturbance_at_microphone,
-    listen_first,
     naming_sample,
     switch_on_sample,
 )
@@ -137,14 +136,9 @@ def simulate(
     K, J, _ = secondary.shape
     _require_fit(controller, len(x), J, K, several)
     noise = SensorNoise(sensor_noise_std, rng)
-    rated = getattr(controller, "rated_power", None) if rated_power is None else rated_power
-    rated = (
-        None
-        if rated is None
-        else per_loudspeaker(rated, J, "rated_power")
-        if several
-        else as_positive(rated, "rated_power")
-    )
+    rated: Any = getattr(controller, "rated_power", None) if rated_power is None else rated_power
+    if rated is not None:
+        rated = per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
     functions, models = _amplifiers(amplifier, J, several)
@@ -154,7 +148,7 @@ def simulate(
     weights = _weight_rows(x.shape[1] - on, controller, every, several)
     if on:
         heard = x[:, :on].copy(), d[:, :on] + noise.take(K, on)
-        listen_first(controller, *(heard if several else (signal[0] for signal in heard)))
+        listening(controller).listen(*(heard if several else (signal[0] for signal in heard)))
         x, d = x[:, on:], d[:, on:]
 
     plant = Plant(
@@ -176,12 +170,8 @@ def simulate(
     for signal in (*results, *recorded.values()):
         signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
-    found = {
-        "error": signals.error,
-        "control_signal": signals.control_signal,
-        "amplifier_output": signals.amplifier_output,
-    }
-    found |= {"anti_noise": signals.anti_noise} | recorded
+    names = ("error", "control_signal", "amplifier_output", "anti_noise")
+    found = {name: getattr(signals, name) for name in names} | recorded
     if not hasattr(controller, "power_weight"):
         found.pop("power_weight", None)
     if not several or (np.ndim(reference) == 1 and J == K == 1):  # one channel drops its axis, as it was given
@@ -320,20 +310,11 @@ def _feedback(feedback_path: Any, fs: float, n_references: int, J: int, several:
     """Return the feedback paths, (I, J, taps); 0 taps without any."""
     if feedback_path is None:
         return np.zeros((n_references, J, 0))
-    if several:
-        feedback, _ = path_matrix(feedback_path, fs=fs, name="feedback_path")
-    else:
-        feedback = path_taps(feedback_path, fs=fs, name="feedback_path").reshape(1, 1, -1)
+    feedback, _ = feedback_paths(feedback_path, several, fs)
     if feedback.shape[:2] != (n_references, J):
         raise ValueError(
             f"feedback_path must be (I references, J loudspeakers, taps) with I = {n_references}, J = {J}, "
             f"got {feedback.shape}"
-        )
-    if np.any(feedback[..., 0]):
-        raise ValueError(
-            f"feedback_path must have a delay of a sample at least: its first tap is {feedback[..., 0].flat[0]:g}, not 0"
-            if not several
-            else "feedback_path must have a delay of a sample at least: a first tap is not 0"
         )
     return feedback
 
@@ -342,12 +323,8 @@ def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.nd
     """Return for each loudspeaker an amplifier that is a user's function, or None, and the models, (J, 3)."""
     each = list(amplifier) if several and isinstance(amplifier, Sequence) else [amplifier] * J
     if len(each) != J or not all(one is None or callable(one) for one in each):
-        one = (
-            "a function of a sample, or one for each of the {J} loudspeakers, or None"
-            if several
-            else "a function of a sample, or None"
-        )
-        raise TypeError(f"amplifier must be {one.format(J=J)}, got {amplifier!r}")
+        of_each = f", or one for each of the {J} loudspeakers" if several else ""
+        raise TypeError(f"amplifier must be a function of a sample{of_each}, or None, got {amplifier!r}")
     functions: list[Any] = [one if one is not None and compiled_model(one) is None else None for one in each]
     models = amplifier_models([None if function else one for one, function in zip(each, functions, strict=True)], J)
     return functions, models.view(np.float64).reshape(J, -1)
