@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModels, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
-from ..controllers.base import Controller, Looped, checked_controller, listening
+from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps
 from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
-from ..power.amplifiers import Amplifier, amplifier_models, compiled_model
+from ..power.amplifiers import Amplifier, amplifier_models, amplifier_of_each, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .inputs import (
     DIVERGENCE_LIMIT,
@@ -141,7 +141,7 @@ def simulate(
         rated = per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
-    functions, models = _amplifiers(amplifier, J, several)
+    functions, models = _amplifiers(amplifier, J)
     feedback = _feedback(feedback_path, fs, len(x), J, several)
     if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
@@ -319,12 +319,9 @@ def _feedback(feedback_path: Any, fs: float, n_references: int, J: int, several:
     return feedback
 
 
-def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.ndarray]:
+def _amplifiers(amplifier: Any, J: int) -> tuple[list[Any], np.ndarray]:
     """Return for each loudspeaker an amplifier that is a user's function, or None, and the models, (J, 3)."""
-    each = list(amplifier) if several and isinstance(amplifier, Sequence) else [amplifier] * J
-    if len(each) != J or not all(one is None or callable(one) for one in each):
-        of_each = f", or one for each of the {J} loudspeakers" if several else ""
-        raise TypeError(f"amplifier must be a function of a sample{of_each}, or None, got {amplifier!r}")
+    each = amplifier_of_each(amplifier, J)
     functions: list[Any] = [one if one is not None and compiled_model(one) is None else None for one in each]
     models = amplifier_models([None if function else one for one, function in zip(each, functions, strict=True)], J)
     return functions, models.view(np.float64).reshape(J, -1)
@@ -336,14 +333,12 @@ def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_micr
         return
     if not controller.multichannel:
         raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
-    counts = {
-        "references": (controller.n_references, n_references),
-        "loudspeakers": (controller.n_loudspeakers, n_loudspeakers),
-        "microphones": (controller.n_microphones, n_microphones),
-    }
-    for name, (own, run) in counts.items():
-        if own != run:
-            raise ValueError(f"the controller is made for {own} {name}, but reference and paths of the run have {run}")
+    run = {"n_references": n_references, "n_loudspeakers": n_loudspeakers, "n_microphones": n_microphones}
+    for name, own in differing_counts(controller, **run):
+        what = name.removeprefix("n_")
+        raise ValueError(
+            f"the controller is made for {own} {what}, but reference and paths of the run have {run[name]}"
+        )
 
 
 def _weight_rows(n_samples: int, controller: Any, every: int | None, several: bool) -> np.ndarray:

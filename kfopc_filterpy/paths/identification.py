@@ -23,6 +23,7 @@ from .._validate import (
     require_channels_lead,
     require_finite,
 )
+from ..power.amplifiers import amplifier_of_each
 from .analysis import responses_of_both
 from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
 from .models import fir_path, path_taps, sampling_rate
@@ -412,7 +413,7 @@ def identify_secondary_path(
         raise ValueError(f"duration_s must be at least {needed / fs:.3g} s for {n_taps} taps, got {duration_s:g}")
     generator = as_generator(rng)
     sent = np.array([_excitation(excitation, n_samples, fs, as_positive(level, "level"), generator) for _ in range(J)])
-    received = _through(sent, _amplifiers(amplifier, J), true)  # (J, K, n_samples)
+    received = _through(sent, amplifier_of_each(amplifier, J, "signal"), true)  # (J, K, n_samples)
     received = received if in_turn else received.sum(axis=0)
     received += as_nonnegative(sensor_noise_std, "sensor_noise_std") * generator.standard_normal(received.shape)
     if not several:
@@ -446,15 +447,6 @@ def _require_sound(paths: np.ndarray) -> None:
             f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
             "loudspeaker if it is unplugged, or the microphone if it is dead"
         )
-
-
-def _amplifiers(amplifier: Any, n_loudspeakers: int) -> list[Any]:
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
-    if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
-        raise TypeError(
-            f"amplifier must be a function of a signal, or one for each of the {n_loudspeakers} loudspeakers, or None"
-        )
-    return each
 
 
 def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.random.Generator) -> np.ndarray:

@@ -6,6 +6,7 @@ the finite impulse response that a sample-by-sample loop runs. Tap arrays are ac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -268,6 +269,12 @@ def _infinite_response(system: Any, length: int, name: str) -> np.ndarray:
         delay = denominator.size - numerator.size
         return lfilter(np.pad(numerator, (delay, 0)), denominator, np.eye(1, length)[0])
     return dimpulse((system.A, system.B, system.C, system.D, 1), n=length)[1][0][:, 0]
+
+
+def stacked(responses: Sequence[np.ndarray]) -> np.ndarray:
+    """Return impulse responses as rows of one array, the shorter ones filled with zeros."""
+    longest = max(taps.size for taps in responses)
+    return np.array([np.pad(taps, (0, longest - taps.size)) for taps in responses])
 
 
 def perturbed_path(
