@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import Constraints, NumberOrArray, PerLoudspeaker
+from .._validate import as_positive
 from ..checkpoint import Checkpointed
 from ..core.run_loop import Steps
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
@@ -69,6 +70,14 @@ def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]
             yield name, own
 
 
+def as_forgetting(value: Any) -> float:
+    """Return a forgetting factor, checked."""
+    forgetting = as_positive(value, "forgetting")
+    if forgetting > 1.0:
+        raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+    return forgetting
+
+
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
     """Raise ValueError if a named part of a controller has another sample rate than the run's `fs` in Hz."""
     for name, rate in rates.items():
@@ -116,6 +125,10 @@ class WrappedController(BlockProcessing, Checkpointed):
         if name == "controller" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.controller, name)
+
+    def update(self, error: NumberOrArray) -> None:
+        """Pass the error e(n) to the controller's `update`."""
+        self.controller.update(error)
 
     def _pass_on(self, name: str, value: Any) -> None:
         """Assign an attribute of the inner controller; a wrapper that knows the value itself extends this."""

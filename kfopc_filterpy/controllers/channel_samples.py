@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._types import Amplifiers
 from .._validate import as_real_array
-
-if TYPE_CHECKING:
-    from ..power.amplifiers import Amplifier
+from ..power.amplifiers import LinearAmplifier, amplifier_of_each
 
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:
@@ -24,17 +22,11 @@ def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndar
     return np.ascontiguousarray(sample)
 
 
-def amplifier_functions(amplifier: Amplifier | Sequence[Amplifier] | None, n_loudspeakers: int) -> list[Any] | None:
+def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any] | None:
     """Return the functions of a sample that stand for the amplifiers, one for each loudspeaker; None without any."""
     if amplifier is None:
         return None
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
-    if len(each) != n_loudspeakers or not all(callable(one) for one in each):
-        raise TypeError(
-            f"amplifier must be a function of a sample, or one for each of the {n_loudspeakers} loudspeakers, "
-            f"got {amplifier!r}"
-        )
-    return each
+    return [LinearAmplifier() if one is None else one for one in amplifier_of_each(amplifier, n_loudspeakers)]
 
 
 def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:
@@ -65,7 +57,7 @@ class ChannelFilters:
 class PlayedSound(ChannelFilters):
     """What loudspeakers with known amplifiers play, and what reaches the microphones of it."""
 
-    def __init__(self, paths: np.ndarray, amplifier: Amplifier | Sequence[Amplifier] | None) -> None:
+    def __init__(self, paths: np.ndarray, amplifier: Amplifiers) -> None:
         super().__init__(paths)
         self._amplifiers = amplifier_functions(amplifier, self.n_inputs)
 

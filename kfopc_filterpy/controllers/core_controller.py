@@ -15,8 +15,7 @@ from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
-from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.path_matrix import is_path_matrix, secondary_paths
+from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
 from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
 from ..power.amplifiers import amplifier_models
 from ..power.constraint import NUMBERS, OutputPowerConstraint
@@ -154,9 +153,8 @@ class CoreController(BlockProcessing, Checkpointed):
         self._limiter = self._checked_limiter(limiter)
         self._own_constraint = self._checked_constraint(own)
         models = amplifier_models(amplifier, self.n_loudspeakers)
-        algorithm = self._algorithm()
         block = Block(
-            algorithm,
+            self._algorithm(),
             self._needed_shape(secondary.shape[-1], guard_taps=0),
             path=secondary.reshape(self.n_microphones, self.n_loudspeakers, -1),
             settings=self._checked_settings(),
@@ -178,13 +176,14 @@ class CoreController(BlockProcessing, Checkpointed):
         self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
         self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
         self.n_microphones, self.n_loudspeakers = 1, 1
+        secondary, self._path_fs = self._taps_and_rate(paths)
         if self.multichannel:
-            secondary, self._path_fs = secondary_paths(paths)
             self.n_microphones, self.n_loudspeakers, _ = secondary.shape
-            return secondary
-        secondary = path_taps(paths, name="secondary_path")
-        self._path_fs = sampling_rate(paths, name="secondary_path") if is_system(paths) else None
         return secondary
+
+    def _taps_and_rate(self, paths: Any) -> tuple[np.ndarray, float | None]:
+        """Return secondary paths as taps, (K, J, taps) or (taps,), and their sampling rate in Hz if systems tell it."""
+        return secondary_paths(paths) if self.multichannel else single_path(paths, "secondary_path")
 
     def _sample(self, value: Any, name: str, what: str) -> Any:
         """Return a checked sample: a number, or with several channels an array of them; `what` names the channels."""
@@ -196,14 +195,14 @@ class CoreController(BlockProcessing, Checkpointed):
         """Return the core's value of each channel: a number, or with several channels a copy."""
         return values.copy() if self.multichannel else float(values[0])
 
+    def _number_of_each(self, name: str) -> Any:
+        """Return a field of the core that has a number for each channel."""
+        return self._shaped(self._opened().fields[name].ravel())
+
     def _by_channel(self, name: str) -> np.ndarray:
         """Return a field of filters, (outputs, inputs, taps) or (taps,), in the core's memory."""
         filters = self._opened().fields[name][0]
         return filters if self.multichannel else filters[0, 0]
-
-    def _each_loudspeaker(self, value: Any, name: str, check: Callable[[Any, str], float] = as_positive) -> Any:
-        """Return a checked number; with several channels (J,), from one number or one for each loudspeaker."""
-        return per_loudspeaker(value, self.n_loudspeakers, name, check) if self.multichannel else check(value, name)
 
     # Checks of what the user gives.
 
@@ -263,11 +262,7 @@ class CoreController(BlockProcessing, Checkpointed):
     def _checked_estimate(self, path: Any) -> np.ndarray:
         """Return the taps of a new estimate, filled with zeros to the length of the present one."""
         present = self._estimated_path().shape
-        if self.multichannel:
-            taps, rate = secondary_paths(path, name="secondary_path")
-        else:
-            taps = path_taps(path, name="secondary_path")
-            rate = sampling_rate(path, name="secondary_path") if is_system(path) else None
+        taps, rate = self._taps_and_rate(path)
         if taps.shape[:-1] != present[:-1]:
             raise ValueError(
                 f"secondary_path must have the channels (microphones, loudspeakers) = {present[:-1]} of the present "
@@ -429,7 +424,10 @@ class CoreController(BlockProcessing, Checkpointed):
             raise ValueError(
                 f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
             )
-        self._take_rated_power(self._each_loudspeaker(value, "rated_power"))
+        several, name = self.multichannel, "rated_power"
+        self._take_rated_power(
+            per_loudspeaker(value, self.n_loudspeakers, name) if several else as_positive(value, name)
+        )
 
     def _read_rated_power(self) -> Any:
         return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
@@ -485,23 +483,20 @@ class CoreController(BlockProcessing, Checkpointed):
         return np.array([getattr(one, name) for one in own]) if isinstance(own, tuple) else getattr(own, name)
 
     def __repr__(self) -> str:
-        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
+        limiters = self._each(self.limiter)
+        counts = {
+            "microphone": self.n_microphones,
+            "loudspeaker": self.n_loudspeakers,
+            "reference": self.n_references,
+        }
         parts = [
-            *(self._channel_counts() if self.multichannel else []),
+            *(f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if self.multichannel),
             f"{self.n_taps} taps",
             *([] if self.rated_power is None else [f"rated power {listed(self.rated_power, 'g')}"]),
             f"constraint factor {listed(self.constraint_factor, '.3g')}",
             *([f"limiter of rated power {listed([one.rated_power for one in limiters], 'g')}"] if limiters else []),
         ]
         return f"<{self.name}: {', '.join(parts)}>"
-
-    def _channel_counts(self) -> list[str]:
-        counts = {
-            "microphone": self.n_microphones,
-            "loudspeaker": self.n_loudspeakers,
-            "reference": self.n_references,
-        }
-        return [f"{count} {what}{'s' if count > 1 else ''}" for what, count in counts.items()]
 
     # Samples.
 
@@ -624,16 +619,10 @@ class CoreController(BlockProcessing, Checkpointed):
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if the secondary path, power estimates or limiter are for another rate than `fs` in Hz."""
-        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
-        named = {f"limiter {j}" if self.multichannel else "limiter": one.fs for j, one in enumerate(limiters)}
-        require_rates(
-            fs,
-            {
-                "secondary path": self._path_fs,
-                "power memory": None if self.rated_power is None else self._powers_fs,
-            }
-            | named,
-        )
+        rates = {"secondary path": self._path_fs, "power memory": None if self.rated_power is None else self._powers_fs}
+        for j, limiter in enumerate(self._each(self.limiter)):
+            rates[f"limiter {j}" if self.multichannel else "limiter"] = limiter.fs
+        require_rates(fs, rates)
 
 
 def _rows(room: np.ndarray, length: int) -> np.ndarray:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 import numpy as np
 
 from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker
@@ -69,7 +67,7 @@ class DiagonalKalman(CoreController):
 
     name = "diagonal KF"
     algorithm = "diagonal"
-    checks = MappingProxyType(dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative))
+    checks = dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative)
     state_noise = setting("State noise variance r.")
     measurement_noise = setting("Measurement noise variance q.")
 

@@ -133,12 +133,12 @@ class DirectKalman(CoreController):
 
         The microphones are measured one after the other, each with the weights that those before it have corrected.
         """
-        return self._shaped(self._opened().fields["innovation"].ravel())
+        return self._number_of_each("innovation")
 
     @property
     def innovation_variance(self) -> NumberOrArray:
         """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
-        return self._shaped(self._opened().fields["innovation_variance"].ravel())
+        return self._number_of_each("innovation_variance")
 
     @property
     def covariance(self) -> np.ndarray:

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from .._types import Amplifiers, NumberOrArray, PathModels
 from .._validate import as_channels, as_number
-from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.path_matrix import is_path_matrix, path_matrix
+from ..paths.path_matrix import feedback_paths, is_path_matrix
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import PlayedSound, channel_sample
 
@@ -70,13 +69,7 @@ class FeedbackNeutralizer(WrappedController):
     def __init__(self, controller: Controller, feedback_path: PathModels, *, amplifier: Amplifiers = None) -> None:
         super().__init__(controller, "with feedback neutralisation")
         self._several = is_path_matrix(feedback_path)
-        if self._several:
-            paths, self._path_fs = path_matrix(feedback_path, fs=None, name="feedback_path")
-        else:
-            paths = path_taps(feedback_path, name="feedback_path").reshape(1, 1, -1)
-            self._path_fs = sampling_rate(feedback_path, name="feedback_path") if is_system(feedback_path) else None
-        if np.any(paths[..., 0]):
-            raise ValueError("feedback_path must have a delay of a sample at least: a first tap is not 0")
+        paths, self._path_fs = feedback_paths(feedback_path, self._several)
         self._require_fitting_controller(paths)
         self._n_taps = paths.shape[2]
         self._sound = PlayedSound(paths[..., 1:], amplifier)  # of the samples before the newest reference
@@ -105,10 +98,6 @@ class FeedbackNeutralizer(WrappedController):
             y = self.controller.control_signal(as_number(reference, "reference") - float(self._sound.output()[0]))
         self._sound.play(y)
         return y
-
-    def update(self, error: NumberOrArray) -> None:
-        """Pass the error to the controller's `update`."""
-        self.controller.update(error)
 
     def listen(self, references: ArrayLike, errors: ArrayLike) -> None:
         """Let the controller follow `references` and `errors` while the loudspeakers are silent.

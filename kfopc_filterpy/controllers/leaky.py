@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -95,7 +94,7 @@ class LeakyFxLMS(CoreController):
     algorithm = "leaky"
     step_size = setting("Step size mu.")
     leak = setting("Leak gamma; with several channels (J,), a copy.")
-    checks = MappingProxyType({"leak": as_nonnegative})
+    checks = dict.fromkeys(("leak",), as_nonnegative)
 
     def __init__(
         self,

@@ -76,10 +76,6 @@ class LimitedController(WrappedController):
     def _rates(self) -> dict[str, float | None]:
         return {"limiter": self.limiter.fs}
 
-    def update(self, error: float) -> None:
-        """Pass the error e(n) to the controller's `update`."""
-        self.controller.update(error)
-
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Let the controller follow `references` and `errors` before the control is switched on, with silent output."""
         listening(self.controller).listen(references, errors)

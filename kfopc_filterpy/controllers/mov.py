@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import MappingProxyType
 from typing import Any
 
 from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker
@@ -116,7 +115,7 @@ class MOVFxLMS(CoreController):
     algorithm = "mov"
     needs_rated_power = True
     step_size = setting("Step size mu.")
-    checks = MappingProxyType({"penalty_factor": as_nonnegative, "modified": as_nonnegative})
+    checks = dict.fromkeys(("penalty_factor", "modified"), as_nonnegative)
 
     def __init__(
         self,

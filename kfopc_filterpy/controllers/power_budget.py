@@ -153,7 +153,7 @@ class PowerBudgetController(PosteriorController):
     @property
     def power_weight(self) -> NumberOrArray:
         """Price of power of the last block, or with several channels that of each loudspeaker, (J,)."""
-        return self._per_channel("price")
+        return self._number_of_each("price")
 
     def looped(self) -> Looped | None:
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,21 +18,6 @@ from .channel_samples import ChannelFilters, PlayedSound
 
 if TYPE_CHECKING:
     import control
-
-
-class Observer(Protocol):
-    """Methods that `VirtualMicrophones` needs of an observer, which estimates the disturbance."""
-
-    def estimate(self, disturbance: np.ndarray) -> np.ndarray:
-        """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
-
-        `disturbance` is the newest sample at the physical microphones, (K_p,).
-        """
-        ...
-
-    def advance(self, disturbance: np.ndarray) -> None:
-        """Add the newest sample at the physical microphones, (K_p,), to the memory."""
-        ...
 
 
 class FilterObserver:
