@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.signal import correlate, fftconvolve
+from scipy.signal import fftconvolve
 
 from .._types import PathModels
 from .._validate import as_channels, as_count
+from ..paths.least_squares import correlation_matrix, cross_correlation
 from ..paths.path_matrix import secondary_paths
-from .wiener import WienerSolution, mean_square, reduction_db, require_sound
+from .wiener import Record
 
 RIDGE = 1e-10  # of the mean energy of a tap: directions of the weights with less energy get no weight
 TOLERANCE = 1e-5  # relative, for a rated power that limits
@@ -27,41 +28,23 @@ ROUNDING = 1e-14  # relative rounding error of the dual function
 SOLUTIONS = 100  # at most; about ten are usual
 
 
-@dataclass(frozen=True, eq=False)
-class ChannelStretch:
-    """Samples to which control filters are fitted; x and x' begin `n_taps` - 1 samples early to fill delay lines."""
-
-    x: np.ndarray  # (I, n + n_taps - 1)
-    filtered: np.ndarray  # (K, J, I, n + n_taps - 1)
-    d: np.ndarray  # (K, n)
-    n_taps: int
-
-    @property
-    def filtered_power(self) -> float:
-        """Power of the filtered references, summed over microphones and loudspeakers."""
-        return float(np.mean(self.filtered[..., self.n_taps - 1 :] ** 2, axis=-1).sum())
-
-    def part(self, start: int, stop: int) -> ChannelStretch:
-        """Return the samples from `start` to before `stop`, with their true past."""
-        with_past = slice(start, stop + self.n_taps - 1)
-        return ChannelStretch(self.x[:, with_past], self.filtered[..., with_past], self.d[:, start:stop], self.n_taps)
+class ChannelStretch(Record):
+    """A record of several channels: x is (I, n + n_taps - 1), x' (K, J, I, n + n_taps - 1) and d (K, n)."""
 
     def correlations(self) -> ChannelCorrelations:
-        """Return the correlations of the stretch."""
-        of_x = block_correlation(self.x, self.n_taps)
-        return ChannelCorrelations(self.correlation(self.filtered), of_x, self.cross(), self.shape)
-
-    def correlation(self, filtered: np.ndarray) -> np.ndarray:
-        """Return the correlation matrix of signals that take the place of x', summed over microphones."""
-        return np.asarray(sum(block_correlation(each, self.n_taps) for each in _rows(filtered)))
+        """Return the correlations R_x' and r, summed over microphones, and R_x."""
+        of_filtered = np.asarray(sum(correlation_matrix(rows, self.n_taps) for rows in self._rows))
+        return ChannelCorrelations(of_filtered, correlation_matrix(self.x, self.n_taps), self.cross(), self.shape)
 
     def cross(self) -> np.ndarray:
         """Return r, the cross-correlation of d and x', summed over microphones."""
-        each = [
-            [correlate(row, d, "valid")[::-1] for row in rows]
-            for rows, d in zip(_rows(self.filtered), self.d, strict=True)
-        ]
-        return np.sum(each, axis=0).ravel() / self.d.shape[1]
+        pairs = zip(self._rows, self.d, strict=True)
+        return np.sum([[cross_correlation(d, row) for row in rows] for rows, d in pairs], axis=0).ravel()
+
+    @property
+    def _rows(self) -> np.ndarray:
+        """Filtered references as (K, J I, n + n_taps - 1)."""
+        return self.filtered.reshape(len(self.filtered), -1, self.filtered.shape[-1])
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -74,27 +57,8 @@ class ChannelStretch:
 
     def antinoise(self, weights: np.ndarray) -> np.ndarray:
         """Return the anti-noise, (K, n)."""
-        n_signals = weights.shape[0] * weights.shape[1]
-        filters = weights.reshape(n_signals, -1)
-        return np.array([_sum_of_convolutions(x.reshape(n_signals, -1), filters) for x in self.filtered])
-
-    def solution(self, weights: np.ndarray) -> WienerSolution:
-        """Return the weights with their powers: the control power is (J,), the others are means over microphones."""
-        antinoise = self.antinoise(weights)
-        error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
-        return WienerSolution(
-            weights=weights,
-            control_power=np.mean(self.control_signal(weights) ** 2, axis=-1),
-            antinoise_power=mean_square(antinoise),
-            disturbance_power=disturbance_power,
-            error_power=error_power,
-            noise_reduction_db=reduction_db(error_power, disturbance_power),
-        )
-
-
-def _rows(filtered: np.ndarray) -> np.ndarray:
-    """Return filtered references (K, J, I, n) as (K, J I, n)."""
-    return filtered.reshape(len(filtered), -1, filtered.shape[-1])
+        filters = weights.reshape(-1, self.n_taps)
+        return np.array([_sum_of_convolutions(rows, filters) for rows in self._rows])
 
 
 def _sum_of_convolutions(signals: np.ndarray, filters: np.ndarray) -> np.ndarray:
@@ -190,28 +154,6 @@ class ChannelCorrelations:
         return step
 
 
-def block_correlation(signals: np.ndarray, n_taps: int) -> np.ndarray:
-    """Return the mean of ``signals[a, n - i] * signals[b, n - j]`` over n >= n_taps - 1, (C n_taps, C n_taps).
-
-    Each row of a block is computed from the one above by adding the products that enter the window and subtracting
-    those that leave it.
-    """
-    n_signals, length = signals.shape
-    count = length - n_taps + 1
-    blocks = np.empty((n_signals, n_signals, n_taps, n_taps))
-    now = signals[:, n_taps - 1 :]
-    for a in range(n_signals):
-        for b in range(n_signals):
-            blocks[a, b, 0] = correlate(signals[b], now[a], "valid")[::-1] / count
-    blocks[:, :, :, 0] = blocks[:, :, 0, :].swapaxes(0, 1)
-    entering = signals[:, : n_taps - 1][:, ::-1]  # the samples before the window, newest first
-    leaving = signals[:, ::-1][:, : n_taps - 1]  # the last samples, newest first
-    for i in range(n_taps - 1):
-        change = entering[:, i, None, None] * entering - leaving[:, i, None, None] * leaving
-        blocks[:, :, i + 1, 1:] = blocks[:, :, i, :-1] + change / count
-    return blocks.swapaxes(1, 2).reshape(n_signals * n_taps, -1)
-
-
 def channel_record(
     reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int, fs: float
 ) -> ChannelStretch:
@@ -234,11 +176,4 @@ def full_channel_stretch(
 ) -> ChannelStretch:
     """Check the signals and return the samples at which all delay lines are full."""
     secondary, _ = secondary_paths(secondary_path, fs=fs)
-    record = channel_record(reference, disturbance, secondary, n_taps, fs)
-    start, stop = n_taps + secondary.shape[2] - 2, record.d.shape[1]
-    if stop < start + n_taps:
-        raise ValueError(
-            f"reference must have at least {start + n_taps} samples for {n_taps} control "
-            f"and {secondary.shape[2]} path taps, got {stop}; use a longer signal or fewer taps"
-        )
-    return require_sound(record.part(start, stop))
+    return channel_record(reference, disturbance, secondary, n_taps, fs).full(secondary.shape[2])

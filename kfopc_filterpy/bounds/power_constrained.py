@@ -13,20 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._types import NumberOrArray, PathModels, PerLoudspeaker
-from .._validate import as_count, as_nonnegative, as_positive, as_sample_count, as_signal, per_loudspeaker
+from .._validate import as_nonnegative, as_positive, as_sample_count, per_loudspeaker
 from ..metrics import overshoot
 from ..paths.models import path_taps
 from ..paths.path_matrix import is_path_matrix
-from .channel_bound import ChannelStretch, channel_record
+from .channel_bound import channel_record
 from .wiener import (
+    Record,
     Stretch,
     WienerSolution,
     constrained_weights,
     full_stretch,
     loss_db,
     mean_square,
+    record_of,
     reduction_db,
-    require_sound,
     warn_of_loss,
 )
 
@@ -55,7 +56,7 @@ class ControlFilter(WienerSolution):
     constraint_factor: float
     start_s: float
     end_s: float
-    stretch: Stretch | ChannelStretch = field(repr=False, compare=False)
+    stretch: Record = field(repr=False, compare=False)
 
     @property
     def control_signal(self) -> np.ndarray:
@@ -66,6 +67,18 @@ class ControlFilter(WienerSolution):
     def error(self) -> np.ndarray:
         """Error e = d - s*y of the stretch, shape (n_samples,)."""
         return self.stretch.d - self.stretch.antinoise(self.weights)
+
+
+def _of_each(name: str, doc: str) -> Any:
+    """Return a property that has this attribute of each segment."""
+    return property(lambda filters: np.array([getattr(segment, name) for segment in filters.segments]), doc=doc)
+
+
+def _joined(name: str, doc: str) -> Any:
+    """Return a property that has this signal of all segments, one after the other."""
+    return property(
+        lambda filters: np.concatenate([getattr(segment, name) for segment in filters.segments], axis=-1), doc=doc
+    )
 
 
 @dataclass(frozen=True)
@@ -80,54 +93,24 @@ class ControlFilters:
 
     segments: tuple[ControlFilter, ...]
 
-    @property
-    def weights(self) -> np.ndarray:
-        """Weights of each segment, shape (n_segments, n_taps)."""
-        return np.array([segment.weights for segment in self.segments])
-
-    @property
-    def penalty(self) -> np.ndarray:
-        """λ of each segment, shape (n_segments,)."""
-        return self._each("penalty")
-
-    @property
-    def control_power(self) -> np.ndarray:
-        """Mean square of y in each segment, shape (n_segments,)."""
-        return self._each("control_power")
-
-    @property
-    def error_power(self) -> np.ndarray:
-        """Mean square of e in each segment, shape (n_segments,)."""
-        return self._each("error_power")
-
-    @property
-    def segment_noise_reduction_db(self) -> np.ndarray:
-        """Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."""
-        return self._each("noise_reduction_db")
-
-    @property
-    def start_s(self) -> np.ndarray:
-        """Start of each segment in seconds from the first sample that counts, shape (n_segments,)."""
-        return self._each("start_s")
+    weights = _of_each("weights", "Weights of each segment, shape (n_segments, n_taps).")
+    penalty = _of_each("penalty", "λ of each segment, shape (n_segments,).")
+    control_power = _of_each("control_power", "Mean square of y in each segment, shape (n_segments,).")
+    error_power = _of_each("error_power", "Mean square of e in each segment, shape (n_segments,).")
+    segment_noise_reduction_db = _of_each(
+        "noise_reduction_db", "Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."
+    )
+    start_s = _of_each(
+        "start_s", "Start of each segment in seconds from the first sample that counts, shape (n_segments,)."
+    )
+    control_signal = _joined("control_signal", "Control signal, each segment with its own weights, shape (n_samples,).")
+    error = _joined("error", "Error, each segment with its own weights, shape (n_samples,).")
 
     @property
     def noise_reduction_db(self) -> float:
         """Noise reduction over all segments, -10 log10(sum e^2 / sum d^2), at most 300 dB."""
         d = np.concatenate([segment.stretch.d for segment in self.segments], axis=-1)
         return reduction_db(mean_square(self.error), mean_square(d))
-
-    @property
-    def control_signal(self) -> np.ndarray:
-        """Control signal, each segment with its own weights, shape (n_samples,)."""
-        return np.concatenate([segment.control_signal for segment in self.segments], axis=-1)
-
-    @property
-    def error(self) -> np.ndarray:
-        """Error, each segment with its own weights, shape (n_samples,)."""
-        return np.concatenate([segment.error for segment in self.segments], axis=-1)
-
-    def _each(self, name: str) -> np.ndarray:
-        return np.array([getattr(segment, name) for segment in self.segments])
 
 
 @dataclass(frozen=True)
@@ -353,13 +336,13 @@ def power_constrained_wiener(
     """
     fs = as_positive(fs, "fs", unit="Hz")
     ridge = as_nonnegative(ridge, "ridge")
-    record: Stretch | ChannelStretch
+    record: Record
     if is_path_matrix(secondary_path):
         record = channel_record(reference, disturbance, secondary_path, n_taps, fs)
         rated_power = per_loudspeaker(rated_power, record.shape[0], "rated_power")
     else:
         rated_power = as_positive(rated_power, "rated_power")
-        record = _record(reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps)
+        record = record_of(reference, disturbance, path_taps(secondary_path, fs=fs, name="secondary_path"), n_taps)
     first = round(as_nonnegative(switch_on_s, "switch_on_s", unit="s") * fs)
     n_samples = record.d.shape[-1]
     if n_samples - first < record.n_taps:
@@ -373,7 +356,7 @@ def power_constrained_wiener(
             f"segment_s must be at least {2 * record.n_taps / fs:g} s, twice the {record.n_taps} taps, got "
             f"{length / fs:g} s: a filter overfits shorter ones; use longer segments or fewer taps"
         )
-    counted = require_sound(record.part(first, n_samples))
+    counted = record.part(first, n_samples).with_sound()
     edges = list(range(first, n_samples, length))
     if len(edges) > 1 and n_samples - edges[-1] < length / 2:
         edges.pop()
@@ -450,25 +433,9 @@ def power_constrained_solution(
     return stretch.solution(weights)
 
 
-def _record(reference: Any, disturbance: Any, taps: np.ndarray, n_taps: int) -> Stretch:
-    """Return the whole record as copies, with zeros for its past."""
-    from scipy.signal import lfilter
-
-    x = as_signal(reference, "reference")
-    d = as_signal(disturbance, "disturbance", length=x.size).copy()
-    n_taps = as_count(n_taps, "n_taps")
-    past = np.zeros(n_taps - 1)
-    record = Stretch(np.concatenate([past, x]), np.concatenate([past, lfilter(taps, 1.0, x)]), d, n_taps)
-    for signal in (record.x, record.filtered, record.d):
-        signal.flags.writeable = False
-    return record
-
-
-def _losses_db(
-    counted: Stretch | ChannelStretch, whole: ControlFilter, unconstrained: ControlFilter, ridge: float
-) -> list[float]:
+def _losses_db(counted: Record, whole: ControlFilter, unconstrained: ControlFilter, ridge: float) -> list[float]:
     """Return `loss_db` of the bound and of the filter without a budget; it is not computed for several channels."""
-    if isinstance(counted, ChannelStretch):
+    if not isinstance(counted, Stretch):
         return [0.0]
     correlations = counted.correlations()
     return [
@@ -477,17 +444,15 @@ def _losses_db(
     ]
 
 
-def weights_within(
-    stretch: Stretch | ChannelStretch, correlations: Any, rated_power: NumberOrArray
-) -> tuple[np.ndarray, NumberOrArray]:
+def weights_within(stretch: Record, correlations: Any, rated_power: NumberOrArray) -> tuple[np.ndarray, NumberOrArray]:
     """Return the weights of the least error within the power of each loudspeaker, and their λ."""
-    if isinstance(stretch, ChannelStretch):
-        return correlations.constrained_weights(rated_power)
-    return constrained_weights(stretch, correlations, rated_power)
+    if isinstance(stretch, Stretch):
+        return constrained_weights(stretch, correlations, rated_power)
+    return correlations.constrained_weights(rated_power)
 
 
 def _solve(
-    stretch: Stretch | ChannelStretch, rated_power: Any, ridge: float, start_s: float, end_s: float
+    stretch: Record, rated_power: Any, ridge: float, start_s: float, end_s: float
 ) -> tuple[ControlFilter, ControlFilter, ControlFilter]:
     """Return the filter within the power, the one without a budget, and the latter scaled."""
 

@@ -12,7 +12,7 @@ from .._types import PathModels
 from .._validate import as_choice, as_positive, as_real_array, per_loudspeaker, require_finite
 from ..paths.path_matrix import is_path_matrix
 from .channel_bound import ChannelCorrelations, channel_record
-from .wiener import reduction_db, require_sound
+from .wiener import reduction_db
 
 ROUNDING_DB = 1e-9  # tolerance above the largest attainable noise reduction: its last digit may have been rounded up
 
@@ -234,7 +234,7 @@ def budgeted_rated_power(
     as_choice(beyond, "beyond", ("raise", "inf"))
     wanted = _wanted(noise_reduction_db)
     several = is_path_matrix(secondary_path) or np.ndim(reference) > 1
-    record = require_sound(channel_record(reference, disturbance, secondary_path, n_taps, fs))
+    record = channel_record(reference, disturbance, secondary_path, n_taps, fs).with_sound()
     shares = per_loudspeaker(1.0 if proportions is None else proportions, record.shape[0], "proportions")
     search = _ScaleSearch(record.correlations(), shares, float(np.sum(np.mean(record.d**2, axis=-1))))
     if beyond == "raise" and np.any(wanted > search.most_db + ROUNDING_DB):

@@ -17,8 +17,8 @@ from ..paths.least_squares import RANK_TOLERANCE
 from ..paths.models import path_taps
 from ..paths.path_matrix import is_path_matrix, secondary_paths
 from ..power.constraint import DEFAULT_FS
-from .channel_bound import ChannelStretch, full_channel_stretch
-from .wiener import ERROR_THAT_MATTERS, Stretch, full_stretch, mean_square, reduction_db
+from .channel_bound import full_channel_stretch
+from .wiener import ERROR_THAT_MATTERS, Record, full_stretch, mean_square, reduction_db
 
 # A longer memory leaves less error in a steady noise, and a shorter one follows changes: of a motor's speed, and of the
 # constraint factor when the noise gets louder or softer. `python tests/helpers/settings_grid.py` shows what this one costs.
@@ -218,7 +218,7 @@ class _Fits:
         max_taps: int,
     ) -> None:
         x = as_channels(reference, "reference")
-        self.stretch: Stretch | ChannelStretch
+        self.stretch: Record
         if is_path_matrix(secondary_path) or x.ndim == 2 or np.ndim(disturbance) == 2:
             s, _ = secondary_paths(secondary_path, fs=fs)
             self.n_microphones, self.per_tap = len(s), s.shape[1] * len(np.atleast_2d(x))

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 import warnings
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, TypeVar
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -279,33 +280,78 @@ class Correlations:
 
 
 @dataclass(frozen=True, eq=False)
-class Stretch:
-    """Samples that a control filter is fitted to. x and x' begin `n_taps` - 1 samples early, to fill the delay line."""
+class Record(ABC):
+    """Samples that control filters are fitted to. x and x' begin `n_taps` - 1 samples early, to fill the delay lines."""
 
     x: np.ndarray
     filtered: np.ndarray
     d: np.ndarray
     n_taps: int
 
+    @abstractmethod
+    def correlations(self) -> Any:
+        """Return the correlations R_x', R_x and r."""
+
+    @abstractmethod
+    def control_signal(self, weights: np.ndarray) -> np.ndarray:
+        """Return the control signal y = w*x."""
+
+    @abstractmethod
+    def antinoise(self, weights: np.ndarray) -> np.ndarray:
+        """Return the anti-noise w*x'."""
+
     @property
     def filtered_power(self) -> float:
-        """Power of the filtered reference."""
-        return mean_square(self.filtered[self.n_taps - 1 :])
+        """Power of the filtered reference, summed over microphones and loudspeakers."""
+        return float(np.mean(self.filtered[..., self.n_taps - 1 :] ** 2, axis=-1).sum())
 
-    def part(self, start: int, stop: int) -> Stretch:
+    def part(self, start: int, stop: int) -> Self:
         """Return the samples from `start` to before `stop`, with their true past."""
         with_past = slice(start, stop + self.n_taps - 1)
-        return Stretch(self.x[with_past], self.filtered[with_past], self.d[start:stop], self.n_taps)
+        return type(self)(self.x[..., with_past], self.filtered[..., with_past], self.d[..., start:stop], self.n_taps)
 
-    def correlations(self) -> Correlations:
-        """Return the correlations of the stretch."""
-        return Correlations(
-            self.correlation(self.filtered), correlation_matrix(self.x, self.n_taps, self.n_taps - 1), self.cross()
+    def full(self, n_path: int) -> Self:
+        """Return the samples at which all delay lines are full, behind paths of `n_path` taps."""
+        start, stop = self.n_taps + n_path - 2, self.d.shape[-1]
+        if stop < start + self.n_taps:
+            raise ValueError(
+                f"reference must have at least {start + self.n_taps} samples for {self.n_taps} control "
+                f"and {n_path} path taps, got {stop}; use a longer signal or fewer taps"
+            )
+        return self.part(start, stop).with_sound()
+
+    def with_sound(self) -> Self:
+        """Return the record, or raise ValueError if x' or d is silent."""
+        filtered_power = self.filtered_power
+        if filtered_power == 0 or mean_square(self.d) == 0:
+            silent = "disturbance" if filtered_power else "reference through secondary_path"
+            raise ValueError(f"{silent} must not be silent: there is nothing to solve for")
+        return self
+
+    def solution(self, weights: np.ndarray) -> WienerSolution:
+        """Return the weights with their powers, those of the signals: the matrices have fewer correct digits.
+
+        With several channels the control power is (J,), and the others are means over microphones.
+        """
+        antinoise, control_power = self.antinoise(weights), np.mean(self.control_signal(weights) ** 2, axis=-1)
+        error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
+        return WienerSolution(
+            weights=weights,
+            control_power=control_power if np.ndim(control_power) else float(control_power),
+            antinoise_power=mean_square(antinoise),
+            disturbance_power=disturbance_power,
+            error_power=error_power,
+            noise_reduction_db=reduction_db(error_power, disturbance_power),
         )
 
-    def correlation(self, filtered: np.ndarray) -> np.ndarray:
-        """Return the correlation matrix of a signal that takes the place of x'."""
-        return correlation_matrix(filtered, self.n_taps, self.n_taps - 1)
+
+class Stretch(Record):
+    """A record of one channel: x, x' and d are one-dimensional."""
+
+    def correlations(self) -> Correlations:
+        """Return the correlations R_x', R_x and r."""
+        of_filtered, of_x = (correlation_matrix(signal, self.n_taps) for signal in (self.filtered, self.x))
+        return Correlations(of_filtered, of_x, self.cross())
 
     def cross(self) -> np.ndarray:
         """Return r, the cross-correlation of d and x'."""
@@ -319,57 +365,25 @@ class Stretch:
         """Return the anti-noise w*x'."""
         return np.convolve(self.filtered, weights, mode="valid")
 
-    def solution(self, weights: np.ndarray) -> WienerSolution:
-        """Return the weights with their powers, those of the signals: the matrices have fewer correct digits."""
-        antinoise = self.antinoise(weights)
-        error_power, disturbance_power = mean_square(self.d - antinoise), mean_square(self.d)
-        return WienerSolution(
-            weights=weights,
-            control_power=mean_square(self.control_signal(weights)),
-            antinoise_power=mean_square(antinoise),
-            disturbance_power=disturbance_power,
-            error_power=error_power,
-            noise_reduction_db=reduction_db(error_power, disturbance_power),
-        )
+
+def record_of(reference: ArrayLike, disturbance: ArrayLike, secondary_path: np.ndarray, n_taps: int) -> Stretch:
+    """Check the signals and return copies of them, with silence before the first sample."""
+    from scipy.signal import lfilter
+
+    x = as_signal(reference, "reference")
+    d = as_signal(disturbance, "disturbance", length=x.size).copy()
+    n_taps = as_count(n_taps, "n_taps")
+    past = np.zeros(n_taps - 1)
+    record = Stretch(np.concatenate([past, x]), np.concatenate([past, lfilter(secondary_path, 1.0, x)]), d, n_taps)
+    for signal in (record.x, record.filtered, record.d):
+        signal.flags.writeable = False
+    return record
 
 
 def full_stretch(reference: ArrayLike, disturbance: ArrayLike, secondary_path: PathModels, n_taps: int) -> Stretch:
     """Check the signals and return the samples at which the delay lines of w and s are full."""
-    from scipy.signal import lfilter
-
-    x = as_signal(reference, "reference")
-    d = as_signal(disturbance, "disturbance", length=x.size)
     taps = path_taps(secondary_path, name="secondary_path")
-    n_taps = as_count(n_taps, "n_taps")
-    past = taps.size - 1
-    start = past + n_taps - 1
-    if x.size < start + n_taps:
-        raise ValueError(
-            f"reference must have at least {start + n_taps} samples for {n_taps} control "
-            f"and {taps.size} path taps, got {x.size}; use a longer signal or fewer taps"
-        )
-    return require_sound(Stretch(x[past:], lfilter(taps, 1.0, x)[past:], d[start:], n_taps))
-
-
-class _Excited(Protocol):
-    """A record of a reference through the secondary path, and of a disturbance."""
-
-    @property
-    def d(self) -> np.ndarray: ...
-    @property
-    def filtered_power(self) -> float: ...
-
-
-_Stretch = TypeVar("_Stretch", bound=_Excited)
-
-
-def require_sound(stretch: _Stretch) -> _Stretch:
-    """Return the stretch, or raise ValueError if x' or d is silent."""
-    filtered_power = stretch.filtered_power
-    if filtered_power == 0 or mean_square(stretch.d) == 0:
-        silent = "disturbance" if filtered_power else "reference through secondary_path"
-        raise ValueError(f"{silent} must not be silent: there is nothing to solve for")
-    return stretch
+    return record_of(reference, disturbance, taps, n_taps).full(taps.size)
 
 
 def mean_square(signal: np.ndarray) -> float:

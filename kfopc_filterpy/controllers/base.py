@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -10,7 +10,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PerLoudspeaker
+from .._types import Constraints, NumberOrArray, PerLoudspeaker
+from .._validate import as_positive
 from ..checkpoint import Checkpointed
 from ..core.run_loop import Steps
 from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
@@ -35,11 +36,7 @@ class Controller(Protocol):
         ...
 
 
-def constraint_for(
-    rated_power: PerLoudspeaker | None,
-    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None,
-    fs: float = DEFAULT_FS,
-) -> Any:
+def constraint_for(rated_power: PerLoudspeaker | None, constraint: Constraints, fs: float = DEFAULT_FS) -> Any:
     """Return a new constraint for a controller: a copy of the one given, or one with default settings for the rate `fs`.
 
     Several rated powers or constraints, one for each loudspeaker, give a tuple.
@@ -58,11 +55,27 @@ def constraint_for(
     return deepcopy(constraint)
 
 
-def constraint_or_none(
-    rated_power: PerLoudspeaker | None, constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None
-) -> Any:
-    """Return `constraint_for`, or None if neither a rated power nor a constraint is given."""
-    return None if rated_power is None and constraint is None else constraint_for(rated_power, constraint)
+def checked_controller(controller: Any) -> Any:
+    """Return a controller, or raise TypeError if it is none."""
+    if isinstance(controller, type) or not isinstance(controller, Controller):
+        raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    return controller
+
+
+def differing_counts(controller: Any, **counts: int) -> Iterator[tuple[str, int]]:
+    """Yield the numbers of channels that a controller states, by name, and that differ from these."""
+    for name, count in counts.items():
+        own = getattr(controller, name, count)
+        if own != count:
+            yield name, own
+
+
+def as_forgetting(value: Any) -> float:
+    """Return a forgetting factor, checked."""
+    forgetting = as_positive(value, "forgetting")
+    if forgetting > 1.0:
+        raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+    return forgetting
 
 
 def require_rates(fs: float, rates: Mapping[str, float | None]) -> None:
@@ -103,16 +116,19 @@ class WrappedController(BlockProcessing, Checkpointed):
     rated_power = passed_on("rated_power", "Rated power of the inner controller; can be assigned if that has one.")
     limiter = passed_on("limiter", "Limiter of the inner controller; can be assigned if the inner controller's can.")
 
-    def __init__(self, controller: Controller) -> None:
-        if isinstance(controller, type) or not isinstance(controller, Controller):
-            raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
-        self.controller = controller
+    def __init__(self, controller: Controller, what: str) -> None:
+        self.controller = checked_controller(controller)
+        self.name = f"{getattr(controller, 'name', type(controller).__name__)} {what}"
 
     def __getattr__(self, name: str) -> Any:
         """Return any other attribute of the inner controller, except special methods such as those for copies."""
         if name == "controller" or name.startswith("__"):
             raise AttributeError(name)
         return getattr(self.controller, name)
+
+    def update(self, error: NumberOrArray) -> None:
+        """Pass the error e(n) to the controller's `update`."""
+        self.controller.update(error)
 
     def _pass_on(self, name: str, value: Any) -> None:
         """Assign an attribute of the inner controller; a wrapper that knows the value itself extends this."""

@@ -1,17 +1,15 @@
-"""Samples of several channels, and amplifiers, one for each loudspeaker."""
+"""Samples of several channels: their checks, FIR filters between them, and amplifiers, one for each loudspeaker."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .._types import Amplifiers
 from .._validate import as_real_array
-
-if TYPE_CHECKING:
-    from ..power.amplifiers import Amplifier
+from ..power.amplifiers import LinearAmplifier, amplifier_of_each
 
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:
@@ -24,20 +22,49 @@ def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndar
     return np.ascontiguousarray(sample)
 
 
-def amplifier_functions(amplifier: Amplifier | Sequence[Amplifier] | None, n_loudspeakers: int) -> list[Any] | None:
+def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any] | None:
     """Return the functions of a sample that stand for the amplifiers, one for each loudspeaker; None without any."""
     if amplifier is None:
         return None
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
-    if len(each) != n_loudspeakers or not all(callable(one) for one in each):
-        raise TypeError(
-            f"amplifier must be a function of a sample, or one for each of the {n_loudspeakers} loudspeakers, "
-            f"got {amplifier!r}"
-        )
-    return each
+    return [LinearAmplifier() if one is None else one for one in amplifier_of_each(amplifier, n_loudspeakers)]
 
 
-def push_sample(line: np.ndarray, sample: np.ndarray) -> None:
-    """Add the newest sample of several channels to a delay line in which the channels of a sample are adjacent."""
-    line[sample.size :] = line[: line.size - sample.size]
-    line[: sample.size] = sample[: line.size]
+def amplified(amplifiers: list[Any] | None, y: np.ndarray) -> np.ndarray:
+    """Return what the amplifiers, as far as they are known, make of the control signals (J,); a divergence stays one."""
+    if amplifiers is None or not np.isfinite(y).all():
+        return y
+    return np.array([amplifier(value) for amplifier, value in zip(amplifiers, y.tolist(), strict=True)])
+
+
+class ChannelFilters:
+    """FIR filters (outputs, inputs, taps) that are given a sample of all inputs at a time."""
+
+    def __init__(self, taps: np.ndarray) -> None:
+        self.n_outputs, self.n_inputs, n_taps = taps.shape
+        self._taps = np.ascontiguousarray(np.moveaxis(taps, 2, 1).reshape(self.n_outputs, -1))
+        self._line = np.zeros(n_taps * self.n_inputs)  # newest first, the inputs of a sample together
+
+    def push(self, sample: np.ndarray) -> None:
+        """Add the newest sample of the inputs."""
+        self._line[sample.size :] = self._line[: self._line.size - sample.size]
+        self._line[: sample.size] = sample[: self._line.size]
+
+    def output(self) -> np.ndarray:
+        """Return the sample of the outputs."""
+        return self._taps @ self._line
+
+
+class PlayedSound(ChannelFilters):
+    """What loudspeakers with known amplifiers play, and what reaches the microphones of it."""
+
+    def __init__(self, paths: np.ndarray, amplifier: Amplifiers) -> None:
+        super().__init__(paths)
+        self._amplifiers = amplifier_functions(amplifier, self.n_inputs)
+
+    def play(self, control_signal: ArrayLike) -> np.ndarray:
+        """Add a controller's newest control signal, and return it, (J,)."""
+        y = np.asarray(control_signal, dtype=np.float64).reshape(-1)
+        if y.size != self.n_inputs:
+            raise ValueError(f"controller must return {self.n_inputs} control signals, got {y.size}")
+        self.push(amplified(self._amplifiers, y))
+        return y

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from .._types import PathModels
-from .core_controller import CoreController, Limiters, setting
+from .._types import Limiters, PathModels, PerLoudspeaker
+from .core_controller import CoreController, setting
 
 
 class ClippingFxLMS(CoreController):
@@ -57,7 +53,7 @@ class ClippingFxLMS(CoreController):
         secondary_path: PathModels,
         *,
         step_size: float,
-        amplitude_limit: float | Sequence[float] | np.ndarray,
+        amplitude_limit: PerLoudspeaker,
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:

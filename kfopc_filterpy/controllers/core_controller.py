@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels, PerLoudspeaker
+from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
-from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.path_matrix import is_path_matrix, secondary_paths
-from ..paths.uncertainty import as_uncertainty, guard_filter
-from ..power.amplifiers import Amplifier, amplifier_models
+from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
+from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
+from ..power.amplifiers import amplifier_models
 from ..power.constraint import NUMBERS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import Looped, calls_of, listed, require_rates
+from .base import Looped, calls_of, constraint_for, listed, require_rates
 from .channel_samples import channel_sample
 from .processing import (
     BlockProcessing,
@@ -33,9 +32,6 @@ from .processing import (
     require_one_length,
 )
 
-if TYPE_CHECKING:
-    from ..paths.uncertainty import Uncertainty
-
 NO_SOLUTION = "the update has no solution: the covariance P is too large, S = x' P x' + q could overflow"
 OVERFLOW = (
     "the disturbance estimate, the reference and the filtered reference must have finite squares, and one overflows: "
@@ -44,8 +40,6 @@ OVERFLOW = (
 LONGEST_CALL = 1600  # samples between two opportunities to interrupt a block: 0.1 s at 16 kHz
 # What a run records of each loudspeaker, by its name in the constraint's numbers.
 RECORDED = {"constraint_factor": "factor", "disturbance_power": "power", "secondary_path_gain": "gain"}
-
-Limiters = OutputLimiter | Sequence[OutputLimiter] | None
 
 
 class setting:
@@ -88,8 +82,11 @@ class CoreController(BlockProcessing, Checkpointed):
         references.
     amplifier : callable or sequence of J of them, optional
         Known amplifier: the disturbance is then estimated with s^ * amplifier(y), not s^ * y.
-    constraint : OutputPowerConstraint or tuple of J of them, optional
-        Constraint that computes the powers and the factor; by default one whose factor is fixed at 1.
+    rated_power : float or array_like, shape (J,), optional
+        Rated power of a constraint with default settings.
+    constraint : OutputPowerConstraint or sequence of J of them, optional
+        Given instead of `rated_power`: the constraint that computes the powers and the factor. A copy is kept. By default
+        one whose factor is fixed at 1.
     limiter : OutputLimiter or sequence of J of them, optional
         Limiter of the control signal, not shared with another controller.
 
@@ -100,6 +97,8 @@ class CoreController(BlockProcessing, Checkpointed):
     checks : mapping of str to callable
         Functions of a value and its name that return a setting as a float, or raise ValueError; settings without one
         must be positive. An attribute of the class.
+    needs_rated_power : bool
+        Whether a rated power or a constraint must be given. An attribute of the class.
 
     Raises
     ------
@@ -128,6 +127,7 @@ class CoreController(BlockProcessing, Checkpointed):
     name = "controller"
     algorithm: str | Algorithm
     checks: ClassVar[Mapping[str, Callable[[Any, str], float]]] = {}  # of settings that need not be positive
+    needs_rated_power: ClassVar[bool] = False  # or a constraint
     takes_guard: ClassVar[bool] = True  # whether the step takes account of an uncertain secondary path
     _block: Block | None = None
     _uncertainty: Any = None  # as it was assigned
@@ -140,20 +140,21 @@ class CoreController(BlockProcessing, Checkpointed):
         settings: Mapping[str, Any],
         n_references: int | None = 1,
         multichannel: bool | None = None,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
-        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
+        amplifier: Amplifiers = None,
+        rated_power: PerLoudspeaker | None = None,
+        constraint: Constraints = None,
         limiter: Limiters = None,
     ) -> None:
+        self._constrained = self.needs_rated_power or rated_power is not None or constraint is not None
+        own = constraint_for(rated_power, constraint) if self._constrained else None
         self._settings = dict(settings)
         self.n_taps = as_count(n_taps, "n_taps")
         secondary = self._read_paths(secondary_path, n_references, multichannel)
         self._limiter = self._checked_limiter(limiter)
-        self._constrained = constraint is not None
-        self._own_constraint = self._checked_constraint(constraint)
+        self._own_constraint = self._checked_constraint(own)
         models = amplifier_models(amplifier, self.n_loudspeakers)
-        algorithm = self._algorithm()
         block = Block(
-            algorithm,
+            self._algorithm(),
             self._needed_shape(secondary.shape[-1], guard_taps=0),
             path=secondary.reshape(self.n_microphones, self.n_loudspeakers, -1),
             settings=self._checked_settings(),
@@ -175,13 +176,14 @@ class CoreController(BlockProcessing, Checkpointed):
         self.n_references = 1 if n_references is None else as_count(n_references, "n_references")
         self.multichannel = several or self.n_references > 1 if multichannel is None else multichannel
         self.n_microphones, self.n_loudspeakers = 1, 1
+        secondary, self._path_fs = self._taps_and_rate(paths)
         if self.multichannel:
-            secondary, self._path_fs = secondary_paths(paths)
             self.n_microphones, self.n_loudspeakers, _ = secondary.shape
-            return secondary
-        secondary = path_taps(paths, name="secondary_path")
-        self._path_fs = sampling_rate(paths, name="secondary_path") if is_system(paths) else None
         return secondary
+
+    def _taps_and_rate(self, paths: Any) -> tuple[np.ndarray, float | None]:
+        """Return secondary paths as taps, (K, J, taps) or (taps,), and their sampling rate in Hz if systems tell it."""
+        return secondary_paths(paths) if self.multichannel else single_path(paths, "secondary_path")
 
     def _sample(self, value: Any, name: str, what: str) -> Any:
         """Return a checked sample: a number, or with several channels an array of them; `what` names the channels."""
@@ -193,9 +195,14 @@ class CoreController(BlockProcessing, Checkpointed):
         """Return the core's value of each channel: a number, or with several channels a copy."""
         return values.copy() if self.multichannel else float(values[0])
 
-    def _each_loudspeaker(self, value: Any, name: str, check: Callable[[Any, str], float] = as_positive) -> Any:
-        """Return a checked number; with several channels (J,), from one number or one for each loudspeaker."""
-        return per_loudspeaker(value, self.n_loudspeakers, name, check) if self.multichannel else check(value, name)
+    def _number_of_each(self, name: str) -> Any:
+        """Return a field of the core that has a number for each channel."""
+        return self._shaped(self._opened().fields[name].ravel())
+
+    def _by_channel(self, name: str) -> np.ndarray:
+        """Return a field of filters, (outputs, inputs, taps) or (taps,), in the core's memory."""
+        filters = self._opened().fields[name][0]
+        return filters if self.multichannel else filters[0, 0]
 
     # Checks of what the user gives.
 
@@ -231,10 +238,9 @@ class CoreController(BlockProcessing, Checkpointed):
             )
         return limiters
 
-    def _checked_constraint(self, constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None) -> Any:
+    def _checked_constraint(self, own: Any) -> Any:
         """Return a constraint, or a tuple of them; if none is given, one whose factor is fixed at 1."""
-        own: Any = constraint
-        if constraint is None:
+        if own is None:
             own = OutputPowerConstraint(1.0)
             own.factor = 1.0
         if not self.multichannel:
@@ -251,17 +257,12 @@ class CoreController(BlockProcessing, Checkpointed):
 
     def _estimated_path(self) -> np.ndarray:
         """Return the estimated secondary path in the core's memory: the steps use what is written into it."""
-        path = self._opened().fields["secondary_path"][0]
-        return path if self.multichannel else path[0, 0]
+        return self._by_channel("secondary_path")
 
     def _checked_estimate(self, path: Any) -> np.ndarray:
         """Return the taps of a new estimate, filled with zeros to the length of the present one."""
         present = self._estimated_path().shape
-        if self.multichannel:
-            taps, rate = secondary_paths(path, name="secondary_path")
-        else:
-            taps = path_taps(path, name="secondary_path")
-            rate = sampling_rate(path, name="secondary_path") if is_system(path) else None
+        taps, rate = self._taps_and_rate(path)
         if taps.shape[:-1] != present[:-1]:
             raise ValueError(
                 f"secondary_path must have the channels (microphones, loudspeakers) = {present[:-1]} of the present "
@@ -338,7 +339,7 @@ class CoreController(BlockProcessing, Checkpointed):
         return self._limiter
 
     @limiter.setter
-    def limiter(self, value: OutputLimiter | Sequence[OutputLimiter] | None) -> None:
+    def limiter(self, value: Limiters) -> None:
         block = self._opened()
         before, self._limiter = self._limiter, self._checked_limiter(value)
         for limiter in self._each(before):
@@ -423,7 +424,10 @@ class CoreController(BlockProcessing, Checkpointed):
             raise ValueError(
                 f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
             )
-        self._take_rated_power(self._each_loudspeaker(value, "rated_power"))
+        several, name = self.multichannel, "rated_power"
+        self._take_rated_power(
+            per_loudspeaker(value, self.n_loudspeakers, name) if several else as_positive(value, name)
+        )
 
     def _read_rated_power(self) -> Any:
         return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
@@ -438,11 +442,7 @@ class CoreController(BlockProcessing, Checkpointed):
     @property
     def weights(self) -> np.ndarray:
         """Control filter w, (L,), or with several channels (J, I, L), newest-sample tap first; a copy."""
-        return self._weights().copy()
-
-    def _weights(self) -> np.ndarray:
-        weights = self._opened().fields["weights"][0]
-        return weights if self.multichannel else weights[0, 0]
+        return self._by_channel("weights").copy()
 
     @property
     def control_filter(self) -> np.ndarray:
@@ -483,23 +483,20 @@ class CoreController(BlockProcessing, Checkpointed):
         return np.array([getattr(one, name) for one in own]) if isinstance(own, tuple) else getattr(own, name)
 
     def __repr__(self) -> str:
-        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
+        limiters = self._each(self.limiter)
+        counts = {
+            "microphone": self.n_microphones,
+            "loudspeaker": self.n_loudspeakers,
+            "reference": self.n_references,
+        }
         parts = [
-            *(self._channel_counts() if self.multichannel else []),
+            *(f"{n} {what}{'s' if n > 1 else ''}" for what, n in counts.items() if self.multichannel),
             f"{self.n_taps} taps",
             *([] if self.rated_power is None else [f"rated power {listed(self.rated_power, 'g')}"]),
             f"constraint factor {listed(self.constraint_factor, '.3g')}",
             *([f"limiter of rated power {listed([one.rated_power for one in limiters], 'g')}"] if limiters else []),
         ]
         return f"<{self.name}: {', '.join(parts)}>"
-
-    def _channel_counts(self) -> list[str]:
-        counts = {
-            "microphone": self.n_microphones,
-            "loudspeaker": self.n_loudspeakers,
-            "reference": self.n_references,
-        }
-        return [f"{count} {what}{'s' if count > 1 else ''}" for what, count in counts.items()]
 
     # Samples.
 
@@ -609,7 +606,7 @@ class CoreController(BlockProcessing, Checkpointed):
         constraint = block.fields["constraint"][0, 0].view(NUMBERS)[:, 0]
         return Looped(
             Steps(block.address, *block.algorithm.steps),
-            self._weights(),
+            self._by_channel("weights"),
             {name: constraint[field] for name, field in RECORDED.items()},
             in_use=block.in_use,
             owner=block,
@@ -622,16 +619,10 @@ class CoreController(BlockProcessing, Checkpointed):
 
     def require_sample_rate(self, fs: float) -> None:
         """Raise ValueError if the secondary path, power estimates or limiter are for another rate than `fs` in Hz."""
-        limiters = [] if self.limiter is None else list(np.ravel(self.limiter))
-        named = {f"limiter {j}" if self.multichannel else "limiter": one.fs for j, one in enumerate(limiters)}
-        require_rates(
-            fs,
-            {
-                "secondary path": self._path_fs,
-                "power memory": None if self.rated_power is None else self._powers_fs,
-            }
-            | named,
-        )
+        rates = {"secondary path": self._path_fs, "power memory": None if self.rated_power is None else self._powers_fs}
+        for j, limiter in enumerate(self._each(self.limiter)):
+            rates[f"limiter {j}" if self.multichannel else "limiter"] = limiter.fs
+        require_rates(fs, rates)
 
 
 def _rows(room: np.ndarray, length: int) -> np.ndarray:

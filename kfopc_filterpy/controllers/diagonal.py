@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from types import MappingProxyType
-
 import numpy as np
 
-from .._types import PathModels
+from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker
 from .._validate import as_nonnegative
-from ..power.amplifiers import Amplifier
-from ..power.constraint import OutputPowerConstraint
-from .base import constraint_or_none
-from .core_controller import CoreController, Limiters, setting
+from .core_controller import CoreController, setting
 
 
 class DiagonalKalman(CoreController):
@@ -73,7 +67,7 @@ class DiagonalKalman(CoreController):
 
     name = "diagonal KF"
     algorithm = "diagonal"
-    checks = MappingProxyType(dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative))
+    checks = dict.fromkeys(("state_noise", "measurement_noise", "initial_variance"), as_nonnegative)
     state_noise = setting("State noise variance r.")
     measurement_noise = setting("Measurement noise variance q.")
 
@@ -85,13 +79,12 @@ class DiagonalKalman(CoreController):
         state_noise: float,
         measurement_noise: float,
         initial_variance: float = 1.0,
-        rated_power: float | Sequence[float] | np.ndarray | None = None,
-        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        rated_power: PerLoudspeaker | None = None,
+        constraint: Constraints = None,
+        amplifier: Amplifiers = None,
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        own = constraint_or_none(rated_power, constraint)
         super().__init__(
             n_taps,
             secondary_path,
@@ -102,17 +95,17 @@ class DiagonalKalman(CoreController):
             },
             n_references=n_references,
             amplifier=amplifier,
-            constraint=own,
+            rated_power=rated_power,
+            constraint=constraint,
             limiter=limiter,
         )
-        if own is not None:
+        if self._constrained:
             self.name = "diagonal KF-OPC"
 
     @property
     def variances(self) -> np.ndarray:
         """Diagonal of P, (L,), with several channels (J, I, L); a copy."""
-        variances = self._opened().fields["variances"][0]
-        return (variances if self.multichannel else variances[0, 0]).copy()
+        return self._by_channel("variances").copy()
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Let the variances grow by that which the new path gives to the weights."""

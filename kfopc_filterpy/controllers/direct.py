@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from .._types import NumberOrArray, PathModels, PerLoudspeaker, PerMicrophone
+from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker, PerMicrophone
 from .._validate import as_nonnegative
 from ..core.triangle import OWED, full_covariance
-from ..power.amplifiers import Amplifier
-from ..power.constraint import OutputPowerConstraint
-from .base import constraint_or_none
-from .core_controller import CoreController, Limiters, setting
+from .core_controller import CoreController, setting
 
 
 class DirectKalman(CoreController):
@@ -108,13 +103,12 @@ class DirectKalman(CoreController):
         fading: float = 1.0,
         n_references: int | None = 1,
         rated_power: PerLoudspeaker | None = None,
-        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        constraint: Constraints = None,
+        amplifier: Amplifiers = None,
         limiter: Limiters = None,
         name: str | None = None,
         **settings: float,
     ) -> None:
-        own = constraint_or_none(rated_power, constraint)
         super().__init__(
             n_taps,
             secondary_path,
@@ -126,11 +120,12 @@ class DirectKalman(CoreController):
                 **settings,
             },
             n_references=n_references,
-            constraint=own,
+            rated_power=rated_power,
+            constraint=constraint,
             amplifier=amplifier,
             limiter=limiter,
         )
-        self.name = name or ("KF-ANC" if own is None else "KF-OPC")
+        self.name = name or ("KF-OPC" if self._constrained else "KF-ANC")
 
     @property
     def innovation(self) -> NumberOrArray:
@@ -138,19 +133,19 @@ class DirectKalman(CoreController):
 
         The microphones are measured one after the other, each with the weights that those before it have corrected.
         """
-        return self._shaped(self._opened().fields["innovation"].ravel())
+        return self._number_of_each("innovation")
 
     @property
     def innovation_variance(self) -> NumberOrArray:
         """Predicted variance S of that innovation (eq. 7), 0 before the first sample; with several channels (K,)."""
-        return self._shaped(self._opened().fields["innovation_variance"].ravel())
+        return self._number_of_each("innovation_variance")
 
     @property
     def covariance(self) -> np.ndarray:
         """State covariance P, (J I L, J I L), in the order of ``weights.ravel()``; a new array."""
         fields = {name: self._opened().fields[name].ravel() for name in ("owed", "triangle", "gain_direction")}
         scale, diagonal, pending, *_ = fields["owed"].view(OWED).item()
-        direction = fields["gain_direction"][: self._weights().size]
+        direction = fields["gain_direction"][: self._by_channel("weights").size]
         return full_covariance(fields["triangle"], direction, scale, diagonal, -scale * pending)
 
     def _after_new_path(self, before: np.ndarray) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from .._types import PathModels
-from .._validate import as_count, as_positive
+from .._validate import as_count
 from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
-from .base import constraint_or_none
+from .base import as_forgetting
 from .core_controller import CoreController
 
 ENERGY, LOST = 1, 4  # places in the records `array_numbers` and `turns` of fast_array.c
@@ -139,9 +139,7 @@ class FastArrayKalman(CoreController):
         limiter: OutputLimiter | None = None,
     ) -> None:
         settings: dict[str, float] = {"measurement_noise": measurement_noise, "initial_variance": initial_variance}
-        forgetting = as_positive(forgetting, "forgetting")
-        if forgetting > 1.0:
-            raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+        forgetting = as_forgetting(forgetting)
         if memory is not None:
             memory = as_count(memory, "memory")
             least = LEAST_MEMORY * as_count(n_taps, "n_taps")
@@ -153,19 +151,17 @@ class FastArrayKalman(CoreController):
             settings["memory"] = memory
         else:
             settings["forgetting"] = forgetting
-        own = constraint_or_none(rated_power, constraint)
         super().__init__(
             n_taps,
             secondary_path,
             settings=settings,
             n_references=None,
             amplifier=amplifier,
-            constraint=own,
+            rated_power=rated_power,
+            constraint=constraint,
             limiter=limiter,
         )
-        self.name = ("" if memory is None else "finite-memory ") + (
-            "fast-array KF" if own is None else "fast-array KF-OPC"
-        )
+        self.name = ("" if memory is None else "finite-memory ") + self.name + ("-OPC" if self._constrained else "")
 
     @property
     def forgetting(self) -> float:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from copy import deepcopy
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels
+from .._types import Amplifiers, NumberOrArray, PathModels
 from .._validate import as_channels, as_number
-from ..paths.models import is_system, path_taps, sampling_rate
-from ..paths.path_matrix import is_path_matrix, path_matrix
-from .base import Controller, WrappedController, listening
-from .channel_samples import amplifier_functions, channel_sample, push_sample
-
-if TYPE_CHECKING:
-    from ..power.amplifiers import Amplifier
+from ..paths.path_matrix import feedback_paths, is_path_matrix
+from .base import Controller, WrappedController, differing_counts, listening
+from .channel_samples import PlayedSound, channel_sample
 
 
 class FeedbackNeutralizer(WrappedController):
@@ -71,28 +66,13 @@ class FeedbackNeutralizer(WrappedController):
     True
     """
 
-    def __init__(
-        self,
-        controller: Controller,
-        feedback_path: PathModels,
-        *,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
-    ) -> None:
-        super().__init__(controller)
+    def __init__(self, controller: Controller, feedback_path: PathModels, *, amplifier: Amplifiers = None) -> None:
+        super().__init__(controller, "with feedback neutralisation")
         self._several = is_path_matrix(feedback_path)
-        if self._several:
-            paths, self._path_fs = path_matrix(feedback_path, fs=None, name="feedback_path")
-        else:
-            paths = path_taps(feedback_path, name="feedback_path").reshape(1, 1, -1)
-            self._path_fs = sampling_rate(feedback_path, name="feedback_path") if is_system(feedback_path) else None
-        if np.any(paths[..., 0]):
-            raise ValueError("feedback_path must have a delay of a sample at least: a first tap is not 0")
+        paths, self._path_fs = feedback_paths(feedback_path, self._several)
         self._require_fitting_controller(paths)
-        self._n_references, self._n_loudspeakers, taps = paths.shape
-        self._amplifiers = amplifier_functions(amplifier, self._n_loudspeakers)
-        self._paths = np.ascontiguousarray(np.moveaxis(paths[..., 1:], 2, 1).reshape(self._n_references, -1))
-        self._played = np.zeros((taps - 1) * self._n_loudspeakers)  # newest first, loudspeakers of a sample together
-        self.name = f"{getattr(controller, 'name', type(controller).__name__)} with feedback neutralisation"
+        self._n_taps = paths.shape[2]
+        self._sound = PlayedSound(paths[..., 1:], amplifier)  # of the samples before the newest reference
 
     def _require_fitting_controller(self, paths: np.ndarray) -> None:
         """Raise ValueError if the controller states numbers of channels that differ from those of the paths."""
@@ -100,38 +80,24 @@ class FeedbackNeutralizer(WrappedController):
             raise ValueError("feedback_path must be (I references, J loudspeakers, taps) for this controller, got taps")
         if self._several and not getattr(self.controller, "multichannel", True):
             raise ValueError("feedback_path must be (taps,) for a controller of one channel")
-        wanted = {"n_references": paths.shape[0], "n_loudspeakers": paths.shape[1]}
-        for name, count in wanted.items():
-            own = getattr(self.controller, name, count)
-            if own != count:
-                raise ValueError(
-                    f"feedback_path must be (I references, J loudspeakers, taps) with the controller's {name} of {own}, "
-                    f"got {paths.shape}"
-                )
+        for name, own in differing_counts(self.controller, n_references=len(paths), n_loudspeakers=paths.shape[1]):
+            raise ValueError(
+                f"feedback_path must be (I references, J loudspeakers, taps) with the controller's {name} of {own}, "
+                f"got {paths.shape}"
+            )
 
     def __repr__(self) -> str:
-        return f"<{self.name}: {self._played.size // self._n_loudspeakers + 1} taps, {self.controller!r}>"
+        return f"<{self.name}: {self._n_taps} taps, {self.controller!r}>"
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n), or (J,), for the newest sample x(n), or (I,), of the reference microphones."""
         if self._several:
-            x = channel_sample(reference, self._n_references, "reference", "references")
-            y = self.controller.control_signal(x - self._paths @ self._played)
+            x = channel_sample(reference, self._sound.n_outputs, "reference", "references")
+            y = self.controller.control_signal(x - self._sound.output())
         else:
-            y = self.controller.control_signal(as_number(reference, "reference") - float(self._paths[0] @ self._played))
-        self._play(np.asarray(y, dtype=np.float64).reshape(-1))
+            y = self.controller.control_signal(as_number(reference, "reference") - float(self._sound.output()[0]))
+        self._sound.play(y)
         return y
-
-    def _play(self, y: np.ndarray) -> None:
-        if y.size != self._n_loudspeakers:
-            raise ValueError(f"controller must return {self._n_loudspeakers} control signals, got {y.size}")
-        if self._amplifiers is not None and np.isfinite(y).all():
-            y = np.array([amplifier(value) for amplifier, value in zip(self._amplifiers, y, strict=True)])
-        push_sample(self._played, y)
-
-    def update(self, error: NumberOrArray) -> None:
-        """Pass the error to the controller's `update`."""
-        self.controller.update(error)
 
     def listen(self, references: ArrayLike, errors: ArrayLike) -> None:
         """Let the controller follow `references` and `errors` while the loudspeakers are silent.
@@ -140,12 +106,12 @@ class FeedbackNeutralizer(WrappedController):
         """
         controller = listening(self.controller)
         x = np.array(np.atleast_2d(as_channels(references, "references")))
-        played = self._played.copy()
+        sound = deepcopy(self._sound)
         for n in range(x.shape[1]):
-            x[:, n] -= self._paths @ played
-            push_sample(played, np.zeros(self._n_loudspeakers))
+            x[:, n] -= sound.output()
+            sound.push(np.zeros(sound.n_inputs))
         controller.listen(x if self._several else x[0], errors)
-        self._played = played
+        self._sound = sound
 
     def _rates(self) -> dict[str, float | None]:
         return {"feedback path": self._path_fs}

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .._types import PathModels
-from .core_controller import CoreController, Limiters, setting
+from .._types import Limiters, PathModels
+from .core_controller import CoreController, setting
 
 
 class FxLMS(CoreController):
@@ -83,10 +83,5 @@ class FxLMS(CoreController):
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(
-            n_taps,
-            secondary_path,
-            settings={"step_size": step_size},
-            n_references=n_references,
-            limiter=limiter,
-        )
+        settings = {"step_size": step_size}
+        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)

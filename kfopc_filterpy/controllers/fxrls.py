@@ -7,6 +7,7 @@ from .._validate import as_positive
 from ..paths.path_matrix import is_path_matrix
 from ..power.amplifiers import Amplifier
 from ..power.limiter import OutputLimiter
+from .base import as_forgetting
 from .direct import DirectKalman
 
 
@@ -73,9 +74,7 @@ def fx_rls(
             "fx_rls takes one channel, because with several every microphone would need a covariance of its own: use "
             "kf_pb, which makes one least-squares estimate for all microphones, or an LMS algorithm such as FxNLMS"
         )
-    forgetting = as_positive(forgetting, "forgetting")
-    if forgetting > 1.0:
-        raise ValueError(f"forgetting must be 1 at most, got {forgetting:g}: 1 forgets nothing")
+    forgetting = as_forgetting(forgetting)
     return DirectKalman(
         n_taps,
         secondary_path,

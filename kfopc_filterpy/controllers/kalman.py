@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._types import PathModels, PerLoudspeaker, PerMicrophone
+from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker, PerMicrophone
 from ..bounds.settings import SuggestedSettings
 from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
 from ..power.amplifiers import Amplifier
-from ..power.constraint import OutputPowerConstraint
+from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .base import constraint_for
 from .core_controller import CoreController
 from .direct import DirectKalman
-
-if TYPE_CHECKING:
-    from ..controllers.core_controller import Limiters
-
 
 _Made = TypeVar("_Made", bound=CoreController)
 
@@ -124,7 +120,7 @@ class KalmanController(CoreController):
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        self._weights()[:] = np.reshape(self.estimator.x, -1)
+        self._by_channel("weights")[:] = np.reshape(self.estimator.x, -1)
         return super().control_signal(reference)
 
     def update(self, error: float) -> None:
@@ -168,7 +164,7 @@ def kf_anc(
     measurement_noise: PerMicrophone | None = None,
     initial_variance: float | None = None,
     n_references: int = 1,
-    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    amplifier: Amplifiers = None,
     limiter: Limiters = None,
 ) -> DirectKalman:
     """Return KF-ANC, the Kalman filter of eq. 2-8 without a constraint.
@@ -217,15 +213,14 @@ def kf_anc(
     >>> kf_anc(suggest_settings(x, np.roll(x, 9), [1.0]), [1.0]).n_taps
     16
     """
-    return _kalman(
+    return with_suggested(
+        DirectKalman,
         n_taps,
         secondary_path,
-        n_references,
-        amplifier,
-        limiter,
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        initial_variance=initial_variance,
+        {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
+        n_references=n_references,
+        amplifier=amplifier,
+        limiter=limiter,
     )
 
 
@@ -234,12 +229,12 @@ def kf_opc(
     secondary_path: PathModels,
     *,
     rated_power: PerLoudspeaker | None = None,
-    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
+    constraint: Constraints = None,
     state_noise: float | None = None,
     measurement_noise: PerMicrophone | None = None,
     initial_variance: float | None = None,
     n_references: int = 1,
-    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    amplifier: Amplifiers = None,
     limiter: Limiters = None,
 ) -> DirectKalman:
     """Return KF-OPC, the Kalman filter with output power constraint (eq. 9-13).
@@ -277,61 +272,45 @@ def kf_opc(
     >>> kf_opc(8, paths, rated_power=[0.5, 0.2], state_noise=1e-6, measurement_noise=0.1).rated_power
     array([0.5, 0.2])
     """
-    return _kalman(
+    return with_suggested(
+        DirectKalman,
         n_taps,
         secondary_path,
-        n_references,
-        amplifier,
-        limiter,
+        {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
         constraint=suggested_constraint(n_taps, rated_power, constraint),
-        state_noise=state_noise,
-        measurement_noise=measurement_noise,
-        initial_variance=initial_variance,
+        n_references=n_references,
+        amplifier=amplifier,
+        limiter=limiter,
     )
 
 
-def _kalman(
+def with_suggested(
+    kind: Callable[..., _Made],
     n_taps: int | SuggestedSettings,
-    secondary_path: Any,
-    n_references: int,
-    amplifier: Any,
-    limiter: Any,
-    **settings: Any,
-) -> DirectKalman:
-    """Return the controller, with suggested settings where none are given."""
-    taps, settings = with_suggested(n_taps, settings)
-    controller = DirectKalman(
-        taps, secondary_path, n_references=n_references, amplifier=amplifier, limiter=limiter, **settings
-    )
-    return at_suggested_rate(controller, n_taps)
-
-
-def with_suggested(n_taps: int | SuggestedSettings, settings: dict[str, Any]) -> tuple[int, dict[str, Any]]:
-    """Return the taps and the settings; the suggested ones, if there are any, replace those that are None.
-
-    A noise that is still missing raises TypeError; the message says how to find it.
-    """
-    suggested: dict[str, Any] = {"initial_variance": 1.0}
+    secondary_path: PathModels,
+    noises: Mapping[str, Any],
+    **others: Any,
+) -> _Made:
+    """Return a controller of a kind; suggested settings, if `n_taps` are such, replace the noises that are None."""
+    suggested: Mapping[str, Any] = {"initial_variance": 1.0}
+    taps = n_taps
     if isinstance(n_taps, SuggestedSettings):
-        suggested, n_taps = n_taps.settings, n_taps.n_taps
-    settings = suggested | {name: value for name, value in settings.items() if value is not None}
+        suggested, taps = n_taps.settings, n_taps.n_taps
+    settings = {**suggested, **{name: value for name, value in noises.items() if value is not None}}
     if not {"state_noise", "measurement_noise"} <= settings.keys():
         raise TypeError(
             "give state_noise and measurement_noise, or pass the result of suggest_settings(reference, disturbance, "
             "secondary_path), from a run with a silent loudspeaker, as n_taps"
         )
-    return n_taps, settings
+    return at_suggested_rate(kind(taps, secondary_path, **settings, **others), n_taps)
 
 
 def suggested_constraint(
-    n_taps: int | SuggestedSettings,
-    rated_power: PerLoudspeaker | None,
-    constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None,
+    n_taps: int | SuggestedSettings, rated_power: PerLoudspeaker | None, constraint: Constraints
 ) -> Any:
     """Return `constraint_for`, for the sample rate of suggested settings if `n_taps` are such."""
-    if not isinstance(n_taps, SuggestedSettings):
-        return constraint_for(rated_power, constraint)
-    return constraint_for(rated_power, constraint, n_taps.fs)
+    fs = n_taps.fs if isinstance(n_taps, SuggestedSettings) else DEFAULT_FS
+    return constraint_for(rated_power, constraint, fs)
 
 
 def at_suggested_rate(controller: _Made, n_taps: int | SuggestedSettings) -> _Made:

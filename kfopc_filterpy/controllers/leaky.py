@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from .._types import PathModels
+from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker
 from .._validate import as_nonnegative
-from ..power.amplifiers import Amplifier
-from ..power.constraint import OutputPowerConstraint
-from .base import constraint_for
-from .core_controller import CoreController, Limiters, setting
+from .core_controller import CoreController, setting
 from .mov import penalty_factor
 
 
@@ -99,7 +94,7 @@ class LeakyFxLMS(CoreController):
     algorithm = "leaky"
     step_size = setting("Step size mu.")
     leak = setting("Leak gamma; with several channels (J,), a copy.")
-    checks = MappingProxyType({"leak": as_nonnegative})
+    checks = dict.fromkeys(("leak",), as_nonnegative)
 
     def __init__(
         self,
@@ -107,17 +102,12 @@ class LeakyFxLMS(CoreController):
         secondary_path: PathModels,
         *,
         step_size: float,
-        leak: float | Sequence[float] | np.ndarray,
+        leak: PerLoudspeaker,
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        super().__init__(
-            n_taps,
-            secondary_path,
-            settings={"step_size": step_size, "leak": leak},
-            n_references=n_references,
-            limiter=limiter,
-        )
+        settings = {"step_size": step_size, "leak": leak}
+        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
 
     def _checked_settings(self) -> dict[str, Any]:
         settings = super()._checked_settings()
@@ -171,6 +161,7 @@ class OptimalLeakyFxLMS(CoreController):
 
     name = "optimal leaky FxLMS"
     algorithm = "optimal_leaky"
+    needs_rated_power = True
     step_size = setting("Step size mu.")
 
     def __init__(
@@ -179,19 +170,19 @@ class OptimalLeakyFxLMS(CoreController):
         secondary_path: PathModels,
         *,
         step_size: float,
-        rated_power: float | Sequence[float] | np.ndarray | None = None,
-        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        rated_power: PerLoudspeaker | None = None,
+        constraint: Constraints = None,
+        amplifier: Amplifiers = None,
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        own = constraint_for(rated_power, constraint)
         super().__init__(
             n_taps,
             secondary_path,
             settings={"step_size": step_size},
             n_references=n_references,
             amplifier=amplifier,
-            constraint=own,
+            rated_power=rated_power,
+            constraint=constraint,
             limiter=limiter,
         )

@@ -45,9 +45,8 @@ class LimitedController(WrappedController):
     def __init__(self, controller: Controller, limiter: OutputLimiter) -> None:
         if isinstance(controller, CoreController):
             raise ValueError("this controller has a limiter of its own: set controller.limiter, or pass limiter=")
-        super().__init__(controller)
+        super().__init__(controller, "limited")
         self.limiter = limiter
-        self.name = f"{getattr(controller, 'name', type(controller).__name__)} limited"
 
     @property
     def limiter(self) -> OutputLimiter:
@@ -76,10 +75,6 @@ class LimitedController(WrappedController):
 
     def _rates(self) -> dict[str, float | None]:
         return {"limiter": self.limiter.fs}
-
-    def update(self, error: float) -> None:
-        """Pass the error e(n) to the controller's `update`."""
-        self.controller.update(error)
 
     def listen(self, references: np.ndarray, errors: np.ndarray) -> None:
         """Let the controller follow `references` and `errors` before the control is switched on, with silent output."""

@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
-from .._types import NumberOrArray, PathModels
+from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_nonnegative, as_positive
-from ..power.amplifiers import Amplifier
-from ..power.constraint import OutputPowerConstraint
-from .base import constraint_for
-from .core_controller import CoreController, Limiters, setting
+from .core_controller import CoreController, setting
 
 
 def penalty_factor(rated_power: float, *, disturbance_power: float, secondary_path_gain: float) -> float:
@@ -120,8 +113,9 @@ class MOVFxLMS(CoreController):
 
     name = "MOV-FxLMS"
     algorithm = "mov"
+    needs_rated_power = True
     step_size = setting("Step size mu.")
-    checks = MappingProxyType({"penalty_factor": as_nonnegative, "modified": as_nonnegative})
+    checks = dict.fromkeys(("penalty_factor", "modified"), as_nonnegative)
 
     def __init__(
         self,
@@ -129,15 +123,14 @@ class MOVFxLMS(CoreController):
         secondary_path: PathModels,
         *,
         step_size: float,
-        rated_power: float | Sequence[float] | np.ndarray | None = None,
-        constraint: OutputPowerConstraint | Sequence[OutputPowerConstraint] | None = None,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        rated_power: PerLoudspeaker | None = None,
+        constraint: Constraints = None,
+        amplifier: Amplifiers = None,
         n_references: int = 1,
         limiter: Limiters = None,
-        penalty_factor: float | Sequence[float] | np.ndarray | None = None,
+        penalty_factor: PerLoudspeaker | None = None,
         modified: bool = False,
     ) -> None:
-        own = constraint_for(rated_power, constraint)
         settings: dict[str, Any] = {"step_size": step_size, "modified": float(bool(modified))}
         if penalty_factor is not None:
             self.algorithm = "mov_fixed"
@@ -148,7 +141,8 @@ class MOVFxLMS(CoreController):
             settings=settings,
             n_references=n_references,
             amplifier=amplifier,
-            constraint=own,
+            rated_power=rated_power,
+            constraint=constraint,
             limiter=limiter,
         )
         if modified:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ def relative_spread(uncertainty: Any, secondary_path: Any) -> float:
 class PosteriorController(CoreController):
     """Base class of these controllers: what is known about the plant, read from the fields of `plant.c`."""
 
-    checks = MappingProxyType({"spread": as_nonnegative})
+    checks = dict.fromkeys(("spread",), as_nonnegative)
     takes_guard = False  # the posterior knows how far the path may be off
 
     @property
@@ -64,22 +63,16 @@ class PosteriorController(CoreController):
 
         It is 0 before the first posterior.
         """
-        return self._per_channel("noise")
-
-    def _per_channel(self, name: str) -> Any:
-        return self._shaped(self._opened().fields[name].ravel())
-
-    def _heard_references(self) -> int:
-        """Return the number of references I."""
-        return self.n_references
+        return self._number_of_each("noise")
 
     def _means(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the posterior means as the core has them, (K, I, N) and (K, J, M)."""
-        block, n_references = self._opened(), self._heard_references()
-        theta, given = block.fields["theta"].reshape(self.n_microphones, -1), block.fields["secondary_path"][0]
-        n = n_references * (self.n_taps + given.shape[-1] - 1)
-        primary = theta[:, :n].reshape(self.n_microphones, n_references, -1)
-        return primary, theta[:, n:].reshape(given.shape) if theta.shape[1] > n else given
+        fields = self._opened().fields
+        theta, given = fields["theta"].reshape(self.n_microphones, -1), fields["secondary_path"][0]
+        learned = given[0].size if fields["spread"].item() > 0.0 else 0  # taps of secondary paths, the last in theta
+        n = theta.shape[1] - learned
+        primary = theta[:, :n].reshape(self.n_microphones, -1, self.n_taps + given.shape[-1] - 1)
+        return primary, theta[:, n:].reshape(given.shape) if learned else given
 
     def _after_new_path(self, before: np.ndarray) -> None:
         """Begin the posterior anew around the new path; the control filter, the account and the signals stay."""
@@ -125,9 +118,6 @@ class PathObserver(PosteriorController):
             n_references=n_references + secondary_path.shape[1],
             multichannel=True,
         )
-
-    def _heard_references(self) -> int:
-        return self.n_references - self.n_loudspeakers
 
     @property
     def fits(self) -> int:

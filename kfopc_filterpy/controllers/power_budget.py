@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from .._types import NumberOrArray, PathModels, PerLoudspeaker
+from .._types import Amplifiers, Limiters, NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_positive
 from ..bounds.settings import SuggestedSettings
-from ..paths.uncertainty import as_uncertainty
-from ..power.amplifiers import Amplifier
+from ..paths.uncertainty import Uncertainty, as_uncertainty
 from ..power.constraint import DEFAULT_FS
 from .base import Looped
-from .core_controller import Limiters
 from .kalman import at_suggested_rate
 from .posterior import DEFAULT_UNCERTAINTY, PosteriorController, block_of, relative_spread
-
-if TYPE_CHECKING:
-    from ..paths.uncertainty import Uncertainty
 
 DEFAULT_AVERAGING_S = 10.0
 LEAST_BLOCKS, MOST_BLOCKS = 20, 100_000  # in the averaging time
@@ -118,7 +112,7 @@ class PowerBudgetController(PosteriorController):
         *,
         rated_power: PerLoudspeaker,
         n_references: int = 1,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        amplifier: Amplifiers = None,
         limiter: Limiters = None,
         secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
         fs: float = DEFAULT_FS,
@@ -159,7 +153,7 @@ class PowerBudgetController(PosteriorController):
     @property
     def power_weight(self) -> NumberOrArray:
         """Price of power of the last block, or with several channels that of each loudspeaker, (J,)."""
-        return self._per_channel("price")
+        return self._number_of_each("price")
 
     def looped(self) -> Looped | None:
         """Return what the core's loop needs to run this controller; None if Python must call the steps."""
@@ -175,7 +169,7 @@ def kf_pb(
     *,
     rated_power: PerLoudspeaker,
     n_references: int = 1,
-    amplifier: Amplifier | Sequence[Amplifier] | None = None,
+    amplifier: Amplifiers = None,
     limiter: Limiters = None,
     secondary_path_uncertainty: Uncertainty | None = DEFAULT_UNCERTAINTY,
     fs: float | None = None,

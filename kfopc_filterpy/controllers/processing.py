@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_real_array, require_finite
-
-if TYPE_CHECKING:
-    pass
 
 
 class RefusedUpdate(ValueError):

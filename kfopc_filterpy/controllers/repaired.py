@@ -20,7 +20,7 @@ from ..power.amplifiers import Amplifier
 from ..power.constraint import OutputPowerConstraint
 from ..power.limiter import OutputLimiter
 from .direct import DirectKalman
-from .kalman import at_suggested_rate, suggested_constraint, with_suggested
+from .kalman import suggested_constraint, with_suggested
 
 DEFAULT_TRIM_S = 1.0
 
@@ -138,18 +138,15 @@ def kf_opc_repaired(
     >>> kf_opc_repaired(8, [1.0], rated_power=0.5, state_noise=1e-6, measurement_noise=0.1).factor_at
     'output'
     """
-    own = suggested_constraint(n_taps, rated_power, constraint)
-    noises = {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance}
-    taps, settings = with_suggested(n_taps, noises)
-    controller = RepairedKFOPC(
-        taps,
+    return with_suggested(
+        RepairedKFOPC,
+        n_taps,
         secondary_path,
-        constraint=own,
+        {"state_noise": state_noise, "measurement_noise": measurement_noise, "initial_variance": initial_variance},
+        constraint=suggested_constraint(n_taps, rated_power, constraint),
         gain_of=gain_of,
         trim_s=trim_s,
         factor_at=factor_at,
         amplifier=amplifier,
         limiter=limiter,
-        **settings,
     )
-    return at_suggested_rate(controller, n_taps)

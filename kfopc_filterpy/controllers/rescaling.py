@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from .._types import PathModels
-from .core_controller import CoreController, Limiters, setting
+from .clipping import ClippingFxLMS
 
 
-class RescalingFxLMS(CoreController):
+class RescalingFxLMS(ClippingFxLMS):
     r"""Re-scaling FxLMS: a control signal beyond the limit is clipped, and the weights are scaled by the same ratio.
 
     .. math:: \text{if } |w(n)^T x(n)| > A: \quad w(n) \leftarrow w(n) \frac{A}{|w(n)^T x(n)|}
@@ -48,18 +43,3 @@ class RescalingFxLMS(CoreController):
 
     name = "re-scaling FxLMS"
     algorithm = "rescaling"
-    step_size = setting("Step size mu.")
-    amplitude_limit = setting("Amplitude limit A of the control signal; with several channels (J,), a copy.")
-
-    def __init__(
-        self,
-        n_taps: int,
-        secondary_path: PathModels,
-        *,
-        step_size: float,
-        amplitude_limit: float | Sequence[float] | np.ndarray,
-        n_references: int = 1,
-        limiter: Limiters = None,
-    ) -> None:
-        settings = {"step_size": step_size, "amplitude_limit": amplitude_limit}
-        super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
-
-from .._types import PathModels
-from .core_controller import CoreController, Limiters, setting
+from .._types import Limiters, PathModels, PerLoudspeaker
+from .core_controller import CoreController, setting
 
 
 class TwoGradientFxLMS(CoreController):
@@ -64,7 +60,7 @@ class TwoGradientFxLMS(CoreController):
         secondary_path: PathModels,
         *,
         step_size: float,
-        amplitude_limit: float | Sequence[float] | np.ndarray,
+        amplitude_limit: PerLoudspeaker,
         output_step_size: float | None = None,
         n_references: int = 1,
         limiter: Limiters = None,

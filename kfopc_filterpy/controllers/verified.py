@@ -12,7 +12,7 @@ import numpy as np
 from .._validate import as_channels, as_number, as_positive
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController, listening
-from .channel_samples import amplifier_functions, channel_sample
+from .channel_samples import amplified, amplifier_functions, channel_sample
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
 AVERAGE_S = 0.1  # of the powers that are compared
@@ -144,7 +144,7 @@ class VerifiedController(WrappedController):
     def __init__(
         self, controller: Controller, *, fs: float = DEFAULT_FS, memory_s: float = 20.0, amplifier: Any = None
     ) -> None:
-        super().__init__(controller)
+        super().__init__(controller, "with a verified path")
         if hasattr(controller, "physical") or not (
             hasattr(controller, "secondary_path") and hasattr(controller, "n_taps")
         ):
@@ -156,7 +156,6 @@ class VerifiedController(WrappedController):
             raise ValueError(f"{controller!r} verifies its path itself")
         self.fs, self.memory_s = as_positive(fs, "fs", unit="Hz"), as_positive(memory_s, "memory_s", unit="s")
         self.multichannel = bool(getattr(controller, "multichannel", False))
-        self.name = f"{getattr(controller, 'name', type(controller).__name__)} with a verified path"
         self.events: list[PathEvent] = []
         path = self._paths()
         J, M = path.shape[1:]
@@ -180,12 +179,12 @@ class VerifiedController(WrappedController):
         self._n = self._samples = 0  # of this block, and of all
         self._awaits_error = False
         self.volume, self._pause_s = 0.0, 0.0  # no pause before the first failure
-        self._stopped_at = 0  # sample of the last stop
+        self._stopped_at = (
+            self._near_at
+        ) = -math.inf  # samples at which it stopped last, and was near the disturbance last
         self._wait = 0  # samples until the volume is next changed
         self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples played since the last one
         self._doubts = False  # whether the controller must not adapt, because the path is not known
-        self._deaf_for = 0  # samples until a fresh controller may adapt
-        self._learns_for = 0  # samples for which the controller still gets the posterior's path
         self._rate = -math.expm1(-1.0 / (AVERAGE_S * self.fs))
         # Mean powers over AVERAGE_S: the error, the expected noise without control, and the error at full volume.
         self._error = self._expected = self._alone = 0.0
@@ -245,12 +244,12 @@ class VerifiedController(WrappedController):
         if self._awaits_error:
             self._take(None)
         if not np.all(np.abs(own) <= LOUDEST):
-            if self.volume > 0.0 or not self._deaf_for:
+            if self.volume > 0.0 or not self._is_fresh():
                 self._stop("not finite")
             own = np.zeros(len(self._withheld))
         y = self.volume * own
-        played = self._played(y)
-        self._push(x, played, self._played(own) - played)
+        played = amplified(self._amplifiers, y)
+        self._push(x, played, amplified(self._amplifiers, own) - played)
         return self._shaped(y)
 
     def update(self, error: Any) -> None:
@@ -260,7 +259,7 @@ class VerifiedController(WrappedController):
         if self.volume < 1.0 or self._withheld.any():
             newest = self._withheld[:, self._n : self._n + self._s.shape[-1]]
             alone = errors - np.einsum("kjm,jm->k", self._s, newest)
-        if not (self._doubts or self._deaf_for):
+        if not (self._doubts or self._is_fresh()):
             self.controller.update(self._shaped(alone))
         self._take(errors, alone)
 
@@ -287,12 +286,6 @@ class VerifiedController(WrappedController):
         _require_moderate(sample, name)
         return sample
 
-    def _played(self, y: np.ndarray) -> np.ndarray:
-        """Return what the amplifiers, as far as they are known, make of the control signals."""
-        if self._amplifiers is None:
-            return y
-        return np.array([amplifier(float(one)) for amplifier, one in zip(self._amplifiers, y, strict=True)])
-
     def _push(self, x: np.ndarray, y: np.ndarray, withheld: np.ndarray) -> None:
         """Take the signals of a sample whose error is still to come; `y` and `withheld` are amplifier outputs."""
         self._x[:, self._x.shape[1] - self._block + self._n] = x
@@ -311,7 +304,6 @@ class VerifiedController(WrappedController):
             self._judge(float(errors @ errors), self._ratio * (float(d @ d) + self._noise), float(alone @ alone))
         self._n += 1
         self._samples += 1
-        self._deaf_for = max(self._deaf_for - 1, 0)
         if self._n == self._block:
             self._end_block()
 
@@ -343,14 +335,14 @@ class VerifiedController(WrappedController):
         # While the noise is reduced well, the path is kept: the posterior may have mistaken a drift of the primary path
         # for one of the secondary path.
         is_near = self.volume < 1.0 or self._error > NEAR * self._expected
-        self._learns_for = round(LEARN_S * self.fs) if is_near else max(self._learns_for - self._block, 0)
+        self._near_at = self._samples if is_near else self._near_at
         if self._observer.alarms > self._alarms:
             self._alarms, self._since_alarm = self._observer.alarms, 0
         is_new = self._since_alarm < HOLD_S * self.fs  # the posterior knows little of the path
         if is_new and is_near and not self._doubts and self.volume == 1.0:
             self._note("alarm")
         self._doubts = is_new and is_near and self.volume == 1.0  # turned down, it adapts with the path that it had
-        if self._known and self._learns_for and not is_new:
+        if self._known and self._samples - self._near_at < round(LEARN_S * self.fs) and not is_new:
             new, old = self._observer.identified_path, self._paths()
             change = np.sum((new - old) ** 2) / max(np.sum(old**2), np.finfo(float).tiny)
             if change > LEAST_CHANGE:
@@ -398,9 +390,12 @@ class VerifiedController(WrappedController):
         if not self._pause_s or (self.volume > 0.0 and what != "another path"):  # a failure that was heard
             self._pause_s = min(max(2.0 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
         self.volume, self._wait = 0.0, round(self._pause_s * self.fs)
-        self._deaf_for = self._p.shape[-1]  # it has no past: first it only hears references
         self._error = self._alone = self._expected
         self._sums = np.zeros(2)
+
+    def _is_fresh(self) -> bool:
+        """Return whether the controller in use has no past yet: first it only hears references."""
+        return self._samples - self._stopped_at < self._p.shape[-1]
 
     def _note(self, what: str) -> None:
         self.events.append(PathEvent(self._samples / self.fs, what))

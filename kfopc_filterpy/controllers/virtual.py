@@ -4,55 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import NumberOrArray, PathModels, PerMicrophone
-from .._validate import as_channels, as_count, as_positive, as_real_array, require_finite
+from .._types import Amplifiers, NumberOrArray, PathModels, PerMicrophone
+from .._validate import as_channels, as_count, as_real_array, per_channel, require_finite
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
-from .base import Controller, WrappedController, listening
-from .channel_samples import amplifier_functions, push_sample
+from .base import Controller, WrappedController, differing_counts, listening
+from .channel_samples import ChannelFilters, PlayedSound
 
 if TYPE_CHECKING:
     import control
-
-    from ..power.amplifiers import Amplifier
-
-
-class Observer(Protocol):
-    """Methods that `VirtualMicrophones` needs of an observer, which estimates the disturbance."""
-
-    def estimate(self, disturbance: np.ndarray) -> np.ndarray:
-        """Return the disturbance at the virtual microphones, (K_v,); nothing is changed.
-
-        `disturbance` is the newest sample at the physical microphones, (K_p,).
-        """
-        ...
-
-    def advance(self, disturbance: np.ndarray) -> None:
-        """Add the newest sample at the physical microphones, (K_p,), to the memory."""
-        ...
 
 
 class FilterObserver:
     """Observation filters, sample by sample: the remote-microphone technique."""
 
     def __init__(self, taps: np.ndarray) -> None:
-        self.n_virtual, self.n_physical, n_taps = taps.shape
+        self.n_virtual, self.n_physical, _ = taps.shape
         self._now = np.ascontiguousarray(taps[:, :, 0])
-        self._before = np.ascontiguousarray(np.moveaxis(taps[:, :, 1:], 2, 1).reshape(self.n_virtual, -1))
-        self._past = np.zeros((n_taps - 1) * self.n_physical)  # newest first, all microphones of a sample together
+        self._past = ChannelFilters(taps[:, :, 1:])
 
     def estimate(self, disturbance: np.ndarray) -> np.ndarray:
         """Return (O * d_p)(n)."""
-        return self._now @ disturbance + self._before @ self._past
+        return self._now @ disturbance + self._past.output()
 
     def advance(self, disturbance: np.ndarray) -> None:
         """Add d_p(n) to the delay lines."""
-        push_sample(self._past, disturbance)
+        self._past.push(disturbance)
 
 
 class KalmanObserver:
@@ -139,8 +121,8 @@ class KalmanObserver:
         self.n_physical = as_count(n_physical, "n_physical")
         A, B, C, D, self.fs = _matrices(model, self.n_physical)
         self.n_virtual = len(C) - self.n_physical
-        Q = np.diag(_each(source_power, B.shape[1], "source_power"))
-        R = np.diag(_each(sensor_noise_std, self.n_physical, "sensor_noise_std") ** 2)
+        Q = np.diag(per_channel(source_power, B.shape[1], "sources", "source_power"))
+        R = np.diag(per_channel(sensor_noise_std, self.n_physical, "physical microphones", "sensor_noise_std") ** 2)
         physical, virtual = slice(None, self.n_physical), slice(self.n_physical, None)
         self._A, self._Cp, self._Cv = A, C[physical], C[virtual]
         white, shared = D[physical] @ Q @ D[physical].T + R, B @ Q @ D[physical].T
@@ -190,14 +172,6 @@ def _matrices(model: Any, n_physical: int) -> tuple[np.ndarray, np.ndarray, np.n
         raise ValueError(f"model must be stable, but has a pole of magnitude {largest:.6g}")
     A, B, C, D = (np.array(getattr(model, name), dtype=np.float64) for name in "ABCD")
     return A, B, C, D, 1.0 / float(model.dt)
-
-
-def _each(value: Any, size: int, name: str) -> np.ndarray:
-    """Return a positive number, or one number for each channel, as (size,)."""
-    numbers = as_real_array(value, name)
-    if numbers.shape not in ((), (size,)):
-        raise ValueError(f"{name} must be one number or an array of {size} numbers, got shape {numbers.shape}")
-    return np.array([as_positive(number, name) for number in np.broadcast_to(numbers, size)])
 
 
 class VirtualMicrophones(WrappedController):
@@ -280,9 +254,9 @@ class VirtualMicrophones(WrappedController):
         *,
         physical: Sequence[int],
         virtual: Sequence[int] | None = None,
-        amplifier: Amplifier | Sequence[Amplifier] | None = None,
+        amplifier: Amplifiers = None,
     ) -> None:
-        super().__init__(controller)
+        super().__init__(controller, "with virtual microphones")
         secondary, self._path_fs = secondary_paths(secondary_path)
         self.n_microphones, self.n_loudspeakers, _ = secondary.shape
         self.physical = self._indices(physical, "physical")
@@ -292,11 +266,8 @@ class VirtualMicrophones(WrappedController):
             raise ValueError(f"virtual must name a microphone: all {self.n_microphones} of secondary_path are physical")
         self.observer = self._checked_observer(observer)
         self._require_fitting_controller()
-        self._amplifiers = amplifier_functions(amplifier, self.n_loudspeakers)
-        self._paths = np.ascontiguousarray(np.moveaxis(secondary, 2, 1).reshape(self.n_microphones, -1))
-        self._played = np.zeros(self._paths.shape[1])  # newest first, all loudspeakers of a sample together
+        self._sound = PlayedSound(secondary, amplifier)
         self._virtual_error = np.zeros(self.virtual.size)
-        self.name = f"{getattr(controller, 'name', type(controller).__name__)} with virtual microphones"
 
     def _indices(self, value: Any, name: str) -> np.ndarray:
         indices = np.array([as_count(index, name, minimum=0) for index in value])
@@ -327,14 +298,11 @@ class VirtualMicrophones(WrappedController):
 
     def _require_fitting_controller(self) -> None:
         wanted = {"n_microphones": self.virtual.size, "n_loudspeakers": self.n_loudspeakers}
-        for name, count in wanted.items():
-            own = getattr(self.controller, name, count)
-            if own != count:
-                raise ValueError(
-                    f"controller must be made for the {wanted['n_microphones']} virtual microphones and "
-                    f"{self.n_loudspeakers} loudspeakers, but its {name} is {own}: make it with the secondary "
-                    "paths to the virtual microphones only"
-                )
+        for name, own in differing_counts(self.controller, **wanted):
+            raise ValueError(
+                f"controller must be made for the {self.virtual.size} virtual microphones and {self.n_loudspeakers} "
+                f"loudspeakers, but its {name} is {own}: make it with the secondary paths to the virtual microphones only"
+            )
 
     def __repr__(self) -> str:
         return f"<{self.name}: {self.physical.size} physical, {self.virtual.size} virtual>"
@@ -354,16 +322,7 @@ class VirtualMicrophones(WrappedController):
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n), (J,), for the newest reference sample x(n), (I,)."""
-        y = np.asarray(self.controller.control_signal(reference), dtype=np.float64).reshape(-1)
-        if y.size != self.n_loudspeakers:
-            raise ValueError(f"controller must return {self.n_loudspeakers} control signals, got {y.size}")
-        self._play(y)
-        return y
-
-    def _play(self, y: np.ndarray) -> None:
-        if self._amplifiers is not None:
-            y = np.array([amplifier(value) for amplifier, value in zip(self._amplifiers, y, strict=True)])
-        push_sample(self._played, y)
+        return self._sound.play(self.controller.control_signal(reference))
 
     def update(self, error: NumberOrArray) -> None:
         """Let the controller adapt to the errors that the last control signal leaves at the virtual microphones.
@@ -384,7 +343,7 @@ class VirtualMicrophones(WrappedController):
 
     def _estimate(self, heard: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the disturbance at the physical and the error at the virtual microphones."""
-        anti_noise = self._paths @ self._played
+        anti_noise = self._sound.output()
         disturbance = heard[self.physical] + anti_noise[self.physical]
         return disturbance, self.observer.estimate(disturbance) - anti_noise[self.virtual]
 
@@ -412,22 +371,18 @@ class VirtualMicrophones(WrappedController):
             np.shape(errors)
         )  # what the virtual microphones hear is not used, so it may be anything
         heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
-        before = deepcopy(self._followed())
+        before = deepcopy((self._sound, self._virtual_error, self.observer))
         virtual_errors = np.empty((self.virtual.size, heard.shape[1]))
         for n, sample in enumerate(heard.T):
-            push_sample(self._played, np.zeros(self.n_loudspeakers))
+            self._sound.push(np.zeros(self.n_loudspeakers))
             disturbance, self._virtual_error = self._estimate(sample)
             virtual_errors[:, n] = self._virtual_error
             self.observer.advance(disturbance)
         try:
             controller.listen(references, virtual_errors)
         except (ValueError, TypeError):
-            self._played, self._virtual_error, self.observer = before
+            self._sound, self._virtual_error, self.observer = before
             raise
-
-    def _followed(self) -> tuple[Any, ...]:
-        """Return what changes in the wrapper with each sample."""
-        return self._played, self._virtual_error, self.observer
 
     def _rates(self) -> dict[str, float | None]:
         return {"secondary path": self._path_fs, "observer": getattr(self.observer, "fs", None)}

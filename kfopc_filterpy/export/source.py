@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -14,16 +16,17 @@ from numpy.typing import NDArray
 
 from ..core.block import _VIEW_PLACES, SLACK, Block
 from ..core.building import FLAGS, FOLDER, stamp
-from ..power.limiter import NUMBERS
+from ..power.limiter import NUMBERS, spans_of
 from .joined import joined, sources_of
-from .literals import braces, number
-from .precision import in_precision
 
 TEMPLATES = Path(__file__).parent
 NOT_OF_AN_EXPORT = ("-shared", "-fvisibility=hidden", "-Wno-psabi")
 COMPARED, MORE = 8, 16  # samples of the self-test that are compared; those that it takes beyond the secondary path
 APART = 8  # equal elements that end a stretch
 _POINTER = 8
+WIDTH = 120
+LARGEST_MARGIN = 0.01  # of the rated power, which the limiter keeps free for rounding
+SINGLE_FLOOR = 1e-30  # of the budget, as in limiter.c
 
 
 @dataclass(frozen=True)
@@ -57,14 +60,9 @@ class Exported:
         tolerance = 0.0 if self.precision == np.float64 else 0.1 if self.block.shape.limiter_windows else 1e-3
         expected, scale = self._expected()
         s = self.block.shape
+        sizes = (s.microphones, s.loudspeakers, s.references, s.taps, s.path_taps, s.guard_taps)
         common: dict[str, Any] = {
-            **dict(
-                zip(
-                    "KJILMG",
-                    (s.microphones, s.loudspeakers, s.references, s.taps, s.path_taps, s.guard_taps),
-                    strict=True,
-                )
-            ),
+            **dict(zip("KJILMG", sizes, strict=True)),
             "description": description,
             "header": header,
             "name": self.name,
@@ -134,9 +132,8 @@ class Exported:
     def _stretches(self) -> str:
         """Return what differs from a fresh block as C's list of stretches."""
         fields = self.block.fields
-        own = {name: fields[name].ravel() for name, _ in self.block.algorithm.settings}
         settings: dict[str, Any] = {
-            name: own[name] if each else own[name][0] for name, each in self.block.algorithm.settings
+            name: fields[name].ravel()[slice(None) if each else 0] for name, each in self.block.algorithm.settings
         }
         fresh = Block(
             self.block.algorithm,
@@ -231,3 +228,49 @@ def _bits(values: NDArray[Any]) -> NDArray[Any]:
 
 def _filled(template: str, common: dict[str, Any], **values: Any) -> str:
     return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(common, **values)
+
+
+def number(value: float, name: str, precision: np.dtype) -> str:
+    """Return a number as C writes it; the precision must be able to hold it."""
+    if isinstance(value, int | np.integer):
+        return str(value)
+    with np.errstate(over="ignore", under="ignore"):
+        rounded = precision.type(value)
+    if not np.isfinite(rounded):
+        raise ValueError(f"{name} must be finite in {precision}, got {value:g}: scale the signals")
+    return f"{rounded!s}{'' if precision == np.float64 else 'f'}"
+
+
+def braces(numbers: Iterable[str], indent: str = "") -> str:
+    """Return an array of numbers in braces, in several lines if it is long."""
+    text = ", ".join(numbers)
+    if len(text) < WIDTH // 2:
+        return f"{{{text}}}"
+    inner = indent + "    "
+    wrapped = fill(text, WIDTH, initial_indent=inner, subsequent_indent=inner, break_on_hyphens=False)
+    return f"{{\n{wrapped}\n{indent}}}"
+
+
+def in_precision(numbers: np.ndarray, precision: np.dtype) -> None:
+    """Change a limiter's record of numbers to those of a precision.
+
+    Raises
+    ------
+    ValueError
+        If the margin for rounding would take too much of the rated power.
+    """
+    if precision == np.float64:
+        return
+    epsilon, window = float(np.finfo(precision).eps), int(numbers["size"][0])
+    margin = (1.0 - float(numbers["budget"][0])) * epsilon / float(np.finfo(np.float64).eps)
+    if margin > LARGEST_MARGIN:
+        longest = int(window * LARGEST_MARGIN / margin)
+        raise ValueError(
+            f"the limiter's window of {window} samples is too long for {precision}, whose rounding errors would take "
+            f"{100 * margin:.1f} % of the rated power: at most {longest} samples, or dtype='float64'"
+        )
+    spans = int(numbers["spans"][0])
+    numbers["peak"] = (1.0 - 4.0 * epsilon) / numbers["scale"]
+    numbers["budget"] = 1.0 - margin
+    for values in (numbers["average"], numbers["loud"], spans_of(numbers)[1:, :spans]):  # held and room
+        np.maximum(values, SINGLE_FLOOR, out=values)

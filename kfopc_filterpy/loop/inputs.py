@@ -11,7 +11,6 @@ from scipy.signal import fftconvolve
 
 from .._types import PathModels, Seed
 from .._validate import as_channels, as_generator, as_nonnegative, as_signal
-from ..controllers.base import listening
 from ..paths.models import path_taps
 from ..paths.path_matrix import primary_paths
 
@@ -53,11 +52,6 @@ def require_one_source(primary_path: PathModels | None, disturbance: ArrayLike |
     """Raise ValueError unless exactly one of the two is given."""
     if (primary_path is None) == (disturbance is None):
         raise ValueError("give either primary_path= or disturbance=, not both and not neither")
-
-
-def listen_first(controller: object, references: np.ndarray, errors: np.ndarray) -> None:
-    """Let the controller follow the noise before it is switched on."""
-    listening(controller).listen(references, errors)
 
 
 class SensorNoise:

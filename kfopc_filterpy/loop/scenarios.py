@@ -16,7 +16,7 @@ from ..controllers.core_controller import CoreController
 from ..controllers.power_budget import PowerBudgetController
 from ..core.block import Block, Shape, reason_of
 from ..core.run_loop import DIVERGED, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals, Steps
-from ..paths.models import is_system, path_taps
+from ..paths.models import is_system, path_taps, stacked
 from ..power.amplifiers import Amplifier, compiled_model
 from ..power.constraint import DEFAULT_FS, NUMBERS
 from .inputs import DIVERGENCE_LIMIT, SensorNoise, disturbance_at_microphone, switch_on_sample
@@ -370,11 +370,7 @@ def _disturbances(x: np.ndarray, primary_path: Any, disturbance: Any, fs: float,
 def _stacked_paths(secondary_path: Any, fs: float, count: int) -> np.ndarray:
     """Return the paths as an array (count, taps), shorter ones padded with zeros."""
     paths = _each(secondary_path, count, "secondary_path") if _several(secondary_path) else [secondary_path] * count
-    taps = [path_taps(path, fs=fs, name="secondary_path") for path in paths]
-    stacked = np.zeros((count, max(t.size for t in taps)))
-    for row, own in zip(stacked, taps, strict=True):
-        row[: own.size] = own
-    return stacked
+    return stacked([path_taps(path, fs=fs, name="secondary_path") for path in paths])
 
 
 def _model(amplifier: Amplifier | None) -> np.ndarray:

@@ -11,19 +11,18 @@ from numpy.typing import ArrayLike
 
 from .._types import PathModels, PerLoudspeaker, Seed
 from .._validate import as_channels, as_count, as_positive, as_signal, per_loudspeaker
-from ..controllers.base import Controller, Looped
+from ..controllers.base import Controller, Looped, checked_controller, differing_counts, listening
 from ..controllers.core_controller import NO_SOLUTION, CoreController
 from ..core.run_loop import DIVERGED, REFUSED_ERROR, REFUSED_REFERENCE, RUNNING, Plant, Record, Signals
 from ..paths.models import path_taps
-from ..paths.path_matrix import is_path_matrix, path_matrix, secondary_paths
-from ..power.amplifiers import Amplifier, amplifier_models, compiled_model
+from ..paths.path_matrix import feedback_paths, is_path_matrix, secondary_paths
+from ..power.amplifiers import Amplifier, amplifier_models, amplifier_of_each, compiled_model
 from ..power.constraint import DEFAULT_FS
 from .inputs import (
     DIVERGENCE_LIMIT,
     SensorNoise,
     channel_disturbances,
     disturbance_at_microphone,
-    listen_first,
     naming_sample,
     switch_on_sample,
 )
@@ -130,32 +129,26 @@ def simulate(
     >>> bool(np.mean(result.control_signal[8000:] ** 2) < 1.02 * 0.25)  # unconstrained it would be 1
     True
     """
-    if isinstance(controller, type) or not isinstance(controller, Controller):
-        raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
+    checked_controller(controller)
     fs = as_positive(fs, "fs", unit="Hz")
     several = is_multichannel(controller, reference, secondary_path, disturbance)
     x, d, secondary = _read_signals(reference, primary_path, disturbance, secondary_path, fs, several)
     K, J, _ = secondary.shape
     _require_fit(controller, len(x), J, K, several)
     noise = SensorNoise(sensor_noise_std, rng)
-    rated = getattr(controller, "rated_power", None) if rated_power is None else rated_power
-    rated = (
-        None
-        if rated is None
-        else per_loudspeaker(rated, J, "rated_power")
-        if several
-        else as_positive(rated, "rated_power")
-    )
+    rated: Any = getattr(controller, "rated_power", None) if rated_power is None else rated_power
+    if rated is not None:
+        rated = per_loudspeaker(rated, J, "rated_power") if several else as_positive(rated, "rated_power")
     every = None if record_weights_every is None else as_count(record_weights_every, "record_weights_every")
     on = switch_on_sample(switch_on_s, fs, x.shape[1])
-    functions, models = _amplifiers(amplifier, J, several)
+    functions, models = _amplifiers(amplifier, J)
     feedback = _feedback(feedback_path, fs, len(x), J, several)
     if hasattr(controller, "require_sample_rate"):
         controller.require_sample_rate(fs)
     weights = _weight_rows(x.shape[1] - on, controller, every, several)
     if on:
         heard = x[:, :on].copy(), d[:, :on] + noise.take(K, on)
-        listen_first(controller, *(heard if several else (signal[0] for signal in heard)))
+        listening(controller).listen(*(heard if several else (signal[0] for signal in heard)))
         x, d = x[:, on:], d[:, on:]
 
     plant = Plant(
@@ -177,12 +170,8 @@ def simulate(
     for signal in (*results, *recorded.values()):
         signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
-    found = {
-        "error": signals.error,
-        "control_signal": signals.control_signal,
-        "amplifier_output": signals.amplifier_output,
-    }
-    found |= {"anti_noise": signals.anti_noise} | recorded
+    names = ("error", "control_signal", "amplifier_output", "anti_noise")
+    found = {name: getattr(signals, name) for name in names} | recorded
     if not hasattr(controller, "power_weight"):
         found.pop("power_weight", None)
     if not several or (np.ndim(reference) == 1 and J == K == 1):  # one channel drops its axis, as it was given
@@ -321,34 +310,18 @@ def _feedback(feedback_path: Any, fs: float, n_references: int, J: int, several:
     """Return the feedback paths, (I, J, taps); 0 taps without any."""
     if feedback_path is None:
         return np.zeros((n_references, J, 0))
-    if several:
-        feedback, _ = path_matrix(feedback_path, fs=fs, name="feedback_path")
-    else:
-        feedback = path_taps(feedback_path, fs=fs, name="feedback_path").reshape(1, 1, -1)
+    feedback, _ = feedback_paths(feedback_path, several, fs)
     if feedback.shape[:2] != (n_references, J):
         raise ValueError(
             f"feedback_path must be (I references, J loudspeakers, taps) with I = {n_references}, J = {J}, "
             f"got {feedback.shape}"
         )
-    if np.any(feedback[..., 0]):
-        raise ValueError(
-            f"feedback_path must have a delay of a sample at least: its first tap is {feedback[..., 0].flat[0]:g}, not 0"
-            if not several
-            else "feedback_path must have a delay of a sample at least: a first tap is not 0"
-        )
     return feedback
 
 
-def _amplifiers(amplifier: Any, J: int, several: bool) -> tuple[list[Any], np.ndarray]:
+def _amplifiers(amplifier: Any, J: int) -> tuple[list[Any], np.ndarray]:
     """Return for each loudspeaker an amplifier that is a user's function, or None, and the models, (J, 3)."""
-    each = list(amplifier) if several and isinstance(amplifier, Sequence) else [amplifier] * J
-    if len(each) != J or not all(one is None or callable(one) for one in each):
-        one = (
-            "a function of a sample, or one for each of the {J} loudspeakers, or None"
-            if several
-            else "a function of a sample, or None"
-        )
-        raise TypeError(f"amplifier must be {one.format(J=J)}, got {amplifier!r}")
+    each = amplifier_of_each(amplifier, J)
     functions: list[Any] = [one if one is not None and compiled_model(one) is None else None for one in each]
     models = amplifier_models([None if function else one for one, function in zip(each, functions, strict=True)], J)
     return functions, models.view(np.float64).reshape(J, -1)
@@ -360,14 +333,12 @@ def _require_fit(controller: Any, n_references: int, n_loudspeakers: int, n_micr
         return
     if not controller.multichannel:
         raise ValueError("controller has one channel: give it secondary paths (K microphones, J loudspeakers, taps)")
-    counts = {
-        "references": (controller.n_references, n_references),
-        "loudspeakers": (controller.n_loudspeakers, n_loudspeakers),
-        "microphones": (controller.n_microphones, n_microphones),
-    }
-    for name, (own, run) in counts.items():
-        if own != run:
-            raise ValueError(f"the controller is made for {own} {name}, but reference and paths of the run have {run}")
+    run = {"n_references": n_references, "n_loudspeakers": n_loudspeakers, "n_microphones": n_microphones}
+    for name, own in differing_counts(controller, **run):
+        what = name.removeprefix("n_")
+        raise ValueError(
+            f"the controller is made for {own} {what}, but reference and paths of the run have {run[name]}"
+        )
 
 
 def _weight_rows(n_samples: int, controller: Any, every: int | None, several: bool) -> np.ndarray:

@@ -50,9 +50,14 @@ def frequency_response(path: PathModel, frequencies_hz: ArrayLike, *, fs: float 
     return _response(path, omega)
 
 
+def _finite_taps(path: Any) -> np.ndarray | None:
+    """Return the taps of a path; None if its response is infinite."""
+    return finite_taps(path) if is_system(path) else as_signal(path, "path")
+
+
 def _response(path: Any, omega: np.ndarray) -> np.ndarray:
     """Return the response at frequencies in rad/sample."""
-    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
+    taps = _finite_taps(path)
     if taps is None:
         return np.asarray(path(np.exp(1j * omega)))
     from scipy.signal import freqz
@@ -62,12 +67,21 @@ def _response(path: Any, omega: np.ndarray) -> np.ndarray:
 
 def _response_on_grid(path: Any, n_frequencies: int) -> np.ndarray:
     """Return the response at evenly spaced frequencies from 0 to fs/2, by one FFT if the response is finite."""
-    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
+    taps = _finite_taps(path)
     if taps is None:
         return _response(path, np.linspace(0.0, np.pi, n_frequencies))
     period = 2 * (n_frequencies - 1)  # taps a period apart have the same phase at all of these frequencies
     padded = np.pad(taps, (0, -taps.size % period))
     return np.fft.rfft(padded.reshape(-1, period).sum(axis=0))
+
+
+def responses_of_both(
+    path: PathModel, estimate: PathModel, frequencies_hz: ArrayLike, fs: float | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frequency responses of a path and an estimate of it, which must have the same sampling rate."""
+    fs = sampling_rate(path, fs)
+    sampling_rate(estimate, fs, name="estimate")
+    return frequency_response(path, frequencies_hz, fs=fs), frequency_response(estimate, frequencies_hz, fs=fs)
 
 
 def _frequencies(frequencies_hz: Any, fs: float) -> np.ndarray:
@@ -109,7 +123,7 @@ def group_delay(path: PathModel, frequencies_hz: ArrayLike, *, fs: float | None 
     """
     fs = sampling_rate(path, fs)
     omega = 2 * np.pi * _frequencies(frequencies_hz, fs) / fs
-    taps = finite_taps(path) if is_system(path) else as_signal(path, "path")
+    taps = _finite_taps(path)
     if taps is None:
         step = 1e-4
         before, after = _response(path, omega - step), _response(path, omega + step)
@@ -254,10 +268,7 @@ def phase_error(
     >>> error.error_deg.round(6), error.within_bound
     (array([ -45., -135.]), array([ True, False]))
     """
-    fs = sampling_rate(path, fs)
-    sampling_rate(estimate, fs, name="estimate")
-    true = frequency_response(path, frequencies_hz, fs=fs)
-    estimated = frequency_response(estimate, frequencies_hz, fs=fs)
+    true, estimated = responses_of_both(path, estimate, frequencies_hz, fs)
     error = np.rad2deg(np.angle(estimated * np.conj(true)))
     return PhaseError(as_signal(frequencies_hz, "frequencies_hz"), error)
 
@@ -490,42 +501,34 @@ def causality_margin(
     share = as_positive(onset_share, "onset_share")
     if share >= 1:
         raise ValueError(f"onset_share must be below 1, got {share:g}")
-    if is_path_matrix(primary) or is_path_matrix(secondary):
-        return _margins(primary, secondary, fs, band, share)
-    fs = sampling_rate(primary, fs, name="primary")
-    sampling_rate(secondary, fs, name="secondary")
-    low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
-    responses = (path_taps(primary, name="primary"), path_taps(secondary, name="secondary"))
-    for name, taps in zip(("primary", "secondary"), responses, strict=True):
-        if not np.any(taps):
-            raise ValueError(f"{name} must not be all zeros: a silent path has no delay")
-    onsets = [energy_onset(h, share) / fs for h in responses]
-    delays = [_mean_group_delay(h, low, high, fs) for h in responses]
-    return CausalityMargin(onsets[0], onsets[1], delays[0], delays[1], fs)
-
-
-def _margins(primary: Any, secondary: Any, fs: float | None, band: Any, share: float) -> CausalityMargin:
-    """Return the causality margins of several channels."""
-    p, fs = sampled_path_matrix(primary, fs, "primary", PRIMARY_AXES)
-    s, fs = sampled_path_matrix(secondary, fs, "secondary", SECONDARY_AXES)
+    several = is_path_matrix(primary) or is_path_matrix(secondary)
+    if several:
+        p, fs = sampled_path_matrix(primary, fs, "primary", PRIMARY_AXES)
+        s, fs = sampled_path_matrix(secondary, fs, "secondary", SECONDARY_AXES)
+    else:
+        fs = sampling_rate(primary, fs, name="primary")
+        sampling_rate(secondary, fs, name="secondary")
+        p, s = (path_taps(h, name=n).reshape(1, 1, -1) for h, n in ((primary, "primary"), (secondary, "secondary")))
     low, high = (0.0, fs / 2) if band is None else as_band(band, fs)
     if len(p) != len(s):
         raise ValueError(
             f"primary and secondary must have the same K microphones as their first axis, got {len(p)} and {len(s)}"
         )
     for name, paths, source in (("primary", p, "reference"), ("secondary", s, "loudspeaker")):
-        silent = np.flatnonzero(~np.any(paths, axis=(1, 2)))
-        if silent.size:
-            raise ValueError(
-                f"{name}[{silent[0]}] must not be all zeros: no {source} reaches that microphone; leave it out"
-            )
+        for k in np.flatnonzero(~np.any(paths, axis=(1, 2))):
+            which, why = name, "a silent path has no delay"
+            if several:
+                which, why = f"{name}[{k}]", f"no {source} reaches that microphone; leave it out"
+            raise ValueError(f"{which} must not be all zeros: {why}")
 
     def of_each(paths: np.ndarray, measure: Callable[[np.ndarray], float]) -> np.ndarray:
         return np.array([[measure(h) if np.any(h) else np.inf for h in row] for row in paths])
 
     onsets = [of_each(paths, lambda h: energy_onset(h, share) / fs) for paths in (p, s)]
     delays = [of_each(paths, lambda h: _mean_group_delay(h, low, high, fs)) for paths in (p, s)]
-    return CausalityMargin(onsets[0].min(axis=1), onsets[1], delays[0].min(axis=1), delays[1], fs)
+    found: list[Any] = [onsets[0].min(axis=1), onsets[1], delays[0].min(axis=1), delays[1]]
+    onset_p, onset_s, delay_p, delay_s = found if several else (one.item() for one in found)
+    return CausalityMargin(onset_p, onset_s, delay_p, delay_s, fs)
 
 
 def _mean_group_delay(taps: np.ndarray, low: float, high: float, fs: float) -> float:

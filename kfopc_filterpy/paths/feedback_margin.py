@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.polynomial.polynomial import polysub
 
 from .._types import PathModel
 from .._validate import as_positive
@@ -124,9 +125,7 @@ def feedback_margin(
     w, left = path_taps(control_filter, name="control_filter"), path_taps(feedback_path, name="feedback_path")
     if feedback_estimate is not None:
         sampling_rate(feedback_estimate, fs, name="feedback_estimate")
-        estimate = path_taps(feedback_estimate, name="feedback_estimate")
-        size = max(left.size, estimate.size)
-        left = np.pad(left, (0, size - left.size)) - np.pad(estimate, (0, size - estimate.size))
+        left = polysub(left, path_taps(feedback_estimate, name="feedback_estimate"))
     if left[0] != 0.0:
         raise ValueError(f"feedback_path must have a delay of a sample at least: a first tap is {left[0]:g}, not 0")
     taps = -np.convolve(w, left)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polysub
 from numpy.typing import ArrayLike
 
 from .._types import PathModel, PathModels, Seed
@@ -22,14 +23,9 @@ from .._validate import (
     require_channels_lead,
     require_finite,
 )
-from .analysis import frequency_response
-from .least_squares import (
-    RANK_TOLERANCE,
-    correlation_matrix,
-    cross_correlation,
-    cross_correlation_matrix,
-    minimum_norm_solve,
-)
+from ..power.amplifiers import amplifier_of_each
+from .analysis import responses_of_both
+from .least_squares import RANK_TOLERANCE, correlation_matrix, cross_correlation, minimum_norm_solve
 from .models import fir_path, path_taps, sampling_rate
 from .path_matrix import SECONDARY_AXES, is_path_matrix, sampled_path_matrix
 from .uncertainty import relative_to
@@ -161,24 +157,22 @@ def estimate_path(
     sent, heard = as_real_array(excitation, "excitation"), as_real_array(response, "response")
     if heard.ndim == 3:
         taps, residual_db, variance = _fit_in_turn(sent, heard, n_taps, ridge)
-        return PathEstimate(_system(taps, fs), taps, residual_db, relative_to(taps, variance))
-    if sent.ndim == 2 or heard.ndim == 2:
+    elif sent.ndim == 2 or heard.ndim == 2:
         sent, heard = np.atleast_2d(as_channels(sent, "excitation")), np.atleast_2d(as_channels(heard, "response"))
         require_length(sent.shape[1], (len(sent) + 1) * n_taps - 1)
         if heard.shape[1] != sent.shape[1]:
             raise ValueError(f"response must have {sent.shape[1]} samples, as excitation has, got {heard.shape[1]}")
         require_audible({"excitation": sent, "response": heard}, n_taps)
         _require_different(sent, n_taps)
-        taps, left, residual_db = fit_paths(sent, heard, n_taps, ridge)
-        variance = squared_error(sent, left, taps, ridge)
-        return PathEstimate(_system(taps, fs), taps, residual_db, relative_to(taps, variance))
-    sent = as_signal(sent, "excitation", min_length=2 * n_taps - 1)
-    heard = as_signal(heard, "response", length=sent.size)
-    require_audible({"excitation": sent, "response": heard}, n_taps)
-    sent = sent[np.newaxis]
-    taps, left, residual_db = fit_paths(sent, heard[np.newaxis], n_taps, ridge)
-    uncertainty = relative_to(taps, squared_error(sent, left, taps, ridge))
-    return PathEstimate(fir_path(taps[0, 0], fs), taps[0, 0], float(residual_db[0]), uncertainty)
+        taps, residual_db, variance = _fit(sent, heard, n_taps, ridge)
+    else:
+        sent = as_signal(sent, "excitation", min_length=2 * n_taps - 1)
+        heard = as_signal(heard, "response", length=sent.size)
+        require_audible({"excitation": sent, "response": heard}, n_taps)
+        taps, residual_db, variance = _fit(sent[np.newaxis], heard[np.newaxis], n_taps, ridge)
+        only, uncertainty = taps[0, 0], relative_to(taps, variance)
+        return PathEstimate(fir_path(only, fs), only, float(residual_db[0]), uncertainty)
+    return PathEstimate(_system(taps, fs), taps, residual_db, relative_to(taps, variance))
 
 
 def require_audible(recorded: Mapping[str, np.ndarray], n_taps: int) -> None:
@@ -216,13 +210,15 @@ def _fit_in_turn(
         )
     require_length(sent.shape[1], 2 * n_taps - 1)
     require_audible({"excitation": sent, "response": heard}, n_taps)
-    fits = [fit_paths(sent[j : j + 1], responses, n_taps, ridge) for j, responses in enumerate(heard)]
-    errors = [squared_error(sent[j : j + 1], left, taps, ridge) for j, (taps, left, _) in enumerate(fits)]
-    return (
-        np.concatenate([taps for taps, _, _ in fits], axis=1),
-        np.stack([residual_db for _, _, residual_db in fits], axis=1),
-        np.concatenate(errors, axis=1),
-    )
+    fits = [_fit(sent[j : j + 1], responses, n_taps, ridge) for j, responses in enumerate(heard)]
+    taps, residual_db, variance = zip(*fits, strict=True)
+    return np.concatenate(taps, axis=1), np.stack(residual_db, axis=1), np.concatenate(variance, axis=1)
+
+
+def _fit(sent: np.ndarray, heard: np.ndarray, n_taps: int, ridge: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the paths from J signals to K others, their residuals in dB and the squared errors to be expected."""
+    taps, left, residual_db = fit_paths(sent, heard, n_taps, ridge)
+    return taps, residual_db, squared_error(sent, left, taps, ridge)
 
 
 def fit_paths(
@@ -232,15 +228,19 @@ def fit_paths(
 
     Return the taps (K, J, n_taps), what they leave unexplained, (K, n_samples - n_taps + 1), and its power in dB, (K,).
     """
-    matrix = _normal_matrix(sent, n_taps)
+    from scipy.linalg import cho_factor, cho_solve
+
+    matrix = correlation_matrix(sent, n_taps)
     for j, signal in enumerate(sent):
         diagonal = np.arange(j * n_taps, (j + 1) * n_taps)
         matrix[diagonal, diagonal] += regularization * float(np.mean(signal[n_taps - 1 :] ** 2))
     settled = heard[:, n_taps - 1 :]
     right = np.array([np.concatenate([cross_correlation(k, signal) for signal in sent]) for k in settled])
-    taps = _solve(matrix, right, definite=len(sent) > 1 and regularization > RANK_TOLERANCE).reshape(
-        len(heard), len(sent), n_taps
-    )
+    if len(sent) > 1 and regularization > RANK_TOLERANCE:  # positive definite: Cholesky's method saves most of the time
+        fitted = cho_solve(cho_factor(matrix), right.T).T
+    else:
+        fitted = minimum_norm_solve(matrix, right)
+    taps = fitted.reshape(len(heard), len(sent), n_taps)
     left = settled - [
         sum(np.convolve(signal, path, mode="valid") for signal, path in zip(sent, paths, strict=True)) for paths in taps
     ]
@@ -307,30 +307,6 @@ def _require_different(sent: np.ndarray, n_taps: int) -> None:
                     f"excitation[{j}] must not be correlated with excitation[{i}], since their paths cannot be told "
                     "apart: play noises of different seeds, or let the loudspeakers play in turn"
                 )
-
-
-def _normal_matrix(sent: np.ndarray, n_taps: int) -> np.ndarray:
-    """Return the correlations of all delays of all excitations, (J n_taps, J n_taps)."""
-    J, start = len(sent), n_taps - 1
-    blocks = np.empty((J, n_taps, J, n_taps))
-    for j, signal in enumerate(sent):
-        blocks[j, :, j] = correlation_matrix(signal, n_taps, start)
-        for i in range(j):
-            blocks[i, :, j] = cross_correlation_matrix(sent[i], signal, n_taps, start)
-            blocks[j, :, i] = blocks[i, :, j].T
-    return blocks.reshape(J * n_taps, J * n_taps)
-
-
-def _solve(matrix: np.ndarray, right: np.ndarray, *, definite: bool) -> np.ndarray:
-    """Solve for each row of `right`.
-
-    With a ridge the matrix is positive definite, and Cholesky's method saves most of the time where it is large.
-    """
-    if definite:
-        from scipy.linalg import cho_factor, cho_solve
-
-        return cho_solve(cho_factor(matrix), right.T).T
-    return minimum_norm_solve(matrix, right)
 
 
 def _system(taps: np.ndarray, fs: float) -> control.TransferFunction:
@@ -437,7 +413,7 @@ def identify_secondary_path(
         raise ValueError(f"duration_s must be at least {needed / fs:.3g} s for {n_taps} taps, got {duration_s:g}")
     generator = as_generator(rng)
     sent = np.array([_excitation(excitation, n_samples, fs, as_positive(level, "level"), generator) for _ in range(J)])
-    received = _through(sent, _amplifiers(amplifier, J), true)  # (J, K, n_samples)
+    received = _through(sent, amplifier_of_each(amplifier, J, "signal"), true)  # (J, K, n_samples)
     received = received if in_turn else received.sum(axis=0)
     received += as_nonnegative(sensor_noise_std, "sensor_noise_std") * generator.standard_normal(received.shape)
     if not several:
@@ -471,15 +447,6 @@ def _require_sound(paths: np.ndarray) -> None:
             f"secondary_path[{k}][{j}] must not be all zeros: an error relative to it is undefined; leave out the "
             "loudspeaker if it is unplugged, or the microphone if it is dead"
         )
-
-
-def _amplifiers(amplifier: Any, n_loudspeakers: int) -> list[Any]:
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
-    if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
-        raise TypeError(
-            f"amplifier must be a function of a signal, or one for each of the {n_loudspeakers} loudspeakers, or None"
-        )
-    return each
 
 
 def _excitation(kind: str, n_samples: int, fs: float, level: float, rng: np.random.Generator) -> np.ndarray:
@@ -535,10 +502,8 @@ def modelling_error_db(
     >>> modelling_error_db([1.0, 0.5], [1.1, 0.55], [100.0, 1000.0], fs=8000.0).round(6)
     array([-20., -20.])
     """
-    fs = sampling_rate(path, fs)
-    sampling_rate(estimate, fs, name="estimate")
-    true = frequency_response(path, frequencies_hz, fs=fs)
-    error = np.abs(frequency_response(estimate, frequencies_hz, fs=fs) - true)
+    true, estimated = responses_of_both(path, estimate, frequencies_hz, fs)
+    error = np.abs(estimated - true)
     tiny = np.finfo(float).tiny
     ratio = np.maximum(error, tiny) / np.maximum(np.abs(true), tiny)
     return np.clip(20 * np.log10(np.maximum(ratio, tiny)), -300.0, 300.0)
@@ -570,6 +535,5 @@ def misalignment_db(path: PathModel, estimate: PathModel) -> float:
     true, estimated = path_taps(path), path_taps(estimate, name="estimate")
     if not np.any(true):
         raise ValueError("path must not be all zeros: an error relative to it is undefined")
-    length = max(true.size, estimated.size)
-    error = np.pad(estimated, (0, length - estimated.size)) - np.pad(true, (0, length - true.size))
+    error = polysub(estimated, true)
     return float(10 * np.log10(max(np.sum(error**2) / np.sum(true**2), 1e-30)))

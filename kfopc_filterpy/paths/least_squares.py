@@ -6,6 +6,7 @@ The fit of a path and the Wiener control filter are both of this kind.
 from __future__ import annotations
 
 import numpy as np
+from scipy.signal import correlate
 
 # Eigenvalues of a correlation matrix below this share of the largest count as zero. Such directions of the weights
 # get no weight, which is the solution of minimum norm; for a tone only two directions remain. The entries of the matrix
@@ -26,42 +27,28 @@ def cross_correlation(output: np.ndarray, regressor: np.ndarray) -> np.ndarray:
     -------
     ndarray, shape (n_taps,)
     """
-    return np.correlate(regressor, output, mode="valid")[::-1] / output.size
+    return correlate(regressor, output, mode="valid")[::-1] / output.size
 
 
-def correlation_matrix(signal: np.ndarray, n_taps: int, start: int) -> np.ndarray:
-    """Return the mean of ``signal[n - i] * signal[n - j]`` over n >= start, shape (n_taps, n_taps).
+def correlation_matrix(signals: np.ndarray, n_taps: int) -> np.ndarray:
+    """Return the mean of ``signals[a, n - i] * signals[b, n - j]`` over n >= n_taps - 1, (C n_taps, C n_taps).
 
-    Each row follows from the one above by the products that enter and leave the window.
+    `signals` are (C, n_samples), or (n_samples,) for C = 1. Each row of a block is computed from the one above by adding the
+    products that enter the window and subtracting those that leave it.
     """
-    count = signal.size - start
-    matrix = np.zeros((n_taps, n_taps))
-    matrix[0] = cross_correlation(signal[start:], signal[start - n_taps + 1 :])
-    entering = signal[start - n_taps + 1 : start][::-1]  # signal[start - 1], signal[start - 2], ...
-    leaving = signal[::-1][: n_taps - 1]  # signal[-1], signal[-2], ...
+    signals = np.atleast_2d(signals)
+    n_signals, length = signals.shape
+    blocks = np.empty((n_signals, n_signals, n_taps, n_taps))
+    for a, now in enumerate(signals[:, n_taps - 1 :]):
+        for b, signal in enumerate(signals):
+            blocks[a, b, 0] = cross_correlation(now, signal)
+    blocks[:, :, :, 0] = blocks[:, :, 0, :].swapaxes(0, 1)
+    entering = signals[:, : n_taps - 1][:, ::-1]  # the samples before the window, newest first
+    leaving = signals[:, ::-1][:, : n_taps - 1]  # the last samples, newest first
     for i in range(n_taps - 1):
-        change = entering[i] * entering[i:] - leaving[i] * leaving[i:]
-        matrix[i + 1, i + 1 :] = matrix[i, i:-1] + change / count
-    return np.triu(matrix) + np.triu(matrix, 1).T
-
-
-def cross_correlation_matrix(
-    first: np.ndarray, second: np.ndarray, n_taps: int, start: int, n_second: int | None = None
-) -> np.ndarray:
-    """Return the mean of ``first[n - i] * second[n - j]`` over n >= start, shape (n_taps, n_second or n_taps).
-
-    As in `correlation_matrix`, each entry follows from the one above it to the left.
-    """
-    count, n_second = first.size - start, n_taps if n_second is None else n_second
-    matrix = np.empty((n_taps, n_second))
-    matrix[0] = cross_correlation(first[start:], second[start - n_second + 1 :])
-    matrix[:, 0] = cross_correlation(second[start:], first[start - n_taps + 1 :])
-    entering = [signal[start - taps + 1 : start][::-1] for signal, taps in ((first, n_taps), (second, n_second))]
-    leaving = [signal[::-1][: taps - 1] for signal, taps in ((first, n_taps), (second, n_second))]
-    for i in range(n_taps - 1):
-        change = entering[0][i] * entering[1] - leaving[0][i] * leaving[1]
-        matrix[i + 1, 1:] = matrix[i, :-1] + change / count
-    return matrix
+        change = entering[:, i, None, None] * entering - leaving[:, i, None, None] * leaving
+        blocks[:, :, i + 1, 1:] = blocks[:, :, i, :-1] + change / (length - n_taps + 1)
+    return blocks.swapaxes(1, 2).reshape(n_signals * n_taps, -1)
 
 
 def minimum_norm_solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ the finite impulse response that a sample-by-sample loop runs. Tap arrays are ac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -261,18 +262,19 @@ def _infinite_response(system: Any, length: int, name: str) -> np.ndarray:
             f"{name} must be stable, but has a pole of magnitude {poles.max():.6g}; a filter of high order "
             "is easily unstable as a transfer function: design it as second-order sections and pass its taps"
         )
-    if hasattr(system, "num_array"):
-        from scipy.signal import lfilter
+    from scipy.signal import dimpulse, lfilter
 
+    if hasattr(system, "num_array"):
         numerator, denominator = system.num_array[0, 0], system.den_array[0, 0]
         delay = denominator.size - numerator.size
         return lfilter(np.pad(numerator, (delay, 0)), denominator, np.eye(1, length)[0])
-    response, state = np.zeros(length), system.B[:, 0]
-    response[0] = system.D[0, 0]
-    for n in range(1, length):
-        response[n] = system.C[0] @ state
-        state = system.A @ state
-    return response
+    return dimpulse((system.A, system.B, system.C, system.D, 1), n=length)[1][0][:, 0]
+
+
+def stacked(responses: Sequence[np.ndarray]) -> np.ndarray:
+    """Return impulse responses as rows of one array, the shorter ones filled with zeros."""
+    longest = max(taps.size for taps in responses)
+    return np.array([np.pad(taps, (0, longest - taps.size)) for taps in responses])
 
 
 def perturbed_path(

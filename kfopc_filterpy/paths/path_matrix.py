@@ -8,7 +8,7 @@ import numpy as np
 
 from .._types import PathModels
 from .._validate import as_real_array, require_finite
-from .models import is_system, path_taps, sampling_rate
+from .models import is_system, path_taps, sampling_rate, stacked
 
 SECONDARY_AXES = "(K microphones, J loudspeakers, taps)"
 PRIMARY_AXES = "(K microphones, I references, taps)"
@@ -28,6 +28,22 @@ def primary_paths(
     return path_matrix(paths, fs=fs, name=name, axes=PRIMARY_AXES)
 
 
+def single_path(path: PathModels, name: str, fs: float | None = None) -> tuple[np.ndarray, float | None]:
+    """Return one path as taps, (n_taps,), and its sampling rate in Hz if a system tells it."""
+    return path_taps(path, fs=fs, name=name), sampling_rate(path, fs, name=name) if is_system(path) else None
+
+
+def feedback_paths(paths: PathModels, several: bool, fs: float | None = None) -> tuple[np.ndarray, float | None]:
+    """Return the paths from the loudspeakers to the reference microphones as taps (I, J, n_taps), and their sampling rate."""
+    name = "feedback_path"
+    taps, rate = path_matrix(paths, fs=fs, name=name) if several else single_path(paths, name, fs)
+    taps = taps if several else taps.reshape(1, 1, -1)
+    for first in taps[..., 0].flat:
+        if first != 0.0:
+            raise ValueError(f"{name} must have a delay of a sample at least: a first tap is {first:g}, not 0")
+    return taps, rate
+
+
 def is_path_matrix(paths: PathModels) -> bool:
     """Return whether paths are given as a matrix (outputs, inputs, taps), be it one by one, or as a matrix of systems."""
     if is_system(paths):
@@ -40,7 +56,9 @@ def path_matrix(
 ) -> tuple[np.ndarray, float | None]:
     """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz if systems tell it."""
     if is_system(paths):
-        rows: Any = [[paths]] if (paths.noutputs, paths.ninputs) == (1, 1) else _entries(paths)
+        if (paths.noutputs, paths.ninputs) == (1, 1):
+            return _from_systems([[paths]], fs, name, axes)
+        rows = [[paths[k, j] for j in range(paths.ninputs)] for k in range(paths.noutputs)]
         return _from_systems(rows, fs, name, axes)
     if _has_systems(paths):
         return _from_systems(paths, fs, name, axes)
@@ -60,11 +78,6 @@ def _has_systems(paths: Any) -> bool:
     return any(is_system(entry) for row in rows if isinstance(row, list | tuple) for entry in row)
 
 
-def _entries(system: Any) -> list[list[Any]]:
-    """Return the entries of a system of several inputs and outputs."""
-    return [[system[k, j] for j in range(system.ninputs)] for k in range(system.noutputs)]
-
-
 def sampled_path_matrix(paths: PathModels, fs: float | None, name: str, axes: str) -> tuple[np.ndarray, float]:
     """Return paths as taps (outputs, inputs, n_taps), and their sampling rate in Hz: the systems' own, or `fs`."""
     taps, rate = path_matrix(paths, fs=fs, name=name, axes=axes)
@@ -77,11 +90,6 @@ def _from_systems(rows: Any, fs: float | None, name: str, axes: str) -> tuple[np
     rates = {sampling_rate(path, fs, name=name) for row in rows for path in row if is_system(path)}
     if len(rates) > 1:
         raise ValueError(f"{name} has systems of different sampling rates: {sorted(rates)} Hz")
-    taps = [
-        [path_taps(path, fs=fs, name=f"{name}[{k}][{j}]") for j, path in enumerate(row)] for k, row in enumerate(rows)
-    ]
-    matrix = np.zeros((len(taps), len(taps[0]), max(path.size for row in taps for path in row)))
-    for k, row in enumerate(taps):
-        for j, path in enumerate(row):
-            matrix[k, j, : path.size] = path
-    return matrix, rates.pop() if rates else None
+    entries = [(path, f"{name}[{k}][{j}]") for k, row in enumerate(rows) for j, path in enumerate(row)]
+    taps = stacked([path_taps(path, fs=fs, name=entry) for path, entry in entries])
+    return taps.reshape(len(rows), len(rows[0]), -1), rates.pop() if rates else None

@@ -105,12 +105,10 @@ def realize_paths(paths: PathModels, order: int, *, fs: float | None = None) -> 
 
 def _residual_db(taps: np.ndarray, system: control.StateSpace) -> np.ndarray:
     """Return the relative error energy of the impulse responses in dB, (outputs,); the model's may be longer."""
-    n_samples = 2 * taps.shape[2]
-    response, state = [system.D], system.B
-    for _ in range(n_samples - 1):
-        response.append(system.C @ state)
-        state = system.A @ state
-    error = np.array(np.moveaxis(np.array(response), 0, 2))
+    from scipy.signal import dimpulse
+
+    responses = dimpulse((system.A, system.B, system.C, system.D, 1), n=2 * taps.shape[2])[1]  # (inputs, n, outputs)
+    error = np.transpose(responses, (2, 0, 1)).copy()
     error[..., : taps.shape[2]] -= taps
     energy = np.maximum(np.sum(taps**2, axis=(1, 2)), np.finfo(float).tiny)
     return 10 * np.log10(np.maximum(np.sum(error**2, axis=(1, 2)) / energy, 1e-30))

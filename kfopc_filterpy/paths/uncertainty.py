@@ -96,12 +96,9 @@ class PathTolerance:
     gain_db: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, check in (
-            ("delay_samples", as_nonnegative),
-            ("phase_deg", as_nonnegative),
-            ("gain_db", as_gain_error),
-        ):
-            object.__setattr__(self, name, check(getattr(self, name), name))
+        for name in ("delay_samples", "phase_deg"):
+            object.__setattr__(self, name, as_nonnegative(getattr(self, name), name))
+        object.__setattr__(self, "gain_db", as_gain_error(self.gain_db, "gain_db"))
 
     def relative_error(self, omega: np.ndarray) -> np.ndarray:
         """Return the largest ``|S/S^ - 1|`` within the tolerances, at frequencies `omega` in radians per sample."""

@@ -21,7 +21,6 @@ POWER = np.dtype([(name, np.float64) for name in ("mean_square", "lap", "taken",
 SETTINGS = ("rated_power", "rate", "supplied_factor", "supplied_power", "supplied_gain")  # NaN if not supplied
 NUMBERS = np.dtype([(name, np.float64) for name in (*SETTINGS, "factor", "power", "gain")])
 PREVIEWED = np.dtype([(name, np.float64) for name in ("factor", "power", "gain", *(f"mean_{name}" for name in _MEANS))])
-REFERENCE = _MEANS.index("reference")
 
 
 class ConstraintState(NamedTuple):

@@ -74,8 +74,36 @@ class OutputLimits:
         return OutputLimiter(self.rated_power, fs=fs, window_s=self.window_s, amplitude_limit=self.amplitude_limit)
 
 
+class _Rating:
+    """What ratings of amplifiers and of loudspeakers have in common."""
+
+    ohm: Any
+    peak_volts: float | None
+    volts_per_unit: float
+
+    def _check_optional(self, **units: str) -> None:
+        """Raise an error if one of these, by its unit, is given and not a positive number."""
+        for name, unit in units.items():
+            if getattr(self, name) is not None:
+                as_positive(getattr(self, name), name, unit=unit)
+
+    def _given(self, *names: str) -> list[str]:
+        """Return which of these are given."""
+        return [name for name in names if getattr(self, name) is not None]
+
+    def _mean_square(self, watts: float | None) -> float:
+        """Return the rated power from the watts, or from the peak voltage if there are none; Inf if there is neither."""
+        if watts is not None:
+            return watts * self.ohm / self.volts_per_unit**2
+        return math.inf if self.peak_volts is None else (self.peak_volts / self.volts_per_unit) ** 2 / 2.0
+
+    def watt(self, power: NumberOrArray) -> NumberOrArray:
+        """Return the watts of a mean square `power` of the control signal."""
+        return power * self.volts_per_unit**2 / self.ohm
+
+
 @dataclass(frozen=True)
-class AmplifierRating:
+class AmplifierRating(_Rating):
     """Rating of an amplifier: a power into a resistance, a peak voltage, or both.
 
     Parameters
@@ -118,10 +146,8 @@ class AmplifierRating:
     def __post_init__(self) -> None:
         as_positive(self.ohm, "ohm", unit="ohm")
         as_positive(self.volts_per_unit, "volts_per_unit", unit="V")
-        for name, unit in (("sine_watt", "W"), ("noise_watt", "W"), ("peak_volts", "V")):
-            if getattr(self, name) is not None:
-                as_positive(getattr(self, name), name, unit=unit)
-        given = [name for name in ("sine_watt", "noise_watt") if getattr(self, name) is not None]
+        self._check_optional(sine_watt="W", noise_watt="W", peak_volts="V")
+        given = self._given("sine_watt", "noise_watt")
         if len(given) > 1 or (not given and self.peak_volts is None):
             raise ValueError(
                 f"an amplifier's rating must have sine_watt or noise_watt, or else peak_volts, got "
@@ -131,10 +157,7 @@ class AmplifierRating:
     @property
     def rated_power(self) -> float:
         """Rated power ρ_o, the largest mean square of the control signal."""
-        watts = self.noise_watt if self.sine_watt is None else self.sine_watt
-        if watts is None:
-            return (float(self.peak_volts or 0.0) / self.volts_per_unit) ** 2 / 2.0
-        return watts * self.ohm / self.volts_per_unit**2
+        return self._mean_square(self.noise_watt if self.sine_watt is None else self.sine_watt)
 
     @property
     def amplitude_limit(self) -> float:
@@ -149,13 +172,9 @@ class AmplifierRating:
         """Limits of the control signal; the mean power counts over windows of 100 ms."""
         return OutputLimits(self.rated_power, self.amplitude_limit, DEFAULT_WINDOW_S, "amplifier")
 
-    def watt(self, power: NumberOrArray) -> NumberOrArray:
-        """Return the watts of a mean square `power` of the control signal."""
-        return power * self.volts_per_unit**2 / self.ohm
-
 
 @dataclass(frozen=True, eq=False)
-class LoudspeakerRating:
+class LoudspeakerRating(_Rating):
     r"""Rating of a loudspeaker: the heat that its voice coil bears, and how far its cone may move.
 
     The thermal rating is a mean over seconds. It becomes the rated power of a controller and a long window of the
@@ -229,18 +248,10 @@ class LoudspeakerRating:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ohm", float(np.min(as_curve(self.ohm, "ohm", "ohm")[1])))
-        for name, unit in (
-            ("noise_watt", "W"),
-            ("sine_watt", "W"),
-            ("programme_watt", "W"),
-            ("peak_volts", "V"),
-            ("x_max_mm", "mm"),
-        ):
-            if getattr(self, name) is not None:
-                as_positive(getattr(self, name), name, unit=unit)
+        self._check_optional(noise_watt="W", sine_watt="W", programme_watt="W", peak_volts="V", x_max_mm="mm")
         for name in ("excursion_crest_factor", "thermal_window_s", "volts_per_unit"):
             as_positive(getattr(self, name), name)
-        powers = [name for name in ("noise_watt", "sine_watt", "programme_watt") if getattr(self, name) is not None]
+        powers = self._given("noise_watt", "sine_watt", "programme_watt")
         if len(powers) > 1 or not (powers or self.peak_volts is not None or self.x_max_mm is not None):
             raise ValueError(
                 "a loudspeaker's rating must have one of noise_watt, sine_watt and programme_watt, or else peak_volts or "
@@ -259,14 +270,8 @@ class LoudspeakerRating:
     def rated_power(self) -> float:
         """Rated power ρ_o from the watts, or from the peak voltage if there are none; Inf if there is neither."""
         if self.programme_watt is not None:
-            watts: float | None = self.programme_watt / PROGRAMME_OVER_NOISE
-        else:
-            watts = self.noise_watt if self.sine_watt is None else self.sine_watt
-        if watts is not None:
-            return watts * self.ohm / self.volts_per_unit**2
-        if self.peak_volts is not None:
-            return (self.peak_volts / self.volts_per_unit) ** 2 / 2.0
-        return math.inf
+            return self._mean_square(self.programme_watt / PROGRAMME_OVER_NOISE)
+        return self._mean_square(self.noise_watt if self.sine_watt is None else self.sine_watt)
 
     @property
     def amplitude_limit(self) -> float | None:
@@ -277,10 +282,6 @@ class LoudspeakerRating:
     def limits(self) -> OutputLimits:
         """Limits of the control signal without the excursion; the mean power counts over `thermal_window_s`."""
         return OutputLimits(self.rated_power, self.amplitude_limit, self.thermal_window_s, "loudspeaker's power")
-
-    def watt(self, power: NumberOrArray) -> NumberOrArray:
-        """Return the watts of a mean square `power` of the control signal."""
-        return power * self.volts_per_unit**2 / self.ohm
 
     def displacement_mm(self, control_signal: ArrayLike, fs: float) -> np.ndarray:
         """Return the displacement h * y of the cone in mm, (n_samples,), at a sample rate `fs` in Hz.

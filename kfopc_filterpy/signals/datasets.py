@@ -19,28 +19,32 @@ _FOLDER_VARIABLE = "KFOPC_DATA"
 _HOST = "https://raw.githubusercontent.com"
 _NO_LICENCE = "none stated"
 
-# The room's files by variable: P{k} to microphone k, S{k}{j} from loudspeaker j to microphone k.
-_ROOM_HASHES = {
-    "P1": "d59075ac333a904ba62dc77a31ba8311ca7af7c5d62857216d328213145be865",
-    "P2": "3d25075269206f42800336576730c0985fd60c37896c7d7cbe53a6ee6063e553",
-    "P3": "a5e91bd2ee1b1f5aa683a087c4f456ee6ff08a6471e23e9ae81d8080fc69f531",
-    "P4": "177bc3cf279a217f7042264d417af99cfde7524339a639880059c5911f373072",
-    "S11": "0dc6fcf0ce36ea4b49119da638308a7da49f15f4bea9604ffad220ee2b0343ba",
-    "S12": "828404f47cc67a01de81ddccacaf9ca84bb1a7f6879944ef072fc16dd3cfe2fe",
-    "S13": "01d8d6493bcc50f176601a4fa3ae01ceb8852f23bd493c63e10d3551d8538ad2",
-    "S14": "0347f5d6876c6dde69f0b1aa1728298aed59d166576f5e2d812758b4f6b16e6f",
-    "S21": "0c5836eda3613ea7c8279654c83578dacd2ad369359c04e7cfa973f2acdad0c9",
-    "S22": "44ca5d237a05e30c42bec2465e27a63a8183b3f0d15635a7a92e5c55d6637245",
-    "S23": "c2efd7f5984341ff267bdd3155847c5276579d830d29eb55a31d7945b96dea58",
-    "S24": "a55ed764ff44e349064390d9f06e95ca2ef08b49a67c783381d87d45b9c07134",
-    "S31": "aed233809d6a6fc6033e9a6249aa711035c29beababda91bd264ccd10b41a935",
-    "S32": "24df3d8ff45027432395676409a3dec9a09e6890206e978832ed7ad4148220fc",
-    "S33": "4e413c66cdef0290c76fd8f5ac5de49fae56ba3de9f9ee134f61431f4442c501",
-    "S34": "d052d8909aa6f324040adaa7dc4990ea63c5eed64efe5c9326ad014dd24b2729",
-    "S41": "160e8cb6d0ac2d59d8ea8e05c90d7b6d0d29683fd03c532fdb1cc2609ce4fe6d",
-    "S42": "8893bb95e6668451843429ef5f68df2e122e115273ce3f2fddb49c1dfdbbd2e1",
-    "S43": "ee087943f71e14ecebbae62db8db1ed33f74de799ed38ff3b2fd2fefad16aea5",
-    "S44": "e9a9abe5d954d98933e13c0b933a3487bb54fcf7e2826a25b2b259a1fa01576c",
+# SHA-256 of each file. The room's are P{k}, to microphone k, and S{k}{j}, from loudspeaker j to microphone k.
+_SHA256 = {
+    "duct/Pz1.mat": "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
+    "duct/Sz.mat": "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
+    "motor/Motor.mat": "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
+    "compressor/compressor_16kHz.mat": "41498a595d746ce706926c2b33156bc868753a7e29be1ebb6a1eabcf3417227d",
+    "room4x4/P1.mat": "d59075ac333a904ba62dc77a31ba8311ca7af7c5d62857216d328213145be865",
+    "room4x4/P2.mat": "3d25075269206f42800336576730c0985fd60c37896c7d7cbe53a6ee6063e553",
+    "room4x4/P3.mat": "a5e91bd2ee1b1f5aa683a087c4f456ee6ff08a6471e23e9ae81d8080fc69f531",
+    "room4x4/P4.mat": "177bc3cf279a217f7042264d417af99cfde7524339a639880059c5911f373072",
+    "room4x4/S11.mat": "0dc6fcf0ce36ea4b49119da638308a7da49f15f4bea9604ffad220ee2b0343ba",
+    "room4x4/S12.mat": "828404f47cc67a01de81ddccacaf9ca84bb1a7f6879944ef072fc16dd3cfe2fe",
+    "room4x4/S13.mat": "01d8d6493bcc50f176601a4fa3ae01ceb8852f23bd493c63e10d3551d8538ad2",
+    "room4x4/S14.mat": "0347f5d6876c6dde69f0b1aa1728298aed59d166576f5e2d812758b4f6b16e6f",
+    "room4x4/S21.mat": "0c5836eda3613ea7c8279654c83578dacd2ad369359c04e7cfa973f2acdad0c9",
+    "room4x4/S22.mat": "44ca5d237a05e30c42bec2465e27a63a8183b3f0d15635a7a92e5c55d6637245",
+    "room4x4/S23.mat": "c2efd7f5984341ff267bdd3155847c5276579d830d29eb55a31d7945b96dea58",
+    "room4x4/S24.mat": "a55ed764ff44e349064390d9f06e95ca2ef08b49a67c783381d87d45b9c07134",
+    "room4x4/S31.mat": "aed233809d6a6fc6033e9a6249aa711035c29beababda91bd264ccd10b41a935",
+    "room4x4/S32.mat": "24df3d8ff45027432395676409a3dec9a09e6890206e978832ed7ad4148220fc",
+    "room4x4/S33.mat": "4e413c66cdef0290c76fd8f5ac5de49fae56ba3de9f9ee134f61431f4442c501",
+    "room4x4/S34.mat": "d052d8909aa6f324040adaa7dc4990ea63c5eed64efe5c9326ad014dd24b2729",
+    "room4x4/S41.mat": "160e8cb6d0ac2d59d8ea8e05c90d7b6d0d29683fd03c532fdb1cc2609ce4fe6d",
+    "room4x4/S42.mat": "8893bb95e6668451843429ef5f68df2e122e115273ce3f2fddb49c1dfdbbd2e1",
+    "room4x4/S43.mat": "ee087943f71e14ecebbae62db8db1ed33f74de799ed38ff3b2fd2fefad16aea5",
+    "room4x4/S44.mat": "e9a9abe5d954d98933e13c0b933a3487bb54fcf7e2826a25b2b259a1fa01576c",
 }
 
 
@@ -106,11 +110,11 @@ class Dataset:
 
 
 def _dataset(
-    name: str, title: str, repository: str, commit: str, units: str, files: list[tuple[str, str, str, str]]
+    name: str, title: str, repository: str, commit: str, units: str, files: dict[str, tuple[str, str]]
 ) -> Dataset:
-    """Return a dataset at 16 kHz without a licence; of each file its name, path at the source, SHA-256, variable."""
-    source = f"{repository}/{commit}"
-    entries = (DatasetFile(name, f"{_HOST}/{source}/{quote(path)}", sha, var) for name, path, sha, var in files)
+    """Return a dataset at 16 kHz without a licence; of each variable its file's name, and the path at the source."""
+    source = f"{_HOST}/{repository}/{commit}"
+    entries = (DatasetFile(name, f"{source}/{quote(path)}", _SHA256[name], var) for var, (name, path) in files.items())
     return Dataset(name, title, repository, commit, _NO_LICENCE, 16000.0, units, tuple(entries))
 
 
@@ -123,20 +127,10 @@ _DATASETS = {
             "Luo-Zhengding/GFANC-Kalman",
             "06badd525411571402e83212e7f00b2345cde62d",
             "arbitrary: the secondary path gains 10 to 30 dB",
-            [
-                (
-                    "duct/Pz1.mat",
-                    "Pz and Sz/Duct_Path/Pz1.mat",
-                    "21933650a3af9a1e0cdf77b36d04c03ca36494d9b33384cbc004bbd7e51f976d",
-                    "Pz1",
-                ),
-                (
-                    "duct/Sz.mat",
-                    "Pz and Sz/Duct_Path/Sz.mat",
-                    "ea6fcee9df766cf361438f73de5fb63590c20562440a88c462f882fa159df176",
-                    "S",
-                ),
-            ],
+            {
+                "Pz1": ("duct/Pz1.mat", "Pz and Sz/Duct_Path/Pz1.mat"),
+                "S": ("duct/Sz.mat", "Pz and Sz/Duct_Path/Sz.mat"),
+            },
         ),
         _dataset(
             "motor",
@@ -144,14 +138,7 @@ _DATASETS = {
             "Ji-Junwei/PriPathEst_MOVFxLMS_ANC",
             "84bcdae3aaba5c7410898dcb20ba14f5d417c0d8",
             "arbitrary",
-            [
-                (
-                    "motor/Motor.mat",
-                    "MOVFxLMS_PriEst/Noise_data/Motor.mat",
-                    "bded8c35cec69f2c2a71f7d75f8248382a2ea80698ded835d9914b0363755dde",
-                    "Motor_noise",
-                )
-            ],
+            {"Motor_noise": ("motor/Motor.mat", "MOVFxLMS_PriEst/Noise_data/Motor.mat")},
         ),
         _dataset(
             "compressor",
@@ -159,14 +146,7 @@ _DATASETS = {
             "ANC-Research/IC-DMCANC-CPA",
             "ed1d5dbe59c990c1718052e6d3e28513ff12b70c",
             "arbitrary",
-            [
-                (
-                    "compressor/compressor_16kHz.mat",
-                    "compressor_16kHz.mat",
-                    "41498a595d746ce706926c2b33156bc868753a7e29be1ebb6a1eabcf3417227d",
-                    "yr",
-                )
-            ],
+            {"yr": ("compressor/compressor_16kHz.mat", "compressor_16kHz.mat")},
         ),
         _dataset(
             "room",
@@ -174,7 +154,7 @@ _DATASETS = {
             "ShiDongyuan/Meta",
             "dd99aaa351c397090ab7efc03f02a84b669cf302",
             "not stated",
-            [(f"room4x4/{name}.mat", f"path/{name}.mat", sha, name) for name, sha in _ROOM_HASHES.items()],
+            {Path(name).stem: (name, f"path/{Path(name).name}") for name in _SHA256 if name.startswith("room4x4/")},
         ),
     )
 }

@@ -8,20 +8,11 @@ Power is the mean square over the whole signal. For several channels, stack call
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from .._types import Seed
-from .._validate import (
-    as_band,
-    as_count,
-    as_generator,
-    as_nonnegative,
-    as_number,
-    as_positive,
-    as_sample_count,
-)
+from .._validate import as_band, as_count, as_generator, as_nonnegative, as_number, as_positive, as_sample_count
 from .shaping import scaled_to_power
 
 # The compressor's spectral envelope: a small shell radiates poorly below its peak, and forces fall above it.
@@ -120,10 +111,8 @@ def band_limited_noise(
     n_samples = as_sample_count(duration_s, fs, "duration_s")
     low, high = as_band(band, fs)
 
-    def inside(frequencies: np.ndarray) -> np.ndarray:
-        return ((frequencies >= low) & (frequencies <= high)).astype(float)
-
-    shaped = _shaped_noise(inside, n_samples, fs, as_generator(rng))
+    frequencies = np.fft.rfftfreq(n_samples, 1 / fs)
+    shaped = _shaped_noise((frequencies >= low) & (frequencies <= high), n_samples, as_generator(rng))
     if not np.any(shaped):
         raise ValueError(
             f"duration_s = {duration_s:g} s is too short for the band {low:g} to {high:g} Hz: "
@@ -337,10 +326,8 @@ def bursty_noise(
         )
     decay = bursts.decay_s * fs
     levels = np.zeros(n_samples)
-    times, levels_db = (
-        generator.integers(0, n_samples, count),
-        bursts.level_spread_db * generator.standard_normal(count),
-    )
+    times = generator.integers(0, n_samples, count)
+    levels_db = bursts.level_spread_db * generator.standard_normal(count)
     np.add.at(levels, times, 10 ** (levels_db / 20))
     envelope = oaconvolve(levels, np.exp(-np.arange(max(round(6 * decay), 1)) / decay))[:n_samples]
     sos = butter(4, (max(low, 1e-6 * fs), min(high, 0.499999 * fs)), "bandpass", fs=fs, output="sos")
@@ -350,10 +337,9 @@ def bursty_noise(
     return scaled_to_power(scaled_to_power(impulsive, 1.0) + scaled_to_power(steady, 1.0) * background, power)
 
 
-def _shaped_noise(gain: Any, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
-    """Return white Gaussian noise whose Fourier bins are multiplied by gain(frequencies in Hz)."""
-    spectrum = np.fft.rfft(generator.standard_normal(n_samples))
-    return np.fft.irfft(spectrum * gain(np.fft.rfftfreq(n_samples, 1 / fs)), n_samples)
+def _shaped_noise(gains: np.ndarray, n_samples: int, generator: np.random.Generator) -> np.ndarray:
+    """Return white Gaussian noise whose Fourier bins are multiplied by these gains."""
+    return np.fft.irfft(np.fft.rfft(generator.standard_normal(n_samples)) * gains, n_samples)
 
 
 def _envelope(frequencies: np.ndarray) -> np.ndarray:
@@ -391,11 +377,9 @@ def _slow_process(n_samples: int, fs: float, generator: np.random.Generator) -> 
 
 def _broadband(upper: float, n_samples: int, fs: float, generator: np.random.Generator) -> np.ndarray:
     """Return noise from 20 Hz to `upper` with the compressor's envelope."""
-
-    def gain(frequencies: np.ndarray) -> np.ndarray:
-        return _envelope(frequencies) * ((frequencies >= _BROADBAND_FROM_HZ) & (frequencies <= upper))
-
-    noise = _shaped_noise(gain, n_samples, fs, generator)
+    frequencies = np.fft.rfftfreq(n_samples, 1 / fs)
+    inside = (frequencies >= _BROADBAND_FROM_HZ) & (frequencies <= upper)
+    noise = _shaped_noise(_envelope(frequencies) * inside, n_samples, generator)
     if not np.any(noise):
         raise ValueError(
             f"duration_s = {n_samples / fs:g} s is too short for the broadband part, "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,8 +25,7 @@ _LEAST_TONE_S = 0.5  # of a calibrator
 _LEAST_TONE_SHARE = 0.9  # of the power of a calibrator's recording
 _LARGEST_DRIFT_DB = 0.5
 
-# What a reader is called in messages, and the reader of a path and a variable, which None stands for if it has none.
-_Reader = Callable[[Any, str | None], Content]
+# What a reader is called in messages, and the reader: of a path and a variable, or of a path only.
 _NAMED = {"a MAT file": read_mat, "a .npz file": read_npz}
 _UNNAMED = {
     "an audio file": read_audio,
@@ -326,7 +324,7 @@ def _kind_of(path: str | os.PathLike[str]) -> str:
         head = file.read(600)
     for beginning, kind in _BEGINNINGS.items():
         if head.startswith(beginning):
-            return "a MAT file" if head.startswith(b"MATLAB") else kind
+            return kind
     if head[512:516] == b"\x89HDF":
         return "a MAT file"
     lines = head.split(b"\n", 2)

@@ -7,7 +7,7 @@ import pytest
 from helpers.channels import constrained_filters, dense_systems, random_paths, through
 
 from kfopc_filterpy import power_constrained_wiener
-from kfopc_filterpy.bounds.channel_bound import block_correlation
+from kfopc_filterpy.paths.least_squares import correlation_matrix
 
 FS, K, J, REFERENCES, TAPS = 1000.0, 3, 2, 2, 10
 SECONDARY = random_paths(K, J, 7, seed=0)
@@ -23,7 +23,7 @@ def signals(n_samples: int = 3000) -> tuple[np.ndarray, np.ndarray]:
 def test_block_correlations_are_sums_over_delayed_signals() -> None:
     x = np.random.default_rng(3).standard_normal((3, 60))
     rows = np.array([s[TAPS - 1 - m : 60 - m] for s in x for m in range(TAPS)])
-    np.testing.assert_allclose(block_correlation(x, TAPS), rows @ rows.T / rows.shape[1], atol=1e-13)
+    np.testing.assert_allclose(correlation_matrix(x, TAPS), rows @ rows.T / rows.shape[1], atol=1e-13)
 
 
 def test_the_bound_meets_dense_solves_and_every_budget() -> None:

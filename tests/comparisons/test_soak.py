@@ -69,7 +69,7 @@ class Breaking(FxLMS):
             raise ValueError("the update has no solution: because")
         super().update(error)
         if self.broken and self.what == "loud":
-            self._weights()[:] = 10.0
+            self._by_channel("weights")[:] = 10.0
 
 
 @pytest.mark.parametrize(

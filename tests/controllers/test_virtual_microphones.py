@@ -275,7 +275,7 @@ def test_settings_that_do_not_fit_are_refused(changed: dict[str, Any], error: ty
         (control.StateSpace([[1.0]], [[1.0]], [[1.0], [1.0]], 0.0, 1 / FS), {}, ValueError, "pole of magnitude 1"),
         (control.StateSpace([[0.5]], [[1.0]], [[1.0]], 0.0, 1 / FS), {}, ValueError, "outputs for the 1 physical .* got 1"),
         (random_model(False)[:2, :2], {"sensor_noise_std": 0.0}, ValueError, "sensor_noise_std must be greater than 0"),
-        (random_model(False)[:2, :2], {"source_power": [1.0]}, ValueError, "source_power must be one .* array of 2 numbers"),
+        (random_model(False)[:2, :2], {"source_power": [1.0]}, ValueError, "source_power must be one .* each of the 2 sources"),
     ],
     ids=["list", "continuous", "unstable", "outputs", "sensor noise", "sources"],
 )  # fmt: skip

@@ -386,7 +386,7 @@ def test_a_controller_that_diverges_stays_finite_and_says_so(dtype, tmp_path):
 @pytest.mark.parametrize(("dtype", "large", "limited"), [("float64", 1e300, True), ("float32", 1e34, False)])
 def test_a_control_signal_that_overflows_is_silent_and_its_update_is_refused(dtype, large, limited, tmp_path):
     controller = kf_anc(2, [1.0], limiter=limiter() if limited else None, **NOISES)
-    controller._weights()[0] = large
+    controller._by_channel("weights")[0] = large
     out = Program(controller, tmp_path, dtype).run(np.array([1e-3 / large, 1e9, 0.0, 1e-3 / large]), np.ones(4))
     np.testing.assert_array_equal(out.status, [0, 3, 0, 0])
     np.testing.assert_allclose(out.y[0], [1e-3, 0.0, 0.0, 1e-3], rtol=1e-6)

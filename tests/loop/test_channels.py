@@ -98,7 +98,7 @@ def test_a_divergence_ends_the_run_with_nan() -> None:
         ({"disturbance": np.zeros((K, N))}, "not both"),
         ({"reference": X.T}, "transpose"),
         ({"feedback_path": np.zeros((J + 1, J, 4))}, r"feedback_path must be \(I references, J loudspeakers, taps\)"),
-        ({"feedback_path": np.ones((REFERENCES, J, 4))}, "a first tap is not 0"),
+        ({"feedback_path": np.ones((REFERENCES, J, 4))}, "a first tap is 1, not 0"),
         ({"record_weights_every": 10}, "attribute weights"),
         ({"switch_on_s": 0.01}, "listen"),
         ({"rated_power": [1.0, 2.0, 3.0]}, "each of the 2 loudspeakers"),
