@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +12,6 @@ from helpers.channels import delayed, random_paths, through
 from helpers.comparing import assert_same_run
 
 from kfopc_filterpy import (
-    HardClipAmplifier,
     OutputLimiter,
     OutputPowerConstraint,
     kf_anc,
@@ -127,24 +124,6 @@ def test_a_run_is_filterpys_filter_of_all_weights(name: str) -> None:
 
 
 # ---- One definition of the step
-
-
-@pytest.mark.parametrize("name", MAKE)
-def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
-    """With feedback, an amplifier, sensor noise, and a controller that first listens; and they go on alike."""
-    options: dict[str, Any] = {
-        "feedback_path": 0.02 * random_paths(I, J, 5, seed=4),
-        "amplifier": [HardClipAmplifier(1.0), None],
-        "record_weights_every": 7,
-        "sensor_noise_std": 0.01,
-        "rng": 1,
-        "switch_on_s": 20 / FS,
-    }
-    fast, slow = MAKE[name](), MAKE[name]()
-    assert_same_run(run(fast, noise(700), **options), run(slow, noise(700), compiled=False, **options))
-    np.testing.assert_array_equal(fast.weights, slow.weights)
-    for twin in (copy.deepcopy(fast), pickle.loads(pickle.dumps(fast))):
-        assert_same_run(run(twin, noise(50)), run(copy.deepcopy(slow), noise(50)))
 
 
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])

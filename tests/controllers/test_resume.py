@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import pickle
 import pkgutil
 from importlib import import_module
 from pathlib import Path
@@ -50,7 +51,7 @@ def test_a_controller_that_is_saved_at_any_sample_continues_to_the_bit(
 
     @given(samples=st.integers(0, N - 30), halfway=st.booleans())
     @example(samples=0, halfway=False)
-    @settings(max_examples=5)
+    @settings(max_examples=4)
     def check(samples: int, halfway: bool) -> None:
         controller = ALL[name]()
         room = Room(controller)
@@ -114,14 +115,16 @@ def test_every_algorithm_of_the_registry_continues_to_the_bit(several: bool, tmp
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_deep_copy_continues_too(name: str) -> None:
+def test_copies_and_pickles_continue_too(name: str) -> None:
     controller = ALL[name]()
     room = Room(controller)
     room.run(controller, 150)
-    twin, other = copy.deepcopy(controller), room.copy()
-    np.testing.assert_array_equal(other.run(twin, 200), room.run(controller, 200))
-    for reading in ("control_filter", "power_weight", "constraint_factor", "rated_power"):
-        np.testing.assert_array_equal(getattr(twin, reading, 0), getattr(controller, reading, 0))
+    twins = copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))
+    runs = [room.copy().run(twin, 200) for twin in twins]
+    expected = room.run(controller, 200)  # what the others did has not reached it
+    for twin, got in zip(twins, runs, strict=True):
+        np.testing.assert_array_equal(got, expected)
+        assert_same_contents(twin, controller)
 
 
 def test_the_rated_power_of_a_copy_of_kf_pb_can_be_assigned() -> None:
@@ -222,9 +225,9 @@ def test_an_amplifier_without_a_name_is_refused_before_anything_is_written(tmp_p
     path = tmp_path / "run.kfopc"
     path.write_bytes(b"before")
     anonymous = VerifiedController(FxLMS(4, S_HAT, step_size=0.01), amplifier=lambda y: y)
-    with pytest.raises(TypeError, match=r"VerifiedController\._amplifiers cannot be saved.*<lambda>"):
+    with pytest.raises(TypeError, match=r"VerifiedController\..*amplifiers cannot be saved.*<lambda>"):
         anonymous.save(path)
     assert path.read_bytes() == b"before"
     named = VerifiedController(FxLMS(4, S_HAT, step_size=0.01), amplifier=own_amplifier)
     named.save(path)
-    assert VerifiedController.load(path, trusted=[own_amplifier])._amplifiers == [own_amplifier]
+    assert_same_contents(VerifiedController.load(path, trusted=[own_amplifier]), named)
