@@ -148,15 +148,15 @@ def test_a_length_at_which_tones_need_huge_weights_is_passed_over():
     assert reached[1] < 10.0
 
 
-def test_a_steady_noise_is_not_bursty_and_its_bursts_lengthen_the_memory():
+def test_bursts_lengthen_the_memory():
     """Bursts of a tenth of the time, with all of the power: the mean square of the power is ten times its square."""
-    fs, tenth = 1000.0, (np.arange(20000) // 20) % 10 == 0  # bursts of 20 ms each 200 ms
-    signal = np.where(tenth, 1.0, 0.0) * (-1.0) ** np.arange(20000)
-    assert settings._burstiness(np.ones(20000), fs, 200.0) == 1.0
-    assert settings._burstiness(signal, fs, 200.0) == pytest.approx(10.0)
-    assert settings._burstiness(signal, fs, 20.0) == pytest.approx(1.0)  # a memory as short as a burst follows it
-    assert settings._burstiness(np.zeros(100), fs, 20.0) == 1.0
-    assert settings._burstiness(signal[:15], fs, 200.0) == pytest.approx(1.0)  # a record of one block
+    x = np.where((np.arange(X.size) // 320) % 10 == 0, X, 0.0)  # 20 ms each 200 ms
+    d = np.convolve(x, np.eye(20)[19])[: x.size] + 0.1 * np.random.default_rng(2).standard_normal(x.size)
+    for wanted, lengthened in ((0.25, np.sqrt(10)), (0.02, 1.0)):  # a memory as short as a burst follows it
+        suggested = suggest_settings(x, d, S, n_taps=24, memory_s=wanted)
+        power = np.mean(np.convolve(x, S) ** 2)
+        memory = np.sqrt(suggested.measurement_noise / (suggested.state_noise * power)) / FS
+        assert memory == pytest.approx(wanted * lengthened, rel=0.1)
 
 
 def test_all_follows_the_units():

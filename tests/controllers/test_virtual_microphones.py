@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from typing import Any
 
 import control
@@ -118,16 +117,6 @@ def test_one_filter_of_one_tap_and_the_default_of_the_virtual_ones() -> None:
     controller.update([np.nan, 4.0])  # the virtual one is not read
     assert controller.virtual_error.tolist() == [2.0]
     assert repr(controller) == "<Recorded with virtual microphones: 1 physical, 1 virtual>"
-
-
-def test_a_copy_stands_alone() -> None:
-    whole, parts = made(), made()
-    run(whole)
-    run(parts)
-    copy = deepcopy(parts)
-    run(parts)
-    np.testing.assert_array_equal(copy.weights, whole.weights)
-    assert not np.array_equal(copy.weights, parts.weights)
 
 
 # ---- The Kalman form

@@ -188,13 +188,9 @@ def test_nse_pools_seeds_and_shows_the_start(noise):
 @pytest.mark.parametrize(
     ("duration_s", "window_s", "said"),
     [
-        (0.01, 0.005, "5 ms"),
         (0.25, 0.005, "5 ms"),
         (0.6, 0.01, "10 ms"),
-        (1.0, 0.02, "20 ms"),
-        (2.0, 0.02, "20 ms"),
         (10.0, 0.2, "200 ms"),
-        (60.0, 1.0, "1 s"),
         (600.0, 10.0, "10 s"),
     ],
 )
@@ -206,15 +202,6 @@ def test_the_window_of_the_nse_grows_with_the_longest_run(duration_s, window_s, 
     np.testing.assert_array_equal(line.get_ydata(), curve[np.round(line.get_xdata() * 200.0).astype(int) - 1])
     assert plotting.plot_nse(run, window_s=0.005).get_ylabel().endswith("over 5 ms")
     assert plotting.plot_nse(run, time_axis="log").get_ylabel().endswith("over 5 ms")
-
-
-def test_seconds_of_noise_are_a_line_and_no_block():
-    """A window of 40 times the samples scatters by the root of 40 less."""
-    run, scatter = _steady_noise(10.0, FS), {}
-    for window_s in (None, 0.005):
-        line = plotting.plot_nse(run, window_s=window_s).get_lines()[0]
-        scatter[window_s] = np.std(line.get_ydata()[line.get_xdata() > 0.5])
-    assert scatter[0.005] / scatter[None] == pytest.approx(np.sqrt(0.2 / 0.005), rel=0.3)
 
 
 def test_disturbance_and_anti_noise_say_how_linear_they_are(noise):
