@@ -20,12 +20,7 @@ from hypothesis import HealthCheck, settings
 # The same examples on every run, and no deadline, since a first call may compile.
 # For new random examples: `pytest --hypothesis-profile default`.
 settings.register_profile(
-    "ci",
-    derandomize=True,
-    deadline=None,
-    database=None,
-    print_blob=True,
-    suppress_health_check=[HealthCheck.too_slow],
+    "ci", derandomize=True, deadline=None, database=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("ci")
 

@@ -12,15 +12,7 @@ from kfopc_filterpy import HardClipAmplifier, noise_reduction_db, nse_db, output
 from kfopc_filterpy.bench import registry as algorithms
 from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller
 from kfopc_filterpy.bench.scene import Runs, Scene, make_scene
-from kfopc_filterpy.bench.tuning import (
-    AllDivergedError,
-    Trial,
-    _best,
-    best_setting,
-    run_setting,
-    try_settings,
-    tune,
-)
+from kfopc_filterpy.bench.tuning import AllDivergedError, Trial, _best, best_setting, run_setting, try_settings, tune
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.plot import curve_style

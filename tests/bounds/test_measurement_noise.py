@@ -24,12 +24,7 @@ def recording(n, n_taps, q, seed, coloured=True):
     return x, np.convolve(np.convolve(x, S), w)[:n] + np.sqrt(q) * rng.standard_normal(n)
 
 
-@given(
-    seed=st.integers(0, 10_000),
-    n_taps=st.integers(1, 40),
-    n=st.integers(400, 3000),
-    q=st.floats(1e-4, 1e2),
-)
+@given(seed=st.integers(0, 10_000), n_taps=st.integers(1, 40), n=st.integers(400, 3000), q=st.floats(1e-4, 1e2))
 @settings(max_examples=40)
 def test_recovers_the_variance_put_in(seed, n_taps, n, q):
     x, d = recording(n, n_taps, q, seed)

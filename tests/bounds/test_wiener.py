@@ -149,17 +149,11 @@ def test_coherence_bound_is_the_incoherent_share():
     [
         (lambda x, d, s: wiener_solution(x, d[:-1], s, 4), "disturbance must have 3000 values, got 2999"),
         (lambda x, d, s: wiener_solution(x[:9], d[:9], s, 4), "reference must have at least 10 samples"),
-        (
-            lambda x, d, s: wiener_solution(0 * x, d, s, 4),
-            "reference through secondary_path must not be silent",
-        ),
+        (lambda x, d, s: wiener_solution(0 * x, d, s, 4), "reference through secondary_path must not be silent"),
         (lambda x, d, s: wiener_solution(x, 0 * d, s, 4), "disturbance must not be silent"),
         (lambda x, d, s: wiener_solution(x, d, s, 0), "n_taps must be at least 1"),
         (lambda x, d, s: wiener_solution(x * np.nan, d, s, 4), "reference must be finite"),
-        (
-            lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1),
-            "regularization must not be negative",
-        ),
+        (lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1), "regularization must not be negative"),
         (lambda x, d, s: wiener_solution(x, d, s, 4, control_penalty=-1), "control_penalty must not be neg"),
         (lambda x, d, s: power_constrained_solution(x, d, s, 4, 0.0), "rated_power must be greater than 0"),
         (lambda x, d, s: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),

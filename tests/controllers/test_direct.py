@@ -11,14 +11,7 @@ from filterpy.kalman import KalmanFilter
 from helpers.channels import delayed, random_paths, through
 from helpers.comparing import assert_same_run
 
-from kfopc_filterpy import (
-    OutputLimiter,
-    OutputPowerConstraint,
-    kf_anc,
-    kf_opc,
-    simulate,
-    simulate_scenarios,
-)
+from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, kf_anc, kf_opc, simulate, simulate_scenarios
 
 K, J, I, L = 3, 2, 2, 5  # microphones, loudspeakers, references, taps  # noqa: E741
 FS = 16000.0

@@ -140,10 +140,7 @@ def statistics(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     ("controller", "price"),
     [
         (lambda mu: LeakyFxLMS(L, PATH, step_size=mu, leak=0.5), lambda R_x: 0.5 * np.eye(L)),
-        (
-            lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6),
-            lambda R_x: 0.6 * R_x,
-        ),
+        (lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6), lambda R_x: 0.6 * R_x),
         (
             lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6, modified=True),
             lambda R_x: 0.6 * R_x,
@@ -163,11 +160,7 @@ def test_it_settles_at_the_regularised_wiener_solution(controller: Any, price: A
         made = controller(mu)
         repeats = round(400 / mu / x.size)
         result = simulate(
-            made,
-            np.tile(x, repeats),
-            disturbance=np.tile(d, repeats),
-            secondary_path=PATH,
-            record_weights_every=1,
+            made, np.tile(x, repeats), disturbance=np.tile(d, repeats), secondary_path=PATH, record_weights_every=1
         )
         assert result.weights is not None
         distances.append(np.max(np.abs(np.mean(result.weights[-x.size :], axis=0) - expected)))

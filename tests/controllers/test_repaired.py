@@ -12,14 +12,7 @@ from helpers.comparing import SIGNALS, assert_same_run
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, P0, S_HAT, Q, R, S, noises, run
 from helpers.naming import plain
 
-from kfopc_filterpy import (
-    OutputPowerConstraint,
-    kf_opc,
-    kf_opc_repaired,
-    noise_reduction_db,
-    output_power,
-    simulate,
-)
+from kfopc_filterpy import OutputPowerConstraint, kf_opc, kf_opc_repaired, noise_reduction_db, output_power, simulate
 from kfopc_filterpy.controllers.repaired import RepairedKFOPC
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import band_limited_noise

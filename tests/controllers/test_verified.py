@@ -10,16 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kfopc_filterpy import (
-    FxLMS,
-    FxNLMS,
-    HardClipAmplifier,
-    OutputLimiter,
-    kf_anc,
-    kf_opc,
-    kf_pb,
-    simulate,
-)
+from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, OutputLimiter, kf_anc, kf_opc, kf_pb, simulate
 from kfopc_filterpy.controllers import VerifiedController, VirtualMicrophones
 from kfopc_filterpy.controllers.posterior import BLOCK_S
 from kfopc_filterpy.controllers.verified import FIRST_PAUSE_S, HOLD_S, LEAST_VOLUME, STEP_S

@@ -19,9 +19,7 @@ sys.path.insert(0, str(DOCS))
 import quoted  # noqa: E402
 
 # Numbers in dB that are not results: aims, settings, definitions, and what an example on the page prints.
-DEFINITIONS = {
-    "limits.md": ["settles to 3 dB of a steady value", "falls to -20 dB of the filter's"],
-}
+DEFINITIONS = {"limits.md": ["settles to 3 dB of a steady value", "falls to -20 dB of the filter's"]}
 
 
 @pytest.mark.parametrize("quote", quoted.QUOTES, ids=lambda quote: f"{quote.page}: {quote.words[:40]}")

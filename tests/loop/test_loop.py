@@ -5,22 +5,7 @@ import math
 import numpy as np
 import pytest
 from helpers.comparing import SIGNALS, assert_goes_on_as, assert_same_run
-from helpers.loop import (
-    AMPLIFIERS,
-    FEEDBACK,
-    FS,
-    MEMORY_S,
-    MU,
-    N_TAPS,
-    P0,
-    S_HAT,
-    Q,
-    R,
-    S,
-    noises,
-    run,
-    sensor_noise,
-)
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run, sensor_noise
 from helpers.naming import plain
 from hypothesis import given, settings
 from hypothesis import strategies as st

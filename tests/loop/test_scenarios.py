@@ -65,8 +65,6 @@ def one_by_one(made, x, own, **options):
     return [simulate(c, x, fs=FS, **mine, **options) for c, mine in zip(made, each, strict=True)]
 
 
-
-
 def assert_as_alone(results, expected, made=(), alone=()):
     """To the bit: the same sums in the same order."""
     for got, want in zip(results, expected, strict=True):

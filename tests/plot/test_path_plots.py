@@ -141,10 +141,7 @@ def test_required_rated_power_rises_to_the_wiener_filter():
     ax = plot_required_rated_power(solution, rated_power=0.5)
     ax.figure.canvas.draw()
     assert ax.get_yscale() == "log"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == (
-        "Noise reduction (dB)",
-        "Rated power needed (mean square)",
-    )
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Noise reduction (dB)", "Rated power needed (mean square)")
     power = ax.get_lines()[0].get_ydata()
     assert np.all(np.diff(power) > 0)
     assert 0.8 * solution.control_power < power[-1] < solution.control_power

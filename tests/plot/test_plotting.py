@@ -187,12 +187,7 @@ def test_nse_pools_seeds_and_shows_the_start(noise):
 
 @pytest.mark.parametrize(
     ("duration_s", "window_s", "said"),
-    [
-        (0.25, 0.005, "5 ms"),
-        (0.6, 0.01, "10 ms"),
-        (10.0, 0.2, "200 ms"),
-        (600.0, 10.0, "10 s"),
-    ],
+    [(0.25, 0.005, "5 ms"), (0.6, 0.01, "10 ms"), (10.0, 0.2, "200 ms"), (600.0, 10.0, "10 s")],
 )
 def test_the_window_of_the_nse_grows_with_the_longest_run(duration_s, window_s, said):
     run, short = _steady_noise(duration_s, 200.0), _steady_noise(0.01, 200.0)

@@ -258,11 +258,7 @@ def test_the_shortest_recording(samples: int, fs: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        lambda x: level_jump(x, 0.1, 6.0, fs=RATE),
-        lambda x: looped(x, 3.0, fs=RATE, start_s=0.3),
-    ],
+    "change", [lambda x: level_jump(x, 0.1, 6.0, fs=RATE), lambda x: looped(x, 3.0, fs=RATE, start_s=0.3)]
 )
 def test_channels_are_changed_as_each_alone(change: Any) -> None:
     x = np.random.default_rng(2).standard_normal((3, 1000))
