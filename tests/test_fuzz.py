@@ -263,18 +263,17 @@ COMMANDS = [
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(inside: Path) -> Path:
     """A working folder with good and bad files."""
     noise = np.random.default_rng(0).standard_normal(800)
     files = {"noise": noise, "d": np.roll(noise, 3), "P": np.eye(16)[6], "S": np.eye(16)[2], "zeros": np.zeros(64)}
     for name, samples in (files | {"stereo": np.stack((noise, noise))}).items():
-        write_wav(tmp_path / f"{name}.wav", 0.2 * samples, 8000)
-    (tmp_path / "empty.wav").write_bytes(b"")
-    (tmp_path / "text.wav").write_text("these are words")
-    (tmp_path / "tiny.csv").write_text("1\n")
-    np.save(tmp_path / "nan.npy", np.full(8, np.nan))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+        write_wav(inside / f"{name}.wav", 0.2 * samples, 8000)
+    (inside / "empty.wav").write_bytes(b"")
+    (inside / "text.wav").write_text("these are words")
+    (inside / "tiny.csv").write_text("1\n")
+    np.save(inside / "nan.npy", np.full(8, np.nan))
+    return inside
 
 
 def test_a_wrong_command_is_told_in_one_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

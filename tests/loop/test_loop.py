@@ -1,7 +1,5 @@
 """The loop against the plain-Python one of `oracles.modified_anc`, and its compiled form against its steps."""
 
-import math
-
 import numpy as np
 import pytest
 from helpers.comparing import SIGNALS, assert_goes_on_as, assert_same_run
@@ -231,19 +229,3 @@ def test_with_rated_power_to_spare_the_constrained_are_the_unconstrained(seed, r
         np.testing.assert_array_equal(one.constraint_factor, 1.0)
         np.testing.assert_array_equal(one.control_signal, other.control_signal)
         np.testing.assert_array_equal(one.error, other.error)
-
-
-@given(seed=st.integers(0, 1000), cut=st.integers(1, 199))
-@settings(max_examples=25)
-@pytest.mark.parametrize("name", NAMES)
-def test_the_future_does_not_show(name, seed, cut):
-    rng = np.random.default_rng(seed)
-    x = rng.standard_normal(200)
-    primary = rng.standard_normal(7)
-    other = np.concatenate([x[:cut], rng.standard_normal(200 - cut)])
-    one, two = (
-        simulate(controller(name), signal, primary_path=primary, secondary_path=S, fs=FS, amplifier=math.tanh)
-        for signal in (x, other)
-    )
-    np.testing.assert_array_equal(one.error[:cut], two.error[:cut])
-    np.testing.assert_array_equal(one.control_signal[:cut], two.control_signal[:cut])

@@ -1,7 +1,6 @@
 """Rooms against closed forms, Allen and Berkley's sum over images, and pyroomacoustics' own impulse responses."""
 
 import itertools
-import sys
 
 import numpy as np
 import pytest
@@ -243,7 +242,7 @@ def test_rooms_refuse(changes, message):
         room_paths(**{"size_m": SIZE, **PLACES, "absorption": 0.5, **changes})
 
 
-def test_without_pyroomacoustics_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pyroomacoustics", None)
+def test_without_pyroomacoustics_the_error_says_what_to_install(uninstall):
+    uninstall("pyroomacoustics")
     with pytest.raises(ImportError, match=r"pip install 'kfopc-filterpy\[rooms\]'"):
         room_paths(SIZE, **PLACES, absorption=0.5)

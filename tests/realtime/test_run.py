@@ -442,9 +442,9 @@ def test_nothing_is_measured_across_a_gap(what: str, message: str, plugged: Call
         round_trip([200])
 
 
-def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
     device = SoundDevice([0], [1])
-    monkeypatch.setitem(sys.modules, "sounddevice", None)
+    uninstall("sounddevice")
     with pytest.raises(ImportError, match=r"kfopc-filterpy\[realtime\]"):
         device.start()
     for channels, message in ((([], [1]), "reference_channels must be"), (([0], [0]), "must be different inputs")):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import pickle
 import struct
-import sys
 import wave
 import zipfile
 from pathlib import Path
@@ -501,9 +500,9 @@ def test_nothing_is_unpickled(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "library"), [("new.mat", "h5py"), ("x.sofa", "h5py"), ("x.uff", "pyuff")])
-def test_without_its_library_the_error_names_the_extra(name, library, tmp_path, monkeypatch):
+def test_without_its_library_the_error_names_the_extra(name, library, tmp_path, uninstall):
     WRITERS[name](tmp_path / name)
-    monkeypatch.setitem(sys.modules, library, None)
+    uninstall(library)
     with pytest.raises(
         ModuleNotFoundError, match=rf"{name} is .* which needs {library}: install kfopc-filterpy\[formats\]"
     ):
