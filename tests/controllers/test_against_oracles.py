@@ -200,7 +200,7 @@ def test_lms(name: str, scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", ["FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling"])
+@pytest.mark.parametrize("name", ["FxLMS", "FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling"])
 def test_lms_with_a_guard(name: str, scene: Scene) -> None:
     W = guard_filter(UNCERTAINTY, scene.s_hat)
     controller, oracle = pair(name, scene, known={"guard": W})

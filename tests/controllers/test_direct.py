@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.channels import delayed, random_paths, through
-from helpers.comparing import assert_same_run
 
 from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, kf_anc, kf_opc, simulate, simulate_scenarios
 
@@ -159,19 +158,6 @@ def test_what_is_unplugged_stays_silent_and_finite(name: str, dead: str) -> None
 
 
 # ---- Refusals
-
-
-@pytest.mark.parametrize("name", MAKE)
-def test_a_dead_microphone_is_refused_by_name_with_nothing_changed(name: str) -> None:
-    refusing, twin = MAKE[name](), MAKE[name]()
-    for one in (refusing, twin):
-        run(one, noise(60))
-        one.control_signal([0.1, 0.2])
-    with pytest.raises(ValueError, match="that of microphone 1 is nan"):
-        refusing.update([0.1, np.nan, 0.2])
-    with pytest.raises(ValueError, match=r"finite squares, and one overflows|too loud"):
-        refusing.update([0.1, 0.2, 1e200])
-    assert_same_run(run(refusing, noise(20)), run(twin, noise(20)))
 
 
 def test_a_microphone_that_is_not_reached_tells_nothing_without_measurement_noise() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import pickle
 from typing import Any
@@ -256,6 +257,8 @@ def test_a_limiter_of_another_rate_is_refused_before_anything_changes() -> None:
     assert pickle.dumps(made) == before
     made.limiter = limiter()
     assert run(made).error.size == N
+    with pytest.raises(ValueError, match="limiter is for 16000 Hz"):
+        run(LimitedController(Loud(), limiter(fs=2 * FS)))
 
 
 def test_scenarios_agree_in_their_limiters_windows() -> None:
@@ -377,3 +380,39 @@ def test_everything_else_is_the_users_controllers() -> None:
 def test_refusals_of_a_limited_controller(own: Any, limits: Any, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         LimitedController(own, limits)
+
+
+class Loud:
+    """Has special methods of its own, which are not the limited controller's."""
+
+    def control_signal(self, reference: float) -> float:
+        return 10.0 * reference
+
+    def update(self, error: float) -> None:
+        pass
+
+    def __deepcopy__(self, memo: Any) -> Loud:
+        return Loud()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_a_copy_is_limited_too(copied: Any) -> None:
+    other = copied(LimitedController(Loud(), OutputLimiter(1.0, amplitude_limit=2.0)))
+    assert isinstance(other, LimitedController)
+    assert other.control_signal(1.0) == 2.0
+
+
+def test_nan_is_a_divergence_as_without_the_limiter() -> None:
+    class Diverging(Loud):
+        def control_signal(self, reference: float) -> float:
+            return math.nan
+
+    for made in (Diverging(), LimitedController(Diverging(), limiter())):
+        assert run(made, n=20).diverged_at_s == 0.0
