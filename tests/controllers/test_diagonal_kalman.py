@@ -50,17 +50,6 @@ def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool) -> Non
     assert controller.rated_power == (0.3 if constrained else None)
 
 
-def test_of_one_tap_it_is_the_full_filter() -> None:
-    x, d = signals()
-    one, full = DiagonalKalman(1, PATH, **NOISES), kf_anc(1, PATH, **NOISES)
-    np.testing.assert_allclose(
-        simulate(one, x, disturbance=d, secondary_path=PATH).error,
-        simulate(full, x, disturbance=d, secondary_path=PATH).error,
-        rtol=0,
-        atol=1e-12,
-    )
-
-
 def test_what_it_loses_against_the_full_filter() -> None:
     """Error beyond the noise, once both have had 32 samples for each of 32 taps: dB on white noise, tens on coloured."""
     losses = []

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfilt
 
-from kfopc_filterpy import FastArrayKalman, OutputPowerConstraint, fx_rls, kf_anc, kf_opc, simulate
+from kfopc_filterpy import FastArrayKalman, OutputPowerConstraint, kf_anc, simulate
 from kfopc_filterpy.signals import band_limited_noise
 
 L = 6
@@ -26,27 +26,6 @@ def band_signals(n: int) -> tuple[np.ndarray, np.ndarray]:
     x = band_limited_noise((100.0, 1000.0), n / 16000, fs=16000, rng=2)
     x /= np.std(x)
     return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[: x.size] + 0.01 * np.random.default_rng(3).standard_normal(x.size)
-
-
-@pytest.mark.parametrize("constrained", [False, True])
-def test_without_forgetting_it_is_the_full_filter(constrained: bool) -> None:
-    """Tolerance: rounding of two forms of one recursion, in a loop that contracts."""
-    x, d = signals()
-    noises: dict[str, Any] = {"measurement_noise": 0.02, "initial_variance": 0.7}
-    rated: dict[str, Any] = {"constraint": OutputPowerConstraint(0.3, memory_s=0.01)} if constrained else {}
-    fast = FastArrayKalman(L, PATH, **noises, **rated)
-    full: Any = kf_opc if constrained else kf_anc
-    result, expected = (
-        simulate(made, x, disturbance=d, secondary_path=PATH, record_weights_every=1)
-        for made in (fast, full(L, PATH, state_noise=0.0, **noises, **rated))
-    )
-    np.testing.assert_allclose(result.error, expected.error, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(result.constraint_factor, expected.constraint_factor, rtol=1e-11)
-    assert result.weights is not None
-    assert expected.weights is not None
-    np.testing.assert_allclose(result.weights, expected.weights, rtol=0, atol=1e-11)
-    assert result.algorithm == ("fast-array KF-OPC" if constrained else "fast-array KF")
-    assert fast.rated_power == (0.3 if constrained else None)
 
 
 @settings(max_examples=25, deadline=None)
@@ -86,16 +65,6 @@ def test_without_forgetting_it_stays_the_full_filter(noise: str) -> None:
     for made in (fast, full):
         simulate(made, x, disturbance=d, secondary_path=PATH)
     assert np.max(np.abs(fast.weights - full.weights)) < 1e-8 * np.max(np.abs(full.weights))
-
-
-def test_with_forgetting_it_forgets_its_start_as_fxrls_does() -> None:
-    """Another start than that of `fx_rls`: after some memories it no longer counts."""
-    x, d = signals(3000)
-    fast = FastArrayKalman(L, PATH, measurement_noise=1.0, forgetting=0.99)
-    rls = fx_rls(L, PATH, forgetting=0.99)
-    for made in (fast, rls):
-        simulate(made, x[:1500], disturbance=d[:1500], secondary_path=PATH)
-    np.testing.assert_allclose(fast.weights, rls.weights, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

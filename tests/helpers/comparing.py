@@ -23,39 +23,6 @@ def assert_same_run(one, two):
         np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
 
 
-def assert_same_estimator(one, two):
-    """All that two random-walk filters show, to the bit; `x_prior`, which the compiled loop does not keep, to rounding."""
-    for name in ("x", "x_post", "P", "P_prior", "P_post", "K", "S", "SI", "y", "z"):
-        a, b = getattr(one, name), getattr(two, name)
-        np.testing.assert_array_equal(a, b, err_msg=name)
-        assert (type(a), a.dtype) == (type(b), b.dtype), name
-    for name in ("log_likelihood", "likelihood", "mahalanobis"):
-        assert getattr(one, name) == getattr(two, name), name
-    assert one.constraint_factor == two.constraint_factor
-    assert one.disturbance_power == two.disturbance_power
-    assert one.secondary_path_gain == two.secondary_path_gain
-    # the compiled loop keeps x only: x_prior = x - K y to rounding
-    np.testing.assert_allclose(one.x_prior, two.x_prior, rtol=0, atol=1e-14 * np.max(np.abs(two.x)))
-
-
-def assert_close(got, want, tolerance=1e-10, scale=None, name=""):
-    """To a tolerance relative to the largest value, or to `scale`; NaN where NaN is wanted."""
-    scale = np.nanmax(np.abs(want)) if scale is None else scale
-    np.testing.assert_allclose(got, want, rtol=0, atol=tolerance * scale, err_msg=name)
-
-
-def assert_run_close(got, want):
-    """Two runs of the same equations with sums in another order.
-
-    The loop contracts, so that rounding does not grow: errors were 1e-13 of the largest value.
-    """
-    for name in (*SIGNALS, "weights_time_s"):
-        if getattr(want, name) is not None:
-            assert_close(getattr(got, name), getattr(want, name), name=name)
-    for name in ("algorithm", "fs", "rated_power", "diverged_at_s"):
-        assert getattr(got, name) == getattr(want, name), name
-
-
 def numbers_of(value):
     """Copies of all arrays in a tuple of tuples, records as plain arrays."""
     if isinstance(value, np.ndarray):

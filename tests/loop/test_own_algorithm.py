@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from helpers.channels import random_paths
 from helpers.comparing import assert_goes_on_as, assert_same_run
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, S_HAT, S, noises, run, sensor_noise
-from oracles import modified_anc as oracle
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, S_HAT, noises, run
 
 from kfopc_filterpy import OutputLimiter, OutputPowerConstraint, simulate
 from kfopc_filterpy.controllers import CoreController, load_algorithm
-from kfopc_filterpy.core.own import CACHE_VARIABLE
+from kfopc_filterpy.core.block import _Algorithm as AlgorithmTable
+from kfopc_filterpy.core.block import _Setting as SettingOfTable
+from kfopc_filterpy.core.own import CACHE_VARIABLE, fault_of
 from kfopc_filterpy.paths import PathTolerance
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -115,42 +116,6 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Any:
         yield file
 
 
-class WrittenOut:
-    """The algorithm for `oracles.modified_anc`."""
-
-    def __init__(self, share: float) -> None:
-        self.w, self.share, self.errors, self.factor = np.zeros(N_TAPS), share, [], oracle.Factor(None)
-
-    @property
-    def weights(self) -> np.ndarray:
-        """What makes y of the reference."""
-        return self.share * self.w
-
-    def adapt(self, e: float, d: float, y: float, xf: np.ndarray, x: np.ndarray) -> None:
-        self.factor.take(d, xf[0], x[0])
-        self.errors.append(abs(e))
-        self.w = self.w + MU * np.mean(self.errors) * np.sign(e) * xf
-
-
-@pytest.mark.parametrize(("kind", "share"), [(SignFxLMS, 1.0), (Halved, 0.5)])
-def test_the_loop_runs_its_equations(kind: type, share: float) -> None:
-    """Rounding of 500 steps in another order of sums."""
-    x, d, _ = noises()
-    algorithm = WrittenOut(share)
-    expected = oracle.modified_anc(
-        algorithm, x, d, S, S_HAT, noise=sensor_noise(), amplifier=AMPLIFIERS["soft"][1], feedback=FEEDBACK
-    )
-    made = kind(N_TAPS, S_HAT)
-    result = run(made, amplifier=AMPLIFIERS["soft"][0], feedback=FEEDBACK)
-    for name in ("error", "control_signal", "anti_noise", "disturbance_power", "secondary_path_gain"):
-        np.testing.assert_allclose(getattr(result, name), expected[name], rtol=0, atol=1e-11, err_msg=name)
-    np.testing.assert_allclose(made.weights, algorithm.w, rtol=0, atol=1e-11)
-    assert made.mean_error == pytest.approx([np.mean(algorithm.errors)], rel=1e-12)
-    assert np.mean(expected["error"][-100:] ** 2) < 0.8 * np.mean(d[-100:] ** 2)  # it did cancel
-    assert result.algorithm == "sign FxLMS"
-    assert result.power_weight is None
-
-
 @pytest.mark.parametrize(
     ("kind", "options"),
     [(Halved, ""), *((SignFxLMS, name) for name in ("", "limiter", "amplifier", "constraint", "uncertainty"))],
@@ -185,7 +150,8 @@ def test_a_run_of_the_loop_is_the_steps_bit_for_bit(kind: type, options: str) ->
         assert_same_run(run(twin, n=50), run(copy.deepcopy(slow), n=50))
 
 
-def test_several_channels_follow_the_equation() -> None:
+@pytest.mark.parametrize(("kind", "share"), [(SignFxLMS, 1.0), (Halved, 0.5)])
+def test_several_channels_follow_the_equation(kind: type, share: float) -> None:
     """Rounding of 200 steps in another order of sums."""
     K, J, I, L, M, n_samples = 3, 2, 2, 5, 4, 200  # noqa: E741
     s = random_paths(K, J, M, seed=1)
@@ -197,16 +163,17 @@ def test_several_channels_follow_the_equation() -> None:
     for n in range(n_samples):
         rows = np.concatenate([x[:, n : n + 1], rows[:, :-1]], axis=1)
         filtered = np.concatenate([np.einsum("kjm,im->kji", s, rows[:, :M])[..., None], filtered[..., :-1]], axis=3)
-        y[:, n] = np.einsum("jil,il->j", w, rows[:, :L])
+        y[:, n] = share * np.einsum("jil,il->j", w, rows[:, :L])
         errors[:, n] = d[:, n] - sum(s[:, :, k] @ y[:, n - k] for k in range(min(M, n + 1)))
         m = np.mean(np.abs(errors[:, : n + 1]), axis=1)
         w = w + MU * np.einsum("k,kjil->jil", m * np.sign(errors[:, n]), filtered)
-    controllers = [SignFxLMS(L, s, n_references=I) for _ in range(2)]
+    controllers = [kind(L, s, n_references=I) for _ in range(2)]
     runs = [
         simulate(made, x, disturbance=d, secondary_path=s, compiled=compiled)
         for made, compiled in zip(controllers, (True, False), strict=True)
     ]
     assert_same_run(*runs)
+    assert runs[0].algorithm == "sign FxLMS"
     np.testing.assert_allclose(runs[0].error, errors, rtol=0, atol=1e-11)
     np.testing.assert_allclose(controllers[0].weights, w, rtol=0, atol=1e-11)
     np.testing.assert_allclose(controllers[0].mean_error, m, rtol=1e-12)
@@ -343,42 +310,11 @@ def test_a_name_that_cannot_be_loaded_is_refused_before_anything_is_compiled(tmp
 
 
 FAULTS = {
-    "does not compile": (
-        "return ANC_DONE;",
-        "return ANC_FINE;",
-        RuntimeError,
-        r"faulty\.c does not compile:\n(.|\n)*ANC_FINE",
-    ),
-    "without the symbol": (
-        "anc_own_sign",
-        "anc_other",
-        ValueError,
-        r"defines no algorithm anc_own_sign.*or give the name",
-    ),
+    "does not compile": ("return ANC_DONE;", "return ANC_FINE;", RuntimeError, r"faulty\.c does not compile:\n(.|\n)*ANC_FINE"),
+    "without the symbol": ("anc_own_sign", "anc_other", ValueError, r"defines no algorithm anc_own_sign.*or give the name"),
     "without a step": ("control_signal, update}", "control_signal}", ValueError, r"anc_own_sign in .* has no update"),
-    "a field twice": ('"mean_error"', '"weights"', ValueError, "two fields have the name weights"),
-    "without the signals": (
-        "layout_signals(&own->s",
-        "if (0) layout_signals(&own->s",
-        ValueError,
-        "layout_signals first",
-    ),
-    "without a name": ('{"own sign FxLMS",', "{0,", ValueError, "its first entry must be the algorithm's name"),
-    "without settings": (
-        'FxLMS", settings',
-        'FxLMS", 0',
-        ValueError,
-        r"its settings must be an array that ends with \{0\}",
-    ),
-    "without a layout": ("settings, layout, start", "settings, 0, 0", ValueError, "it has no layout and no start"),
-    "an empty range": ('"step_size", 0, 1', '"step_size", 2, 1', ValueError, "the range of step_size is from 2 to 1"),
-    "too many settings": (
-        '{"step_size", 0, 1, 0}',
-        ", ".join(f'{{"s{i}", 0, 1, 0}}' for i in range(9)),
-        ValueError,
-        "it can have 8 settings",
-    ),
-}
+    "without the signals": ("layout_signals(&own->s", "if (0) layout_signals(&own->s", ValueError, "layout_signals first"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -388,3 +324,29 @@ def test_a_faulty_file_says_what_to_mend(fault: str, tmp_path: Path) -> None:
     (file := tmp_path / "faulty.c").write_text(CODE.replace(before, after))
     with pytest.raises(error, match=match):
         load_algorithm(file, "own_sign")
+
+
+@pytest.mark.parametrize(
+    ("entries", "says"),
+    [
+        ({}, ""),
+        ({"name": None}, "its first entry must be the algorithm's name"),
+        ({"settings": []}, "its settings must be an array that ends with {0}, also if there is none"),
+        ({"layout": None, "start": None}, "it has no layout and no start; it must be {name, settings, layout, start,"),
+        ({"settings": [("a", 0, 0), ("b", 2, 1)]}, "the range of b is from 2 to 1, which is empty"),
+        ({"settings": [(f"s{i}", 0, 0) for i in range(8)]}, ""),
+        ({"settings": [(f"s{i}", 0, 0) for i in range(9)]}, "it can have 8 settings, and they must end with {0}"),
+        ({"settings": [("a", 0, 0), ("a", 0, 0)]}, "two fields have the name a"),
+    ],
+)
+def test_a_table_is_checked(entries: dict[str, Any], says: str) -> None:
+    """The struct is changed in Python: to compile a file for each fault takes long."""
+    struct = AlgorithmTable.from_buffer_copy(SignFxLMS.algorithm._struct)
+    for name, value in entries.items():
+        if name == "settings":
+            value = (
+                (SettingOfTable * (len(value) + 1))(*((n.encode(), *bounds) for n, *bounds in value)) if value else None
+            )
+        setattr(struct, name, value)
+    assert fault_of(struct).startswith(says)
+    assert bool(fault_of(struct)) == bool(says)

@@ -211,30 +211,6 @@ def test_controllers_go_on(window):
     assert_as_alone(results, one_by_one(alone[3:], x, mine), made, alone)
 
 
-def stepped(c):
-    c.control_signal(1.0)
-    c.update(2.0)
-
-
-def run_alone(c):
-    x, own = differing(1, 100)
-    simulate(c, x, disturbance=own["disturbance"][0], secondary_path=S, fs=FS)
-
-
-def test_each_goes_on_alone():
-    """Whoever goes on leaves the others as they are."""
-    made = filters(4)
-    x, own = differing(4, 300)
-    run_scenarios(made, x, fs=FS, **own)
-    twin = copy.deepcopy(made[1])
-    for goes_on, i in ((stepped, 0), (run_alone, 3), (stepped, 0), (run_alone, 2)):
-        goes_on(made[i])
-        assert_untouched([made[1]], [twin])
-    for c in (made[1], twin):
-        run_alone(c)
-    assert_untouched([made[1]], [twin])
-
-
 def test_an_interrupted_run_leaves_the_controllers_as_they_were():
     """All or nothing: a covariance a block ahead of the weights would be neither."""
     x, own = differing(9, 3 * STRETCH)
@@ -314,17 +290,6 @@ def test_a_reference_that_is_too_loud_is_refused_with_its_reason():
     assert_untouched(made, untouched)
 
 
-def test_a_scenario_that_diverges_by_a_huge_control_signal_leaves_the_others_alone():
-    """MOV-FxLMS takes a step in proportion to its last control signal."""
-    x, own = differing(3, 300)
-    own["disturbance"][1] *= 1e40
-    made, alone = ([MOVFxLMS(7, S_HAT, step_size=1e-3, rated_power=0.1) for _ in range(3)] for _ in range(2))
-    results = run_scenarios(made, x, **own)
-    assert [r.diverged_at_s is not None for r in results] == [False, True, False]
-    expected = [simulate(c, x, **{name: value[i] for name, value in own.items()}) for i, c in enumerate(alone)]
-    assert_as_alone(results, expected, made[::2], alone[::2])
-
-
 # ---- What each scenario may have of its own
 
 
@@ -336,13 +301,6 @@ def test_true_paths_of_different_lengths():
         run_scenarios(filters(3), x, fs=FS, **own | {"secondary_path": s}) for s in (own["secondary_path"], ragged)
     )
     assert_as_alone(other, one)
-
-
-def test_sensor_noise_in_some_scenarios_only():
-    x, own = differing(3, 200)
-    own["sensor_noise_std"] = [0.0, 0.1, 0.0]
-    made, alone = filters(3), filters(3)
-    assert_as_alone(run_scenarios(made, x, fs=FS, **own), one_by_one(alone, x, own), made, alone)
 
 
 @pytest.mark.parametrize("several", [lambda one: one, lambda one: [one, 1, one]])
@@ -407,9 +365,7 @@ REFUSED = [
     (lambda: one_of_three(measurement_noise=0.2), ValueError, AGREE + "measurement_noise"),
     (lambda: one_of_three(initial_variance=1.0), ValueError, AGREE + "initial_variance"),
     (lambda: one_of_three(secondary=0.9 * S_HAT), ValueError, AGREE + "their estimated secondary path"),
-    (lambda: one_of_three(secondary=S), ValueError, AGREE + "their estimated secondary path"),
     (lambda: one_of_three(window="sliding"), ValueError, AGREE + "the length of the sliding windows of their powers"),
-    (lambda: one_of_three(heard=[1]), ValueError, HEARD),
     (lambda: one_of_three(heard=[-1, 1, 1]), ValueError, HEARD),  # with the same covariance
     ({"amplifier": [None] * 2}, ValueError, "amplifier must be one value or 3, one for each controller, got 2"),
     ({"rng": [1, 2], "sensor_noise_std": 0.1}, ValueError, "rng must be one value or 3"),
