@@ -12,7 +12,7 @@ from kfopc_filterpy import HardClipAmplifier, noise_reduction_db, nse_db, output
 from kfopc_filterpy.bench import registry as algorithms
 from kfopc_filterpy.bench.registry import PRICE_GRID, REGISTRY, STATE_NOISE_GRID, make_controller
 from kfopc_filterpy.bench.scene import Runs, Scene, make_scene
-from kfopc_filterpy.bench.tuning import AllDivergedError, Trial, _best, best_setting, run_setting, try_settings, tune
+from kfopc_filterpy.bench.tuning import AllDivergedError, Trial, best_setting, run_setting, try_settings, tune
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.plot import curve_style
@@ -152,13 +152,12 @@ def test_a_filter_that_refuses_to_go_on_counts_as_diverged(scene: Scene) -> None
         try_settings(Runs(), scene, {"FxRLS": [1.5]})
 
 
-def at_edge(trials: list[Trial]) -> bool:
-    best = _best(trials, 1.0)
-    assert best is not None
-    return best.at_edge
+def test_edges_of_one_and_of_two_settings(scene: Scene) -> None:
+    def at_edge(trials: list[Trial]) -> bool:
+        best = best_setting(scene, "FxLMS", trials)
+        assert best is not None
+        return best.at_edge
 
-
-def test_edges_of_one_and_of_two_settings() -> None:
     one = [Trial(s, -s, 0.1) for s in (1.0, 2.0, 3.0)]
     assert at_edge(one)
     assert not at_edge([replace(one[1], mean_nse_db=-9.0), one[0], one[2]])

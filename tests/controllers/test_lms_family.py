@@ -43,14 +43,6 @@ def delayed(signal: Any, n: int, length: int) -> np.ndarray:
     return np.array([signal[n - k] if n >= k else 0.0 for k in range(length)])
 
 
-RATED, MEMORY, A = 0.3, 60, 0.6
-
-
-def constraint() -> OutputPowerConstraint:
-    """The rated power at 1 kHz, the powers with a memory of `MEMORY` samples."""
-    return OutputPowerConstraint(RATED, fs=1000, memory_s=MEMORY / 1000)
-
-
 AMPLITUDE = {
     "two-gradient FxLMS": TwoGradientFxLMS,
     "re-scaling FxLMS": RescalingFxLMS,

@@ -18,7 +18,6 @@ from kfopc_filterpy.paths import PathTolerance
 
 FS = 2000.0
 L, M = 24, 16
-RNG = np.random.default_rng(0)
 
 
 def resonance(delay: int, decay: float, frequency: float, taps: int) -> np.ndarray:
