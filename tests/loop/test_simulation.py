@@ -278,9 +278,3 @@ def test_divergence_at_the_first_sample():
     result = simulate(made, X, disturbance=D, secondary_path=S, record_weights_every=50)
     assert result.diverged_at_s == 0.0
     assert np.all(np.isnan(result.weights))
-
-
-def test_a_result_is_read_only() -> None:
-    result = simulate(FxLMS(2, [1.0], step_size=0.1), np.ones(5), secondary_path=[1.0], disturbance=np.ones(5))
-    with pytest.raises(ValueError, match="read-only"):
-        result.error[0] = 0.0
