@@ -325,5 +325,3 @@ def test_limiter(amplitude_limit: float | None, window_s: float) -> None:
     assert_close(y[clear], expected[clear], "output")
     assert own.clipped > 0
     assert own.gain == pytest.approx(theirs.gain, rel=TOLERANCE)
-
-
