@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import sys
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 # One BLAS thread in each worker and subprocess; set here, before anything imports numpy. On two cores, the threads of two
 # workers wait for each other: that took a third of the time of some files.
@@ -20,12 +24,7 @@ from hypothesis import HealthCheck, settings
 # The same examples on every run, and no deadline, since a first call may compile.
 # For new random examples: `pytest --hypothesis-profile default`.
 settings.register_profile(
-    "ci",
-    derandomize=True,
-    deadline=None,
-    database=None,
-    print_blob=True,
-    suppress_health_check=[HealthCheck.too_slow],
+    "ci", derandomize=True, deadline=None, database=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("ci")
 
@@ -59,3 +58,29 @@ def shared_data() -> Path:
         setting = f"KFOPC_DATA={named}" if named else "KFOPC_DATA is not set"
         pytest.skip(f"no measured data: {setting}, and {folder} is not a folder")
     return folder
+
+
+@pytest.fixture
+def data_folder(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
+    """Return what names the user's folder of measured data, `KFOPC_DATA`; None takes the name away."""
+
+    def name(folder: Any) -> None:
+        if folder is None:
+            monkeypatch.delenv("KFOPC_DATA", raising=False)
+        else:
+            monkeypatch.setenv("KFOPC_DATA", str(folder))
+
+    return name
+
+
+@pytest.fixture
+def uninstall(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Return what makes a library of an extra missing, as in an environment without it."""
+    return lambda library: monkeypatch.setitem(sys.modules, library, None)
+
+
+@pytest.fixture
+def inside(tmp_path: Path) -> Iterator[Path]:
+    """Be in a folder of the test's own."""
+    with contextlib.chdir(tmp_path):
+        yield tmp_path

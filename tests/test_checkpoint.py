@@ -28,10 +28,11 @@ from helpers.checkpoints import assert_same_contents, forge, pickle_of, sealed
 from helpers.naming import plain
 
 import kfopc_filterpy
-from kfopc_filterpy import KFOPC, OutputLimiter, _pickles
+from kfopc_filterpy import KFOPC
 from kfopc_filterpy.core.block import Algorithm
 
 ROOT = Path(__file__).resolve().parents[1]
+GENERATORS = ("MT19937", "PCG64", "PCG64DXSM", "Philox", "SFC64")
 
 
 def new_filter(n: int = 3) -> KFOPC:
@@ -82,7 +83,7 @@ def test_every_kind_of_value_comes_back_as_it_was(tmp_path: Path) -> None:
         "inv": np.linalg.pinv,
         "inverses": [np.linalg.inv, inv_diagonal],
         "generator": np.random.Generator(np.random.Philox(3)),
-        "generators": [np.random.Generator(getattr(np.random, name)(4)) for name in _pickles.GENERATORS],
+        "generators": [np.random.Generator(getattr(np.random, name)(4)) for name in GENERATORS],
     }
     values["cycle"] = [values["others"]]
     values["cycle"].append(values["cycle"])
@@ -113,15 +114,6 @@ def test_every_kind_of_value_comes_back_as_it_was(tmp_path: Path) -> None:
     assert loaded.cycle[1] is loaded.cycle
     assert loaded.cycle[0] is loaded.others
     np.testing.assert_array_equal(loaded.generator.standard_normal(5), kf.generator.standard_normal(5))
-
-
-def test_objects_that_hold_each_other_come_back(tmp_path: Path) -> None:
-    kf = KFOPC(2)
-    kf.limiter = OutputLimiter(1.0)
-    kf.limiter.owner = kf
-    kf.save(tmp_path / "filter.kfopc")
-    loaded = KFOPC.load(tmp_path / "filter.kfopc")
-    assert loaded.limiter.owner is loaded
 
 
 def test_an_array_that_is_held_twice_is_one_and_a_view_is_an_array_of_its_own(tmp_path: Path) -> None:
@@ -199,9 +191,9 @@ def test_a_tuple_that_contains_itself_is_refused(saved: Path) -> None:
 # What is refused.
 
 
-def test_every_damaged_byte_is_found(saved: Path) -> None:
+def test_a_damaged_byte_is_found_wherever_it_is(saved: Path) -> None:
     content, rng = saved.read_bytes(), np.random.default_rng(0)
-    for at in range(len(content)):
+    for at in {*range(100), *range(100, len(content), 13), *range(len(content) - 70, len(content))}:
         damaged = bytearray(content)
         damaged[at] ^= int(rng.integers(1, 256))
         saved.write_bytes(damaged)
@@ -211,7 +203,7 @@ def test_every_damaged_byte_is_found(saved: Path) -> None:
 
 def test_a_file_that_is_cut_short_or_longer_is_refused(saved: Path) -> None:
     content = saved.read_bytes()
-    for size in {*range(1, 200), *range(200, len(content), 17), *range(len(content) - 200, len(content))}:
+    for size in {*range(1, 100), *range(100, len(content), 31), *range(len(content) - 70, len(content))}:
         saved.write_bytes(content[:size])
         with pytest.raises(ValueError, match="damaged"):
             KFOPC.load(saved)
@@ -280,6 +272,7 @@ def called(name: str, *arguments: bytes) -> bytes:
 
 
 ARRAY = "numpy:ndarray"
+GENERATOR = f"{np.random.Generator.__module__}:Generator"
 FILTER = named("kfopc_filterpy.filters.kfopc:KFOPC") + b")\x81"
 CLASS = "kfopc_filterpy.power.limiter"
 HUGE = b"\x8a\x06" + (10**12).to_bytes(6, "little")
@@ -287,48 +280,23 @@ FORGED: dict[str, tuple[bytes, str]] = {
     "a process": (called("os:system", text("touch {trace}")), "names os.system, which is none of"),
     "a process, protocol 0": (b"cos\nsystem\n(S'touch {trace}'\ntR.", "the instruction GLOBAL"),
     "a process, inst": (b"(S'touch {trace}'\nios\nsystem\n.", "the instruction STRING"),
-    "a process, obj": (b"(" + named("os:system") + text("touch {trace}") + b"o.", "names os.system"),
     "code": (called("builtins:eval", text("open('{trace}', 'w')")), "names builtins.eval"),
-    "an import": (called("builtins:__import__", text("antigravity")), "names builtins.__import__"),
     "a dotted name": (called("kfopc_filterpy.checkpoint:os.system", text("touch {trace}")), "os.system, which is none"),
-    "a dotted name in a folder": (
-        called("kfopc_filterpy.core.block:ctypes.PyDLL", text("{trace}")),
-        "names kfopc_filterpy.core.block.ctypes.PyDLL",
-    ),
     "a library": (
         called("kfopc_filterpy.core.block:Algorithm", text("fxlms"), text("{trace}")),
         "Algorithm says itself how it is copied",
     ),
-    "a library, as an object": (
-        named("kfopc_filterpy.core.block:Algorithm") + text("fxlms") + text("{trace}") + b"\x86\x81",
-        "Algorithm says itself how it is copied",
-    ),
-    "an import of a module": (
-        called("kfopc_filterpy.core.library:Path", text("{trace}")),
-        "names kfopc_filterpy.core.library.Path",
-    ),
     "a function of the package": (called("kfopc_filterpy.core.own:load_algorithm", text("a.c")), "none of"),
-    "the command line": (called("kfopc_filterpy.commands:main"), "names kfopc_filterpy.commands.main"),
     "a module that is not there": (called("kfopc_filterpy.power.nothing:A"), "ModuleNotFoundError"),
-    "a folder above": (called("kfopc_filterpy.power.:os"), "names "),
     "a constructor": (called(f"{CLASS}:OutputLimiter", text("1")), "OutputLimiter has other fields"),
     "a call of a function that can be named": (called("numpy.linalg:inv", b"]"), "something is made of other parts"),
-    "a call of an object": (FILTER + b")R", "something is made of other parts"),
-    "a class with a metaclass": (called("builtins:type", text("A"), b")", b"}"), "names builtins.type"),
     "attributes of a class": (named(f"{CLASS}:OutputLimiter") + b"}" + text("a") + b"K\x01sb", "correct checksum"),
-    "attributes of a function": (named("numpy.linalg:inv") + b"}" + text("a") + b"K\x01sb", "correct checksum"),
-    "attributes, twice": (FILTER + b"}b}b", "correct checksum"),
     "items of an object": (FILTER + b"K\x01a", "TypeError"),
     "a key that is an object": (b"}" + FILTER + b"K\x01s", "a key that is no number"),
     "a key with many parts": (b"}" + b")" + b"\x85" * 10**5 + b"K\x01s", "a key that is no number"),
     "too few fields": (named(f"{CLASS}:LimiterState") + b")\x81", "LimiterState has other fields"),
-    "fields of an object": (named(f"{CLASS}:LimiterState") + FILTER + b"\x81", "something is made of other parts"),
     "a huge array": (
         called(ARRAY, HUGE + b"\x85", text("<f8") + b"\x85", b"\x89", text("C"), b"K\x00", b"\x89"),
-        "buffer is too small",
-    ),
-    "long strings": (
-        called(ARRAY, b"K\x01\x85", text("<U100000000") + b"\x85", b"\x89", text("C"), b"K\x00", b"\x89"),
         "buffer is too small",
     ),
     "an array beyond the end": (
@@ -347,22 +315,15 @@ FORGED: dict[str, tuple[bytes, str]] = {
         called(ARRAY, b"K\x01\x85", text("a") + text("f8,O") + b"\x86", b"\x89", text("C"), b"K\x00", b"\x89"),
         "an array of",
     ),
-    "an array of a shape that is an object": (
-        called(ARRAY, FILTER + b"\x85", text("<f8") + b"\x85", b"\x89", text("C"), b"K\x00", b"\x89"),
-        "a shape of other things",
-    ),
     "a huge buffer": (b"\x96" + (2**60).to_bytes(8, "little") + b"abc.", "correct checksum"),
-    "a huge string": (b"\x8d" + (2**60).to_bytes(8, "little") + b"abc.", "correct checksum"),
     "a huge memo": (b"Nr\xff\xff\xff\xff", "the instruction LONG_BINPUT"),
     "a place in the memo": (b"j\xff\xff\xff\xff", "IndexError"),
     "another generator": (
-        called("numpy.random._generator:Generator", b"}" + text("bit_generator") + text("RandomState") + b"s"),
+        called(GENERATOR, b"}" + text("bit_generator") + text("RandomState") + b"s"),
         "correct checksum",
     ),
     "a persistent name": (b"Pname\n.", "the instruction PERSID"),
     "nothing": (b"", "correct checksum"),
-    "no value": (b"(", "IndexError"),
-    "an empty stack": (b"0", "the instruction POP"),
     "no pickle": (b"\xff\xff\xff", "correct checksum"),
 }
 
@@ -448,48 +409,17 @@ class Watched(KFOPC):
 @pytest.mark.parametrize(
     "program",
     [
-        *(
-            b"%b}" + text(name) + b"%fs" + end
-            for name in ("append", "extend", "__setstate__")
-            for end in (b"bK\x01a", b"b}b")
-        ),
-        *(b"%b" + end for end in (b"K\x01a", b"(K\x01e", b")R", b"K\x01K\x01s", b"(K\x01\x90", b"}b0")),
-        *(b"%f" + end for end in (b")R", b")\x81", b"}b", b"K\x01a")),
+        *(b"%b}" + text(name) + b"%fsbK\x01a" for name in ("append", "__setstate__")),
+        *(b"%b" + end for end in (b"(K\x01e", b")R", b"K\x01K\x01s", b"(K\x01\x90", b"}b0")),
+        *(b"%f" + end for end in (b")R", b")\x81", b"}b")),
         b"}%bK\x01s",
-        b"}%b\x85K\x01s",
-        called(ARRAY, b"%b"),
-        called(ARRAY, b"%b", b"]"),
         called(ARRAY, b"%b\x85", b"]"),
-        called(ARRAY, b"K\x01\x85", b"%b\x85", b"\x89", text("C"), b"K\x00", b"\x89"),
-        called(ARRAY, b"K\x01\x85", text("<f8") + b"\x85", b"%b", text("C"), b"K\x00", b"\x89"),
         called(ARRAY, b"K\x01\x85", text("<f8") + b"\x85", b"\x89", text("C"), b"%b", b"\x89"),
         called("collections:deque", b"%b"),
-        called("collections:deque", b")", b"%b"),
-        called("collections:Counter", b"%b"),
         called("collections:Counter", b"]%ba"),
-        called("numpy.random._generator:Generator", b"%b"),
-        called("numpy.random._generator:Generator", b"}" + text("bit_generator") + b"%bs" + text("state") + b"}s"),
-        called(
-            "numpy.random._generator:Generator",
-            b"}" + text("bit_generator") + text("PCG64") + b"s" + text("state") + b"%bs",
-        ),
-        called(
-            "numpy.random._generator:Generator",
-            b"}"
-            + text("bit_generator")
-            + text("MT19937")
-            + b"s"
-            + text("state")
-            + b"}"
-            + text("pos")
-            + b"K\x01s"
-            + text("key")
-            + called(ARRAY, b"M\x70\x02\x85", b"](" + b"%b" * 624 + b"e")
-            + b"ss",
-        ),
+        called(GENERATOR, b"}" + text("bit_generator") + text("PCG64") + b"s" + text("state") + b"%bs"),
         named(f"{CLASS}:LimiterState") + b"%b\x81",
         named("kfopc_filterpy.power.shared_constraint:SharedConstraint") + b"%b\x85\x81",
-        b"%b%bb",
         b"%b" + text("a") + b"%b\x93",
     ],
 )
@@ -509,7 +439,7 @@ def test_attributes_are_set_without_setters(saved: Path) -> None:
     loaded = Watched.load(forge(saved, me + state + b"b."))
     assert not CALLS
     assert object.__getattribute__(loaded, "__dict__") == {"rated_power": 1}
-    assert KFOPC._constraint.__get__(loaded) == 2  # type: ignore[attr-defined]
+    assert object.__getattribute__(loaded, "_constraint") == 2
 
 
 def peak_of(path: Path) -> int:
@@ -569,100 +499,76 @@ def test_what_killed_processes_left_is_removed_after_an_hour(tmp_path: Path) -> 
     assert sorted(os.listdir(tmp_path)) == sorted([path.name, new.name, other.name])
 
 
-# A process forks children that save again and again, and kills them. The first kind of child kills itself before one of
-# the lines of the functions that write; the second is killed by its parent after a random time.
+# A process forks children that save and kill themselves, each one line of the module later than the one before.
 
 KILLED = """
-import os, random, signal, sys, time
+import os, signal, sys
 import numpy as np
 from kfopc_filterpy import KFOPC, checkpoint
 
-path, kind = sys.argv[1], sys.argv[2]
-WRITERS = {checkpoint._write.__code__}
+path = sys.argv[1]
 
 
-def saved():
-    return int(KFOPC.load(path).x[0, 0])
-
-
-def begin(kf, pipe, kill_at):
+def save_until(kf, pipe, kill_at):
     lines = 0
 
     def trace(frame, event, argument):
         nonlocal lines
-        if frame.f_code in WRITERS and event == "line":
+        if frame.f_code.co_filename == checkpoint.__file__ and event == "line":
             lines += 1
             if lines == kill_at:
                 os.kill(os.getpid(), signal.SIGKILL)
         return trace
 
-    sys.settrace(trace if kill_at else None)
-    count = saved()
-    while True:
-        count += 1
-        kf.x[:] = count
-        kf.save(path)
-        os.write(pipe, count.to_bytes(8, "little"))
-        if kill_at:
-            os._exit(0)  # the save has fewer lines
+    sys.settrace(trace)
+    kf.save(path)
+    os.write(pipe, b"saved")
+    sys.exit()  # the save has fewer lines
 
 
-def run(kf, kill_at, delay):
-    before = saved()
+def files():
+    return os.listdir(os.path.dirname(path))
+
+
+kf = KFOPC(4)
+kf.save(path)
+old = new = unfinished = 0
+killed = True
+while killed:
+    before = int(KFOPC.load(path).x[0, 0])
+    kf.x[:] = before + 1
     reader, writer = os.pipe()
     child = os.fork()
     if child == 0:
-        os.close(reader)
-        begin(kf, writer, kill_at)
+        save_until(kf, writer, old + new + 1)
     os.close(writer)
-    if not kill_at:
-        time.sleep(delay)
-        os.kill(child, signal.SIGKILL)
     _, status = os.waitpid(child, 0)
     with os.fdopen(reader, "rb") as file:
-        told = [int.from_bytes(word, "little") for word in iter(lambda: file.read(8), b"")]
-    last = told[-1] if told else before
-    now = saved()  # the file is whole: its checksum is right
-    assert now in (last, last + 1), (now, last)
-    assert np.all(KFOPC.load(path).x == now)
-    return os.WIFSIGNALED(status), now - before, len(os.listdir(os.path.dirname(path))) > 1
-
-
-kf = KFOPC(150 if kind == "times" else 4)
-kf.x[:] = 0
-kf.save(path)
-begun = time.perf_counter()
-for _ in range(5):
-    kf.save(path)
-longest = time.perf_counter() - begun  # that a child lives: five saves, however slow and busy the disk is
-random.seed(1)
-outcomes = []
-for trial in range(1, 151):
-    outcomes.append(run(kf, trial if kind == "lines" else 0, random.uniform(0.0, longest)))
-    for name in os.listdir(os.path.dirname(path)):
+        saved = bool(file.read())
+    loaded = KFOPC.load(path).x  # the file is whole: its checksum is right
+    assert np.all(loaded == before + 1) or np.all(loaded == before) and not saved, (loaded, before)
+    killed = os.WIFSIGNALED(status)
+    old += killed and loaded[0, 0] == before
+    new += killed and loaded[0, 0] > before
+    unfinished += killed and len(files()) > 1
+    for name in files():
         if name.endswith(".part"):
             os.remove(os.path.join(os.path.dirname(path), name))
-    if kind == "lines" and not outcomes[-1][0]:
-        break
-killed = [one for one in outcomes if one[0]]
-print(len(killed), sum(one[1] == 0 for one in killed), sum(one[1] > 0 for one in killed), sum(one[2] for one in killed))
+print(old, new, unfinished)
 """
 
 
-@pytest.mark.parametrize("kind", ["lines", "times"])
-def test_a_process_that_is_killed_at_any_point_leaves_a_whole_file(kind: str, tmp_path: Path) -> None:
+def test_a_process_that_is_killed_at_any_line_leaves_a_whole_file(tmp_path: Path) -> None:
     folder = tmp_path / "saved"
     folder.mkdir()
-    command = [sys.executable, "-c", KILLED, str(folder / "run.kfopc"), kind]
+    command = [sys.executable, "-c", KILLED, str(folder / "run.kfopc")]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
-    killed, old, new, unfinished = map(int, done.stdout.split())
-    assert killed > 15
-    assert unfinished > 3  # killed while a file was being written
+    old, new, unfinished = map(int, done.stdout.split())
+    assert old > 8  # the file that was there before stayed
     assert new > 0
-    if kind == "lines":
-        assert old > 8  # and the file that was there before stayed
+    assert unfinished > 3  # killed while a file was being written
 
 
 def test_a_second_process_continues_to_the_bit(tmp_path: Path) -> None:
@@ -691,8 +597,3 @@ print(y.hex(), controller.weights.tobytes().hex())
     whole = run(0, 300)
     run(0, 117)
     assert run(117, 300) == whole
-
-
-def test_the_folders_whose_classes_a_file_may_name_are_there() -> None:
-    for folder in _pickles.FOLDERS:
-        assert (ROOT / "kfopc_filterpy" / folder / "__init__.py").exists()

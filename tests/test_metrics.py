@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kfopc_filterpy import metrics
 from kfopc_filterpy.metrics import (
@@ -36,7 +34,7 @@ def sine(frequency, n, amplitude=1.0, phase=0.0):
 # ---- NSE
 
 
-@pytest.mark.parametrize("window", [1, 2, 3, 7, 80, 100, 101, 500])
+@pytest.mark.parametrize("window", [1, 7, 101, 500])
 def test_nse_is_the_direct_sum_over_the_window_that_ends_with_the_sample(window):
     e, d = noise(101, 1), noise(101, 2)
     expected = [
@@ -58,13 +56,6 @@ def test_nse_keeps_a_small_residual_after_a_huge_transient():
     np.testing.assert_allclose(nse_db(e, np.ones(1000), FS)[580:], -120.0, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("runs", [False, True])
-def test_nse_sums_over_microphones_and_over_runs(runs):
-    e, d = noise((3, 200), 1), noise((3, 200), 2)
-    pooled_e, pooled_d = np.sqrt(np.sum(e**2, axis=0)), np.sqrt(np.sum(d**2, axis=0))
-    np.testing.assert_allclose(nse_db(e, d, FS, runs=runs), nse_db(pooled_e, pooled_d, FS), rtol=0, atol=1e-10)
-
-
 def test_nse_is_nan_exactly_where_its_window_sees_nan_or_silence():
     e, d = np.ones(40), np.ones(40)
     e[20] = np.nan
@@ -79,16 +70,6 @@ def test_perfect_cancellation_is_minus_infinity_without_a_warning():
     assert noise_reduction_db(np.zeros(10), np.ones(10)) == np.inf
 
 
-@given(st.floats(1e-3, 1e3), st.integers(1, 60), st.integers(1, 200), st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
-def test_nse_does_not_change_when_both_signals_are_scaled(scale, window, n, seed):
-    e, d = noise(n, seed), noise(n, seed + 1)
-    curve = nse_db(e, d, FS, window / FS)
-    np.testing.assert_allclose(nse_db(scale * e, scale * d, FS, window / FS), curve, rtol=0, atol=1e-9)
-    # Scaling the error alone moves the curve by the scale's level.
-    np.testing.assert_allclose(nse_db(scale * e, d, FS, window / FS), curve + 20 * np.log10(scale), rtol=0, atol=1e-9)
-
-
 # ---- noise reduction, power, peaks
 
 
@@ -96,12 +77,6 @@ def test_noise_reduction_is_of_the_second_half():
     e, d = noise(1001, 1), noise(1001, 2)
     assert noise_reduction_db(e, d) == pytest.approx(-10 * math.log10(sum(e[500:] ** 2) / sum(d[500:] ** 2)), abs=1e-10)
     assert noise_reduction_db(e, d, steady=1.0) == pytest.approx(-nse_db(e, d, FS, 1.0)[-1], abs=1e-10)
-
-
-@given(st.floats(-60.0, 60.0))
-def test_noise_reduction_of_a_scaled_disturbance_is_the_scale(level):
-    d = noise(200)
-    assert noise_reduction_db(d * 10 ** (-level / 20), d) == pytest.approx(level, abs=1e-10)
 
 
 def test_output_power_is_the_mean_square_of_the_steady_portion():
@@ -194,13 +169,6 @@ def test_harmonics_above_half_the_sampling_rate_are_left_out():
     assert harmonics_db(d + sine(6000, 16000, 0.1), d, 3000.0, FS) == pytest.approx(-20.0, abs=1e-6)
 
 
-def test_harmonics_average_power_over_runs():
-    d = sine(400, 16000)
-    e = np.array([sine(800, 16000, 0.1), sine(800, 16000, 0.3)])
-    expected = 10 * math.log10((0.1**2 + 0.3**2) / 2)
-    assert harmonics_db(e, np.array([d, d]), 400.0, FS, runs=True) == pytest.approx(expected, abs=1e-6)
-
-
 # ---- convergence time
 
 
@@ -231,20 +199,6 @@ def test_convergence_is_zero_where_nothing_happens_and_nan_where_it_never_settle
     assert convergence_time_s(np.r_[np.ones(10), np.zeros(90)], np.ones(100), 1000, window_s=0.001) == 0.01
 
 
-def test_convergence_of_noise_needs_runs_or_a_window():
-    n, tau = 5 * FS, 0.1
-    decay = np.exp(-np.arange(n) / FS / tau)
-    d, floor = noise((8, n), 1), noise((8, n), 2)
-    e = decay * d + 0.1 * floor
-    # exp(-2 t / tau) + 0.01 is 3 dB above 0.01.
-    true_time = -tau / 2 * math.log(0.01 * (10**0.3 - 1))
-    # A window delays by at most its length; eight runs leave a spread of about 0.02 s.
-    measured = convergence_time_s(e, d, FS, window_s=0.02, runs=True)
-    assert true_time - 0.02 < measured < true_time + 0.04
-    measured = convergence_time_s(e[0], d[0], FS, window_s=0.1)
-    assert true_time - 0.05 < measured < true_time + 0.15
-
-
 # ---- coherence and spectra
 
 
@@ -266,13 +220,6 @@ def test_coherence_gain_is_that_of_the_band_only():
     assert gain == pytest.approx(0.5, abs=1e-6)
 
 
-def test_coherence_of_unrelated_signals_is_near_zero():
-    d, a = noise((2, 10 * FS), 1), noise((2, 10 * FS), 2)
-    coherence, gain = coherence_and_gain(d, a, FS, (200.0, 2000.0), runs=True)
-    assert coherence < 0.01
-    assert abs(gain) < 0.02
-
-
 def test_density_integrates_to_the_power():
     x = noise(20 * FS)
     f, level = power_spectrum_db(x, FS, steady=1.0)
@@ -291,7 +238,7 @@ def test_spectrum_of_silence_and_of_short_signals():
 # ---- short-time power
 
 
-@pytest.mark.parametrize("window", [1, 7, 80, 500])
+@pytest.mark.parametrize("window", [1, 7, 500])
 def test_short_time_power_is_the_direct_mean_of_the_samples_there_are(window):
     x = noise(101)
     expected = [np.mean(x[max(0, n - window + 1) : n + 1] ** 2) for n in range(101)]
@@ -359,13 +306,6 @@ def test_a_figure_of_the_sound_field_takes_all_microphones_and_runs_together(nam
     one = figure(e[0, 0], d[0, 0])
     np.testing.assert_allclose(figure(e[0, :1], d[0, :1]), one, rtol=1e-12)
     assert np.shape(in_a_row) == np.shape(one)
-
-
-def test_noise_reduction_of_microphones_weighs_them_by_their_energy():
-    d = np.array([noise(N, 1), 10 * noise(N, 2)])
-    e = d * [[1.0], [0.1]]
-    expected = 10 * math.log10(np.sum(d[:, N // 2 :] ** 2) / np.sum(e[:, N // 2 :] ** 2))
-    assert noise_reduction_db(e, d) == pytest.approx(expected, abs=1e-10)
 
 
 def test_coherence_and_gain_are_of_each_microphone():
@@ -454,35 +394,15 @@ def test_silent_disturbance_gives_nan_without_a_warning():
         (lambda: nse_db(["a"], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got list"),
         (lambda: nse_db([1j], [1.0], FS), TypeError, r"error must be a sequence of real numbers, got complex"),
         (lambda: nse_db(np.ones((1, 1, 1)), [1.0], FS), ValueError, r"error must be \(n_samples,\) or"),
-        (
-            lambda: noise_reduction_db([1.0], [1.0], steady=0.0),
-            ValueError,
-            r"steady must be a portion above 0",
-        ),
-        (
-            lambda: noise_reduction_db([1.0], [1.0], steady=1.5),
-            ValueError,
-            r"steady must be a portion above 0",
-        ),
+        (lambda: noise_reduction_db([1.0], [1.0], steady=0.0), ValueError, r"steady must be a portion above 0"),
+        (lambda: noise_reduction_db([1.0], [1.0], steady=1.5), ValueError, r"steady must be a portion above 0"),
         (lambda: output_power([]), ValueError, r"control_signal must have at least one sample"),
         (lambda: overshoot([1.0], 0.0, FS), ValueError, r"rated_power must be greater than 0"),
         (lambda: clipped_fraction([1.0], -1.0), ValueError, r"limit must be greater than 0"),
         (lambda: harmonics_db(np.ones(80), np.ones(80), 400.0, FS), ValueError, r"at least 16 periods"),
-        (
-            lambda: harmonics_db(np.ones(999), np.ones(999), 5e3, FS),
-            ValueError,
-            r"second harmonic below fs/2",
-        ),
-        (
-            lambda: convergence_time_s([1.0], [1.0], FS, tolerance_db=0),
-            ValueError,
-            r"tolerance_db must be greater",
-        ),
-        (
-            lambda: coherence_and_gain(np.ones(999), np.ones(999), FS, (200, 2000)),
-            ValueError,
-            r"at least 8 segments",
-        ),
+        (lambda: harmonics_db(np.ones(999), np.ones(999), 5e3, FS), ValueError, r"second harmonic below fs/2"),
+        (lambda: convergence_time_s([1.0], [1.0], FS, tolerance_db=0), ValueError, r"tolerance_db must be greater"),
+        (lambda: coherence_and_gain(np.ones(999), np.ones(999), FS, (200, 2000)), ValueError, r"at least 8 segments"),
         (
             lambda: coherence_and_gain(np.ones(FS), np.ones(FS), FS, (201, 202), segment_s=0.01),
             ValueError,
@@ -494,10 +414,6 @@ def test_silent_disturbance_gives_nan_without_a_warning():
 def test_refusals_say_what_was_wrong(call, error, message):
     with pytest.raises(error, match=message):
         call()
-
-
-def test_every_public_name_exists():
-    assert all(hasattr(metrics, name) for name in metrics.__all__)
 
 
 # Levels.

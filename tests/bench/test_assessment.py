@@ -14,7 +14,7 @@ import pytest
 import soundfile
 
 from kfopc_filterpy import noise_reduction_db
-from kfopc_filterpy.bench import algorithms, assess, assessed_runs, compare_recordings
+from kfopc_filterpy.bench import algorithms, assess, compare_recordings
 from kfopc_filterpy.bench.assessment import CAUSES, SCHEMA, advice_on
 from kfopc_filterpy.metrics import convergence_time_s, overshoot
 from kfopc_filterpy.power import AmplifierRating, LoudspeakerRating
@@ -71,6 +71,11 @@ def test_a_fault_is_found_as_the_cause(case):
     assert case in verdict.reason.lower()
     assert verdict.advice
     assert repr(verdict).startswith(f"Not enough: {verdict.algorithm} reaches")
+    # No ceiling is above the one before. A fit of 32 taps to 1.3 s explains some hundredths of a dB by chance.
+    c = verdict.ceilings
+    known = [value for value in (c.coherence_db, c.time_db, c.filter_db, c.power_db) if value is not None]
+    assert all(later <= earlier + 0.1 for earlier, later in itertools.pairwise(known))
+    jsonschema.validate(strict(verdict.json), strict(SCHEMA.read_text(encoding="utf-8")))
 
 
 @pytest.mark.parametrize("case", CAUSES)
@@ -81,16 +86,6 @@ def test_without_the_fault_the_same_scene_is_enough(case):
     assert verdict.reason == ""
     assert verdict.noise_reduction_db >= verdict.want_db
     assert repr(verdict).startswith(f"Enough: {verdict.algorithm} reaches")
-
-
-@pytest.mark.parametrize("case", CAUSES)
-@pytest.mark.parametrize("better", [False, True])
-def test_no_ceiling_is_above_the_one_before(case, better):
-    """A fit of 32 taps to 1.3 s explains some hundredths of a dB by chance."""
-    c = verdict_on(case, better).ceilings
-    chain = [c.coherence_db, c.time_db, c.filter_db, c.power_db]
-    known = [value for value in chain if value is not None]
-    assert all(later <= earlier + 0.1 for earlier, later in itertools.pairwise(known))
 
 
 def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
@@ -192,16 +187,13 @@ class Bar:
         pass
 
 
-@pytest.mark.parametrize("tuned_on_s", [0.5, 60.0], ids=["excerpt", "whole record"])
-def test_the_bar_moves_while_fxlms_is_tuned_and_ends_at_its_total(monkeypatch, tuned_on_s):
-    monkeypatch.setattr(assessed_runs, "TUNED_ON_S", tuned_on_s)
+def test_the_bar_moves_while_fxlms_is_tuned_and_ends_at_its_total():
     bar, options = Bar(), {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "want_db": 0.0}
     assess(noise(), arriving(20), arriving(6, length=16), algorithm="FxLMS", beside=("KF-PB",), bar=bar, **options)
     after_switch_on = round(0.9 * SECONDS * FS)
-    tried = min(round(tuned_on_s * FS), after_switch_on)
     grid = len(algorithms()["FxLMS"].grid)
-    assert bar.total == sum(bar.moved) == 2 * after_switch_on + grid * tried
-    assert bar.moved.count(tried) >= grid
+    assert bar.total == sum(bar.moved) == (2 + grid) * after_switch_on
+    assert bar.moved.count(after_switch_on) >= grid
 
 
 def test_the_required_power_is_that_of_the_bound_and_the_estimate_is_not_below():
@@ -312,11 +304,6 @@ def test_the_json_is_strict_and_as_its_schema_says(written):
         jsonschema.validate(data | {"surprise": 1}, schema)
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(data | {"limited_by": "bad luck"}, schema)
-
-
-@pytest.mark.parametrize("case", CAUSES)
-def test_every_cause_is_as_the_schema_says(case):
-    jsonschema.validate(strict(verdict_on(case, better=False).json), strict(SCHEMA.read_text(encoding="utf-8")))
 
 
 def test_the_page_needs_no_other_file_and_says_the_verdict(written):

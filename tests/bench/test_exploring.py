@@ -149,8 +149,8 @@ def test_a_run_takes_less_than_a_second(algorithm):
     assert min(taken) < 1.0  # on a core that other work shares
 
 
-def test_the_measured_duct_is_there_with_its_two_recordings(shared_data, monkeypatch):
-    monkeypatch.setenv("KFOPC_DATA", str(shared_data))
+def test_the_measured_duct_is_there_with_its_two_recordings(shared_data, data_folder):
+    data_folder(shared_data)
     setups = {setup.name: setup for setup in explore_setups()}
     assert list(setups)[1:] == ["Measured duct", "Measured duct, motor", "Measured duct, compressor"]
     motor = setups["Measured duct, motor"]
@@ -161,8 +161,8 @@ def test_the_measured_duct_is_there_with_its_two_recordings(shared_data, monkeyp
     assert result.noise_reduction_db > 1.0
 
 
-def test_without_data_only_the_models_are_offered(monkeypatch, tmp_path):
-    monkeypatch.setenv("KFOPC_DATA", str(tmp_path))
+def test_without_data_only_the_models_are_offered(data_folder, tmp_path):
+    data_folder(tmp_path)
     assert [setup.name for setup in explore_setups()] == ["Band-pass paths"]
 
 

@@ -235,46 +235,49 @@ class Now:
         return done
 
 
-@pytest.mark.parametrize("kind", [0, 1], ids=["relative", "absolute"])
-def test_a_move_is_run_once_although_the_page_then_moves_the_other_rating(kind):
+def opened(setup):
+    """Return a page whose first run is shown, its pool, and what lets the server take its next turn."""
     from bokeh.document import Document
 
     from kfopc_filterpy.bench.exploring_page import _Page
 
-    setup, pool = explore_setups()[0], Now()
-    page = _Page(Document(), [setup], pool)
+    document, pool = Document(), Now()
+    page = _Page(document, [setup], pool)
 
-    def show():  # as the server does when a run has ended
-        page._show(Now().submit(explore, setup, page._settings()), 0.0)
+    def turn():
+        for waiting in document.session_callbacks:
+            document.remove_next_tick_callback(waiting)
+            waiting.callback()
 
     page.open()
-    show()
+    turn()
+    return page, pool, turn
+
+
+@pytest.mark.parametrize("kind", [0, 1], ids=["relative", "absolute"])
+def test_a_move_is_run_once_although_the_page_then_moves_the_other_rating(kind):
+    page, pool, turn = opened(explore_setups()[0])
     page.controls["rating_kind"].active = kind
-    show()
+    turn()
     own, other = ("relative_rating", "absolute_rating")[:: 1 - 2 * kind]
     before, pool.runs = page.controls[other].value, 0
     page.controls[own].value -= 1.0
-    show()
+    turn()
     assert page.controls[other].value == pytest.approx(before - 1.0)
     assert pool.runs == 1
 
 
 def test_what_cannot_be_computed_is_said_in_the_page():
-    from bokeh.document import Document
-
-    from kfopc_filterpy.bench.exploring_page import _Page
-
     t = np.arange(16000) / 8000
     silent_above = np.round(np.sin(2 * np.pi * 100 * t), 3) * (t > 0)
-    setup = AcousticSetup("hum", [0, 0, 0, 1.0], [0, 1.0], 8000, silent_above)
-    page = _Page(Document(), [setup], Now())
-    page._is_running = True
-    failed = Now().submit(explore, setup, ExploreSettings(band=(3999.9, 4000.1)))
-    page._show(failed, 0.0)
+    page, _, turn = opened(AcousticSetup("hum", [0, 0, 0, 1.0], [0, 1.0], 8000, silent_above))
+    page.controls["band"].value = (3999.9, 4000.1)
+    turn()
     assert page.texts["status"].text.startswith("<b>Not computed:</b> band")
-    page._show(Now().submit(explore, setup, ExploreSettings(band=(50.0, 4000.0))), 0.0)
+    page.controls["band"].value = (50.0, 4000.0)
+    turn()
     assert page.texts["status"].text.startswith("Computed in")
-    assert {name: set(data) for name, data in CURVES.items()}.keys() == page.sources.keys()
+    assert CURVES.keys() == page.sources.keys()
 
 
 def test_a_port_in_use_is_named():

@@ -8,14 +8,13 @@ from kfopc_filterpy.bench import algorithms
 from kfopc_filterpy.bench.mathematics import FORMULAS, PARAMETERS, mathml, parameter, prose
 
 STATE_NOISE = FORMULAS["r E[x'^2]/q"]
-SYMBOLS = sorted({tex for tex, _ in PARAMETERS.values() if tex} | set(FORMULAS.values()))
 
 
-@pytest.mark.parametrize("tex", SYMBOLS, ids=range(len(SYMBOLS)))
-def test_every_formula_becomes_mathml_without_a_rest_of_tex(tex):
-    math = ElementTree.fromstring(mathml(tex))
-    assert math.tag == "math"
-    assert not set("\\{}_$") & set("".join(math.itertext()))
+def test_every_formula_becomes_mathml_without_a_rest_of_tex():
+    for tex in {tex for tex, _ in PARAMETERS.values() if tex} | set(FORMULAS.values()):
+        math = ElementTree.fromstring(mathml(tex))
+        assert math.tag == "math"
+        assert not set("\\{}_$") & set("".join(math.itertext())), tex
 
 
 def test_a_fraction_is_a_fraction():

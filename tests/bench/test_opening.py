@@ -17,32 +17,22 @@ def made(name, conditions, *claims, **changes):
 
 
 @pytest.mark.parametrize(
-    ("holds", "sentence"),
+    ("claims", "sentence"),
     [
-        (True, "All 3 claims of the paper were reproduced."),
-        (False, "None of the 3 claims of the paper was reproduced."),
+        ([(POWER, True), (SPEED, True), (CLEAN, True)], "All 3 claims of the paper were reproduced."),
+        ([(POWER, False), (SPEED, False), (CLEAN, False)], "None of the 3 claims of the paper was reproduced."),
+        ([(POWER, True)], "The one claim of the paper was reproduced."),
+        ([(POWER, False)], "The one claim of the paper was not reproduced."),
+        (
+            [(POWER, True), (SPEED, False)],
+            "1 of the 2 claims of the paper was reproduced; the exception is “It converges faster”.",
+        ),
+        ([], ""),
     ],
-    ids=["all", "none"],
+    ids=["all", "none", "one holds", "one fails", "one exception", "without"],
 )
-def test_all_or_none(holds, sentence):
-    assert claims_sentence([made("a", ["a tone"], (POWER, holds), (SPEED, holds), (CLEAN, holds))]) == sentence
-
-
-def test_without_claims_there_is_nothing_to_say():
-    assert claims_sentence([made("a", ["a tone"])]) == ""
-
-
-@pytest.mark.parametrize(("holds", "word"), [(True, "was"), (False, "was not")], ids=["holds", "fails"])
-def test_one_claim(holds, word):
-    assert claims_sentence([made("a", [], (POWER, holds))]) == f"The one claim of the paper {word} reproduced."
-
-
-def test_one_exception_is_named():
-    studies = [made("a", ["a tone"], (POWER, True), (SPEED, False))]
-    assert (
-        claims_sentence(studies)
-        == "1 of the 2 claims of the paper was reproduced; the exception is “It converges faster”."
-    )
+def test_claims_of_one_study(claims, sentence):
+    assert claims_sentence([made("a", ["a tone"], *claims)]) == sentence
 
 
 def test_what_all_exceptions_share_is_named():

@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 from helpers.channels import dense_systems, random_paths, through
 
-from kfopc_filterpy.bench import (
-    Scene,
-    Trial,
-    algorithms,
-    best_setting,
-    make_controller,
-    make_scene,
-    run_setting,
-)
+from kfopc_filterpy.bench import Scene, Trial, algorithms, best_setting, make_controller, make_scene, run_setting
 from kfopc_filterpy.signals import tone
 
 FS = 16000.0

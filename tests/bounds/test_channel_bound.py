@@ -47,7 +47,7 @@ def test_the_bound_meets_dense_solves_and_every_budget() -> None:
     assert bound.unconstrained.noise_reduction_db > bound.whole.noise_reduction_db > bound.scaled.noise_reduction_db
 
 
-@pytest.mark.parametrize("share", [1e-8, 1e-3, 0.5, 0.99])
+@pytest.mark.parametrize("share", [1e-8, 0.99])
 def test_the_powers_are_met_however_tight_they_are(share: float) -> None:
     """With the optimality conditions of the problem, from dense sums: a gradient of zero, and what binds used up."""
     x, d = signals()

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kfopc_filterpy.bounds import measurement_noise_from_residual, measurement_noise_from_run
 from kfopc_filterpy.bounds.wiener import wiener_solution
@@ -14,29 +12,12 @@ from kfopc_filterpy.signals import band_limited_noise
 S = np.array([0.0, 0.9, -0.4, 0.2])
 
 
-def recording(n, n_taps, q, seed, coloured=True):
+def recording(n, n_taps, q, seed):
     """Return a reference, and d = w' x' + e_o of eq. 1b with white e_o of variance q."""
     rng = np.random.default_rng(seed)
-    x = rng.standard_normal(n)
-    if coloured:
-        x = scipy.signal.lfilter([1.0, 0.3], [1.0, -0.7], x)
+    x = scipy.signal.lfilter([1.0, 0.3], [1.0, -0.7], rng.standard_normal(n))
     w = rng.standard_normal(n_taps)
     return x, np.convolve(np.convolve(x, S), w)[:n] + np.sqrt(q) * rng.standard_normal(n)
-
-
-@given(
-    seed=st.integers(0, 10_000),
-    n_taps=st.integers(1, 40),
-    n=st.integers(400, 3000),
-    q=st.floats(1e-4, 1e2),
-)
-@settings(max_examples=40)
-def test_recovers_the_variance_put_in(seed, n_taps, n, q):
-    x, d = recording(n, n_taps, q, seed)
-    estimate = measurement_noise_from_run(x, d, S, n_taps)
-    # chi squared with as many degrees of freedom as samples fitted less weights: 5 of its standard deviations
-    freedom = n - (n_taps + S.size - 2) - n_taps
-    assert estimate == pytest.approx(q, rel=5 * np.sqrt(2 / freedom))
 
 
 def test_has_no_bias_from_the_weights_fitted():
@@ -70,20 +51,6 @@ def test_what_the_filter_cannot_explain_counts():
     assert measurement_noise_from_run(x, other, S, 16) == pytest.approx(np.var(other), rel=0.01)
     assert measurement_noise_from_run(x, x, [0.0, 0.0, 1.0], 16) == pytest.approx(np.var(x), rel=0.01)
     assert measurement_noise_from_run(x, x, [1.0], 16) < 1e-25
-
-
-def test_scales_with_the_square_of_the_disturbance():
-    x, d = recording(800, 8, 0.1, 3)
-    one = measurement_noise_from_run(x, d, S, 8)
-    assert measurement_noise_from_run(x, 8.0 * d, S, 8) == pytest.approx(64 * one, rel=1e-12)
-    assert measurement_noise_from_run(8.0 * x, d, S, 8) == pytest.approx(one, rel=1e-9)
-
-
-def test_a_tone_that_is_all_explained_leaves_the_noise():
-    n = np.arange(8000)
-    noise = 0.1 * np.random.default_rng(4).standard_normal(8000)
-    d = 3 * np.sin(0.2 * n + 1.0) + noise
-    assert measurement_noise_from_run(np.sin(0.2 * n), d, S, 16) == pytest.approx(0.01, rel=5 * np.sqrt(2 / 8000))
 
 
 def test_from_a_residual():

@@ -66,8 +66,7 @@ def asked_for(x, d, s, n_taps):
     return np.mean((control @ np.linalg.lstsq(filtered, d, rcond=None)[0]) ** 2)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("seed", "share"), [(0, 0.02), (1, 0.3), (0, 0.9)])
 def test_no_general_optimiser_finds_less_error_within_the_power(share, seed):
     x, d, s = scene(300, seed)
     rated = share * asked_for(x, d, s, 3)
@@ -98,17 +97,16 @@ def test_no_general_optimiser_finds_less_error_within_the_power(share, seed):
 
 
 @pytest.mark.parametrize(
-    ("n", "switch_on", "edges"),
+    ("n", "switch_on", "edges", "share"),
     [
-        (1000, 0, [0, 200, 400, 600, 800, 1000]),
-        (1099, 0, [0, 200, 400, 600, 800, 1099]),  # a rest of under half a second joins the last
-        (1100, 0, [0, 200, 400, 600, 800, 1000, 1100]),  # half a second is a segment of its own
-        (1000, 130, [130, 330, 530, 730, 1000]),
-        (150, 0, [0, 150]),  # less than a second in all, and less than half a second
-        (90, 0, [0, 90]),
+        (1000, 0, [0, 200, 400, 600, 800, 1000], 0.2),
+        (1099, 0, [0, 200, 400, 600, 800, 1099], 0.8),  # a rest of under half a second joins the last
+        (1100, 0, [0, 200, 400, 600, 800, 1000, 1100], 1.5),  # half a second is a segment of its own
+        (1000, 130, [130, 330, 530, 730, 1000], 0.2),
+        (150, 0, [0, 150], 0.8),  # less than a second in all, and less than half a second
+        (90, 0, [0, 90], 0.2),
     ],
 )
-@pytest.mark.parametrize("share", [0.2, 0.8, 1.5])
 def test_record_and_segments_are_those_of_dense_least_squares(n, switch_on, edges, share):
     n_taps = 6
     x, d, s = scene(n)
@@ -258,25 +256,6 @@ def test_more_power_never_means_more_error():
     assert np.all((np.diff(penalties, axis=0) < 0) | (penalties[1:] == 0))
     assert np.all(penalties[0] > 0)
     assert np.all(penalties[-1, 0] == 0)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_bound_lies_below_the_scaled_filter(seed):
-    x, d, s = scene(seed=seed)
-    found = power_constrained_wiener(x, d, s, 8, 0.25 * asked_for(x, d, s, 8), fs=FS)
-    # Both keep the budget, and the path is not flat: tenths of a per cent in the quietest second, not rounding.
-    assert found.whole.error_power < 0.985 * found.scaled.error_power
-    assert np.all(found.per_second.error_power < 0.998 * found.scaled_per_second.error_power)
-    for part in (found.scaled, *found.scaled_per_second.segments):
-        assert part.control_power == pytest.approx(found.rated_power, rel=1e-12)
-    np.testing.assert_allclose(found.scaled.weights, found.scaled.constraint_factor * found.unconstrained.weights)
-
-
-def test_flat_path_and_white_reference_leave_nothing_to_gain_over_scaling():
-    x = np.random.default_rng(0).standard_normal(20_000)
-    found = power_constrained_wiener(x, 3 * x, [2.0], 8, 0.5, fs=4000.0)
-    # x' = 2 x exactly, so that R_x' = 4 R_x whatever the sample.
-    np.testing.assert_allclose(found.whole.weights, found.scaled.weights, atol=1e-12)
 
 
 @pytest.mark.parametrize("gain", [1e-8, 1e7])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.signal
+from helpers.channels import dense_systems
 from helpers.settings_grid import FS, NOISES, ON, compare, made_paths, signals
 
 from kfopc_filterpy import (
@@ -25,7 +25,6 @@ from kfopc_filterpy import (
     suggest_settings,
 )
 from kfopc_filterpy.bounds import measurement_noise_from_run, settings
-from kfopc_filterpy.bounds.wiener import full_stretch
 from kfopc_filterpy.signals import bursty_noise, tone
 
 S = np.array([0.0, 0.0, 0.8, 0.3])
@@ -56,36 +55,17 @@ def test_the_length_is_that_of_the_true_filter(delay):
     assert suggested.measurement_noise == pytest.approx(0.01, rel=5 * np.sqrt(2 / 32000))
 
 
-@pytest.mark.parametrize("ridge", [0.0, 0.01])
-@pytest.mark.parametrize("pole", [0.0, 0.9], ids=["white", "coloured"])
-def test_the_error_powers_of_all_lengths_are_those_of_separate_least_squares_fits(pole, ridge):
-    x = scipy.signal.lfilter([1.0], [1.0, -pole], X[:4000])
-    d = np.convolve(x, 0.9 ** np.arange(30))[:4000] + D[:4000]
-    stretch = full_stretch(x, d, S, 40)
-    errors = settings._Fits(x, d, S, 16000.0, 40, 40).error_powers(ridge)
-    rows = np.lib.stride_tricks.sliding_window_view(stretch.filtered, 40)[:, ::-1]
-    right = np.concatenate([stretch.d, np.zeros(40)])
-    for n in (1, 2, 7, 24, 40):
-        below = np.sqrt(ridge * len(rows)) * np.eye(40)[:, :n]  # the ridge as 40 samples more
-        left = np.concatenate([rows[:, :n], below])
-        residual = right - left @ np.linalg.lstsq(left, right, rcond=None)[0]
-        # without a ridge there is one of 1e-11, which float64 correlations need: it costs less than 1e-6
-        assert errors[n - 1] == pytest.approx(residual @ residual / (len(rows) - n), rel=1e-6)
-
-
-def test_of_several_channels_the_error_powers_are_those_of_separate_least_squares_fits_too():
+def test_of_several_channels_the_measurement_noise_is_the_residual_of_dense_least_squares():
     x, paths = X[:6000].reshape(2, 3000), PATHS
     d = np.stack([np.convolve(x[0], 0.9 ** np.arange(30))[:3000], np.convolve(x[1], 0.5 ** np.arange(30))[:3000]])
     d = d + D[:6000].reshape(2, 3000)
-    fit = settings._Fits(x, d, paths, 16000.0, 10, 10)
-    errors, stretch = fit.error_powers(0.0), fit.stretch
-    windows = np.lib.stride_tricks.sliding_window_view(stretch.filtered, 10, axis=-1)[..., ::-1]  # (K, J, I, n, taps)
     for n in (1, 4, 10):
-        rows = np.concatenate([np.moveaxis(one[..., :n], 2, 0).reshape(one.shape[2], -1) for one in windows])
-        right = stretch.d.ravel()
-        residual = right - rows @ np.linalg.lstsq(rows, right, rcond=None)[0]
-        weights = rows.shape[1] / 2  # for each microphone
-        assert errors[n - 1] == pytest.approx(residual @ residual / 2 / (len(rows) / 2 - weights), rel=1e-6)
+        start = n + paths.shape[2] - 2  # where the delay lines are full
+        R, _, r = dense_systems(x, d, paths, n, start)
+        residual = np.sum(np.mean(d[:, start:] ** 2, axis=1)) - r @ np.linalg.solve(R, r)
+        n_samples, weights = d.shape[1] - start, r.size / 2  # weights for each microphone
+        expected = residual / 2 * n_samples / (n_samples - weights)
+        assert suggest_settings(x, d, paths, n_taps=n).measurement_noise == pytest.approx(expected, rel=1e-6)
 
 
 def test_two_loudspeakers_that_do_not_meet_get_the_settings_of_one():
@@ -148,15 +128,15 @@ def test_a_length_at_which_tones_need_huge_weights_is_passed_over():
     assert reached[1] < 10.0
 
 
-def test_a_steady_noise_is_not_bursty_and_its_bursts_lengthen_the_memory():
+def test_bursts_lengthen_the_memory():
     """Bursts of a tenth of the time, with all of the power: the mean square of the power is ten times its square."""
-    fs, tenth = 1000.0, (np.arange(20000) // 20) % 10 == 0  # bursts of 20 ms each 200 ms
-    signal = np.where(tenth, 1.0, 0.0) * (-1.0) ** np.arange(20000)
-    assert settings._burstiness(np.ones(20000), fs, 200.0) == 1.0
-    assert settings._burstiness(signal, fs, 200.0) == pytest.approx(10.0)
-    assert settings._burstiness(signal, fs, 20.0) == pytest.approx(1.0)  # a memory as short as a burst follows it
-    assert settings._burstiness(np.zeros(100), fs, 20.0) == 1.0
-    assert settings._burstiness(signal[:15], fs, 200.0) == pytest.approx(1.0)  # a record of one block
+    x = np.where((np.arange(X.size) // 320) % 10 == 0, X, 0.0)  # 20 ms each 200 ms
+    d = np.convolve(x, np.eye(20)[19])[: x.size] + 0.1 * np.random.default_rng(2).standard_normal(x.size)
+    for wanted, lengthened in ((0.25, np.sqrt(10)), (0.02, 1.0)):  # a memory as short as a burst follows it
+        suggested = suggest_settings(x, d, S, n_taps=24, memory_s=wanted)
+        power = np.mean(np.convolve(x, S) ** 2)
+        memory = np.sqrt(suggested.measurement_noise / (suggested.state_noise * power)) / FS
+        assert memory == pytest.approx(wanted * lengthened, rel=0.1)
 
 
 def test_all_follows_the_units():

@@ -5,8 +5,6 @@ import re
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from kfopc_filterpy.bounds import coherence_bound, wiener_solution
 from kfopc_filterpy.bounds.power_constrained import power_constrained_solution, power_constrained_wiener
@@ -29,8 +27,9 @@ def _regressors(signal, n_taps, start):
     return np.array([signal[n - n_taps + 1 : n + 1][::-1] for n in range(start, signal.size)])
 
 
-@pytest.mark.parametrize("n_taps", [1, 2, 7, 16])
-@pytest.mark.parametrize(("ridge", "penalty"), [(0.0, 0.0), (0.01, 0.0), (0.0, 0.5), (0.02, 0.3)])
+@pytest.mark.parametrize(
+    ("n_taps", "ridge", "penalty"), [(1, 0.0, 0.0), (16, 0.0, 0.0), (7, 0.01, 0.0), (7, 0.0, 0.5), (2, 0.02, 0.3)]
+)
 def test_weights_are_those_of_dense_least_squares(n_taps, ridge, penalty):
     x, d, s = _scene()
     start = n_taps + s.size - 2
@@ -50,16 +49,6 @@ def test_weights_are_those_of_dense_least_squares(n_taps, ridge, penalty):
     assert found.disturbance_power == pytest.approx(np.mean(d[start:] ** 2), rel=1e-12)
     residual = np.mean((d - antinoise)[start:] ** 2)
     assert found.noise_reduction_db == pytest.approx(-10 * np.log10(residual / found.disturbance_power))
-
-
-@given(n_taps=st.integers(1, 12), extra=st.integers(0, 5), seed=st.integers(0, 1000))
-@settings(max_examples=30, deadline=None)
-def test_correlation_matrix_is_the_mean_of_outer_products(n_taps, extra, seed):
-    signal = np.random.default_rng(seed).standard_normal(60)
-    start = n_taps - 1 + extra
-    rows = _regressors(signal, n_taps, start)
-    expected = rows.T @ rows / len(rows)
-    np.testing.assert_allclose(correlation_matrix(signal[extra:], n_taps), expected, atol=1e-13)
 
 
 def test_antinoise_power_is_what_the_error_lacks():
@@ -102,36 +91,6 @@ def test_minimum_norm_solve_leaves_out_empty_directions():
     np.testing.assert_allclose(minimum_norm_solve(matrix, np.array([1.0, 1.0, 1.0])), [0.5, 0.0, 0.0])
 
 
-def test_power_constrained_solution_is_the_optimum_within_the_power():
-    x, d, s = _scene()
-    free = wiener_solution(x, d, s, 8)
-    rated = free.control_power / 4
-    found = power_constrained_solution(x, d, s, 8, rated)
-    assert found.control_power == pytest.approx(rated, rel=1e-5)
-
-    def error(weights):
-        start = 8 + s.size - 2
-        return np.mean((d - scipy.signal.lfilter(np.convolve(s, weights), 1.0, x))[start:] ** 2)
-
-    best = error(found.weights)
-    assert best < error(free.weights / 2)  # KF-OPC's scaling at the same power cannot be better
-    rng = np.random.default_rng(5)
-    for _ in range(50):  # nor any neighbour scaled back to the power
-        other = found.weights + 0.05 * rng.standard_normal(8)
-        power = np.mean(scipy.signal.lfilter(other, 1.0, x)[8 + s.size - 2 :] ** 2)
-        assert error(other * np.sqrt(rated / power)) >= best * (1 - 1e-5)
-    same = power_constrained_solution(x, d, s, 8, 2 * free.control_power)
-    np.testing.assert_array_equal(same.weights, free.weights)
-
-
-def test_flat_paths_penalty_is_the_movs_scaling():
-    # For white noise and a flat path G_s / (G_s + gamma) scales the weights: eq. 13's alpha.
-    x = np.random.default_rng(0).standard_normal(20_000)
-    free = wiener_solution(x, 3 * x, [2.0], 1)
-    shrunk = wiener_solution(x, 3 * x, [2.0], 1, control_penalty=1.5)
-    assert shrunk.weights[0] / free.weights[0] == pytest.approx(4 / (4 + 1.5), rel=1e-12)
-
-
 def test_coherence_bound_is_the_incoherent_share():
     rng = np.random.default_rng(0)
     x = rng.standard_normal(200_000)
@@ -149,17 +108,11 @@ def test_coherence_bound_is_the_incoherent_share():
     [
         (lambda x, d, s: wiener_solution(x, d[:-1], s, 4), "disturbance must have 3000 values, got 2999"),
         (lambda x, d, s: wiener_solution(x[:9], d[:9], s, 4), "reference must have at least 10 samples"),
-        (
-            lambda x, d, s: wiener_solution(0 * x, d, s, 4),
-            "reference through secondary_path must not be silent",
-        ),
+        (lambda x, d, s: wiener_solution(0 * x, d, s, 4), "reference through secondary_path must not be silent"),
         (lambda x, d, s: wiener_solution(x, 0 * d, s, 4), "disturbance must not be silent"),
         (lambda x, d, s: wiener_solution(x, d, s, 0), "n_taps must be at least 1"),
         (lambda x, d, s: wiener_solution(x * np.nan, d, s, 4), "reference must be finite"),
-        (
-            lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1),
-            "regularization must not be negative",
-        ),
+        (lambda x, d, s: wiener_solution(x, d, s, 4, regularization=-1), "regularization must not be negative"),
         (lambda x, d, s: wiener_solution(x, d, s, 4, control_penalty=-1), "control_penalty must not be neg"),
         (lambda x, d, s: power_constrained_solution(x, d, s, 4, 0.0), "rated_power must be greater than 0"),
         (lambda x, d, s: coherence_bound(x, d, FS, segment=1024), "reference must have at least 8192"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import numpy as np
 import pytest
 from helpers.commands import FS
@@ -30,13 +32,13 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def command(folder, monkeypatch, capsys):
+def command(folder, capsys):
     """Run the command in the folder; return its exit code, output and errors."""
-    monkeypatch.chdir(folder)
 
     def run(*arguments: object) -> tuple[int, str, str]:
         try:
-            code = main([str(one) for one in arguments])
+            with contextlib.chdir(folder):
+                code = main([str(one) for one in arguments])
         except SystemExit as end:
             code = int(end.code or 0)
         return code, *capsys.readouterr()

@@ -19,8 +19,8 @@ def test_the_measured_data_are_listed_and_an_unknown_name_is_refused(command, tm
     assert "there is no data set 'fan'; there are duct" in err
 
 
-def test_a_folder_of_data_that_is_named_but_does_not_exist_is_said(command, tmp_path, monkeypatch):
-    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
+def test_a_folder_of_data_that_is_named_but_does_not_exist_is_said(command, tmp_path, data_folder):
+    data_folder(tmp_path / "nowhere")
     code, _, err = command("data", "list")
     assert code == 0
     assert f"the folder {tmp_path / 'nowhere'} does not exist: correct --folder or KFOPC_DATA" in err

@@ -51,29 +51,32 @@ POWERS: dict[str, Any] = {"fs": FS, "memory_s": MEMORY_S}
 
 
 class Scene:
-    """Paths and noises for a number of channels."""
+    """Paths and noises: one channel, or three microphones, two loudspeakers and two references."""
 
-    def __init__(self, channels: int) -> None:
-        self.channels, self.one = channels, channels == 1
-        self.s = 0.3 * random_paths(channels, channels, 12, seed=1) + np.eye(channels)[..., None] * np.eye(12)[2]
-        self.s_hat = 0.9 * self.s[..., :9] + random_paths(channels, channels, 9, seed=2) / 20
-        self.primary = random_paths(channels, channels, 20, seed=3, delay=5)
+    def __init__(self, several: bool) -> None:
+        self.one = not several
+        K, J, I = (3, 2, 2) if several else (1, 1, 1)  # noqa: E741
+        self.microphones, self.loudspeakers, self.references = K, J, I
+        self.s = 0.3 * random_paths(K, J, 12, seed=1) + np.eye(K, J)[..., None] * np.eye(12)[2]
+        self.s_hat = 0.9 * self.s[..., :9] + random_paths(K, J, 9, seed=2) / 20
+        self.primary = random_paths(K, I, 20, seed=3, delay=5)
 
     def noises(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Coloured references, soft at first and then loud, and disturbances that they explain in part."""
         rng = np.random.default_rng(4)
-        x = through(np.eye(self.channels)[..., None] * [1.0, 0.6, 0.3], rng.standard_normal((self.channels, n)))
+        colours = np.eye(self.references)[..., None] * [1.0, 0.6, 0.3]
+        x = through(colours, rng.standard_normal((self.references, n)))
         x[:, : n // 3] *= 0.05
         x[:, 3 * n // 4 :] *= 0.6
-        return x, through(self.primary, x) + 0.02 * rng.standard_normal((self.channels, n))
+        return x, through(self.primary, x) + 0.02 * rng.standard_normal((self.microphones, n))
 
-    def each(self, values: list[float]) -> Any:
-        """The values of the loudspeakers; of one channel, a number."""
+    def each(self, values: list[Any]) -> Any:
+        """The values of the loudspeakers or microphones; of one channel, a number."""
         return values[0] if self.one else values
 
 
-ONE, TWO = Scene(1), Scene(2)
-SCENES = [pytest.param(ONE, id="one channel"), pytest.param(TWO, id="two of each")]
+ONE, SEVERAL = Scene(several=False), Scene(several=True)
+SCENES = [pytest.param(ONE, id="one channel"), pytest.param(SEVERAL, id="several")]
 
 
 def assert_close(got: Any, expected: Any, what: str) -> None:
@@ -93,7 +96,7 @@ def compare(
     own = (x[0], d[0]) if scene.one else (x, d)
     options: dict[str, Any] = {"secondary_path": paths, "fs": FS, "amplifier": amplifier, "switch_on_s": on / FS}
     result = simulate(controller, own[0], disturbance=own[1], **options)
-    amplifiers = None if played is None else [played] * scene.channels
+    amplifiers = None if played is None else [played] * scene.loudspeakers
     expected = signals.run(oracle, x, d, scene.s, amplifiers=amplifiers, on=on)
     assert result.diverged_at_s is None
     assert_close(result.control_signal, expected.y, "control signal")
@@ -129,12 +132,12 @@ LMS: dict[str, Algorithm] = {
     "re-scaling": (RescalingFxLMS, lms.RescalingFxLMS, {"step_size": MU, "amplitude_limit": A}, {"mu": MU, "A": A}),
 }
 
-R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2], 0.5, 0.9995
+R, Q, P0, LAMBDA = 1e-6, [1e-2, 3e-2, 2e-2], 0.5, 0.9995
 OURS: dict[str, Any] = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
 THEIRS: dict[str, Any] = {"r": R, "q": Q, "P0": P0}
 ARRAY: dict[str, Any] = {"measurement_noise": Q[0], "initial_variance": P0}  # the oracle's P is in units of q
 
-ONE_NOISE: tuple[dict[str, Any], dict[str, Any]] = OURS | {"measurement_noise": Q[0]}, THEIRS | {"q": 2 * Q[:1]}
+ONE_NOISE: tuple[dict[str, Any], dict[str, Any]] = OURS | {"measurement_noise": Q[0]}, THEIRS | {"q": 3 * Q[:1]}
 
 SEVERAL_KALMAN: dict[str, Algorithm] = {  # several channels, too
     "KF-ANC": (kf_anc, Kalman, OURS, THEIRS),
@@ -177,14 +180,14 @@ def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: st
     """The package's controller and the oracle; `own` and `known` are further settings of each."""
     make, oracle, ours, theirs = ALGORITHMS[name]
     ours = {key: scene.each(value) if isinstance(value, list) else value for key, value in ours.items()} | (own or {})
-    theirs = {key: value[: scene.channels] if isinstance(value, list) else value for key, value in theirs.items()}
+    theirs = {key: value[:1] if scene.one and isinstance(value, list) else value for key, value in theirs.items()}
     if name in WITH_POWERS:
         ours["constraint"] = scene.each([OutputPowerConstraint(p, window=window, **POWERS) for p in RATED])
-        theirs["constraints"] = [Constraint(p, window=window, **POWERS) for p in RATED[: scene.channels]]
+        theirs["constraints"] = [Constraint(p, window=window, **POWERS) for p in RATED[: scene.loudspeakers]]
     if not scene.one:
-        ours["n_references"] = scene.channels
+        ours["n_references"] = scene.references
     controller = make(16, scene.s_hat[0, 0] if scene.one else scene.s_hat, **ours)
-    channels = {"s_hat": scene.s_hat, "n_taps": 16, "n_references": scene.channels}
+    channels = {"s_hat": scene.s_hat, "n_taps": 16, "n_references": scene.references}
     return controller, oracle(**channels, **theirs, **(known or {}))
 
 
@@ -193,11 +196,11 @@ def pair(name: str, scene: Scene, own: Any = None, known: Any = None, window: st
 def test_lms(name: str, scene: Scene) -> None:
     """A second; half of it with running powers, and a quarter of that with several channels: the oracles are slow."""
     n = 8000 if name in WITH_POWERS else 16000
-    compare(scene, *pair(name, scene), n // scene.channels**2)
+    compare(scene, *pair(name, scene), n if scene.one else n // 4)
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("name", [name for name in LMS if name != "MOV fixed"])
+@pytest.mark.parametrize("name", ["FxLMS", "FxNLMS", "leaky", "MOV", "two-gradient", "re-scaling"])
 def test_lms_with_a_guard(name: str, scene: Scene) -> None:
     W = guard_filter(UNCERTAINTY, scene.s_hat)
     controller, oracle = pair(name, scene, known={"guard": W})
@@ -212,7 +215,7 @@ def limiters(scene: Scene) -> tuple[Any, list[Limiter]]:
         (0.02, {"fs": FS, "window_s": 0.013, "amplitude_limit": 0.3}),
     ]
     own, theirs = ([make(p, **o) for p, o in settings] for make in (OutputLimiter, Limiter))
-    return scene.each(own), theirs[: scene.channels]
+    return scene.each(own), theirs[: scene.loudspeakers]
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -225,7 +228,9 @@ def test_lms_with_limiters(name: str, scene: Scene) -> None:
 
 def saturating(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
     """A soft amplifier model, for the package and for the oracle."""
-    return {"amplifier": SoftSaturationAmplifier(0.2, 1.5)}, {"amplifiers": [signals.rapp(0.2, 1.5)] * scene.channels}
+    return {"amplifier": SoftSaturationAmplifier(0.2, 1.5)}, {
+        "amplifiers": [signals.rapp(0.2, 1.5)] * scene.loudspeakers
+    }
 
 
 @pytest.mark.parametrize("scene", SCENES)
@@ -238,9 +243,9 @@ def test_lms_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> Non
 
 
 def kalman_cases(names: Any) -> list[Any]:
-    """Each algorithm with one channel; with two of each if it takes them."""
+    """Each algorithm with one channel; with several if it takes them."""
     cases = [pytest.param(name, ONE, id=f"{name}, one channel") for name in names]
-    return cases + [pytest.param(name, TWO, id=f"{name}, two of each") for name in names if name in SEVERAL_KALMAN]
+    return cases + [pytest.param(name, SEVERAL, id=f"{name}, several") for name in names if name in SEVERAL_KALMAN]
 
 
 @pytest.mark.parametrize(("name", "scene"), kalman_cases(KALMAN))
@@ -274,8 +279,11 @@ def test_kalman_with_amplifiers_and_sliding_windows(name: str, scene: Scene) -> 
 
 @pytest.mark.parametrize(
     ("name", "scene"),
-    kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired"])
-    + [pytest.param("MOV", scene, id=f"MOV, {scene.channels}") for scene in (ONE, TWO)],
+    [
+        *kalman_cases(["KF-OPC", "diagonal KF-OPC", "FxRLS", "fast array KF-OPC", "fast array, finite", "repaired"]),
+        pytest.param("MOV", ONE, id="MOV, one channel"),
+        pytest.param("MOV", SEVERAL, id="MOV, several"),
+    ],
 )
 def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
     compare(scene, *pair(name, scene), 2000, on=400)
@@ -285,7 +293,7 @@ def test_control_that_is_switched_on_later(name: str, scene: Scene) -> None:
 @pytest.mark.parametrize("unheard", [[1], [0, 1]], ids=["one", "both"])
 def test_a_loudspeaker_that_no_microphone_hears(unheard: list[int], name: str) -> None:
     """Its factor of zero does not count, unless there is no other."""
-    scene = Scene(2)
+    scene = Scene(several=True)
     scene.s_hat[:, unheard] = 0.0
     controller, oracle = pair(name, scene)
     x, d = scene.noises(300)
@@ -317,20 +325,3 @@ def test_limiter(amplitude_limit: float | None, window_s: float) -> None:
     assert_close(y[clear], expected[clear], "output")
     assert own.clipped > 0
     assert own.gain == pytest.approx(theirs.gain, rel=TOLERANCE)
-
-
-@pytest.mark.parametrize("window", ["exponential", "sliding"])
-@pytest.mark.parametrize("gain", [None, 0.7])
-def test_powers(window: str, gain: float | None) -> None:
-    """The running powers themselves, over several lengths of the window; the reference is silent at first."""
-    d, xf, x = np.random.default_rng(6).standard_normal((3, 2000))
-    xf[:5] = x[:5] = 0.0
-    d[1000:] *= 0.1
-    own = OutputPowerConstraint(0.3, secondary_path_gain=gain, fs=FS, memory_s=0.01, window=window)
-    theirs = Constraint(0.3, gain=gain, fs=FS, memory_s=0.01, window=window)
-    for n in range(d.size):
-        assert own.advance(d[n], xf[n], x[n]) == pytest.approx(theirs.take(d[n] ** 2, xf[n] ** 2, x[n] ** 2), rel=1e-12)
-        assert own.disturbance_power == pytest.approx(theirs.disturbance_power, rel=1e-12)
-        assert own.secondary_path_gain is None or own.secondary_path_gain == pytest.approx(theirs.gain, rel=1e-12)
-        assert n != 900 or 0.0 < theirs.alpha < 1.0
-    assert theirs.alpha == 1.0

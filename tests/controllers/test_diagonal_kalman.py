@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from helpers.channels import random_paths
-from helpers.comparing import state_of
 
-from kfopc_filterpy import DiagonalKalman, HardClipAmplifier, OutputPowerConstraint, kf_anc, kf_opc, simulate
+from kfopc_filterpy import DiagonalKalman, OutputPowerConstraint, kf_anc, kf_opc, simulate
 
 L = 6
 PATH = np.array([0.0, 0.8, -0.3])
@@ -24,9 +21,8 @@ def signals(n: int = 400, colour: tuple[float, ...] = (1.0,)) -> tuple[np.ndarra
     return x, np.convolve(x, [0.0, 0.0, 1.2, 0.5])[:n] + 0.1 * other
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("constrained", [False, True])
-def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool, compiled: bool) -> None:
+def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool) -> None:
     """filterpy's predict and update, P cut to its diagonal after each; the factors are those of a KF-OPC beside it.
 
     Known path: d^ = d. Tolerance: rounding of filterpy's Joseph form.
@@ -34,7 +30,7 @@ def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool, compil
     x, d = signals()
     rated: dict[str, Any] = {"constraint": OutputPowerConstraint(0.3, memory_s=0.01)} if constrained else {}
     controller = DiagonalKalman(L, PATH, **NOISES, **rated)
-    result = simulate(controller, x, disturbance=d, secondary_path=PATH, record_weights_every=1, compiled=compiled)
+    result = simulate(controller, x, disturbance=d, secondary_path=PATH, record_weights_every=1)
     factors = np.ones(x.size)
     if constrained:
         factors = simulate(kf_opc(L, PATH, **NOISES, **rated), x, disturbance=d, secondary_path=PATH).constraint_factor
@@ -52,17 +48,6 @@ def test_it_is_filterpys_filter_with_the_diagonal_of_p(constrained: bool, compil
     np.testing.assert_allclose(controller.variances, np.diag(kf.P), rtol=1e-9)
     assert result.algorithm == ("diagonal KF-OPC" if constrained else "diagonal KF")
     assert controller.rated_power == (0.3 if constrained else None)
-
-
-def test_of_one_tap_it_is_the_full_filter() -> None:
-    x, d = signals()
-    one, full = DiagonalKalman(1, PATH, **NOISES), kf_anc(1, PATH, **NOISES)
-    np.testing.assert_allclose(
-        simulate(one, x, disturbance=d, secondary_path=PATH).error,
-        simulate(full, x, disturbance=d, secondary_path=PATH).error,
-        rtol=0,
-        atol=1e-12,
-    )
 
 
 def test_what_it_loses_against_the_full_filter() -> None:
@@ -92,50 +77,9 @@ def test_variances_stay_positive_and_a_silent_reference_tells_nothing() -> None:
     x, d = signals()
     simulate(controller, x, disturbance=d, secondary_path=PATH)
     assert np.all(controller.variances >= 0.0)
+    controller.variances[:] = -1.0  # a copy
+    assert np.all(controller.variances >= 0.0)
     assert np.all(np.isfinite(controller.weights))
-
-
-def test_of_several_channels_it_is_its_equations() -> None:
-    """Two microphones measure the weights of two loudspeakers one after the other; the smaller factor scales them."""
-    rng, rated = np.random.default_rng(3), (0.05, 0.3)
-    paths = random_paths(2, 2, 4, seed=1)
-    x, e = rng.standard_normal(300), rng.standard_normal((2, 300))
-    constraints = [OutputPowerConstraint(power, memory_s=0.01) for power in rated]
-    controller = DiagonalKalman(L, paths, constraint=constraints, **NOISES)
-    w, p, y = np.zeros(2 * L), np.full(2 * L, 0.7), np.zeros((2, 300))
-    xf = np.array([[np.convolve(x, path)[:300] for path in of_microphone] for of_microphone in paths])
-    padded = np.pad(xf, ((0, 0), (0, 0), (L - 1, 0)))
-    for n in range(300):
-        y[:, n] = controller.control_signal([x[n]])
-        row_of_x = np.pad(x, (L - 1, 0))[n : n + L][::-1]
-        np.testing.assert_allclose(y[:, n], w.reshape(2, L) @ row_of_x, rtol=0, atol=1e-11)
-        controller.update(e[:, n])
-        factor = np.min(controller.constraint_factor)
-        p = p + 1e-5
-        for k in range(2):
-            d = e[k, n] + sum(np.convolve(y[j, : n + 1], paths[k, j])[n] for j in range(2))
-            h = padded[k, :, n : n + L][:, ::-1].ravel()
-            K = p * h / (p @ h**2 + 0.02)
-            w, p = w + K * (factor * d - h @ w), (1.0 - K * h) * p
-    assert factor < 0.8
-    np.testing.assert_allclose(controller.weights.ravel(), w, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(controller.variances.ravel(), p, rtol=1e-9)
-    assert controller.variances.shape == controller.weights.shape == (2, 1, L)
-
-
-@pytest.mark.parametrize("several", [False, True])
-def test_a_loud_error_is_refused_and_nothing_changed(several: bool) -> None:
-    x, d = signals()
-    paths = random_paths(2, 2, 4, seed=1) if several else PATH
-    controller = DiagonalKalman(L, paths, rated_power=0.3, **NOISES)
-    e = np.tile(d, (2, 1)) if several else d
-    controller.process(x[None] if several else x, e)
-    controller.control_signal([0.3] if several else 0.3)
-    before = state_of(controller)
-    with pytest.raises(ValueError, match="error is too loud"):
-        controller.update([0.1, 1e200] if several else 1e200)
-    assert [field.tobytes() for field in state_of(controller)] == [field.tobytes() for field in before]
-    assert (controller.state_noise, controller.measurement_noise) == (1e-5, 0.02)
 
 
 def test_a_step_that_would_be_too_large_is_left_out() -> None:
@@ -150,20 +94,8 @@ def test_a_step_that_would_be_too_large_is_left_out() -> None:
     assert controller.weights[0] == pytest.approx(1e40)
 
 
-def test_a_copy_goes_on_alone() -> None:
-    x, d = signals()
-    controller = DiagonalKalman(L, PATH, amplifier=HardClipAmplifier(1.0), **NOISES)
-    simulate(controller, x, disturbance=d, secondary_path=PATH, switch_on_s=0.005)
-    twin = pickle.loads(pickle.dumps(controller))
-    one, other = (simulate(c, x, disturbance=d, secondary_path=PATH) for c in (controller, twin))
-    np.testing.assert_array_equal(one.error, other.error)
-    np.testing.assert_array_equal(controller.variances, twin.variances)
-    controller.variances[:] = 0.0
-    assert np.all(controller.variances > 0.0)
-
-
 @pytest.mark.parametrize("name", ["state_noise", "measurement_noise", "initial_variance"])
-@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf, 1e51])
+@pytest.mark.parametrize("value", [-1.0, np.nan, 1e51])
 def test_bad_variances_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         DiagonalKalman(L, PATH, **(NOISES | {name: value}))

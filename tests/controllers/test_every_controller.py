@@ -5,15 +5,18 @@ from __future__ import annotations
 import inspect
 import itertools
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
+from helpers.channels import random_paths
+from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run, numbers_of
-from helpers.controllers import KALMAN, MAKERS, VARIANTS, made
-from helpers.loop import AMPLIFIERS, FEEDBACK, N_TAPS, S_HAT, noises, run
+from helpers.controllers import ALL, KALMAN, MAKERS, PATHS, SEVERAL, VARIANTS, I, J, K, made
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, S_HAT, noises, run
 
 import kfopc_filterpy
-from kfopc_filterpy import OutputLimiter, kf_opc
+from kfopc_filterpy import HardClipAmplifier, OutputLimiter, kf_opc, simulate
 
 
 @pytest.mark.parametrize(("name", "variant"), VARIANTS)
@@ -33,24 +36,46 @@ def test_compiled_run_is_the_steps_bit_for_bit(name: str, variant: str) -> None:
     assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
 
 
-@pytest.mark.parametrize("name", [name for name in MAKERS if "fast" not in name])
+@pytest.mark.parametrize("name", SEVERAL)
+def test_so_it_is_with_several_channels(name: str) -> None:
+    """With feedback, amplifiers, sensor noise, and a controller that first listens; and they go on alike."""
+    fast, slow = SEVERAL[name](), SEVERAL[name]()
+    x = np.random.default_rng(3).standard_normal((I, 300))
+    options: dict[str, Any] = {
+        "primary_path": random_paths(K, I, 9, seed=2, delay=3),
+        "secondary_path": 1.1 * PATHS,
+        "feedback_path": 0.02 * random_paths(I, J, 5, seed=4),
+        "amplifier": [HardClipAmplifier(1.0), None],
+        "sensor_noise_std": 0.01,
+        "rng": 1,
+        "fs": FS,
+    }
+    both = [
+        simulate(one, x, compiled=one is fast, record_weights_every=7, switch_on_s=20 / FS, **options)
+        for one in (fast, slow)
+    ]
+    assert_same_run(*both)
+    np.testing.assert_array_equal(fast.weights, slow.weights)
+    assert_same_run(*(simulate(one, x[:, :50], compiled=one is slow, **options) for one in (fast, slow)))
+
+
+@pytest.mark.parametrize("name", [name for name in ALL if "fast" not in name and "a user's" not in name])
 def test_blocks_are_the_steps_bit_for_bit(name: str) -> None:
     """However a recording is cut into blocks, and whichever samples are not adapted to."""
-    blocks, steps = made(name, "plain"), made(name, "plain")
-    x, d, _ = noises(300)
+    blocks, steps = ALL[name](), ALL[name]()
+    room = Room(blocks)
+    x, d = room.x[:300].T, room.d[:300].T
     adapt = np.random.default_rng(1).random(300) < 0.9
-    expected = np.empty(300)
+    expected = []
     for n in range(300):
-        expected[n] = steps.control_signal(x[n])
+        expected.append(steps.control_signal(x[..., n]))
         if adapt[n]:
-            steps.update(d[n])
+            steps.update(d[..., n])
     cuts = [0, 1, 2, 18, 82, 83, 300]
-    got = [blocks.process(x[a:b], d[a:b], adapt=adapt[a:b]) for a, b in itertools.pairwise(cuts)]
-    np.testing.assert_array_equal(np.concatenate(got), expected)
+    got = [blocks.process(x[..., a:b], d[..., a:b], adapt=adapt[a:b]) for a, b in itertools.pairwise(cuts)]
+    np.testing.assert_array_equal(np.concatenate(got, axis=-1), np.transpose(expected))
     np.testing.assert_array_equal(blocks.weights, steps.weights)
-    for mine, theirs in zip(numbers_of(blocks.constraint.state), numbers_of(steps.constraint.state), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
-    blocks.update(d[-1]), steps.update(d[-1])  # they go on alike, sample by sample
+    blocks.update(d[..., -1]), steps.update(d[..., -1])  # they go on alike, sample by sample
     np.testing.assert_array_equal(blocks.weights, steps.weights)
 
 
@@ -69,7 +94,7 @@ def test_a_fast_array_stands_by_while_samples_are_left_out(name: str) -> None:
     assert after < 1.1 * expected
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB", "FxLMS"])
 def test_repr_names_the_algorithm_and_its_settings(name: str) -> None:
     controller, limited = made(name, "plain"), made(name, "limiter")
     run(controller, n=50)

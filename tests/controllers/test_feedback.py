@@ -10,15 +10,7 @@ import pytest
 from helpers.controllers import quickly_verified, short_blocks
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MU, N_TAPS, P0, S_HAT, Q, R, S, noises
 
-from kfopc_filterpy import (
-    FxLMS,
-    LimitedController,
-    OutputLimiter,
-    OutputPowerConstraint,
-    kf_anc,
-    kf_opc,
-    simulate,
-)
+from kfopc_filterpy import FxLMS, LimitedController, OutputLimiter, OutputPowerConstraint, kf_anc, kf_opc, simulate
 from kfopc_filterpy.controllers import FeedbackNeutralizer
 from kfopc_filterpy.paths import fir_path
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.comparing import assert_same_run, state_of
+from helpers.comparing import assert_same_run
 from helpers.controllers import short_blocks
 from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, P0, Q, R, S, noises
 from helpers.naming import plain
@@ -79,24 +79,6 @@ def assert_kept(y: np.ndarray, rated_power: float = LIMITED_POWER) -> None:
 # ---- In the loop
 
 
-@pytest.mark.parametrize("amplifier", AMPLIFIERS)
-@pytest.mark.parametrize("name", NAMES)
-def test_compiled_run_is_the_steps_bit_for_bit(name: str, amplifier: str) -> None:
-    options = {"amplifier": AMPLIFIERS[amplifier][0], "feedback_path": FEEDBACK, "switch_on_s": 37 / FS}
-    options |= {"sensor_noise_std": 0.05, "rng": 11, "record_weights_every": 1, "record_powers": True}
-    fast, slow = (controller(name, limiter=limiter(amplitude_limit=0.6)) for _ in range(2))
-    result = run(fast, **options)
-    assert_same_run(result, run(slow, compiled=False, **options))
-    np.testing.assert_array_equal(fast.weights, slow.weights)
-    for now, then in zip(state_of(fast), state_of(slow), strict=True):
-        np.testing.assert_array_equal(now, then)
-    assert pickle.dumps(fast.limiter) == pickle.dumps(slow.limiter)
-    assert fast.limiter.gain < 0.8  # it did act
-    assert_kept(result.control_signal)
-    assert_same_run(run(fast, n=50), run(slow, n=50, compiled=False))  # and they go on alike
-    assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_what_fits_passes_as_if_there_were_no_limiter(name: str) -> None:
     """Its rated power is a hundred times the control signal's largest window."""
@@ -132,7 +114,7 @@ def opposite_path_and_feedback() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("trouble", [level_jump, wrong_path, clipping_amplifier, opposite_path_and_feedback])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB", "MOV-FxLMS"])
 def test_no_window_is_above_the_rated_power(name: str, trouble: Any) -> None:
     x, d, _ = noises(2000)
     options = {"x": x, "disturbance": d, "secondary_path": S, "estimate": S, "fs": FS} | trouble()
@@ -164,18 +146,17 @@ def test_no_window_is_above_the_rated_power_for_any_levels(
     assert_kept(result.control_signal, 10.0**rated)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("name", NAMES)
-def test_windows_across_two_runs_keep_the_bound(name: str, compiled: bool) -> None:
+@pytest.mark.parametrize("name", ["KF-OPC", "FxLMS"])
+def test_windows_across_two_runs_keep_the_bound(name: str) -> None:
     """A limiter that began anew with the second run would not: both runs fill their windows at the seam."""
     both = []
     for anew in (False, True):
         made = controller(name, limiter=limiter())
-        first = run(made, compiled=compiled)
+        first = run(made)
         if anew:
             made.limiter.reset()
         x, d, _ = noises(200)
-        second = simulate(made, 30.0 * x, disturbance=30.0 * d, secondary_path=S, fs=FS, compiled=compiled)
+        second = simulate(made, 30.0 * x, disturbance=30.0 * d, secondary_path=S, fs=FS)
         both.append(np.concatenate([first.control_signal, second.control_signal]))
     assert_kept(both[0])
     assert worst_window(both[1]) > 1.2 * LIMITED_POWER
@@ -184,43 +165,13 @@ def test_windows_across_two_runs_keep_the_bound(name: str, compiled: bool) -> No
 # ---- What the adaptation hears
 
 
-def driven(name: str, made: Any, limit_outside: OutputLimiter | None = None) -> tuple[np.ndarray, ...]:
-    """Disturbance, the estimator's z for each sample, and what was played: the loop by hand, with the true path S."""
-    x, d, _ = noises()
-    measured, played = [], []
-    for n in range(x.size):
-        y = made.control_signal(x[n])
-        played.append(y if limit_outside is None else limit_outside(y))
-        made.update(d[n] - sum(S[k] * played[n - k] for k in range(min(S.size, n + 1))))
-        measured.append(made._block.fields["disturbance"].item())
-    return d, np.array(measured), np.array(played)
-
-
-@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC repaired"])
-def test_the_estimator_is_given_the_true_disturbance(name: str) -> None:
-    """With the exact path, however hard the limiter cuts; 1e-12 is rounding of sums over five taps, values below 10.
-
-    (KF-OPC as published scales z by its factor; the next test has it.) A limiter that the controller does not know of
-    spoils it: what was cut off is missing from d^.
-    """
-    known = controller(name, limiter=limiter())
-    d, measured, played = driven(name, known)
-    assert known.limiter.gain < 0.8
-    assert_kept(played)
-    np.testing.assert_allclose(measured, d, rtol=0, atol=1e-12)
-    d, measured, played = driven(name, controller(name), limiter())
-    assert_kept(played)
-    assert np.mean((measured - d) ** 2) > 0.02 * np.mean(d**2)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC"])
-def test_the_weights_are_those_without_a_limiter(name: str, compiled: bool) -> None:
+def test_the_weights_are_those_without_a_limiter(name: str) -> None:
     """With the exact path z, factor and H do not depend on what is played; to rounding, in a filter that contracts.
 
     A limiter outside spoils them. KF-OPC's the least: a d^ that is too small raises its factor.
     """
-    options = {"record_powers": True, "compiled": compiled}
+    options = {"record_powers": True}
     free, known, unaware = controller(name), controller(name, limiter=limiter()), controller(name)
     results = [run(free, **options), run(known, **options)]
     spoilt = run(unaware, amplifier=limiter(), record_powers=True)  # a user's own amplifier: any function of a sample
@@ -265,7 +216,7 @@ def test_it_works_with_a_known_amplifier() -> None:
 # ---- Assigned, removed, copied, refused
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["KF-OPC", "KF-PB", "FxLMS"])
 def test_a_limiter_can_be_assigned_and_removed(name: str) -> None:
     given_, assigned, removed, plain = (
         controller(name, limiter=limiter()), controller(name), controller(name, limiter=limiter()), controller(name)
@@ -285,20 +236,18 @@ def test_a_limiter_can_be_assigned_and_removed(name: str) -> None:
 
 
 @pytest.mark.parametrize("wrong", [1.0, "limiter", OutputLimiter, np.tanh, HardClipAmplifier(1.0)], ids=plain)
-@pytest.mark.parametrize("name", NAMES)
-def test_what_is_no_limiter_is_refused(name: str, wrong: Any) -> None:
-    made = controller(name, limiter=limiter())
+def test_what_is_no_limiter_is_refused(wrong: Any) -> None:
+    made = controller("FxLMS", limiter=limiter())
     own = made.limiter
     with pytest.raises(TypeError, match=r"^limiter must be an OutputLimiter or None, got "):
         made.limiter = wrong
     assert made.limiter is own
     with pytest.raises(TypeError, match=r"^limiter must be an OutputLimiter or None, got "):
-        controller(name, limiter=wrong)
+        controller("FxLMS", limiter=wrong)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_limiter_of_another_rate_is_refused_before_anything_changes(name: str) -> None:
-    made = controller(name, limiter=limiter(fs=2 * FS))
+def test_a_limiter_of_another_rate_is_refused_before_anything_changes() -> None:
+    made = controller("FxLMS", limiter=limiter(fs=2 * FS))
     before = pickle.dumps(made)
     with pytest.raises(
         ValueError,
@@ -308,26 +257,8 @@ def test_a_limiter_of_another_rate_is_refused_before_anything_changes(name: str)
     assert pickle.dumps(made) == before
     made.limiter = limiter()
     assert run(made).error.size == N
-
-
-@pytest.mark.parametrize(
-    "clone", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))], ids=["copy", "pickle"]
-)
-@pytest.mark.parametrize("name", NAMES)
-def test_copies_go_their_own_ways(name: str, clone: Any) -> None:
-    made, fresh = controller(name, limiter=limiter()), controller(name, limiter=limiter())
-    for one in (made, fresh):
-        run(one, n=150)
-    other = clone(made)
-    assert other.limiter is not made.limiter
-    gain = made.limiter.gain
-    results = [run(other, n=100), run(other, n=100, seed=5, compiled=False)]
-    assert made.limiter.gain == gain
-    assert other.limiter.gain != gain  # its loop drives its own limiter
-    for one in (made, fresh):
-        assert_same_run(results[0], run(one, n=100))
-        assert_same_run(results[1], run(one, n=100, seed=5))
-    assert pickle.dumps(other.limiter) == pickle.dumps(made.limiter)
+    with pytest.raises(ValueError, match="limiter is for 16000 Hz"):
+        run(LimitedController(Loud(), limiter(fs=2 * FS)))
 
 
 def test_scenarios_agree_in_their_limiters_windows() -> None:
@@ -424,20 +355,6 @@ def test_everything_else_is_the_users_controllers() -> None:
 
 
 @pytest.mark.parametrize(
-    "clone", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))], ids=["copy", "pickle"]
-)
-def test_copies_of_a_limited_users_controller_go_their_own_ways(clone: Any) -> None:
-    made = LimitedController(Told(), limiter())
-    run(made, n=150)
-    other, before = clone(made), pickle.dumps(made)
-    assert isinstance(other, LimitedController)
-    assert repr(other) == f"<own LMS limited: limiter of rated power {made.limiter.rated_power:g}>"
-    result = run(other, n=100)
-    assert pickle.dumps(made) == before
-    assert_same_run(result, run(made, n=100))
-
-
-@pytest.mark.parametrize(
     ("own", "limits", "error", "message"),
     [
         (Own(), None, TypeError, r"^limiter must be an OutputLimiter, got None"),
@@ -456,10 +373,46 @@ def test_copies_of_a_limited_users_controller_go_their_own_ways(clone: Any) -> N
         ),
         *(
             (controller(name), limiter(), ValueError, r"limiter of its own: set controller\.limiter, or pass limiter=")
-            for name in NAMES
+            for name in ("KF-OPC", "FxLMS")
         ),
     ],
 )
 def test_refusals_of_a_limited_controller(own: Any, limits: Any, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
         LimitedController(own, limits)
+
+
+class Loud:
+    """Has special methods of its own, which are not the limited controller's."""
+
+    def control_signal(self, reference: float) -> float:
+        return 10.0 * reference
+
+    def update(self, error: float) -> None:
+        pass
+
+    def __deepcopy__(self, memo: Any) -> Loud:
+        return Loud()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_a_copy_is_limited_too(copied: Any) -> None:
+    other = copied(LimitedController(Loud(), OutputLimiter(1.0, amplitude_limit=2.0)))
+    assert isinstance(other, LimitedController)
+    assert other.control_signal(1.0) == 2.0
+
+
+def test_nan_is_a_divergence_as_without_the_limiter() -> None:
+    class Diverging(Loud):
+        def control_signal(self, reference: float) -> float:
+            return math.nan
+
+    for made in (Diverging(), LimitedController(Diverging(), limiter())):
+        assert run(made, n=20).diverged_at_s == 0.0

@@ -1,15 +1,13 @@
-"""The LMS family against literal transcriptions of the published equations, and against what each must settle to."""
+"""The LMS family against what each must settle to, its limits, and its refusals."""
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.optimize
-from helpers.comparing import state_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,7 +19,6 @@ from kfopc_filterpy import (
     LeakyFxLMS,
     MOVFxLMS,
     OptimalLeakyFxLMS,
-    OutputLimiter,
     OutputPowerConstraint,
     RescalingFxLMS,
     TwoGradientFxLMS,
@@ -46,136 +43,11 @@ def delayed(signal: Any, n: int, length: int) -> np.ndarray:
     return np.array([signal[n - k] if n >= k else 0.0 for k in range(length)])
 
 
-def transcribed(x: np.ndarray, d: np.ndarray, step: Any, held: Any = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The loop of Fig. 4 sample by sample, with `step(w, at)` for the update and `held(w, y)` for what leaves the filter.
-
-    Returns errors, control signals and the last weights.
-    """
-    w, y, xf, e, d_hat = np.zeros(L), np.zeros(x.size), np.zeros(x.size), np.zeros(x.size), np.zeros(x.size)
-    for n in range(x.size):
-        row = delayed(x, n, L)
-        xf[n] = ESTIMATE @ delayed(x, n, ESTIMATE.size)
-        y[n] = w @ row
-        if held is not None:
-            w, y[n] = held(w, y[n])
-        e[n] = d[n] - PATH @ delayed(y, n, PATH.size)
-        d_hat[n] = e[n] + ESTIMATE @ delayed(y, n, ESTIMATE.size)
-        at = {"n": n, "e": e[n], "y": y[n], "x": row, "xf": delayed(xf, n, L), "d": d_hat, "signals": (x, xf)}
-        w = step(w, at)
-    return e, y, w
-
-
-def powers(at: dict[str, Any], memory: int) -> tuple[float, float, float]:
-    """Means of d^^2, x'^2, x^2: plain means until the window is full, then forgetting (eq. 10-11 as in the docs)."""
-    n, (x, xf) = at["n"], at["signals"]
-    means = []
-    for signal in (at["d"], xf, x):
-        mean = 0.0
-        for k in range(n + 1):
-            mean += max(-np.expm1(-1.0 / memory), 1.0 / (k + 1)) * (signal[k] ** 2 - mean)
-        means.append(mean)
-    return means[0], means[1], means[2]
-
-
-def rated_gamma(at: dict[str, Any], rated_power: float, memory: int) -> float:
-    """gamma = max(sqrt(G_s delta_d^2 / rho_o) - G_s, 0)."""
-    d2, xf2, x2 = powers(at, memory)
-    gain = xf2 / x2 if x2 > 0 else 0.0
-    return max(np.sqrt(gain * d2 / rated_power) - gain, 0.0)
-
-
-RATED, MEMORY, A = 0.3, 60, 0.6
-
-
-def constraint() -> OutputPowerConstraint:
-    """The rated power at 1 kHz, the powers with a memory of `MEMORY` samples."""
-    return OutputPowerConstraint(RATED, fs=1000, memory_s=MEMORY / 1000)
-
-
-EVERY: dict[str, tuple[Any, Any, Any]] = {
-    "FxLMS": (
-        lambda **o: FxLMS(L, ESTIMATE, step_size=MU, **o),
-        lambda w, at: w + MU * at["e"] * at["xf"],
-        None,
-    ),
-    "FxNLMS": (
-        lambda **o: FxNLMS(L, ESTIMATE, step_size=0.1, regularization=1e-3, **o),
-        lambda w, at: w + 0.1 * at["e"] * at["xf"] / (1e-3 + at["xf"] @ at["xf"]),
-        None,
-    ),
-    "leaky FxLMS": (
-        lambda **o: LeakyFxLMS(L, ESTIMATE, step_size=MU, leak=0.4, **o),
-        lambda w, at: (1 - MU * 0.4) * w + MU * at["e"] * at["xf"],
-        None,
-    ),
-    "optimal leaky FxLMS": (
-        lambda **o: OptimalLeakyFxLMS(L, ESTIMATE, step_size=MU, constraint=constraint(), **o),
-        lambda w, at: (1 - MU * powers(at, MEMORY)[2] * rated_gamma(at, RATED, MEMORY)) * w + MU * at["e"] * at["xf"],
-        None,
-    ),
-    "MOV-FxLMS": (
-        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, constraint=constraint(), **o),
-        lambda w, at: w + MU * (at["e"] * at["xf"] - rated_gamma(at, RATED, MEMORY) * at["y"] * at["x"]),
-        None,
-    ),
-    "MOV-FxLMS fixed": (
-        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, rated_power=RATED, penalty_factor=0.7, **o),
-        lambda w, at: w + MU * (at["e"] * at["xf"] - 0.7 * at["y"] * at["x"]),
-        None,
-    ),
-    "MOV-MFxLMS": (
-        lambda **o: MOVFxLMS(L, ESTIMATE, step_size=MU, constraint=constraint(), modified=True, **o),
-        lambda w, at: (
-            w + MU * ((at["d"][at["n"]] - w @ at["xf"]) * at["xf"] - rated_gamma(at, RATED, MEMORY) * at["y"] * at["x"])
-        ),
-        None,
-    ),
-    "two-gradient FxLMS": (
-        lambda **o: TwoGradientFxLMS(L, ESTIMATE, step_size=MU, amplitude_limit=A, output_step_size=0.05, **o),
-        lambda w, at: w + (MU * at["e"] * at["xf"] if abs(at["y"]) <= A else -0.05 * at["y"] * at["x"]),
-        None,
-    ),
-    "re-scaling FxLMS": (
-        lambda **o: RescalingFxLMS(L, ESTIMATE, step_size=MU, amplitude_limit=A, **o),
-        lambda w, at: w + MU * at["e"] * at["xf"],
-        lambda w, y: (w, y) if abs(y) <= A else (w * A / abs(y), np.sign(y) * A),
-    ),
-    "clipping FxLMS": (
-        lambda **o: ClippingFxLMS(L, ESTIMATE, step_size=MU, amplitude_limit=A, **o),
-        lambda w, at: w + MU * at["e"] * at["xf"],
-        lambda w, y: (w, np.clip(y, -A, A)),
-    ),
-}
 AMPLITUDE = {
     "two-gradient FxLMS": TwoGradientFxLMS,
     "re-scaling FxLMS": RescalingFxLMS,
     "clipping FxLMS": ClippingFxLMS,
 }
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("name", EVERY)
-def test_a_run_is_the_published_equations(name: str, compiled: bool) -> None:
-    """To rounding: sums over a few taps in another order, in a loop that contracts."""
-    make, step, held = EVERY[name]
-    x, d = noise()
-    controller = make()
-    result = simulate(controller, x, disturbance=d, secondary_path=PATH, fs=controller.constraint.fs, compiled=compiled)
-    e, y, w = transcribed(x, d, step, held)
-    np.testing.assert_allclose(result.error, e, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(result.control_signal, y, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(controller.weights, w, rtol=0, atol=1e-11)
-    assert result.algorithm == controller.name == name.removesuffix(" fixed")
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_the_rule_acts_in_that_run(name: str) -> None:
-    """The transcriptions above would agree as well where no constraint ever acted."""
-    x, d = noise()
-    controller = EVERY[name][0]()
-    result = simulate(controller, x, disturbance=d, secondary_path=PATH, fs=controller.constraint.fs)
-    plain = simulate(FxLMS(L, ESTIMATE, step_size=MU), x, disturbance=d, secondary_path=PATH)
-    assert (name == "FxLMS") == bool(np.array_equal(result.error, plain.error))
 
 
 @pytest.mark.parametrize("switch_on_s", [0.0, 0.1])
@@ -244,10 +116,7 @@ def statistics(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     ("controller", "price"),
     [
         (lambda mu: LeakyFxLMS(L, PATH, step_size=mu, leak=0.5), lambda R_x: 0.5 * np.eye(L)),
-        (
-            lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6),
-            lambda R_x: 0.6 * R_x,
-        ),
+        (lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6), lambda R_x: 0.6 * R_x),
         (
             lambda mu: MOVFxLMS(L, PATH, step_size=mu, rated_power=1.0, penalty_factor=0.6, modified=True),
             lambda R_x: 0.6 * R_x,
@@ -267,11 +136,7 @@ def test_it_settles_at_the_regularised_wiener_solution(controller: Any, price: A
         made = controller(mu)
         repeats = round(400 / mu / x.size)
         result = simulate(
-            made,
-            np.tile(x, repeats),
-            disturbance=np.tile(d, repeats),
-            secondary_path=PATH,
-            record_weights_every=1,
+            made, np.tile(x, repeats), disturbance=np.tile(d, repeats), secondary_path=PATH, record_weights_every=1
         )
         assert result.weights is not None
         distances.append(np.max(np.abs(np.mean(result.weights[-x.size :], axis=0) - expected)))
@@ -329,7 +194,7 @@ def test_re_scaling_holds_a_tone_to_its_rated_power() -> None:
     assert np.mean(result.error[-2000:] ** 2) == pytest.approx((3.0 - 1.0) ** 2 / 2, rel=0.03)  # the rest of the sine
 
 
-@pytest.mark.parametrize("ratio", [0.3, 1.0, 10.0, 50.0])
+@pytest.mark.parametrize("ratio", [0.3, 1.0, 10.0])
 def test_two_gradients_settle_where_they_balance(ratio: float) -> None:
     """For a tone d = D sin, y = a sin and a path of 1: mu (D - a) I = mu_y a (1/2 - I), I the mean of sin^2 within A.
 
@@ -368,7 +233,7 @@ def test_clipping_lets_the_weights_grow() -> None:
 # ---- Refusals
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
 @pytest.mark.parametrize("kind", AMPLITUDE.values())
 def test_bad_limits_and_steps_are_refused(kind: Any, value: float) -> None:
     with pytest.raises(ValueError, match="amplitude_limit"):
@@ -391,9 +256,6 @@ def test_bad_factors_are_refused(value: float) -> None:
         penalty_factor(1.0, disturbance_power=value, secondary_path_gain=1.0)
     with pytest.raises(ValueError, match="reference_power"):
         leak_factor(1.0, disturbance_power=1.0, secondary_path_gain=1.0, reference_power=value)
-
-
-def test_a_leak_of_more_than_the_weight_is_refused() -> None:
     with pytest.raises(ValueError, match=r"step_size \* leak must be 1 at most, got 2"):
         LeakyFxLMS(L, ESTIMATE, step_size=0.5, leak=4.0)
 
@@ -421,61 +283,4 @@ def test_a_known_amplifier_is_in_the_estimate_of_those_that_have_one() -> None:
         np.testing.assert_allclose(result.disturbance_power, means, rtol=1e-12)
 
 
-def test_toeplitz_statistics_are_those_of_the_signal() -> None:
-    """The oracle's own oracle: a stationary periodic signal has Toeplitz correlations."""
-    _, _, R_xf, R_x, _ = statistics()
-    for R in (R_xf, R_x):
-        np.testing.assert_allclose(R, scipy.linalg.toeplitz(R[0]), rtol=0, atol=1e-12)
-
-
 # ---- As controllers
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("name", EVERY)
-def test_a_controller_and_its_copy_go_on_from_its_state(name: str, compiled: bool) -> None:
-    """With nothing left in the true path, two parts of a signal are the whole."""
-    x, d = noise()
-    whole, parts = EVERY[name][0](), EVERY[name][0]()
-    options: Any = {"secondary_path": [0.9], "fs": whole.constraint.fs, "compiled": compiled}
-    all_of_it = simulate(whole, x, disturbance=d, **options)
-    first = simulate(parts, x[:150], disturbance=d[:150], **options)
-    twin = pickle.loads(pickle.dumps(parts))
-    for controller in (parts, twin):
-        second = simulate(controller, x[150:], disturbance=d[150:], **options)
-        np.testing.assert_array_equal(np.r_[first.error, second.error], all_of_it.error)
-        np.testing.assert_array_equal(controller.weights, whole.weights)
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_a_refused_error_changes_nothing(name: str) -> None:
-    x, d = noise()
-    controller = EVERY[name][0]()
-    options: Any = {"secondary_path": PATH, "fs": controller.constraint.fs}
-    simulate(controller, x, disturbance=d, **options)
-    before = state_of(controller)
-    with pytest.raises(ValueError, match="error"):
-        controller.update(np.nan)
-    for error, reason in ((1e200, "error is too loud"), (0.9e100, "too loud|too large")):
-        with pytest.raises(ValueError, match=reason):
-            controller.update(error)
-    with pytest.raises(ValueError, match="reference"):
-        controller.control_signal(np.inf)
-    with pytest.raises(ValueError, match="reference is too loud"):
-        controller.control_signal(-1e101)
-    for now, then in zip(state_of(controller), before, strict=True):
-        assert now.tobytes() == then.tobytes()
-    controller.update(0.1)  # and it goes on
-    assert np.all(np.isfinite(controller.weights))
-
-
-@pytest.mark.parametrize("name", ["FxLMS", "MOV-FxLMS", "two-gradient FxLMS", "re-scaling FxLMS", "clipping FxLMS"])
-def test_behind_a_limiter_no_window_is_above_the_rated_power(name: str) -> None:
-    x, d = noise(2000)
-    limiter = OutputLimiter(rated_power=0.1, fs=1000, window_s=0.05)
-    controller = EVERY[name][0](limiter=limiter)
-    if name.startswith(("optimal", "MOV")):
-        controller.constraint.fs = 1000.0
-    result = simulate(controller, x, disturbance=d, secondary_path=PATH, fs=1000)
-    powers_50ms = np.convolve(result.control_signal**2, np.ones(50) / 50)[: x.size]
-    assert np.max(powers_50ms) <= 0.1 * (1 + 1e-9)

@@ -1,9 +1,7 @@
-"""The LMS family with several channels: against a literal transcription, against one channel, and where it settles."""
+"""The LMS family with several channels: against one channel, on odd systems, and where it settles."""
 
 from __future__ import annotations
 
-import copy
-import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -23,7 +21,6 @@ from kfopc_filterpy import (
     KalmanController,
     LeakyFxLMS,
     MOVFxLMS,
-    OptimalLeakyFxLMS,
     OutputLimiter,
     OutputPowerConstraint,
     RescalingFxLMS,
@@ -42,9 +39,7 @@ PATHS[:, :, 1:5] = _rng.standard_normal((K, J, 4)) * [0.8, 0.5, 0.3, 0.2]
 ESTIMATE = 0.9 * PATHS[:, :, :4]  # what the controllers know of them
 PRIMARY = _rng.standard_normal((K, I, 7)) * 0.5
 A = np.array([0.3, 0.6])  # amplitude limits
-LEAK = np.array([0.4, 0.1])
 PENALTY = np.array([0.7, 0.2])
-EPSILON = 2.0  # regularization of the normalised step
 RATED, MEMORY = np.array([0.4, 0.8]), 60
 
 
@@ -57,165 +52,21 @@ def constraints() -> list[OutputPowerConstraint]:
     return [OutputPowerConstraint(power, fs=FS, memory_s=MEMORY / FS) for power in RATED]
 
 
-# ---- A literal transcription
-
-
-def delayed(signal: np.ndarray, n: int, length: int) -> np.ndarray:
-    """The newest `length` samples of a signal at n, newest first, zeros before the first."""
-    return np.array([signal[n - m] if n >= m else 0.0 for m in range(length)])
-
-
-def transcribed(x: np.ndarray, d: np.ndarray, step: Any, held: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The loop, sum by sum; `step(w, j, i, at)` is the new w_ji, `held(w_j, y_j, j)` what leaves loudspeaker j."""
-    n_samples = x.shape[1]
-    w, y, e, d_hat = np.zeros((J, I, L)), np.zeros((J, n_samples)), np.zeros((K, n_samples)), np.zeros((K, n_samples))
-    xf = np.zeros((K, J, I, n_samples))
-    for n in range(n_samples):
-        rows = [delayed(x[i], n, L) for i in range(I)]
-        for k in range(K):
-            for j in range(J):
-                for i in range(I):
-                    xf[k, j, i, n] = ESTIMATE[k, j] @ delayed(x[i], n, ESTIMATE.shape[2])
-        for j in range(J):
-            y[j, n] = sum(w[j, i] @ rows[i] for i in range(I))
-            w[j], y[j, n] = held(w[j], y[j, n], j)
-        for k in range(K):
-            heard = sum(PATHS[k, j] @ delayed(y[j], n, PATHS.shape[2]) for j in range(J))
-            e[k, n] = d[k, n] - heard
-            d_hat[k, n] = e[k, n] + sum(ESTIMATE[k, j] @ delayed(y[j], n, ESTIMATE.shape[2]) for j in range(J))
-        filtered = np.array(
-            [[[delayed(xf[k, j, i], n, L) for i in range(I)] for j in range(J)] for k in range(K)]
-        )  # (K, J, I, L)
-        at = {"n": n, "e": e[:, n], "y": y[:, n], "x": rows, "xf": filtered, "signals": (d_hat, xf, x)}
-        at["modified"] = np.array(
-            [d_hat[k, n] - sum(w[j, i] @ filtered[k, j, i] for j in range(J) for i in range(I)) for k in range(K)]
-        )
-        w = np.array([[step(w[j, i], j, i, at) for i in range(I)] for j in range(J)])
-    return e, y, w
-
-
-def gradient(at: dict[str, Any], j: int, i: int, error: str = "e") -> np.ndarray:
-    """mu sum_k e_k(n) x'_kji(n)."""
-    return MU * sum(at[error][k] * at["xf"][k, j, i] for k in range(K))
-
-
-def mean_square(squares: np.ndarray) -> float:
-    """A plain mean until the window is full, then forgetting."""
-    mean = 0.0
-    for k, square in enumerate(squares):
-        mean += max(-np.expm1(-1.0 / MEMORY), 1.0 / (k + 1)) * (square - mean)
-    return mean
-
-
-def rated_gamma(at: dict[str, Any], j: int) -> float:
-    """gamma_j = max(sqrt(G_j delta^2 / rho_j) - G_j, 0)."""
-    (d, xf, _), n = at["signals"], at["n"]
-    d2 = mean_square(np.sum(d[:, : n + 1] ** 2, axis=0))
-    gain = mean_square(np.sum(xf[:, j, :, : n + 1] ** 2, axis=(0, 1))) / reference_power(at)
-    return max(np.sqrt(gain * d2 / RATED[j]) - gain, 0.0)
-
-
-def reference_power(at: dict[str, Any]) -> float:
-    _, _, x = at["signals"]
-    return mean_square(np.sum(x[:, : at["n"] + 1] ** 2, axis=0))
-
-
-def as_it_is(w: np.ndarray, y: float, j: int) -> tuple[np.ndarray, float]:
-    return w, y
-
-
-EVERY: dict[str, tuple[Callable[..., Any], Any, Any]] = {
-    "FxLMS": (
-        lambda path, **o: FxLMS(L, path, step_size=MU, **o),
-        lambda w, j, i, at: w + gradient(at, j, i),
-        as_it_is,
-    ),
-    "FxNLMS": (
-        lambda path, **o: FxNLMS(L, path, step_size=40 * MU, regularization=EPSILON, **o),
-        lambda w, j, i, at: w + 40 * gradient(at, j, i) / (EPSILON + np.sum(at["xf"] ** 2)),
-        as_it_is,
-    ),
-    "clipping FxLMS": (
-        lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=A, **o),
-        lambda w, j, i, at: w + gradient(at, j, i),
-        lambda w, y, j: (w, np.clip(y, -A[j], A[j])),
-    ),
-    "re-scaling FxLMS": (
-        lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=A, **o),
-        lambda w, j, i, at: w + gradient(at, j, i),
-        lambda w, y, j: (w, y) if abs(y) <= A[j] else (w * A[j] / abs(y), np.sign(y) * A[j]),
-    ),
-    "leaky FxLMS": (
-        lambda path, **o: LeakyFxLMS(L, path, step_size=MU, leak=LEAK, **o),
-        lambda w, j, i, at: (1 - MU * LEAK[j]) * w + gradient(at, j, i),
-        as_it_is,
-    ),
-    "optimal leaky FxLMS": (
-        lambda path, **o: OptimalLeakyFxLMS(L, path, step_size=MU, constraint=constraints(), **o),
-        lambda w, j, i, at: (1 - MU * reference_power(at) * rated_gamma(at, j)) * w + gradient(at, j, i),
-        as_it_is,
-    ),
-    "MOV-FxLMS": (
-        lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), **o),
-        lambda w, j, i, at: w + gradient(at, j, i) - MU * rated_gamma(at, j) * at["y"][j] * at["x"][i],
-        as_it_is,
-    ),
-    "MOV-FxLMS fixed": (
-        lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), penalty_factor=PENALTY, **o),
-        lambda w, j, i, at: w + gradient(at, j, i) - MU * PENALTY[j] * at["y"][j] * at["x"][i],
-        as_it_is,
-    ),
-    "MOV-MFxLMS": (
-        lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), modified=True, **o),
-        lambda w, j, i, at: w + gradient(at, j, i, "modified") - MU * rated_gamma(at, j) * at["y"][j] * at["x"][i],
-        as_it_is,
-    ),
-    "two-gradient FxLMS": (
-        lambda path, **o: TwoGradientFxLMS(L, path, step_size=MU, amplitude_limit=A, output_step_size=0.05, **o),
-        lambda w, j, i, at: w + (gradient(at, j, i) if abs(at["y"][j]) <= A[j] else -0.05 * at["y"][j] * at["x"][i]),
-        as_it_is,
-    ),
+EVERY: dict[str, Callable[..., Any]] = {
+    "FxLMS": lambda path, **o: FxLMS(L, path, step_size=MU, **o),
+    "FxNLMS": lambda path, **o: FxNLMS(L, path, step_size=40 * MU, regularization=2.0, **o),
+    "clipping FxLMS": lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=A, **o),
+    "re-scaling FxLMS": lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=A, **o),
+    "MOV-FxLMS": lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints(), **o),
 }
 
 
 def made(name: str, path: np.ndarray = ESTIMATE, **options: Any) -> Any:
-    return EVERY[name][0](path, **({"n_references": I} | options))
+    return EVERY[name](path, **({"n_references": I} | options))
 
 
 def run(controller: Any, x: np.ndarray, **options: Any) -> Any:
     return simulate(controller, x, primary_path=PRIMARY, secondary_path=PATHS, fs=FS, **options)
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_a_run_is_the_equations(name: str) -> None:
-    x = noise()
-    controller = made(name)
-    result = run(controller, x)
-    e, y, w = transcribed(x, result.disturbance, *EVERY[name][1:])
-    for got, want in ((result.error, e), (result.control_signal, y), (controller.weights, w)):
-        np.testing.assert_allclose(got, want, rtol=0, atol=1e-12 * np.abs(want).max())
-    assert np.mean(e[:, -100:] ** 2) < 0.9 * np.mean(result.disturbance[:, -100:] ** 2)  # it did cancel
-
-
-@pytest.mark.parametrize("name", [name for name in EVERY if name != "FxLMS"])
-def test_the_rule_acts_in_that_run(name: str) -> None:
-    """The transcriptions above would agree as well where no limit or penalty ever acted."""
-    x = noise()
-    one, free = made(name), made("FxLMS")
-    one_run, free_run = run(one, x), run(free, x)
-    for j in range(J):
-        assert np.abs(one_run.control_signal[j] - free_run.control_signal[j]).max() > 0.05
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_the_compiled_run_is_the_steps_bit_for_bit(name: str) -> None:
-    fast, slow = made(name), made(name)
-    options: dict[str, Any] = {"record_weights_every": 7, "sensor_noise_std": 0.01, "rng": 1, "switch_on_s": 20 / FS}
-    assert_same_run(run(fast, noise(200), **options), run(slow, noise(200), compiled=False, **options))
-    np.testing.assert_array_equal(fast.weights, slow.weights)
-    assert_same_run(run(fast, noise(50), compiled=False), run(slow, noise(50)))  # and they go on alike
-    for twin in (copy.deepcopy(fast), pickle.loads(pickle.dumps(fast))):
-        assert_same_run(run(twin, noise(50)), run(copy.deepcopy(slow), noise(50)))
 
 
 # ---- One channel
@@ -225,12 +76,8 @@ ONE_PATH = np.array([0.0, 0.7, -0.25, 0.1])
 ONE: dict[str, Callable[..., Any]] = {
     "FxLMS": lambda path, **o: FxLMS(L, path, step_size=MU, **o),
     "FxNLMS": lambda path, **o: FxNLMS(L, path, step_size=10 * MU, **o),
-    "clipping FxLMS": lambda path, **o: ClippingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
-    "re-scaling FxLMS": lambda path, **o: RescalingFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
     "leaky FxLMS": lambda path, **o: LeakyFxLMS(L, path, step_size=MU, leak=0.4, **o),
-    "optimal leaky FxLMS": lambda path, **o: OptimalLeakyFxLMS(L, path, step_size=MU, constraint=constraints()[0], **o),
     "MOV-FxLMS": lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints()[0], **o),
-    "MOV-MFxLMS": lambda path, **o: MOVFxLMS(L, path, step_size=MU, constraint=constraints()[0], modified=True, **o),
     "two-gradient FxLMS": lambda path, **o: TwoGradientFxLMS(L, path, step_size=MU, amplitude_limit=0.3, **o),
 }
 
@@ -400,31 +247,6 @@ def test_every_loudspeaker_keeps_its_rated_power() -> None:
 
 
 # ---- Odd systems
-
-
-@pytest.mark.parametrize("name", EVERY)
-@pytest.mark.parametrize("dead", ["loudspeaker", "microphone"])
-def test_what_is_unplugged_stays_silent_and_finite(name: str, dead: str) -> None:
-    paths = PATHS.copy()
-    paths[(slice(None), 1) if dead == "loudspeaker" else 1] = 0.0
-    controller = made(name, paths)
-    result = simulate(controller, noise(2000), primary_path=PRIMARY, secondary_path=paths, fs=FS)
-    assert np.isfinite(result.error).all()
-    assert np.isfinite(controller.weights).all()
-    if dead == "loudspeaker":
-        np.testing.assert_array_equal(result.control_signal[1], 0.0)
-        np.testing.assert_array_equal(controller.weights[1], 0.0)
-    assert np.any(result.control_signal[0])
-
-
-def test_two_identical_loudspeakers_share_the_work() -> None:
-    paths = np.repeat(PATHS[:, :1], 2, axis=1)
-    controller = FxLMS(L, paths, step_size=MU / 2, n_references=I)
-    simulate(controller, noise(2000), primary_path=PRIMARY, secondary_path=paths, fs=FS)
-    np.testing.assert_array_equal(controller.weights[0], controller.weights[1])
-    alone = FxLMS(L, paths[:, :1], step_size=MU, n_references=I)
-    simulate(alone, noise(2000), primary_path=PRIMARY, secondary_path=paths[:, :1], fs=FS)
-    np.testing.assert_allclose(2 * controller.weights[0], alone.weights[0], rtol=0, atol=1e-12)
 
 
 def test_a_matrix_of_systems_is_a_secondary_path() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
+import pickle
 import pkgutil
 from importlib import import_module
 from pathlib import Path
@@ -12,17 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.checkpoints import N, Room, assert_same_contents
-from helpers.comparing import assert_same_run
 from helpers.controllers import ALL, OWN, SEVERAL, OwnController, made, own_amplifier
-from helpers.loop import S_HAT, run
+from helpers.loop import S_HAT
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import kfopc_filterpy
-from kfopc_filterpy import FxLMS, controllers, simulate
-from kfopc_filterpy.bench import algorithms, make_controller, make_scene
+from kfopc_filterpy import FxLMS, controllers
 from kfopc_filterpy.checkpoint import Checkpointed
-from kfopc_filterpy.controllers import VerifiedController, VirtualMicrophones
+from kfopc_filterpy.controllers import VerifiedController
 from kfopc_filterpy.controllers.base import WrappedController
 from kfopc_filterpy.controllers.core_controller import CoreController
 from kfopc_filterpy.controllers.posterior import PathObserver, PosteriorController
@@ -50,7 +49,7 @@ def test_a_controller_that_is_saved_at_any_sample_continues_to_the_bit(
 
     @given(samples=st.integers(0, N - 30), halfway=st.booleans())
     @example(samples=0, halfway=False)
-    @settings(max_examples=5)
+    @settings(max_examples=4)
     def check(samples: int, halfway: bool) -> None:
         controller = ALL[name]()
         room = Room(controller)
@@ -70,69 +69,17 @@ def test_a_controller_that_is_saved_at_any_sample_continues_to_the_bit(
     check()
 
 
-@pytest.mark.parametrize("name", [name for name in ALL if not name.endswith("many")])
-def test_it_continues_at_compiled_speed_too(name: str, tmp_path: Path) -> None:
-    if ALL[name]().__class__ is VirtualMicrophones:
-        pytest.skip("takes several channels")
-    controller = ALL[name]()
-    run(controller, n=100, on=20)
-    loaded = again(controller, tmp_path)
-    assert_same_run(run(loaded, n=200), run(controller, n=200))
-    assert_same_contents(loaded, controller)
-
-
-@pytest.mark.parametrize("name", SEVERAL)
-def test_so_do_several_channels(name: str, tmp_path: Path) -> None:
-    controller = SEVERAL[name]()
-    room = Room(controller)
-    plant = {"secondary_path": np.moveaxis(room.path, 0, 2), "fs": 8000.0}
-    simulate(controller, room.x[:100].T, disturbance=room.d[:100].T, switch_on_s=0.005, **plant)
-    loaded = again(controller, tmp_path)
-    runs = [simulate(one, room.x[100:].T, disturbance=room.d[100:].T, **plant) for one in (loaded, controller)]
-    assert_same_run(*runs)
-    assert_same_contents(loaded, controller)
-
-
-@pytest.mark.parametrize("several", [False, True])
-def test_every_algorithm_of_the_registry_continues_to_the_bit(several: bool, tmp_path: Path) -> None:
-    x = np.random.default_rng(1).standard_normal((1, 2000) if several else 2000)
-    primary, secondary = np.array([0.0, 0.0, 1.0, 0.5]), np.array([0.0, 0.8, -0.3])
-    if several:
-        primary, secondary = primary[None, None], secondary * np.array([[1.0, 0.3], [0.2, 1.0]])[..., None]
-        primary = np.repeat(primary, 2, axis=0)
-    rated = np.array([0.5, 0.5]) if several else 1.0
-    settings = {"fs": 16000.0, "rated_power": rated, "power_multiple": 2.0, "n_taps": 8, "switch_on_s": 0.02}
-    scene = make_scene({1: x}, primary, secondary, **settings)
-    found = algorithms(several_channels=several)
-    assert len(found) > 5
-    for name, algorithm in found.items():
-        controller = make_controller(scene, name, algorithm.grid[0])
-        scene.run(controller)
-        loaded = again(controller, tmp_path)
-        assert_same_run(scene.run(loaded), scene.run(controller))
-        assert_same_contents(loaded, controller)
-
-
 @pytest.mark.parametrize("name", ALL)
-def test_a_deep_copy_continues_too(name: str) -> None:
+def test_copies_and_pickles_continue_too(name: str) -> None:
     controller = ALL[name]()
     room = Room(controller)
     room.run(controller, 150)
-    twin, other = copy.deepcopy(controller), room.copy()
-    np.testing.assert_array_equal(other.run(twin, 200), room.run(controller, 200))
-    for reading in ("control_filter", "power_weight", "constraint_factor", "rated_power"):
-        np.testing.assert_array_equal(getattr(twin, reading, 0), getattr(controller, reading, 0))
-
-
-def test_the_rated_power_of_a_copy_of_kf_pb_can_be_assigned() -> None:
-    controller = made("KF-PB", "plain")
-    room = Room(controller)
-    room.run(controller, 200)
-    twin, other = copy.deepcopy(controller), room.copy()
-    for one in (controller, twin):
-        one.rated_power = 1e-4
-    np.testing.assert_array_equal(other.run(twin, 200), room.run(controller, 200))
-    np.testing.assert_array_equal(twin.control_filter, controller.control_filter)
+    twins = copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))
+    runs = [room.copy().run(twin, 200) for twin in twins]
+    expected = room.run(controller, 200)  # what the others did has not reached it
+    for twin, got in zip(twins, runs, strict=True):
+        np.testing.assert_array_equal(got, expected)
+        assert_same_contents(twin, controller)
 
 
 def test_a_verified_controller_does_not_keep_the_arrays_that_it_is_given() -> None:
@@ -222,9 +169,9 @@ def test_an_amplifier_without_a_name_is_refused_before_anything_is_written(tmp_p
     path = tmp_path / "run.kfopc"
     path.write_bytes(b"before")
     anonymous = VerifiedController(FxLMS(4, S_HAT, step_size=0.01), amplifier=lambda y: y)
-    with pytest.raises(TypeError, match=r"VerifiedController\._amplifiers cannot be saved.*<lambda>"):
+    with pytest.raises(TypeError, match=r"VerifiedController\..*amplifiers cannot be saved.*<lambda>"):
         anonymous.save(path)
     assert path.read_bytes() == b"before"
     named = VerifiedController(FxLMS(4, S_HAT, step_size=0.01), amplifier=own_amplifier)
     named.save(path)
-    assert VerifiedController.load(path, trusted=[own_amplifier])._amplifiers == [own_amplifier]
+    assert_same_contents(VerifiedController.load(path, trusted=[own_amplifier]), named)

@@ -125,7 +125,7 @@ def test_the_limiter_of_a_users_controller_can_be_replaced() -> None:
     assert controller.limiter is limiter
 
 
-@pytest.mark.parametrize("name", WRAPPERS)
+@pytest.mark.parametrize("name", ["verifier", "neutraliser"])
 @pytest.mark.parametrize(
     ("references", "errors", "room", "message"),
     [

@@ -204,11 +204,7 @@ class Guarded:
         return bool(np.all(self.room[:GUARD_BYTES] == 0xA5) and np.all(after == 0xA5))
 
 
-@given(
-    plan=plans(odd=True),
-    samples=st.lists(ANY_SAMPLE, min_size=1, max_size=20),
-    seed=st.integers(0, 99),
-)
+@given(plan=plans(odd=True), samples=st.lists(ANY_SAMPLE, min_size=1, max_size=20), seed=st.integers(0, 99))
 @settings(max_examples=300)
 def test_a_controller_stays_within_its_bytes(
     plan: tuple[str, Shape, dict[str, Any]], samples: list[float], seed: int

@@ -17,8 +17,9 @@ import kfopc_filterpy
 from kfopc_filterpy import KFOPC
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-sys.path.insert(0, str(DOCS / "extensions"))
+sys.path[:0] = [str(DOCS), str(DOCS / "extensions")]
 
+import diagrams  # noqa: E402
 import offline  # noqa: E402
 import public_names  # noqa: E402
 import source_lines  # noqa: E402
@@ -28,7 +29,6 @@ TUTORIALS = sorted(page for page in (DOCS / "tutorials").glob("*.md") if page.st
 LINE_ROLE = re.compile(r"\{line\}`([^`]+)`")
 PUBLIC = [(name, public_names.thing_of(name)) for name in public_names.public_names()]
 NAMES = [name for name, _ in PUBLIC]
-CLASSES = [(name, thing) for name, thing in PUBLIC if inspect.isclass(thing)]
 BUILT_OTHERWISE = (tuple, Exception)  # named tuples and errors: made by the package, not by its users
 
 
@@ -39,11 +39,11 @@ def text_of(page: Path) -> str:
 # Links into the code.
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_line_that_a_page_points_at_is_there_once(page):
-    for role in LINE_ROLE.findall(text_of(page)):
-        module, _, code = role.partition(": ")
-        assert source_lines.find_line(module, code) > 0
+def test_every_line_that_a_page_points_at_is_there_once():
+    for page in PAGES:
+        for role in LINE_ROLE.findall(text_of(page)):
+            module, _, code = role.partition(": ")
+            assert source_lines.find_line(module, code) > 0, page
 
 
 def test_a_line_that_is_not_there_or_not_alone_is_refused():
@@ -98,8 +98,8 @@ def test_a_page_that_loads_something_from_a_network_fails_the_build(tmp_path, lo
         offline.require_offline(app, None)
 
 
-def test_without_mathjax_the_error_names_what_to_install(monkeypatch):
-    monkeypatch.setattr(offline, "find_spec", lambda name: None)
+def test_without_mathjax_the_error_names_what_to_install(uninstall):
+    uninstall("sphinx-mathjax-offline")
     with pytest.raises(ModuleNotFoundError, match=r"sphinx-mathjax-offline; install the extra"):
         offline.mathjax_file()
 
@@ -118,16 +118,16 @@ def test_every_public_name_has_a_page_and_a_line_in_the_table():
     assert "plot.plot_nse" in NAMES
 
 
-@pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=NAMES)
-def test_every_public_name_has_a_summary_and_an_example_or_is_made_by_one(name, thing):
-    doc = inspect.getdoc(thing) or ""
-    assert re.match(r"\S.*[.:]", doc), f"{name} has no summary"
-    made_by_the_package = inspect.isclass(thing) and (
-        hasattr(thing, "__dataclass_fields__")
-        or issubclass(thing, BUILT_OTHERWISE)
-        or thing is kfopc_filterpy.controllers.Controller
-    )
-    assert ">>>" in doc or made_by_the_package, f"{name} has no example"
+def test_every_public_name_has_a_summary_and_an_example_or_is_made_by_one():
+    for name, thing in PUBLIC:
+        doc = inspect.getdoc(thing) or ""
+        assert re.match(r"\S.*[.:]", doc), f"{name} has no summary"
+        made_by_the_package = inspect.isclass(thing) and (
+            hasattr(thing, "__dataclass_fields__")
+            or issubclass(thing, BUILT_OTHERWISE)
+            or thing is kfopc_filterpy.controllers.Controller
+        )
+        assert ">>>" in doc or made_by_the_package, f"{name} has no example"
 
 
 def described(doc: str | None) -> set[str]:
@@ -162,12 +162,12 @@ def test_the_reader_of_docstrings_finds_what_is_described_and_only_that():
     assert described(doc) == {"a", "b", "more"}
 
 
-@pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=NAMES)
-def test_every_argument_of_a_public_name_is_described_in_its_docstring(name, thing):
-    if inspect.isclass(thing) and (issubclass(thing, BUILT_OTHERWISE) or getattr(thing, "_is_protocol", False)):
-        pytest.skip("not called by users")
-    missing = set(arguments(thing)) - described(thing.__doc__)
-    assert not missing, f"{name} leaves undescribed: {sorted(missing)}"
+def test_every_argument_of_a_public_name_is_described_in_its_docstring():
+    for name, thing in PUBLIC:
+        if inspect.isclass(thing) and (issubclass(thing, BUILT_OTHERWISE) or getattr(thing, "_is_protocol", False)):
+            continue  # not called by users
+        missing = set(arguments(thing)) - described(thing.__doc__)
+        assert not missing, f"{name} leaves undescribed: {sorted(missing)}"
 
 
 def methods(kind: type) -> list[tuple[str, Any]]:
@@ -187,37 +187,35 @@ def full_text(kind: type, name: str, depth: int = 2) -> str:
     return text
 
 
-@pytest.mark.parametrize(("name", "kind"), CLASSES, ids=[name for name, _ in CLASSES])
-def test_every_argument_of_a_public_method_is_named_where_it_is_described(name, kind):
-    if issubclass(kind, BUILT_OTHERWISE):
-        pytest.skip("no methods of its own")
-    for method_name, method in methods(kind):
-        assert method.__doc__, f"{name}.{method_name} has no docstring"
-        text = full_text(kind, method_name)
-        missing = [argument for argument in arguments(method) if not re.search(rf"\b{argument}\b", text)]
-        assert not missing, f"{name}.{method_name} leaves undescribed: {missing}"
+def test_every_argument_of_a_public_method_is_named_where_it_is_described():
+    own = [(name, kind) for name, kind in PUBLIC if inspect.isclass(kind) and not issubclass(kind, BUILT_OTHERWISE)]
+    for name, kind in own:
+        for method_name, method in methods(kind):
+            assert method.__doc__, f"{name}.{method_name} has no docstring"
+            text = full_text(kind, method_name)
+            missing = [argument for argument in arguments(method) if not re.search(rf"\b{argument}\b", text)]
+            assert not missing, f"{name}.{method_name} leaves undescribed: {missing}"
 
 
 # Code fits its box in a window of 1300 pixels. A box has room for 124 columns on a page, 120 in the docstring of a function
 # or class, and 116 in that of a method.
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_code_on_a_page_is_no_wider_than_its_box(page):
-    blocks = re.findall(r"^```([^\n]*)\n(.*?)^```", text_of(page), re.M | re.S)
-    code = [block for kind, block in blocks if not kind.startswith("{figure}")]
-    too_wide = [line for block in code for line in block.splitlines() if len(line) > 120]
-    assert not too_wide
+def test_code_on_a_page_is_no_wider_than_its_box():
+    for page in PAGES:
+        blocks = re.findall(r"^```([^\n]*)\n(.*?)^```", text_of(page), re.M | re.S)
+        code = [block for kind, block in blocks if not kind.startswith("{figure}")]
+        assert not [line for block in code for line in block.splitlines() if len(line) > 120], page
 
 
-@pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=NAMES)
-def test_an_example_in_a_docstring_is_no_wider_than_its_box(name, thing):
-    docs = [(inspect.getdoc(thing), 118)]
-    docs += [(inspect.getdoc(method), 114) for _, method in methods(thing) if inspect.isclass(thing)]
-    for doc, room in docs:
-        for example in doctest.DocTestParser().get_examples(doc or ""):
-            lines = [f">>> {line}" for line in example.source.splitlines()] + example.want.splitlines()
-            assert not [line for line in lines if len(line) > room]
+def test_an_example_in_a_docstring_is_no_wider_than_its_box():
+    for name, thing in PUBLIC:
+        docs = [(inspect.getdoc(thing), 118)]
+        docs += [(inspect.getdoc(method), 114) for _, method in methods(thing) if inspect.isclass(thing)]
+        for doc, room in docs:
+            for example in doctest.DocTestParser().get_examples(doc or ""):
+                lines = [f">>> {line}" for line in example.source.splitlines()] + example.want.splitlines()
+                assert not [line for line in lines if len(line) > room], name
 
 
 # Tutorials.
@@ -247,9 +245,8 @@ def drawing_cells(text: str) -> list[str]:
     return [cell for cell in CELL.findall(text) if DRAWS.search(cell) and "remove-cell" not in cell]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_figure_that_a_page_draws_has_a_caption_and_words_in_its_place(page):
-    for cell in drawing_cells(text_of(page)):
+def test_every_figure_that_a_page_draws_has_a_caption_and_words_in_its_place():
+    for cell in (cell for page in PAGES for cell in drawing_cells(text_of(page))):
         settings = cell.split("---")[1] if cell.count("---") >= 2 else ""
         assert re.search(r"^  figure:\n    caption: \|\n      \S", settings, flags=re.M), f"no caption:\n{cell}"
         assert re.search(r"^  image:\n    alt: \S", settings, flags=re.M), f"no alternative text:\n{cell}"
@@ -294,9 +291,7 @@ def test_the_covariance_of_the_state_prediction_error_is_P():
 
 
 @pytest.mark.parametrize("name", ["state_space_model", "kalman_anc", "kalman_opc"])
-def test_the_block_diagrams_are_drawn_with_the_sign_convention(name, monkeypatch):
-    monkeypatch.syspath_prepend(DOCS)
-    import diagrams
+def test_the_block_diagrams_are_drawn_with_the_sign_convention(name):
     import matplotlib.pyplot as plt
 
     figure = getattr(diagrams, name)()

@@ -46,8 +46,7 @@ def test_the_bound_is_above_what_keeps_the_rated_power(overload, runs):
     assert runs["KF-PB"][0] < overload.bound(12.0) < runs["KF-PB"][0] + 0.5
 
 
-def test_the_figure_shows_each_algorithm_in_both_panels(monkeypatch):
-    monkeypatch.setenv("MPLBACKEND", "agg")
+def test_the_figure_shows_each_algorithm_in_both_panels():
     import matplotlib.pyplot as plt
 
     found = {name: np.array([[12.0, 5.0], [0.5, 1.0 + k]]) for k, name in enumerate(overview.ALGORITHMS)}

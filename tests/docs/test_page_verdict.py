@@ -13,8 +13,7 @@ from helpers.pages import Page
 
 
 @pytest.mark.slow
-def test_the_commands_say_what_the_page_says(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_commands_say_what_the_page_says(inside, monkeypatch, capsys):
     monkeypatch.setenv("PATH", "/usr/bin:/bin")  # the page changes it, and the folder
     page = Page("verdict")
     page.run(until="The verdict")

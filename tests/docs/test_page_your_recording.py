@@ -52,16 +52,15 @@ def test_the_figures_say_what_the_page_says():
     assert len(v.run.error) == len(v.small.runs["KF-PB"].error)
 
 
-def test_it_runs_on_the_files_of_someone_else(tmp_path, monkeypatch, capsys):
+def test_it_runs_on_the_files_of_someone_else(inside, capsys):
     """Integers in stereo at 48 kHz, another length, another duct, and impulse responses of other rates and lengths."""
-    folder = tmp_path / "recordings"
+    folder = inside / "recordings"
     folder.mkdir()
     noise = band_limited_noise((150, 900), 2.6, fs=48000, rng=3, power=0.01) + 0.02
     soundfile.write(folder / "noise.wav", np.stack([noise, 0 * noise], axis=1), 48000, subtype="PCM_16")
     for name, fs in (("primary", 22050), ("secondary", 16000)):
         system = getattr(duct_paths(Duct(length_m=3.0), fs=fs), name)
         write_wav(folder / f"{name}.wav", path_taps(system)[: round(0.05 * fs)], fs)
-    monkeypatch.chdir(tmp_path)
     v = Page("your_recording", without="example-files").run()
     said = capsys.readouterr().out
     assert str(v.verdict) in said

@@ -12,19 +12,22 @@ from threading import Event, Thread
 
 import pytest
 
-from kfopc_filterpy.signals import datasets
+from kfopc_filterpy.signals import datasets, list_datasets
+
+HOST = "https://raw.githubusercontent.com"  # where the measured data are published
 
 
-def publish(folder: Path, monkeypatch: pytest.MonkeyPatch, *, host: str = datasets._HOST) -> None:
+def publish(folder: Path, monkeypatch: pytest.MonkeyPatch, *, host: str = HOST) -> None:
     """Make the files that `folder` has the published ones: their hashes are pinned, and `host` is their source."""
 
     def published(file: datasets.DatasetFile) -> datasets.DatasetFile:
         path = folder / file.name
         sha256 = hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else file.sha256
-        return replace(file, sha256=sha256, url=file.url.replace(datasets._HOST, host))
+        return replace(file, sha256=sha256, url=host + "/" + file.url.split("/", 3)[3])
 
-    for name, dataset in datasets._DATASETS.items():
-        monkeypatch.setitem(datasets._DATASETS, name, replace(dataset, files=tuple(map(published, dataset.files))))
+    for dataset in list_datasets():
+        copied = replace(dataset, files=tuple(map(published, dataset.files)))
+        monkeypatch.setitem(datasets._DATASETS, dataset.name, copied)
 
 
 class Source:
@@ -80,10 +83,9 @@ def serving(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Source]:
         def log_message(self, *_: object) -> None:
             pass
 
-    for name in ("http_proxy", "https_proxy", "all_proxy"):
+    proxies = ("http_proxy", "https_proxy", "all_proxy")
+    for name in (*proxies, *map(str.upper, proxies), "KFOPC_DATA"):
         monkeypatch.delenv(name, raising=False)
-        monkeypatch.delenv(name.upper(), raising=False)
-    monkeypatch.delenv("KFOPC_DATA", raising=False)
     monkeypatch.setattr(pooch, "os_cache", lambda name: folder / "cache" / name)
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         server.daemon_threads = True

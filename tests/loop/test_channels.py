@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.channels import random_paths, through
 
-from kfopc_filterpy import FxLMS, bandpass_path, kf_pb, simulate
+from kfopc_filterpy import FxLMS, kf_pb, simulate
 from kfopc_filterpy.paths import fir_path
 
 K, J, REFERENCES, N = 3, 2, 2, 400
@@ -121,11 +121,3 @@ def test_a_control_signal_of_the_wrong_size_is_refused() -> None:
         run(Wrong())
     with pytest.raises(TypeError, match="function of a sample"):
         run(amplifier=[1.0, 2.0])
-
-
-def test_one_channel_is_the_run_of_today() -> None:
-    """A band-pass system as the secondary path, a reference of one axis: nothing changes."""
-    result = simulate(
-        FxLMS(8, [1.0], step_size=1e-3), X[0], primary_path=PRIMARY[0, 0], secondary_path=bandpass_path(16)
-    )
-    assert result.error.shape == (N,)

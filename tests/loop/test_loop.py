@@ -1,28 +1,9 @@
 """The loop against the plain-Python one of `oracles.modified_anc`, and its compiled form against its steps."""
 
-import math
-
 import numpy as np
 import pytest
-from helpers.comparing import SIGNALS, assert_same_run, state_of
-from helpers.loop import (
-    AMPLIFIERS,
-    FEEDBACK,
-    FS,
-    MEMORY_S,
-    MU,
-    N_TAPS,
-    P0,
-    S_HAT,
-    N,
-    Q,
-    R,
-    S,
-    noises,
-    run,
-    sensor_noise,
-)
-from helpers.naming import plain
+from helpers.comparing import SIGNALS, assert_goes_on_as, assert_same_run
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, MEMORY_S, MU, N_TAPS, P0, S_HAT, Q, R, S, noises, run, sensor_noise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import modified_anc as oracle
@@ -38,25 +19,26 @@ from kfopc_filterpy import (
     kf_opc,
     simulate,
 )
+from kfopc_filterpy.loop.simulation import STRETCH
 
 
-def controller(name, *, rated_power=0.3, window="exponential", gain=None, known=None, n_taps=N_TAPS):
-    kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0, "amplifier": known}
-    constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S, window=window, secondary_path_gain=gain)
+def controller(name, *, rated_power=0.3, n_taps=N_TAPS):
+    kalman = {"state_noise": R, "measurement_noise": Q, "initial_variance": P0}
+    constraint = OutputPowerConstraint(rated_power, fs=FS, memory_s=MEMORY_S)
     if name == "KF-ANC":
         return kf_anc(n_taps, S_HAT, **kalman)
     if name == "KF-OPC":
         return kf_opc(n_taps, S_HAT, constraint=constraint, **kalman)
     if name == "FxLMS":
         return FxLMS(n_taps, S_HAT, step_size=MU)
-    return MOVFxLMS(n_taps, S_HAT, step_size=MU, constraint=constraint, amplifier=known)
+    return MOVFxLMS(n_taps, S_HAT, step_size=MU, constraint=constraint)
 
 
-def reference_algorithm(name, *, rated_power=0.3, window="exponential", gain=None):
+def reference_algorithm(name):
     if name in ("KF-ANC", "FxLMS"):  # they only follow the powers, as eq. 10-11 with the defaults
         factor = oracle.Factor(None)
     else:
-        factor = oracle.Factor(rated_power, gain, MEMORY_S, FS, window)
+        factor = oracle.Factor(0.3, None, MEMORY_S, FS, "exponential")
     if name in ("KF-ANC", "KF-OPC"):
         return oracle.Kalman(N_TAPS, factor, r=R, q=Q, p0=P0)
     return oracle.LMS(N_TAPS, factor, mu=MU)
@@ -74,11 +56,11 @@ def assert_agrees(result, expected):
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-10 * np.nanmax(np.abs(want)), err_msg=name)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("feedback", [None, FEEDBACK], ids=["", "feedback"])
-@pytest.mark.parametrize("amplifier", AMPLIFIERS)
+@pytest.mark.parametrize(
+    ("amplifier", "feedback"), [("none", None), ("hard", FEEDBACK), ("soft", FEEDBACK)], ids=["", "hard", "soft"]
+)
 @pytest.mark.parametrize("name", NAMES)
-def test_every_controller_is_the_papers_loop(name, amplifier, feedback, compiled):
+def test_every_controller_is_the_papers_loop(name, amplifier, feedback):
     x, d, _ = noises()
     ours, theirs = AMPLIFIERS[amplifier]
     expected = oracle.modified_anc(
@@ -91,52 +73,12 @@ def test_every_controller_is_the_papers_loop(name, amplifier, feedback, compiled
         amplifier=theirs,
         feedback=(0.0,) if feedback is None else feedback,
     )
-    result = run(controller(name), amplifier=ours, feedback=feedback, compiled=compiled)
+    result = run(controller(name), amplifier=ours, feedback=feedback)
     assert_agrees(result, expected)
     assert result.algorithm == name
     assert (np.min(expected["constraint_factor"]) < 0.9) == (name in ("KF-OPC", "MOV-FxLMS"))  # it did act
     if amplifier in ("hard", "soft"):
         assert np.max(np.abs(expected["control_signal"])) > 0.7  # the amplifier did act
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("options", [{"window": "sliding"}, {"gain": 0.5}, {"rated_power": 30.0}], ids=plain)
-@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
-def test_constraint_options(name, options, compiled):
-    x, d, _ = noises()
-    expected = oracle.modified_anc(reference_algorithm(name, **options), x, d, S, S_HAT, noise=sensor_noise())
-    assert_agrees(run(controller(name, **options), compiled=compiled), expected)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("amplifier", ["hard", "soft"])
-@pytest.mark.parametrize("name", ["KF-ANC", "KF-OPC", "MOV-FxLMS"])
-def test_known_amplifier_takes_the_saturation_out_of_the_disturbance_estimate(name, amplifier, compiled):
-    x, d, _ = noises()
-    ours, theirs = AMPLIFIERS[amplifier]
-    algorithm = reference_algorithm(name)
-    expected = oracle.modified_anc(
-        algorithm, x, d, S, S_HAT, noise=sensor_noise(), amplifier=theirs, known_amplifier=theirs
-    )
-    published = oracle.modified_anc(reference_algorithm(name), x, d, S, S_HAT, noise=sensor_noise(), amplifier=theirs)
-    assert np.max(np.abs(expected["weights"] - published["weights"])) > 1e-3
-    assert_agrees(run(controller(name, known=ours), amplifier=ours, compiled=compiled), expected)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("name", NAMES)
-def test_switched_on_late_it_has_listened(name, compiled):
-    """Until then the loudspeaker is silent, delay lines and powers follow the noise, the weights stay."""
-    x, d, _ = noises()
-    on = 123
-    expected = oracle.modified_anc(
-        reference_algorithm(name), x, d, S, S_HAT, noise=sensor_noise(), feedback=FEEDBACK, on=on
-    )
-    result = run(controller(name), feedback=FEEDBACK, on=on, compiled=compiled)
-    assert_agrees(result, expected)
-    np.testing.assert_array_equal(result.reference, x[on:])
-    np.testing.assert_array_equal(result.disturbance, d[on:])
-    assert result.time_s[0] == result.weights_time_s[0] == 0.0
 
 
 @pytest.mark.parametrize(("own", "rated_power"), [("filterpy", None), ("KFOPC", None), ("KFOPC", 0.3)])
@@ -160,17 +102,14 @@ def test_any_filterpy_filter_runs_in_the_loop(own, rated_power):
 # ---- One definition of the equations, two ways to run them
 
 
-@pytest.mark.parametrize("n_taps", [1, 2, 3, 4, 5, 7, 8, 13, 16, 31, 64, 129])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("n_taps", [1, 2, 3, 4, 7, 16, 129])  # the vectors have 2, 4 or 8 numbers, and a rest
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
 def test_compiled_run_is_the_steps_bit_for_bit(name, n_taps):
     fast, slow = controller(name, n_taps=n_taps), controller(name, n_taps=n_taps)
     options = {"amplifier": AMPLIFIERS["soft"][0], "feedback": FEEDBACK, "on": 17, "n": 300}
     assert_same_run(run(fast, **options), run(slow, compiled=False, **options))
     np.testing.assert_array_equal(fast.weights, slow.weights)
-    for attribute in ("constraint_factor", "disturbance_power", "secondary_path_gain"):
-        assert getattr(fast, attribute) == getattr(slow, attribute)
-    for now, then in zip(state_of(fast), state_of(slow), strict=True):
-        np.testing.assert_array_equal(now, then)
+    assert_goes_on_as(fast, slow)
     assert_same_run(run(fast, n=50), run(slow, n=50, compiled=False))  # and they go on alike
     assert_same_run(run(fast, n=50, compiled=False), run(slow, n=50))
 
@@ -196,18 +135,13 @@ def test_compiled_run_takes_up_what_was_set(name, change):
     assert not np.array_equal(untouched.weights, run(fast).weights)
 
 
-@pytest.mark.parametrize("step", [1, 7, 499, 500])
-@pytest.mark.parametrize("name", NAMES)
-def test_pieces_of_the_compiled_loop_do_not_show(name, step, monkeypatch):
-    whole = run(controller(name))
-    monkeypatch.setattr("kfopc_filterpy.loop.simulation.STRETCH", step)
-    done = []
-    assert_same_run(whole, run(controller(name), progress=done.append))
-    assert sum(done) == N
-    assert max(done) == step
-
-
-# ---- The delay line
+@pytest.mark.parametrize("name", ["KF-OPC", "MOV-FxLMS"])
+def test_pieces_of_the_compiled_loop_do_not_show(name):
+    """Progress comes after each; the steps have none."""
+    n, done = 2 * STRETCH + 7, []
+    whole = run(controller(name), n=n, progress=done.append)
+    assert done == [STRETCH, STRETCH, 7]
+    assert_same_run(whole, run(controller(name), n=n, compiled=False))
 
 
 # ---- What must hold for any signal
@@ -258,19 +192,3 @@ def test_with_rated_power_to_spare_the_constrained_are_the_unconstrained(seed, r
         np.testing.assert_array_equal(one.constraint_factor, 1.0)
         np.testing.assert_array_equal(one.control_signal, other.control_signal)
         np.testing.assert_array_equal(one.error, other.error)
-
-
-@given(seed=st.integers(0, 1000), cut=st.integers(1, 199))
-@settings(max_examples=25)
-@pytest.mark.parametrize("name", NAMES)
-def test_the_future_does_not_show(name, seed, cut):
-    rng = np.random.default_rng(seed)
-    x = rng.standard_normal(200)
-    primary = rng.standard_normal(7)
-    other = np.concatenate([x[:cut], rng.standard_normal(200 - cut)])
-    one, two = (
-        simulate(controller(name), signal, primary_path=primary, secondary_path=S, fs=FS, amplifier=math.tanh)
-        for signal in (x, other)
-    )
-    np.testing.assert_array_equal(one.error[:cut], two.error[:cut])
-    np.testing.assert_array_equal(one.control_signal[:cut], two.control_signal[:cut])

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers.comparing import assert_same_run, state_of
+from helpers.comparing import assert_goes_on_as, assert_same_run
 from helpers.loop import AMPLIFIERS, S_HAT, S
 
 from kfopc_filterpy import (
@@ -65,10 +65,6 @@ def one_by_one(made, x, own, **options):
     return [simulate(c, x, fs=FS, **mine, **options) for c, mine in zip(made, each, strict=True)]
 
 
-def up_to(n, own):
-    return own | {"disturbance": own["disturbance"][:, :n]}
-
-
 def assert_as_alone(results, expected, made=(), alone=()):
     """To the bit: the same sums in the same order."""
     for got, want in zip(results, expected, strict=True):
@@ -78,8 +74,7 @@ def assert_as_alone(results, expected, made=(), alone=()):
 
 def assert_untouched(made, fresh):
     for one, other in zip(made, fresh, strict=True):
-        for now, then in zip(state_of(one), state_of(other), strict=True):
-            np.testing.assert_array_equal(now, then)
+        assert_goes_on_as(one, other)
 
 
 def require_as_alone(count, n, n_taps=7, window="exponential", **options):
@@ -93,8 +88,7 @@ def require_as_alone(count, n, n_taps=7, window="exponential", **options):
 # ---- As run one by one
 
 
-@pytest.mark.parametrize("n_taps", [1, 7, 40])
-@pytest.mark.parametrize("count", [1, 3, 9, 17, 35])  # groups of 32 inside
+@pytest.mark.parametrize(("count", "n_taps"), [(1, 7), (3, 1), (9, 40), (35, 7)])  # groups of 32 inside
 def test_scenarios_are_their_runs_one_by_one(count, n_taps):
     results = require_as_alone(count, 777, n_taps)
     assert min(r.constraint_factor.min() for r in results) < 0.9  # it did act, and so did the amplifiers
@@ -104,22 +98,16 @@ def test_scenarios_are_their_runs_one_by_one(count, n_taps):
     assert {r.algorithm for r in results} == ({"KF-OPC", "KF-ANC"} if count > 2 else {"KF-OPC"})
 
 
-@pytest.mark.parametrize("n", [1, 63, 64, 129, STRETCH - 1, STRETCH, STRETCH + 1, 3 * STRETCH + 1])
+@pytest.mark.parametrize("n", [1, 64, 129, STRETCH, 3 * STRETCH + 1])
 def test_any_length_of_a_run(n):
     assert [r.error.shape for r in require_as_alone(3, n)] == [(n,)] * 3
 
 
-@pytest.mark.parametrize("block", [1, 50, 64, 300, 1000])
-def test_the_length_of_the_blocks_does_not_show(block, monkeypatch):
-    """Not in a bit. Progress comes after each block."""
-    x, own = differing(9, 300)
-    whole, counts = run_scenarios(filters(9), x, fs=FS, **own), []
-    monkeypatch.setattr(scenarios, "STRETCH", block)
-    pieces = run_scenarios(filters(9), x, fs=FS, progress=counts.append, **own)
-    assert (counts[0], sum(counts), len(counts)) == (9 * min(block, 300), 9 * 300, -(-300 // block))
-    assert_as_alone(pieces, whole)
-    for one, other in zip(pieces, whole, strict=True):
-        np.testing.assert_array_equal(one.error, other.error)
+def test_progress_comes_after_each_block():
+    x, own = differing(9, STRETCH + 7)
+    counts = []
+    run_scenarios(filters(9), x, fs=FS, progress=counts.append, **own)
+    assert counts == [9 * STRETCH, 9 * 7]
 
 
 def test_options_of_the_run():
@@ -223,51 +211,18 @@ def test_controllers_go_on(window):
     assert_as_alone(results, one_by_one(alone[3:], x, mine), made, alone)
 
 
-def stepped(c):
-    c.control_signal(1.0)
-    c.update(2.0)
-
-
-def run_alone(c):
-    x, own = differing(1, 100)
-    simulate(c, x, disturbance=own["disturbance"][0], secondary_path=S, fs=FS)
-
-
-def test_each_goes_on_alone():
-    """Whoever goes on leaves the others as they are."""
-    made = filters(4)
-    x, own = differing(4, 300)
-    run_scenarios(made, x, fs=FS, **own)
-    twin, before = copy.deepcopy(made[1]), state_of(made[1])
-    for goes_on, i in ((stepped, 0), (run_alone, 3), (stepped, 0), (run_alone, 2)):
-        goes_on(made[i])
-        for now, then in zip(state_of(made[1]), before, strict=True):
-            np.testing.assert_array_equal(now, then)
-    for c in (made[1], twin):
-        run_alone(c)
-    assert_untouched([made[1]], [twin])
-
-
-@pytest.mark.parametrize("place", ["progress", "run"])
-def test_an_interrupted_run_leaves_the_controllers_as_they_were(place, monkeypatch):
+def test_an_interrupted_run_leaves_the_controllers_as_they_were():
     """All or nothing: a covariance a block ahead of the weights would be neither."""
     x, own = differing(9, 3 * STRETCH)
-    made, alone, calls, compiled = filters(9), filters(9), [], scenarios.Plant.run
+    made, alone, calls = filters(9), filters(9), []
 
-    def interrupt(*arguments):
-        calls.append(arguments)
+    def interrupt(n_samples):
+        calls.append(n_samples)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return compiled(*arguments) if place == "run" else None
 
-    options = {"fs": FS}
-    if place == "run":
-        monkeypatch.setattr(scenarios.Plant, "run", interrupt)
-    else:
-        options["progress"] = interrupt
     with pytest.raises(KeyboardInterrupt):
-        run_scenarios(made, x, **options, **own)
-    monkeypatch.undo()
+        run_scenarios(made, x, fs=FS, progress=interrupt, **own)
     assert_untouched(made, alone)
     assert_as_alone(run_scenarios(made, x, fs=FS, **own), one_by_one(alone, x, own), made, alone)
 
@@ -335,17 +290,6 @@ def test_a_reference_that_is_too_loud_is_refused_with_its_reason():
     assert_untouched(made, untouched)
 
 
-def test_a_scenario_that_diverges_by_a_huge_control_signal_leaves_the_others_alone():
-    """MOV-FxLMS takes a step in proportion to its last control signal."""
-    x, own = differing(3, 300)
-    own["disturbance"][1] *= 1e40
-    made, alone = ([MOVFxLMS(7, S_HAT, step_size=1e-3, rated_power=0.1) for _ in range(3)] for _ in range(2))
-    results = run_scenarios(made, x, **own)
-    assert [r.diverged_at_s is not None for r in results] == [False, True, False]
-    expected = [simulate(c, x, **{name: value[i] for name, value in own.items()}) for i, c in enumerate(alone)]
-    assert_as_alone(results, expected, made[::2], alone[::2])
-
-
 # ---- What each scenario may have of its own
 
 
@@ -357,13 +301,6 @@ def test_true_paths_of_different_lengths():
         run_scenarios(filters(3), x, fs=FS, **own | {"secondary_path": s}) for s in (own["secondary_path"], ragged)
     )
     assert_as_alone(other, one)
-
-
-def test_sensor_noise_in_some_scenarios_only():
-    x, own = differing(3, 200)
-    own["sensor_noise_std"] = [0.0, 0.1, 0.0]
-    made, alone = filters(3), filters(3)
-    assert_as_alone(run_scenarios(made, x, fs=FS, **own), one_by_one(alone, x, own), made, alone)
 
 
 @pytest.mark.parametrize("several", [lambda one: one, lambda one: [one, 1, one]])
@@ -428,9 +365,7 @@ REFUSED = [
     (lambda: one_of_three(measurement_noise=0.2), ValueError, AGREE + "measurement_noise"),
     (lambda: one_of_three(initial_variance=1.0), ValueError, AGREE + "initial_variance"),
     (lambda: one_of_three(secondary=0.9 * S_HAT), ValueError, AGREE + "their estimated secondary path"),
-    (lambda: one_of_three(secondary=S), ValueError, AGREE + "their estimated secondary path"),
     (lambda: one_of_three(window="sliding"), ValueError, AGREE + "the length of the sliding windows of their powers"),
-    (lambda: one_of_three(heard=[1]), ValueError, HEARD),
     (lambda: one_of_three(heard=[-1, 1, 1]), ValueError, HEARD),  # with the same covariance
     ({"amplifier": [None] * 2}, ValueError, "amplifier must be one value or 3, one for each controller, got 2"),
     ({"rng": [1, 2], "sensor_noise_std": 0.1}, ValueError, "rng must be one value or 3"),
@@ -458,11 +393,9 @@ def test_refused_with_nothing_changed(wrong, kind, message):
     if not callable(wrong):  # with all in order they run, before and after
         run_scenarios(made, **options)
         options |= wrong
-    before = [state_of(c) if hasattr(c, "name") else [] for c in made]
+    before = copy.deepcopy(made)
     with pytest.raises(kind, match=message):
         run_scenarios(made, **options)
-    for c, state in zip(made, before, strict=True):
-        for now, then in zip(state_of(c) if state else [], state, strict=True):
-            np.testing.assert_array_equal(now, then)
+    assert_untouched(*([c for c in each if hasattr(c, "update")] for each in (made, before)))
     if not callable(wrong):
         run_scenarios(made, X, disturbance=D, secondary_path=S, fs=FS)

@@ -1,9 +1,11 @@
 """What `simulate` refuses, with nothing changed; silence, and updates without a solution."""
 
+import copy
+
 import control
 import numpy as np
 import pytest
-from helpers.comparing import assert_same_run, state_of
+from helpers.comparing import assert_goes_on_as, assert_same_run
 from helpers.naming import plain
 from helpers.simulation import MAKERS, D, Integrator, S, X, constraint
 
@@ -46,19 +48,17 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize(("wrong", "kind", "message"), REFUSED, ids=[message[:40] for _, _, message in REFUSED])
-def test_refused_with_nothing_changed(name, wrong, kind, message):
-    made = MAKERS[name]()
+def test_refused_with_nothing_changed(wrong, kind, message):
+    made = MAKERS["KF-OPC"]()
     simulate(made, X, disturbance=D, secondary_path=S)
-    before = state_of(made)
+    before = copy.deepcopy(made)
     arguments = {"reference": X, "disturbance": D, "secondary_path": S} | wrong
     if "switch_on_s" not in arguments:
         arguments["switch_on_s"] = 0.001  # it must be refused before it listens
     with pytest.raises(kind, match=message):
         simulate(made, arguments.pop("reference"), **arguments)
-    for one, other in zip(before, state_of(made), strict=True):
-        np.testing.assert_array_equal(one, other)
+    assert_goes_on_as(made, before)
 
 
 @pytest.mark.parametrize("wrong", [None, 3.0, FxLMS, Integrator, object(), np.sin], ids=plain)
@@ -139,14 +139,11 @@ def test_a_silent_reference_leaves_everything_alone(name, compiled):
     np.testing.assert_array_equal(made.weights, 0.0)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_noise_that_has_not_come_through_the_path_yet_does_no_harm(compiled):
+def test_noise_that_has_not_come_through_the_path_yet_does_no_harm():
     """Disturbance and reference from the first sample on, filtered reference zero: G_s = 0 and alpha = 0."""
     late = np.concatenate([np.zeros(5), [1.0]])
     for name in ("KF-OPC", "MOV-FxLMS"):
-        result = simulate(
-            MAKERS[name](late), X, disturbance=D + 1.0, secondary_path=late, record_powers=True, compiled=compiled
-        )
+        result = simulate(MAKERS[name](late), X, disturbance=D + 1.0, secondary_path=late, record_powers=True)
         assert result.diverged_at_s is None
         np.testing.assert_array_equal(result.secondary_path_gain[:5], 0.0)
         np.testing.assert_array_equal(result.constraint_factor[:5], 0.0)
@@ -180,18 +177,16 @@ def test_an_estimator_that_refuses_a_silent_row_names_the_sample():
     assert np.all(np.isfinite(simulate(made, X, disturbance=D, secondary_path=path).error))
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_without_any_noise_a_tone_is_cancelled_and_nothing_overflows(compiled):
+def test_without_any_noise_a_tone_is_cancelled_and_nothing_overflows():
     """r = q = 0: after the first samples of a tone P is singular on x', and S is rounding."""
     x = np.cos(0.3 * np.arange(400))
     made = MAKERS["KF-ANC"]([1.0], state_noise=0.0, measurement_noise=0.0)
-    result = simulate(made, x, disturbance=x, secondary_path=[1.0], compiled=compiled)
+    result = simulate(made, x, disturbance=x, secondary_path=[1.0])
     assert np.max(np.abs(result.error[10:])) < 1e-3
     np.testing.assert_array_equal(made.covariance, made.covariance.T)
 
 
-@pytest.mark.parametrize("fading", [1.0, 1.01])
-@pytest.mark.parametrize("rated_power", [None, 0.2])
+@pytest.mark.parametrize(("fading", "rated_power"), [(1.0, 0.2), (1.01, None)])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_a_covariance_that_could_overflow_is_refused_with_nothing_changed(fading, rated_power, compiled):
     """At sample 50, with a downdate pending: what the controller has is what 50 samples left."""
@@ -207,8 +202,9 @@ def test_a_covariance_that_could_overflow_is_refused_with_nothing_changed(fading
     assert caught.value.__notes__ == ["in sample 50 of the run"]
     simulate(before, x[:50], disturbance=quiet[:50], secondary_path=[1.0, 0.5])
     before.control_signal(x[50])
-    for now, then in zip(state_of(made), state_of(before), strict=True):
-        np.testing.assert_array_equal(now, then)
+    np.testing.assert_array_equal(made.covariance, before.covariance)
+    np.testing.assert_array_equal(made.weights, before.weights)
+    assert made.disturbance_power == before.disturbance_power
 
 
 @pytest.mark.parametrize("compiled", [True, False])

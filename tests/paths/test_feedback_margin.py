@@ -53,24 +53,6 @@ def test_stability_is_that_of_the_poles() -> None:
     assert outcomes == {True, False}
 
 
-@pytest.mark.parametrize(("share", "stable"), [(0.98, True), (1.02, False)])
-def test_the_gain_margin_is_that_of_the_loop_in_time(share: float, stable: bool) -> None:
-    """The loop x + f * y -> w is run, with a gain just below or above the one at which the margin is used up."""
-    w, f = np.array([0.4, -0.2]), np.array([0.0, 0.0, 0.5, 0.3])
-    top = 1.0 / np.abs(np.fft.rfft(np.convolve(w, f), 4096)).max()  # unity loop gain at the loudest frequency
-    worst = max(g for g in np.linspace(0.5 * top, 4 * top, 800) if feedback_margin(g * w, f, fs=FS).stable)
-    margin = feedback_margin(share * worst * w, f, fs=FS)
-    assert margin.stable == stable
-    taps = share * worst * np.convolve(w, f)
-    y = np.zeros(6000)
-    y[0] = 1.0
-    for n in range(1, y.size):
-        y[n] += taps[1 : n + 1] @ y[n - 1 :: -1][: taps.size - 1][: min(n, taps.size - 1)] if n >= taps.size else 0.0
-        if n < taps.size:
-            y[n] += sum(taps[k] * y[n - k] for k in range(1, n + 1))
-    assert (np.abs(y[-100:]).max() < 1e-3) == stable
-
-
 def test_an_estimate_widens_the_margin() -> None:
     w, f = [0.5, 0.3], fir_path([0.0, 0.8, 0.4], FS)
     alone = feedback_margin(w, f)

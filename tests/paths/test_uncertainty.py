@@ -171,8 +171,8 @@ def test_the_guard_of_a_relative_error_has_the_response_wanted() -> None:
         assert np.max(share * delta) < 0.7  # stable with a margin
 
 
-@pytest.mark.parametrize("n_frequencies", [1, 2, 5, 11, 40, N_FREQUENCIES])
-@pytest.mark.parametrize("height", [3.0, 10.0, 100.0])
+@pytest.mark.parametrize("n_frequencies", [1, 5, 40, N_FREQUENCIES])
+@pytest.mark.parametrize("height", [3.0, 100.0])
 def test_a_peak_of_a_relative_error_is_guarded_against(n_frequencies: int, height: float) -> None:
     """A resonance that has moved, for example, in a few of 257 frequencies, wherever it is; control elsewhere goes on."""
     for first in (0, 100, N_FREQUENCIES - n_frequencies):

@@ -64,7 +64,7 @@ def test_bode_draws_magnitude_and_phase_in_hz():
     assert _labels(phase)[1] == "S, less 0.81 ms"
 
 
-@pytest.mark.parametrize(("degrees", "step"), [(20, 15), (90, 45), (180, 90), (360, 180), (1800, 720)])
+@pytest.mark.parametrize(("degrees", "step"), [(20, 15), (180, 90), (1800, 720)])
 def test_phase_axes_tick_at_parts_of_a_right_angle_or_at_whole_turns(degrees, step):
     ax = plt.figure().add_subplot()
     ax.set_ylim(-degrees, degrees)
@@ -141,10 +141,7 @@ def test_required_rated_power_rises_to_the_wiener_filter():
     ax = plot_required_rated_power(solution, rated_power=0.5)
     ax.figure.canvas.draw()
     assert ax.get_yscale() == "log"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == (
-        "Noise reduction (dB)",
-        "Rated power needed (mean square)",
-    )
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Noise reduction (dB)", "Rated power needed (mean square)")
     power = ax.get_lines()[0].get_ydata()
     assert np.all(np.diff(power) > 0)
     assert 0.8 * solution.control_power < power[-1] < solution.control_power

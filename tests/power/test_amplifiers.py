@@ -26,11 +26,6 @@ def make(limit, sharpness):
     return [LinearAmplifier(), HardClipAmplifier(limit), SoftSaturationAmplifier(limit, sharpness)]
 
 
-@given(signals)
-def test_linear_passes_the_signal(y):
-    assert LinearAmplifier()(y) == y
-
-
 @given(signals, limits)
 def test_hard_clip_is_the_nearest_value_within_the_limit(y, limit):
     assert HardClipAmplifier(limit)(y) == float(np.clip(y, -limit, limit))
@@ -44,17 +39,6 @@ def test_soft_saturation_is_rapps_formula(ratio, limit, sharpness):
     assert SoftSaturationAmplifier(limit, sharpness)(y) == pytest.approx(expected, rel=1e-13, abs=1e-300)
 
 
-def test_soft_saturation_known_values():
-    assert SoftSaturationAmplifier(1.0, 1.0)(1.0) == pytest.approx(1 / math.sqrt(2), rel=1e-15)  # y / sqrt(1 + y^2)
-    assert SoftSaturationAmplifier(2.0)(2.0) == pytest.approx(2 * 2**-0.25, rel=1e-15)
-
-
-@given(signals, limits, sharpnesses)
-def test_every_model_is_odd(y, limit, sharpness):
-    for amplifier in make(limit, sharpness):
-        assert amplifier(-y) == -amplifier(y)
-
-
 @given(signals, signals, limits, sharpnesses)
 def test_every_model_rises_and_never_amplifies(a, b, limit, sharpness):
     low, high = sorted((a, b))
@@ -63,29 +47,12 @@ def test_every_model_rises_and_never_amplifies(a, b, limit, sharpness):
         assert abs(amplifier(a)) <= abs(a)
 
 
-@given(signals, limits, sharpnesses)
-def test_saturating_models_stay_within_their_limit(y, limit, sharpness):
-    assert abs(HardClipAmplifier(limit)(y)) <= limit
-    assert abs(SoftSaturationAmplifier(limit, sharpness)(y)) <= limit
-
-
 @pytest.mark.parametrize("sharpness", [0.5, 2.0, 50.0, 400.0])
 def test_soft_saturation_far_above_its_limit_is_the_limit(sharpness):
     # the power in Rapp's formula overflows from a ratio of 1e6 on at sharpness 26: the output must not become 0
     for y in (1e6, 1e100, 1e300):
         assert SoftSaturationAmplifier(0.5, sharpness)(y) == pytest.approx(0.5, rel=1e-5)
         assert SoftSaturationAmplifier(0.5, sharpness)(-y) == pytest.approx(-0.5, rel=1e-5)
-
-
-@given(st.floats(-3.0, 3.0))
-def test_soft_saturation_tends_to_the_hard_clip(y):
-    # largest at the limit itself, where it is 2 ** (-1 / 2p)
-    assert SoftSaturationAmplifier(1.0, 500.0)(y) == pytest.approx(HardClipAmplifier(1.0)(y), abs=1 - 2**-0.001 + 1e-12)
-
-
-def test_small_signals_pass_unchanged():
-    for amplifier in make(1.0, 2.0):
-        assert amplifier(1e-5) == pytest.approx(1e-5, rel=1e-15)
 
 
 @pytest.mark.parametrize("amplifier", make(0.7, 2.5))
@@ -109,13 +76,6 @@ def test_gaussian_noise_at_rated_power_exceeds_a_sines_peak_15_7_percent_of_the_
     assert share == clipped_fraction(noise, limit, steady=1.0)
     assert math.erfc(1.0) == pytest.approx(0.157, abs=5e-4)  # P(|z| > sqrt(2)), the figure of the documentation
     assert share == pytest.approx(math.erfc(1.0), abs=4 * math.sqrt(0.157 * 0.843 / 400_000))  # 4 sigma
-
-
-def test_sine_at_rated_power_passes_unharmed():
-    rated_power = 0.8
-    sine = math.sqrt(2 * rated_power) * np.sin(2 * np.pi * 400 / 16000 * np.arange(1600))
-    assert np.mean(sine**2) == pytest.approx(rated_power, rel=1e-12)
-    np.testing.assert_array_equal(HardClipAmplifier(math.sqrt(2 * rated_power))(sine), sine)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])

@@ -6,7 +6,6 @@ summed in another order here.
 
 from __future__ import annotations
 
-import copy
 import math
 import pickle
 
@@ -46,7 +45,7 @@ def signals(n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("window", ["exponential", "sliding"])
-@pytest.mark.parametrize("samples", [1, 2, 7, 50])
+@pytest.mark.parametrize("samples", [1, 7, 50])
 def test_powers_gain_and_factor_follow_eq_10_to_13(window: str, samples: int) -> None:
     ours = constraint(samples, window, rated_power=0.8)
     d, xf, x = signals(160)
@@ -68,32 +67,12 @@ def test_any_signal_any_memory(x: list[float], samples: int, sliding: bool) -> N
         assert ours.disturbance_power == pytest.approx(direct_power(np.array(x), n, samples, window), rel=CLOSE)
 
 
-@given(x=st.lists(values, min_size=1, max_size=40))
-def test_the_start_is_a_plain_mean(x: list[float]) -> None:
-    """While 1/(n+1) > 1-λ, whatever the window."""
-    for window in ("exponential", "sliding"):
-        ours = constraint(50, window, secondary_path_gain=1.0)
-        for n, value in enumerate(x):
-            ours.advance(value)
-            assert ours.disturbance_power == pytest.approx(np.mean(np.square(x[: n + 1])), rel=CLOSE)
-
-
-def test_the_exponential_window_forgets_with_its_time_constant() -> None:
-    ours = constraint(100, secondary_path_gain=1.0)
-    for _ in range(1000):
-        ours.advance(2.0)
-    for _ in range(100):
-        ours.advance(0.0)
-    assert ours.disturbance_power == pytest.approx(4.0 * math.exp(-1.0), rel=CLOSE)
-
-
-@pytest.mark.parametrize("switch", [1000, 1037, 1099])
-def test_the_sliding_window_keeps_no_rounding(switch: int) -> None:
+def test_the_sliding_window_keeps_no_rounding() -> None:
     """Loud, then 300 dB softer: once the loud part has left the window nothing of it remains.
 
     A running sum with the oldest square taken off it would keep 1e30 * 1e-16.
     """
-    samples = 100
+    samples, switch = 100, 1037
     x = np.random.default_rng(1).normal(size=switch + 3 * samples)
     x[:switch] *= 1e15
     ours = constraint(samples, "sliding", secondary_path_gain=1.0)
@@ -104,7 +83,7 @@ def test_the_sliding_window_keeps_no_rounding(switch: int) -> None:
 
 
 def test_the_sliding_window_does_not_drift_in_a_long_run() -> None:
-    x = np.random.default_rng(2).normal(size=200_000)
+    x = np.random.default_rng(2).normal(size=50_000)
     ours = constraint(333, "sliding", secondary_path_gain=1.0)
     for n in range(x.size):
         ours.advance(x[n])
@@ -189,8 +168,10 @@ def test_a_reference_is_needed_unless_the_gain_or_the_factor_is_supplied() -> No
     ours.advance(1.0)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, 1e200, "loud", [1.0, 2.0], None])
-@pytest.mark.parametrize("position", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("bad", "position"),
+    [(math.nan, 0), (math.inf, 1), (math.nan, 2), (1e200, 0), ("loud", 1), ([1.0, 2.0], 2), (None, 0)],
+)
 def test_a_bad_sample_changes_nothing(bad: object, position: int) -> None:
     ours = constraint(10)
     ours.advance(1.0, 2.0, 3.0)
@@ -258,15 +239,3 @@ def test_a_bias_free_start_scales_a_steady_tone_right_at_once() -> None:
         from_zero = forgetting * from_zero + (1 - forgetting) * value**2
     assert factor == pytest.approx(right, rel=0.01)  # 20 periods, of which the last is whole
     assert min(math.sqrt(1.0 / from_zero), 1.0) > 2 * right
-
-
-@pytest.mark.parametrize("window", ["exponential", "sliding"])
-def test_a_copy_goes_on_by_itself(window: str) -> None:
-    ours = constraint(5, window)
-    d, xf, x = signals(20)
-    for n in range(8):
-        ours.advance(d[n], xf[n], x[n])
-    clones = [copy.deepcopy(ours), pickle.loads(pickle.dumps(ours))]
-    expected = [ours.advance(d[n], xf[n], x[n]) for n in range(8, 20)]
-    for clone in clones:
-        assert [clone.advance(d[n], xf[n], x[n]) for n in range(8, 20)] == expected

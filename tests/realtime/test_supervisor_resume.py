@@ -127,13 +127,3 @@ def test_the_health_record_goes_on_counting(tmp_path: Path) -> None:
     assert repr(loaded) == repr(twin)
     assert loaded.health.events == twin.health.events
     assert loaded.health.events.maxlen == 1000
-
-
-def test_a_supervisor_is_not_a_controller(tmp_path: Path) -> None:
-    path = tmp_path / "run.kfopc"
-    supervised("one channel").save(path)
-    with pytest.raises(TypeError, match="Supervisor"):
-        FxLMS.load(path)
-    MAKERS["one channel"]().save(path)
-    with pytest.raises(TypeError, match="FxLMS"):
-        Supervisor.load(path)

@@ -235,18 +235,6 @@ def test_what_is_compressed_as_far_as_it_may_be_takes_no_more_than_three_times_i
 MULTIPLE = 32  # docs/formats.md states it, of what is not compressed
 
 
-@pytest.mark.parametrize("name", [name for name in WRITERS if name != "x.sofa"])
-def test_reading_takes_no_more_than_the_stated_multiple_of_the_file(name, tmp_path, monkeypatch):
-    monkeypatch.setattr("helpers.files.signal", lambda n_channels=1: signal(n_channels, 60_000))
-    WRITERS[name](tmp_path / name)
-    settings = {"fs": FS, "file_fs": FS if name in ("x.npy", "x.csv") else None}
-    read_path(tmp_path / name, **settings)  # what is imported is not the file's
-    with Memory() as memory:
-        recording = read_path(tmp_path / name, **settings)
-    assert recording.samples.shape[-1] == 60_000
-    assert memory.peak <= MULTIPLE * (tmp_path / name).stat().st_size
-
-
 def test_the_worst_of_what_is_not_compressed_takes_no_more_than_the_stated_multiple(tmp_path):
     soundfile.write(tmp_path / "x.wav", signal(2, 60_000).T, FS, subtype="PCM_U8")
     (tmp_path / "x.txt").write_text("1 " * 60_000)

@@ -2,8 +2,6 @@
 
 import hashlib
 import socket
-import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,6 @@ from kfopc_filterpy.signals import (
     DataUnavailableError,
     MeasuredDuct,
     dataset_folder,
-    datasets,
     fetch_dataset,
     has_dataset,
     list_datasets,
@@ -28,12 +25,6 @@ FILES = {
     "motor/Motor.mat": ("Motor_noise", 162001),
     "compressor/compressor_16kHz.mat": ("yr", 279378),
 }
-
-
-@pytest.fixture
-def no_folder(monkeypatch):
-    """No data folder in the environment."""
-    monkeypatch.delenv("KFOPC_DATA", raising=False)
 
 
 @pytest.fixture
@@ -91,26 +82,26 @@ def test_an_unknown_noise_is_refused(own_files):
         load_measured_duct(own_files, noise="fan")
 
 
-def test_folder_argument_comes_before_the_environment(own_files, monkeypatch, tmp_path):
-    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "elsewhere"))
+def test_folder_argument_comes_before_the_environment(own_files, data_folder, tmp_path):
+    data_folder(tmp_path / "elsewhere")
     assert load_measured_duct(own_files).primary.tolist() == [1.0, 2.0, 3.0]
     with pytest.raises(DataUnavailableError, match=r"elsewhere.duct.Pz1\.mat is missing: put https"):
         load_measured_duct()
-    monkeypatch.setenv("KFOPC_DATA", str(own_files))
+    data_folder(own_files)
     assert load_measured_duct().noise.tolist() == [1.0, 2.0, 3.0]
 
 
-@pytest.mark.usefixtures("no_folder")
-def test_without_folder_or_permission_the_error_names_every_way(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pooch", None)
+def test_without_folder_or_permission_the_error_names_every_way(data_folder, uninstall):
+    data_folder(None)
+    uninstall("pooch")
     with pytest.raises(DataUnavailableError, match=r"pass folder, set KFOPC_DATA, or pass allow_download=True"):
         load_measured_duct()
     with pytest.raises(FileNotFoundError):
         load_measured_duct()
 
 
-def test_empty_environment_variable_names_no_folder(source, monkeypatch, tmp_path):
-    monkeypatch.setenv("KFOPC_DATA", "")
+def test_empty_environment_variable_names_no_folder(source, data_folder, tmp_path):
+    data_folder("")
     with pytest.raises(
         DataUnavailableError, match="no folder with the measured duct is named, and none is in the cache"
     ):
@@ -141,8 +132,8 @@ def test_download_asks_once_for_each_pinned_file_and_keeps_it(source):
     assert source.asked[3:] == [compressor]
 
 
-def test_a_folder_comes_before_a_download(source, own_files, monkeypatch):
-    monkeypatch.setenv("KFOPC_DATA", str(own_files))
+def test_a_folder_comes_before_a_download(source, own_files, data_folder):
+    data_folder(own_files)
     load_measured_duct(allow_download=True)
     (own_files / "duct" / "Sz.mat").unlink()
     with pytest.raises(DataUnavailableError, match=r"Sz\.mat is missing"):
@@ -157,9 +148,9 @@ def left_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.rglob("*") if path.is_file())
 
 
-def test_a_dataset_is_fetched_once_to_the_folder_of_the_environment(source, monkeypatch, tmp_path):
+def test_a_dataset_is_fetched_once_to_the_folder_of_the_environment(source, data_folder, tmp_path):
     folder = tmp_path / "measured"
-    monkeypatch.setenv("KFOPC_DATA", str(folder))
+    data_folder(folder)
     assert not has_dataset("duct")
     assert fetch_dataset("duct") == dataset_folder() == folder
     assert has_dataset("duct")
@@ -213,10 +204,7 @@ def test_without_a_network_what_is_fetched_is_read_and_the_rest_refused(source, 
     with socket.socket() as closed:  # a port at which nothing listens
         closed.bind(("127.0.0.1", 0))
         publish_at = f"http://127.0.0.1:{closed.getsockname()[1]}"
-    for name, dataset in datasets._DATASETS.items():
-        there = dataset.files[0].url.split("/")[2]
-        files = [replace(file, url=file.url.replace(f"http://{there}", publish_at)) for file in dataset.files]
-        monkeypatch.setitem(datasets._DATASETS, name, replace(dataset, files=tuple(files)))
+    publish(own_files, monkeypatch, host=publish_at)
     assert fetch_dataset("duct") == dataset_folder()
     with pytest.raises(
         DataUnavailableError, match=r"(?s)Motor\.mat could not be fetched \(.*refused.*\): set KFOPC_DATA"
@@ -240,9 +228,9 @@ def test_a_folder_that_cannot_be_written_is_refused(source, tmp_path):
         fetch_dataset("duct", tmp_path / "taken")
 
 
-@pytest.mark.usefixtures("no_folder")
-def test_download_without_pooch_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pooch", None)
+def test_download_without_pooch_says_what_to_install(data_folder, uninstall):
+    data_folder(None)
+    uninstall("pooch")
     for call in (lambda: load_measured_duct(allow_download=True), lambda: fetch_dataset("duct"), dataset_folder):
         with pytest.raises(DataUnavailableError, match=r"pooch is not installed.*kfopc-filterpy\[studies\]"):
             call()

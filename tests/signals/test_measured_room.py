@@ -16,9 +16,9 @@ HOST = "https://raw.githubusercontent.com"
 
 
 @pytest.fixture
-def own_files(tmp_path, monkeypatch):
+def own_files(tmp_path, monkeypatch, data_folder):
     """A folder of small files in the published layout, which counts as the published one: S{k}{j} holds k and j."""
-    monkeypatch.delenv("KFOPC_DATA", raising=False)
+    data_folder(None)
     (tmp_path / "room4x4").mkdir()
     for name in NAMES:
         path = tmp_path / "room4x4" / f"{name}.mat"
@@ -50,12 +50,12 @@ def test_first_index_is_the_microphone_and_second_the_loudspeaker(own_files):
             assert room.secondary[k - 1, j - 1].tolist() == [k, j]
 
 
-def test_room_is_found_through_the_environment(own_files, monkeypatch):
+def test_room_is_found_through_the_environment(own_files, data_folder):
     with pytest.raises(
         DataUnavailableError, match="no folder with the measured room is named, and none is in the cache: pass folder"
     ):
         load_measured_room()
-    monkeypatch.setenv("KFOPC_DATA", str(own_files))
+    data_folder(own_files)
     assert load_measured_room().secondary.shape == (4, 4, 2)
     (own_files / "room4x4" / "S41.mat").unlink()
     with pytest.raises(DataUnavailableError, match=rf"S41\.mat is missing: put {HOST}/{SOURCE}/S41\.mat there"):

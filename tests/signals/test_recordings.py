@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import pickle
 import struct
-import sys
 import wave
 import zipfile
 from pathlib import Path
@@ -56,13 +55,6 @@ def test_a_file_without_a_known_suffix_is_known_by_how_it_begins(name, tmp_path)
     np.testing.assert_array_equal(read_recording(tmp_path / "recording.bin").samples, expected)
 
 
-@pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE"])
-def test_wav_of_any_depth_has_full_scale_one(tmp_path, subtype):
-    x = np.array([-1.0, 0.0, 0.5])
-    soundfile.write(tmp_path / "x.wav", x, 8000, subtype=subtype)
-    assert read_recording(tmp_path / "x.wav").samples.tolist() == x.tolist()
-
-
 @pytest.mark.parametrize(
     ("width", "stored"),
     [
@@ -80,8 +72,7 @@ def test_wav_by_another_writer_is_read(tmp_path, width, stored):
     assert (recording.samples.tolist(), recording.fs) == ([-1.0, 0.0, 0.5], 8000.0)
 
 
-@pytest.mark.parametrize("shape", [(5, 1), (1, 5), (5,)])
-@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int16])
+@pytest.mark.parametrize(("shape", "kind"), [((5, 1), np.float64), ((1, 5), np.float32), ((5,), np.int16)])
 @pytest.mark.parametrize("suffix", ["mat", "npy", "npz"])
 def test_vectors_of_any_shape_and_type_are_read(tmp_path, shape, kind, suffix):
     values, path = np.arange(5).astype(kind).reshape(shape), tmp_path / f"x.{suffix}"
@@ -252,8 +243,9 @@ def tone(level: float = 0.1, seconds: float = 2.0, hz: float = 1000.0, fs: float
     return level * np.sqrt(2) * np.sin(2 * np.pi * hz * np.arange(int(seconds * fs)) / fs + 0.3)
 
 
-@pytest.mark.parametrize(("level_db", "pascal"), [(94.0, 1.0024), (114.0, 10.024), (93.9794, 1.0)])
-@pytest.mark.parametrize("hz", [250.0, 997.3])
+@pytest.mark.parametrize(
+    ("level_db", "pascal", "hz"), [(94.0, 1.0024, 997.3), (114.0, 10.024, 250.0), (93.9794, 1.0, 997.3)]
+)
 def test_the_tone_of_a_calibrator_becomes_its_level(tmp_path, rng, level_db, pascal, hz):
     hum = 0.002 * np.sin(2 * np.pi * 50 * np.arange(96000) / 48000)
     noise = 0.002 * rng.standard_normal(96000)
@@ -295,9 +287,6 @@ def test_each_channel_has_its_own_calibrator_tone(tmp_path):
 def test_what_is_no_calibrator_is_refused(samples, message):
     with pytest.raises(ValueError, match=message):
         calibration_factor(Recording(samples, 48000, name="calibrator.wav"))
-
-
-def test_a_calibrator_that_is_scaled_already_is_refused():
     with pytest.raises(ValueError, match=r"calibrator must not be scaled yet, got Pa"):
         calibration_factor(Recording(tone(), 48000, unit="Pa"))
 
@@ -343,7 +332,7 @@ def test_a_recording_cannot_be_changed_or_made_of_nothing():
 # ---- files that are wrong
 
 
-@pytest.mark.parametrize("name", [*WRITERS, "x.unknown"])
+@pytest.mark.parametrize("name", ["pcm16.wav", "x.npz", "plain.mat", "x.csv", "x.uff", "x.sofa", "x.unknown"])
 def test_a_missing_or_empty_file_is_refused(name, tmp_path):
     with pytest.raises(FileNotFoundError, match=rf"{name} does not exist or is not a file; the current folder is"):
         read_recording(tmp_path / name)
@@ -381,12 +370,6 @@ def test_a_truncated_file_is_refused(name, tmp_path):
         path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ValueError, match=rf"{name} ({CUT[name]})"):
         read_recording(path, fs=FS)
-
-
-def test_text_that_is_cut_off_within_a_row_is_refused(tmp_path):
-    (tmp_path / "x.csv").write_text("0.5,1\n0.25,2\n0.125")
-    with pytest.raises(ValueError, match=r"x\.csv cannot be read as text: .*number of columns changed"):
-        read_recording(tmp_path / "x.csv", fs=FS)
 
 
 def put(path: Path, at: int, what: bytes) -> None:
@@ -459,7 +442,7 @@ def test_nan_is_refused_with_its_place_and_only_in_the_channel_that_is_read(tmp_
         assert read_recording(tmp_path / name, channel=1, fs=FS).samples.tolist() == [0.0, 0.0, 1.0]
 
 
-@pytest.mark.parametrize("name", ["x.txt", "x.csv", "x.unknown"])
+@pytest.mark.parametrize("name", ["x.csv", "x.unknown"])
 @pytest.mark.parametrize(
     "content", [b"Dear Sir or Madam,\nno numbers\n", bytes(range(128, 256)) * 9, b"\n\n\n", b"\0" * 99]
 )
@@ -469,14 +452,15 @@ def test_text_that_is_no_numbers_is_refused(tmp_path, name, content):
         read_recording(tmp_path / name, fs=FS)
 
 
-def test_numbers_after_which_text_comes_are_refused(tmp_path):
-    (tmp_path / "x.txt").write_text("1\n2\nstopped by user\n")
-    with pytest.raises(ValueError, match=r"x\.txt cannot be read as text: the number of columns changed"):
-        read_recording(tmp_path / "x.txt", fs=FS)
+@pytest.mark.parametrize("text", ["0.5,1\n0.25,2\n0.125", "1\n2\nstopped by user\n"])
+def test_a_row_of_another_length_is_refused(tmp_path, text):
+    (tmp_path / "x.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"x\.csv cannot be read as text: the number of columns changed"):
+        read_recording(tmp_path / "x.csv", fs=FS)
 
 
 @pytest.mark.parametrize("name", ["x.wav", "x.flac", "x.mat", "x.npy", "x.npz", "x.sofa", "x.uff"])
-@pytest.mark.parametrize("content", [b"RIFF", b"no such file at all", bytes(range(256)) * 8, b"\n" * 700])
+@pytest.mark.parametrize("content", [b"RIFF", bytes(range(256)) * 8])
 def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
     if name in ("x.sofa", "x.uff"):
         pytest.importorskip("h5py" if name == "x.sofa" else "pyuff")
@@ -516,9 +500,9 @@ def test_nothing_is_unpickled(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "library"), [("new.mat", "h5py"), ("x.sofa", "h5py"), ("x.uff", "pyuff")])
-def test_without_its_library_the_error_names_the_extra(name, library, tmp_path, monkeypatch):
+def test_without_its_library_the_error_names_the_extra(name, library, tmp_path, uninstall):
     WRITERS[name](tmp_path / name)
-    monkeypatch.setitem(sys.modules, library, None)
+    uninstall(library)
     with pytest.raises(
         ModuleNotFoundError, match=rf"{name} is .* which needs {library}: install kfopc-filterpy\[formats\]"
     ):
@@ -572,14 +556,6 @@ def test_an_archive_that_is_damaged_inside_is_refused(tmp_path):
 # ---- writing
 
 
-def test_wav_without_peak_keeps_single_precision_values(tmp_path):
-    x = np.random.default_rng(1).normal(0, 3, 1000)
-    write_wav(tmp_path / "x.wav", x, 16000)
-    read = read_recording(tmp_path / "x.wav")
-    assert read.fs == 16000.0
-    np.testing.assert_array_equal(read.samples, x.astype(np.float32))
-
-
 def test_wav_with_one_peak_shares_one_scale(tmp_path):
     loud = np.array([4.0, -4.0, 1.0])
     for name, samples in (("loud", loud), ("soft", loud / 10)):
@@ -591,6 +567,8 @@ def test_wav_with_one_peak_shares_one_scale(tmp_path):
 
 
 def test_wav_writes_the_tail_of_a_diverged_run_as_silence(tmp_path):
+    write_wav(tmp_path / "x.wav", [[1.0, 2.0, np.nan], [1.0, np.nan, np.nan]], 16000)
+    assert read_recording(tmp_path / "x.wav").samples.tolist() == [[1.0, 2.0, 0.0], [1.0, 0.0, 0.0]]
     for peak in (None, 2.0):
         write_wav(tmp_path / "x.wav", [1.0, -2.0, np.nan, np.nan], 16000, peak=peak)
         assert read_recording(tmp_path / "x.wav").samples[2:].tolist() == [0.0, 0.0]
@@ -608,11 +586,6 @@ def test_two_channels_come_back_as_they_were_written(tmp_path, peak):
     np.testing.assert_array_equal(read, expected)
     write_wav(tmp_path / "y.wav", x[:1], 16000, peak=peak)
     np.testing.assert_array_equal(read_recording(tmp_path / "y.wav").samples, expected[0])  # one channel drops its axis
-
-
-def test_channels_that_diverged_at_different_times_end_in_silence(tmp_path):
-    write_wav(tmp_path / "x.wav", [[1.0, 2.0, np.nan], [1.0, np.nan, np.nan]], 16000)
-    assert read_recording(tmp_path / "x.wav").samples.tolist() == [[1.0, 2.0, 0.0], [1.0, 0.0, 0.0]]
 
 
 def test_the_same_signal_gives_the_same_bytes(tmp_path):

@@ -56,7 +56,7 @@ def test_a_seed_repeats_and_the_global_state_is_left_alone() -> None:
     np.testing.assert_array_equal(np.random.get_state()[1], before)  # noqa: NPY002
 
 
-@pytest.mark.parametrize("rate", [0.5, 2.0, 5.0])
+@pytest.mark.parametrize("rate", [0.5, 5.0])
 def test_bursts_come_as_a_poisson_process(rate: float) -> None:
     """The pauses of a Poisson process are exponential with mean 1/rate, however long the bursts are and however they
     overlap. Mean and standard deviation are therefore equal; both are held to 5 standard errors."""
@@ -76,7 +76,7 @@ def lone(x: np.ndarray, decay: float, threshold: float = 0.01, rings_s: float = 
     return starts[(ends - starts < (6 * decay + rings_s) * FS) & (starts < x.size - 8 * decay * FS)]
 
 
-@pytest.mark.parametrize("decay", [0.05, 0.1, 0.2])
+@pytest.mark.parametrize("decay", [0.05, 0.2])
 def test_bursts_die_away_with_their_time_constant(decay: float) -> None:
     """The mean power of n lone bursts falls as exp(-2 t/tau).
 
@@ -113,7 +113,7 @@ def test_bursts_differ_in_level_as_stated() -> None:
     assert np.sqrt(deviation[4.0] ** 2 - deviation[0.0] ** 2) == pytest.approx(4.0, rel=errors)
 
 
-@pytest.mark.parametrize("background_db", [-30.0, -20.0, 0.0])
+@pytest.mark.parametrize("background_db", [-30.0, 0.0])
 def test_the_background_has_its_level(background_db: float) -> None:
     """The background is measured between the bursts, which the same seed without background shows.
 
@@ -169,8 +169,7 @@ def test_swelling_keeps_the_mean_power_and_its_input(
         np.testing.assert_allclose(y, x, rtol=1e-14)
 
 
-@pytest.mark.parametrize("phase", [0.0, 1.0, -2.5])
-@pytest.mark.parametrize(("swing", "period"), [(6.0, 4.0), (3.0, 1.6), (12.0, 8.0)])
+@pytest.mark.parametrize(("swing", "period", "phase"), [(6.0, 4.0, 0.0), (3.0, 1.6, 1.0), (12.0, 8.0, -2.5)])
 def test_the_level_swings_as_a_sine_of_its_period(swing: float, period: float, phase: float) -> None:
     """The level is measured as the power of noise in each 40th of a period, 0.04 s and more.
 
@@ -227,14 +226,6 @@ def test_a_tone_has_no_click(frequency: float, phase: float, samples: int, start
     assert np.max(np.abs(np.diff(y))) <= np.sqrt(2) * (turn + np.pi / (2 * FADE))
 
 
-def test_a_cut_without_a_fade_does_click() -> None:
-    """Shows that the test above can fail: a quarter period is missing where the loop begins again."""
-    tone = np.sin(2 * np.pi * 100.0 / RATE * np.arange(4000 - 13))
-    fast = np.sqrt(2) * (2 * np.pi * 100.0 / RATE + np.pi / (2 * FADE))
-    assert np.max(np.abs(np.diff(np.resize(tone, 15000)))) > 4 * fast
-    assert np.max(np.abs(np.diff(looped(tone, 3.0, fs=RATE)))) < fast
-
-
 def test_noise_keeps_its_power_through_the_fade() -> None:
     """In 400 recordings each tenth of the fade has 10000 samples, so 5 sqrt(2/10000) = 7 %. A linear fade would halve the
     power in its middle."""
@@ -258,11 +249,7 @@ def test_the_shortest_recording(samples: int, fs: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        lambda x: level_jump(x, 0.1, 6.0, fs=RATE),
-        lambda x: looped(x, 3.0, fs=RATE, start_s=0.3),
-    ],
+    "change", [lambda x: level_jump(x, 0.1, 6.0, fs=RATE), lambda x: looped(x, 3.0, fs=RATE, start_s=0.3)]
 )
 def test_channels_are_changed_as_each_alone(change: Any) -> None:
     x = np.random.default_rng(2).standard_normal((3, 1000))
