@@ -158,14 +158,14 @@ class VerifiedController(WrappedController):
         self.multichannel = bool(getattr(controller, "multichannel", False))
         self.events: list[PathEvent] = []
         path = self._paths()
-        J, M = path.shape[1:]
-        n_references = getattr(controller, "n_references", 1)
-        self._amplifiers = amplifier_functions(amplifier, J)
+        self.n_microphones, self.n_loudspeakers, M = path.shape
+        self.n_references = getattr(controller, "n_references", 1)
+        self._amplifiers = amplifier_functions(amplifier, self.n_loudspeakers)
         uncertainty = getattr(controller, "secondary_path_uncertainty", None)
         self._observer = PathObserver(
             controller.n_taps,
             path,
-            n_references=n_references,
+            n_references=self.n_references,
             spread=relative_spread(DEFAULT_UNCERTAINTY if uncertainty is None else uncertainty, path) or LEAST_SPREAD,
             fs=self.fs,
             memory_s=self.memory_s,
@@ -174,8 +174,8 @@ class VerifiedController(WrappedController):
         # The samples of this block and those before it, the oldest first: x, and the part of the control signal that is
         # not played.
         self._block = self._observer.block
-        self._x = np.zeros((n_references, self._observer.primary_path.shape[-1] - 1 + self._block))
-        self._withheld = np.zeros((J, M - 1 + self._block))
+        self._x = np.zeros((self.n_references, self._observer.primary_path.shape[-1] - 1 + self._block))
+        self._withheld = np.zeros((self.n_loudspeakers, M - 1 + self._block))
         self._n = self._samples = 0  # of this block, and of all
         self._awaits_error = False
         self.volume, self._pause_s = 0.0, 0.0  # no pause before the first failure

@@ -276,6 +276,16 @@ def test_a_control_signal_that_is_never_finite_is_one_event() -> None:
     assert names(controller) == ["not finite"]
 
 
+def test_blocks_around_a_controller_that_states_no_channels() -> None:
+    x, d = noises(0.2)
+    blocks, steps = verified(Own(10**6)), verified(Own(10**6))
+    expected = []
+    for reference, error in zip(x, d, strict=True):
+        expected.append(steps.control_signal(reference))
+        steps.update(error)
+    np.testing.assert_array_equal(blocks.process(x, d), expected)
+
+
 @pytest.mark.parametrize("bad", [np.nan, 1e200, "0.1", [1.0, 2.0]])
 def test_a_bad_sample_is_refused_and_changes_nothing(bad: Any) -> None:
     x, d = noises(1.0)
