@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from inspect import signature
+from math import isfinite
 from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from .._validate import as_real_array, require_finite
+from .._validate import as_number, as_real_array, require_finite
 
 INDEFINITE_LIMIT = 1e-8  # of the largest element: a more negative eigenvalue of P is not rounding
 
@@ -18,8 +19,11 @@ SILENT_REFERENCE = (
     "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
     "Nothing was changed"
 )
+NOT_FINITE = (
+    "{} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, H, M, K before this step"
+)
 
-
+Checks = Callable[..., Any]  # of the arguments of a step, with the filter before them
 State = tuple[dict[str, Any], dict[str, Any]]
 
 
@@ -51,29 +55,44 @@ def undoing(kf: KalmanFilter) -> Callable[[], None]:
     return undo
 
 
-@contextmanager
-def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[None]:
+def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[Any, ...], checks: Checks | None) -> None:
     """Run a step of `kf`: either it leaves x and P finite, or it raises an error and changes nothing.
 
-    The `arguments` must be finite. The step must assign arrays, as filterpy's steps do, or copy those it writes into.
+    NaN and Inf in an argument reach x or P. So the `checks`, which say which argument is wrong, need only be made after a
+    failure. The step must assign arrays, as filterpy's steps do, or copy those it writes into.
     """
-    for argument, value in arguments.items():
-        if value is not None:
-            require_finite(as_real_array(value, argument), argument)
-    before = state_of(kf)
+    before = kf.__dict__.copy()
     try:
-        with np.errstate(all="ignore"):  # overflow and division by zero are detected below
-            yield
-        _require_sound(kf)
+        step(*arguments)
+        if not _is_plainly_sound(kf):
+            if checks is not None:
+                checks(kf, *arguments)
+            _require_sound(kf)
     except BaseException as error:
-        restore(kf, before)
+        kf.__dict__.clear()
+        kf.__dict__.update(before)
+        if not isinstance(error, ValueError | TypeError | RuntimeWarning):  # numpy's warnings may be errors
+            raise
+        if checks is not None:
+            checks(kf, *arguments)
+        name, cause = step.__name__, NOT_FINITE.format("x or P") if isinstance(error, RuntimeWarning) else error
         if isinstance(error, np.linalg.LinAlgError):
             raise ValueError(f"{name}: S = H P H' + R cannot be inverted ({error}); {SILENT_REFERENCE}") from error
-        if not isinstance(error, ValueError | TypeError):
-            raise
-        shapes = {key: np.shape(value) for key, value in {"x": kf.x, "P": kf.P, **arguments}.items()}
+        given = {"x": kf.x, "P": kf.P, **dict(zip(signature(step).parameters, arguments, strict=False))}
+        shapes = {key: np.shape(value) for key, value in given.items() if value is not None}
         kind = TypeError if isinstance(error, TypeError) else ValueError
-        raise kind(f"{name}: {error} (shapes: {shapes}). Nothing was changed") from error
+        raise kind(f"{name}: {cause} (shapes: {shapes}). Nothing was changed") from error
+
+
+def _is_plainly_sound(kf: KalmanFilter) -> bool:
+    """Return whether x and P are finite arrays of floats of the usual sizes. A finite sum implies finite elements."""
+    x, P, n = kf.x, kf.P, kf.dim_x
+    if not (
+        type(x) is type(P) is np.ndarray and x.size == n and P.shape == (n, n) and x.dtype.kind == P.dtype.kind == "f"
+    ):
+        return False
+    elements = P.ravel()
+    return isfinite(elements.dot(elements) + sum(x.ravel().tolist()))  # one element at a time is quick for x only
 
 
 def _require_sound(kf: KalmanFilter) -> None:
@@ -83,10 +102,27 @@ def _require_sound(kf: KalmanFilter) -> None:
         raise ValueError(f"x would become {np.shape(kf.x)} and P {np.shape(kf.P)}, for dim_x = {n}")
     for key in ("x", "P"):
         if not np.all(np.isfinite(getattr(kf, key))):
-            raise ValueError(
-                f"{key} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, "
-                "H, M, K before this step"
-            )
+            raise ValueError(NOT_FINITE.format(key))
+
+
+def is_variance(value: Any, shape: tuple[int, int]) -> bool:
+    """Return whether a value is an array of numbers of this shape, without negative variances."""
+    usual = type(value) is np.ndarray and value.shape == shape and value.dtype.kind in "fi"
+    return usual and not min(value.diagonal().tolist()) < 0
+
+
+def is_usual_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> bool:
+    """Return whether z, R and H are arrays of the sizes that filterpy uses as they are, H that of the filter."""
+    rows, row = kf.dim_z, kf.H if H is None else H
+    return (
+        type(row) is np.ndarray
+        and row.shape == (rows, kf.dim_x)
+        and is_variance(kf.R if R is None else R, (rows, rows))
+        and (
+            (type(z) is np.ndarray and (z.shape == (rows, 1)[: kf.x.ndim] or (H is None and z.shape == (rows,))))
+            or (H is None and rows == 1 and type(z) is float)
+        )
+    )
 
 
 def checked_measurement(
@@ -95,7 +131,6 @@ def checked_measurement(
     """Return z, R and H as filterpy handles them, or raise a clear error."""
     n = kf.dim_x
     given = kf.H if H is None else H
-    require_observation(kf, given)
     if H is not None or np.ndim(given) == 1:
         H = np.asarray(given)
         H = H.reshape(1, -1) if H.ndim == 1 else H
@@ -117,13 +152,40 @@ def checked_measurement(
     return np.reshape(z, wanted), R, H
 
 
-def require_observation(kf: KalmanFilter, H: ArrayLike, name: str = "H") -> None:
-    """Raise ValueError if H is the array of zeros that filterpy makes and nothing was written into it."""
-    if H is getattr(kf, "_default_H", None) and not np.any(H):
-        raise ValueError(
-            f"H was never assigned, and filterpy's default, zeros, corrects nothing: pass {name}= or assign kf.H. "
-            "Nothing was changed"
-        )
+def checked_prediction(kf: KalmanFilter, u: Any, B: Any, F: Any, Q: Any) -> tuple[Any, Any, Any, Any]:
+    """Return u, B, F and Q as filterpy handles them, or raise a clear error."""
+    n = kf.dim_x
+    F = as_matrix(F, "F")
+    if F is not None and np.ndim(F) == 0:
+        F = np.float64(as_number(F, "F"))  # filterpy transposes it, which Python's numbers cannot
+    transition = kf.F if F is None else F
+    require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
+    require_variance(kf.Q if Q is None else Q, n, "Q")
+    require_control(kf, u, B)
+    return u, B, F, Q
+
+
+def as_matrix(value: Any, name: str) -> Any:
+    """Return a list or tuple as an array, and anything else as it is."""
+    return as_real_array(value, name) if isinstance(value, list | tuple) else value
+
+
+def is_usual_prediction(kf: KalmanFilter, u: Any, F: Any, Q: Any) -> bool:
+    """Return whether u is left out, and F and Q are arrays of their sizes."""
+    square, transition = (kf.dim_x, kf.dim_x), kf.F if F is None else F
+    return (
+        u is None
+        and type(transition) is np.ndarray
+        and transition.shape == square
+        and is_variance(kf.Q if Q is None else Q, square)
+    )
+
+
+def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) -> None:
+    """Raise ValueError if a control input u, or the B that it passes, holds NaN or Inf."""
+    for name, value in {"u": u, "B": None if u is None else kf.B if B is None else B}.items():
+        if value is not None:
+            require_finite(as_real_array(value, name), name)
 
 
 def require_measurement(z: ArrayLike, rows: int) -> None:
