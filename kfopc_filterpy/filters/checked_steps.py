@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from inspect import signature
-from math import isfinite
+from math import isfinite, pi
 from typing import Any
 
 import numpy as np
@@ -114,14 +114,15 @@ def is_variance(value: Any, shape: tuple[int, int]) -> bool:
 def is_usual_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> bool:
     """Return whether z, R and H are arrays of the sizes that filterpy uses as they are, H that of the filter."""
     rows, row = kf.dim_z, kf.H if H is None else H
+    if type(z) is float:
+        usual = rows == 1 and (H is None or np.ndim(kf.x) == 2)
+    else:
+        usual = type(z) is np.ndarray and z.shape in ((rows, 1), (rows,)) and (H is None or z.ndim == np.ndim(kf.x))
     return (
-        type(row) is np.ndarray
+        usual
+        and type(row) is np.ndarray
         and row.shape == (rows, kf.dim_x)
         and is_variance(kf.R if R is None else R, (rows, rows))
-        and (
-            (type(z) is np.ndarray and (z.shape == (rows, 1)[: kf.x.ndim] or (H is None and z.shape == (rows,))))
-            or (H is None and rows == 1 and type(z) is float)
-        )
     )
 
 
@@ -188,10 +189,35 @@ def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) 
             require_finite(as_real_array(value, name), name)
 
 
+def without_masked(kf: KalmanFilter, z: np.ma.MaskedArray, R: Any, H: Any) -> tuple[Any, Any, Any, np.ndarray | None]:
+    """Return z, R and H with which filterpy corrects by the components of z that are not masked, and which are masked.
+
+    z is None if all are. A masked component gets a row of zeros in H and a noise of its own, so that all sizes stay: its
+    residual and its gain are 0. The noise is 1/(2 pi), which adds nothing to the log-likelihood.
+    """
+    missing = np.ma.getmaskarray(z).reshape(-1)
+    if missing.all():
+        return None, R, H, None
+    if not missing.any():
+        return z.data, R, H, None
+    size = missing.size
+    row, noise = np.array(kf.H if H is None else H), np.array(kf.R if R is None else R)
+    if row.shape != (size, kf.dim_x):
+        raise ValueError(
+            f"z must have {len(np.atleast_2d(row))} value(s), the masked ones included, got shape {z.shape}"
+        )
+    require_variance(noise, size, "R")
+    noise = noise * np.eye(size) if noise.ndim == 0 else noise.astype(np.float64)
+    row[missing], noise[missing], noise[:, missing] = 0.0, 0.0, 0.0
+    noise[missing, missing] = 0.5 / pi
+    values = np.where(missing, 0.0, z.data.reshape(-1)).reshape((size, 1)[: np.ndim(kf.x)])
+    return values, noise, row, missing
+
+
 def require_measurement(z: ArrayLike, rows: int) -> None:
     """Raise an error unless z holds finite numbers, one per row of H, in a shape that converts to (rows, 1)."""
     if np.ma.is_masked(z):  # numpy would use the value behind the mask
-        raise ValueError("z must not be masked: pass None for a missed sample")
+        raise ValueError("z must not be masked, except in update and batch_filter: pass None for a missed sample")
     values = np.asarray(z)
     if values.dtype.kind == "c":
         raise TypeError(f"z must be real, got complex numbers: {z!r}")
@@ -200,7 +226,11 @@ def require_measurement(z: ArrayLike, rows: int) -> None:
     shape = values.shape
     if values.size != rows or shape not in ((), (rows,), (rows, 1), (1, rows)):
         raise ValueError(f"z must have {rows} value(s), shape ({rows}, 1) or what converts to it, got shape {shape}")
-    require_finite(values, "z")
+    if not np.isfinite(values).all():
+        try:
+            require_finite(values, "z")
+        except ValueError as error:
+            raise ValueError(f"{error}. If a value is missing, mask it: np.ma.masked_invalid(z)") from None
 
 
 def require_matrix(value: ArrayLike, shape: tuple[int, ...], name: str) -> None:
@@ -226,17 +256,24 @@ def require_semidefinite(value: ArrayLike, name: str, limit: float = INDEFINITE_
     NaN, Inf and wrong shapes pass: the step that uses them refuses them.
     """
     P = np.atleast_2d(as_real_array(value, name))
-    if P.ndim != 2 or P.shape[0] != P.shape[1] or not np.isfinite(P).all():
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or (P.tobytes() == P.T.tobytes() and _is_definite(P)):
         return
     largest = np.abs(P).max()
-    if largest == 0.0:
+    if not 0.0 < largest < np.inf:  # NaN is not
         return
     scaled = 0.5 * (P / largest + P.T / largest)  # overflows nowhere
-    try:
-        np.linalg.cholesky(scaled + limit * np.eye(len(P)))
-    except np.linalg.LinAlgError:
+    if not _is_definite(scaled + limit * np.eye(len(P))):
         smallest = largest * np.linalg.eigvalsh(scaled)[0]
         raise ValueError(
             f"{name} must be positive semidefinite: it is a covariance, but its smallest eigenvalue is {smallest:g}. "
             "Nothing was changed"
-        ) from None
+        )
+
+
+def _is_definite(P: np.ndarray) -> bool:
+    """Return whether a symmetric array has a Cholesky factor."""
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return False
+    return True

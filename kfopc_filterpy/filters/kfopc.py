@@ -30,6 +30,7 @@ from .checked_steps import (
     restore,
     run_or_undo,
     state_of,
+    without_masked,
 )
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, a wrong shape, a negative variance) raise an error before
-    anything changes. So do a P that is not positive semidefinite, complex measurements, and an update without an H.
+    anything changes. So do a P that is not positive semidefinite and complex measurements.
     `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters
@@ -358,7 +359,9 @@ class KFOPC(KalmanFilter, Checkpointed):
         ----------
         z : float, array_like or None
             Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
-            no power estimate advances.
+            no power estimate advances. Masked components of a masked array are missing: the state is corrected by
+            the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and the likelihoods
+            are those of the others. All masked is None.
         R : float or array_like, optional
             Measurement noise variance of this step; by default `self.R`.
         H : array_like, optional
@@ -371,12 +374,26 @@ class KFOPC(KalmanFilter, Checkpointed):
         Raises
         ------
         ValueError
-            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, no H given or
-            assigned, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
+            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
             gain, or with only some of the measurements. The filter is unchanged and can continue.
         TypeError
             A measurement that is not a real number.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC(dim_x=2, dim_z=2)
+        >>> kf.H = np.eye(2)
+        >>> kf.update(np.ma.masked_invalid([4.0, np.nan]))  # the second component is missing
+        >>> kf.x.ravel(), kf.z.ravel()
+        (array([2., 0.]), array([ 4., nan]))
         """
+        missing = None
+        if isinstance(z, np.ma.MaskedArray):
+            z, R, H, missing = without_masked(self, z, R, H)
+            if missing is not None and self._constraint is not None:
+                raise ValueError("a rated power needs all measurements at once: mask them all if one is missing")
         reference = self._next_reference(z, reference)
         if z is None:
             super().update(None)
@@ -387,6 +404,8 @@ class KFOPC(KalmanFilter, Checkpointed):
         else:
             z, R, H = checked_measurement(self, z, R, H)
             self._scaled_step(super().update, z, R, H, H=H, reference=reference)
+        if missing is not None:
+            self.z[missing] = np.nan
 
     def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
         """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
@@ -464,8 +483,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         Parameters
         ----------
         zs : sequence or numpy.ma.MaskedArray
-            As in filterpy: a sample of None is missing. So is a masked sample, and a sample of several measurements if
-            any of them is masked.
+            As in filterpy: a sample of None is missing. So are masked components, as in `update`.
         Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional
@@ -497,10 +515,12 @@ class KFOPC(KalmanFilter, Checkpointed):
         for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
             if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
                 raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
+        # in an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None
+        samples = np.fromiter(zs, dtype=object, count=len(zs))
         before = self._snapshot()
         self._batch_references = batch
         try:
-            result = super().batch_filter(_with_none_for_masked(zs), Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
+            result = super().batch_filter(samples, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
         except BaseException:
             restore(self, before)
             raise
@@ -664,16 +684,6 @@ class KFOPC(KalmanFilter, Checkpointed):
     def _all_or_nothing(self, step: Callable[..., None], checks: Checks | None, *arguments: Any) -> None:
         self._take_in_edits()
         run_or_undo(self, step, arguments, checks)
-
-
-def _with_none_for_masked(zs: Sequence[Any] | np.ndarray) -> np.ndarray:
-    """Return the samples, None for each that is masked in whole or in part.
-
-    In an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None.
-    """
-    samples = (None if np.ma.is_masked(z) else z for z in zs)
-    plain = (z.data if isinstance(z, np.ma.MaskedArray) else z for z in samples)
-    return np.fromiter(plain, dtype=object, count=len(zs))
 
 
 class BatchReferences:

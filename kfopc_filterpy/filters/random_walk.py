@@ -21,6 +21,7 @@ from .checked_steps import (
     restore,
     run_or_undo,
     state_of,
+    without_masked,
 )
 from .covariance import RandomWalkCovariance, require_covariance
 from .kfopc import KFOPC
@@ -342,6 +343,8 @@ class RandomWalkKFOPC(KFOPC):
         reference: ArrayLike | None = None,
     ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
+        if isinstance(z, np.ma.MaskedArray):
+            z, R, H, _ = without_masked(self, z, R, H)
         row: Any = self.H if H is None else H
         measurement: Any
         own_inverse = self.inv is not np.linalg.inv
