@@ -15,6 +15,8 @@ from .._validate import as_number, as_real_array, require_finite
 
 INDEFINITE_LIMIT = 1e-8  # of the largest element: a more negative eigenvalue of P is not rounding
 
+FLOAT = np.dtype(np.float64)
+
 SILENT_REFERENCE = (
     "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
     "Nothing was changed"
@@ -85,14 +87,14 @@ def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[An
 
 
 def _is_plainly_sound(kf: KalmanFilter) -> bool:
-    """Return whether x and P are finite arrays of floats of the usual sizes. A finite sum implies finite elements."""
+    """Return whether x and P are finite arrays of floats of the usual sizes.
+
+    Finite sums imply finite elements. `vdot` is quick for many elements, and overflows without a warning.
+    """
     x, P, n = kf.x, kf.P, kf.dim_x
-    if not (
-        type(x) is type(P) is np.ndarray and x.size == n and P.shape == (n, n) and x.dtype.kind == P.dtype.kind == "f"
-    ):
+    if not (type(x) is type(P) is np.ndarray and x.size == n and P.shape == (n, n) and x.dtype == P.dtype == FLOAT):
         return False
-    elements = P.ravel()
-    return isfinite(elements.dot(elements) + sum(x.ravel().tolist()))  # one element at a time is quick for x only
+    return isfinite(np.vdot(P, P)) and isfinite(sum(x.ravel().tolist()))
 
 
 def _require_sound(kf: KalmanFilter) -> None:
@@ -106,9 +108,13 @@ def _require_sound(kf: KalmanFilter) -> None:
 
 
 def is_variance(value: Any, shape: tuple[int, int]) -> bool:
-    """Return whether a value is an array of numbers of this shape, without negative variances."""
-    usual = type(value) is np.ndarray and value.shape == shape and value.dtype.kind in "fi"
-    return usual and not min(value.diagonal().tolist()) < 0
+    """Return whether a value is an array of floats of this shape, without negative variances."""
+    return (
+        type(value) is np.ndarray
+        and value.shape == shape
+        and value.dtype == FLOAT
+        and not min(value.diagonal().tolist()) < 0
+    )
 
 
 def is_usual_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> bool:

@@ -65,6 +65,7 @@ COVARIANCES = {
     "of very different sizes": np.diag([1e12, 1.0, 1e-12]),
     "a number": 3.0,
     "tiny": 1e-300 * np.eye(N),
+    "huge": 1e200 * np.eye(N),  # the squares overflow
 }
 
 
