@@ -21,6 +21,7 @@ import numpy as np
 from kfopc_filterpy import KFOPC
 
 from . import variants
+from .beside_filterpy import table_beside_filterpy, times_beside_filterpy
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -322,7 +323,7 @@ def main(folder: Path, quiet: bool = False) -> int:
     with (
         threadpool_limits(1),
         tqdm(
-            total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 2 + len(variants.FIRST_USES), disable=quiet, unit="round"
+            total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 3 + len(variants.FIRST_USES), disable=quiet, unit="round"
         ) as bar,
     ):
         for taps in TAPS:
@@ -335,6 +336,9 @@ def main(folder: Path, quiet: bool = False) -> int:
             bar.set_description(f"speed, worst of {WORST_SAMPLES:,} samples, {taps} taps")
             worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
             bar.update()
+        bar.set_description("speed, beside filterpy")
+        beside = times_beside_filterpy()
+        bar.update()
         bar.set_description("speed, several channels")
         channels = channel_times()
         bar.update()
@@ -350,6 +354,7 @@ def main(folder: Path, quiet: bool = False) -> int:
         "dgemm_gflops": max(rates),
         "rows": rows,
         "worst_sample": worst,
+        "beside_filterpy": beside,
         "channels": channels,
         "blocks": blocks,
         "first_use_s": first_use,
@@ -360,6 +365,8 @@ def main(folder: Path, quiet: bool = False) -> int:
         table(result),
         "",
         channel_table(channels),
+        "",
+        table_beside_filterpy(beside),
         "",
         block_table(blocks),
         "",

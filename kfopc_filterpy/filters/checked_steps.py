@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from inspect import signature
+from math import isfinite, pi
 from typing import Any
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import ArrayLike
 
-from .._validate import as_real_array, require_finite
+from .._validate import as_number, as_real_array, require_finite
 
 INDEFINITE_LIMIT = 1e-8  # of the largest element: a more negative eigenvalue of P is not rounding
+
+FLOAT = np.dtype(np.float64)
 
 SILENT_REFERENCE = (
     "a silent reference (H = 0) with R = 0 tells nothing: give R > 0, or z=None for a missed sample. "
     "Nothing was changed"
 )
+NOT_FINITE = (
+    "{} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, H, M, K before this step"
+)
 
-
+Checks = Callable[..., Any]  # of the arguments of a step, with the filter before them
 State = tuple[dict[str, Any], dict[str, Any]]
 
 
@@ -51,29 +57,44 @@ def undoing(kf: KalmanFilter) -> Callable[[], None]:
     return undo
 
 
-@contextmanager
-def all_or_nothing(kf: KalmanFilter, name: str, **arguments: Any) -> Iterator[None]:
+def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[Any, ...], checks: Checks | None) -> None:
     """Run a step of `kf`: either it leaves x and P finite, or it raises an error and changes nothing.
 
-    The `arguments` must be finite. The step must assign arrays, as filterpy's steps do, or copy those it writes into.
+    NaN and Inf in an argument reach x or P. So the `checks`, which say which argument is wrong, need only be made after a
+    failure. The step must assign arrays, as filterpy's steps do, or copy those it writes into.
     """
-    for argument, value in arguments.items():
-        if value is not None:
-            require_finite(as_real_array(value, argument), argument)
-    before = state_of(kf)
+    before = kf.__dict__.copy()
     try:
-        with np.errstate(all="ignore"):  # overflow and division by zero are detected below
-            yield
-        _require_sound(kf)
+        step(*arguments)
+        if not _is_plainly_sound(kf):
+            if checks is not None:
+                checks(kf, *arguments)
+            _require_sound(kf)
     except BaseException as error:
-        restore(kf, before)
+        kf.__dict__.clear()
+        kf.__dict__.update(before)
+        if not isinstance(error, ValueError | TypeError | RuntimeWarning):  # numpy's warnings may be errors
+            raise
+        if checks is not None:
+            checks(kf, *arguments)
+        name, cause = step.__name__, NOT_FINITE.format("x or P") if isinstance(error, RuntimeWarning) else error
         if isinstance(error, np.linalg.LinAlgError):
             raise ValueError(f"{name}: S = H P H' + R cannot be inverted ({error}); {SILENT_REFERENCE}") from error
-        if not isinstance(error, ValueError | TypeError):
-            raise
-        shapes = {key: np.shape(value) for key, value in {"x": kf.x, "P": kf.P, **arguments}.items()}
+        given = {"x": kf.x, "P": kf.P, **dict(zip(signature(step).parameters, arguments, strict=False))}
+        shapes = {key: np.shape(value) for key, value in given.items() if value is not None}
         kind = TypeError if isinstance(error, TypeError) else ValueError
-        raise kind(f"{name}: {error} (shapes: {shapes}). Nothing was changed") from error
+        raise kind(f"{name}: {cause} (shapes: {shapes}). Nothing was changed") from error
+
+
+def _is_plainly_sound(kf: KalmanFilter) -> bool:
+    """Return whether x and P are finite arrays of floats of the usual sizes.
+
+    Finite sums imply finite elements. `vdot` is quick for many elements, and overflows without a warning.
+    """
+    x, P, n = kf.x, kf.P, kf.dim_x
+    if not (type(x) is type(P) is np.ndarray and x.size == n and P.shape == (n, n) and x.dtype == P.dtype == FLOAT):
+        return False
+    return isfinite(np.vdot(P, P)) and isfinite(sum(x.ravel().tolist()))
 
 
 def _require_sound(kf: KalmanFilter) -> None:
@@ -83,10 +104,32 @@ def _require_sound(kf: KalmanFilter) -> None:
         raise ValueError(f"x would become {np.shape(kf.x)} and P {np.shape(kf.P)}, for dim_x = {n}")
     for key in ("x", "P"):
         if not np.all(np.isfinite(getattr(kf, key))):
-            raise ValueError(
-                f"{key} would hold NaN or Inf: look for them, or for values that overflow, in x, P, F, Q, R, "
-                "H, M, K before this step"
-            )
+            raise ValueError(NOT_FINITE.format(key))
+
+
+def is_variance(value: Any, shape: tuple[int, int]) -> bool:
+    """Return whether a value is an array of floats of this shape, without negative variances."""
+    return (
+        type(value) is np.ndarray
+        and value.shape == shape
+        and value.dtype == FLOAT
+        and not min(value.diagonal().tolist()) < 0
+    )
+
+
+def is_usual_measurement(kf: KalmanFilter, z: Any, R: Any, H: Any) -> bool:
+    """Return whether z, R and H are arrays of the sizes that filterpy uses as they are, H that of the filter."""
+    rows, row = kf.dim_z, kf.H if H is None else H
+    if type(z) is float:
+        usual = rows == 1 and (H is None or np.ndim(kf.x) == 2)
+    else:
+        usual = type(z) is np.ndarray and z.shape in ((rows, 1), (rows,)) and (H is None or z.ndim == np.ndim(kf.x))
+    return (
+        usual
+        and type(row) is np.ndarray
+        and row.shape == (rows, kf.dim_x)
+        and is_variance(kf.R if R is None else R, (rows, rows))
+    )
 
 
 def checked_measurement(
@@ -95,7 +138,6 @@ def checked_measurement(
     """Return z, R and H as filterpy handles them, or raise a clear error."""
     n = kf.dim_x
     given = kf.H if H is None else H
-    require_observation(kf, given)
     if H is not None or np.ndim(given) == 1:
         H = np.asarray(given)
         H = H.reshape(1, -1) if H.ndim == 1 else H
@@ -117,19 +159,71 @@ def checked_measurement(
     return np.reshape(z, wanted), R, H
 
 
-def require_observation(kf: KalmanFilter, H: ArrayLike, name: str = "H") -> None:
-    """Raise ValueError if H is the array of zeros that filterpy makes and nothing was written into it."""
-    if H is getattr(kf, "_default_H", None) and not np.any(H):
+def checked_prediction(kf: KalmanFilter, u: Any, B: Any, F: Any, Q: Any) -> tuple[Any, Any, Any, Any]:
+    """Return u, B, F and Q as filterpy handles them, or raise a clear error."""
+    n = kf.dim_x
+    F = as_matrix(F, "F")
+    if F is not None and np.ndim(F) == 0:
+        F = np.float64(as_number(F, "F"))  # filterpy transposes it, which Python's numbers cannot
+    transition = kf.F if F is None else F
+    require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
+    require_variance(kf.Q if Q is None else Q, n, "Q")
+    require_control(kf, u, B)
+    return u, B, F, Q
+
+
+def as_matrix(value: Any, name: str) -> Any:
+    """Return a list or tuple as an array, and anything else as it is."""
+    return as_real_array(value, name) if isinstance(value, list | tuple) else value
+
+
+def is_usual_prediction(kf: KalmanFilter, u: Any, F: Any, Q: Any) -> bool:
+    """Return whether u is left out, and F and Q are arrays of their sizes."""
+    square, transition = (kf.dim_x, kf.dim_x), kf.F if F is None else F
+    return (
+        u is None
+        and type(transition) is np.ndarray
+        and transition.shape == square
+        and is_variance(kf.Q if Q is None else Q, square)
+    )
+
+
+def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) -> None:
+    """Raise ValueError if a control input u, or the B that it passes, holds NaN or Inf."""
+    for name, value in {"u": u, "B": None if u is None else kf.B if B is None else B}.items():
+        if value is not None:
+            require_finite(as_real_array(value, name), name)
+
+
+def without_masked(kf: KalmanFilter, z: np.ma.MaskedArray, R: Any, H: Any) -> tuple[Any, Any, Any, np.ndarray | None]:
+    """Return z, R and H with which filterpy corrects by the components of z that are not masked, and which are masked.
+
+    z is None if all are. A masked component gets a row of zeros in H and a noise of its own, so that all sizes stay: its
+    residual and its gain are 0. The noise is 1/(2 pi), which adds nothing to the log-likelihood.
+    """
+    missing = np.ma.getmaskarray(z).reshape(-1)
+    if missing.all():
+        return None, R, H, None
+    if not missing.any():
+        return z.data, R, H, None
+    size = missing.size
+    row, noise = np.array(kf.H if H is None else H), np.array(kf.R if R is None else R)
+    if row.shape != (size, kf.dim_x):
         raise ValueError(
-            f"H was never assigned, and filterpy's default, zeros, corrects nothing: pass {name}= or assign kf.H. "
-            "Nothing was changed"
+            f"z must have {len(np.atleast_2d(row))} value(s), the masked ones included, got shape {z.shape}"
         )
+    require_variance(noise, size, "R")
+    noise = noise * np.eye(size) if noise.ndim == 0 else noise.astype(np.float64)
+    row[missing], noise[missing], noise[:, missing] = 0.0, 0.0, 0.0
+    noise[missing, missing] = 0.5 / pi
+    values = np.where(missing, 0.0, z.data.reshape(-1)).reshape((size, 1)[: np.ndim(kf.x)])
+    return values, noise, row, missing
 
 
 def require_measurement(z: ArrayLike, rows: int) -> None:
     """Raise an error unless z holds finite numbers, one per row of H, in a shape that converts to (rows, 1)."""
     if np.ma.is_masked(z):  # numpy would use the value behind the mask
-        raise ValueError("z must not be masked: pass None for a missed sample")
+        raise ValueError("z must not be masked, except in update and batch_filter: pass None for a missed sample")
     values = np.asarray(z)
     if values.dtype.kind == "c":
         raise TypeError(f"z must be real, got complex numbers: {z!r}")
@@ -138,7 +232,11 @@ def require_measurement(z: ArrayLike, rows: int) -> None:
     shape = values.shape
     if values.size != rows or shape not in ((), (rows,), (rows, 1), (1, rows)):
         raise ValueError(f"z must have {rows} value(s), shape ({rows}, 1) or what converts to it, got shape {shape}")
-    require_finite(values, "z")
+    if not np.isfinite(values).all():
+        try:
+            require_finite(values, "z")
+        except ValueError as error:
+            raise ValueError(f"{error}. If a value is missing, mask it: np.ma.masked_invalid(z)") from None
 
 
 def require_matrix(value: ArrayLike, shape: tuple[int, ...], name: str) -> None:
@@ -164,17 +262,24 @@ def require_semidefinite(value: ArrayLike, name: str, limit: float = INDEFINITE_
     NaN, Inf and wrong shapes pass: the step that uses them refuses them.
     """
     P = np.atleast_2d(as_real_array(value, name))
-    if P.ndim != 2 or P.shape[0] != P.shape[1] or not np.isfinite(P).all():
+    if P.ndim != 2 or P.shape[0] != P.shape[1] or (P.tobytes() == P.T.tobytes() and _is_definite(P)):
         return
     largest = np.abs(P).max()
-    if largest == 0.0:
+    if not 0.0 < largest < np.inf:  # NaN is not
         return
     scaled = 0.5 * (P / largest + P.T / largest)  # overflows nowhere
-    try:
-        np.linalg.cholesky(scaled + limit * np.eye(len(P)))
-    except np.linalg.LinAlgError:
+    if not _is_definite(scaled + limit * np.eye(len(P))):
         smallest = largest * np.linalg.eigvalsh(scaled)[0]
         raise ValueError(
             f"{name} must be positive semidefinite: it is a covariance, but its smallest eigenvalue is {smallest:g}. "
             "Nothing was changed"
-        ) from None
+        )
+
+
+def _is_definite(P: np.ndarray) -> bool:
+    """Return whether a symmetric array has a Cholesky factor."""
+    try:
+        np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return False
+    return True

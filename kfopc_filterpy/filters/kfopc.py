@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from copy import deepcopy
 from math import sqrt
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -17,16 +16,21 @@ from .._validate import as_count, as_nonnegative, as_number, as_real_array, as_s
 from ..checkpoint import Checkpointed
 from .checked_steps import (
     SILENT_REFERENCE,
+    Checks,
     State,
-    all_or_nothing,
+    as_matrix,
     checked_measurement,
-    require_matrix,
+    checked_prediction,
+    is_usual_measurement,
+    is_usual_prediction,
+    require_control,
     require_measurement,
-    require_observation,
     require_semidefinite,
     require_variance,
     restore,
+    run_or_undo,
     state_of,
+    without_masked,
 )
 
 if TYPE_CHECKING:
@@ -40,27 +44,15 @@ MOST_STATES_SHOWN = 8  # with more, `repr` is a summary: filterpy's shows every 
 class _Matrix:
     """An attribute of filterpy that it transposes: a list or tuple assigned to it is stored as an array.
 
-    It is no property, because filterpy's `Saver` would record a property twice.
+    It is no property, because filterpy's `Saver` would record a property twice. Without `__get__`, Python reads the
+    attribute from the filter's `__dict__`.
     """
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
-    def __get__(self, kf: Any, owner: Any = None) -> Any:
-        if kf is None:
-            return self
-        try:
-            return kf.__dict__[self.name]
-        except KeyError:
-            raise AttributeError(f"{type(kf).__name__} has no {self.name} yet") from None
-
     def __set__(self, kf: Any, value: Any) -> None:
-        kf.__dict__[self.name] = _as_matrix(value, self.name)
-
-
-def _as_matrix(value: Any, name: str) -> Any:
-    """Return a list or tuple as an array, and anything else as it is."""
-    return as_real_array(value, name) if isinstance(value, list | tuple) else value
+        kf.__dict__[self.name] = as_matrix(value, self.name)
 
 
 class KFOPC(KalmanFilter, Checkpointed):
@@ -72,7 +64,7 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
     arguments that would corrupt that filter (NaN, Inf, a wrong shape, a negative variance) raise an error before
-    anything changes. So do a P that is not positive semidefinite, complex measurements, and an update without an H.
+    anything changes. So do a P that is not positive semidefinite and complex measurements.
     `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters
@@ -151,7 +143,7 @@ class KFOPC(KalmanFilter, Checkpointed):
     """
 
     if not TYPE_CHECKING:  # Keeps these out of filterpy's `Saver`, which records __dict__.
-        __slots__ = ("_batch_references", "_constraint", "_default_H", "_lifted", "_unconstrained_factor")
+        __slots__ = ("_batch_references", "_constraint", "_lifted", "_unconstrained_factor")
 
     _written_into: ClassVar[tuple[str, ...]] = ("_constraint",)  # in slots
 
@@ -178,7 +170,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._batch_references: BatchReferences | None = None
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
         super().__init__(dim_x, dim_z, as_count(dim_u, "dim_u", minimum=0))
-        self._default_H = self.H
         if constraint is not None:
             if rated_power is not None:
                 raise ValueError("give either rated_power= or constraint=, which has a rated power, not both")
@@ -345,21 +336,14 @@ class KFOPC(KalmanFilter, Checkpointed):
         Q: ArrayLike | None = None,
     ) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
-        n = self.dim_x
-        F = _as_matrix(F, "F")
-        if F is not None and np.ndim(F) == 0:
-            F = np.float64(as_number(F, "F"))  # filterpy transposes it, which Python's numbers cannot
-        transition = self.F if F is None else F
-        require_matrix(transition, (n, n) if np.ndim(transition) else (), "F")
-        require_variance(self.Q if Q is None else Q, n, "Q")
-        used_B = None if u is None else self.B if B is None else B
-        with self._all_or_nothing("predict", u=u, B=used_B):
-            super().predict(u, B, F, Q)
+        if not is_usual_prediction(self, u, F, Q):
+            u, B, F, Q = checked_prediction(self, u, B, F, Q)
+        self._all_or_nothing(super().predict, checked_prediction, u, B, F, Q)
 
     def predict_steadystate(self, u: ArrayLike = 0, B: ArrayLike | None = None) -> None:
         """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
-        with self._all_or_nothing("predict_steadystate", u=u, B=self.B if B is None else B):
-            super().predict_steadystate(u, B)
+        require_control(self, u, B)
+        self._all_or_nothing(super().predict_steadystate, None, u, B)
 
     def update(
         self,
@@ -375,7 +359,9 @@ class KFOPC(KalmanFilter, Checkpointed):
         ----------
         z : float, array_like or None
             Measurement, (dim_z, 1) or what converts to it. None is a missed sample: nothing is corrected and
-            no power estimate advances.
+            no power estimate advances. Masked components of a masked array are missing: the state is corrected by
+            the others, with their rows of H and R. `z` is NaN there, `y` and the column of `K` are 0, and the likelihoods
+            are those of the others. All masked is None.
         R : float or array_like, optional
             Measurement noise variance of this step; by default `self.R`.
         H : array_like, optional
@@ -388,18 +374,38 @@ class KFOPC(KalmanFilter, Checkpointed):
         Raises
         ------
         ValueError
-            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, no H given or
-            assigned, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
+            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
             gain, or with only some of the measurements. The filter is unchanged and can continue.
         TypeError
             A measurement that is not a real number.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kfopc_filterpy import KFOPC
+        >>> kf = KFOPC(dim_x=2, dim_z=2)
+        >>> kf.H = np.eye(2)
+        >>> kf.update(np.ma.masked_invalid([4.0, np.nan]))  # the second component is missing
+        >>> kf.x.ravel(), kf.z.ravel()
+        (array([2., 0.]), array([ 4., nan]))
         """
+        missing = None
+        if isinstance(z, np.ma.MaskedArray):
+            z, R, H, missing = without_masked(self, z, R, H)
+            if missing is not None and self._constraint is not None:
+                raise ValueError("a rated power needs all measurements at once: mask them all if one is missing")
         reference = self._next_reference(z, reference)
         if z is None:
             super().update(None)
             return
-        z, R, H = checked_measurement(self, z, R, H)
-        self._scaled_step("update", lambda scaled: KalmanFilter.update(self, scaled, R, H), z, H, reference)
+        plain = self._constraint is None and self._unconstrained_factor == 1.0
+        if plain and is_usual_measurement(self, z, R, H):
+            self._all_or_nothing(super().update, checked_measurement, z, R, H)
+        else:
+            z, R, H = checked_measurement(self, z, R, H)
+            self._scaled_step(super().update, z, R, H, H=H, reference=reference)
+        if missing is not None:
+            self.z[missing] = np.nan
 
     def update_steadystate(self, z: ArrayLike | None, *, reference: ArrayLike | None = None) -> None:
         """Run filterpy's `update_steadystate` with the measurement scaled; see `update`."""
@@ -408,8 +414,7 @@ class KFOPC(KalmanFilter, Checkpointed):
             return
         reference = self._next_reference(z, reference)
         z, _, _ = checked_measurement(self, z, None, None)
-        step = super().update_steadystate
-        self._scaled_step("update_steadystate", step, z, None, reference)
+        self._scaled_step(super().update_steadystate, z, H=None, reference=reference)
 
     def update_correlated(
         self,
@@ -425,8 +430,7 @@ class KFOPC(KalmanFilter, Checkpointed):
             return
         reference = self._next_reference(z, reference)
         z, R, H = checked_measurement(self, z, R, H)
-        step = super().update_correlated
-        self._scaled_step("update_correlated", lambda scaled: step(scaled, R, H), z, H, reference)
+        self._scaled_step(super().update_correlated, z, R, H, H=H, reference=reference)
 
     def update_sequential(
         self,
@@ -445,8 +449,6 @@ class KFOPC(KalmanFilter, Checkpointed):
         if not 0 <= start <= self.dim_z - length:
             raise ValueError(f"start must be 0 to dim_z - len(z_i) = {self.dim_z - length}, got {start}")
         require_measurement(z_i, length)
-        if H_i is None:
-            require_observation(self, self.H, "H_i")
         rows = self.H[start : start + length] if H_i is None else np.reshape(H_i, (length, self.dim_x))
         require_finite(rows, "H_i")
         noise = self.R[start : start + length, start : start + length] if R_i is None else R_i
@@ -454,13 +456,13 @@ class KFOPC(KalmanFilter, Checkpointed):
         if not np.any(rows) and not np.any(noise):
             raise ValueError(SILENT_REFERENCE)
 
-        def step(scaled: Any) -> None:
+        def update_sequential(scaled: Any, R_i: Any, H_i: Any) -> None:
             # filterpy writes into these four in place: give it copies, so that the step can be undone
             self.x, self.y, self.K = self.x.copy(), self.y.copy(), self.K.copy()
             self.z = np.array(self.z).reshape(self.dim_z, 1)
             KalmanFilter.update_sequential(self, start, scaled, R_i, H_i)
 
-        self._scaled_step("update_sequential", step, z_i, rows, reference, start)
+        self._scaled_step(update_sequential, z_i, R_i, H_i, H=rows, reference=reference, start=start)
 
     def batch_filter(
         self,
@@ -481,8 +483,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         Parameters
         ----------
         zs : sequence or numpy.ma.MaskedArray
-            As in filterpy: a sample of None is missing. So is a masked sample, and a sample of several measurements if
-            any of them is masked.
+            As in filterpy: a sample of None is missing. So are masked components, as in `update`.
         Fs, Qs, Hs, Rs, Bs, us, update_first, saver
             As in filterpy; each step of `Hs` may be (n,).
         references : array_like, optional
@@ -514,10 +515,12 @@ class KFOPC(KalmanFilter, Checkpointed):
         for name, given in {"Fs": Fs, "Qs": Qs, "Hs": Hs, "Rs": Rs, "Bs": Bs, "us": us}.items():
             if given is not None and len(given) < len(zs):  # filterpy would stop there and leave zeros
                 raise ValueError(f"{name} must have one value for each of the {len(zs)} of zs, got {len(given)}")
+        # in an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None
+        samples = np.fromiter(zs, dtype=object, count=len(zs))
         before = self._snapshot()
         self._batch_references = batch
         try:
-            result = super().batch_filter(_with_none_for_masked(zs), Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
+            result = super().batch_filter(samples, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
         except BaseException:
             restore(self, before)
             raise
@@ -637,21 +640,14 @@ class KFOPC(KalmanFilter, Checkpointed):
         return z if factor == 1.0 else factor * np.asarray(z)
 
     def _scaled_step(
-        self,
-        name: str,
-        step: Callable[[Any], None],
-        z: Any,
-        H: np.ndarray | None,
-        reference: Any,
-        start: int | None = None,
+        self, step: Callable[..., None], z: Any, *others: Any, H: Any, reference: Any, start: int | None = None
     ) -> None:
         """Run `step` on the scaled measurement, then update the powers; an error leaves the filter unchanged."""
         factor = self.constraint_factor
         if self._constraint is not None:
             shared, sample = self._powers_sample(z, self.H if H is None else H, reference)
             factor = shared.preview(*sample)
-        with self._all_or_nothing(name):
-            step(self._scaled(z, factor))
+        self._all_or_nothing(step, None, self._scaled(z, factor), *others)
         if factor != 1.0:  # store z as given, not scaled, in filterpy's shape
             if start is None:
                 self.z = np.reshape(z, np.shape(self.z)).copy()
@@ -681,22 +677,13 @@ class KFOPC(KalmanFilter, Checkpointed):
 
     def _take_in_edits(self) -> None:
         """Check P if it was assigned or written into since the last step, so that other steps do not pay for it."""
-        if not (np.array_equal(self.P, self.P_post) or np.array_equal(self.P, self.P_prior)):
+        P = np.asarray(self.P).tobytes()
+        if np.asarray(self.P_post).tobytes() != P and np.asarray(self.P_prior).tobytes() != P:
             require_semidefinite(self.P, "P")
 
-    def _all_or_nothing(self, name: str, **arguments: Any) -> AbstractContextManager[None]:
+    def _all_or_nothing(self, step: Callable[..., None], checks: Checks | None, *arguments: Any) -> None:
         self._take_in_edits()
-        return all_or_nothing(self, name, **arguments)
-
-
-def _with_none_for_masked(zs: Sequence[Any] | np.ndarray) -> np.ndarray:
-    """Return the samples, None for each that is masked in whole or in part.
-
-    In an array of objects, because filterpy 1.4.5 cannot count a list of arrays and None.
-    """
-    samples = (None if np.ma.is_masked(z) else z for z in zs)
-    plain = (z.data if isinstance(z, np.ma.MaskedArray) else z for z in samples)
-    return np.fromiter(plain, dtype=object, count=len(zs))
+        run_or_undo(self, step, arguments, checks)
 
 
 class BatchReferences:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from math import isfinite, log, nan, pi, sqrt
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,16 @@ from .._validate import as_count, as_nonnegative, as_number, require_finite
 from ..core.block import LOUD_STEP, NO_SOLUTION
 from ..core.triangle import covariance_update, direction_of
 from ..power.constraint import OutputPowerConstraint
-from .checked_steps import SILENT_REFERENCE, State, checked_measurement, require_observation
+from .checked_steps import (
+    SILENT_REFERENCE,
+    Checks,
+    State,
+    checked_measurement,
+    restore,
+    run_or_undo,
+    state_of,
+    without_masked,
+)
 from .covariance import RandomWalkCovariance, require_covariance
 from .kfopc import KFOPC
 
@@ -292,14 +300,18 @@ class RandomWalkKFOPC(KFOPC):
 
     # The steps.
 
-    @contextmanager
-    def _all_or_nothing(self, name: str, **arguments: Any) -> Iterator[None]:
+    def _all_or_nothing(self, step: Callable[..., None], checks: Checks | None, *arguments: Any) -> None:
         """Run filterpy's own equations, which see P, F, Q as full arrays."""
-        with super()._all_or_nothing(name, **arguments):
+        self._take_in_edits()
+        before = state_of(self)
+        try:
             self._replace_covariance(self._covariance.full(self._covariance.now))
             self._delegating = True
-            yield
+            run_or_undo(self, step, arguments, checks)
             self._delegating = False
+        except BaseException:
+            restore(self, before)
+            raise
 
     def predict(
         self,
@@ -331,14 +343,14 @@ class RandomWalkKFOPC(KFOPC):
         reference: ArrayLike | None = None,
     ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
+        if isinstance(z, np.ma.MaskedArray):
+            z, R, H, _ = without_masked(self, z, R, H)
         row: Any = self.H if H is None else H
         measurement: Any
         own_inverse = self.inv is not np.linalg.inv
         if z is not None and (own_inverse or np.size(row) != self.dim_x):
             super().update(z, R, H, reference=reference)
             return
-        if z is not None:
-            require_observation(self, row)
         reference = self._next_reference(z, reference)
         self._take_in_edits()
         if z is None:

@@ -78,6 +78,11 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
     assert "     1 x  2 x  3,   16" in printed
     assert "times as fast as filterpy" in printed
     assert "16 taps, 200 samples" in printed
+    for row in result["beside_filterpy"]:
+        assert 0.0 < row["ours_us"] < 1e6
+        assert row["what"] in printed
+    many = result["beside_filterpy"][-1]
+    assert many["filterpy_us"] > 5 * many["ours_us"], many  # O(L^3) against O(L^2) at 256 taps
     assert "1.0 s for `simulate`" in printed
 
 

@@ -17,12 +17,17 @@ def test_the_figures_say_what_the_page_says():
     assert v.ours.log_likelihood == v.theirs.log_likelihood
     assert 0.05 < np.mean(np.isnan(v.measured)) < 0.15
 
-    v = page.run(until="Banks of filters: IMM and MMAE")
+    v = page.run(until="Gaps in a vector measurement")
     assert np.array_equal(v.xs, v.their_xs)
     assert np.array_equal(v.smoothed, v.their_smoothed)
     np.testing.assert_array_equal(v.saver.P, v.Ps)
     errors = [v.rms(signal - v.position) for signal in (v.masked, v.xs[:, 0, 0], v.smoothed[:, 0, 0])]
     assert errors[0] > 1.5 * errors[1] > 1.5 * errors[2]
+
+    v = page.run(until="Banks of filters: IMM and MMAE")
+    np.testing.assert_allclose(v.kf.x, v.theirs.x, rtol=1e-12)
+    assert np.array_equal(v.in_a_batch[-1], v.kf.x)
+    assert 0.3 < np.mean(v.pair_of_sensors.mask[:, 1]) < 0.7
 
     v = page.run(until="A bank with a rated power")
     for got, expected in zip(v.banks(v.KFOPC), v.banks(v.KalmanFilter), strict=True):

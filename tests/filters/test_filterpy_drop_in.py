@@ -311,9 +311,8 @@ def steady_state(cls: type) -> list:
 
 
 def defaults(cls: type) -> list:
-    """test_default_dims, with its zeros for H assigned: KFOPC refuses an update if no H was (test_refusals)."""
+    """test_default_dims, in which H keeps its zeros."""
     kf = cls(dim_x=3, dim_z=1)
-    kf.H = np.zeros((1, 3))
     kf.predict()
     kf.update(np.array([[1.0]]).T)
     return [kf.x, kf.P, kf.K]

@@ -1,4 +1,8 @@
-"""A masked sample of `batch_filter` is a missing one: the run with None written by hand is the oracle, bit for bit."""
+"""Masked components of a measurement are missing.
+
+The run with None written by hand is the oracle where all are masked, bit for bit. Where some are, it is filterpy's update
+with their rows left out of H and R, and over a whole record dense batch least squares.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from filterpy.common import Saver
+from filterpy.kalman import KalmanFilter
 
 from kfopc_filterpy import KFOPC
 
@@ -62,18 +68,6 @@ def test_masked_samples_are_missing_without_references(kind: str, update_first: 
     require_same_run(kf, other, masked(Z), by_hand(Z), Hs=list(ROWS), update_first=update_first)
 
 
-@pytest.mark.parametrize("shape", [(STEPS, 2), (STEPS, 2, 1)])
-def test_a_vector_sample_is_missing_if_any_element_is_masked(shape: tuple[int, ...]) -> None:
-    kf, other = KFOPC(N, 2), KFOPC(N, 2)
-    for f in (kf, other):
-        f.H = np.eye(2, N)
-    z = np.random.default_rng(5).normal(size=shape)
-    zs = masked(z)
-    zs.mask[list(MISSING[1:]), 0] = False  # the second element only
-    assert zs[7].mask.sum() == 1
-    require_same_run(kf, other, zs, by_hand(z))
-
-
 def test_a_list_may_hold_masked_samples() -> None:
     kf, other = MAKERS["general"](), MAKERS["general"]()
     zs = [np.ma.masked if z is None else np.ma.array([z]) for z in by_hand(Z)]
@@ -94,3 +88,134 @@ def test_a_batch_of_masked_samples_only_is_a_prediction() -> None:
     means, covariances, _, _ = kf.batch_filter(np.ma.masked_all(3))
     assert not means.any()
     np.testing.assert_array_equal(covariances[-1], 4.0 * np.eye(N))
+
+
+# Some components of a measurement
+
+
+STATES, SENSORS = 4, 3
+
+
+def system(cls: type, x_ndim: int = 2) -> Any:
+    """A filter with correlated sensors."""
+    rng = np.random.default_rng(8)
+    kf = cls(STATES, SENSORS)
+    kf.x = rng.normal(size=(STATES, 1)[:x_ndim])
+    kf.F = np.eye(STATES) + 0.1 * np.eye(STATES, k=2)
+    kf.H = rng.normal(size=(SENSORS, STATES))
+    root = rng.normal(size=(SENSORS, SENSORS))
+    kf.R, kf.Q = root @ root.T + 0.1 * np.eye(SENSORS), 0.02 * np.eye(STATES)
+    return kf
+
+
+def record(steps: int) -> np.ma.MaskedArray:
+    """Measurements of which about 40 % are missing, all of them in some steps, with NaN behind the mask."""
+    rng = np.random.default_rng(9)
+    z = rng.normal(size=(steps, SENSORS))
+    z[rng.random(z.shape) < 0.4] = np.nan
+    z[5] = np.nan
+    return np.ma.masked_invalid(z)
+
+
+@pytest.mark.parametrize("x_ndim", [1, 2])
+@pytest.mark.parametrize("given", ["nothing", "H", "R", "a number R"])
+def test_the_rows_that_are_there_correct_the_state(x_ndim: int, given: str) -> None:
+    kf, oracle = system(KFOPC, x_ndim), system(KalmanFilter, x_ndim)
+    rng = np.random.default_rng(10)
+    for z in record(60):
+        H = rng.normal(size=(SENSORS, STATES)) if given == "H" else None
+        R = {"R": np.diag(rng.uniform(0.1, 1.0, SENSORS)), "a number R": 0.3}.get(given)
+        for f in (kf, oracle):
+            f.predict()
+        kf.update(z, R=R, H=H)
+        there = ~z.mask
+        oracle.dim_z = there.sum()  # filterpy 1.4.5 wants as many values
+        if there.any():
+            noise = 0.3 * np.eye(SENSORS) if given == "a number R" else oracle.R if R is None else R
+            row = oracle.H if H is None else H
+            oracle.update(z.data[there].reshape((-1, 1)[:x_ndim]), R=noise[np.ix_(there, there)], H=row[there])
+            np.testing.assert_allclose(kf.log_likelihood, oracle.log_likelihood, rtol=1e-12, atol=1e-12)
+            distance = np.sqrt(oracle.y.ravel() @ oracle.SI @ oracle.y.ravel())  # 1.4.5's own fails on numpy 2
+            np.testing.assert_allclose(kf.mahalanobis, distance, rtol=1e-12)
+            np.testing.assert_array_equal(kf.z.ravel(), np.where(there, z.data, np.nan))
+            assert not kf.y[~there].any()
+            assert not kf.K[:, ~there].any()
+        else:
+            oracle.update(None)
+        np.testing.assert_allclose(kf.x, oracle.x, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(kf.P, oracle.P, rtol=1e-12, atol=1e-12)
+
+
+def test_a_batch_with_gaps_is_its_steps_and_a_saver_keeps_it() -> None:
+    kf, steps, zs = system(KFOPC), system(KFOPC), record(30)
+    zs[zs.mask.all(axis=1)] = 0.0  # filterpy keeps None in z where all are missing
+    saver = Saver(kf)
+    means, covariances, _, _ = kf.batch_filter(zs, saver=saver)
+    saver.to_array()
+    for k, z in enumerate(zs):
+        steps.predict()
+        steps.update(z)
+        np.testing.assert_array_equal(means[k], steps.x)
+        np.testing.assert_array_equal(covariances[k], steps.P)
+    assert saver.z.shape == (30, SENSORS, 1)
+    np.testing.assert_array_equal(np.isnan(saver.z[..., 0]), zs.mask)
+
+
+def test_the_smoother_over_gaps_is_batch_least_squares() -> None:
+    """The states of all steps together, as one dense system with a row for each equation."""
+    kf, steps, zs = system(KFOPC), 12, record(12)
+    start, P = kf.x.copy(), kf.P.copy()
+    means, covariances, _, _ = kf.batch_filter(zs)
+    smoothed, smoothed_P, _, _ = kf.rts_smoother(means, covariances)
+
+    size = steps * STATES
+    information, right = np.zeros((size, size)), np.zeros((size, 1))
+    for k, z in enumerate(zs):
+        equations = np.zeros((STATES, size))  # x_k - F x_{k-1} = noise Q; the first state has F P F' + Q
+        equations[:, k * STATES : (k + 1) * STATES] = np.eye(STATES)
+        known, noise = kf.F @ start, kf.F @ P @ kf.F.T + kf.Q
+        if k:
+            equations[:, (k - 1) * STATES : k * STATES] = -kf.F
+            known, noise = np.zeros((STATES, 1)), kf.Q
+        information += equations.T @ np.linalg.solve(noise, equations)
+        right += equations.T @ np.linalg.solve(noise, known)
+        there = ~z.mask
+        rows = np.zeros((there.sum(), size))
+        rows[:, k * STATES : (k + 1) * STATES] = kf.H[there]
+        weighted = np.linalg.solve(kf.R[np.ix_(there, there)], rows).T
+        information += weighted @ rows
+        right += weighted @ z.data[there].reshape(-1, 1)
+    covariance = np.linalg.inv(information)
+    np.testing.assert_allclose(smoothed.reshape(-1, 1), covariance @ right, rtol=1e-9, atol=1e-10)
+    for k in range(steps):
+        part = slice(k * STATES, (k + 1) * STATES)
+        np.testing.assert_allclose(smoothed_P[k], covariance[part, part], rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("z", "match"),
+    [
+        (np.ma.array([1.0, 2.0], mask=[False, True]), r"z must have 3 value\(s\), the masked ones included"),
+        (np.ma.array([np.nan, 2.0, 0.0], mask=[False, False, True]), "z must be finite"),
+    ],
+)
+def test_what_is_wrong_beside_a_gap_is_refused(z: np.ma.MaskedArray, match: str) -> None:
+    kf, twin = system(KFOPC), system(KFOPC)
+    with pytest.raises(ValueError, match=match):
+        kf.update(z)
+    for name in ("x", "P", "y", "z"):
+        np.testing.assert_array_equal(getattr(kf, name), getattr(twin, name))
+
+
+def test_a_rated_power_needs_all_measurements() -> None:
+    """The power of the disturbance cannot be taken from some of the microphones."""
+    kf, twin = (KFOPC(STATES, 2, rated_power=1.0) for _ in range(2))
+    H = np.ones((2, STATES))
+    with pytest.raises(ValueError, match="a rated power needs all measurements at once: mask them all"):
+        kf.update(np.ma.array([1.0, 2.0], mask=[False, True]), H=H, reference=1.0)
+    kf.update(np.ma.masked_all(2), H=H, reference=1.0)
+    twin.update(None)
+    for f in (kf, twin):
+        f.update([1.0, 2.0], H=H, reference=1.0)
+    np.testing.assert_array_equal(kf.x, twin.x)
+    assert kf.disturbance_power == twin.disturbance_power

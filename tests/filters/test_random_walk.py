@@ -465,9 +465,9 @@ def test_batch_filter_stays_fast_and_saves() -> None:
     delegated: list[str] = []
     original = type(ours)._all_or_nothing
     try:
-        type(ours)._all_or_nothing = lambda self, name, **kwargs: (
-            delegated.append(name),
-            original(self, name, **kwargs),
+        type(ours)._all_or_nothing = lambda self, step, *arguments: (
+            delegated.append(step.__name__),
+            original(self, step, *arguments),
         )[1]
         got = ours.batch_filter(zs, Hs=list(rows), saver=savers[0])
     finally:
