@@ -374,8 +374,9 @@ class KFOPC(KalmanFilter, Checkpointed):
         Raises
         ------
         ValueError
-            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference with R = 0, or a rated power with neither a reference nor a secondary-path
-            gain, or with only some of the measurements. The filter is unchanged and can continue.
+            NaN or Inf, a wrong shape, a negative variance, a P that is not positive semidefinite, a silent reference
+            with R = 0, or a rated power with neither a reference nor a secondary-path gain, or with only some of the
+            measurements. The filter is unchanged and can continue.
         TypeError
             A measurement that is not a real number.
 
