@@ -1,3 +1,4 @@
+from .consistency import plot_consistency as plot_consistency
 from .paths import plot_bode as plot_bode
 from .paths import plot_causality_margin as plot_causality_margin
 from .paths import plot_group_delay as plot_group_delay

@@ -1,0 +1,262 @@
+"""Estimates within limits: closed forms, optimality conditions, scipy's minimiser, and KF-PB's price."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
+from oracles.power_budget import System
+from scipy.linalg import toeplitz
+from scipy.optimize import minimize
+
+from kfopc_filterpy import KFOPC
+from kfopc_filterpy.filters import constrained
+
+
+def made(n: int, seed: int, kind=KalmanFilter):
+    """A filter with a random estimate and covariance."""
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((n, n))
+    kf = kind(dim_x=n, dim_z=1)
+    kf.x, kf.P = rng.standard_normal((n, 1)), root @ root.T + 0.1 * np.eye(n)
+    return kf
+
+
+def everything(n: int, seed: int):
+    """Limits of every kind that a random state keeps, some of them by little."""
+    rng = np.random.default_rng(1000 + seed)
+    inside, root = 0.3 * rng.standard_normal(n), rng.standard_normal((n, n))
+    D, A, M = rng.standard_normal((1, n)), rng.standard_normal((3, n)), root @ root.T
+    return {
+        "equalities": (D, D @ inside),
+        "inequalities": (A, A @ inside + rng.uniform(0.0, 0.5, 3)),
+        "lower": inside - rng.uniform(0.05, 1.0, n),
+        "upper": inside + rng.uniform(0.05, 1.0, n),
+        "power": (M, 1.1 * inside @ M @ inside),
+    }
+
+
+def optimality(kf, x, limits):
+    """Largest violation of a limit, and of the Karush-Kuhn-Tucker conditions, relative to the gradient.
+
+    The gradient of the distance must be a combination of the normals of the limits that are active, with weights of the
+    right sign for inequalities: non-negative least squares finds how much of it is none.
+    """
+    from scipy.optimize import nnls
+
+    x, n = x.ravel(), x.size
+    D, d = limits.get("equalities", (np.zeros((0, n)), np.zeros(0)))
+    rows, room = [], []
+    if "inequalities" in limits:
+        A, b = limits["inequalities"]
+        rows, room = [*A], [*(b - A @ x)]
+    for i in range(n):
+        for name, sign in (("lower", -1), ("upper", 1)):
+            if name in limits:
+                rows.append(sign * np.eye(n)[i])
+                room.append(sign * (np.broadcast_to(limits[name], n)[i] - x[i]))
+    if "power" in limits:
+        M, rho = limits["power"]
+        rows.append(M @ x / rho)
+        room.append(1 - x @ M @ x / rho)
+    room = np.array(room)
+    gradient = np.linalg.solve(kf.P, kf.x.ravel() - x)
+    normals = [row for row, left in zip(rows, room, strict=True) if left < 1e-7]
+    basis = np.array([*normals, *D, *(-D)]).reshape(-1, n).T
+    left = nnls(basis, gradient)[1] if basis.size else np.linalg.norm(gradient)
+    broken = max(np.max(-room, initial=0.0), np.max(np.abs(D @ x - d), initial=0.0))
+    return broken, left / max(np.linalg.norm(gradient), 1.0)
+
+
+KINDS = ["equalities", "inequalities", "lower", "upper", "power"]
+
+
+@pytest.mark.parametrize("kind", [KalmanFilter, KFOPC])
+@pytest.mark.parametrize("names", [KINDS, KINDS[:1], KINDS[1:2], KINDS[2:4], KINDS[4:], KINDS[:4], KINDS[1:]])
+def test_the_state_keeps_the_limits_and_the_optimality_conditions(kind, names):
+    """Tolerance 1e-8: 1e-9 is promised of linear limits; the weights of the normals round with the condition of P."""
+    moved = 0
+    for seed in range(25):
+        n = 2 + seed % 5
+        kf, limits = made(n, seed, kind), {name: everything(n, seed)[name] for name in names}
+        x = constrained(kf, **limits)
+        assert x.shape == kf.x.shape
+        assert max(optimality(kf, x, limits)) < 1e-8, seed
+        moved += not np.allclose(x, kf.x)
+    assert moved > 12
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_scipys_minimiser_finds_no_nearer_state(seed):
+    """SLSQP stops at a relative change of 1e-12 of the distance, so its states are good to about 1e-5."""
+    kf, limits = made(4, seed), everything(4, seed)
+    (D, d), (A, b), (M, rho) = limits["equalities"], limits["inequalities"], limits["power"]
+    inverse, estimate = np.linalg.inv(kf.P), kf.x.ravel()
+    found = minimize(
+        lambda x: (x - estimate) @ inverse @ (x - estimate),
+        np.zeros(4),
+        jac=lambda x: 2 * inverse @ (x - estimate),
+        bounds=list(zip(limits["lower"], limits["upper"], strict=True)),
+        constraints=[
+            {"type": "eq", "fun": lambda x: D @ x - d},
+            {"type": "ineq", "fun": lambda x: b - A @ x},
+            {"type": "ineq", "fun": lambda x: rho - x @ M @ x},
+        ],
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 500},
+    )
+    assert found.success
+    assert_allclose(constrained(kf, **limits).ravel(), found.x, atol=2e-5)
+
+
+def test_equalities_have_the_closed_form_and_projection_its_covariance():
+    kf = made(5, 3)
+    D, d = np.random.default_rng(0).standard_normal((2, 5)), np.array([1.0, -2.0])
+    P, x = kf.P.copy(), kf.x.copy()
+    gain = P @ D.T @ np.linalg.inv(D @ P @ D.T)
+    expected = x - gain @ (D @ x - d[:, None])
+    assert_allclose(constrained(kf, equalities=(D, d)), expected, rtol=1e-12, atol=1e-12)
+    assert np.array_equal(kf.x, x) and np.array_equal(kf.P, P)  # noqa: PT018
+    constrained(kf, equalities=(D, d), project=True)
+    assert_allclose(kf.x, expected, rtol=1e-12, atol=1e-12)
+    assert_allclose(kf.P, P - gain @ D @ P, atol=1e-12 * np.abs(P).max())
+    assert_allclose(D @ kf.P, 0, atol=1e-12 * np.abs(P).max())
+    assert_allclose(constrained(kf, equalities=(D, d)), kf.x, atol=1e-12)  # a P that is singular, and already there
+
+
+def test_inequalities_and_a_power_leave_the_covariance_as_it_is():
+    kf = made(3, 5)
+    P = kf.P.copy()
+    x = constrained(kf, upper=-1.0, power=(np.eye(3), 100.0), project=True)
+    assert np.array_equal(kf.x, x) and np.array_equal(kf.P, P)  # noqa: PT018
+    kf.x[0] = 7.0
+    assert x[0, 0] <= -1.0  # what was returned is an array of its own
+
+
+def test_a_filter_goes_on_after_a_projection_and_on_the_random_walk():
+    kf = KFOPC.random_walk(3, state_noise=0.1, measurement_noise=0.1)
+    kf.predict()
+    kf.update(5.0, H=np.array([1.0, 0.5, 0.2]))
+    constrained(kf, equalities=([1.0, 1.0, 1.0], 1.0), upper=0.9, project=True)
+    assert_allclose(kf.x.sum(), 1.0)
+    assert kf.x.max() <= 0.9 + 1e-9
+    kf.predict()
+    kf.update(1.0, H=np.array([0.0, 1.0, 0.0]))
+    assert np.all(np.isfinite(kf.P))
+
+
+def test_without_a_limit_that_acts_the_estimate_is_returned():
+    kf = made(4, 2)
+    assert_allclose(constrained(kf), kf.x, rtol=0, atol=0)
+    assert_allclose(constrained(kf, lower=-50.0, upper=np.full(4, np.inf), power=(np.eye(4), 1e4)), kf.x, atol=1e-14)
+
+
+def test_a_diagonal_covariance_clips_at_the_box_in_any_units():
+    kf = made(3, 0)
+    kf.x, kf.P = np.array([3e6, -2e-9, 1.0]), np.diag([1e10, 1e-20, 1.0])
+    assert_allclose(constrained(kf, lower=[0, -1e-9, -1], upper=[1e6, 1, 1]), [1e6, -1e-9, 1.0], rtol=1e-12)
+
+
+def test_a_limit_many_deviations_away_is_kept_too():
+    kf = made(3, 8)
+    kf.P *= 1e-12
+    limits = {"inequalities": (np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0]]), np.array([-40.0, -30.0]))}
+    x = constrained(kf, **limits).ravel()
+    assert_allclose(limits["inequalities"][0] @ x, [-40.0, -30.0], rtol=1e-9)
+
+
+def test_a_state_that_is_known_does_not_move():
+    kf = made(2, 1)
+    kf.x, kf.P = np.array([1.0, 2.0]), np.diag([0.0, 1.0])
+    assert_allclose(constrained(kf, equalities=([1.0, 1.0], 2.0)), [1.0, 1.0])
+    with pytest.raises(ValueError, match="contradict"):
+        constrained(kf, upper=0.5)
+    with pytest.raises(ValueError, match="contradict"):
+        constrained(kf, equalities=([1.0, 0.0], 0.5))
+    kf.P = np.zeros((2, 2))
+    assert_allclose(constrained(kf, upper=5.0, equalities=([1.0, 0.0], 1.0)), kf.x)
+
+
+def test_the_price_of_KF_PB_is_this_limit_with_the_autocorrelation_matrix():
+    """KF-PB solves (A + price R) v = b: the estimate A^-1 b with the covariance A^-1, limited to v' R v <= rho.
+
+    `price_of` stops within 0.5 % of the power. With the power that it took as the limit, both are the same to rounding
+    with the condition of A.
+    """
+    rng = np.random.default_rng(4)
+    x = np.convolve(rng.standard_normal(4000), [1.0, 0.6, 0.2])
+    heard = np.convolve(x, [0.0, 1.0, 0.5])
+    taps = 12
+
+    def lags(signal):
+        middle = signal.size - 1
+        return np.correlate(signal, signal, "full")[middle - taps + 1 : middle + taps] / signal.size
+
+    A, R, b = lags(heard)[None, None], lags(x)[None, None], rng.standard_normal((1, taps))
+    A[0, 0, taps - 1] += 0.05
+    system = System(A, R, b)
+    whole, M = (toeplitz(lag[0, 0, taps - 1 :]) for lag in (system.A, system.R))
+    kf = SimpleNamespace(x=np.linalg.solve(whole, b[0]), P=np.linalg.inv(whole))
+    kf.P = 0.5 * (kf.P + kf.P.T)
+    for share in (0.9, 0.5, 0.1, 0.01):
+        rho = share * kf.x @ M @ kf.x
+        price, v, taken = system.price_of(rho, 0.0)
+        assert price > 0
+        assert abs(taken / rho - 1) < 0.005
+        assert_allclose(constrained(kf, power=(M, taken)), v[0], rtol=1e-8, atol=1e-10 * np.abs(v).max())
+    assert_allclose(constrained(kf, power=(M, 1.01 * kf.x @ M @ kf.x)), kf.x)  # price 0
+
+
+@pytest.mark.parametrize(
+    ("limits", "error", "message"),
+    [
+        ({"upper": -1.0, "lower": 1.0}, ValueError, r"lower\[0\] = 1 must not be above upper\[0\] = -1"),
+        ({"upper": [1.0, 2.0]}, ValueError, r"upper must be one number or \(3,\), with inf for a state without one"),
+        ({"upper": np.nan}, ValueError, "upper must be"),
+        ({"lower": np.inf}, ValueError, "lower must be one number"),
+        ({"equalities": np.eye(3)}, TypeError, r"equalities must be a pair of a matrix \(m, 3\)"),
+        ({"equalities": (np.eye(3), 1.0)}, ValueError, "one row and one value for each limit"),
+        ({"inequalities": (np.eye(2), np.ones(2))}, ValueError, r"a matrix \(m, 3\) and values"),
+        ({"inequalities": ([1.0, np.nan, 0.0], 1.0)}, ValueError, r"inequalities\[0\] must be finite"),
+        ({"inequalities": (["a", "b", "c"], 1.0)}, TypeError, r"inequalities\[0\] must be a sequence of real"),
+        ({"power": np.eye(3)}, TypeError, "power must be a pair"),
+        ({"power": (np.eye(2), 1.0)}, ValueError, r"power\[0\] must have shape \(3, 3\), got \(2, 2\)"),
+        ({"power": (np.eye(3), 0.0)}, ValueError, r"power\[1\] must be greater than 0"),
+        (
+            {"power": (-np.eye(3), 1.0)},
+            ValueError,
+            r"power\[0\] must be symmetric and positive semidefinite.*negative variances",
+        ),
+        ({"power": (np.triu(np.ones((3, 3))), 1.0)}, ValueError, "must be symmetric"),
+        ({"inequalities": ([[1, 0, 0], [-1, 0, 0]], [-1.0, -1.0])}, ValueError, "contradict"),
+        ({"equalities": ([[1, 0, 0], [2, 0, 0]], [1.0, 1.0])}, ValueError, "contradict"),
+        ({"equalities": ([1, 0, 0], 1.0), "upper": 0.5}, ValueError, "contradict"),
+        ({"lower": 1.0, "power": (np.eye(3), 2.0)}, ValueError, r"x' M x <= 2 keeps the other limits: raise rho"),
+    ],
+)
+def test_limits_that_cannot_be_kept_or_read_are_refused_and_change_nothing(limits, error, message):
+    kf = made(3, 6)
+    x, P = kf.x.copy(), kf.P.copy()
+    with pytest.raises(error, match=message):
+        constrained(kf, project=True, **limits)
+    assert np.array_equal(kf.x, x)
+    assert np.array_equal(kf.P, P)
+
+
+@pytest.mark.parametrize(
+    ("x", "P", "message"),
+    [
+        (np.zeros((1, 2)), np.eye(2), r"kf.x must have shape \(n,\) or \(n, 1\), got \(1, 2\)"),
+        (np.zeros(3), np.eye(2), r"kf.P must have shape \(3, 3\), got \(2, 2\)"),
+        (np.zeros(2), -np.eye(2), "negative variances"),
+        (np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]), "positive semidefinite"),
+        (np.full(2, np.nan), np.eye(2), "x must be finite"),
+        (np.zeros(2), np.full((2, 2), np.inf), "P must be finite"),
+    ],
+)
+def test_a_filter_whose_state_is_no_estimate_is_refused(x, P, message):
+    with pytest.raises(ValueError, match=message):
+        constrained(SimpleNamespace(x=x, P=P), upper=1.0)
