@@ -30,9 +30,9 @@ class NoiseFit:
 
     Attributes
     ----------
-    q, r : ndarray, shapes (n_Q_parts,) and (n_R_parts,)
+    state_noise, measurement_noise : ndarray, shapes (n_Q_parts,) and (n_R_parts,)
         Factors of the parts of Q and of R. 0 if the record shows none of that noise.
-    q_errors, r_errors : ndarray, shapes (n_Q_parts,) and (n_R_parts,)
+    state_noise_errors, measurement_noise_errors : ndarray, shapes (n_Q_parts,) and (n_R_parts,)
         Their standard errors; NaN for a factor of 0, where the likelihood has no peak.
     Q, R : ndarray, shapes (n, n) and (dim_z, dim_z)
         The noises themselves.
@@ -40,10 +40,10 @@ class NoiseFit:
         Natural logarithm of the density of the record, at these noises.
     """
 
-    q: np.ndarray
-    r: np.ndarray
-    q_errors: np.ndarray
-    r_errors: np.ndarray
+    state_noise: np.ndarray
+    measurement_noise: np.ndarray
+    state_noise_errors: np.ndarray
+    measurement_noise_errors: np.ndarray
     Q: np.ndarray
     R: np.ndarray
     log_likelihood: float
@@ -55,11 +55,10 @@ class NoiseFit:
         return "\n".join([*self._lines(), f"log-likelihood {self.log_likelihood:.2f}"])
 
     def _lines(self) -> list[str]:
-        groups = ("q", self.q, self.q_errors), ("r", self.r, self.r_errors)
         return [
             f"{name}[{i}] = {value:.3g} ± {error:.2g}"
-            for name, values, errors in groups
-            for i, (value, error) in enumerate(zip(values, errors, strict=True))
+            for name in ("state_noise", "measurement_noise")
+            for i, (value, error) in enumerate(zip(getattr(self, name), getattr(self, f"{name}_errors"), strict=True))
         ]
 
 
@@ -84,10 +83,10 @@ def fit_noise(
     H : array_like, shape (dim_z, n) or (n_samples, dim_z, n), optional
         Observation matrix, or that of each sample; by default ``kf.H``.
     Q_parts : sequence of array_like, each of shape (n, n), optional
-        Positive semidefinite matrices. Q is to be their sum, each multiplied by a factor, q. By default ``[kf.Q]``: with
+        Positive semidefinite matrices. Q is to be their sum, each multiplied by a factor. By default ``[kf.Q]``: with
         ``Q_discrete_white_noise(var=1)`` the factor is the variance of the acceleration. An empty list keeps ``kf.Q``.
     R_parts : sequence of array_like, each of shape (dim_z, dim_z), optional
-        The same for R, whose factors are r. By default ``[kf.R]``.
+        The same for R. By default ``[kf.R]``.
 
     Returns
     -------
@@ -116,7 +115,7 @@ def fit_noise(
 
     Derivatives are central differences over 1e-3 of a log-variance, which are good to about 1e-6, and so are the
     factors. The standard errors come from the inverse of the observed information, the negative second derivative of the
-    log-likelihood, and of factors by :math:`\sigma(q) = q\, \sigma(\log q)`. They hold for long records. All points of a
+    log-likelihood, and of factors by :math:`\sigma(f) = f\, \sigma(\log f)`. They hold for long records. All points of a
     difference go through the record together.
 
     A record with a steady error of the model (a wrong F, a bias) puts it into the noises.
@@ -137,8 +136,8 @@ def fit_noise(
     >>> kf = KalmanFilter(dim_x=1, dim_z=1)
     >>> kf.H = np.array([[1.0]])
     >>> print(fit_noise(kf, z))  # true: 0.25 and 4
-    q[0] = 0.229 ± 0.062
-    r[0] = 3.42 ± 0.26
+    state_noise[0] = 0.229 ± 0.062
+    measurement_noise[0] = 3.42 ± 0.26
     log-likelihood -973.80
     """
     record = _Record(kf, z, H)
@@ -174,7 +173,8 @@ def fit_noise(
     if np.any(curvatures < FLAT):
         unclear[found] |= np.abs(vectors[:, 0]) > 0.1
     if unclear.any():
-        names = [f"q[{i}]" for i in range(n_q)] + [f"r[{i}]" for i in range(n_parts - n_q)]
+        names = [f"state_noise[{i}]" for i in range(n_q)]
+        names += [f"measurement_noise[{i}]" for i in range(n_parts - n_q)]
         raise ValueError(
             f"the record does not determine {' and '.join(np.array(names)[unclear])}: the likelihood is the same for other "
             "values; give fewer parts, or a longer record"

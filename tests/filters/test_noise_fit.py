@@ -88,14 +88,14 @@ def test_the_noises_are_at_the_peak_of_the_joint_density(case):
 
     start = np.log([q, r])
     found = minimize(negative, start, method="Nelder-Mead", options={"xatol": 1e-8, "fatol": 1e-12, "maxiter": 500})
-    assert_allclose([fit.q[0], fit.r[0]], np.exp(found.x), rtol=1e-4)
+    assert_allclose([fit.state_noise[0], fit.measurement_noise[0]], np.exp(found.x), rtol=1e-4)
     h, information = 1e-2 * np.eye(2), np.zeros((2, 2))
     for i in range(2):
         for j in range(2):
             corners = [negative(found.x + a * h[i] + b * h[j]) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
             information[i, j] = (corners[0] - corners[1] - corners[2] + corners[3]) / (4 * 1e-4)
     errors = np.sqrt(np.diag(np.linalg.inv(information))) * np.exp(found.x)
-    assert_allclose([fit.q_errors[0], fit.r_errors[0]], errors, rtol=1e-3)
+    assert_allclose([fit.state_noise_errors[0], fit.measurement_noise_errors[0]], errors, rtol=1e-3)
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.2])
@@ -128,8 +128,8 @@ def test_statsmodels_finds_the_same_noises_errors_and_likelihood(make, missing):
 
     fit, model = fit_noise(kf, z), Model()
     model.ssm.tolerance = 0  # its filter must not stop at a gain that is only nearly steady
-    factors = np.array([fit.q[0], fit.r[0]])
-    errors = np.array([fit.q_errors[0], fit.r_errors[0]])
+    factors = np.array([fit.state_noise[0], fit.measurement_noise[0]])
+    errors = np.array([fit.state_noise_errors[0], fit.measurement_noise_errors[0]])
     assert_allclose(fit.log_likelihood, model.loglike(factors), rtol=1e-10)
     theirs = model.fit(disp=False, cov_type="none", method="bfgs", gtol=1e-6, maxiter=500)
     assert np.all(np.abs(theirs.params - factors) < 1e-3 * errors)
@@ -144,9 +144,9 @@ def test_a_random_walk_without_measurement_noise_has_the_closed_form():
     z = np.cumsum(1.7 * np.random.default_rng(0).standard_normal(400))
     fit = fit_noise(kf, z, R_parts=[])
     q = np.mean(np.diff(z, prepend=0.0) ** 2)
-    assert_allclose(fit.q[0], q, rtol=1e-6)
-    assert_allclose(fit.q_errors[0], q * np.sqrt(2 / 400), rtol=1e-5)
-    assert fit.r.size == 0
+    assert_allclose(fit.state_noise[0], q, rtol=1e-6)
+    assert_allclose(fit.state_noise_errors[0], q * np.sqrt(2 / 400), rtol=1e-5)
+    assert fit.measurement_noise.size == 0
     assert np.array_equal(fit.R, [[0.0]])
 
 
@@ -158,13 +158,16 @@ def test_parts_are_told_apart_and_found_within_their_errors():
     z = drawn(kf, 1.0, 1.0, 1500, seed=3, missing=0.1)
     unit = [np.diag([1.0, 0.0]), np.diag([0.0, 1.0])]
     fit = fit_noise(kf, z, Q_parts=unit, R_parts=unit)
-    for values, errors, true in ((fit.q, fit.q_errors, [0.2, 1.5]), (fit.r, fit.r_errors, [3.0, 0.5])):
+    for values, errors, true in (
+        (fit.state_noise, fit.state_noise_errors, [0.2, 1.5]),
+        (fit.measurement_noise, fit.measurement_noise_errors, [3.0, 0.5]),
+    ):
         assert np.all(np.abs(values - true) < 4 * errors)
         assert np.all(errors < 0.5 * np.array(true))
-    assert_allclose(fit.Q, np.diag(fit.q))
-    assert_allclose(fit.R, np.diag(fit.r))
-    assert str(fit).splitlines()[3].startswith("r[1] = 0.")
-    assert repr(fit).startswith("<NoiseFit: q[0] = 0.")
+    assert_allclose(fit.Q, np.diag(fit.state_noise))
+    assert_allclose(fit.R, np.diag(fit.measurement_noise))
+    assert str(fit).splitlines()[3].startswith("measurement_noise[1] = 0.")
+    assert repr(fit).startswith("<NoiseFit: state_noise[0] = 0.")
 
 
 def test_an_observation_that_changes_with_time_is_used():
@@ -188,10 +191,12 @@ def test_the_scale_of_the_parts_does_not_matter():
 
 def test_a_noise_that_the_record_does_not_show_is_zero():
     fit = fit_noise(local_level(), 2.0 * np.random.default_rng(0).standard_normal(500))
-    assert fit.q[0] == 0
-    assert np.isnan(fit.q_errors[0])
-    assert abs(fit.r[0] - 4.0) < 4 * fit.r_errors[0]
-    assert_allclose(fit.r_errors[0], fit.r[0] * np.sqrt(2 / 500), rtol=0.01)  # of a white noise
+    assert fit.state_noise[0] == 0
+    assert np.isnan(fit.state_noise_errors[0])
+    assert abs(fit.measurement_noise[0] - 4.0) < 4 * fit.measurement_noise_errors[0]
+    assert_allclose(
+        fit.measurement_noise_errors[0], fit.measurement_noise[0] * np.sqrt(2 / 500), rtol=0.01
+    )  # of a white noise
 
 
 def test_a_list_with_none_is_a_masked_record_and_the_filter_is_not_changed():
@@ -237,7 +242,7 @@ def test_a_record_or_a_model_that_cannot_be_used_is_refused(z, arguments, error,
 def test_a_noise_that_does_not_reach_the_measurement_is_not_said_to_be_zero():
     kf = constant_velocity()
     kf.F = np.eye(2)  # the velocity moves nothing
-    with pytest.raises(ValueError, match=r"the record does not determine q\[1\]: the likelihood is the same"):
+    with pytest.raises(ValueError, match=r"the record does not determine state_noise\[1\]: the likelihood is the same"):
         fit_noise(kf, np.cumsum(RECORD), Q_parts=[np.diag([1.0, 0.0]), np.diag([0.0, 1.0])])
 
 
@@ -245,7 +250,7 @@ def test_noises_that_only_their_sum_reaches_are_not_told_apart():
     kf = constant_velocity(rows=2)
     kf.F, kf.H = np.eye(2), np.array([[1.0, 1.0], [2.0, 2.0]])
     z = np.cumsum(RECORD)[:, None] * [1, 2] + RECORD[::-1, None] * [1, -1]
-    with pytest.raises(ValueError, match=r"does not determine q\[0\] and q\[1\]"):
+    with pytest.raises(ValueError, match=r"does not determine state_noise\[0\] and state_noise\[1\]"):
         fit_noise(kf, z, Q_parts=[np.diag([1.0, 0.0]), np.diag([0.0, 1.0])])
 
 
