@@ -48,7 +48,7 @@ def plot_consistency(result: Consistency, *, ax: Sequence[Axes] | None = None) -
     >>> y = np.random.default_rng(0).standard_normal((200, 1))
     >>> axes = plot_consistency(consistency(innovations=y, S=np.ones((200, 1, 1))))
     >>> [ax.get_ylabel() for ax in axes]
-    ['NIS', 'Correlation of the innovations']
+    ['NIS', 'Correlation']
     >>> plt.close(axes[0].figure)
     """
     if not isinstance(result, Consistency):
@@ -57,7 +57,7 @@ def plot_consistency(result: Consistency, *, ax: Sequence[Axes] | None = None) -
     if result.nees is not None and result.nees_bounds is not None:
         errors.append(("NEES", result.nees, np.tile(result.nees_bounds[:, np.newaxis], result.nees.size)))
     axes = np.asarray(new_axes(ax, len(errors) + 1, sharex=False))
-    within = f"{100 * result.coverage:g} % of a right filter are within"
+    within = f"{100 * result.coverage:g} % bounds"
     for panel, (name, values, bounds) in zip(axes, errors, strict=False):
         samples = np.arange(values.size)
         panel.plot(samples, values, ".", markersize=3, color=line_style(0)["color"], label=f"{name} of each sample")
@@ -65,10 +65,10 @@ def plot_consistency(result: Consistency, *, ax: Sequence[Axes] | None = None) -
         panel.plot(samples, bounds[1], **_BOUND)
         panel.set(xlabel="Sample", ylabel=name, xlim=(0, values.size - 1))
     lags = np.arange(1, result.autocorrelation.size + 1)
-    axes[-1].bar(lags, result.autocorrelation, color=line_style(0)["color"], label="correlation at each lag")
+    axes[-1].bar(lags, result.autocorrelation, color=line_style(0)["color"], label="Correlation of the innovations")
     axes[-1].plot(lags, result.autocorrelation_bounds, label=within, **_BOUND)
     axes[-1].plot(lags, -result.autocorrelation_bounds, **_BOUND)
-    axes[-1].set(xlabel="Lag (samples)", ylabel="Correlation of the innovations")
+    axes[-1].set(xlabel="Lag (samples)", ylabel="Correlation")
     for panel in axes:
         panel.grid(True, alpha=0.3)
         legend_above(panel)

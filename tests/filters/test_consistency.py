@@ -201,7 +201,7 @@ def test_the_figure_shows_the_values_and_their_bounds():
         saver, truth = tracked(np.random.default_rng(4), 60)
         result = consistency(saver, truth=truth, max_lag=7)
         axes = plot_consistency(result)
-        assert [ax.get_ylabel() for ax in axes] == ["NIS", "NEES", "Correlation of the innovations"]
+        assert [ax.get_ylabel() for ax in axes] == ["NIS", "NEES", "Correlation"]
         for ax, values, bounds in zip(axes, (result.nis, result.nees), (result.nis_bounds, None), strict=False):
             drawn = [line.get_ydata() for line in ax.get_lines()]
             assert np.array_equal(drawn[0], values)

@@ -179,6 +179,15 @@ def test_an_observation_that_changes_with_time_is_used():
     assert abs(fit_noise(kf, z).log_likelihood - fit.log_likelihood) > 1
 
 
+def test_the_random_walk_of_a_control_filter_is_a_model_like_others():
+    kf = KFOPC.random_walk(3, state_noise=0.01, measurement_noise=0.2)
+    H = np.random.default_rng(2).standard_normal((70, 1, 3))
+    z = drawn(kf, 1.0, 1.0, 70, seed=8, H=H)
+    fit = fit_noise(kf, z, H=H)
+    assert_allclose(fit.log_likelihood, log_density(kf, z, fit.Q, fit.R, H), rtol=1e-9)
+    assert_allclose(fit.Q, fit.state_noise[0] * 0.01 * np.eye(3))
+
+
 def test_the_scale_of_the_parts_does_not_matter():
     kf = constant_velocity()
     z = drawn(kf, 0.3, 2.0, 150, seed=5)
