@@ -81,6 +81,7 @@ def test_several_runs_tell_at_each_sample_and_a_wrong_filter_is_outside():
     savers, truths = zip(*(tracked(np.random.default_rng(seed), 50) for seed in range(40)), strict=True)
     right = consistency(list(savers), truth=np.array(truths))
     assert_allclose(right.nees_bounds, chi2.ppf([0.025, 0.975], 80) / 40)
+    assert_allclose(right.nis_bounds[:, 3], chi2.ppf([0.025, 0.975], 80) / 40)
     one = consistency(savers[0], truth=truths[0])
     rest = consistency(list(savers[1:]), truth=np.array(truths[1:]))
     assert_allclose(right.nees, (one.nees + 39 * rest.nees) / 40, rtol=1e-12)
@@ -118,6 +119,8 @@ def test_samples_that_were_missed_do_not_count():
     assert np.isnan(result.nis_bounds[:, missed]).all()
     there = 80 - missed.sum()
     assert_allclose(result.nis_mean_bounds, chi2.ppf([0.025, 0.975], 2 * there) / (2 * there))
+    pairs = np.sum(~missed[3:] & ~missed[:-3])
+    assert_allclose(result.autocorrelation_bounds[2], 1.959963984540054 / np.sqrt(2 * pairs))
     saver.to_array()
     assert_allclose(consistency(saver, max_lag=4).nis, result.nis)
     assert result.nees is None

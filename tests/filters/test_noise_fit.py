@@ -26,7 +26,7 @@ def constant_velocity(kind=KalmanFilter, rows=1):
     kf = kind(dim_x=2, dim_z=rows)
     kf.F, kf.H = np.array([[1.0, 0.5], [0.0, 1.0]]), np.eye(2)[:rows]
     kf.Q, kf.P = Q_discrete_white_noise(2, dt=0.5, var=1.0), np.diag([50.0, 10.0])
-    kf.R = np.eye(rows)
+    kf.R = np.array([[1.0, 0.4], [0.4, 2.0]])[:rows, :rows]
     return kf
 
 

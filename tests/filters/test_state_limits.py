@@ -162,10 +162,21 @@ def test_a_diagonal_covariance_clips_at_the_box_in_any_units():
 
 def test_a_limit_many_deviations_away_is_kept_too():
     kf = made(3, 8)
-    kf.P *= 1e-12
+    kf.P *= 1e-24
     limits = {"inequalities": (np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 0.0]]), np.array([-40.0, -30.0]))}
     x = constrained(kf, **limits).ravel()
     assert_allclose(limits["inequalities"][0] @ x, [-40.0, -30.0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-20, 1e-10, 1e10, 1e20])
+def test_the_size_of_the_covariance_does_not_matter(size):
+    """Limits are then up to 1e15 deviations away; the state is the same to the rounding of the two solutions."""
+    for seed in range(60):
+        kf, limits = made(2 + seed % 6, seed), everything(2 + seed % 6, seed)
+        limits = {name: limits[name] for name in ("inequalities", "lower", "upper")}
+        expected = constrained(kf, **limits)
+        kf.P *= size
+        assert_allclose(constrained(kf, **limits), expected, rtol=1e-6, atol=1e-8)
 
 
 def test_a_state_that_is_known_does_not_move():
@@ -176,7 +187,9 @@ def test_a_state_that_is_known_does_not_move():
         constrained(kf, upper=0.5)
     with pytest.raises(ValueError, match="contradict"):
         constrained(kf, equalities=([1.0, 0.0], 0.5))
-    kf.P = np.zeros((2, 2))
+    kf.x[0] = np.nextafter(3e8, np.inf)
+    assert_allclose(constrained(kf, upper=[3e8, 1.5]), [3e8, 1.5], rtol=1e-15)  # above by rounding alone
+    kf.x, kf.P = np.array([1.0, 2.0]), np.zeros((2, 2))
     assert_allclose(constrained(kf, upper=5.0, equalities=([1.0, 0.0], 1.0)), kf.x)
 
 
