@@ -91,8 +91,8 @@ def consistency(
     Parameters
     ----------
     saver : filterpy.common.Saver or sequence of them, optional
-        What a filter of filterpy or a `KFOPC` did, saved after each update; several are independent runs of one length. A
-        sample whose ``z`` was None is left out; of one that a `KFOPC` took in part, the components that are there count. The arrays that follow take its place.
+        What a filter of filterpy or a `KFOPC` did, saved after each update; several are independent runs of one length. What
+        was missing, a sample whose ``z`` was None or masked components, does not count. The arrays that follow take its place.
     innovations : array_like, shape (n_samples, dim_z) or (n_runs, n_samples, dim_z), optional
         The filter's ``y``; masked where a measurement is missing.
     S : array_like, shape (n_samples, dim_z, dim_z) or (n_runs, n_samples, dim_z, dim_z), optional
@@ -222,16 +222,13 @@ def _saved(runs: Any) -> tuple[Any, Any, Any, Any]:
     lengths = {len(run.z) for run in runs}
     if len(lengths) != 1:
         raise ValueError(f"the Savers must have saved equally many samples, got {sorted(lengths)}")
-    rows = max(np.size(y) for run in runs for y in run.y)
-    innovations = np.ma.array(np.zeros((len(runs), *lengths, rows)), mask=True)
-    S = np.tile(np.eye(rows), (len(runs), *lengths, 1, 1))
-    for i, run in enumerate(runs):
-        for k, (z, y, covariance) in enumerate(zip(run.z, run.y, run.S, strict=True)):
-            if not any(value is None for value in np.ravel(z)):  # filterpy saves None for a missed sample
-                there = np.size(y)  # a `KFOPC` saves only the components that are there
-                innovations[i, k, :there], S[i, k, :there, :there] = np.ravel(y), covariance
-    x = np.array([np.reshape(run.x, (len(run.z), -1)) for run in runs])
-    return innovations, S, x, np.array([run.P for run in runs])
+    y, S, z, x, P = (
+        np.array([as_real_array(getattr(run, name), name) for run in runs]) for name in ("y", "S", "z", "x", "P")
+    )
+    y, x = (array.reshape(*array.shape[:2], -1) for array in (y, x))
+    # filterpy saves None for a missed sample, and a `KFOPC` NaN for a missing component.
+    missing = np.isnan(z).reshape(*z.shape[:2], -1)
+    return np.ma.array(y, mask=np.broadcast_to(missing, y.shape)), S, x, P
 
 
 def _innovations(innovations: Any) -> tuple[np.ndarray, np.ndarray]:

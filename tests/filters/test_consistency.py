@@ -145,17 +145,17 @@ def test_arrays_are_the_same_as_a_saver_and_a_mask_leaves_rows_out():
 
 
 def test_a_saver_of_a_filter_that_took_some_components_counts_those():
-    kf = KalmanFilter(dim_x=2, dim_z=2)
+    kf = KFOPC(dim_x=2, dim_z=2)
     kf.F, kf.H, kf.Q, kf.R = F, H, Q, R
     saver = Saver(kf)
-    for rows in ([0, 1], [1], [0, 1], [0]):
+    for hidden in ([0, 0], [1, 0], [1, 1], [0, 1]):
         kf.predict()
-        kf.update(np.ones((len(rows), 1)), H=H[rows], R=R[np.ix_(rows, rows)])
-        kf.z = np.ones((len(rows), 1))
+        kf.update(np.ma.array([1.0, 2.0], mask=hidden))
         saver.save()
     result = consistency(saver, max_lag=1)
-    assert_allclose(result.nis[1], saver.y[1][0, 0] ** 2 / saver.S[1][0, 0])
-    assert_allclose(result.nis_bounds[1, [0, 1, 2, 3]], chi2.ppf(0.975, [2, 1, 2, 1]))
+    assert_allclose(result.nis[1], saver.y[1][1, 0] ** 2 / saver.S[1][1, 1])
+    assert_allclose(result.nis_bounds[1], chi2.ppf(0.975, [2, 1, np.nan, 1]))
+    assert_allclose(result.autocorrelation_bounds, 1.959963984540054)  # one pair: the second component at first
 
 
 WHITE = {"innovations": np.ones((30, 1)), "S": np.ones((30, 1, 1))}
