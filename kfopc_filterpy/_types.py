@@ -11,19 +11,11 @@ if TYPE_CHECKING:
     import control
     import numpy as np
 
-    from .power.amplifiers import Amplifier
-    from .power.constraint import OutputPowerConstraint
-    from .power.limiter import OutputLimiter
-
 # A float with one channel, with several an array with a number for each, (n,). As with numpy's own functions that return
 # a number or an array, it is Any: with a union, a type checker would have every caller check which of them came.
 NumberOrArray: TypeAlias = Any
 PerLoudspeaker: TypeAlias = float | ArrayLike  # one number for all loudspeakers, or one for each, (J,)
 PerMicrophone: TypeAlias = float | ArrayLike  # one number for all microphones, or one for each, (K,)
-# What a controller takes: one for all loudspeakers or one for each; of limiters, only the latter.
-Amplifiers: TypeAlias = "Amplifier | Sequence[Amplifier] | None"
-Constraints: TypeAlias = "OutputPowerConstraint | Sequence[OutputPowerConstraint] | None"
-Limiters: TypeAlias = "OutputLimiter | Sequence[OutputLimiter] | None"
 # What rng= takes; in quotes, because numpy imports numpy.random only when it is first used.
 Seed: TypeAlias = "int | Sequence[int] | np.random.SeedSequence | np.random.Generator"
 

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import Constraints, NumberOrArray, PerLoudspeaker
+from .._types import NumberOrArray, PerLoudspeaker
 from .._validate import as_positive
 from ..checkpoint import Checkpointed
 from ..core.run_loop import Steps
-from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
+from ..power.constraint import DEFAULT_FS, Constraints, OutputPowerConstraint
 from .processing import BlockProcessing
 
 

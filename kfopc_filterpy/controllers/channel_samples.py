@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import Amplifiers
 from .._validate import as_real_array
-from ..power.amplifiers import LinearAmplifier, amplifier_of_each
+from ..power.amplifiers import Amplifiers, LinearAmplifier, amplifier_of_each
 
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:

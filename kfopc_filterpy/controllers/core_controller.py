@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker
+from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
 from ..core.block import Algorithm, Block, Shape, reason_of
@@ -17,9 +17,9 @@ from ..core.own import load_algorithm as load_algorithm
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
 from ..paths.uncertainty import Uncertainty, as_uncertainty, guard_filter
-from ..power.amplifiers import amplifier_models
-from ..power.constraint import NUMBERS, OutputPowerConstraint
-from ..power.limiter import OutputLimiter
+from ..power.amplifiers import Amplifiers, amplifier_models
+from ..power.constraint import NUMBERS, Constraints, OutputPowerConstraint
+from ..power.limiter import Limiters, OutputLimiter
 from .base import Looped, calls_of, constraint_for, listed, require_rates
 from .channel_samples import channel_sample
 from .processing import (

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker
+from .._types import PathModels, PerLoudspeaker
 from .._validate import as_nonnegative
+from ..power.amplifiers import Amplifiers
+from ..power.constraint import Constraints
+from ..power.limiter import Limiters
 from .core_controller import CoreController, setting
 
 

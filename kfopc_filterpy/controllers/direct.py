@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker, PerMicrophone
+from .._types import NumberOrArray, PathModels, PerLoudspeaker, PerMicrophone
 from .._validate import as_nonnegative
 from ..core.triangle import OWED, full_covariance
+from ..power.amplifiers import Amplifiers
+from ..power.constraint import Constraints
+from ..power.limiter import Limiters
 from .core_controller import CoreController, setting
 
 

@@ -7,9 +7,10 @@ from copy import deepcopy
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import Amplifiers, NumberOrArray, PathModels
+from .._types import NumberOrArray, PathModels
 from .._validate import as_channels, as_number
 from ..paths.path_matrix import feedback_paths, is_path_matrix
+from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import PlayedSound, channel_sample
 

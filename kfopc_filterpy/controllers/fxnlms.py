@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .._types import Limiters, PathModels
+from .._types import PathModels
+from ..power.limiter import Limiters
 from .core_controller import CoreController, setting
 
 

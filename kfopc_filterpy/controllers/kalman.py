@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from .._types import Amplifiers, Constraints, Limiters, PathModels, PerLoudspeaker, PerMicrophone
+from .._types import PathModels, PerLoudspeaker, PerMicrophone
 from ..bounds.settings import SuggestedSettings
 from ..filters.checked_steps import undoing
 from ..filters.kfopc import KFOPC
-from ..power.amplifiers import Amplifier
-from ..power.constraint import DEFAULT_FS, OutputPowerConstraint
-from ..power.limiter import OutputLimiter
+from ..power.amplifiers import Amplifier, Amplifiers
+from ..power.constraint import DEFAULT_FS, Constraints, OutputPowerConstraint
+from ..power.limiter import Limiters, OutputLimiter
 from .base import constraint_for
 from .core_controller import CoreController
 from .direct import DirectKalman

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .._types import Amplifiers, Constraints, Limiters, NumberOrArray, PathModels, PerLoudspeaker
+from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_nonnegative, as_positive
+from ..power.amplifiers import Amplifiers
+from ..power.constraint import Constraints
+from ..power.limiter import Limiters
 from .core_controller import CoreController, setting
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .._types import Amplifiers, Limiters, NumberOrArray, PathModels, PerLoudspeaker
+from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_positive
 from ..bounds.settings import SuggestedSettings
 from ..paths.uncertainty import Uncertainty, as_uncertainty
+from ..power.amplifiers import Amplifiers
 from ..power.constraint import DEFAULT_FS
+from ..power.limiter import Limiters
 from .base import Looped
 from .kalman import at_suggested_rate
 from .posterior import DEFAULT_UNCERTAINTY, PosteriorController, block_of, relative_spread

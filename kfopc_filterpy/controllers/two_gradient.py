@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .._types import Limiters, PathModels, PerLoudspeaker
+from .._types import PathModels, PerLoudspeaker
+from ..power.limiter import Limiters
 from .core_controller import CoreController, setting
 
 

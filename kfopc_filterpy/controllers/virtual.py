@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._types import Amplifiers, NumberOrArray, PathModels, PerMicrophone
+from .._types import NumberOrArray, PathModels, PerMicrophone
 from .._validate import as_channels, as_count, as_real_array, per_channel, require_finite
 from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
+from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
 from .channel_samples import ChannelFilters, PlayedSound
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -110,6 +110,7 @@ class SoftSaturationAmplifier(_Amplifier):
 
 
 Amplifier = Callable[[Any], Any]  # any function of a sample
+Amplifiers: TypeAlias = Amplifier | Sequence[Amplifier] | None  # one for all loudspeakers, or one for each
 
 
 def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -240,3 +241,8 @@ def squared(value: ArrayLike, name: str) -> float:
     if math.isinf(square):
         raise ValueError(f"{name} must have a finite square, got {number:g}")
     return square
+
+
+Constraints: TypeAlias = (
+    OutputPowerConstraint | Sequence[OutputPowerConstraint] | None
+)  # one for all loudspeakers, or one for each

@@ -8,8 +8,9 @@ energy of a window is the sum over this lap plus the part of the last lap that i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from operator import attrgetter
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -228,3 +229,6 @@ def spans_of(numbers: np.ndarray) -> np.ndarray:
 def _kept(windows: float, size: int) -> float:
     """Return the factor per sample of a decay whose time constant is `windows` windows."""
     return math.exp(-1.0 / (windows * size))
+
+
+Limiters: TypeAlias = OutputLimiter | Sequence[OutputLimiter] | None  # with several loudspeakers one for each
