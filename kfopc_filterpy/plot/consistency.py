@@ -69,6 +69,7 @@ def plot_consistency(result: Consistency, *, ax: Sequence[Axes] | None = None) -
     axes[-1].plot(lags, result.autocorrelation_bounds, label=within, **_BOUND)
     axes[-1].plot(lags, -result.autocorrelation_bounds, **_BOUND)
     axes[-1].set(xlabel="Lag (samples)", ylabel="Correlation")
+    axes[-1].xaxis.get_major_locator().set_params(integer=True)
     for panel in axes:
         panel.grid(True, alpha=0.3)
         legend_above(panel)
