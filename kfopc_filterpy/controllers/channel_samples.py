@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from copy import copy
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,6 +52,12 @@ class ChannelFilters:
     def output(self) -> np.ndarray:
         """Return the sample of the outputs."""
         return self._taps @ self._line
+
+    def branched(self) -> Self:
+        """Return filters that go on from here by themselves: they have the line of now, and share the rest."""
+        other = copy(self)
+        other._line = self._line.copy()
+        return other
 
 
 class PlayedSound(ChannelFilters):

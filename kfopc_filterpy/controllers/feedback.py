@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -107,7 +105,7 @@ class FeedbackNeutralizer(WrappedController):
         """
         controller = listening(self.controller)
         x = np.array(np.atleast_2d(as_channels(references, "references")))
-        sound = deepcopy(self._sound)
+        sound = self._sound.branched()
         for n in range(x.shape[1]):
             x[:, n] -= sound.output()
             sound.push(np.zeros(sound.n_inputs))

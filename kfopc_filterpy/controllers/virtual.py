@@ -372,7 +372,7 @@ class VirtualMicrophones(WrappedController):
             np.shape(errors)
         )  # what the virtual microphones hear is not used, so it may be anything
         heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
-        before = deepcopy((self._sound, self._virtual_error, self.observer))
+        before = self._sound.branched(), self._virtual_error, deepcopy(self.observer)
         virtual_errors = np.empty((self.virtual.size, heard.shape[1]))
         for n, sample in enumerate(heard.T):
             self._sound.push(np.zeros(self.n_loudspeakers))

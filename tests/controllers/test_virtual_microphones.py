@@ -89,6 +89,18 @@ def test_with_exact_filters_it_is_the_controller_that_hears_the_virtual_places(k
     assert got.algorithm == f"{there.name} with virtual microphones"
 
 
+def test_listening_leaves_the_users_amplifier_alone() -> None:
+    class Own:
+        def __call__(self, y: float) -> float:
+            return y
+
+        def __deepcopy__(self, memo: Any) -> Any:
+            raise TypeError("cannot be copied")
+
+    got, want = run(made(amplifier=Own()), switch_on_s=50 / FS), run(made(), switch_on_s=50 / FS)
+    np.testing.assert_allclose(got.error, want.error, rtol=0, atol=1e-12)
+
+
 def test_with_other_filters_it_is_not() -> None:
     exact, wrong = run(made()), run(made(-OBSERVATION))
     reductions = [noise_reduction_db(r.error[VIRTUAL], r.disturbance[VIRTUAL]) for r in (exact, wrong)]
