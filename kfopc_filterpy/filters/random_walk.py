@@ -343,7 +343,7 @@ class RandomWalkKFOPC(KFOPC):
         reference: ArrayLike | None = None,
     ) -> None:
         """Apply eq. 5-9; an H of several rows, or another `inv`, uses filterpy's own equations. See `KFOPC.update`."""
-        if isinstance(z, np.ma.MaskedArray):
+        if isinstance(z, np.ma.MaskedArray) and z.size == 1:  # several are left to `KFOPC.update`
             z, R, H, _ = without_masked(self, z, R, H)
         row: Any = self.H if H is None else H
         measurement: Any

@@ -219,3 +219,13 @@ def test_a_rated_power_needs_all_measurements() -> None:
         f.update([1.0, 2.0], H=H, reference=1.0)
     np.testing.assert_array_equal(kf.x, twin.x)
     assert kf.disturbance_power == twin.disturbance_power
+
+
+def test_a_random_walk_with_several_rows_says_which_are_missing() -> None:
+    walk, general = KFOPC.random_walk(N, **NOISES), KFOPC(N, 2)
+    general.P, general.Q, general.R = np.array(walk.P), np.array(walk.Q), 0.5 * np.eye(2)
+    z = np.ma.masked_invalid([np.nan, 1.0])
+    for kf in (walk, general):
+        kf.update(z, H=np.eye(2, N), R=0.5 * np.eye(2))
+        np.testing.assert_array_equal(kf.z.ravel(), [np.nan, 1.0])
+    np.testing.assert_allclose(walk.x, general.x, rtol=0, atol=1e-12)
