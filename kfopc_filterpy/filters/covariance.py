@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._validate import as_real_array, require_finite
 from ..core.triangle import Covariance, copy_covariance, covariance_at, new_covariance, owed_of
 from .checked_steps import INDEFINITE_LIMIT, require_semidefinite
 
@@ -150,12 +151,27 @@ class RandomWalkCovariance:
         self.posterior = self.now
 
 
-def require_covariance(P: np.ndarray) -> None:
+def require_covariance(P: np.ndarray, name: str = "P") -> None:
     """Raise ValueError unless P is symmetric and positive semidefinite, to rounding."""
     if np.diagonal(P).min() < 0:
-        raise ValueError("P must not have negative variances on its diagonal")
+        raise ValueError(f"{name} must not have negative variances on its diagonal")
     difference = np.abs(P - P.T)
     if difference.max() > ASYMMETRY_LIMIT * np.abs(P).max():
         i, j = np.unravel_index(np.argmax(difference), P.shape)
-        raise ValueError(f"P must be symmetric, but P[{i}, {j}] = {P[i, j]:g} and P[{j}, {i}] = {P[j, i]:g}")
-    require_semidefinite(P, "P", INDEFINITE_LIMIT)
+        raise ValueError(
+            f"{name} must be symmetric, but {name}[{i}, {j}] = {P[i, j]:g} and {name}[{j}, {i}] = {P[j, i]:g}"
+        )
+    require_semidefinite(P, name, INDEFINITE_LIMIT)
+
+
+def as_semidefinite(value: Any, size: int, name: str) -> np.ndarray:
+    """Return a symmetric, positive semidefinite matrix (size, size), or raise a clear error."""
+    matrix = as_real_array(value, name)
+    if matrix.shape != (size, size):
+        raise ValueError(f"{name} must have shape ({size}, {size}), got {matrix.shape}")
+    require_finite(matrix, name)
+    try:
+        require_covariance(matrix, name)
+    except ValueError as error:
+        raise ValueError(f"{name} must be symmetric and positive semidefinite: {error}") from None
+    return 0.5 * (matrix + matrix.T)

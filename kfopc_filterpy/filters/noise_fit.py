@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_real_array, require_finite
-from .state_limits import as_semidefinite
+from .covariance import as_semidefinite
 
 STEP = 1e-3  # of log-variances, for derivatives: see the notes of `fit_noise`
 COARSE = np.log(10.0) * np.arange(-8, 9, 2)  # factors that are tried first, 1e-8 to 1e8
@@ -113,10 +113,11 @@ def fit_noise(
     derivatives, from the best point of a grid of 1e-8 to 1e8 times Q and R. So scale the parts to within that of what you
     expect.
 
-    Derivatives are central differences over 1e-3 of a log-variance, which are good to about 1e-6. The
-    search ends at a gradient of 1e-4, so the factors are within 1e-4 of their standard errors. The standard errors come from the inverse of the observed information, the negative second derivative of the
-    log-likelihood, and of factors by :math:`\sigma(f) = f\, \sigma(\log f)`. They hold for long records. All points of a
-    difference go through the record together.
+    Derivatives are central differences over 1e-3 of a log-variance, which are good to about 1e-6. The search ends at a
+    gradient of 1e-4, so the factors are within 1e-4 of their standard errors. The standard errors come from the inverse
+    of the observed information, the negative second derivative of the log-likelihood, and of factors by
+    :math:`\sigma(f) = f\, \sigma(\log f)`. They hold for long records. All points of a difference go through the record
+    together.
 
     A record with a steady error of the model (a wrong F, a bias) puts it into the noises.
 
@@ -210,7 +211,7 @@ class _Record:
             require_finite(getattr(self, name), name)
         if not self.H.any():
             raise ValueError("H must not be zero: it says what is measured; assign kf.H or pass H=")
-        self.z, self.there = measured(z, self.H.shape[-2], "z")
+        self.z, self.there = _measured(z, self.H.shape[-2])
         if self.H.ndim == 3 and len(self.H) != len(self.z):
             raise ValueError(f"H must have one matrix for each of the {len(self.z)} samples of z, got {len(self.H)}")
         self.H = np.broadcast_to(self.H, (len(self.z), *self.H.shape[-2:]))
@@ -243,25 +244,25 @@ class _Record:
         return total
 
 
-def measured(z: Any, rows: int, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _measured(z: Any, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a record as numbers, (n_samples, rows), and which of them are there."""
     if isinstance(z, list | tuple):
         samples = [np.ma.array(np.zeros(rows), mask=True) if value is None else np.ma.atleast_1d(value) for value in z]
         hidden = [np.ma.getmaskarray(sample) for sample in samples]
         if any(np.size(sample) != rows for sample in samples):
-            raise ValueError(f"{name} must hold None or {rows} value(s) for each sample, one for each row of H")
+            raise ValueError(f"z must hold None or {rows} value(s) for each sample, one for each row of H")
         z = np.ma.array([np.ma.getdata(sample).ravel() for sample in samples], mask=np.reshape(hidden, (-1, rows)))
     there = ~np.ma.getmaskarray(z)
-    values = as_real_array(np.ma.getdata(z), name)
+    values = as_real_array(np.ma.getdata(z), "z")
     if (values.ndim == 1 and rows == 1) or (values.ndim == 3 and values.shape[2] == 1):
         values, there = values.reshape(len(values), -1), there.reshape(len(values), -1)
     if values.ndim != 2 or values.shape[1] != rows:
-        raise ValueError(f"{name} must be a record (n_samples, {rows}), for the {rows} row(s) of H, got {values.shape}")
+        raise ValueError(f"z must be a record (n_samples, {rows}), for the {rows} row(s) of H, got {values.shape}")
     values = np.where(there, values, 0.0)
     try:
-        require_finite(values, name)
+        require_finite(values, "z")
     except ValueError as error:
-        raise ValueError(f"{error}; mask what is missing: np.ma.masked_invalid({name})") from None
+        raise ValueError(f"{error}; mask what is missing: np.ma.masked_invalid(z)") from None
     return values, there
 
 

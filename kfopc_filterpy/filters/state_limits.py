@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._validate import as_positive, as_real_array, require_finite
-from .covariance import require_covariance
+from .covariance import as_semidefinite
 
 ROUNDING = 1e-12  # eigenvalues of a correlation matrix, and slopes of limits, below this are taken as zero
 KEPT = 1e-9  # how well linear limits are kept, in the unit of `_in_deviations`
@@ -119,19 +119,6 @@ def constrained(
         if len(D):
             kf.P = directions @ directions.T
     return state
-
-
-def as_semidefinite(value: Any, size: int, name: str) -> np.ndarray:
-    """Return a symmetric, positive semidefinite matrix (size, size), or raise a clear error."""
-    matrix = as_real_array(value, name)
-    if matrix.shape != (size, size):
-        raise ValueError(f"{name} must have shape ({size}, {size}), got {matrix.shape}")
-    require_finite(matrix, name)
-    try:
-        require_covariance(matrix)
-    except ValueError as error:
-        raise ValueError(f"{name} must be symmetric and positive semidefinite, as a covariance P is: {error}") from None
-    return 0.5 * (matrix + matrix.T)
 
 
 def _directions(P: np.ndarray, deviations: np.ndarray) -> np.ndarray:
