@@ -69,18 +69,6 @@ class ControlFilter(WienerSolution):
         return self.stretch.d - self.stretch.antinoise(self.weights)
 
 
-def _of_each(name: str, doc: str) -> Any:
-    """Return a property that has this attribute of each segment."""
-    return property(lambda filters: np.array([getattr(segment, name) for segment in filters.segments]), doc=doc)
-
-
-def _joined(name: str, doc: str) -> Any:
-    """Return a property that has this signal of all segments, one after the other."""
-    return property(
-        lambda filters: np.concatenate([getattr(segment, name) for segment in filters.segments], axis=-1), doc=doc
-    )
-
-
 @dataclass(frozen=True)
 class ControlFilters:
     """A control filter for each segment of a record.
@@ -93,24 +81,54 @@ class ControlFilters:
 
     segments: tuple[ControlFilter, ...]
 
-    weights = _of_each("weights", "Weights of each segment, shape (n_segments, n_taps).")
-    penalty = _of_each("penalty", "λ of each segment, shape (n_segments,).")
-    control_power = _of_each("control_power", "Mean square of y in each segment, shape (n_segments,).")
-    error_power = _of_each("error_power", "Mean square of e in each segment, shape (n_segments,).")
-    segment_noise_reduction_db = _of_each(
-        "noise_reduction_db", "Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."
-    )
-    start_s = _of_each(
-        "start_s", "Start of each segment in seconds from the first sample that counts, shape (n_segments,)."
-    )
-    control_signal = _joined("control_signal", "Control signal, each segment with its own weights, shape (n_samples,).")
-    error = _joined("error", "Error, each segment with its own weights, shape (n_samples,).")
+    @property
+    def weights(self) -> np.ndarray:
+        """Weights of each segment, shape (n_segments, n_taps)."""
+        return np.array([segment.weights for segment in self.segments])
+
+    @property
+    def penalty(self) -> np.ndarray:
+        """λ of each segment, shape (n_segments,)."""
+        return self._each("penalty")
+
+    @property
+    def control_power(self) -> np.ndarray:
+        """Mean square of y in each segment, shape (n_segments,)."""
+        return self._each("control_power")
+
+    @property
+    def error_power(self) -> np.ndarray:
+        """Mean square of e in each segment, shape (n_segments,)."""
+        return self._each("error_power")
+
+    @property
+    def segment_noise_reduction_db(self) -> np.ndarray:
+        """Noise reduction of each segment in dB, shape (n_segments,); NaN without a disturbance."""
+        return self._each("noise_reduction_db")
+
+    @property
+    def start_s(self) -> np.ndarray:
+        """Start of each segment in seconds from the first sample that counts, shape (n_segments,)."""
+        return self._each("start_s")
 
     @property
     def noise_reduction_db(self) -> float:
         """Noise reduction over all segments, -10 log10(sum e^2 / sum d^2), at most 300 dB."""
         d = np.concatenate([segment.stretch.d for segment in self.segments], axis=-1)
         return reduction_db(mean_square(self.error), mean_square(d))
+
+    @property
+    def control_signal(self) -> np.ndarray:
+        """Control signal, each segment with its own weights, shape (n_samples,)."""
+        return np.concatenate([segment.control_signal for segment in self.segments], axis=-1)
+
+    @property
+    def error(self) -> np.ndarray:
+        """Error, each segment with its own weights, shape (n_samples,)."""
+        return np.concatenate([segment.error for segment in self.segments], axis=-1)
+
+    def _each(self, name: str) -> np.ndarray:
+        return np.array([getattr(segment, name) for segment in self.segments])
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from operator import attrgetter
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -133,14 +132,30 @@ class OutputLimiter:
         self._state = _silent_state(size, self._rated_power, self._amplitude_limit)
         self.reset()
 
-    state = property(attrgetter("_state"), doc="Arrays that the core updates.")
-    rated_power = property(
-        attrgetter("_rated_power"),
-        doc="Rated output power; read-only, because past outputs were limited to it. Make a new limiter to change it.",
-    )
-    fs = property(attrgetter("_fs"), doc="Sample rate in Hz.")
-    window_s = property(attrgetter("_window_s"), doc="Averaging time of the rated power in seconds.")
-    amplitude_limit = property(attrgetter("_amplitude_limit"), doc="Peak rating, or None.")
+    @property
+    def state(self) -> LimiterState:
+        """Arrays that the core updates."""
+        return self._state
+
+    @property
+    def rated_power(self) -> float:
+        """Rated output power; read-only, because past outputs were limited to it. Make a new limiter to change it."""
+        return self._rated_power
+
+    @property
+    def fs(self) -> float:
+        """Sample rate in Hz."""
+        return self._fs
+
+    @property
+    def window_s(self) -> float:
+        """Averaging time of the rated power in seconds."""
+        return self._window_s
+
+    @property
+    def amplitude_limit(self) -> float | None:
+        """Peak rating, or None."""
+        return self._amplitude_limit
 
     @property
     def gain(self) -> float:
