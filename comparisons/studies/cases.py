@@ -273,12 +273,6 @@ def bounds_db(scene: Scene, stationary: bool) -> tuple[float, float]:
     return reached["per_second"], reached["scaled_per_second"]
 
 
-def record_bound_db(scene: Scene) -> float:
-    """Return the noise reduction over the steady half of the best fixed filter for the record, whatever the noise."""
-    bound = bound_of(scene)
-    return bound.noise_reduction_over(0.5 * bound.whole.end_s)["whole"]
-
-
 # ---- Tuning
 
 

@@ -36,7 +36,6 @@ from .cases import (
     make_case,
     noises,
     paths,
-    record_bound_db,
 )
 from .report_parts import MARK, case_parameters, new_figure, tried
 from .worst_cases import worst
@@ -186,7 +185,7 @@ def _bounds(case: Case, scene: Scene, seed: int, share_db: float) -> list[Budget
     place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share_db": share_db, "seed": seed}
     power = min(1.0 / scene.rated_power, 1.0)
     bound, scaled = bounds_db(scene, case.stationary)
-    record = bound if case.stationary else record_bound_db(scene)
+    record = bound if case.stationary else bounds_db(scene, True)[0]
     return [
         BudgetRow(**place, algorithm=label, noise_reduction_db=reached, power=power)
         for label, reached in ((BOUND, bound), (RECORD, record), (SCALED, scaled))

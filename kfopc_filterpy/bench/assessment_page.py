@@ -249,15 +249,16 @@ def _level_rows(verdict: Assessment) -> tuple[list[str], list[list[str | float]]
     """Return the headings and rows of the third-octave bands, of all microphones."""
     levels = verdict.levels
     assert levels is not None
-    numbered = verdict.channels is not None
+    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
     pairs = zip(np.atleast_2d(levels.before_db), np.atleast_2d(levels.after_db), strict=True)
     rows: list[list[str | float]] = [
-        [*[str(k)] * numbered, _nominal(centre), float(before), float(after), float(before - after)]
+        [str(k), _nominal(centre), float(before), float(after), float(before - after)]
         for k, (before_db, after_db) in enumerate(pairs, 1)
         for centre, before, after in zip(levels.centres_hz, before_db, after_db, strict=True)
     ]
-    headings = ["Centre (Hz)", "Without control (dB)", "With control (dB)", "Less by (dB)"]
-    return ["Microphone"] * numbered + headings, rows
+    if verdict.channels is None:  # there is one microphone only
+        return headings, [row[1:] for row in rows]
+    return ["Microphone", *headings], rows
 
 
 def _number(value: Any, scale: Any = None) -> Any:

@@ -424,10 +424,11 @@ class CoreController(BlockProcessing, Checkpointed):
             raise ValueError(
                 f"{self.name} has no rated power that could be changed; kf_opc, kf_pb and MOVFxLMS, for example, have one"
             )
-        several, name = self.multichannel, "rated_power"
-        self._take_rated_power(
-            per_loudspeaker(value, self.n_loudspeakers, name) if several else as_positive(value, name)
-        )
+        if self.multichannel:
+            value = per_loudspeaker(value, self.n_loudspeakers, "rated_power")
+        else:
+            value = as_positive(value, "rated_power")
+        self._take_rated_power(value)
 
     def _read_rated_power(self) -> Any:
         return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None

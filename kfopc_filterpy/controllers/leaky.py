@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -97,7 +97,7 @@ class LeakyFxLMS(CoreController):
     algorithm = "leaky"
     step_size = setting("Step size mu.")
     leak = setting("Leak gamma; with several channels (J,), a copy.")
-    checks = dict.fromkeys(("leak",), as_nonnegative)
+    checks: ClassVar = {"leak": as_nonnegative}
 
     def __init__(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,7 +37,7 @@ def relative_spread(uncertainty: Any, secondary_path: Any) -> float:
 class PosteriorController(CoreController):
     """Base class of these controllers: what is known about the plant, read from the fields of `plant.c`."""
 
-    checks = dict.fromkeys(("spread",), as_nonnegative)
+    checks: ClassVar = {"spread": as_nonnegative}
     takes_guard = False  # the posterior knows how far the path may be off
 
     @property

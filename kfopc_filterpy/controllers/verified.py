@@ -179,9 +179,8 @@ class VerifiedController(WrappedController):
         self._n = self._samples = 0  # of this block, and of all
         self._awaits_error = False
         self.volume, self._pause_s = 0.0, 0.0  # no pause before the first failure
-        self._stopped_at = (
-            self._near_at
-        ) = -math.inf  # samples at which it stopped last, and was near the disturbance last
+        # Samples at which it stopped last, and at which the error was near the disturbance last.
+        self._stopped_at = self._near_at = -math.inf
         self._wait = 0  # samples until the volume is next changed
         self._alarms, self._since_alarm = 0, round(HOLD_S * self.fs)  # alarms so far; samples played since the last one
         self._doubts = False  # whether the controller must not adapt, because the path is not known

@@ -125,9 +125,14 @@ def compiled_model(amplifier: Amplifier | None) -> np.ndarray | None:
     return amplifier.model if isinstance(amplifier, models) and type(amplifier) in models else None
 
 
+def _each(amplifier: Any, n_loudspeakers: int) -> list[Any]:
+    """Return what is given for each loudspeaker: a sequence, or one for all."""
+    return list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
+
+
 def amplifier_of_each(amplifier: Any, n_loudspeakers: int, of: str = "sample") -> list[Any]:
     """Return for each loudspeaker a function that stands for its amplifier, or None, from one for all or one for each."""
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
+    each = _each(amplifier, n_loudspeakers)
     if len(each) != n_loudspeakers or not all(one is None or callable(one) for one in each):
         for_each = f", or one for each of the {n_loudspeakers} loudspeakers" if n_loudspeakers > 1 else ""
         raise TypeError(f"amplifier must be a function of a {of}{for_each}, or None, got {amplifier!r}")
@@ -136,8 +141,7 @@ def amplifier_of_each(amplifier: Any, n_loudspeakers: int, of: str = "sample") -
 
 def amplifier_models(amplifier: Amplifier | Sequence[Amplifier | None] | None, n_loudspeakers: int) -> np.ndarray:
     """Return the records of the amplifier models of all loudspeakers, (J, 1)."""
-    each = list(amplifier) if isinstance(amplifier, Sequence) else [amplifier] * n_loudspeakers
-    models = [compiled_model(one) for one in each]
+    models = [compiled_model(one) for one in _each(amplifier, n_loudspeakers)]
     if len(models) != n_loudspeakers or any(model is None for model in models):
         raise TypeError(
             "amplifier must be None, one of kfopc_filterpy's amplifier models, or one for each of the "

@@ -243,6 +243,5 @@ def squared(value: ArrayLike, name: str) -> float:
     return square
 
 
-Constraints: TypeAlias = (
-    OutputPowerConstraint | Sequence[OutputPowerConstraint] | None
-)  # one for all loudspeakers, or one for each
+# One for all loudspeakers, or one for each.
+Constraints: TypeAlias = OutputPowerConstraint | Sequence[OutputPowerConstraint] | None
