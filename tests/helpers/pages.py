@@ -41,6 +41,11 @@ class Page:
         self._left = [part for part in parts if without is None or f"[{without}]" not in (part["options"] or "")]
         assert without is None or len(self._left) < len(parts), f"{stem}.md has no cell tagged {without}"
 
+    def skip(self, to: str) -> None:
+        """Leave out the cells before the heading `to`."""
+        while self._left[0]["heading"] != to:
+            self._left.pop(0)
+
     def run(self, until: str | None = None) -> Any:
         """Run the cells before the heading `until`, by default all that are left; return the variables."""
         while self._left and not (until and self._left[0]["heading"] == until):
