@@ -27,7 +27,7 @@ from .studies import (
 )
 
 Study = tuple[Callable[[Runs], StudyReport | str], Callable[[], int]]
-SPEED, SWEEP, SOAK = "speed", "sweep", "soak"
+SPEED, SWEEP, SOAK, BOARD = "speed", "sweep", "soak", "board"
 STUDIES: dict[str, Study] = {
     "tonal": (tonal.main, tonal.planned_runs),
     "broadband": (broadband.main, broadband.planned_runs),
@@ -59,6 +59,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from .soak import study as soak_study
 
         return soak_study.main(arguments[1:])
+    if arguments[:1] == [BOARD]:
+        from .board import study as board_study
+
+        return board_study.main(arguments[1:])
     parser = argparse.ArgumentParser(
         prog="python -m comparisons", description="Reproduce the studies of the KF-OPC paper."
     )
@@ -67,14 +71,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         metavar="STUDY",
         help=f"{', '.join(STUDIES)}, by default all of these; beyond the paper: {', '.join(FURTHER)}; "
-        "speed, which times the filter against others; sweep, which runs a grid; or soak, which runs controllers for very "
-        "long; the last two have options of their own (sweep --help)",
+        "speed, which times the filter against others; board, which runs exported controllers on an emulated microcontroller; "
+        "sweep, which runs a grid; or soak, which runs controllers for very long; the last two have options of their own "
+        "(sweep --help)",
     )
     parser.add_argument("--output", type=Path, default=Path("studies"), help="folder to write into (default: studies)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     options = parser.parse_args(arguments)
-    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK)
-    for name in (SWEEP, SOAK):
+    known = (*STUDIES, *FURTHER, SPEED, SWEEP, SOAK, BOARD)
+    for name in (SWEEP, SOAK, BOARD):
         if name in options.studies:
             parser.error(f"{name} runs alone, and is named first: its options follow it")
     unknown = [name for name in options.studies if name not in known]

@@ -1,0 +1,1 @@
+"""Exported controllers on an emulated microcontroller."""
