@@ -321,7 +321,7 @@ class Block:
         field = self.fields[name]
         if f"{name}_at" not in self.fields:
             return field
-        at, taps = self.fields[f"{name}_at"].item(), (field.shape[-1] - SLACK) // 4  # as `layout_lines` makes them
+        at, taps = self.fields[f"{name}_at"].item(), (field.shape[-1] - SLACK) // 2  # as `layout_lines` makes them
         return field[..., at : at + taps]
 
     def fresh(self, shape: Shape, guard: NDArray[np.float64] | None = None) -> Block:

@@ -30,7 +30,7 @@ int32_t *int32s(anc_layout *at, const char *name, anc_role role, int32_t n)
 
 static lines layout_lines(anc_layout *at, const char *name, const char *name_at, int32_t n0, int32_t n1, int32_t n2, int32_t taps)
 {
-    const int32_t length = 4 * taps + SLACK;
+    const int32_t length = 2 * taps + SLACK;
     real *room = reals(at, name, ANC_STATE, n0, n1, n2, length);
     return (lines){room, int32s(at, name_at, ANC_STATE, 1), n0 * n1 * n2, taps, length};
 }

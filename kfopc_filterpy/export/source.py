@@ -215,7 +215,7 @@ def _tidy_lines(state: dict[str, NDArray[Any]]) -> None:
     """Move the newest samples of each delay line to its end, and clear the others, which no step reads."""
     for name in [name.removesuffix("_at") for name in state if name.endswith("_at")]:
         line, at = state[name], state[f"{name}_at"]
-        taps = (line.shape[-1] - SLACK) // 4
+        taps = (line.shape[-1] - SLACK) // 2
         newest = line[..., int(at.item()) :][..., :taps].copy()
         line[...] = 0.0
         line[..., -taps:] = newest
