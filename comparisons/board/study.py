@@ -63,7 +63,7 @@ def missing_tools() -> list[str]:
 
 def controllers() -> dict[str, Any]:
     """Return the controllers of the table."""
-    noises = {"state_noise": 1e-9, "measurement_noise": 1e-3}
+    noises: dict[str, Any] = {"state_noise": 1e-9, "measurement_noise": 1e-3}
     return {
         "FxLMS, 256 taps": FxLMS(256, SECONDARY, step_size=1e-4),
         "diagonal Kalman, 256 taps": DiagonalKalman(256, SECONDARY, rated_power=0.5, **noises),
