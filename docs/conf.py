@@ -25,6 +25,7 @@ extensions = [
     "myst_nb",
     "source_lines",  # docs/extensions: the package's source with line numbers, and links into it
     "public_names",  # docs/extensions: a reference page for each public name
+    "listening",  # docs/extensions: the C core as WebAssembly, for the page that plays
     "offline",  # docs/extensions: nothing that a page loads comes from a network
 ]
 from offline import mathjax_file  # noqa: E402
