@@ -197,6 +197,7 @@ class _Session:
         self.blocks = self.overruns = self.lost = 0
         self.load = self.load_since_report = 0.0
         self._dry_before = self._dry
+        self._noted = 0  # underflows that the health record has, or that were before it
 
     @property
     def _dry(self) -> int:
@@ -222,6 +223,7 @@ class _Session:
         if not heard:
             raise FaultError("the interface ended before anything was heard")
         self.lost += sum(block.lost for block in heard)
+        self._noted = self.underflows
         x, e = (_finite(np.concatenate([block[i] for block in heard], axis=1)) for i in (0, 1))
         return _Heard(x, e, padded[:, : x.shape[1]])
 
@@ -249,10 +251,10 @@ class _Session:
         began = time.perf_counter()
         x, e = (signals if supervisor.multichannel else signals[0] for signals in (block.references, block.errors))
         y = np.atleast_2d(supervisor.process(x, e, lost=block.lost))
-        before = self.underflows
         self.interface.write(y)
-        if self.underflows > before:
-            supervisor.note("output underflow", y.shape[1])
+        if self.underflows > self._noted:
+            supervisor.note("output underflow", (self.underflows - self._noted) * y.shape[1])
+            self._noted = self.underflows
         share = (time.perf_counter() - began) / self.block_s
         self.blocks += 1
         self.overruns += share > 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,14 @@ import numpy as np
 from .._validate import as_count, as_positive
 from .interfaces import Block
 
+SILENT_S = 5.0  # without a block: the device is gone
+
 
 class SoundDevice:
     """A sound card: microphones at some of its inputs, loudspeakers at some of its outputs.
 
     It needs the extra ``realtime`` (sounddevice, and the PortAudio library, which its wheels bring on Windows and macOS).
-    It has been tested with its stream replaced, not on hardware.
+    It has been tested with JACK's dummy driver and a simulated plant, not on hardware.
 
     Parameters
     ----------
@@ -33,14 +36,15 @@ class SoundDevice:
     latency : float or {"low", "high"}, default "low"
         What sounddevice is asked for. `measure_round_trip` measures what came of it.
     ahead : int, default 2
-        Blocks of silence that are written first, so that the output does not run dry at once.
+        Blocks of silence that are played first. So many blocks after it was heard, a block is played, besides the delay of
+        the device.
 
     Attributes
     ----------
     full_scale : float
         1, the largest value of a sample.
     dry : int
-        Blocks that came too late for the output, which PortAudio calls an output underflow.
+        Blocks that came too late for the output: silence was played in their place.
 
     Raises
     ------
@@ -85,8 +89,14 @@ class SoundDevice:
         self._stream: Any = None
 
     def start(self) -> None:
-        """Open the stream, and write the silence that goes ahead."""
+        """Open the stream, with the silence that goes ahead."""
         sounddevice = _sounddevice()
+        self._heard: SimpleQueue[tuple[np.ndarray, bool]] = SimpleQueue()
+        self._played: SimpleQueue[np.ndarray] = SimpleQueue()
+        self._late = 0  # blocks that silence has replaced
+        for _ in range(self.ahead):
+            self._played.put(np.zeros((self.block, max(self._outputs) + 1), dtype=np.float32))
+        # not `read` and `write` of PortAudio, which crash with JACK
         self._stream = sounddevice.Stream(
             samplerate=self.fs,
             blocksize=self.block,
@@ -94,24 +104,40 @@ class SoundDevice:
             channels=(max(self._references + self._errors) + 1, max(self._outputs) + 1),
             dtype="float32",
             latency=self.latency,
+            callback=self._exchange,
         )
         self._stream.start()
-        before = self.dry
-        for _ in range(self.ahead):
-            self.write(np.zeros((self.n_loudspeakers, self.block)))
-        self.dry = before  # the output is empty until then
+
+    def _exchange(self, heard: np.ndarray, played: np.ndarray, frames: int, times: Any, status: Any) -> None:
+        """Take a block and give one, on PortAudio's thread; where none is ready, silence."""
+        self._heard.put((heard.copy(), bool(status.input_overflow)))
+        try:
+            played[:] = self._played.get_nowait()
+            self.dry += bool(status.output_underflow)
+        except Empty:
+            played.fill(0.0)
+            self._late += 1
+            self.dry += 1
 
     def read(self) -> Block | None:
         """Return the next block; a block is counted as lost if the driver reports that the input overflowed."""
-        heard, overflowed = self._stream.read(self.block)
-        signals = np.asarray(heard, dtype=np.float64).T
+        try:
+            heard, overflowed = self._heard.get(timeout=SILENT_S)
+        except Empty:
+            raise RuntimeError(
+                f"no block came from the sound card for {SILENT_S:g} s: was it unplugged, or its server stopped?"
+            ) from None
+        signals = heard.T.astype(np.float64)
         return Block(signals[self._references], signals[self._errors], self.block if overflowed else 0)
 
     def write(self, control_signals: np.ndarray) -> None:
-        """Play `control_signals`, (J, n_samples), those of a block."""
+        """Play `control_signals`, (J, n_samples), those of a block; not if silence was played in its place already."""
+        if self._late:
+            self._late -= 1  # or all that follows would be late
+            return
         frames = np.zeros((control_signals.shape[1], max(self._outputs) + 1), dtype=np.float32)
         frames[:, self._outputs] = control_signals.T
-        self.dry += bool(self._stream.write(frames))
+        self._played.put(frames)
 
     def stop(self) -> None:
         """Close the stream."""

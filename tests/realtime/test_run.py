@@ -334,14 +334,13 @@ def test_channels_that_do_not_fit_are_refused() -> None:
 
 
 class Card:
-    """Stands for sounddevice.Stream: a simulated plant behind the channels of a card."""
+    """Stands for sounddevice.Stream: a simulated plant behind the channels of a card, which asks for blocks."""
 
     def __init__(self, interface: SimulatedInterface) -> None:
         self.interface = interface
         self.asked: dict[str, Any] = {}
         self.states: list[str] = []
-        self.reads, self.lost_at, self.dry_at, self.repeated_at = 0, [100], [120, 700, 701], []  # block numbers
-        self.ahead: list[Any] = []
+        self.blocks, self.lost_at, self.dry_at, self.repeated_at = 0, [100], [120, 700, 701], []  # block numbers
 
     def __call__(self, **asked: Any) -> Card:
         self.asked = asked
@@ -349,23 +348,23 @@ class Card:
 
     def start(self) -> None:
         self.states.append("start")
-        self.reads_before_control = self.reads
+        self.blocks_before_control = self.blocks
 
-    def read(self, n: int) -> tuple[Any, bool]:
-        block = self.interface.read()
+    def ask(self) -> None:
+        """Hand over a block and take one, as PortAudio's thread does."""
+        block, n = self.interface.read(), self.asked["blocksize"]
         assert block is not None
-        self.reads += 1
-        if self.reads not in self.repeated_at:
-            self.frames = np.zeros((n, 4), np.float32)
-            self.frames[:, 2], self.frames[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
-        return self.frames, self.reads in self.lost_at
-
-    def write(self, frames: Any) -> bool:
-        assert frames.dtype == np.float32
-        assert frames.shape[1] == 2
-        assert not np.any(frames[:, 0])
-        self.interface.write(10.0 * frames[:, 1:].T.astype(float))
-        return self.reads in self.dry_at
+        self.blocks += 1
+        if self.blocks not in self.repeated_at:
+            self.heard = np.zeros((n, 4), np.float32)
+            self.heard[:, 2], self.heard[:, 3] = 0.1 * block.references[0], 0.1 * block.errors[0]
+        played = np.full((n, 2), np.nan, np.float32)
+        status = SimpleNamespace(
+            input_overflow=self.blocks in self.lost_at, output_underflow=self.blocks in self.dry_at
+        )
+        self.asked["callback"](self.heard, played, n, None, status)
+        assert not np.any(played[:, 0])
+        self.interface.write(10.0 * played[:, 1:].T.astype(float))
 
     def stop(self) -> None:
         self.states.append("stop")
@@ -374,12 +373,24 @@ class Card:
         self.states.append("close")
 
 
+class PluggedDevice(SoundDevice):
+    """A sound card that asks for a block whenever one is read."""
+
+    def __init__(self, card: Card, **settings: Any) -> None:
+        super().__init__([2], [3], [1], fs=FS, block=32, ahead=1, **settings)
+        self.card = card
+
+    def read(self) -> Any:
+        self.card.ask()
+        return super().read()
+
+
 @pytest.fixture
 def plugged(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Card]:
     """Return what plugs a card in, with settings of the plant behind it."""
 
     def plug(**changed: Any) -> Card:
-        card = Card(plant(**changed))
+        card = Card(plant(**({"latency": 32} | changed)))
         monkeypatch.setitem(sys.modules, "sounddevice", SimpleNamespace(Stream=card))
         return card
 
@@ -388,7 +399,7 @@ def plugged(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Card]:
 
 def test_a_sound_card_is_driven_through_its_stream(plugged: Callable[..., Card]) -> None:
     card = plugged()
-    device = SoundDevice([2], [3], [1], fs=FS, block=32, device="duplex")
+    device = PluggedDevice(card, device="duplex")
     assert isinstance(device, Interface)
     report = started(device, step_size=0.2, amplitude_limit=0.8, seconds=2.0)
     assert card.asked["channels"] == (4, 2)
@@ -402,14 +413,14 @@ def test_a_sound_card_is_driven_through_its_stream(plugged: Callable[..., Card])
     assert report.health.samples == {"output underflow": 2 * 32}
     assert report.health.counts == {"output underflow": 1}
     (event,) = report.health.events
-    assert event.time_s == pytest.approx((700 - card.reads_before_control) * 32 / FS)
+    assert event.time_s == pytest.approx((700 - card.blocks_before_control) * 32 / FS)
 
 
 def test_lost_and_repeated_blocks_of_a_card_are_in_the_health_record(plugged: Callable[..., Card]) -> None:
     card = plugged()
     card.lost_at, card.dry_at, card.repeated_at = [640, 641], [], [680]
     reports: list[RunStatus] = []
-    device = SoundDevice([2], [3], [1], fs=FS, block=32)
+    device = PluggedDevice(card)
     report = started(
         device, step_size=0.2, amplitude_limit=0.8, seconds=1.6, on_report=reports.append, report_every_s=0.8
     )
@@ -425,7 +436,7 @@ def test_nothing_is_measured_across_a_gap(what: str, message: str, plugged: Call
     card = plugged()
     setattr(card, what, [200])
     with pytest.raises(FaultError, match=f"{message}.* while the path was identified"):
-        started(SoundDevice([2], [3], [1], fs=FS, block=32), amplitude_limit=0.8)
+        started(PluggedDevice(card), amplitude_limit=0.8)
     assert card.states == ["start", "stop", "close"]
 
     def round_trip(gaps: list[int]) -> int:
@@ -433,13 +444,41 @@ def test_nothing_is_measured_across_a_gap(what: str, message: str, plugged: Call
         card.lost_at, card.dry_at = [], []
         setattr(card, what, gaps)
         try:
-            return measure_round_trip(SoundDevice([2], [3], [1], fs=FS, block=32), level=0.1, longest=256)
+            return measure_round_trip(PluggedDevice(card), level=0.1, longest=256)
         finally:
             assert card.states == ["start", "stop", "close"]
 
     assert round_trip([]) == 65
     with pytest.raises(FaultError, match=f"{message}.* while the round trip was measured, so it .* run again"):
         round_trip([200])
+
+
+def test_a_block_that_comes_too_late_is_left_out_and_the_next_is_in_time(plugged: Callable[..., Card]) -> None:
+    card = plugged()
+    played: list[float] = []
+    card.interface.write = lambda y: played.append(float(y[0, 0]))  # type: ignore[method-assign]
+    device = PluggedDevice(card)
+    device.start()
+    for sample in range(1, 6):
+        if sample != 3:
+            card.ask()
+        SoundDevice.read(device)
+        if sample == 2:
+            card.ask()  # again, before anything was written
+        device.write(np.full((1, 32), 0.1 * sample))
+    card.ask()
+    assert np.round(played).tolist() == [0, 1, 0, 3, 4, 5]  # the second would have been played a block too late
+    assert device.dry == 1
+    device.stop()
+
+
+def test_a_card_that_is_gone_is_an_error(plugged: Callable[..., Card], monkeypatch: pytest.MonkeyPatch) -> None:
+    plugged()
+    monkeypatch.setattr("kfopc_filterpy.realtime.sound_device.SILENT_S", 0.01)
+    device = SoundDevice([2], [3], [1], fs=FS, block=32)
+    device.start()
+    with pytest.raises(RuntimeError, match="no block came from the sound card"):
+        device.read()
 
 
 def test_without_sounddevice_or_portaudio_the_error_says_what_to_install(uninstall: Callable[[str], None]) -> None:
