@@ -31,7 +31,6 @@ from .cases import (
     TONE_HZ,
     Case,
     Pair,
-    Row,
     Setting,
     driven_case,
     ducts,
@@ -41,6 +40,7 @@ from .cases import (
     with_overdrive,
 )
 from .report_parts import driven_parameters, legend_of, new_figure, tuned_in_words, without_measured
+from .rows import Row
 
 PEAK_LIMITED = ("clipping FxLMS", "re-scaling FxLMS", "two-gradient FxLMS")
 ALGORITHMS = ("KF-ANC", "FxLMS", "KF-OPC", "KF-PB", "MOV-FxLMS", *PEAK_LIMITED)

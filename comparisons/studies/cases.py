@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -11,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import (
-    SimulationResult,
     bandpass_path,
-    noise_reduction_db,
-    output_power,
     power_constrained_wiener,
 )
 from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_scene, try_settings
+from kfopc_filterpy.bench.scene import reachable_weights
 from kfopc_filterpy.bounds import PowerConstrainedWiener
-from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import (
     DataUnavailableError,
@@ -70,47 +66,6 @@ class Case:
 
     def __str__(self) -> str:
         return f"{self.path}, {self.noise}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """The result of an algorithm in a case, common to all studies; figures are NaN if it diverged."""
-
-    path: str
-    noise: str
-    algorithm: str
-    setting: Any = None  # the tuned one, if any
-    noise_reduction_db: float = np.nan  # over the steady half
-    power: float = np.nan  # over the steady half, over the rated one
-    diverged_at_s: float | None = None
-
-    @property
-    def case(self) -> Case:
-        """Where it was run."""
-        return Case(self.path, self.noise)
-
-    @property
-    def unstable(self) -> bool:
-        """Whether it ran away, or left more noise than there was."""
-        return self.diverged_at_s is not None or not self.noise_reduction_db > 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class WindowRow(Row):
-    """A row that knows the short-time output power too."""
-
-    worst_window: float = np.nan  # largest power over WINDOW_S, over the rated one
-
-
-def figures_of(result: SimulationResult | None, rated_power: float) -> dict[str, Any]:
-    """Return the figures of a `WindowRow`; a filter that could not go on diverged at its start."""
-    if result is None or result.diverged_at_s is not None:
-        return {"diverged_at_s": 0.0 if result is None else result.diverged_at_s}
-    return {
-        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
-        "power": output_power(result.control_signal) / rated_power,
-        "worst_window": overshoot(result.control_signal, rated_power, FS, window_s=WINDOW_S),
-    }
 
 
 # ---- Paths and noises
@@ -245,9 +200,7 @@ def louder(scene: Scene, gain: float) -> Scene:
 def bound_of(scene: Scene, segment_s: float = 1.0) -> PowerConstrainedWiener:
     """Return the power-constrained Wiener solutions of a case, of weights that controllers reach."""
     ridge = scene.measurement_noise / (scene.settled[0].shape[-1] * scene.initial_variance)
-    with warnings.catch_warnings():
-        # In directions without energy very large weights would do better, and no controller reaches them.
-        warnings.simplefilter("ignore", np.exceptions.RankWarning)
+    with reachable_weights():
         return power_constrained_wiener(
             scene.references[0],
             scene.disturbances[0],

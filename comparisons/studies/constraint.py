@@ -26,21 +26,9 @@ from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
-from .cases import (
-    FS,
-    SWITCH_ON_S,
-    WINDOW_S,
-    Case,
-    WindowRow,
-    bounds_db,
-    figures_of,
-    grid_runs,
-    make_case,
-    noises,
-    paths,
-    with_jump,
-)
-from .report_parts import MARK, case_parameters, cell, legend_of, new_figure, without_measured
+from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, bounds_db, grid_runs, make_case, noises, paths, with_jump
+from .report_parts import MARK, case_parameters, legend_of, new_figure, without_measured
+from .rows import WindowRow, cell, figures_of
 
 N_TAPS = 160
 DURATIONS_S = (8.0, 60.0)  # settings are tuned and convergence is measured on the first; the second averages more

@@ -8,31 +8,19 @@ from functools import partial
 
 import numpy as np
 
-from kfopc_filterpy import OutputLimiter, kf_pb
+from kfopc_filterpy import OutputLimiter
 from kfopc_filterpy.bench import FigureItem, Parameter, Runs, StudyReport, Table
 
+from . import kf_pb_cases as cases
 from .cases import FS, SENSOR_NOISE_DB, Pair
-from .kf_pb import (
-    DURATION_S,
-    FAULTS,
-    N_TAPS,
-    SEED,
-    SHARES,
-    SILENT_S,
-    STEADY,
-    all_paths,
-    fixed_filters,
-    make_rated,
-    noises,
-    with_any_power,
-)
+from .kf_pb_cases import FAULTS, STEADY, fixed_filters, make_rated, with_any_power
 from .report_parts import new_figure, without_measured
 
-LONG = 4 * N_TAPS  # taps that stand for a filter of any length
+LONG = 4 * cases.N_TAPS  # taps that stand for a filter of any length
 FAULT = "two samples early"  # of the estimate that KF-PB gets to verify
 STAGES = {  # what each stage adds to the one before
     "causality": f"a causal filter of {LONG} taps, with any power",
-    "length": f"a filter of {N_TAPS} taps",
+    "length": f"a filter of {cases.N_TAPS} taps",
     "price": "the rated power is kept in every second, and each second has its own filter",
     "adaptation": "KF-PB with the exact path, within the rated power over 10 s",
     "path": f"KF-PB with an estimate that is {FAULT}, which it verifies",
@@ -58,19 +46,17 @@ class LossRow:
 def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
     """Run every stage of a case."""
     path, noise = job
-    case = make_rated(pairs[path], noises()[noise][1](), SHARES[0])
-    make = partial(kf_pb, N_TAPS, rated_power=case.rated_power, fs=FS)
+    case = make_rated(pairs[path], cases.noises()[noise][1](), cases.SHARES[0])
     wrong = FAULTS[FAULT](case.secondary)
-    limiter = OutputLimiter(case.rated_power, fs=FS)
     controllers = [
-        make(secondary_path=case.secondary, secondary_path_uncertainty=None),
-        make(secondary_path=wrong),
-        make(secondary_path=wrong, limiter=limiter),
+        case.kf_pb(case.secondary, secondary_path_uncertainty=None),
+        case.kf_pb(wrong),
+        case.kf_pb(wrong, limiter=OutputLimiter(case.rated_power, fs=FS)),
     ]
     plant = (case.reference, case.disturbance, case.secondary)
-    errors = [*(with_any_power(*plant, n_taps).error for n_taps in (LONG, N_TAPS)), case.bound_error]
+    errors = [*(with_any_power(*plant, n_taps).error for n_taps in (LONG, cases.N_TAPS)), case.bound_error]
     errors += [case.run(controller).error for controller in controllers]
-    bound = fixed_filters(*plant, N_TAPS, rated_power=case.rated_power)
+    bound = fixed_filters(*plant, cases.N_TAPS, rated_power=case.rated_power)
     return LossRow(
         path, noise, [case.reduction_db(error) for error in errors], case.reduction_db(bound.within_windows().error)
     )
@@ -78,8 +64,8 @@ def loss_row(pairs: dict[str, Pair], job: tuple[str, str]) -> LossRow:
 
 def jobs() -> list[tuple[str, str]]:
     """Return the cases: every pair of paths with every steady noise at hand."""
-    steady = [noise for noise, (kind, _) in noises().items() if kind == STEADY]
-    return [(path, noise) for path in all_paths() for noise in steady]
+    steady = [noise for noise, (kind, _) in cases.noises().items() if kind == STEADY]
+    return [(path, noise) for path in cases.all_paths() for noise in steady]
 
 
 def planned_runs() -> int:
@@ -89,7 +75,7 @@ def planned_runs() -> int:
 
 def main(runs: Runs) -> StudyReport:
     """Run the study on the paths and noises at hand."""
-    pairs = all_paths()
+    pairs = cases.all_paths()
     rows = list(runs.map(partial(loss_row, pairs), jobs()))
     return StudyReport(
         name="loss-map",
@@ -102,13 +88,12 @@ def main(runs: Runs) -> StudyReport:
         fs=FS,
         rated_power=1.0,
         parameters={
-            "n_taps": Parameter(N_TAPS, "of the control filter"),
-            "duration_s": Parameter([SILENT_S, DURATION_S], "before and after the control is switched on"),
-            "rated_share": Parameter(SHARES[0], "of the power that full control needs"),
+            "n_taps": Parameter(cases.N_TAPS, "of the control filter"),
+            "duration_s": Parameter([cases.SILENT_S, cases.DURATION_S], "before and after the control is switched on"),
+            "rated_share": Parameter(cases.SHARES[0], "of the power that full control needs"),
             "sensor_noise_db": Parameter(SENSOR_NOISE_DB, "relative to the disturbance"),
-            "seed": Parameter(SEED, "of noise and sensor noise"),
+            "seed": Parameter(cases.SEED, "of noise and sensor noise"),
         },
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=[],
         figures=[loss_figure(rows)],
@@ -131,7 +116,7 @@ def loss_table(rows: Sequence[LossRow]) -> Table:
 
 def loss_figure(rows: Sequence[LossRow]) -> FigureItem:
     """Return a figure with a bar for each case, from the sensor noise down to what is left."""
-    figure, axes = new_figure((7.0, 1.2 + 0.32 * len(rows)))
+    figure, axes = new_figure((7.0, 1.2 + 0.32 * len(rows)), grid="")
     ax, names = axes[0, 0], [f"{row.path}, {row.noise}" for row in rows]
     left = np.array([row.reduction_db[-1] for row in rows])
     ax.barh(names, left, color="0.25", label="left")

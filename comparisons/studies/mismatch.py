@@ -24,19 +24,17 @@ from kfopc_filterpy.bench import (
 from kfopc_filterpy.paths import frequency_response, path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
-from .cases import BAND_HZ, FS, Case, Pair, Row, driven_case, ducts, grid_runs, grids, noise_of
+from .cases import BAND_HZ, FS, Case, Pair, driven_case, ducts, grid_runs, grids, noise_of
 from .report_parts import (
     MARK,
-    by_algorithm,
     ceilings_note,
-    cell,
     driven_parameters,
     legend_of,
     new_figure,
     tuned_in_words,
     without_measured,
 )
-from .worst_cases import worst
+from .rows import Row, cell, table_of_cells, worst
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 UNCONSTRAINED = ("KF-ANC", "FxRLS", "FxLMS")
@@ -293,7 +291,7 @@ def _table(stem: str, caption: str, rows: Sequence[MismatchRow], tuned_with: str
     own = [row for row in rows if row.tuned_with == tuned_with]
     cells = (((row.path, row.noise, row.point), row.algorithm, cell(row, figure)) for row in own)
     whole = f"{caption}, at the settings that are best with the {tuned_with}"
-    return by_algorithm(stem, whole, ["paths", "noise", "mismatch"], ALGORITHMS, cells)
+    return table_of_cells(stem, whole, ["paths", "noise", "mismatch"], ALGORITHMS, cells)
 
 
 def _figure(rows: Sequence[MismatchRow], case: Case) -> FigureItem:

@@ -27,10 +27,10 @@ from kfopc_filterpy.bench import (
 from kfopc_filterpy.plot import curve_style, plot_nse
 
 from . import multichannel_rooms as rooms
-from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Row, Setting, bound_of
+from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Setting, bound_of
 from .multichannel_rooms import MEASURED, RECORDINGS, Place, equally_rated, level_map_db, make_rated_scene, places
-from .report_parts import MARK, by_algorithm, cell, legend_of, new_figure, tuned_in_words
-from .worst_cases import worst
+from .report_parts import MARK, legend_of, new_figure, tuned_in_words
+from .rows import Row, cell, table_of_cells, worst
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
@@ -321,7 +321,7 @@ def _table(stem: str, caption: str, rows: Sequence[ChannelRow], figure: str = "n
     """Return a table with a line for each rating and algorithm and a column for each place and noise."""
     columns = list(dict.fromkeys(str(row.case) for row in rows))
     cells = (((row.rating, row.algorithm), str(row.case), cell(row, figure)) for row in rows)
-    return by_algorithm(stem, caption, ["ratings", "algorithm"], columns, cells)
+    return table_of_cells(stem, caption, ["ratings", "algorithm"], columns, cells)
 
 
 # ---- Figures and sounds

@@ -25,20 +25,9 @@ from kfopc_filterpy.bench import (
 )
 from kfopc_filterpy.plot import curve_style
 
-from .cases import (
-    FS,
-    SWITCH_ON_S,
-    Case,
-    WindowRow,
-    bounds_db,
-    figures_of,
-    grid_runs,
-    make_case,
-    noises,
-    paths,
-)
+from .cases import FS, SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, paths
 from .report_parts import MARK, case_parameters, new_figure, tried
-from .worst_cases import worst
+from .rows import WindowRow, figures_of, worst
 
 SHARES_DB = (-20.0, -15.0, -12.0, -9.0, -6.0, -3.0, 0.0)  # rated power over the unconstrained control power
 DURATION_S = 8.0

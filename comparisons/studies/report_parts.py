@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from kfopc_filterpy import SimulationResult
-from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, Table, Trial, Tuned, algorithms
+from kfopc_filterpy.bench import FigureItem, Parameter, Scene, Sound, Trial, Tuned, algorithms
 from kfopc_filterpy.bounds import power_constrained_solution
 from kfopc_filterpy.plot import curve_style, plot_bode
 
-from .cases import BAND_HZ, FS, N_TAPS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, TONE_HZ, Row, bounds_db
+from .cases import BAND_HZ, FS, N_TAPS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, TONE_HZ, bounds_db
 
 MARK = "0.35"  # colour of reference lines
 BANDPASS_PATHS = {
@@ -37,12 +37,17 @@ def draw_paths(caption: str, paths: Mapping[str, Any]) -> FigureItem:
     return FigureItem("paths", caption, np.ravel(plot_bode(paths))[0].figure)
 
 
-def new_figure(size: tuple[float, float], rows: int = 1, columns: int = 1, **shared: Any) -> tuple[Any, Any]:
-    """Return a figure that pyplot does not know, and its axes as an array (rows, columns)."""
+def new_figure(
+    size: tuple[float, float], rows: int = 1, columns: int = 1, *, grid: str = "both", **shared: Any
+) -> tuple[Any, Any]:
+    """Return a figure that pyplot does not know, and its axes as an array (rows, columns); `grid` is "" for none."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, **shared)
+    axes = figure.subplots(rows, columns, squeeze=False, **shared)
+    for ax in axes.flat if grid else ():
+        ax.grid(True, axis=grid, alpha=0.3)
+    return figure, axes
 
 
 def thin_style(algorithm: str) -> dict[str, Any]:
@@ -215,26 +220,3 @@ def sounds(results: Mapping[str, SimulationResult]) -> list[Sound]:
     first = next(iter(results.values()))
     heard = [Sound("disturbance", "Control off", first.disturbance)]
     return heard + [Sound(name.lower(), name, r.error) for name, r in results.items()]
-
-
-# ---- Tables
-
-
-def cell(row: Row, figure: str) -> Any:
-    """Return a figure of a row for a table."""
-    return getattr(row, figure) if row.diverged_at_s is None else "diverged"
-
-
-def by_algorithm(
-    stem: str,
-    caption: str,
-    headings: Sequence[str],
-    names: Sequence[str],
-    cells: Iterable[tuple[tuple[str | float, ...], str, Any]],
-) -> Table:
-    """Return a table of a line for each key and a column for each algorithm, of keys, algorithms and values."""
-    lines: dict[tuple[str | float, ...], dict[str, Any]] = {}
-    for key, name, value in cells:
-        lines.setdefault(key, {})[name] = value
-    rows = [[*key, *(own.get(name, "") for name in names)] for key, own in lines.items()]
-    return Table(stem, caption, [*headings, *names], rows)

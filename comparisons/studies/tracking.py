@@ -20,7 +20,6 @@ from .cases import (
     SWITCH_ON_S,
     WINDOW_S,
     Pair,
-    WindowRow,
     driven_case,
     ducts,
     grid_runs,
@@ -31,9 +30,7 @@ from .cases import (
 )
 from .report_parts import (
     MARK,
-    by_algorithm,
     ceilings_note,
-    cell,
     driven_parameters,
     legend_of,
     new_figure,
@@ -41,7 +38,7 @@ from .report_parts import (
     tuned_in_words,
     without_measured,
 )
-from .worst_cases import worst
+from .rows import WindowRow, cell, table_of_cells, worst
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 CONSTRAINED = ("KF-OPC", "KF-PB", "MOV-FxLMS")
@@ -343,7 +340,7 @@ def _back(rows: Sequence[TrackingRow]) -> Claim:
 
 def _table(stem: str, caption: str, rows: Sequence[TrackingRow], figure: str) -> Table:
     cells = (((row.event, row.path), row.algorithm, cell(row, figure)) for row in rows)
-    return by_algorithm(stem, caption, ["event", "paths"], ALGORITHMS, cells)
+    return table_of_cells(stem, caption, ["event", "paths"], ALGORITHMS, cells)
 
 
 def _settling_table(rows: Sequence[TrackingRow]) -> Table:
@@ -356,7 +353,7 @@ def _settling_table(rows: Sequence[TrackingRow]) -> Table:
         "Time in s from the start of each stretch until the NSE (50 ms, all seeds) stays within 3 dB of its value in the "
         "stretch's second half"
     )
-    return by_algorithm("settling", caption, ["event", "stretch", "paths"], ALGORITHMS, times)
+    return table_of_cells("settling", caption, ["event", "stretch", "paths"], ALGORITHMS, times)
 
 
 def _figure(event: Event, courses: Mapping[str, Mapping[str, Course]]) -> FigureItem:

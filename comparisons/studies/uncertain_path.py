@@ -22,8 +22,6 @@ from .cases import (
     SWITCH_ON_S,
     Noise,
     Pair,
-    WindowRow,
-    figures_of,
     grid_runs,
     grids,
     make_case,
@@ -31,17 +29,8 @@ from .cases import (
     paths,
     tune_all,
 )
-from .report_parts import (
-    MARK,
-    by_algorithm,
-    case_parameters,
-    cell,
-    legend_of,
-    new_figure,
-    tuned_in_words,
-    without_measured,
-)
-from .worst_cases import worst
+from .report_parts import MARK, case_parameters, legend_of, new_figure, tuned_in_words, without_measured
+from .rows import WindowRow, cell, figures_of, table_of_cells, worst
 
 ALGORITHM = "KF-PB"
 N_TAPS = 128
@@ -260,7 +249,7 @@ def _power_note(rows: Sequence[AllowanceRow]) -> str:
 
 def _table(stem: str, caption: str, rows: Sequence[AllowanceRow], figure: str) -> Table:
     cells = (((row.path, row.noise, row.error), row.allowance, cell(row, figure)) for row in rows)
-    return by_algorithm(stem, caption, ["paths", "noise", "estimate"], ALLOWANCES, cells)
+    return table_of_cells(stem, caption, ["paths", "noise", "estimate"], ALLOWANCES, cells)
 
 
 def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:

@@ -255,7 +255,7 @@ class StudyReport:
     fs: float
     rated_power: float
     parameters: dict[str, Parameter]
-    algorithms: dict[str, dict[str, float | None]]
+    algorithms: dict[str, dict[str, float | None]] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)
     claims: list[Claim] = field(default_factory=list)
     figures: list[FigureItem] = field(default_factory=list)

@@ -9,12 +9,13 @@ import pytest
 
 from comparisons import __main__ as command
 from comparisons.studies import kf_pb as study
+from comparisons.studies import kf_pb_cases
 from comparisons.studies.cases import FS, measured_data
 from kfopc_filterpy import kf_pb, noise_reduction_db, simulate
 from kfopc_filterpy.bench import Runs, StudyReport
 
 PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
-SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "JUMP_S": 2.0, "SHARES": (0.25,)}
+SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "SHARES": (0.25,)}
 
 
 @pytest.fixture(scope="module")
@@ -23,26 +24,27 @@ def small() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
         measured_data.cache_clear()
-        study.recordings.cache_clear()
+        kf_pb_cases.recordings.cache_clear()
         for name, value in SMALL.items():
-            patch.setattr(study, name, value)
-        patch.setattr(study, "JUMPS", {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)})
+            patch.setattr(kf_pb_cases, name, value)
+        patch.setattr(study, "JUMP_S", 2.0)
+        patch.setattr(kf_pb_cases, "JUMPS", {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)})
         patch.setattr(study, "STEPS", np.array([0.01]))
         patch.setattr(study, "PENALTIES", np.array([1.0]))
-        patch.setattr(study, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
+        patch.setattr(kf_pb_cases, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
         runs = Runs()
         yield study.main(runs), runs.done, study.planned_runs()
     measured_data.cache_clear()
-    study.recordings.cache_clear()
+    kf_pb_cases.recordings.cache_clear()
 
 
 def test_the_report_is_complete(small: Any) -> None:
     report, done, planned = small
     assert isinstance(report, StudyReport)
     assert done == planned
-    assert {row["kind"] for row in report.extra["rows"]} == {study.STEADY, study.CHANGING}
+    assert {row["kind"] for row in report.extra["rows"]} == {kf_pb_cases.STEADY, kf_pb_cases.CHANGING}
     faults = {(row["fault"], row["begins"]) for row in report.extra["faults"]}
-    expected = {(fault, begins) for fault in study.FAULTS for begins in ("start", "jump")}
+    expected = {(fault, begins) for fault in kf_pb_cases.FAULTS for begins in ("start", "jump")}
     assert faults == expected | {(fault, "jump") for fault in study.PRIMARY}
     assert [table.stem for table in report.tables] == ["classes", "cases", "faults"]
     assert len(report.claims) == 8
@@ -51,7 +53,7 @@ def test_the_report_is_complete(small: Any) -> None:
 
 def test_a_row_is_what_a_run_of_ones_own_says(small: Any) -> None:
     row = next(row for row in small[0].extra["rows"] if row["noise"] == "band noise")
-    case = study.make_rated((PRIMARY, SECONDARY), study.noises()["band noise"][1](), 0.25)
+    case = kf_pb_cases.make_rated((PRIMARY, SECONDARY), kf_pb_cases.noises()["band noise"][1](), 0.25)
     controller = kf_pb(16, SECONDARY, rated_power=case.rated_power, fs=FS)
     result = simulate(
         controller, case.reference, disturbance=case.disturbance, secondary_path=SECONDARY, fs=FS, switch_on_s=1.0

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from comparisons import __main__ as command
-from comparisons.studies import kf_pb as kf_pb_study
-from comparisons.studies import loss_map
+from comparisons.studies import kf_pb_cases, loss_map
 from comparisons.studies.cases import SENSOR_NOISE_DB, measured_data
-from comparisons.studies.kf_pb import Rated, make_rated, noises
+from comparisons.studies.kf_pb_cases import Rated, make_rated, noises
 from kfopc_filterpy.bench import Runs, StudyReport
 
 TAPS, LONG = 12, 40
@@ -24,15 +23,14 @@ def small() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("KFOPC_DATA", "/no/such/folder")
         measured_data.cache_clear()
-        kf_pb_study.recordings.cache_clear()
-        for study in (kf_pb_study, loss_map):
-            patch.setattr(study, "N_TAPS", TAPS)
+        kf_pb_cases.recordings.cache_clear()
+        patch.setattr(kf_pb_cases, "N_TAPS", TAPS)
         patch.setattr(loss_map, "LONG", LONG)
-        patch.setattr(loss_map, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
+        patch.setattr(kf_pb_cases, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
         runs = Runs()
         yield loss_map.main(runs), runs.done, loss_map.planned_runs()
     measured_data.cache_clear()
-    kf_pb_study.recordings.cache_clear()
+    kf_pb_cases.recordings.cache_clear()
 
 
 def test_planned_runs_are_those_taken(small: Any) -> None:
@@ -60,5 +58,5 @@ def test_a_filter_with_any_power_is_that_of_batch_least_squares() -> None:
     rows = np.lib.stride_tricks.sliding_window_view(filtered, TAPS)[begin - TAPS + 1 :, ::-1]
     weights = np.linalg.lstsq(rows, case.after, rcond=None)[0]
     expected = case.reduction_db(case.after - rows @ weights)
-    found = kf_pb_study.with_any_power(case.reference, case.disturbance, case.secondary, TAPS)
+    found = kf_pb_cases.with_any_power(case.reference, case.disturbance, case.secondary, TAPS)
     assert case.reduction_db(found.error) == pytest.approx(expected, abs=0.1)

@@ -17,7 +17,9 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).res
 
 from oracles import power_budget as law  # noqa: E402
 
-from comparisons.studies import kf_pb as study  # noqa: E402
+from comparisons.studies import kf_pb_cases as study  # noqa: E402
+from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S  # noqa: E402
+from kfopc_filterpy.metrics import overshoot  # noqa: E402
 
 CASES = (
     ("duct", "compressor"),
@@ -101,7 +103,7 @@ def main() -> None:
                 with without(rule) as settings:
                     e, y = run(case, **settings)
                 gains.append(case.reduction_db(e) - case.reduction_db(case.bound_error))
-                powers.append(study.overshoot(y, case.rated_power, study.FS, window_s=study.DEFAULT_AVERAGING_S))
+                powers.append(overshoot(y, case.rated_power, study.FS, window_s=DEFAULT_AVERAGING_S))
                 bar.update()
             bar.write(f"{rule:26}{np.mean(gains):+22.2f}{min(gains):+10.2f}{max(powers):24.2f}", file=sys.stdout)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from comparisons.studies.worst_cases import worst
+from comparisons.studies.rows import worst
 
 
 @pytest.mark.parametrize("lost", [3.0, np.inf, np.nan])

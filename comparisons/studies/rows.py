@@ -1,0 +1,141 @@
+"""Rows of results, which all studies beyond the paper have: selected, put into words, put into tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
+from kfopc_filterpy.bench import Claim, Table
+from kfopc_filterpy.metrics import overshoot
+
+from .cases import FS, WINDOW_S, Case
+
+AnyRow = TypeVar("AnyRow")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """The result of an algorithm in a case, common to all studies; figures are NaN if it diverged."""
+
+    path: str
+    noise: str
+    algorithm: str
+    setting: Any = None  # the tuned one, if any
+    noise_reduction_db: float = np.nan  # over the steady half
+    power: float = np.nan  # over the steady half, over the rated one
+    diverged_at_s: float | None = None
+
+    @property
+    def case(self) -> Case:
+        """Where it was run."""
+        return Case(self.path, self.noise)
+
+    @property
+    def unstable(self) -> bool:
+        """Whether it ran away, or left more noise than there was."""
+        return self.diverged_at_s is not None or not self.noise_reduction_db > 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindowRow(Row):
+    """A row that knows the short-time output power too."""
+
+    worst_window: float = np.nan  # largest power over WINDOW_S, over the rated one
+
+
+def figures_of(result: SimulationResult | None, rated_power: float) -> dict[str, Any]:
+    """Return the figures of a `WindowRow`; a filter that could not go on diverged at its start."""
+    if result is None or result.diverged_at_s is not None:
+        return {"diverged_at_s": 0.0 if result is None else result.diverged_at_s}
+    return {
+        "noise_reduction_db": noise_reduction_db(result.error, result.disturbance),
+        "power": output_power(result.control_signal) / rated_power,
+        "worst_window": overshoot(result.control_signal, rated_power, FS, window_s=WINDOW_S),
+    }
+
+
+# ---- Selections
+
+
+def select(rows: Iterable[AnyRow], **values: Any) -> list[AnyRow]:
+    """Return the rows that have these values."""
+    return [row for row in rows if all(getattr(row, name) == value for name, value in values.items())]
+
+
+def grouped(rows: Iterable[AnyRow], *names: str) -> dict[tuple[Any, ...], list[AnyRow]]:
+    """Return the rows by their values of these names, in the order in which they come."""
+    groups: dict[tuple[Any, ...], list[AnyRow]] = {}
+    for row in rows:
+        groups.setdefault(tuple(getattr(row, name) for name in names), []).append(row)
+    return groups
+
+
+def column(rows: Iterable[Any], name: str) -> np.ndarray:
+    """Return one value of all rows."""
+    return np.array([getattr(row, name) for row in rows])
+
+
+# ---- Words
+
+
+def worst(losses: Mapping[Any, float]) -> tuple[Any, float]:
+    """Return the largest of the losses, and whose it is; NaN, of a run that diverged, counts as the largest."""
+    where = list(losses)[int(np.argmax(list(losses.values())))]
+    return where, losses[where]
+
+
+def loss_claim(text: str, most_db: float, losses_db: Mapping[Any, float], below: str = "") -> Claim:
+    """Return the claim that no loss is larger than `most_db`."""
+    where, loss = worst(losses_db)
+    mean = np.mean(list(losses_db.values()))
+    return Claim(text, loss <= most_db, f"{mean:z.2f} dB{below} on average, {loss:z.2f} dB at worst ({where})")
+
+
+def span(values: Iterable[float], form: str = ".3g") -> str:
+    """Return the least and the largest of some values in words."""
+    own = list(values)
+    return f"{np.min(own):{form}} to {np.max(own):{form}}" if own else "(none)"
+
+
+# ---- Tables
+
+
+def cell(row: Row, figure: str) -> Any:
+    """Return a figure of a row for a table."""
+    return getattr(row, figure) if row.diverged_at_s is None else "diverged"
+
+
+def figure_table(
+    stem: str,
+    caption: str,
+    rows: Iterable[Row],
+    figure: str,
+    keys: Mapping[str, str],
+    columns: Iterable[Any],
+    column_of: str = "algorithm",
+) -> Table:
+    """Return a table of one figure: a line for the keys, given by heading and name, and a column for each algorithm."""
+    cells = (
+        (tuple(getattr(row, name) for name in keys.values()), getattr(row, column_of), cell(row, figure))
+        for row in rows
+    )
+    return table_of_cells(stem, caption, list(keys), columns, cells)
+
+
+def table_of_cells(
+    stem: str,
+    caption: str,
+    headings: Sequence[str],
+    columns: Iterable[Any],
+    cells: Iterable[tuple[tuple[str | float, ...], Any, Any]],
+) -> Table:
+    """Return a table of cells, each given with the beginning of its line and with its column."""
+    columns, lines = list(columns), dict[tuple[str | float, ...], dict[Any, Any]]()
+    for key, name, value in cells:
+        lines.setdefault(key, {})[name] = value
+    rows = [[*key, *(own.get(name, "") for name in columns)] for key, own in lines.items()]
+    return Table(stem, caption, [*headings, *map(str, columns)], rows)
