@@ -2,47 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 from scipy.linalg import toeplitz
 
-from kfopc_filterpy import SimulationResult, bandpass_path, noise_reduction_db, output_power
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Tuned,
-    figures_of_merit,
-    make_controller,
-    make_scene,
-    run_settings,
-    tune,
-    with_clipping,
-)
+from kfopc_filterpy import SimulationResult, bandpass_path, bench, noise_reduction_db, output_power
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, figures_of_merit
 from kfopc_filterpy.metrics import coherence_and_gain, peak_control_signal
 from kfopc_filterpy.plot import plot_disturbance_and_anti_noise, plot_error_spectra, plot_nse
 from kfopc_filterpy.signals import band_limited_noise
 
-from .cases import PAPER, grid_runs
-from .report_parts import (
-    BANDPASS_PATHS,
-    ceiling_note,
-    common_parameters,
-    draw,
-    first_second_db,
-    milliseconds,
-    sounds,
-    thin_style,
-    tuning_note,
-)
+from . import report_parts as parts
+from .cases import FS, PAPER, grid_runs
+from .report_parts import milliseconds
+from .rows import span
 
-FS = 16000.0
 BAND = (200.0, 2000.0)
 DURATION_S = 10.5
 RATED_POWER = 0.8
@@ -78,20 +56,21 @@ def planned_runs() -> int:
 def main(runs: Runs) -> StudyReport:
     """Run the study."""
     scene = _scene(N_TAPS)
-    tuned = tune(runs, scene, seeds=TUNING_SEEDS)
+    tuned = bench.tune(runs, scene, seeds=TUNING_SEEDS)
     results, weight_errors = _run_recorded(runs, scene, tuned)
     merits: dict[str, dict[str, Any]] = {name: figures_of_merit(rows, scene) for name, rows in results.items()}
     settling = {name: settled_after_s(curve, SETTLED_DB) for name, curve in weight_errors.items()}
     reached = {name: first_below_s(curve, SETTLED_DB) for name, curve in weight_errors.items()}
-    clipped_scene = with_clipping(scene)
+    clipped_scene = bench.with_clipping(scene)
     clipped = _run_clipped(runs, scene, clipped_scene, tuned)
     clipped_figures = {name: figures_of_merit(rows, clipped_scene) | _starts(rows) for name, rows in clipped.items()}
     other = _other_length(runs)
     powers = {name: [output_power(r.control_signal) for r in rows] for name, rows in results.items()}
     first = results["KF-OPC"][0]
     coherence = coherence_and_gain(first.disturbance, first.anti_noise, FS, BAND)
-    times = {name: own["convergence_time_s"] for name, own in merits.items()}
-    reductions = {name: own["noise_reduction_db"] for name, own in merits.items()}
+    times, reductions = (
+        {name: own[figure] for name, own in merits.items()} for figure in ("convergence_time_s", "noise_reduction_db")
+    )
     return StudyReport(
         name="broadband",
         conditions=("broadband noise", "band-pass paths"),
@@ -103,7 +82,7 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=RATED_POWER,
-        parameters=common_parameters(scene, tuned)
+        parameters=parts.common_parameters(scene, tuned)
         | {
             "noise": Parameter(f"Gaussian, {BAND[0]:g}-{BAND[1]:g} Hz", "the paper's band"),
             "duration_s": Parameter(DURATION_S - scene.switch_on_s, "10 s"),
@@ -115,7 +94,7 @@ def main(runs: Runs) -> StudyReport:
                 "clips off the best control signal of rated power; the settings tuned, r E[x'^2]/q among them, are kept",
             ),
         }
-        | BANDPASS_PATHS,
+        | parts.BANDPASS_PATHS,
         algorithms=merits,
         extra={
             "output_power_of_each_seed": powers,
@@ -135,15 +114,14 @@ def main(runs: Runs) -> StudyReport:
             clipped_claim(clipped_figures, clipped_scene.amplitude_limit),
         ],
         figures=_figures_of(results, weight_errors, clipped, clipped_scene),
-        sounds=sounds({name: rows[0] for name, rows in results.items()}),
-        notes=[*tuning_note(tuned), ceiling_note(scene), _length_note(times, other)],
+        sounds=parts.sounds({name: rows[0] for name, rows in results.items()}),
+        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene), _length_note(times, other)],
     )
 
 
 def _scene(n_taps: int) -> Scene:
-    noises = {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS}
-    return make_scene(
-        noises,
+    return bench.make_scene(
+        {seed: band_limited_noise(BAND, DURATION_S, fs=FS, rng=seed) for seed in SEEDS},
         bandpass_path(128, fs=FS),
         bandpass_path(32, fs=FS),
         fs=FS,
@@ -161,33 +139,28 @@ def _run_recorded(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> tuple
 
     The weights of a run take 40 MB, and are given up as soon as their error is known.
     """
-    jobs = [(name, k) for name in tuned for k in range(len(SEEDS))]
 
     def run(job: tuple[str, int]) -> tuple[SimulationResult, np.ndarray]:
         name, k = job
-        controller = make_controller(scene, name, tuned[name].setting)
+        controller = bench.make_controller(scene, name, tuned[name].setting)
         result = scene.run(controller, k, record_weights_every=WEIGHTS_EVERY)
         filtered = np.convolve(scene.references[k], scene.secondary)[: scene.references[k].size]
         assert result.weights is not None
-        error = weight_error(result.weights, filtered)
-        return dataclasses.replace(result, weights=None, weights_time_s=None), error
+        return replace(result, weights=None, weights_time_s=None), weight_error(result.weights, filtered)
 
-    results: Results = {name: [] for name in tuned}
-    errors: dict[str, list[np.ndarray]] = {name: [] for name in tuned}
-    for (name, _), (result, error) in zip(jobs, runs.map(run, jobs), strict=True):
-        results[name].append(result)
-        errors[name].append(error)
-    return results, {name: np.mean(own, axis=0) for name, own in errors.items()}
+    jobs = list(product(tuned, range(len(SEEDS))))
+    outcomes = dict(zip(jobs, runs.map(run, jobs), strict=True))
+    of = {name: [outcomes[name, k] for k in range(len(SEEDS))] for name in tuned}
+    return (
+        {name: [result for result, _ in own] for name, own in of.items()},
+        {name: np.mean([error for _, error in own], axis=0) for name, own in of.items()},
+    )
 
 
 def _run_all(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> Results:
-    jobs = [(name, tuned[name].setting, k) for name in tuned for k in range(len(SEEDS))]
-    outcomes = run_settings(runs, scene, jobs, lambda result: result)
-    results: Results = {name: [] for name in tuned}
-    for (name, _, _), result in zip(jobs, outcomes, strict=True):
-        assert result is not None  # none of these algorithms refuses
-        results[name].append(result)
-    return results
+    jobs = [(name, best.setting, k) for name, best in tuned.items() for k in range(len(SEEDS))]
+    outcomes: Any = iter(bench.run_settings(runs, scene, jobs, lambda result: result))  # none of these refuses
+    return {name: [next(outcomes) for _ in SEEDS] for name in tuned}
 
 
 def _run_clipped(runs: Runs, scene: Scene, clipped: Scene, tuned: Mapping[str, Tuned]) -> Results:
@@ -195,20 +168,18 @@ def _run_clipped(runs: Runs, scene: Scene, clipped: Scene, tuned: Mapping[str, T
 
     That q is right if the disturbance estimate knows the amplifier, e + s^ * amplifier(y).
     """
-    unaware = dataclasses.replace(clipped, measurement_noise=scene.measurement_noise)
-    knowing = dataclasses.replace(unaware, known_amplifier=clipped.amplifier)
+    unaware = replace(clipped, measurement_noise=scene.measurement_noise)
+    knowing = replace(unaware, known_amplifier=clipped.amplifier)
     own = {"KF-OPC": tuned["KF-OPC"]}
     return _run_all(runs, clipped, tuned) | {
-        UNAWARE: _run_all(runs, unaware, own)["KF-OPC"],
-        KNOWING: _run_all(runs, knowing, own)["KF-OPC"],
+        name: _run_all(runs, other, own)["KF-OPC"] for name, other in ((UNAWARE, unaware), (KNOWING, knowing))
     }
 
 
 def _other_length(runs: Runs) -> dict[str, float | None]:
     """Return the convergence times of the constrained methods with another length, tuned again on the first seed."""
     scene = _scene(OTHER_N_TAPS)
-    tuned = tune(runs, scene, CONSTRAINED)
-    results = _run_all(runs, scene, tuned)
+    results = _run_all(runs, scene, bench.tune(runs, scene, CONSTRAINED))
     return {name: figures_of_merit(rows, scene)["convergence_time_s"] for name, rows in results.items()}
 
 
@@ -246,7 +217,7 @@ def first_below_s(curve: np.ndarray, level_db: float) -> float | None:
 def _starts(results: Sequence[SimulationResult]) -> dict[str, list[float]]:
     """Return figures of each seed of the start, which the steady half does not show."""
     return {
-        "first_second_noise_reduction_db": [first_second_db(r) for r in results],
+        "first_second_noise_reduction_db": [parts.first_second_db(r) for r in results],
         "steady_noise_reduction_db": [noise_reduction_db(r.error, r.disturbance) for r in results],
         "peak_control_signal_of_the_whole_run": [peak_control_signal(r.control_signal, steady=1.0) for r in results],
         "output_power_of_each_seed": [output_power(r.control_signal) for r in results],
@@ -319,31 +290,25 @@ def linear_claim(coherence: float, gain: float, mov_reduction_db: float) -> Clai
 def clipped_claim(clipped: Mapping[str, Mapping[str, Any]], limit: float) -> Claim:
     """Return the claim about the amplifier that clips from the figures of each seed, see `_starts`."""
 
-    def of_seeds(name: str, key: str) -> np.ndarray:
-        return np.array(clipped[name][key])
-
+    own = {name: {key: np.array(value) for key, value in figures.items()} for name, figures in clipped.items()}
     first, steady = "first_second_noise_reduction_db", "steady_noise_reduction_db"
     peak, power = "peak_control_signal_of_the_whole_run", "output_power_of_each_seed"
-    starts = of_seeds("KF-OPC", first) >= of_seeds("KF-OPC", steady) - START_DB
-    kept = of_seeds("KF-OPC", power) <= Tuned.BUDGET * RATED_POWER
+    opc = own["KF-OPC"]
+    starts, kept = opc[first] >= opc[steady] - START_DB, opc[power] <= Tuned.BUDGET * RATED_POWER
 
     def start(name: str) -> str:
-        return f"{_span(of_seeds(name, first), 1)} dB, control signal up to {_span(of_seeds(name, peak), 1)}"
+        return f"{span(own[name][first], '.1f')} dB, control signal up to {span(own[name][peak], '.1f')}"
 
     return Claim(
         "Where the amplifier clips, KF-OPC is stable from the start and keeps to the rated power (runs that the paper does "
         "not show)",
         bool(starts.size and np.all(starts) and np.all(kept)),
-        f"over {starts.size} seeds: steady half {_span(of_seeds('KF-OPC', steady), 1)} dB, output power "
-        f"{_span(of_seeds('KF-OPC', power), 3)} of {RATED_POWER:g}; first second {start('KF-OPC')} against a limit of "
-        f"{limit:.2f}: {100 * clipped['KF-OPC']['clipped_fraction']:.1f} % of the samples are clipped, as Gaussian noise of "
-        f"that power must be. With the q of a linear amplifier, first second {start(UNAWARE)}; with the amplifier known to "
-        f"the disturbance estimate {start(KNOWING)}",
+        f"over {starts.size} seeds: steady half {span(opc[steady], '.1f')} dB, output power {span(opc[power], '.3f')} of "
+        f"{RATED_POWER:g}; first second {start('KF-OPC')} against a limit of {limit:.2f}: "
+        f"{100 * opc['clipped_fraction']:.1f} % of the samples are clipped, as Gaussian noise of that power must be. With the q "
+        f"of a linear amplifier, first second {start(UNAWARE)}; with the amplifier known to the disturbance estimate "
+        f"{start(KNOWING)}",
     )
-
-
-def _span(values: np.ndarray, digits: int) -> str:
-    return f"{values.min():.{digits}f} to {values.max():.{digits}f}"
 
 
 def _or_never(time_s: float | None) -> float:
@@ -366,8 +331,8 @@ def _draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray]) -> None:
     for name, curve in curves.items():
         start = curve[: int(0.5 * FS / WEIGHTS_EVERY)]
         time_ms = 1e3 * np.arange(start.size) * WEIGHTS_EVERY / FS
-        ax.semilogx(time_ms[1:], 10 * np.log10(start[1:]), **thin_style(name), label=name)
-    ax.axhline(SETTLED_DB, color="0.35", linestyle=":")
+        ax.semilogx(time_ms[1:], 10 * np.log10(start[1:]), **parts.thin_style(name), label=name)
+    ax.axhline(SETTLED_DB, color=parts.MARK, linestyle=":")
     ax.set(xlabel="Time (ms)", ylabel="Weight error (dB)")
     ax.legend(), ax.grid(alpha=0.3)
 
@@ -377,28 +342,28 @@ def _figures_of(
 ) -> list[FigureItem]:
     firsts = [rows[0] for rows in results.values()]
     return [
-        draw(
+        parts.draw(
             "a-nse",
             f"Normalised squared error over 5 ms, pooled over {len(SEEDS)} seeds, first 0.25 s (Fig. 6 a).",
             lambda ax: plot_nse(results, window_s=0.005, ax=ax).set_xlim(0, 0.25),
         ),
-        draw(
+        parts.draw(
             "a-weight-error",
             "Error of the weights, weighted by the filtered reference, over the anti-noise of each algorithm's own steady "
             f"solution, mean over {len(SEEDS)} seeds. Unlike the NSE it does not depend on how low an algorithm settles.",
             lambda ax: _draw_weight_errors(ax, weight_errors),
         ),
-        draw(
+        parts.draw(
             "b-error-spectra",
             "Power spectra of disturbance and error signals over the steady half (Fig. 6 b).",
             lambda ax: plot_error_spectra(firsts, band=(0, 4000), ax=ax),
         ),
-        draw(
+        parts.draw(
             "c-waveform",
             "Disturbance and KF-OPC's anti-noise, with their coherence and gain (Fig. 6 c).",
             lambda ax: plot_disturbance_and_anti_noise(results["KF-OPC"][0], span_s=(9.0, 9.02), band=BAND, ax=ax),
         ),
-        draw(
+        parts.draw(
             "clipped-nse",
             f"Normalised squared error over 50 ms with an amplifier that clips at {clipped_scene.amplitude_limit:.3f}, "
             f"pooled over {len(SEEDS)} seeds. Up to 50 ms the mean is over the time since switch-on, so the start still "

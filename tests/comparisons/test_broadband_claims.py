@@ -13,7 +13,7 @@ from helpers.results import single_result
 from comparisons.studies import broadband
 from comparisons.studies.broadband import FS, KNOWING, UNAWARE, WEIGHTS_EVERY
 from comparisons.studies.report_parts import first_second_db
-from kfopc_filterpy.bench import make_scene
+from kfopc_filterpy.bench import make_scene, with_clipping
 from kfopc_filterpy.signals import band_limited_noise
 
 
@@ -186,7 +186,7 @@ def test_q_with_clipping_is_that_of_a_clipped_gaussian(monkeypatch: pytest.Monke
     noise = np.random.default_rng(3).standard_normal(200_000)
     scene = make_scene({0: noise}, [0.0, 1.0], [1.0], fs=FS, rated_power=0.8, power_multiple=4.0, n_taps=4)
     scene = dataclasses.replace(scene, sensor_noise_std=0.0)
-    limited = broadband.with_clipping(scene)
+    limited = with_clipping(scene)
     a = sqrt(2.0)  # the limit over the standard deviation of y
     tail, density = (1.0 - erf(a / sqrt(2.0))) / 2.0, exp(-(a**2) / 2.0) / sqrt(2.0 * pi)
     power = 2.0 * ((1.0 + a**2) * tail - a * density)  # E[(y - clip(y))^2] for a variance of 1
@@ -201,7 +201,7 @@ def test_every_run_with_clipping_is_made_as_it_says(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(broadband, "SEEDS", (1, 2))
     noises = {k: band_limited_noise((200.0, 2000.0), 0.7, fs=FS, rng=k) for k in (1, 2)}
     scene = make_scene(noises, [0.0, 0.0, 1.0], [1.0], fs=FS, rated_power=0.8, power_multiple=4.0, n_taps=8)
-    limited = broadband.with_clipping(scene)
+    limited = with_clipping(scene)
     seen = []
 
     def run_all(runs: Any, own: Any, tuned: Any) -> Any:
