@@ -8,29 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, output_power
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    Sound,
-    StudyReport,
-    Table,
-    Tuned,
-    algorithms,
-    run_setting,
-    try_settings,
-    tune,
-)
+from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, output_power
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, Sound, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.plot import curve_style, plot_nse
 
 from . import multichannel_rooms as rooms
+from . import report_parts as parts
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Setting, bound_of
 from .multichannel_rooms import MEASURED, RECORDINGS, Place, equally_rated, level_map_db, make_rated_scene, places
-from .report_parts import MARK, legend_of, new_figure, tuned_in_words
-from .rows import Row, cell, table_of_cells, worst
+from .rows import Row, column, figure_table, loss_claim, select, worst
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
 BOUND, SCALED, FREE = "bound", "scaled Wiener", "no limit"
@@ -79,8 +65,7 @@ def coarse_grids(place: Place) -> dict[str, list[Setting]]:
     registry = algorithms(several_channels=True)
     return {
         name: [(one, two) for one in registry[name].first[::2] for two in registry[name].second[::2]]
-        if registry[name].second
-        else registry[name].grid
+        or registry[name].grid
         for name in names(place)
     }
 
@@ -103,7 +88,7 @@ def main(runs: Runs) -> StudyReport | str:
     sounds: list[Sound] = []
     for place, noise in cases():
         scene = make_rated_scene(place, noise, RECORDED_S if noise in RECORDINGS else DURATION_S)
-        best = tune(runs, scene, names(place), trials=try_settings(runs, scene, coarse_grids(place)))
+        best = bench.tune(runs, scene, names(place), trials=bench.try_settings(runs, scene, coarse_grids(place)))
         results = final_runs(runs, scene, best)
         own = place_rows(place.name, noise, scene, best, results)
         rows += own
@@ -124,7 +109,6 @@ def main(runs: Runs) -> StudyReport | str:
         fs=rooms.FS,
         rated_power=1.0,
         parameters=_parameters(tuned),
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_reduction_figure(rows), *figures],
@@ -143,22 +127,23 @@ def main(runs: Runs) -> StudyReport | str:
 
 def final_runs(runs: Runs, scene: Scene, tuned: Mapping[str, Tuned]) -> Results:
     """Run every algorithm at its best setting; those that refuse it are left out."""
-    finals = runs.map(lambda item: run_setting(scene, item[0], item[1].setting), tuned.items(), worth=lambda item: 0)
+    settings = {name: best.setting for name, best in tuned.items()}
+    finals = runs.map(lambda item: bench.run_setting(scene, *item), settings.items(), worth=lambda item: 0)
     return {name: result for name, result in zip(tuned, finals, strict=True) if result is not None}
 
 
-def place_rows(name: str, noise: str, scene: Scene, tuned: Mapping[str, Tuned], results: Results) -> list[ChannelRow]:
+def place_rows(path: str, noise: str, scene: Scene, tuned: Mapping[str, Tuned], results: Results) -> list[ChannelRow]:
     """Return the rows of a place and noise; those with one equal rating are of the bounds and of KF-PB."""
-    equal = equally_rated(scene)
-    repeated = run_setting(equal, KF_PB, tuned[KF_PB].setting)
+    equal, place = equally_rated(scene), {"path": path, "noise": noise}
+    repeated = bench.run_setting(equal, KF_PB, tuned[KF_PB].setting)
     return [
-        *_bound_rows(scene, path=name, noise=noise),
+        *_bound_rows(scene, **place),
         *(
-            channel_row(scene, results.get(own), path=name, noise=noise, algorithm=own, setting=best.setting)
+            channel_row(scene, results.get(own), **place, algorithm=own, setting=best.setting)
             for own, best in tuned.items()
         ),
-        *_bound_rows(equal, path=name, noise=noise, rating=EQUAL),
-        channel_row(equal, repeated, path=name, noise=noise, rating=EQUAL, algorithm=KF_PB),
+        *_bound_rows(equal, **place, rating=EQUAL),
+        channel_row(equal, repeated, **place, rating=EQUAL, algorithm=KF_PB),
     ]
 
 
@@ -189,19 +174,10 @@ def _bound_rows(scene: Scene, *, noise: str, **place: Any) -> list[ChannelRow]:
     for label, solution in solutions.items():
         signal = getattr(bound, solution).control_signal
         powers = output_power(signal) / scene.rated_power
+        figures = {"noise_reduction_db": reached[solution], "power": float(np.max(powers)), "powers": powers.tolist()}
         # A rating that limits is used in full over the record. Over half of it, chance makes any power look like that.
         limited = output_power(signal, steady=1.0) > 0.995 * scene.rated_power
-        rows.append(
-            ChannelRow(
-                **place,
-                noise=noise,
-                algorithm=label,
-                noise_reduction_db=reached[solution],
-                power=float(np.max(powers)),
-                powers=powers.tolist(),
-                limited=limited.tolist(),
-            )
-        )
+        rows.append(ChannelRow(**place, noise=noise, algorithm=label, **figures, limited=limited.tolist()))
     return rows
 
 
@@ -210,18 +186,23 @@ def _bound_rows(scene: Scene, *, noise: str, **place: Any) -> list[ChannelRow]:
 
 def claims(rows: Sequence[ChannelRow]) -> list[Claim]:
     """Return the aims of KF-PB, and whether they are met."""
-    bound = {row.key: row for row in rows if row.algorithm == BOUND}
-    pairs = [(row, bound[row.key]) for row in rows if row.algorithm == KF_PB]
-    steady = [pair for pair in pairs if pair[0].noise not in RECORDINGS]
-    recorded = [pair for pair in pairs if pair[0].noise in RECORDINGS]
+    bound = {row.key: row for row in select(rows, algorithm=BOUND)}
+    pairs = [(row, bound[row.key]) for row in select(rows, algorithm=KF_PB)]
+    steady, recorded = ([pair for pair in pairs if (pair[0].noise in RECORDINGS) is own] for own in (False, True))
+
+    def losses(pairs: Sequence[tuple[ChannelRow, ChannelRow]]) -> dict[str, float]:
+        return {", ".join(own.key): bound.noise_reduction_db - own.noise_reduction_db for own, bound in pairs}
+
+    below = " below it"
     found = [
         _power_claim("Steady noise", "0.97 to 1.02", (0.97, 1.02), steady),
-        _loss_claim("On steady noise KF-PB reaches the bound to within 0.5 dB", 0.5, steady),
+        loss_claim("On steady noise KF-PB reaches the bound to within 0.5 dB", 0.5, losses(steady), below),
     ]
     if recorded:
+        text = "On recordings KF-PB reaches the bound of each second to within 1 dB"
         found += [
             _power_claim("Recordings", "at most 1.05", (0.0, 1.05), recorded),
-            _loss_claim("On recordings KF-PB reaches the bound of each second to within 1 dB", 1.0, recorded),
+            loss_claim(text, 1.0, losses(recorded), below),
         ]
     return [*found, _rivals_claim(rows)]
 
@@ -240,18 +221,10 @@ def _power_claim(
     )
 
 
-def _loss_claim(text: str, most_db: float, pairs: Sequence[tuple[ChannelRow, ChannelRow]]) -> Claim:
-    losses = {own.key: bound.noise_reduction_db - own.noise_reduction_db for own, bound in pairs}
-    where, loss = worst(losses)
-    mean = np.mean(list(losses.values()))
-    measured = f"{mean:.2f} dB below it on average, {loss:.2f} dB at worst ({', '.join(where)})"
-    return Claim(text, loss <= most_db, measured)
-
-
 def _rivals_claim(rows: Sequence[ChannelRow]) -> Claim:
     """Judge KF-PB against the best other method that keeps the ratings, for each place and noise with one."""
     text = "No method of another kind that keeps every rating is more than 0.3 dB better"
-    own = [row for row in rows if row.algorithm == KF_PB and row.rating != EQUAL]
+    own = select(rows, algorithm=KF_PB, rating=QUARTER)
     behind = {}
     for row in own:
         rivals = _rivals([other for other in rows if other.key == row.key])
@@ -311,7 +284,7 @@ def _parameters(tuned: Mapping[str, Mapping[str, Tuned]]) -> dict[str, Parameter
         "tones_hz": Parameter(list(rooms.TONES_HZ), "of equal level"),
         "band_hz": Parameter([list(rooms.BAND_HZ), list(rooms.WIDE_BAND_HZ)], "built-in and measured room"),
         "tuned": Parameter(
-            {where: tuned_in_words(own) for where, own in tuned.items()},
+            {where: parts.tuned_in_words(own) for where, own in tuned.items()},
             f"{Tuned.RULE}; for each setting tried: the setting, mean NSE in dB, power of each loudspeaker",
         ),
     }
@@ -319,9 +292,8 @@ def _parameters(tuned: Mapping[str, Mapping[str, Tuned]]) -> dict[str, Parameter
 
 def _table(stem: str, caption: str, rows: Sequence[ChannelRow], figure: str = "noise_reduction_db") -> Table:
     """Return a table with a line for each rating and algorithm and a column for each place and noise."""
-    columns = list(dict.fromkeys(str(row.case) for row in rows))
-    cells = (((row.rating, row.algorithm), str(row.case), cell(row, figure)) for row in rows)
-    return table_of_cells(stem, caption, ["ratings", "algorithm"], columns, cells)
+    keys = {"ratings": "rating", "algorithm": "algorithm"}
+    return figure_table(stem, caption, rows, figure, keys, dict.fromkeys(row.case for row in rows), "case")
 
 
 # ---- Figures and sounds
@@ -329,25 +301,23 @@ def _table(stem: str, caption: str, rows: Sequence[ChannelRow], figure: str = "n
 
 def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
     """Return a figure with a panel for each place: noise reduction of each algorithm, with a mark for each noise."""
-    own = [row for row in rows if row.rating != EQUAL]
+    own = select(rows, rating=QUARTER)
     shown = list(dict.fromkeys(row.path for row in own))
     order = list(dict.fromkeys(row.algorithm for row in own))[::-1]
-    figure, axes = new_figure((3.1 * len(shown) + 1.6, 5.4), 1, len(shown), sharey=True)
+    figure, axes = parts.new_figure((3.1 * len(shown) + 1.6, 5.4), 1, len(shown), sharey=True)
     for name, ax in zip(shown, axes[0], strict=True):
-        here = [row for row in own if row.path == name and row.noise_reduction_db > 0.0]
+        here = [row for row in select(own, path=name) if row.noise_reduction_db > 0.0]
         for i, noise in enumerate(dict.fromkeys(row.noise for row in own)):
             style = curve_style(i) | {"linestyle": ""}
             hollow = style | {"markerfacecolor": "white", "label": "_over"}
             for kept, marks in ((True, style | {"label": noise}), (False, hollow)):
-                mine = [row for row in here if row.noise == noise and row.within_ratings == kept]
-                at = [order.index(row.algorithm) for row in mine]
-                ax.plot([row.noise_reduction_db for row in mine], at, **marks)
+                mine = select(here, noise=noise, within_ratings=kept)
+                ax.plot(column(mine, "noise_reduction_db"), [order.index(row.algorithm) for row in mine], **marks)
         ax.set_title(name, fontsize="medium")
         ax.set_xlabel("Noise reduction (dB)")
         ax.set_yticks(range(len(order)), order)
         ax.set_xlim(0.0, 1.1 * max(row.noise_reduction_db for row in here if row.within_ratings))
-        ax.grid(True, alpha=0.3)
-    legend_of(figure, axes[0])
+    parts.legend_of(figure, axes[0])
     caption = (
         "Noise reduction over the steady half, all microphones together. Hollow marks: a loudspeaker's power exceeds "
         f"{Tuned.BUDGET:g} times its rating; those beyond the axis are in the table."
@@ -356,11 +326,11 @@ def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
 
 
 def _course_figure(rows: Sequence[ChannelRow], results: Results, shown: Sequence[str]) -> FigureItem:
-    figure, axes = new_figure((7.0, 4.0))
+    figure, axes = parts.new_figure((7.0, 4.0))
     plot_nse({name: results[name] for name in shown}, window_s=NSE_WINDOW_S, ax=axes[0, 0])
-    reached = {row.algorithm: row.noise_reduction_db for row in rows if row.rating != EQUAL}
+    reached = {row.algorithm: row.noise_reduction_db for row in select(rows, rating=QUARTER)}
     for name, dashes in ((BOUND, "-"), (SCALED, ":")):
-        axes[0, 0].axhline(-reached[name], color=MARK, linestyle=dashes, linewidth=1, label=name)
+        axes[0, 0].axhline(-reached[name], color=parts.MARK, linestyle=dashes, linewidth=1, label=name)
     axes[0, 0].legend(fontsize="small")
     caption = (
         f"Built-in room, {', '.join(SHOWN)}: the error over time, over all microphones ({NSE_WINDOW_S:g} s), with the "
@@ -373,7 +343,7 @@ def _map_figure(scene: Scene, results: Results, shown: Sequence[str]) -> FigureI
     size = int(SHOWN[0].split()[0])
     panels = {"Without control": None} | {name: results[name] for name in shown}
     room = rooms.built_in_room(size)
-    figure, axes = new_figure((4.1 * len(panels), 3.4), 1, len(panels), sharey=True)
+    figure, axes = parts.new_figure((4.1 * len(panels), 3.4), 1, len(panels), grid="", sharey=True)
     for (name, result), ax in zip(panels.items(), axes[0], strict=True):
         level, (x, y) = level_map_db(size, scene.settled[0], result)
         mesh = ax.pcolormesh(x, y, level, cmap="viridis", vmin=-15.0, vmax=10.0, shading="nearest", rasterized=True)
