@@ -9,38 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Table,
-    Tuned,
-    figures_of_merit,
-    make_controller,
-    make_scene,
-    tune,
-)
+from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, nse_db, output_power
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, make_controller
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
 from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot_nse, plot_output_power
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
+from . import report_parts as parts
 from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain
-from .report_parts import (
-    ceiling_note,
-    common_parameters,
-    draw,
-    draw_paths,
-    first_second_db,
-    milliseconds,
-    sounds,
-    tuning_note,
-)
+from .report_parts import milliseconds
 
 DURATION_S = 10.5
 RATED_POWER = 0.5
@@ -95,7 +74,6 @@ def planned_runs() -> int:
 def main(runs: Runs) -> StudyReport:
     """Run the study with the built-in duct and compressor-like noise."""
     duct = duct_paths(fs=FS)
-    noise = compressor_noise(DURATION_S, fs=FS, rng=SEED)
     parameters = {
         "noise": Parameter("fluctuating shaft harmonics and broadband noise, as of a compressor", "seeded stand-in"),
         "primary_path": Parameter(f"modelled duct, {duct.model.length_m:g} m", "defaults of duct_paths"),
@@ -103,18 +81,14 @@ def main(runs: Runs) -> StudyReport:
             f"modelled duct, loudspeaker at {duct.model.loudspeaker_m:g} m", "defaults of duct_paths"
         ),
     }
-    title = "Machine noise in a modelled duct"
-    return _study(runs, "duct", title, noise, (duct.primary, duct.secondary), parameters)
+    noise = compressor_noise(DURATION_S, fs=FS, rng=SEED)
+    return _study(runs, "duct", "Machine noise in a modelled duct", noise, (duct.primary, duct.secondary), parameters)
 
 
 def main_measured(runs: Runs) -> StudyReport | str:
     """Run the study with the measured duct and the recorded compressor; without them return a line that says why."""
-    return _measured(
-        runs,
-        "duct-measured",
-        "compressor",
-        "published by the paper's first author, and probably the paper's; its source does not say",
-    )
+    chosen = "published by the paper's first author, and probably the paper's; its source does not say"
+    return _measured(runs, "duct-measured", "compressor", chosen)
 
 
 def main_motor(runs: Runs) -> StudyReport | str:
@@ -130,7 +104,7 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
             f"{name} is left out: set KFOPC_DATA to a folder with the measured data, or run again with a network "
             f"({shorten(str(error), 120, placeholder=' ...')})"
         )
-    primary, secondary = of_unit_gain(data)
+    paths = tuple(fir_path(taps, data.fs) for taps in of_unit_gain(data))
     parameters = {
         "noise": Parameter(f"recorded {noise} noise, mean removed", chosen),
         "primary_path": Parameter(f"measured duct, {data.primary.size} taps", "as published, scale arbitrary"),
@@ -138,25 +112,14 @@ def _measured(runs: Runs, name: str, noise: str, chosen: str) -> StudyReport | s
             f"measured duct, {data.secondary.size} taps, scaled to unit gain for white noise", "scale arbitrary"
         ),
     }
-    return _study(
-        runs,
-        name,
-        f"Recorded {noise} noise in a measured duct",
-        data.noise - data.noise.mean(),
-        (fir_path(primary, data.fs), fir_path(secondary, data.fs)),
-        parameters,
-    )
+    title = f"Recorded {noise} noise in a measured duct"
+    return _study(runs, name, title, data.noise - data.noise.mean(), paths, parameters)
 
 
 def _study(
-    runs: Runs,
-    name: str,
-    title: str,
-    noise: np.ndarray,
-    paths: tuple[Any, Any],
-    parameters: dict[str, Parameter],
+    runs: Runs, name: str, title: str, noise: np.ndarray, paths: tuple[Any, ...], parameters: dict[str, Parameter]
 ) -> StudyReport:
-    scene = make_scene(
+    scene = bench.make_scene(
         {SEED: noise},
         *paths,
         fs=FS,
@@ -165,7 +128,7 @@ def _study(
         n_taps=N_TAPS,
         nse_window_s=NSE_WINDOW_S,
     )
-    tuned = tune(runs, scene, ALGORITHMS)
+    tuned = bench.tune(runs, scene, ALGORITHMS)
     smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
 
     def run_all(at: Scene, names: Sequence[str]) -> dict[str, SimulationResult]:
@@ -190,13 +153,13 @@ def _study(
         ),
         fs=FS,
         rated_power=RATED_POWER,
-        parameters=common_parameters(scene, tuned)
+        parameters=parts.common_parameters(scene, tuned)
         | parameters
         | {
             "duration_s": Parameter(results["KF-OPC"].error.size / FS, "10 s, or what the recording holds"),
             "amplifier": Parameter("linear", "the paper names no clipping here"),
         },
-        algorithms={algorithm: figures_of_merit([result], scene) for algorithm, result in results.items()},
+        algorithms={algorithm: bench.figures_of_merit([result], scene) for algorithm, result in results.items()},
         extra={
             "gain_of_the_reference_eq_11": secondary_path_gain(scene.secondary, reference=scene.settled[0]),
             "gain_of_the_wiener_control_signal": wiener.antinoise_power / wiener.control_power,
@@ -208,8 +171,8 @@ def _study(
         claims=claims(figures, start),
         tables=[_rating_table({POWER_MULTIPLE: figures, OTHER_MULTIPLE: at_smaller})],
         figures=_figures_of(results, paths),
-        sounds=sounds({algorithm: results[algorithm] for algorithm in PAPER}),
-        notes=[*tuning_note(tuned), ceiling_note(scene)],
+        sounds=parts.sounds({algorithm: results[algorithm] for algorithm in PAPER}),
+        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene)],
     )
 
 
@@ -265,10 +228,10 @@ def start_under_constraint(scene: Scene, tuned: Mapping[str, Tuned], factor: np.
     equal_time, mov_equal_time = times_to_a_common_level(equal, results["MOV-FxLMS"])
     return Start(
         at_s=float(at_s),
-        noise_reduction_db={algorithm: first_second_db(r) for algorithm, r in results.items()},
+        noise_reduction_db={algorithm: parts.first_second_db(r) for algorithm, r in results.items()},
         power={algorithm: own / RATED_POWER for algorithm, own in power.items()},
         equal_power=float(np.mean(equal.control_signal**2)) / RATED_POWER,
-        equal_power_db=first_second_db(equal),
+        equal_power_db=parts.first_second_db(equal),
         time_s=time,
         mov_time_s=mov_time,
         equal_time_s=equal_time,
@@ -369,27 +332,29 @@ def _figures_of(results: Mapping[str, SimulationResult], paths: tuple[Any, Any])
         plot_error_spectra([results[name] for name in names], band=(0, 3000), segment_s=0.05, ax=ax)
 
     return [
-        draw(
+        parts.draw(
             "a-nse",
             "Normalised squared error over 50 ms (Fig. 7 a).",
             lambda ax: plot_nse(group, window_s=NSE_WINDOW_S, ax=ax),
         ),
-        draw(
+        parts.draw(
             "b-error-spectra",
             "Power spectra of disturbance and error signals over the steady half, in steps of 20 Hz (Fig. 7 b). Left: "
             "without a rated power; right: with one. MOV-FxLMS by variance is in the table.",
             lambda ax: spectra([name for name in PAPER if name not in RATED], ax),
             lambda ax: spectra([name for name in RATED if name != FIXED], ax),
         ),
-        draw(
+        parts.draw(
             "output-power",
             "Output power over 0.25 s, and the rated power.",
             lambda ax: plot_output_power(group, rated_power=RATED_POWER, ax=ax),
         ),
-        draw(
+        parts.draw(
             "constraint-factor",
             "Constraint factor. Both follow the same powers, so the lines coincide if the residuals are alike.",
             lambda ax: plot_constraint_factor([results["KF-OPC"], results["MOV-FxLMS"]], ax=ax),
         ),
-        draw_paths("Primary and secondary path.", dict(zip(("primary path", "secondary path"), paths, strict=True))),
+        parts.draw_paths(
+            "Primary and secondary path.", dict(zip(("primary path", "secondary path"), paths, strict=True))
+        ),
     ]

@@ -14,31 +14,10 @@ from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, Stud
 from kfopc_filterpy.metrics import overshoot, short_time_power
 from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 
-from .cases import (
-    FS,
-    SEED,
-    SWITCH_ON_S,
-    WINDOW_S,
-    Pair,
-    driven_case,
-    ducts,
-    grid_runs,
-    grids,
-    noise_of,
-    tune_all,
-    with_jump,
-)
-from .report_parts import (
-    MARK,
-    ceilings_note,
-    driven_parameters,
-    legend_of,
-    new_figure,
-    thin_style,
-    tuned_in_words,
-    without_measured,
-)
-from .rows import WindowRow, cell, table_of_cells, worst
+from . import cases
+from . import report_parts as parts
+from .cases import FS, SEED, SWITCH_ON_S, WINDOW_S, Pair, ducts
+from .rows import WindowRow, figure_table, select, table_of_cells, worst
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 CONSTRAINED = ("KF-OPC", "KF-PB", "MOV-FxLMS")
@@ -97,7 +76,7 @@ class Course:
 
 def planned_runs() -> int:
     """Return the number of runs of the study; an algorithm's runs of one event on all seeds count as one."""
-    return len(jobs(ducts())) * (grid_runs(ALGORITHMS) + len(ALGORITHMS))
+    return len(jobs(ducts())) * (cases.grid_runs(ALGORITHMS) + len(ALGORITHMS))
 
 
 def main(runs: Runs) -> StudyReport:
@@ -108,13 +87,13 @@ def main(runs: Runs) -> StudyReport:
     tuned, first = {}, {}
     for event, path in jobs(pairs):
         scenes = scenes_of(event, pairs[path])
-        best = tune_all(runs, scenes[0], grids(ALGORITHMS))  # on the first seed
+        best = cases.tune_all(runs, scenes[0], cases.grids(ALGORITHMS))  # on the first seed
         outcomes = runs.map(partial(run_event, event, path, scenes, best), ALGORITHMS)
         rows += [row for row, _ in outcomes]
         own = {row.algorithm: course for row, course in outcomes if course is not None}
         courses.setdefault(event.name, {})[path] = own
         first[f"{event.name}, {path}"] = scenes[0]
-        tuned[f"{event.name}, {path}"] = tuned_in_words(best)
+        tuned[f"{event.name}, {path}"] = parts.tuned_in_words(best)
     return StudyReport(
         name="tracking",
         title="Noises and paths that change",
@@ -124,7 +103,7 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=1.0 / 10 ** (OVERDRIVE_DB / 10),
-        parameters=driven_parameters([JUMP_RUN_S, CHANGE_RUN_S, SWEEP_S, SWEEPS * SWEEP_S], OVERDRIVE_DB)
+        parameters=parts.driven_parameters([JUMP_RUN_S, CHANGE_RUN_S, SWEEP_S, SWEEPS * SWEEP_S], OVERDRIVE_DB)
         | {
             "seeds": Parameter(
                 list(SEEDS), "of noise and sensor noise, pooled; the first is tuned on; sweeps have one"
@@ -140,24 +119,25 @@ def main(runs: Runs) -> StudyReport:
             ),
             "settings": Parameter(tuned, "best and tried of each event"),
         },
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(event, courses[event.name]) for event in events()],
-        sounds=[],
         notes=[
-            *without_measured(pairs),
+            *parts.without_measured(pairs),
             "An algorithm that reduces the noise by little is soon back within 3 dB of its steady NSE: compare settling "
             "times only together with the noise reduction. During a jump of +20 dB the budget allows less than 1 dB, so "
             "the constrained algorithms count as settled whatever they do.",
-            ceilings_note(first),
+            parts.ceilings_note(first),
         ],
         tables=[
-            _table("reduction", "Noise reduction over the whole run in dB", rows, "noise_reduction_db"),
-            _table("worst", "Largest output power over 100 ms over the rated power", rows, "worst_window"),
-            _table("power", "Output power of the steady half over the rated power", rows, "power"),
-            _settling_table(rows),
-        ],
+            figure_table(stem, caption, rows, figure, {"event": "event", "paths": "path"}, ALGORITHMS)
+            for stem, caption, figure in (
+                ("reduction", "Noise reduction over the whole run in dB", "noise_reduction_db"),
+                ("worst", "Largest output power over 100 ms over the rated power", "worst_window"),
+                ("power", "Output power of the steady half over the rated power", "power"),
+            )
+        ]
+        + [_settling_table(rows)],
         claims_heading="Findings",
     )
 
@@ -194,14 +174,14 @@ def scenes_of(event: Event, pair: Pair) -> list[Scene]:
 
 def jump_scene(pair: Pair, seed: int, gain_db: float) -> Scene:
     """Return band noise that is louder or softer for a while; the rated power is that of its usual level."""
-    scene = driven_case(pair, noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
-    x = with_jump(scene.references[0], gain_db, *(t + SWITCH_ON_S for t in JUMP_S))
+    scene = cases.driven_case(pair, cases.noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
+    x = cases.with_jump(scene.references[0], gain_db, *(t + SWITCH_ON_S for t in JUMP_S))
     return replace(scene, references=[x], disturbances=[np.convolve(x, pair[0])[: x.size]])
 
 
 def change_scene(pair: Pair, seed: int, other: np.ndarray) -> Scene:
     """Return band noise whose primary path changes at `CHANGE_S`: what is on its way then arrives by the new one."""
-    scene = driven_case(pair, noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
+    scene = cases.driven_case(pair, cases.noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
     x, d = scene.references[0], scene.disturbances[0].copy()
     at = round((CHANGE_S + SWITCH_ON_S) * FS)
     d[at:] = np.convolve(x, other)[at : x.size]
@@ -211,7 +191,9 @@ def change_scene(pair: Pair, seed: int, other: np.ndarray) -> Scene:
 def sweep_scene(pair: Pair, sweeps: int) -> Scene:
     """Return sweeps from a standing start: silence until the control is switched on."""
     silence = np.zeros(round(SWITCH_ON_S * FS))
-    return driven_case(pair, np.concatenate([silence, np.tile(sweep(CHIRP_HZ, SWEEP_S, FS), sweeps)]), OVERDRIVE_DB)
+    return cases.driven_case(
+        pair, np.concatenate([silence, np.tile(sweep(CHIRP_HZ, SWEEP_S, FS), sweeps)]), OVERDRIVE_DB
+    )
 
 
 def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndarray:
@@ -276,12 +258,12 @@ def claims(rows: Sequence[TrackingRow]) -> list[Claim]:
 
 
 def _by(rows: Iterable[TrackingRow], algorithm: str) -> dict[tuple[str, str], TrackingRow]:
-    return {(row.event, row.path): row for row in rows if row.algorithm == algorithm}
+    return {(row.event, row.path): row for row in select(rows, algorithm=algorithm)}
 
 
 def _mean_nse(rows: Sequence[TrackingRow]) -> Claim:
-    ours, theirs = _by(rows, "KF-ANC"), _by(rows, "FxLMS")
-    behind = {key: row.mean_nse_db - theirs[key].mean_nse_db for key, row in ours.items()}
+    theirs = _by(rows, "FxLMS")
+    behind = {key: row.mean_nse_db - theirs[key].mean_nse_db for key, row in _by(rows, "KF-ANC").items()}
     where, most = worst(behind)
     return Claim(
         "The mean NSE over the whole run of KF-ANC is below that of FxLMS, through every event",
@@ -291,15 +273,17 @@ def _mean_nse(rows: Sequence[TrackingRow]) -> Claim:
 
 
 def _sooner(rows: Sequence[TrackingRow]) -> Claim:
-    ours, theirs = _by(rows, "KF-ANC"), _by(rows, "FxLMS")
+    theirs = _by(rows, "FxLMS")
     times = {
-        key: (_time(row, "changed"), _time(theirs[key], "changed")) for key, row in ours.items() if key[0] in CHANGES
+        ", ".join(key): (_time(row, "changed"), _time(theirs[key], "changed"))
+        for key, row in _by(rows, "KF-ANC").items()
+        if row.event in CHANGES
     }
+    told = "; ".join(f"{_ms(one)} and {_ms(other)} ({where})" for where, (one, other) in times.items())
     return Claim(
         "After a change of the primary path KF-ANC is back within 3 dB of its steady NSE sooner than FxLMS",
         all(one < other for one, other in times.values()),
-        "KF-ANC and FxLMS: "
-        + "; ".join(f"{_ms(one)} and {_ms(other)} ({', '.join(key)})" for key, (one, other) in times.items()),
+        f"KF-ANC and FxLMS: {told}",
     )
 
 
@@ -313,19 +297,19 @@ def _ms(time_s: float) -> str:
 
 
 def _jump(rows: Sequence[TrackingRow]) -> Claim:
-    powers = {(r.algorithm, r.path): r.worst_window for r in rows if r.event == LOUDER and r.algorithm in CONSTRAINED}
+    louder = [row for row in select(rows, event=LOUDER) if row.algorithm in CONSTRAINED]
+    told = ", ".join(f"{row.algorithm} {row.worst_window:.0f} ({row.path})" for row in louder)
     return Claim(
         "Through a jump of +20 dB no algorithm's constraint holds: each spends more than ten times its rated power over "
         "some 100 ms",
-        all(power > 10.0 for power in powers.values()),
-        "worst 100 ms over the rated power: "
-        + ", ".join(f"{name} {power:.0f} ({path})" for (name, path), power in powers.items()),
+        all(row.worst_window > 10.0 for row in louder),
+        f"worst 100 ms over the rated power: {told}",
     )
 
 
 def _back(rows: Sequence[TrackingRow]) -> Claim:
     times = {
-        name: [_time(row, "back") for row in rows if row.event == LOUDER and row.algorithm == name]
+        name: [_time(row, "back") for row in select(rows, event=LOUDER, algorithm=name)]
         for name in ("KF-ANC", "KF-OPC", "KF-PB")
     }
     return Claim(
@@ -336,11 +320,6 @@ def _back(rows: Sequence[TrackingRow]) -> Claim:
 
 
 # ---- Tables and figures
-
-
-def _table(stem: str, caption: str, rows: Sequence[TrackingRow], figure: str) -> Table:
-    cells = (((row.event, row.path), row.algorithm, cell(row, figure)) for row in rows)
-    return table_of_cells(stem, caption, ["event", "paths"], ALGORITHMS, cells)
 
 
 def _settling_table(rows: Sequence[TrackingRow]) -> Table:
@@ -359,25 +338,21 @@ def _settling_table(rows: Sequence[TrackingRow]) -> Table:
 def _figure(event: Event, courses: Mapping[str, Mapping[str, Course]]) -> FigureItem:
     """Return a figure of NSE and output power over time, a column for each path."""
     size = (10.5 if len(courses) > 1 else 7.5, 5.6)
-    figure, axes = new_figure(size, 2, len(courses), sharex=True, sharey="row")
+    figure, axes = parts.new_figure(size, 2, len(courses), sharex=True, sharey="row")
     highest = max(float(np.nanmax(course.power)) for own in courses.values() for course in own.values())
     for (nse, power), (path, own) in zip(axes.T, courses.items(), strict=True):
         for k, (name, course) in enumerate(own.items()):
-            above = 3.0 - 0.1 * k  # the first in front
-            nse.plot(course.time_s, np.clip(course.nse_db, *NSE_DB), label=name, zorder=above, **thin_style(name))
-            power.plot(course.time_s, course.power, zorder=above, **thin_style(name))
+            style = parts.thin_style(name) | {"zorder": 3.0 - 0.1 * k}  # the first in front
+            nse.plot(course.time_s, np.clip(course.nse_db, *NSE_DB), label=name, **style)
+            power.plot(course.time_s, course.power, **style)
             nse.set_xlim(0, course.time_s[-1])
         nse.set_title(path, fontsize="medium")
-        nse.axhline(0.0, color=MARK, linewidth=1)
-        power.axhline(1.0, color=MARK, linewidth=1)
-        power.set_yscale("log")
-        power.set_ylim(POWERS[0], min(POWERS[1], 1.5 * highest))
-        power.set_xlabel("Time (s)")
-        for ax in (nse, power):
-            ax.grid(True, alpha=0.3)
+        nse.axhline(0.0, color=parts.MARK, linewidth=1)
+        power.axhline(1.0, color=parts.MARK, linewidth=1)
+        power.set(yscale="log", ylim=(POWERS[0], min(POWERS[1], 1.5 * highest)), xlabel="Time (s)")
     axes[0, 0].set_ylabel("Normalised squared error (dB)")
     axes[1, 0].set_ylabel("Output power / rated power")
-    legend_of(figure, axes[0])
+    parts.legend_of(figure, axes[0])
     return FigureItem(
         event.name.lower().replace(" ", "-"),
         f"{event.name[0].upper()}{event.name[1:]}: normalised squared error over {1e3 * event.shown_window_s:g} ms and output "
