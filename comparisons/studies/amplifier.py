@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, noise_reduction_db, output_power
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Table,
-    Tuned,
-    algorithms,
-    make_controller,
-)
+from kfopc_filterpy import HardClipAmplifier, SoftSaturationAmplifier, bench, noise_reduction_db, output_power
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.metrics import coherence_and_gain, harmonics_db
 from kfopc_filterpy.plot import curve_style
 
+from . import report_parts as parts
 from .cases import (
     BAND_HZ,
     FS,
@@ -39,8 +30,7 @@ from .cases import (
     tune_all,
     with_overdrive,
 )
-from .report_parts import driven_parameters, legend_of, new_figure, tuned_in_words, without_measured
-from .rows import Row
+from .rows import Row, column, grouped, select, span, worst
 
 PEAK_LIMITED = ("clipping FxLMS", "re-scaling FxLMS", "two-gradient FxLMS")
 ALGORITHMS = ("KF-ANC", "FxLMS", "KF-OPC", "KF-PB", "MOV-FxLMS", *PEAK_LIMITED)
@@ -103,7 +93,7 @@ def main(runs: Runs) -> StudyReport:
     for case in cases(list(pairs)):
         own, best = run_case(runs, case, pairs[case.path])
         rows += own
-        tuned[f"{case}, {case.amplifier}"] = {at: tuned_in_words(one) for at, one in best.items()}
+        tuned[f"{case}, {case.amplifier}"] = {at: parts.tuned_in_words(one) for at, one in best.items()}
     return StudyReport(
         name="amplifier",
         title="An amplifier that saturates",
@@ -114,7 +104,7 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=1.0,
-        parameters=driven_parameters(DURATION_S, list(OVERDRIVES_DB))
+        parameters=parts.driven_parameters(DURATION_S, list(OVERDRIVES_DB))
         | {
             "amplitude_limits": Parameter(
                 list(LIMIT_SHARES),
@@ -125,11 +115,10 @@ def main(runs: Runs) -> StudyReport:
             ),
             "settings": Parameter(tuned, "best and tried at each overdrive, without and with the amplifier known"),
         },
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=amplifier_figures(rows),
-        notes=without_measured(pairs),
+        notes=parts.without_measured(pairs),
         tables=[_table(rows)],
         claims_heading="Findings",
     )
@@ -182,18 +171,19 @@ def run_case(runs: Runs, case: Case, pair: Pair) -> tuple[list[AmplifierRow], di
         driven = saturating(scene, case, overdrive, known)
         tuned = tune_all(runs, driven, settings_for(driven, names))
         best[f"{overdrive:g} dB, {known}"] = tuned
-        rows += runs.map(
-            lambda job: _run(*job), [(driven, case, name, tuned[name], overdrive, known) for name in names]
-        )
+        rows += runs.map(partial(_run, driven, case, tuned, overdrive, known), names)
     return rows, best
 
 
-def _run(scene: Scene, case: Case, algorithm: str, best: Tuned | None, overdrive_db: float, known: str) -> AmplifierRow:
+def _run(
+    scene: Scene, case: Case, tuned: Mapping[str, Tuned | None], overdrive_db: float, known: str, algorithm: str
+) -> AmplifierRow:
     own: dict[str, Any] = asdict(case) | {"algorithm": algorithm, "overdrive_db": overdrive_db, "known": known}
+    best = tuned[algorithm]
     if best is None:
         return AmplifierRow(**own, diverged_at_s=0.0)
     own |= {"setting": best.setting, "within_budget": best.within_budget}
-    result = scene.run(make_controller(scene, algorithm, best.setting), record_weights_every=WEIGHTS_EVERY)
+    result = scene.run(bench.make_controller(scene, algorithm, best.setting), record_weights_every=WEIGHTS_EVERY)
     if result.diverged_at_s is not None:
         return AmplifierRow(**own, diverged_at_s=result.diverged_at_s)
     e, d, y = result.error, result.disturbance, result.control_signal
@@ -227,10 +217,8 @@ def claims(rows: Sequence[AmplifierRow]) -> list[Claim]:
     ]
 
 
-def _of(
-    rows: Iterable[AmplifierRow], algorithm: str, *, noise: str | None = None, known: str = UNKNOWN
-) -> list[AmplifierRow]:
-    return [r for r in rows if r.algorithm == algorithm and r.known == known and noise in (None, r.noise)]
+def _of(rows: Iterable[AmplifierRow], algorithm: str, known: str = UNKNOWN, **values: str) -> list[AmplifierRow]:
+    return select(rows, algorithm=algorithm, known=known, **values)
 
 
 def _overruns(rows: Sequence[AmplifierRow], algorithm: str) -> Claim:
@@ -240,21 +228,16 @@ def _overruns(rows: Sequence[AmplifierRow], algorithm: str) -> Claim:
     return Claim(
         f"A tone of 5 dB of overdrive or more makes {algorithm} overrun, with both amplifiers, if it does not know them",
         over == len(driven) > 0,
-        f"{over} of {len(driven)} runs; their weights end up asking for {_span(row.asked_power for row in went_on)} times the "
-        f"power that cancels the tone, and grow {_span(row.weight_growth for row in went_on)} times over the second half; "
+        f"{over} of {len(driven)} runs; their weights end up asking for {span(column(went_on, 'asked_power'))} times the "
+        f"power that cancels the tone, and grow {span(column(went_on, 'weight_growth'))} times over the second half; "
         f"{len(driven) - len(went_on)} passed 1e6 times the rated amplitude in {DURATION_S:g} s",
     )
-
-
-def _span(values: Iterable[float]) -> str:
-    own = list(values)
-    return f"{np.min(own):.3g} to {np.max(own):.3g}" if own else "(none)"
 
 
 def _known(rows: Sequence[AmplifierRow]) -> Claim:
     own = _of(rows, "KF-ANC", known=KNOWN)
     over = sum(row.overruns for row in own)
-    asked = _span(row.asked_power for row in own if row.diverged_at_s is None)
+    asked = span(row.asked_power for row in own if row.diverged_at_s is None)
     return Claim(
         "With the amplifier known to its disturbance estimate KF-ANC overruns nowhere",
         over == 0,
@@ -264,28 +247,27 @@ def _known(rows: Sequence[AmplifierRow]) -> Claim:
 
 def _clean(rows: Sequence[AmplifierRow]) -> Claim:
     free = {row.place: np.nan_to_num(row.harmonics_db, nan=np.inf) for row in _of(rows, "KF-ANC")}
-    own = [
-        row
+    above = {
+        row: row.harmonics_db - free[row.place]
         for name in KEEPS_POWER
-        for row in _of(rows, name, noise="tone")
-        if row.overdrive_db > 0.0 and row.amplifier == "hard clip"
-    ]
-    below = [free[row.place] - row.harmonics_db for row in own]
-    least = int(np.argmin(below))  # NaN is the least to numpy
+        for row in _of(rows, name, noise="tone", amplifier="hard clip")
+        if row.overdrive_db > 0.0
+    }
+    own, most = worst(above)
     return Claim(
         f"With a hard clip the harmonics of {' and '.join(KEEPS_POWER)} are {CLEANER_DB:g} dB below those of KF-ANC at every "
         "overdrive",
-        bool(below[least] >= CLEANER_DB),
-        f"by {below[least]:.1f} dB at least ({own[least].algorithm}, {', '.join(map(str, own[least].place))} dB)",
+        bool(most <= -CLEANER_DB),
+        f"by {-most:.1f} dB at least ({own.algorithm}, {', '.join(map(str, own.place))} dB)",
     )
 
 
 def _power(rows: Sequence[AmplifierRow]) -> Claim:
-    powers = {name: [row.power for row in _of(rows, name)] for name in KEEPS_POWER}
+    powers = {name: column(_of(rows, name), "power") for name in KEEPS_POWER}
     return Claim(
         "KF-OPC and KF-PB keep their rated power to 2 % at every overdrive, although they do not know the amplifier",
         all(bool(np.max(own) <= 1.02) for own in powers.values()),
-        "output power over the rated one: " + ", ".join(f"{name} {_span(own)}" for name, own in powers.items()),
+        "output power over the rated one: " + ", ".join(f"{name} {span(own)}" for name, own in powers.items()),
     )
 
 
@@ -311,7 +293,7 @@ def _table(rows: Sequence[AmplifierRow]) -> Table:
     for known, name in product((UNKNOWN, KNOWN), ALGORITHMS):
         if own := _of(rows, name, known=known):
             went_on = [row for row in own if row.diverged_at_s is None]
-            spans = [_span(getattr(row, figure) for row in went_on) for figure in ("power", "asked_power")]
+            spans = [span(column(went_on, figure)) for figure in ("power", "asked_power")]
             lines.append([name, known, len(own), sum(row.overruns for row in own), len(own) - len(went_on), *spans])
     return Table(
         "summary",
@@ -325,21 +307,20 @@ def _table(rows: Sequence[AmplifierRow]) -> Table:
 def amplifier_figures(rows: Sequence[AmplifierRow]) -> list[FigureItem]:
     """Return figures of noise reduction, distortion and output power against the overdrive, one for each case."""
     items = []
-    for case in dict.fromkeys(row.place[:3] for row in rows):
-        own = [row for row in rows if row.place[:3] == case]
-        figure, axes = new_figure((11.0, 6.4), 2, 3, sharex=True, sharey="col")
+    for case, own in grouped(rows, "path", "noise", "amplifier").items():
+        figure, axes = parts.new_figure((11.0, 6.4), 2, 3, sharex=True, sharey="col")
         shown = ("noise_reduction_db", "harmonics_db" if case[1] == "tone" else "coherence", "power")
-        for (line, known), column in product(zip(axes, (UNKNOWN, KNOWN), strict=True), range(3)):
-            ax, value = line[column], shown[column]
-            for name in ALGORITHMS:
-                _draw(ax, _of(own, name, known=known), value)
-            ax.grid(True, alpha=0.3)
-            ax.set_ylabel(LABELS[value] if column else f"amplifier {known}\n{LABELS[value]}")
+        for line, known in zip(axes, (UNKNOWN, KNOWN), strict=True):
+            for ax, value in zip(line, shown, strict=True):
+                for name in ALGORITHMS:
+                    _draw(ax, _of(own, name, known), value)
+                ax.set_ylabel(LABELS[value])
+            line[0].set_ylabel(f"amplifier {known}\n{LABELS[shown[0]]}")
         axes[0, 0].set_ylim(top=TOP_DB)
         axes[0, 2].set_yscale("log")
         for ax in axes[1]:
             ax.set_xlabel("Overdrive (dB)")
-        legend_of(figure, [axes[0, 0]])
+        parts.legend_of(figure, [axes[0, 0]])
         caption = (
             f"{', '.join(case).capitalize()}. Above: the disturbance estimate does not know the amplifier; below: it does, if "
             "it can. Black crosses: the filter overruns. A gap: it diverged. Output power is before the amplifier. "
@@ -353,8 +334,6 @@ def _draw(ax: Any, rows: Sequence[AmplifierRow], figure: str) -> None:
     """Draw a figure of an algorithm against the overdrive; there are no rows of one that cannot know the amplifier."""
     if not rows:
         return
-    levels = np.array([row.overdrive_db for row in rows])
-    values = np.array([getattr(row, figure) for row in rows])
+    levels, values, over = (column(rows, name) for name in ("overdrive_db", figure, "overruns"))
     ax.plot(levels, values, label=rows[0].algorithm, linewidth=1.3, markersize=4.5, **curve_style(rows[0].algorithm))
-    over = np.array([row.overruns for row in rows])
     ax.plot(levels[over], values[over], "x", color="black", markersize=7, markeredgewidth=0.9)

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, product
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, OutputLimiter, convergence_time_s
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Table,
-    Tuned,
-    make_controller,
-    tune,
-)
+from kfopc_filterpy import HardClipAmplifier, OutputLimiter, bench, convergence_time_s
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned
 from kfopc_filterpy.controllers.power_budget import DEFAULT_AVERAGING_S
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
-from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, bounds_db, grid_runs, make_case, noises, paths, with_jump
-from .report_parts import MARK, case_parameters, legend_of, new_figure, without_measured
-from .rows import WindowRow, cell, figures_of
+from . import cases
+from . import report_parts as parts
+from .cases import FS, SWITCH_ON_S, WINDOW_S, Case, noises, paths
+from .rows import WindowRow, cell, column, figures_of, select, span, worst
 
 N_TAPS = 160
 DURATIONS_S = (8.0, 60.0)  # settings are tuned and convergence is measured on the first; the second averages more
@@ -74,7 +64,7 @@ class ClippedRow(WindowRow):
 def planned_runs() -> int:
     """Return the number of jobs of the study."""
     everything = [Case(*names) for names in product(paths(), noises())]
-    runs = len(everything) * (grid_runs(TUNED) + len(DURATIONS_S) * len(SEEDS))
+    runs = len(everything) * (cases.grid_runs(TUNED) + len(DURATIONS_S) * len(SEEDS))
     return runs + sum(case.stationary for case in everything) + len(paths()) * len(CLIPPED_NOISES)
 
 
@@ -85,25 +75,25 @@ def main(runs: Runs) -> StudyReport:
 
     def scene(case: Case, duration_s: float, seed: int) -> Scene:
         noise = made[case.noise](duration_s + SWITCH_ON_S, seed)
-        return replace(make_case(pairs[case.path], noise, n_taps=N_TAPS), rated_power=SHARES[0])
+        return replace(cases.make_case(pairs[case.path], noise, n_taps=N_TAPS), rated_power=SHARES[0])
 
     def first(case: Case) -> Scene:
         return scene(case, DURATIONS_S[0], SEEDS[0])
 
     tuned: dict[Case, Settings] = {}
     for case in everything:
-        own = tune(runs, first(case), TUNED)
+        own = bench.tune(runs, first(case), TUNED)
         tuned[case] = own | {name: own[other] for name, other in SHARED.items()}
     jobs = list(product(everything, DURATIONS_S, SEEDS))
-    rows = _joined(runs.map(lambda job: run_case(scene(*job), *job, tuned[job[0]]), jobs))
+    rows = list(chain(*runs.map(lambda job: run_case(scene(*job), *job, tuned[job[0]]), jobs)))
     stationary = [case for case in everything if case.stationary]
     times = runs.map(
         lambda case: convergence_times([scene(case, DURATIONS_S[0], seed) for seed in SEEDS], tuned[case]), stationary
     )
     settled = dict(zip(map(str, stationary), times, strict=True))
     clipping = [Case(*names) for names in product(pairs, CLIPPED_NOISES)]
-    clipped = _joined(
-        runs.map(lambda case: run_amplifiers(first(case), pairs[case.path][0], case, tuned[case]), clipping)
+    clipped = list(
+        chain(*runs.map(lambda case: run_amplifiers(first(case), pairs[case.path][0], case, tuned[case]), clipping))
     )
     return StudyReport(
         name="constraint",
@@ -116,22 +106,17 @@ def main(runs: Runs) -> StudyReport:
         fs=FS,
         rated_power=SHARES[0],
         parameters=_parameters(tuned),
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows], "convergence_s": settled},
         claims=claims(rows, clipped, settled),
         figures=[_cases_figure(rows)],
-        notes=without_measured(pairs),
+        notes=parts.without_measured(pairs),
         tables=[_summary_table(rows), _amplifier_table(clipped)],
         claims_heading="Aims",
     )
 
 
-def _joined(lists: Iterable[list[Any]]) -> list[Any]:
-    return list(chain.from_iterable(lists))
-
-
 def _parameters(tuned: Mapping[Case, Settings]) -> dict[str, Parameter]:
-    return case_parameters(Parameter(N_TAPS, "the aim's own")) | {
+    return parts.case_parameters(Parameter(N_TAPS, "the aim's own")) | {
         "rated_power": Parameter(list(SHARES), "shares of the unconstrained control power of each noise"),
         "durations_s": Parameter(list(DURATIONS_S), "from switch-on on; the steady half counts"),
         "seeds": Parameter(list(SEEDS), "of noise; of a tone, its phase; of the recording, where it begins"),
@@ -150,7 +135,7 @@ def _parameters(tuned: Mapping[Case, Settings]) -> dict[str, Parameter]:
 def _controller(scene: Scene, name: str, tuned: Settings, amplifier: Any = None) -> Any:
     """Return a fresh controller, behind the limiter if its name says so."""
     algorithm = name.removesuffix(" limited")
-    controller = make_controller(scene, algorithm, tuned[name].setting, amplifier=amplifier)
+    controller = bench.make_controller(scene, algorithm, tuned[name].setting, amplifier=amplifier)
     if algorithm != name:
         controller.limiter = OutputLimiter(scene.rated_power, fs=FS, window_s=WINDOW_S)
     return controller
@@ -161,21 +146,11 @@ def run_case(scene: Scene, case: Case, duration_s: float, seed: int, tuned: Sett
     rows: list[ConstraintRow] = []
     for share in SHARES:
         rated = replace(scene, rated_power=share)
-        bound = bounds_db(rated, case.stationary)[0]
-        rows += [
-            ConstraintRow(
-                path=case.path,
-                noise=case.noise,
-                share=share,
-                duration_s=duration_s,
-                seed=seed,
-                bound_db=bound,
-                algorithm=name,
-                setting=tuned[name].setting,
-                **figures_of(rated.run(_controller(rated, name, tuned)), share),
-            )
-            for name in (*TUNED, *LIMITED)
-        ]
+        place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share": share, "seed": seed}
+        place |= {"duration_s": duration_s, "bound_db": cases.bounds_db(rated, case.stationary)[0]}
+        for name in (*TUNED, *LIMITED):
+            figures = figures_of(rated.run(_controller(rated, name, tuned)), share)
+            rows.append(ConstraintRow(**place, algorithm=name, setting=tuned[name].setting, **figures))
     return rows
 
 
@@ -205,19 +180,14 @@ def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Setting
         for words, amplifier in known.items()
     ]
     wrong = replace(scene, secondary=path_taps(perturbed_path(scene.secondary, fs=FS, gain_db=6.0, phase_deg=45.0)))
-    x = with_jump(scene.references[0], JUMP_DB, *JUMP_S)
+    x = cases.with_jump(scene.references[0], JUMP_DB, *JUMP_S)
     jumping = replace(clipping, references=[x], disturbances=[np.convolve(x, primary)[: x.size]])
     for name in LIMITED:
         jobs.append((clipping, name, "path 6 dB, 45° off", _controller(wrong, name, tuned)))
         jobs.append((jumping, name, f"{JUMP_DB:g} dB louder for a second", _controller(scene, name, tuned)))
+    place = {"path": case.path, "noise": case.noise}
     return [
-        ClippedRow(
-            path=case.path,
-            noise=case.noise,
-            algorithm=name,
-            known=words,
-            **figures_of(at.run(controller), scene.rated_power),
-        )
+        ClippedRow(**place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
         for at, name, words, controller in jobs
     ]
 
@@ -227,7 +197,7 @@ def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Setting
 
 def claims(rows: Sequence[ConstraintRow], clipped: Sequence[ClippedRow], settled: Settled) -> list[Claim]:
     """Return the aims; a run without a figure, which diverged, meets none."""
-    ours = [row for row in rows if row.algorithm == "KF-PB"]
+    ours = select(rows, algorithm="KF-PB")
     longest = max(row.duration_s for row in rows)
     return [
         _bound_claim(
@@ -251,18 +221,18 @@ def claims(rows: Sequence[ConstraintRow], clipped: Sequence[ClippedRow], settled
 
 
 def _bound_claim(text: str, rows: Sequence[ConstraintRow], powers: tuple[float, float], loss_db: float) -> Claim:
-    own, losses = [row.power for row in rows], [row.loss_db for row in rows]
-    least, most, worst = np.min(own), np.max(own), rows[int(np.argmax(losses))]  # NaN is the largest to numpy
+    own, losses = column(rows, "power"), {row.place: row.loss_db for row in rows}
+    where, most = worst(losses)
     return Claim(
         text,
-        bool(least >= powers[0] and most <= powers[1] and worst.loss_db <= loss_db),
-        f"{len(rows)} runs: output power {least:.3f} to {most:.3f}, {np.mean(losses):.2f} dB below the bound on average and "
-        f"{worst.loss_db:.2f} dB ({worst.place}) at worst",
+        bool(own.min() >= powers[0] and own.max() <= powers[1] and most <= loss_db),
+        f"{len(rows)} runs: output power {span(own, '.3f')}, {column(rows, 'loss_db').mean():.2f} dB below the bound on average "
+        f"and {most:.2f} dB ({where}) at worst",
     )
 
 
 def _guarantee_claim(rows: Sequence[WindowRow]) -> Claim:
-    most = np.max([row.worst_window for row in rows])
+    most = column(rows, "worst_window").max()
     return Claim(
         f"With the limiter no window of {1e3 * WINDOW_S:g} ms is above the rated power: a level jump, a wrong secondary path "
         "and a clipping amplifier included",
@@ -272,13 +242,13 @@ def _guarantee_claim(rows: Sequence[WindowRow]) -> Claim:
 
 
 def _limited_claim(rows: Sequence[ConstraintRow]) -> Claim:
-    opc, ours = ({row.place: row.noise_reduction_db for row in rows if row.algorithm == name} for name in LIMITED)
-    gains = np.array([ours[place] - opc[place] for place in ours])
-    least = int(np.argmin(gains))  # NaN is the least to numpy
+    opc, ours = ({row.place: row.noise_reduction_db for row in select(rows, algorithm=name)} for name in LIMITED)
+    losses = {place: opc[place] - ours[place] for place in ours}
+    where, most = worst(losses)
     return Claim(
         "Behind the limiter KF-PB reduces the noise by at most 0.3 dB less than KF-OPC behind it, in every run",
-        bool(gains[least] >= -0.3),
-        f"{np.mean(gains):+.2f} dB on average, {gains[least]:+.2f} dB at worst ({list(ours)[least]})",
+        bool(most <= 0.3),
+        f"{-np.mean(list(losses.values())):+.2f} dB on average, {-most:+.2f} dB at worst ({where})",
     )
 
 
@@ -302,13 +272,12 @@ def _summary_table(rows: Sequence[ConstraintRow]) -> Table:
     for name, kind in product((*TUNED, *LIMITED), ("stationary", "varying")):
         own = [
             row
-            for row in rows
-            if (row.algorithm, row.duration_s, row.case.stationary) == (name, longest, kind == "stationary")
+            for row in select(rows, algorithm=name, duration_s=longest)
+            if row.case.stationary == (kind == "stationary")
         ]
-        powers, losses = [row.power for row in own], [row.loss_db for row in own]
-        spent = f"{np.min(powers):.2f}-{np.max(powers):.2f}"
-        window = float(np.max([row.worst_window for row in own]))
-        lines.append([name, kind, len(own), spent, float(np.mean(losses)), float(np.max(losses)), window])
+        losses, powers = column(own, "loss_db"), column(own, "power")
+        spent, window = f"{powers.min():.2f}-{powers.max():.2f}", column(own, "worst_window").max()
+        lines.append([name, kind, len(own), spent, losses.mean(), losses.max(), window])
     return Table(
         "summary",
         f"Runs of {longest:g} s: output power over the rated one, noise reduction below the bound in dB, and largest mean "
@@ -334,20 +303,19 @@ def _amplifier_table(clipped: Sequence[ClippedRow]) -> Table:
 def _cases_figure(rows: Sequence[ConstraintRow]) -> FigureItem:
     """Return a figure of a column for each combination of paths and noise, and a mark for each seed."""
     shortest = min(row.duration_s for row in rows)
-    shown = [row for row in rows if (row.duration_s, row.share) == (shortest, SHARES[0])]
+    shown = select(rows, duration_s=shortest, share=SHARES[0])
     places = list(dict.fromkeys(str(row.case) for row in shown))
-    figure, axes = new_figure((10.5, 7.0), 2, sharex=True)
+    figure, axes = parts.new_figure((10.5, 7.0), 2, sharex=True)
     panels = {"loss_db": ("Below the bound (dB)", 0.0), "power": ("Output power / rated power", 1.0)}
     for (ax,), (value, (label, mark)) in zip(axes, panels.items(), strict=True):
         for k, name in enumerate(TUNED):
-            own = [row for row in shown if row.algorithm == name]
+            own = select(shown, algorithm=name)
             x = [places.index(str(row.case)) + 0.25 * (k - 1) for row in own]
-            ax.plot(x, [getattr(row, value) for row in own], **curve_style(name) | {"linestyle": ""}, label=name)
-        ax.axhline(mark, color=MARK, linewidth=1)
-        ax.grid(True, alpha=0.3)
+            ax.plot(x, column(own, value), **curve_style(name) | {"linestyle": ""}, label=name)
+        ax.axhline(mark, color=parts.MARK, linewidth=1)
         ax.set_ylabel(label)
     axes[-1, 0].set_xticks(range(len(places)), places, rotation=40, ha="right", fontsize="small")
-    legend_of(figure, axes[0])
+    parts.legend_of(figure, axes[0])
     return FigureItem(
         "cases",
         f"Noise reduction below the bound, the power-constrained Wiener solution, and output power (rated power "

@@ -8,33 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Table,
-    Tuned,
-    algorithms,
-    best_setting,
-    try_settings,
-)
-from kfopc_filterpy.paths import frequency_response, path_taps, perturbed_path
+from kfopc_filterpy import bench
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
+from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.plot import curve_style
 
+from . import report_parts as parts
 from .cases import BAND_HZ, FS, Case, Pair, driven_case, ducts, grid_runs, grids, noise_of
-from .report_parts import (
-    MARK,
-    ceilings_note,
-    driven_parameters,
-    legend_of,
-    new_figure,
-    tuned_in_words,
-    without_measured,
-)
-from .rows import Row, cell, table_of_cells, worst
+from .rows import Row, column, figure_table, select, worst
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 UNCONSTRAINED = ("KF-ANC", "FxRLS", "FxLMS")
@@ -94,8 +75,7 @@ def main(runs: Runs) -> StudyReport:
         scene = scenes[str(case)] = case_scene(case, pairs[case.path])
         own, best = run_case(runs, case, scene, known[case.path])
         rows += own
-        tuned[str(case)] = {f"{kind} {amount:g}": tuned_in_words(t) for (kind, amount), t in best.items()}
-    accuracy = {name: phase_accuracy_deg(pairs[name][1], own) for name, own in known.items()}
+        tuned[str(case)] = {f"{kind} {amount:g}": parts.tuned_in_words(t) for (kind, amount), t in best.items()}
     return StudyReport(
         name="mismatch",
         title="A secondary path that is not as it was identified",
@@ -107,33 +87,39 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=1.0 / 10 ** (OVERDRIVE_DB / 10),
-        parameters=driven_parameters(DURATION_S, OVERDRIVE_DB)
+        parameters=parts.driven_parameters(DURATION_S, OVERDRIVE_DB)
         | {
             "mismatch": Parameter({kind: list(own) for kind, own in AMOUNTS.items()}, "degrees, dB and samples"),
-            "phase_accuracy_deg": Parameter(
-                accuracy, f"largest deviation from the phase wanted over {BAND_HZ[0]:g} to {BAND_HZ[1]:g} Hz"
-            ),
             "settings": Parameter(
                 tuned, "best and tried at each mismatch, relative to the known path's filtered reference"
             ),
         },
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(rows, case) for case in dict.fromkeys(row.case for row in rows)],
         notes=[
-            *without_measured(pairs),
+            *parts.without_measured(pairs),
             "A tone can stay in control somewhat past 90 degrees, which is the bound of small step sizes.",
             f"A delay of {FS / (2 * sum(BAND_HZ)):.1f} samples turns the middle of the band by 90 degrees, one of "
             f"{FS / (4 * BAND_HZ[1]):.0f} its upper edge.",
             "There is one seed and one record for each case: differences of some tenths of a dB between algorithms mean "
             "nothing.",
-            ceilings_note(scenes),
+            parts.ceilings_note(scenes),
         ],
         tables=[
-            _table("exact", "Noise reduction over the steady half in dB", rows, EXACT, "noise_reduction_db"),
-            _table("wrong", "Noise reduction over the steady half in dB", rows, WRONG, "noise_reduction_db"),
-            _table("power", "Output power over the rated one", rows, EXACT, "power"),
+            figure_table(
+                stem,
+                f"{caption}, at the settings that are best with the {tuned_with}",
+                select(rows, tuned_with=tuned_with),
+                figure,
+                {"paths": "path", "noise": "noise", "mismatch": "point"},
+                ALGORITHMS,
+            )
+            for stem, caption, tuned_with, figure in (
+                ("exact", "Noise reduction over the steady half in dB", EXACT, "noise_reduction_db"),
+                ("wrong", "Noise reduction over the steady half in dB", WRONG, "noise_reduction_db"),
+                ("power", "Output power over the rated one", EXACT, "power"),
+            )
         ],
         claims_heading="Findings",
     )
@@ -160,22 +146,6 @@ def estimates(secondary: np.ndarray) -> dict[Point, np.ndarray]:
     }
 
 
-def phase_accuracy_deg(secondary: np.ndarray, known: Mapping[Point, np.ndarray]) -> float:
-    """Return the largest deviation of the phase over the band from the one wanted, which no causal filter has exactly."""
-    f = np.arange(BAND_HZ[0], BAND_HZ[1] + 1.0, 10.0)
-    exact = frequency_response(secondary, f, fs=FS)
-    wanted = {
-        "phase": lambda a: np.deg2rad(a) + 0 * f,
-        "gain": lambda a: 0 * f,
-        "delay": lambda a: -2 * np.pi * f / FS * a,
-    }
-    turns = [
-        np.angle(frequency_response(taps, f, fs=FS) / exact * np.exp(-1j * wanted[kind](amount)))
-        for (kind, amount), taps in known.items()
-    ]
-    return float(np.max(np.abs(np.degrees(turns))))
-
-
 def case_scene(case: Case, pair: Pair) -> Scene:
     """Return the scene of a case with the exact path."""
     return driven_case(pair, noise_of(case.noise, DURATION_S), OVERDRIVE_DB)
@@ -191,11 +161,12 @@ def run_case(
     is not, since a true path of less gain asks for more power.
     """
     tried = {
-        point: try_settings(runs, replace(scene, secondary_estimate=taps), grids(ALGORITHMS))
+        point: bench.try_settings(runs, replace(scene, secondary_estimate=taps), grids(ALGORITHMS))
         for point, taps in known.items()
     }
     best = {
-        point: {name: best_setting(scene, name, trials) for name, trials in own.items()} for point, own in tried.items()
+        point: {name: bench.best_setting(scene, name, trials) for name, trials in own.items()}
+        for point, own in tried.items()
     }
     rows = []
     for kind, amount in [(kind, amount) for kind, amounts in AMOUNTS.items() for amount in amounts]:
@@ -205,20 +176,14 @@ def run_case(
             for tuned_with, tuned in ((EXACT, best["phase", 0.0][name]), (WRONG, best[point][name])):
                 # If it diverged at every setting, any of them will do.
                 trial = trials[tuned.setting if tuned else algorithms()[name].grid[0]]
-                rows.append(
-                    MismatchRow(
-                        path=case.path,
-                        noise=case.noise,
-                        kind=kind,
-                        amount=amount,
-                        algorithm=name,
-                        tuned_with=tuned_with,
-                        setting=trial.setting,
-                        noise_reduction_db=trial.noise_reduction_db,
-                        power=np.nan if trial.diverged else trial.output_power / scene.rated_power,
-                        diverged_at_s=trial.diverged_at_s,
-                    )
-                )
+                figures = {
+                    "setting": trial.setting,
+                    "noise_reduction_db": trial.noise_reduction_db,
+                    "power": np.nan if trial.diverged else trial.output_power / scene.rated_power,
+                    "diverged_at_s": trial.diverged_at_s,
+                }
+                place = {"path": case.path, "noise": case.noise, "kind": kind, "amount": amount, "algorithm": name}
+                rows.append(MismatchRow(**place, tuned_with=tuned_with, **figures))
     return rows, best
 
 
@@ -231,8 +196,7 @@ def claims(rows: Sequence[MismatchRow]) -> list[Claim]:
 
 
 def _quarter_turn(rows: Sequence[MismatchRow], name: str) -> Claim:
-    phases = [row for row in rows if (row.kind, row.noise, row.algorithm) == ("phase", "band noise", name)]
-    own = [row for row in phases if row.tuned_with == WRONG]
+    own = select(rows, kind="phase", noise="band noise", algorithm=name, tuned_with=WRONG)
     below, above = [row for row in own if row.amount < 90.0], [row for row in own if row.amount > 90.0]
     reduced, left = ([row for row in some if not row.unstable] for some in (below, above))
     least, most = max(below, key=lambda row: row.loss_db), min(above, key=lambda row: row.loss_db)
@@ -247,21 +211,21 @@ def _quarter_turn(rows: Sequence[MismatchRow], name: str) -> Claim:
 def _gain(rows: Sequence[MismatchRow]) -> Claim:
     losses = {}
     for name in ("KF-ANC", "KF-PB", "FxLMS", "MOV-FxLMS"):
-        own = [row for row in rows if (row.kind, row.algorithm, row.tuned_with) == ("gain", name, EXACT)]
+        own = select(rows, kind="gain", algorithm=name, tuned_with=EXACT)
         exact = {row.case: row.loss_db for row in own if row.amount == 0.0}
         _, losses[name] = worst({row: row.loss_db - exact[row.case] for row in own})
     largest = max(abs(amount) for amount in AMOUNTS["gain"])
+    told = (f"{name} {f'{loss:.1f} dB' if np.isfinite(loss) else 'diverges'}" for name, loss in losses.items())
     return Claim(
         f"A gain up to {largest:g} dB off costs KF-ANC and KF-PB at most {GAIN_LOSS_DB:g} dB without tuning again",
         all(losses[name] <= GAIN_LOSS_DB for name in ("KF-ANC", "KF-PB")),
-        "largest loss: "
-        + ", ".join(f"{name} {f'{loss:.1f} dB' if np.isfinite(loss) else 'diverges'}" for name, loss in losses.items()),
+        f"largest loss: {', '.join(told)}",
     )
 
 
 def _bounded(rows: Sequence[MismatchRow]) -> Claim:
     own = [row for row in rows if row.algorithm in KEEPS_POWER]
-    others = [row for row in rows if row.algorithm in UNCONSTRAINED and row.tuned_with == EXACT]
+    others = [row for row in select(rows, tuned_with=EXACT) if row.algorithm in UNCONSTRAINED]
     away, others_away = ([row for row in some if row.diverged_at_s is not None] for some in (own, others))
     loudest, gain_db = worst({row: row.loss_db for row in own})
     return Claim(
@@ -273,53 +237,44 @@ def _bounded(rows: Sequence[MismatchRow]) -> Claim:
 
 
 def _power(rows: Sequence[MismatchRow]) -> Claim:
-    gains = [row for row in rows if row.kind == "gain" and row.tuned_with == EXACT]
-    powers = {name: np.array([row.power for row in gains if row.algorithm == name]) for name in KEEPS_POWER}
+    gains = select(rows, kind="gain", tuned_with=EXACT)
+    powers = {name: column(select(gains, algorithm=name), "power") for name in KEEPS_POWER}
     kept = {name: bool(np.all((own >= KEPT[0]) & (own <= KEPT[1]))) for name, own in powers.items()}
+    told = (f"{name} {np.nanmin(own):.2f} to {np.nanmax(own):.2f}" for name, own in powers.items())
     return Claim(
         f"With a wrong gain KF-PB keeps {KEPT[0]:g} to {KEPT[1]:g} of its rated power, and KF-OPC does not",
         kept["KF-PB"] and not kept["KF-OPC"],
-        "output power over the rated one: "
-        + ", ".join(f"{name} {np.nanmin(own):.2f} to {np.nanmax(own):.2f}" for name, own in powers.items()),
+        f"output power over the rated one: {', '.join(told)}",
     )
 
 
-# ---- Tables and figures
-
-
-def _table(stem: str, caption: str, rows: Sequence[MismatchRow], tuned_with: str, figure: str) -> Table:
-    own = [row for row in rows if row.tuned_with == tuned_with]
-    cells = (((row.path, row.noise, row.point), row.algorithm, cell(row, figure)) for row in own)
-    whole = f"{caption}, at the settings that are best with the {tuned_with}"
-    return table_of_cells(stem, whole, ["paths", "noise", "mismatch"], ALGORITHMS, cells)
+# ---- Figures
 
 
 def _figure(rows: Sequence[MismatchRow], case: Case) -> FigureItem:
     """Return a figure with a column for each kind of mismatch: noise reduction for both tunings, output power."""
-    own = [row for row in rows if row.case == case]
-    figure, axes = new_figure((10.5, 9.0), 3, len(AMOUNTS), sharex="col", sharey="row")
+    own = select(rows, case=case)
+    figure, axes = parts.new_figure((10.5, 9.0), 3, len(AMOUNTS), sharex="col", sharey="row")
     top = 1.05 * max(row.noise_reduction_db for row in own if row.diverged_at_s is None) + 1.0
     lines = (("noise_reduction_db", EXACT), ("noise_reduction_db", WRONG), ("power", EXACT))
     for line, (measure, tuned_with) in zip(axes, lines, strict=True):
         for ax, kind in zip(line, AMOUNTS, strict=True):
             for k, name in enumerate(ALGORITHMS):
-                curve = [row for row in own if (row.kind, row.algorithm, row.tuned_with) == (kind, name, tuned_with)]
+                curve = select(own, kind=kind, algorithm=name, tuned_with=tuned_with)
                 _draw(ax, curve, measure, k)
-            ax.axhline(1.0 if measure == "power" else 0.0, color=MARK, linewidth=1)
+            ax.axhline(1.0 if measure == "power" else 0.0, color=parts.MARK, linewidth=1)
             if kind == "phase":
-                ax.axvline(90.0, color=MARK, linewidth=1, linestyle=":")
+                ax.axvline(90.0, color=parts.MARK, linewidth=1, linestyle=":")
             ax.set_xticks(AMOUNTS[kind])
             ax.tick_params(axis="x", labelsize="small")
-            ax.grid(True, alpha=0.3)
         words = "Output power / rated power" if measure == "power" else "Noise reduction (dB)"
         line[0].set_ylabel(f"{words}\ntuned with the {tuned_with}")
-    axes[0, 0].set_ylim(BOTTOM_DB - 3.5, top)
-    axes[1, 0].set_ylim(BOTTOM_DB - 3.5, top)
-    axes[2, 0].set_yscale("log")
-    axes[2, 0].set_ylim(POWERS[0], 4 * POWERS[1])
+    for ax in axes[:2, 0]:
+        ax.set_ylim(BOTTOM_DB - 3.5, top)
+    axes[2, 0].set(yscale="log", ylim=(POWERS[0], 4 * POWERS[1]))
     for ax, kind in zip(axes[2], AMOUNTS, strict=True):
         ax.set_xlabel(f"{kind.capitalize()} error ({UNITS[kind]})")
-    legend_of(figure, axes[0])
+    parts.legend_of(figure, axes[0])
     caption = (
         "Noise reduction and output power over the rated one against what is wrong with the secondary path known to the "
         f"controllers ({case}). Crosses: diverged, below {BOTTOM_DB:g} dB, or above {POWERS[1]:g} times the rated power."
@@ -329,8 +284,7 @@ def _figure(rows: Sequence[MismatchRow], case: Case) -> FigureItem:
 
 def _draw(ax: Any, rows: Sequence[MismatchRow], measure: str, k: int) -> None:
     """Draw a curve as far as it lies on the scale, and a cross at the edge for each amount at which it does not."""
-    amounts = np.array([row.amount for row in rows])
-    values = np.array([getattr(row, measure) for row in rows])
+    amounts, values = column(rows, "amount"), column(rows, measure)
     inside = values <= POWERS[1] if measure == "power" else values >= BOTTOM_DB  # NaN is outside
     style = curve_style(rows[0].algorithm)
     ax.plot(amounts, np.where(inside, values, np.nan), label=rows[0].algorithm, linewidth=1.4, markersize=4.5, **style)

@@ -8,26 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import SimulationResult
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Table,
-    Tuned,
-    algorithms,
-    run_setting,
-    try_settings,
-    tune,
-)
+from kfopc_filterpy import SimulationResult, bench
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, algorithms
 from kfopc_filterpy.plot import curve_style
 
+from . import report_parts as parts
 from .cases import FS, SWITCH_ON_S, Case, bounds_db, grid_runs, make_case, noises, paths
-from .report_parts import MARK, case_parameters, new_figure, tried
-from .rows import WindowRow, figures_of, worst
+from .rows import WindowRow, column, figures_of, grouped, loss_claim, span, worst
 
 SHARES_DB = (-20.0, -15.0, -12.0, -9.0, -6.0, -3.0, 0.0)  # rated power over the unconstrained control power
 DURATION_S = 8.0
@@ -104,7 +91,6 @@ def main(runs: Runs) -> StudyReport:
         fs=FS,
         rated_power=1.0,
         parameters=_parameters(tuned),
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=_claims(means),
         figures=[_figure(means, case) for case in tuned],
@@ -133,9 +119,9 @@ def _joined(scenes: Sequence[Scene]) -> Scene:
 def _tune(runs: Runs, scene: Scene) -> TunedAt:
     """Return the best settings at each rated power. Runs that do not see the rated power serve for all of them."""
     once = {name: own.grid for name, own in algorithms().items() if not own.sees_budget}
-    trials = try_settings(runs, scene, once, len(SEEDS))
+    trials = bench.try_settings(runs, scene, once, len(SEEDS))
     return {
-        share_db: tune(runs, _rated(scene, share_db), list(algorithms()), len(SEEDS), trials=trials)
+        share_db: bench.tune(runs, _rated(scene, share_db), list(algorithms()), len(SEEDS), trials=trials)
         for share_db in SHARES_DB
     }
 
@@ -148,13 +134,12 @@ def _measure(runs: Runs, case: Case, scenes: Mapping[int, Scene], joined: Scene,
 
     def run(seed: int, share_db: float, name: str) -> SimulationResult | None:
         setting = tuned[share_db][name].setting
-        return run_setting(_rated(joined, share_db), name, setting, joined.seeds.index(seed))
+        return bench.run_setting(_rated(joined, share_db), name, setting, joined.seeds.index(seed))
 
     def row(seed: int, share_db: float, name: str, result: SimulationResult | None) -> BudgetRow:
-        figures = figures_of(result, 10 ** (share_db / 10))
-        setting = tuned[share_db][name].setting
         place: dict[str, Any] = {"path": case.path, "noise": case.noise, "share_db": share_db, "seed": seed}
-        return BudgetRow(**place, algorithm=name, setting=setting, **figures)
+        figures = figures_of(result, 10 ** (share_db / 10))
+        return BudgetRow(**place, algorithm=name, setting=tuned[share_db][name].setting, **figures)
 
     def job(at: tuple[int, float | None]) -> list[BudgetRow]:
         seed, share_db = at
@@ -186,21 +171,14 @@ def _bounds(case: Case, scene: Scene, seed: int, share_db: float) -> list[Budget
 
 def mean_rows(rows: Sequence[BudgetRow]) -> Means:
     """Return means over seeds by case and algorithm, in the order of the rated power; of windows the worst."""
-    groups: dict[tuple[Case, str], dict[float, list[BudgetRow]]] = {}
-    for row in rows:
-        groups.setdefault((row.case, row.algorithm), {}).setdefault(row.share_db, []).append(row)
-    return {
-        key: [
-            replace(
-                own[share][0],
-                noise_reduction_db=float(np.mean([row.noise_reduction_db for row in own[share]])),
-                power=float(np.mean([row.power for row in own[share]])),
-                worst_window=float(np.max([row.worst_window for row in own[share]])),
-            )
-            for share in sorted(own)
-        ]
-        for key, own in groups.items()
-    }
+    means: dict[tuple[Case, str], list[BudgetRow]] = {}
+    for (case, name, _), own in sorted(
+        grouped(rows, "case", "algorithm", "share_db").items(), key=lambda item: item[0][2]
+    ):
+        mean = {figure: float(column(own, figure).mean()) for figure in ("noise_reduction_db", "power")}
+        row = replace(own[0], **mean, worst_window=float(column(own, "worst_window").max()))
+        means.setdefault((case, name), []).append(row)
+    return means
 
 
 def _claims(means: Means) -> list[Claim]:
@@ -208,19 +186,16 @@ def _claims(means: Means) -> list[Claim]:
     bound = {(row.case, row.share_db): row for (_, name), rows in means.items() if name == BOUND for row in rows}
     losses = {str(row): bound[row.case, row.share_db].noise_reduction_db - row.noise_reduction_db for row in own}
     behind = {str(row): _best_other_db(means, row) - row.noise_reduction_db for row in own}
-    powers = [row.power for row in own]
-    (where, loss), (where_behind, most_behind) = worst(losses), worst(behind)
-    ahead = -np.array(list(behind.values()))
+    powers, ahead = column(own, "power"), -np.array(list(behind.values()))
+    where_behind, most_behind = worst(behind)
     return [
         Claim(
             "KF-PB keeps the rated power to 2 %, mean over seeds, at every rated power and in every case",
             bool(np.max(powers) <= Tuned.BUDGET),
-            f"{np.min(powers):.3f} to {np.max(powers):.3f} of it",
+            f"{span(powers, '.3f')} of it",
         ),
-        Claim(
-            "KF-PB reaches the bound to within 1 dB at every rated power and in every case",
-            loss <= 1.0,
-            f"{np.mean(list(losses.values())):.2f} dB below it on average, {loss:.2f} dB at worst ({where})",
+        loss_claim(
+            "KF-PB reaches the bound to within 1 dB at every rated power and in every case", 1.0, losses, " below it"
         ),
         Claim(
             "No other method that keeps the budget reduces the noise by more than 0.3 dB more than KF-PB",
@@ -276,7 +251,7 @@ def _table(means: Means) -> Table:
         "power in dB over the unconstrained one",
         headings,
         [
-            [case.path, case.noise, name, *(row.noise_reduction_db for row in own), *(row.power for row in own)]
+            [case.path, case.noise, name, *column(own, "noise_reduction_db"), *column(own, "power")]
             for (case, name), own in means.items()
         ],
     )
@@ -284,25 +259,21 @@ def _table(means: Means) -> Table:
 
 def _parameters(tuned: Mapping[Case, TunedAt]) -> dict[str, Parameter]:
     registry = algorithms()
-    trials = {
-        f"{case}, {share_db:g} dB, {name}": tried(best.trials, digits=5)
+    settings = {
+        # The grids of those that do not see the rated power serve for all of them.
+        f"{case}, {share_db:g} dB": parts.tuned_in_words(
+            {name: best for name, best in own.items() if registry[name].sees_budget or share_db == SHARES_DB[0]}
+        )
         for case, shares in tuned.items()
         for share_db, own in shares.items()
-        for name, best in own.items()
-        if registry[name].sees_budget or share_db == SHARES_DB[0]  # the others' grids serve for all rated powers
     }
-    return case_parameters(Parameter(N_TAPS, "as in the constraint study")) | {
+    return parts.case_parameters(Parameter(N_TAPS, "as in the constraint study")) | {
         "duration_s": Parameter(DURATION_S, "from switch-on on; the steady half counts"),
         "rated_power_db": Parameter(list(SHARES_DB), "over the unconstrained control power of each noise"),
         "seeds": Parameter(list(SEEDS), "of noise; of the recording, where it begins; tuned on all of them"),
         "settings": Parameter(
-            {name: [own.kind, own.second_kind] for name, own in registry.items()}, "what the settings of each are"
+            settings, f"best and tried at each rated power; for two settings a finer grid follows; {Tuned.RULE}"
         ),
-        "grids": Parameter(
-            {name: [list(own.first), list(own.second)] for name, own in registry.items()},
-            "for two settings a finer grid follows around the best",
-        ),
-        "trials": Parameter(trials, f"setting, mean NSE in dB, output power; {Tuned.RULE}"),
     }
 
 
@@ -314,9 +285,8 @@ def _figure(means: Means, case: Case) -> FigureItem:
     of = {name: own for (where, name), own in means.items() if where == case}
     # Of a noise that does not vary, the record has no bound of its own.
     bounds = {BOUND: "-", SCALED: ":"} if case.stationary else {BOUND: "-", RECORD: "--", SCALED: ":"}
-    figure, axes = new_figure((12.0, 6.6), 2, len(PANELS), sharex=True, sharey="row")
-    for column, (family, names) in enumerate(PANELS.items()):
-        above, below = axes[:, column]
+    figure, axes = parts.new_figure((12.0, 6.6), 2, len(PANELS), sharex=True, sharey="row")
+    for (above, below), (family, names) in zip(axes.T, PANELS.items(), strict=True):
         for label, dashes in bounds.items():
             above.plot(*_line(of[label], "noise_reduction_db"), color="black", linestyle=dashes, label=label)
         for name in names:
@@ -328,15 +298,12 @@ def _figure(means: Means, case: Case) -> FigureItem:
         above.set_title(family, fontsize="medium")
         # Below, where the powers leave room; above, it would cover curves.
         below.legend(*above.get_legend_handles_labels(), loc="upper right", fontsize="small", frameon=False)
-        below.axhline(1.0, color=MARK, linewidth=1)
+        below.axhline(1.0, color=parts.MARK, linewidth=1)
         below.set_xlabel("Rated power (dB over the unconstrained)")
-        for ax in (above, below):
-            ax.grid(True, alpha=0.3)
     free = {name: own[0] for name, own in of.items() if name in algorithms() and not algorithms()[name].keeps_budget}
     unconstrained = max(row.noise_reduction_db for name in ("KF-ANC", "FxLMS") for row in of[name])
     axes[0, 0].set_ylim(0.0, 1.1 * max(unconstrained, of[BOUND][-1].noise_reduction_db))
-    axes[1, 0].set_yscale("log")
-    axes[1, 0].set_ylim(0.3, 30.0)
+    axes[1, 0].set(yscale="log", ylim=(0.3, 30.0))
     axes[0, 0].set_ylabel("Noise reduction (dB)")
     axes[1, 0].set_ylabel("Output power / rated power")
     of_which = "" if case.stationary else " of each second, that of the whole record"
@@ -351,4 +318,4 @@ def _figure(means: Means, case: Case) -> FigureItem:
 
 
 def _line(rows: Sequence[BudgetRow], value: str) -> tuple[np.ndarray, np.ndarray]:
-    return np.array([row.share_db for row in rows]), np.array([getattr(row, value) for row in rows])
+    return column(rows, "share_db"), column(rows, value)

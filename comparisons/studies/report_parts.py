@@ -121,12 +121,12 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
     return parameters
 
 
-def tried(trials: Iterable[Trial], digits: int = 4) -> list[tuple[Any, ...]]:
+def tried(trials: Iterable[Trial]) -> list[tuple[Any, ...]]:
     """Return what was tried for results.json: setting, mean NSE in dB and output power, or that it diverged."""
     return [
         (t.setting, "diverged")
         if t.diverged
-        else (t.setting, round(t.mean_nse_db, 3), np.round(t.output_power, digits).tolist())
+        else (t.setting, round(t.mean_nse_db, 3), np.round(t.output_power, 5).tolist())
         for t in trials
     ]
 

@@ -2,41 +2,28 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from kfopc_filterpy import HardClipAmplifier, SimulationResult, bandpass_path, noise_reduction_db, output_power
-from kfopc_filterpy.bench import (
-    Claim,
-    FigureItem,
-    Parameter,
-    Runs,
-    Scene,
-    StudyReport,
-    Tuned,
-    algorithms,
-    figures_of_merit,
-    make_controller,
-    make_scene,
-    tune,
+from kfopc_filterpy import (
+    HardClipAmplifier,
+    SimulationResult,
+    bandpass_path,
+    bench,
+    noise_reduction_db,
+    output_power,
+    plot,
 )
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, algorithms
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.metrics import harmonics_db, peak_control_signal
-from kfopc_filterpy.plot import (
-    plot_amplifier_output,
-    plot_anti_noise,
-    plot_error_spectra,
-    plot_noise_reduction_against_overdrive,
-    plot_weight_history,
-)
 from kfopc_filterpy.signals import tone
 
+from . import report_parts as parts
 from .cases import FS, PAPER, Setting, grid_runs
-from .report_parts import BANDPASS_PATHS, ceiling_note, common_parameters, draw, draw_paths, sounds, tuning_note
 
 KALMAN = ("KF-ANC", "KF-OPC")
 TONE_HZ = 400.0
@@ -69,10 +56,10 @@ def main(runs: Runs) -> StudyReport:
     """Run the study."""
     primary, secondary = bandpass_path(128, fs=FS), bandpass_path(32, fs=FS)
     scene = _scene(primary, secondary)
-    tuned = tune(runs, scene)
+    tuned = bench.tune(runs, scene)
 
     def run(job: tuple[str, Setting]) -> SimulationResult:
-        return scene.run(make_controller(scene, *job), record_weights_every=WEIGHTS_EVERY)
+        return scene.run(bench.make_controller(scene, *job), record_weights_every=WEIGHTS_EVERY)
 
     def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
         return dict(zip(settings, runs.map(run, settings.items()), strict=True))
@@ -95,14 +82,14 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=RATED_POWER,
-        parameters=common_parameters(scene, tuned)
+        parameters=parts.common_parameters(scene, tuned)
         | {
             "noise": Parameter(f"sine, {TONE_HZ:g} Hz", "the paper's"),
             "duration_s": Parameter(DURATION_S - scene.switch_on_s, "long enough for the weights of KF-ANC to grow"),
             "amplifier": Parameter(f"hard clip at {LIMIT:.4f}", "the paper's, sqrt(2 rated power)"),
             "amplitude": Parameter(float(np.abs(scene.references[0]).max()), "follows from the control power"),
         }
-        | BANDPASS_PATHS,
+        | parts.BANDPASS_PATHS,
         algorithms=merits,
         extra={
             "overdrive_db": OVERDRIVES_DB,
@@ -119,18 +106,18 @@ def main(runs: Runs) -> StudyReport:
         claims=claims(merits, peak_control_signal(results["KF-OPC"].control_signal, steady=1.0), growths, crossings),
         figures=[
             *_figures_of(pairs, sweep, crossings),
-            draw_paths(
+            parts.draw_paths(
                 "The band-pass paths: what 128 and 32 taps realise of 20-5000 Hz.",
                 {"primary path, 128 taps": primary, "secondary path, 32 taps": secondary},
             ),
         ],
-        sounds=sounds(results),
-        notes=[*tuning_note(tuned), ceiling_note(scene)],
+        sounds=parts.sounds(results),
+        notes=[*parts.tuning_note(tuned), parts.ceiling_note(scene)],
     )
 
 
 def _scene(primary: Any, secondary: Any) -> Scene:
-    scene = make_scene(
+    scene = bench.make_scene(
         {0: tone(TONE_HZ, DURATION_S, fs=FS)},
         primary,
         secondary,
@@ -139,12 +126,12 @@ def _scene(primary: Any, secondary: Any) -> Scene:
         power_multiple=POWER_MULTIPLE,
         n_taps=N_TAPS,
     )
-    return dataclasses.replace(scene, amplifier=HardClipAmplifier(LIMIT))
+    return replace(scene, amplifier=HardClipAmplifier(LIMIT))
 
 
 def _figures(result: SimulationResult, scene: Scene) -> dict[str, float | None]:
     harmonics = harmonics_db(result.error, result.disturbance, TONE_HZ, FS)
-    return figures_of_merit([result], scene) | {"harmonics_db": harmonics}
+    return bench.figures_of_merit([result], scene) | {"harmonics_db": harmonics}
 
 
 def _extremes(result: SimulationResult, optimal_weight: float) -> dict[str, float]:
@@ -168,8 +155,8 @@ def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[
     amplifiers = [HardClipAmplifier(float(np.sqrt(2 * power))) for power in powers]
 
     def reductions(name: str) -> list[float]:
-        smaller = [dataclasses.replace(scene, rated_power=float(power)) for power in powers]
-        controllers = [make_controller(budget, name, tuned[name].setting) for budget in smaller]
+        smaller = [replace(scene, rated_power=float(power)) for power in powers]
+        controllers = [bench.make_controller(budget, name, tuned[name].setting) for budget in smaller]
         results = scene.run_together(controllers, amplifier=amplifiers)
         return [noise_reduction_db(result.error, result.disturbance) for result in results]
 
@@ -288,40 +275,40 @@ def _figures_of(
 
     def weights(setting: Setting, group: Sequence[SimulationResult]) -> Callable[[Any], None]:
         def panel(ax: Any) -> None:
-            plot_weight_history(group, tap=tap, ax=ax).set_yscale("linear")  # a straight line is the point
+            plot.plot_weight_history(group, tap=tap, ax=ax).set_yscale("linear")  # a straight line is the point
             ax.autoscale(axis="y")
             ax.set_title(f"$r\\,E[x'^2]/q$ = {setting:g}", pad=22, fontsize="medium")  # above the legend
 
         return panel
 
     def overdrive(ax: Any) -> None:
-        plot_noise_reduction_against_overdrive(OVERDRIVES_DB, sweep, flip_db=crossings, ax=ax)
+        plot.plot_noise_reduction_against_overdrive(OVERDRIVES_DB, sweep, flip_db=crossings, ax=ax)
         ax.set_ylim(0, 25)
 
     return [
-        draw(
+        parts.draw(
             "a-error-spectra",
             "Power spectra of disturbance and error signals over the steady half (Fig. 5 a). At 400 Hz KF-ANC lies behind "
             "KF-OPC.",
-            lambda ax: plot_error_spectra(pair, ax=ax),
+            lambda ax: plot.plot_error_spectra(pair, ax=ax),
         ),
-        draw(
+        parts.draw(
             "b-anti-noise",
             "Anti-noise at the error microphone, last 20 ms (Fig. 5 b).",
-            lambda ax: plot_anti_noise(pair, span_s=span, ax=ax),
+            lambda ax: plot.plot_anti_noise(pair, span_s=span, ax=ax),
         ),
-        draw(
+        parts.draw(
             "c-amplifier-output",
             "Amplifier output, last 20 ms; dotted: the control signal it was asked for (Fig. 5 c).",
-            lambda ax: plot_amplifier_output(pair, span_s=span, limit=LIMIT, ax=ax),
+            lambda ax: plot.plot_amplifier_output(pair, span_s=span, limit=LIMIT, ax=ax),
         ),
-        draw(
+        parts.draw(
             "d-weight-history",
             f"History of weight {tap}, the largest of KF-ANC at the end (Fig. 5 d). Left: with the state noise r that "
             "KF-ANC is tuned to; right: with the most of the grid. KF-OPC is the same in both.",
             *(weights(*own) for own in groups.items()),
         ),
-        draw(
+        parts.draw(
             "overdrive",
             f"Noise reduction over the overdrive: the paper's ordering holds where KF-OPC lies above. At 0 dB, off the "
             f"scale, KF-ANC reaches {sweep['KF-ANC'][0]:.0f} and KF-OPC {sweep['KF-OPC'][0]:.0f} dB.",

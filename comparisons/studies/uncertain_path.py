@@ -10,27 +10,15 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, noise_reduction_db
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, run_setting
 from kfopc_filterpy.controllers.posterior import DEFAULT_UNCERTAINTY
 from kfopc_filterpy.paths import PathTolerance, identify_secondary_path, path_taps, perturbed_path
 from kfopc_filterpy.signals import band_limited_noise, tone
 
-from .cases import (
-    FS,
-    SEED,
-    SENSOR_NOISE_DB,
-    SWITCH_ON_S,
-    Noise,
-    Pair,
-    grid_runs,
-    grids,
-    make_case,
-    noises,
-    paths,
-    tune_all,
-)
-from .report_parts import MARK, case_parameters, legend_of, new_figure, tuned_in_words, without_measured
-from .rows import WindowRow, cell, figures_of, table_of_cells, worst
+from . import cases
+from . import report_parts as parts
+from .cases import FS, SEED, SENSOR_NOISE_DB, SWITCH_ON_S, Noise, Pair, noises, paths
+from .rows import WindowRow, figure_table, figures_of, loss_claim, select, worst
 
 ALGORITHM = "KF-PB"
 N_TAPS = 128
@@ -72,7 +60,7 @@ class AllowanceRow(WindowRow):
 
 def planned_runs() -> int:
     """Return the number of runs of the study."""
-    return len(paths()) * len(study_noises()) * (grid_runs([ALGORITHM]) + len(jobs()))
+    return len(paths()) * len(study_noises()) * (cases.grid_runs([ALGORITHM]) + len(jobs()))
 
 
 def main(runs: Runs) -> StudyReport:
@@ -83,10 +71,10 @@ def main(runs: Runs) -> StudyReport:
     for path, pair in pairs.items():
         estimates = known_paths(pair)
         for noise, make in study_noises().items():
-            scene = make_case(pair, make(DURATION_S + SWITCH_ON_S, SEED), n_taps=N_TAPS)
+            scene = cases.make_case(pair, make(DURATION_S + SWITCH_ON_S, SEED), n_taps=N_TAPS)
             scene = replace(scene, rated_power=RATED_SHARE * scene.unconstrained_power)
-            best = tune_all(runs, scene, grids([ALGORITHM]))
-            settings[f"{path}, {noise}"] = tuned_in_words(best)
+            best = cases.tune_all(runs, scene, cases.grids([ALGORITHM]))
+            settings[f"{path}, {noise}"] = parts.tuned_in_words(best)
             rows += runs.map(partial(run_job, scene, estimates, best[ALGORITHM], path, noise), jobs())
     return StudyReport(
         name="uncertain-path",
@@ -99,7 +87,7 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=RATED_SHARE,
-        parameters=case_parameters(Parameter(N_TAPS, "as in the other studies of wrong estimates"))
+        parameters=parts.case_parameters(Parameter(N_TAPS, "as in the other studies of wrong estimates"))
         | {
             "duration_s": Parameter(DURATION_S, "from switch-on on"),
             "errors": Parameter(ERRORS, "of the estimate: samples of delay, dB and degrees"),
@@ -109,14 +97,24 @@ def main(runs: Runs) -> StudyReport:
             "seed": Parameter(SEED, "of noise and sensor noise"),
             "settings": Parameter(settings, "with the exact path"),
         },
-        algorithms={},
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
         figures=[_figure(rows)],
-        notes=[*without_measured(pairs), _power_note(rows), "There is one seed and one record for each case."],
+        notes=[*parts.without_measured(pairs), _power_note(rows), "There is one seed and one record for each case."],
         tables=[
-            _table("worst", "Least noise reduction in dB over any second after the first", rows, "worst_second_db"),
-            _table("steady", "Noise reduction in dB over the steady half", rows, "noise_reduction_db"),
+            figure_table(
+                stem,
+                caption,
+                rows,
+                figure,
+                {"paths": "path", "noise": "noise", "estimate": "error"},
+                ALLOWANCES,
+                "allowance",
+            )
+            for stem, caption, figure in (
+                ("worst", "Least noise reduction in dB over any second after the first", "worst_second_db"),
+                ("steady", "Noise reduction in dB over the steady half", "noise_reduction_db"),
+            )
         ],
         claims_heading="Findings",
     )
@@ -231,9 +229,7 @@ def _cost(rows: Iterable[AllowanceRow], error: str, allowance: str, text: str) -
     reduction = {(row.case, row.error, row.allowance): row.noise_reduction_db for row in rows}
     cases = dict.fromkeys(case for case, *_ in reduction)
     costs = {str(case): reduction[case, EXACT, NOTHING] - reduction[case, error, allowance] for case in cases}
-    where, most = worst(costs)
-    mean = np.mean(list(costs.values()))
-    return Claim(text, most <= COST_DB, f"{mean:z.2f} dB on average, {most:z.2f} dB at most ({where})")
+    return loss_claim(text, COST_DB, costs)
 
 
 def _power_note(rows: Sequence[AllowanceRow]) -> str:
@@ -244,34 +240,28 @@ def _power_note(rows: Sequence[AllowanceRow]) -> str:
     )
 
 
-# ---- Tables and figures
-
-
-def _table(stem: str, caption: str, rows: Sequence[AllowanceRow], figure: str) -> Table:
-    cells = (((row.path, row.noise, row.error), row.allowance, cell(row, figure)) for row in rows)
-    return table_of_cells(stem, caption, ["paths", "noise", "estimate"], ALLOWANCES, cells)
+# ---- Figure
 
 
 def _figure(rows: Sequence[AllowanceRow]) -> FigureItem:
     """Return a figure of the worst seconds: a panel for each pair of paths, a group for each error."""
     names, estimates = list(dict.fromkeys(row.path for row in rows)), [EXACT, IDENTIFIED, *ERRORS]
-    figure, axes = new_figure((10.5, 4.2), 1, len(names), sharey=True)
+    figure, axes = parts.new_figure((10.5, 4.2), 1, len(names), grid="y", sharey=True)
     markers = {NOTHING: ("x", "C3"), DEFAULT: ("o", "C0"), STATED: ("^", "C2")}
     bottom = max(BOTTOM_DB, min(-row.louder_db for row in rows))
     for ax, path in zip(axes[0], names, strict=True):
         for place, allowance in enumerate(ALLOWANCES):
-            own = [row for row in rows if (row.path, row.allowance) == (path, allowance)]
+            own = select(rows, path=path, allowance=allowance)
             x = [estimates.index(row.error) + 0.25 * (place - 1) for row in own]
             y = [max(-row.louder_db, bottom) for row in own]
             marker, colour = markers[allowance]
             ax.plot(x, y, marker, color=colour, markersize=5, alpha=0.8, label=allowance)
-        ax.axhline(0.0, color=MARK, linewidth=1)
+        ax.axhline(0.0, color=parts.MARK, linewidth=1)
         ax.set_xticks(range(len(estimates)), estimates, rotation=40, ha="right", fontsize="small")
         ax.set_title(path)
-        ax.grid(True, axis="y", alpha=0.3)
     axes[0, 0].set_ylabel("Worst second: noise reduction (dB)")
     axes[0, 0].set_ylim(bottom=bottom - 0.5)
-    legend_of(figure, axes[0])
+    parts.legend_of(figure, axes[0])
     return FigureItem(
         "worst-seconds",
         "Least noise reduction over a second after the first, for each noise, against what is wrong with the estimate of "

@@ -148,7 +148,7 @@ def test_all_findings_hold_on_good_rows() -> None:
         "if nothing is allowed for 1 of 1 do, the worst second is -7.0 dB (duct, white, a sample late)"
         in found[0].measured
     )
-    assert found[2].measured == "0.40 dB on average, 0.40 dB at most (duct, motor)"
+    assert found[2].measured == "0.40 dB on average, 0.40 dB at worst (duct, motor)"
 
 
 @pytest.mark.parametrize(
