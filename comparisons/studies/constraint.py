@@ -185,7 +185,7 @@ def run_amplifiers(scene: Scene, primary: np.ndarray, case: Case, tuned: Setting
     for name in LIMITED:
         jobs.append((clipping, name, "path 6 dB, 45° off", _controller(wrong, name, tuned)))
         jobs.append((jumping, name, f"{JUMP_DB:g} dB louder for a second", _controller(scene, name, tuned)))
-    place = {"path": case.path, "noise": case.noise}
+    place: dict[str, Any] = {"path": case.path, "noise": case.noise}
     return [
         ClippedRow(**place, algorithm=name, known=words, **figures_of(at.run(controller), scene.rated_power))
         for at, name, words, controller in jobs

@@ -176,13 +176,19 @@ def run_case(
             for tuned_with, tuned in ((EXACT, best["phase", 0.0][name]), (WRONG, best[point][name])):
                 # If it diverged at every setting, any of them will do.
                 trial = trials[tuned.setting if tuned else algorithms()[name].grid[0]]
-                figures = {
+                figures: dict[str, Any] = {
                     "setting": trial.setting,
                     "noise_reduction_db": trial.noise_reduction_db,
                     "power": np.nan if trial.diverged else trial.output_power / scene.rated_power,
                     "diverged_at_s": trial.diverged_at_s,
                 }
-                place = {"path": case.path, "noise": case.noise, "kind": kind, "amount": amount, "algorithm": name}
+                place: dict[str, Any] = {
+                    "path": case.path,
+                    "noise": case.noise,
+                    "kind": kind,
+                    "amount": amount,
+                    "algorithm": name,
+                }
                 rows.append(MismatchRow(**place, tuned_with=tuned_with, **figures))
     return rows, best
 

@@ -175,7 +175,7 @@ def mean_rows(rows: Sequence[BudgetRow]) -> Means:
     for (case, name, _), own in sorted(
         grouped(rows, "case", "algorithm", "share_db").items(), key=lambda item: item[0][2]
     ):
-        mean = {figure: float(column(own, figure).mean()) for figure in ("noise_reduction_db", "power")}
+        mean: dict[str, Any] = {figure: float(column(own, figure).mean()) for figure in ("noise_reduction_db", "power")}
         row = replace(own[0], **mean, worst_window=float(column(own, "worst_window").max()))
         means.setdefault((case, name), []).append(row)
     return means
