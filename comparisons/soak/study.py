@@ -25,23 +25,9 @@ from typing import Any
 import numpy as np
 from scipy.signal import butter, lfilter, sosfilt, unit_impulse
 
-from kfopc_filterpy import (
-    ClippingFxLMS,
-    DiagonalKalman,
-    FastArrayKalman,
-    FxLMS,
-    FxNLMS,
-    LeakyFxLMS,
-    MOVFxLMS,
-    OptimalLeakyFxLMS,
-    OutputLimiter,
-    RescalingFxLMS,
-    TwoGradientFxLMS,
-    kf_anc,
-    kf_opc,
-    kf_pb,
-    simulate,
-)
+import kfopc_filterpy as anc
+from kfopc_filterpy import OutputLimiter, simulate
+from kfopc_filterpy.bench.report import aligned
 
 SAMPLES = 10_000_000
 CHECKS = 20  # in a run
@@ -154,10 +140,10 @@ def kalman_case(name: str, make: Any, ratio: float, **settings: Any) -> Case:
     return Case(name, partial(make, TAPS, SECONDARY, **noises, **settings), ratio)
 
 
-def limited_kf_opc(**settings: Any) -> Any:
+def limited_kf_opc(*arguments: Any, **settings: Any) -> Any:
     """Return KF-OPC behind a limiter."""
     limiter = OutputLimiter(RATED_POWER, fs=FS)
-    return kf_opc(TAPS, SECONDARY, rated_power=RATED_POWER, limiter=limiter, **settings)
+    return anc.kf_opc(*arguments, rated_power=RATED_POWER, limiter=limiter, **settings)
 
 
 def several_channels() -> np.ndarray:
@@ -168,51 +154,37 @@ def several_channels() -> np.ndarray:
 def all_cases() -> list[Case]:
     """Return every case, in the order of the table."""
     rated: dict[str, Any] = {"rated_power": RATED_POWER}
-    steps: dict[str, Any] = {"step_size": 1e-3}
     limit: dict[str, Any] = {"amplitude_limit": 1.0}
-    array: dict[str, Any] = {"measurement_noise": Q}
-    filters: tuple[tuple[str, Any, dict[str, Any]], ...] = (
-        ("KF-ANC", kf_anc, {}),
-        ("KF-OPC", kf_opc, rated),
-    )
-    lms = {
-        "FxLMS": (FxLMS, {}),
-        "FxNLMS": (FxNLMS, {}),
-        "leaky FxLMS": (LeakyFxLMS, {"leak": 0.1}),
-        "optimal leaky FxLMS": (OptimalLeakyFxLMS, rated),
-        "MOV-FxLMS": (MOVFxLMS, rated),
-        "two-gradient FxLMS": (TwoGradientFxLMS, limit),
-        "re-scaling FxLMS": (RescalingFxLMS, limit),
-        "clipping FxLMS": (ClippingFxLMS, limit),
-    }
     zero: dict[str, Any] = {"state_noise": 0.0, "measurement_noise": Q, "initial_variance": 1e12 * Q}
+    array = partial(anc.FastArrayKalman, TAPS, SECONDARY, measurement_noise=Q)
     paths = several_channels()
+    lms: dict[str, tuple[Any, dict[str, Any]]] = {
+        "FxLMS": (anc.FxLMS, {}),
+        "FxNLMS": (anc.FxNLMS, {}),
+        "leaky FxLMS": (anc.LeakyFxLMS, {"leak": 0.1}),
+        "optimal leaky FxLMS": (anc.OptimalLeakyFxLMS, rated),
+        "MOV-FxLMS": (anc.MOVFxLMS, rated),
+        "two-gradient FxLMS": (anc.TwoGradientFxLMS, limit),
+        "re-scaling FxLMS": (anc.RescalingFxLMS, limit),
+        "clipping FxLMS": (anc.ClippingFxLMS, limit),  # lets the weights grow, and is loud when the noise changes
+    }
     return [
-        *(kalman_case(name, make, ratio, **settings) for name, make, settings in filters for ratio in (1e4, 1e12)),
-        Case("KF-OPC, limiter", partial(limited_kf_opc, **zero), ratio=1e12),
-        Case("KF-PB", partial(kf_pb, TAPS, SECONDARY, **rated)),
-        Case("diagonal KF", partial(DiagonalKalman, TAPS, SECONDARY, **zero), ratio=1e12),
-        Case("KF-ANC, 2 x 2", partial(kf_anc, TAPS // 2, paths, **zero), ratio=1e12, secondary=paths, share=0.1),
+        *(kalman_case("KF-ANC", anc.kf_anc, ratio) for ratio in (1e4, 1e12)),
+        *(kalman_case("KF-OPC", anc.kf_opc, ratio, **rated) for ratio in (1e4, 1e12)),
+        kalman_case("KF-OPC, limiter", limited_kf_opc, 1e12),
+        Case("KF-PB", partial(anc.kf_pb, TAPS, SECONDARY, **rated)),
+        kalman_case("diagonal KF", anc.DiagonalKalman, 1e12),
+        Case("KF-ANC, 2 x 2", partial(anc.kf_anc, TAPS // 2, paths, **zero), ratio=1e12, secondary=paths, share=0.1),
         Case(
             GROWING,
-            partial(FastArrayKalman, TAPS, SECONDARY, **array, initial_variance=1e4 * Q),
+            partial(array, initial_variance=1e4 * Q),
             ratio=1e4,
             signals=("tone", "silence", "white"),  # the others spoil an array that is never restarted
         ),
+        *(Case(FINITE, partial(array, initial_variance=r * Q, memory=MEMORY), ratio=r) for r in (1e4, 1e12)),
         *(
-            Case(
-                FINITE,
-                partial(FastArrayKalman, TAPS, SECONDARY, **array, initial_variance=ratio * Q, memory=MEMORY),
-                ratio=ratio,
-            )
-            for ratio in (1e4, 1e12)
-        ),
-        *(
-            Case(name, partial(make, TAPS, SECONDARY, **steps, **settings), quiet=make is not ClippingFxLMS)
-            for name, (
-                make,
-                settings,
-            ) in lms.items()  # clipping lets the weights grow, and is loud when the noise changes
+            Case(name, partial(make, TAPS, SECONDARY, step_size=1e-3, **settings), quiet=name != "clipping FxLMS")
+            for name, (make, settings) in lms.items()
         ),
     ]
 
@@ -403,22 +375,16 @@ def table(outcomes: Sequence[Outcome]) -> str:
                 str(sum(len(one.violations) for one in own)),
             ]
         )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
-    return "\n".join(
-        "  ".join(
-            text.ljust(width) if k < 1 else text.rjust(width)
-            for k, (text, width) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in rows
-    )
+    return "\n".join(aligned(rows, left={0}))
 
 
 def remarks(outcomes: Sequence[Outcome]) -> list[str]:
     """Return what the table does not say."""
     longest = max(one.samples for one in outcomes)
     arrays = [one for one in outcomes if one.stray is not None]
-    least = {name: min([one.us_per_sample for one in arrays if one.name == name], default=np.nan) for name in ARRAYS}
-    growing, finite = (least[name] for name in ARRAYS)
+    growing, finite = (
+        min([one.us_per_sample for one in arrays if one.name == name], default=np.nan) for name in ARRAYS
+    )
     return [
         f"{len(outcomes)} runs of {longest:,} samples (several channels: a tenth), {CHECKS} checks in each, "
         f"{TAPS} taps, no state noise, q = {Q:g}. dB: noise reduction in the last interval; least/largest: eigenvalues of "

@@ -104,13 +104,9 @@ def times_beside_filterpy() -> list[dict[str, Any]]:
 def table_beside_filterpy(rows: list[dict[str, Any]]) -> str:
     """Return the times for the terminal."""
     title = f"{'predict and update, in turns':42}{'filterpy µs':>12}{'ours µs':>10}{'times its time':>16}{'times as fast':>15}"
-    return "\n".join(
-        [
-            title,
-            *(
-                f"{row['what']:42}{row['filterpy_us']:12.1f}{row['ours_us']:10.1f}"
-                f"{row['ours_us'] / row['filterpy_us']:16.2f}{row['filterpy_us'] / row['ours_us']:15.2f}"
-                for row in rows
-            ),
-        ]
+    lines = (
+        f"{row['what']:42}{row['filterpy_us']:12.1f}{row['ours_us']:10.1f}"
+        f"{row['ours_us'] / row['filterpy_us']:16.2f}{row['filterpy_us'] / row['ours_us']:15.2f}"
+        for row in rows
     )
+    return "\n".join([title, *lines])

@@ -7,9 +7,6 @@ all variants take turns, and the best time of each counts, so that other work on
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -33,7 +30,6 @@ TURN_S = 0.05  # a variant's turn, about as long as the probe's
 REAL_TIME_FS = (16000.0, 48000.0)
 WORST_TAPS = (128, 256, 512)
 WORST_SAMPLES = 1_000_000
-FIRST_USE_TIMES = 3  # the shortest counts
 CHANNEL_BLOCKS = 100
 BLOCK_SAMPLES = 640_000  # 40 s at 16 kHz; 40,000 of the shortest blocks
 # Above these taps a variant would take minutes or gigabytes, and the trend is clear.
@@ -45,15 +41,6 @@ NEEDS = {
     "pyroomacoustics RLS": "pyroomacoustics",
 }
 OTHER_RECURSIONS = ("padasip RLS", "pyroomacoustics RLS")
-FIRST_USE = """
-import time
-from comparisons.speed.variants import {name}
-def seconds():
-    began = time.perf_counter()
-    {name}()
-    return time.perf_counter() - began
-print(seconds() - seconds())
-"""
 
 
 def seconds(work: Callable[[], Any]) -> float:
@@ -171,16 +158,12 @@ def channel_times(taps: int = 512) -> list[dict[str, Any]]:
 def channel_table(rows: list[dict[str, Any]], taps: int = 512) -> str:
     """Return the times of several channels for the terminal."""
     title = f"KF-PB: I x J x K, taps L    µs a sample   times one channel of {taps} taps   worst block / its duration"
-    return "\n".join(
-        [
-            title,
-            *(
-                f"{row['references']:6} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}"
-                f"{row['us_per_sample']:18.1f}{row['times_one_channel']:22.2f}{row['worst_block_share']:36.2f}"
-                for row in rows
-            ),
-        ]
+    lines = (
+        f"{row['references']:6} x {row['loudspeakers']:2} x {row['microphones']:2}, {row['n_taps']:4}"
+        f"{row['us_per_sample']:18.1f}{row['times_one_channel']:22.2f}{row['worst_block_share']:36.2f}"
+        for row in rows
     )
+    return "\n".join([title, *lines])
 
 
 def block_times(samples: int = BLOCK_SAMPLES) -> list[dict[str, Any]]:
@@ -214,16 +197,6 @@ def block_table(rows: list[dict[str, Any]]) -> str:
         times = f"{row['median_us']:11.1f}{row['percentile_99_99_us']:10.1f}{row['worst_us']:10.1f}"
         lines.append(f"{row['controller']:28}{row['block']:6}{times}{shares}")
     return "\n".join(lines)
-
-
-def first_use_s(name: str) -> float:
-    """Return the seconds that the first use in a process takes longer than the second."""
-    path = os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
-    command = [sys.executable, "-c", FIRST_USE.format(name=variants.FIRST_USES[name].__name__)]
-    ran = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
-    if ran.returncode:
-        raise RuntimeError(f"the first run failed: {ran.stderr}")
-    return float(ran.stdout)
 
 
 def real_time_taps(rows: list[dict[str, Any]], name: str, fs: float) -> int | None:
@@ -304,9 +277,6 @@ def remarks(result: dict[str, Any]) -> list[str]:
             f"P(0|0): {w['first_samples_us']:.0f} µs."
             for w in result["worst_sample"]
         ),
-        "First use in a process: "
-        + ", ".join(f"{took:.1f} s for {name}" for name, took in result["first_use_s"].items())
-        + ".",
         f"{' and '.join(OTHER_RECURSIONS)}: another recursion, with forgetting in place of state noise.",
         *([f"Not installed, left out: {', '.join(missing)}; they come with the extra bench."] if missing else []),
     ]
@@ -319,59 +289,37 @@ def main(folder: Path, quiet: bool = False) -> int:
     from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
-    rates, rows = [], []
-    with (
-        threadpool_limits(1),
-        tqdm(
-            total=len(TAPS) * ROUNDS + len(WORST_TAPS) + 3 + len(variants.FIRST_USES), disable=quiet, unit="round"
-        ) as bar,
-    ):
+    rates, rows, worst, others = [], [], [], {}
+    measures: dict[str, Callable[[], Any]] = {
+        "beside_filterpy": times_beside_filterpy,
+        "channels": channel_times,
+        "blocks": block_times,
+    }
+    planned = len(TAPS) * ROUNDS + len(WORST_TAPS) + len(measures)
+    with threadpool_limits(1), tqdm(total=planned, disable=quiet, unit="round") as bar:
         for taps in TAPS:
             bar.set_description(f"speed, {taps} taps")
             rate, best = measure(taps, tick=bar.update)
             rates.append(rate)
             rows += rows_of(taps, rate, best)
-        worst = []
         for taps in WORST_TAPS:
             bar.set_description(f"speed, worst of {WORST_SAMPLES:,} samples, {taps} taps")
             worst.append(worst_sample(taps) | {"first_samples_us": first_samples_us(taps)})
             bar.update()
-        bar.set_description("speed, beside filterpy")
-        beside = times_beside_filterpy()
-        bar.update()
-        bar.set_description("speed, several channels")
-        channels = channel_times()
-        bar.update()
-        bar.set_description("speed, blocks")
-        blocks = block_times()
-        bar.update()
-        first_use = {}
-        for name in variants.FIRST_USES:
-            bar.set_description(f"speed, first use, {name}")
-            first_use[name] = min(first_use_s(name) for _ in range(FIRST_USE_TIMES))
+        for name, work in measures.items():
+            bar.set_description(f"speed, {name.replace('_', ' ')}")
+            others[name] = work()
             bar.update()
-    result = {
-        "dgemm_gflops": max(rates),
-        "rows": rows,
-        "worst_sample": worst,
-        "beside_filterpy": beside,
-        "channels": channels,
-        "blocks": blocks,
-        "first_use_s": first_use,
-    }
+    result = {"dgemm_gflops": max(rates), "rows": rows, "worst_sample": worst} | others
     (folder / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
     figure(result).savefig(folder / "speed.png", dpi=150)
     print(
         table(result),
-        "",
-        channel_table(channels),
-        "",
-        table_beside_filterpy(beside),
-        "",
-        block_table(blocks),
-        "",
-        *(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)),
-        sep="\n",
+        channel_table(others["channels"]),
+        table_beside_filterpy(others["beside_filterpy"]),
+        block_table(others["blocks"]),
+        "\n".join(fill(f"- {line}", 110, subsequent_indent="  ") for line in remarks(result)),
+        sep="\n\n",
     )
     print(f"\n{folder / 'speed.json'} and speed.png written")
     return 0

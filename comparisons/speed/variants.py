@@ -167,35 +167,6 @@ def scenarios(taps: int) -> Work:
     return run, SCENARIOS * samples
 
 
-# ---- The first use, in a fresh process
-
-
-def first_update() -> None:
-    """Use the filter as a filterpy filter."""
-    kf = random_walk(8)
-    kf.predict()
-    kf.update(1.0, H=np.ones(8))
-
-
-def first_simulate() -> None:
-    """Run one controller; to the compiler those that the paper compares are one type."""
-    x, d = _noise(100)
-    simulate(CONTROLLERS["KF-OPC"](8), x, disturbance=d, secondary_path=PATH)
-
-
-def first_scenarios() -> None:
-    """Run controllers that share their gains."""
-    x, d = _noise(100)
-    simulate_scenarios([CONTROLLERS["KF-OPC"](8)], x, disturbance=d, secondary_path=PATH)
-
-
-FIRST_USES = {
-    "`predict` and `update`": first_update,
-    "`simulate`": first_simulate,
-    "`simulate_scenarios`": first_scenarios,
-}
-
-
 # ---- Others
 
 

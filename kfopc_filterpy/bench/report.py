@@ -158,14 +158,14 @@ def results_table(studies: Sequence[StudyReport]) -> str:
             columns, rows = merit_table(study)
             heads = [["", *head] for head in zip(*columns, strict=True)]
             named = [[name, *row] for name, row in zip(study.algorithms, rows, strict=True)]
-            lines += _columns([*heads, *named], {0})
+            lines += aligned([*heads, *named], {0})
         for claim in study.claims:
             mark = study.marks[0 if claim.holds else 1].upper()
             lines += textwrap.wrap(claim.text, 116, initial_indent=f"  {mark:<16}", subsequent_indent=18 * " ")
             lines += textwrap.wrap(claim.measured, 116, initial_indent=18 * " ", subsequent_indent=18 * " ")
         for table in _on_a_screen(study):
             left = set(range(len(table.headings))) - table.numbers
-            lines += ["", *textwrap.wrap(table.caption, 116), *_columns([table.headings, *table.cells], left)]
+            lines += ["", *textwrap.wrap(table.caption, 116), *aligned([table.headings, *table.cells], left)]
         lines.append("")
     return "\n".join([*lines, *textwrap.wrap(claims_sentence(studies), 116)])
 
@@ -178,7 +178,7 @@ def _on_a_screen(study: StudyReport) -> list[Table]:
     return [] if study.algorithms else fitting[:1]
 
 
-def _columns(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]], left: set[int]) -> list[str]:
     """Return lines of cells in columns; the columns `left` are aligned to the left."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [

@@ -32,7 +32,6 @@ def small(monkeypatch):
     fxlms = speed_variants.BLOCK_CONTROLLERS["FxLMS, 256 taps"]
     monkeypatch.setattr(speed_variants, "BLOCK_CONTROLLERS", {"FxLMS, 256 taps": fxlms})
     monkeypatch.setattr(speed, "block_times", lambda: BLOCK_TIMES(6400))
-    monkeypatch.setattr(speed, "first_use_s", lambda name: 1.0)
     monkeypatch.setattr(speed, "find_spec", lambda name: None)  # the same wherever it runs
     monkeypatch.setattr(speed_variants, "samples_for", lambda taps, most=0, least=0: 96)
 
@@ -83,7 +82,6 @@ def test_the_command_writes_what_it_measured(small, tmp_path, capsys):
         assert row["what"] in printed
     many = result["beside_filterpy"][-1]
     assert many["filterpy_us"] > 5 * many["ours_us"], many  # O(L^3) against O(L^2) at 256 taps
-    assert "1.0 s for `simulate`" in printed
 
 
 def test_what_is_stepped_from_python_is_what_the_loop_runs():
@@ -92,11 +90,6 @@ def test_what_is_stepped_from_python_is_what_the_loop_runs():
             run, samples = make(name, 8)
             run()
             assert samples > 0
-
-
-@pytest.mark.parametrize("use", speed_variants.FIRST_USES.values())
-def test_a_first_use_is_complete_without_what_the_study_has_imported(use):
-    use()
 
 
 def test_rows_follow_from_the_measured_times():
