@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, make_controller
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, make_controller
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
@@ -19,14 +19,13 @@ from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_
 
 from . import report_parts as parts
 from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain
-from .report_parts import milliseconds
+from .duct_start import Start, faster_claim, start_under_constraint
 
 DURATION_S = 10.5
 RATED_POWER = 0.5
 POWER_MULTIPLE = 4.0
 N_TAPS = 256
 NSE_WINDOW_S = 0.05
-TIME_WINDOW_S = 0.02  # of the times to a common level, which are shorter than 50 ms would resolve
 FIXED = "MOV-FxLMS by variance"
 ALGORITHMS = (*PAPER, FIXED, "KF-PB")
 RATED = ("KF-OPC", "KF-PB", "MOV-FxLMS", FIXED)  # those with a rated power
@@ -45,25 +44,6 @@ class Figures:
     power: float  # over the steady half
     worst_second: float
     worst_50_ms: float
-
-
-@dataclass(frozen=True)
-class Start:
-    """The second after the control is switched on, at a time at which the constraint acts throughout that second.
-
-    Noise reductions and powers are over that second, the powers over the rated power. Times are those at which the NSE
-    first comes within 1 dB of the lesser of the two steady reductions: a level that both reach.
-    """
-
-    at_s: float
-    noise_reduction_db: Mapping[str, float]
-    power: Mapping[str, float]
-    equal_power: float  # of KF-OPC with another rated power, chosen so that it puts out as much as MOV-FxLMS
-    equal_power_db: float
-    time_s: float  # of KF-OPC
-    mov_time_s: float
-    equal_time_s: float  # of KF-OPC with equal power, to the level that it has in common with MOV-FxLMS there
-    mov_equal_time_s: float
 
 
 def planned_runs() -> int:
@@ -187,69 +167,6 @@ def figures_of(result: SimulationResult, rated_power: float) -> Figures:
     )
 
 
-# ---- The start, at a time at which the constraint acts
-
-
-def first_second_below_one(factor: np.ndarray, fs: float) -> int | None:
-    """Return the first whole second in which the constraint factor is below 1 throughout; None if there is none."""
-    second = int(fs)
-    seconds = factor[: factor.size // second * second].reshape(-1, second)
-    below = np.flatnonzero(seconds.max(axis=1) < 1.0)
-    return int(below[0]) if below.size else None
-
-
-def start_under_constraint(scene: Scene, tuned: Mapping[str, Tuned], factor: np.ndarray) -> Start | None:
-    """Return what happens if the control is switched on where the constraint acts; None if it never does for a second.
-
-    A constraint factor of 1 makes KF-OPC the same as KF-ANC, so a start with it says nothing about the constraint.
-    """
-    at_s = first_second_below_one(factor, scene.fs)
-    if at_s is None:
-        return None
-    switch_on_s = scene.switch_on_s + at_s
-    end = int((switch_on_s + 1.0) * scene.fs)
-    second = replace(
-        scene,
-        references=[x[:end] for x in scene.references],
-        disturbances=[d[:end] for d in scene.disturbances],
-        switch_on_s=switch_on_s,
-    )
-
-    def run(algorithm: str, rated_power: float = RATED_POWER) -> SimulationResult:
-        # The settings are in the units of the whole noise.
-        whole = replace(scene, rated_power=rated_power)
-        return second.run(make_controller(whole, algorithm, tuned[algorithm].setting))
-
-    results = {algorithm: run(algorithm) for algorithm in ("KF-OPC", "MOV-FxLMS")}
-    power = {algorithm: float(np.mean(r.control_signal**2)) for algorithm, r in results.items()}
-    # KF-OPC's power is proportional to its rated power as long as the factor is below 1.
-    equal = run("KF-OPC", RATED_POWER * power["MOV-FxLMS"] / power["KF-OPC"])
-    time, mov_time = times_to_a_common_level(results["KF-OPC"], results["MOV-FxLMS"])
-    equal_time, mov_equal_time = times_to_a_common_level(equal, results["MOV-FxLMS"])
-    return Start(
-        at_s=float(at_s),
-        noise_reduction_db={algorithm: parts.first_second_db(r) for algorithm, r in results.items()},
-        power={algorithm: own / RATED_POWER for algorithm, own in power.items()},
-        equal_power=float(np.mean(equal.control_signal**2)) / RATED_POWER,
-        equal_power_db=parts.first_second_db(equal),
-        time_s=time,
-        mov_time_s=mov_time,
-        equal_time_s=equal_time,
-        mov_equal_time_s=mov_equal_time,
-    )
-
-
-def times_to_a_common_level(one: SimulationResult, other: SimulationResult) -> tuple[float, float]:
-    """Return when the NSE of each first comes within 1 dB of the lesser of their steady noise reductions, in seconds."""
-    level = 1.0 - min(noise_reduction_db(r.error, r.disturbance) for r in (one, other))
-
-    def first(result: SimulationResult) -> float:
-        below = nse_db(result.error, result.disturbance, FS, TIME_WINDOW_S) <= level
-        return float(np.argmax(below)) / FS if below.any() else np.inf
-
-    return first(one), first(other)
-
-
 # ---- Claims
 
 
@@ -269,7 +186,7 @@ def claims(figures: Mapping[str, Figures], start: Start | None) -> list[Claim]:
             f"output power {opc.power:.3f} of the rated power over the steady half, at most {opc.worst_second:.3f} over 1 s, "
             f"and {opc.worst_50_ms:.1f} times the rated power over 50 ms",
         ),
-        _faster_claim(start),
+        faster_claim(start),
         Claim(
             "KF-OPC's output power is closer to the rated power than MOV-FxLMS's",
             bool(abs(opc.power - 1.0) < abs(mov.power - 1.0)),
@@ -283,26 +200,6 @@ def claims(figures: Mapping[str, Figures], start: Start | None) -> list[Claim]:
             f"{mov.power:.2f} of the rated power",
         ),
     ]
-
-
-def _faster_claim(start: Start | None) -> Claim:
-    """Return the claim about the start: KF-OPC must be sooner as it is, and with as much power as MOV-FxLMS."""
-    text = "KF-OPC converges faster than MOV-FxLMS"
-    if start is None:
-        return Claim(
-            text, False, "not tested: the constraint acts throughout no second, and without it KF-OPC is KF-ANC"
-        )
-    reduction, power = start.noise_reduction_db, start.power
-    return Claim(
-        text,
-        bool(start.time_s < start.mov_time_s and start.equal_time_s < start.mov_equal_time_s),
-        f"after a start at {start.at_s:g} s, where the constraint acts, they reach a common level in "
-        f"{milliseconds(start.time_s)} and {milliseconds(start.mov_time_s)}, at {power['KF-OPC']:.2f} and "
-        f"{power['MOV-FxLMS']:.2f} of the rated power; with a rated power at which KF-OPC puts out {start.equal_power:.2f} "
-        f"as well, in {milliseconds(start.equal_time_s)} and {milliseconds(start.mov_equal_time_s)}. The noise reduction over "
-        f"that second is {reduction['KF-OPC']:.2f} against {reduction['MOV-FxLMS']:.2f} dB, and {start.equal_power_db:.2f} dB "
-        "at equal power",
-    )
 
 
 # ---- Table and figures

@@ -15,7 +15,7 @@ from kfopc_filterpy.plot import curve_style, plot_nse
 from . import multichannel_rooms as rooms
 from . import report_parts as parts
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, Setting, bound_of
-from .multichannel_rooms import MEASURED, RECORDINGS, Place, equally_rated, level_map_db, make_rated_scene, places
+from .multichannel_rooms import MEASURED, RECORDINGS, Place, equally_rated, make_rated_scene, places
 from .rows import Row, column, figure_table, loss_claim, select, worst
 
 DURATION_S, RECORDED_S = 8.0, 20.0  # a recording lasts for twice KF-PB's averaging time
@@ -95,7 +95,11 @@ def main(runs: Runs) -> StudyReport | str:
         tuned[f"{place.name}, {noise}"] = best
         if (place.name, noise) == SHOWN:
             heard = [KF_PB, "FxLMS", *(row.algorithm for row in _rivals(own)[:2])]
-            figures = [_course_figure(own, results, heard), _map_figure(scene, results, (heard[0], heard[2]))]
+            mapped = {name: results[name] for name in (heard[0], heard[2])}
+            figures = [
+                _course_figure(own, {name: results[name] for name in heard}),
+                rooms.map_figure(place.secondary.shape[1], noise, scene, mapped),
+            ]
             sounds = _sounds(results, heard)
     return StudyReport(
         name="multichannel",
@@ -325,9 +329,9 @@ def _reduction_figure(rows: Sequence[ChannelRow]) -> FigureItem:
     return FigureItem("reduction", caption, figure)
 
 
-def _course_figure(rows: Sequence[ChannelRow], results: Results, shown: Sequence[str]) -> FigureItem:
+def _course_figure(rows: Sequence[ChannelRow], results: Results) -> FigureItem:
     figure, axes = parts.new_figure((7.0, 4.0))
-    plot_nse({name: results[name] for name in shown}, window_s=NSE_WINDOW_S, ax=axes[0, 0])
+    plot_nse(results, window_s=NSE_WINDOW_S, ax=axes[0, 0])
     reached = {row.algorithm: row.noise_reduction_db for row in select(rows, rating=QUARTER)}
     for name, dashes in ((BOUND, "-"), (SCALED, ":")):
         axes[0, 0].axhline(-reached[name], color=parts.MARK, linestyle=dashes, linewidth=1, label=name)
@@ -337,28 +341,6 @@ def _course_figure(rows: Sequence[ChannelRow], results: Results, shown: Sequence
         "bound within the ratings and the scaled solution."
     )
     return FigureItem("course", caption, figure)
-
-
-def _map_figure(scene: Scene, results: Results, shown: Sequence[str]) -> FigureItem:
-    size = int(SHOWN[0].split()[0])
-    panels = {"Without control": None} | {name: results[name] for name in shown}
-    room = rooms.built_in_room(size)
-    figure, axes = parts.new_figure((4.1 * len(panels), 3.4), 1, len(panels), grid="", sharey=True)
-    for (name, result), ax in zip(panels.items(), axes[0], strict=True):
-        level, (x, y) = level_map_db(size, scene.settled[0], result)
-        mesh = ax.pcolormesh(x, y, level, cmap="viridis", vmin=-15.0, vmax=10.0, shading="nearest", rasterized=True)
-        for points, mark in ((room.sources_m, "*"), (room.loudspeakers_m, "s"), (room.microphones_m, "o")):
-            ax.plot(*points[:, :2].T, mark, color="white", markeredgecolor="black", markersize=7)
-        ax.set_title(name, fontsize="medium")
-        ax.set(xlabel="x (m)", aspect="equal")
-    axes[0, 0].set_ylabel("y (m)")
-    figure.colorbar(mesh, ax=axes[0].tolist(), label="Level (dB)", shrink=0.8)
-    caption = (
-        f"Built-in room, {', '.join(SHOWN)}: sound level over the last second in a plane {rooms.HEIGHT_M:g} m above the "
-        "floor, in dB relative to the mean without control. Star: noise source; squares: loudspeakers; circles: error "
-        "microphones."
-    )
-    return FigureItem("map", caption, figure)
 
 
 def _sounds(results: Results, heard: Sequence[str]) -> list[Sound]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.util import find_spec
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from kfopc_filterpy import SimulationResult
-from kfopc_filterpy.bench import Scene, make_scene
+from kfopc_filterpy.bench import FigureItem, Scene, make_scene
 from kfopc_filterpy.paths import RoomPaths, horizontal_plane, room_paths
 from kfopc_filterpy.signals import (
     DataUnavailableError,
@@ -25,6 +25,7 @@ from kfopc_filterpy.signals import (
 )
 
 from .cases import SENSOR_NOISE_DB, SWITCH_ON_S, bound_of
+from .report_parts import new_figure
 
 FS = 4000.0  # of the built-in room: ample for a band up to 500 Hz, with a quarter of the samples of 16 kHz
 N_TAPS, N_PATH_TAPS = 128, 256
@@ -173,6 +174,28 @@ def level_map_db(size: int, reference: np.ndarray, result: SimulationResult | No
         sound = sound - fftconvolve(y, paths.secondary, mode="valid", axes=-1).sum(axis=1)
     level = 10 * np.log10(np.mean(sound**2, axis=1) / without)
     return level.reshape(plane.shape[:2]), (plane[0, :, 0], plane[:, 0, 1])
+
+
+def map_figure(size: int, noise: str, scene: Scene, results: Mapping[str, SimulationResult]) -> FigureItem:
+    """Return a figure of the sound level in a plane of a built-in room without control, and in some runs."""
+    panels: dict[str, SimulationResult | None] = {"Without control": None, **results}
+    room = built_in_room(size)
+    figure, axes = new_figure((4.1 * len(panels), 3.4), 1, len(panels), grid="", sharey=True)
+    for (name, result), ax in zip(panels.items(), axes[0], strict=True):
+        level, (x, y) = level_map_db(size, scene.settled[0], result)
+        mesh = ax.pcolormesh(x, y, level, cmap="viridis", vmin=-15.0, vmax=10.0, shading="nearest", rasterized=True)
+        for points, mark in ((room.sources_m, "*"), (room.loudspeakers_m, "s"), (room.microphones_m, "o")):
+            ax.plot(*points[:, :2].T, mark, color="white", markeredgecolor="black", markersize=7)
+        ax.set_title(name, fontsize="medium")
+        ax.set(xlabel="x (m)", aspect="equal")
+    axes[0, 0].set_ylabel("y (m)")
+    figure.colorbar(mesh, ax=axes[0].tolist(), label="Level (dB)", shrink=0.8)
+    caption = (
+        f"Built-in room, {size} x {size}, {noise}: sound level over the last second in a plane {HEIGHT_M:g} m above the "
+        "floor, in dB relative to the mean without control. Star: noise source; squares: loudspeakers; circles: error "
+        "microphones."
+    )
+    return FigureItem("map", caption, figure)
 
 
 def _plane() -> np.ndarray:

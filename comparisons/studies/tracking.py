@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -12,48 +12,19 @@ import numpy as np
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, nse_db, output_power
 from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, Tuned, run_setting
 from kfopc_filterpy.metrics import overshoot, short_time_power
-from kfopc_filterpy.paths import Duct, duct_paths, path_taps
 
 from . import cases
 from . import report_parts as parts
-from .cases import FS, SEED, SWITCH_ON_S, WINDOW_S, Pair, ducts
+from . import tracking_events as events
+from .cases import FS, WINDOW_S, ducts
 from .rows import WindowRow, figure_table, select, table_of_cells, worst
+from .tracking_events import CHANGES, LOUDER, OVERDRIVE_DB, Event
 
 ALGORITHMS = ("KF-ANC", "KF-OPC", "KF-PB", "FxRLS", "FxLMS", "MOV-FxLMS", "optimal leaky FxLMS")
 CONSTRAINED = ("KF-OPC", "KF-PB", "MOV-FxLMS")
-OVERDRIVE_DB = 3.0
-LOUDER, SOFTER = "20 dB louder", "20 dB softer"
-JUMP_DB = 20.0
-JUMP_S = (1.5, 3.0)  # of a run of JUMP_RUN_S, from switch-on on
-JUMP_RUN_S = 7.0
-CHANGE_S, CHANGE_RUN_S = 2.0, 6.0
-CHANGES = ("sign", "delay", "longer duct")
-DELAY_SAMPLES = 16
-OTHER_LENGTH_M = 2.6
-CHIRP_HZ, SWEEP_S, SWEEPS = (20.0, 1600.0), 0.25, 16
-SEEDS = (SEED, 2, 3)  # the first is tuned on
-NSE_WINDOW_S = 0.05
-SWEEP_NSE_S = 0.01
 POINTS_A_SECOND = 200  # of the curves that are kept
 POWERS = (0.02, 500.0)  # of the figures
 NSE_DB = (-25.0, 12.0)
-
-
-@dataclass(frozen=True)
-class Event:
-    """A run in which something changes: its scene from paths and a seed, and the stretches in which the filter settles.
-
-    A stretch ends with the next change. Sweeps have none: the noise never comes to rest.
-    """
-
-    name: str
-    scene: Callable[[Pair, int], Scene]
-    stretches: dict[str, tuple[float, float]]
-    paths: tuple[str, ...] | None = None  # None: all
-    seeds: tuple[int, ...] | None = None  # None: SEEDS
-    nse_window_s: float = NSE_WINDOW_S
-    shown_window_s: float = NSE_WINDOW_S  # of the NSE in the figure
-    noise: str = "band noise"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +47,7 @@ class Course:
 
 def planned_runs() -> int:
     """Return the number of runs of the study; an algorithm's runs of one event on all seeds count as one."""
-    return len(jobs(ducts())) * (cases.grid_runs(ALGORITHMS) + len(ALGORITHMS))
+    return len(events.jobs(ducts())) * (cases.grid_runs(ALGORITHMS) + len(ALGORITHMS))
 
 
 def main(runs: Runs) -> StudyReport:
@@ -85,8 +56,8 @@ def main(runs: Runs) -> StudyReport:
     rows: list[TrackingRow] = []
     courses: dict[str, dict[str, dict[str, Course]]] = {}  # by event, path and algorithm
     tuned, first = {}, {}
-    for event, path in jobs(pairs):
-        scenes = scenes_of(event, pairs[path])
+    for event, path in events.jobs(pairs):
+        scenes = events.scenes_of(event, pairs[path])
         best = cases.tune_all(runs, scenes[0], cases.grids(ALGORITHMS))  # on the first seed
         outcomes = runs.map(partial(run_event, event, path, scenes, best), ALGORITHMS)
         rows += [row for row, _ in outcomes]
@@ -103,25 +74,34 @@ def main(runs: Runs) -> StudyReport:
         ),
         fs=FS,
         rated_power=1.0 / 10 ** (OVERDRIVE_DB / 10),
-        parameters=parts.driven_parameters([JUMP_RUN_S, CHANGE_RUN_S, SWEEP_S, SWEEPS * SWEEP_S], OVERDRIVE_DB)
+        parameters=parts.driven_parameters(
+            [events.JUMP_RUN_S, events.CHANGE_RUN_S, events.SWEEP_S, events.SWEEPS * events.SWEEP_S], OVERDRIVE_DB
+        )
         | {
             "seeds": Parameter(
-                list(SEEDS), "of noise and sensor noise, pooled; the first is tuned on; sweeps have one"
+                list(events.SEEDS), "of noise and sensor noise, pooled; the first is tuned on; sweeps have one"
             ),
-            "jump_s": Parameter(list(JUMP_S), "from switch-on on; the steady half comes after"),
-            "change_s": Parameter(CHANGE_S, "from switch-on on; what is on its way then arrives by the new path"),
+            "jump_s": Parameter(list(events.JUMP_S), "from switch-on on; the steady half comes after"),
+            "change_s": Parameter(
+                events.CHANGE_S, "from switch-on on; what is on its way then arrives by the new path"
+            ),
             "changes": Parameter(
-                {"delay": f"{DELAY_SAMPLES} samples more", "longer duct": f"{OTHER_LENGTH_M:g} m", "sign": "-1"},
+                {
+                    "delay": f"{events.DELAY_SAMPLES} samples more",
+                    "longer duct": f"{events.OTHER_LENGTH_M:g} m",
+                    "sign": "-1",
+                },
                 "of the primary path",
             ),
             "sweep": Parameter(
-                [*CHIRP_HZ, SWEEP_S], "Hz and s, linear, from a standing start; the sweeps follow on each other"
+                [*events.CHIRP_HZ, events.SWEEP_S],
+                "Hz and s, linear, from a standing start; the sweeps follow on each other",
             ),
             "settings": Parameter(tuned, "best and tried of each event"),
         },
         extra={"rows": [asdict(row) for row in rows]},
         claims=claims(rows),
-        figures=[_figure(event, courses[event.name]) for event in events()],
+        figures=[_figure(event, courses[event.name]) for event in events.all_events()],
         notes=[
             *parts.without_measured(pairs),
             "An algorithm that reduces the noise by little is soon back within 3 dB of its steady NSE: compare settling "
@@ -142,71 +122,6 @@ def main(runs: Runs) -> StudyReport:
     )
 
 
-# ---- Events
-
-
-def events() -> list[Event]:
-    """Return all events."""
-    back = {"back": (JUMP_S[1], JUMP_RUN_S)}
-    changed = {"changed": (CHANGE_S, CHANGE_RUN_S)}
-    return [
-        Event(LOUDER, lambda pair, seed: jump_scene(pair, seed, JUMP_DB), {"louder": JUMP_S} | back),
-        Event(SOFTER, lambda pair, seed: jump_scene(pair, seed, -JUMP_DB), {"softer": JUMP_S} | back),
-        Event("sign", lambda pair, seed: change_scene(pair, seed, -pair[0]), changed),
-        Event("delay", lambda pair, seed: change_scene(pair, seed, np.pad(pair[0], (DELAY_SAMPLES, 0))), changed),
-        Event("longer duct", lambda pair, seed: change_scene(pair, seed, _longer_duct()), changed, paths=("duct",)),
-        Event("one sweep", lambda pair, _: sweep_scene(pair, 1), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_NSE_S, "sweep"),
-        Event("sweeps", lambda pair, _: sweep_scene(pair, SWEEPS), {}, None, (SEED,), SWEEP_NSE_S, SWEEP_S, "sweep"),
-    ]
-
-
-def jobs(names: Iterable[str]) -> list[tuple[Event, str]]:
-    """Return the events on the paths that have them."""
-    return [(event, path) for event in events() for path in names if event.paths is None or path in event.paths]
-
-
-def scenes_of(event: Event, pair: Pair) -> list[Scene]:
-    """Return a scene for each seed, with a sensor noise of its own."""
-    return [
-        replace(event.scene(pair, seed), seeds=[seed], nse_window_s=event.nse_window_s) for seed in event.seeds or SEEDS
-    ]
-
-
-def jump_scene(pair: Pair, seed: int, gain_db: float) -> Scene:
-    """Return band noise that is louder or softer for a while; the rated power is that of its usual level."""
-    scene = cases.driven_case(pair, cases.noise_of("band noise", JUMP_RUN_S, seed), OVERDRIVE_DB)
-    x = cases.with_jump(scene.references[0], gain_db, *(t + SWITCH_ON_S for t in JUMP_S))
-    return replace(scene, references=[x], disturbances=[np.convolve(x, pair[0])[: x.size]])
-
-
-def change_scene(pair: Pair, seed: int, other: np.ndarray) -> Scene:
-    """Return band noise whose primary path changes at `CHANGE_S`: what is on its way then arrives by the new one."""
-    scene = cases.driven_case(pair, cases.noise_of("band noise", CHANGE_RUN_S, seed), OVERDRIVE_DB)
-    x, d = scene.references[0], scene.disturbances[0].copy()
-    at = round((CHANGE_S + SWITCH_ON_S) * FS)
-    d[at:] = np.convolve(x, other)[at : x.size]
-    return replace(scene, disturbances=[d])
-
-
-def sweep_scene(pair: Pair, sweeps: int) -> Scene:
-    """Return sweeps from a standing start: silence until the control is switched on."""
-    silence = np.zeros(round(SWITCH_ON_S * FS))
-    return cases.driven_case(
-        pair, np.concatenate([silence, np.tile(sweep(CHIRP_HZ, SWEEP_S, FS), sweeps)]), OVERDRIVE_DB
-    )
-
-
-def sweep(band_hz: tuple[float, float], duration_s: float, fs: float) -> np.ndarray:
-    """Return a sine whose frequency rises linearly from one frequency to another."""
-    t = np.arange(round(duration_s * fs)) / fs
-    rise = (band_hz[1] - band_hz[0]) / duration_s
-    return np.sin(2 * np.pi * (band_hz[0] * t + 0.5 * rise * t**2))
-
-
-def _longer_duct() -> np.ndarray:
-    return path_taps(duct_paths(Duct(length_m=OTHER_LENGTH_M), fs=FS).primary)
-
-
 # ---- Runs
 
 
@@ -222,7 +137,7 @@ def run_event(
         return TrackingRow(**place, settled_s=dict.fromkeys(event.stretches), diverged_at_s=0.0), None
     e, d, y = (np.array([getattr(r, name) for r in kept]) for name in ("error", "disturbance", "control_signal"))
     rated = scenes[0].rated_power
-    parts = {name: slice(*(round(t * FS) for t in span)) for name, span in event.stretches.items()}
+    stretches = {name: slice(*(round(t * FS) for t in span)) for name, span in event.stretches.items()}
     row = TrackingRow(
         **place,
         setting=best.setting,
@@ -230,7 +145,7 @@ def run_event(
         noise_reduction_db=noise_reduction_db(e, d, steady=1.0, runs=True),
         power=output_power(y, runs=True) / rated,
         worst_window=overshoot(y, rated, FS, window_s=WINDOW_S, runs=True),
-        settled_s={name: _settled(e[:, part], d[:, part], event.nse_window_s) for name, part in parts.items()},
+        settled_s={name: _settled(e[:, part], d[:, part], event.nse_window_s) for name, part in stretches.items()},
         diverged_at_s=min((r.diverged_at_s for r in kept if r.diverged_at_s is not None), default=None),
     )
     return row, _course(e, d, y, rated, event)

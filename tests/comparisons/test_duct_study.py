@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from comparisons import __main__ as command
-from comparisons.studies import duct
-from comparisons.studies.duct import Figures, Start
+from comparisons.studies import duct, duct_start
+from comparisons.studies.duct import Figures
+from comparisons.studies.duct_start import Start
 from kfopc_filterpy.bench import Claim, Runs, Tuned, make_scene
 from kfopc_filterpy.signals import band_limited_noise
 
@@ -144,14 +145,14 @@ def test_better_is_by_the_papers_measure_and_both_are_told(nse: float, reduction
 
 def test_the_first_second_below_one_is_found() -> None:
     factor = np.ones(45)
-    assert duct.first_second_below_one(factor, 10.0) is None
+    assert duct_start.first_second_below_one(factor, 10.0) is None
     factor[12:35] = 0.9
-    assert duct.first_second_below_one(factor, 10.0) == 2  # the second from 10 on begins with a factor of 1
+    assert duct_start.first_second_below_one(factor, 10.0) == 2  # the second from 10 on begins with a factor of 1
     factor[10:12] = 0.999
-    assert duct.first_second_below_one(factor, 10.0) == 1
+    assert duct_start.first_second_below_one(factor, 10.0) == 1
     factor[0:45] = 0.5
-    assert duct.first_second_below_one(factor, 10.0) == 0
-    assert duct.first_second_below_one(np.full(9, 0.5), 10.0) is None  # not a whole second
+    assert duct_start.first_second_below_one(factor, 10.0) == 0
+    assert duct_start.first_second_below_one(np.full(9, 0.5), 10.0) is None  # not a whole second
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +165,7 @@ def test_both_start_where_the_constraint_acts_and_with_equal_power(scene: Any) -
     tuned = {name: Tuned(1e-6 if name.startswith("KF") else 0.003, True, False, []) for name in duct.RATED}
     factor = np.full(int(2.5 * FS), 0.6)
     factor[: int(0.2 * FS)] = 1.0
-    found = duct.start_under_constraint(scene, tuned, factor)
+    found = duct_start.start_under_constraint(scene, tuned, factor)
     assert found is not None
     assert found.at_s == 1.0
     # Flat paths: the constraint factor is 1/2, so the power is the rated one, and the noise is reduced by 6 dB.
@@ -173,7 +174,7 @@ def test_both_start_where_the_constraint_acts_and_with_equal_power(scene: Any) -
     assert found.equal_power == pytest.approx(found.power["MOV-FxLMS"], rel=0.02)
     assert found.equal_power < 0.98 * found.power["KF-OPC"]
     assert found.equal_power_db < found.noise_reduction_db["KF-OPC"]
-    assert duct.start_under_constraint(scene, tuned, np.ones(int(2.5 * FS))) is None
+    assert duct_start.start_under_constraint(scene, tuned, np.ones(int(2.5 * FS))) is None
 
 
 def test_the_common_level_is_that_of_the_lesser(scene: Any) -> None:
@@ -185,11 +186,11 @@ def test_the_common_level_is_that_of_the_lesser(scene: Any) -> None:
         return SimpleNamespace(error=np.where(late, d * 10 ** (-reduction_db / 20), d), disturbance=d)
 
     lesser, better = course(0.2, 5.0), course(0.1, 20.0)
-    one, other = duct.times_to_a_common_level(lesser, better)
-    assert duct.times_to_a_common_level(better, lesser) == (other, one)
+    one, other = duct_start.times_to_a_common_level(lesser, better)
+    assert duct_start.times_to_a_common_level(better, lesser) == (other, one)
     # At -4 dB most of the window has to be late for the lesser, and less of it for the better.
-    assert 0.2 < one < 0.2 + duct.TIME_WINDOW_S + 1 / FS
-    assert 0.1 < other < 0.1 + duct.TIME_WINDOW_S
+    assert 0.2 < one < 0.2 + duct_start.TIME_WINDOW_S + 1 / FS
+    assert 0.1 < other < 0.1 + duct_start.TIME_WINDOW_S
     assert other - 0.1 < one - 0.2
 
 

@@ -9,11 +9,12 @@ import pytest
 
 from comparisons import __main__ as command
 from comparisons.studies import cases, tracking
-from comparisons.studies.tracking import (
+from comparisons.studies import tracking_events as events
+from comparisons.studies.tracking import TrackingRow
+from comparisons.studies.tracking_events import (
     CHIRP_HZ,
     SWEEP_S,
     Event,
-    TrackingRow,
     change_scene,
     jump_scene,
     sweep,
@@ -38,17 +39,17 @@ def small() -> Any:
         patch.setattr(cases, "N_TAPS", TAPS)
         patch.setattr(tracking, "ducts", lambda: short)
         patch.setattr(tracking, "ALGORITHMS", STUDIED)
-        patch.setattr(tracking, "SEEDS", (1, 2))
-        patch.setattr(tracking, "JUMP_S", (0.4, 0.8))
-        patch.setattr(tracking, "JUMP_RUN_S", 1.6)
-        patch.setattr(tracking, "CHANGE_S", 0.5)
-        patch.setattr(tracking, "CHANGE_RUN_S", 1.2)
-        chosen = [event for event in tracking.events() if event.name in ("20 dB louder", "sign", "one sweep")]
-        patch.setattr(tracking, "events", lambda: chosen)
+        patch.setattr(events, "SEEDS", (1, 2))
+        patch.setattr(events, "JUMP_S", (0.4, 0.8))
+        patch.setattr(events, "JUMP_RUN_S", 1.6)
+        patch.setattr(events, "CHANGE_S", 0.5)
+        patch.setattr(events, "CHANGE_RUN_S", 1.2)
+        chosen = [event for event in events.all_events() if event.name in ("20 dB louder", "sign", "one sweep")]
+        patch.setattr(events, "all_events", lambda: chosen)
         runs = Runs()
         report = tracking.main(runs)
         planned = tracking.planned_runs()
-        scenes = tracking.scenes_of(chosen[1], short["duct"])
+        scenes = events.scenes_of(chosen[1], short["duct"])
     cases.measured_data.cache_clear()
     return report, runs.done, planned, scenes
 
@@ -157,10 +158,10 @@ def test_a_jump_is_of_the_reference(pair: Any) -> None:
 
 
 def test_events_say_where_they_happen() -> None:
-    found = {event.name: event for event in tracking.events()}
+    found = {event.name: event for event in events.all_events()}
     assert list(found) == ["20 dB louder", "20 dB softer", "sign", "delay", "longer duct", "one sweep", "sweeps"]
     assert found["longer duct"].paths == ("duct",)
-    names = [(event.name, path) for event, path in tracking.jobs({"duct": None, "measured duct": None})]
+    names = [(event.name, path) for event, path in events.jobs({"duct": None, "measured duct": None})]
     assert len(names) == 13
     assert ("longer duct", "measured duct") not in names
 
