@@ -8,7 +8,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.linalg import toeplitz
 
 from kfopc_filterpy import SimulationResult, bandpass_path, bench, noise_reduction_db, output_power
 from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Tuned, figures_of_merit
@@ -20,6 +19,7 @@ from . import report_parts as parts
 from .cases import FS, PAPER, grid_runs
 from .report_parts import milliseconds
 from .rows import span
+from .weight_errors import WEIGHTS_EVERY, first_below_s, settled_after_s, weight_error
 
 BAND = (200.0, 2000.0)
 DURATION_S = 10.5
@@ -31,7 +31,6 @@ CONSTRAINED = ("KF-OPC", "MOV-FxLMS")
 SEEDS = tuple(range(1, 9))
 TUNING_SEEDS = 2
 
-WEIGHTS_EVERY = 4  # samples: 0.25 ms
 SETTLED_DB = -20.0  # of the weight error
 KNOWING = "KF-OPC, known amplifier"
 UNAWARE = "KF-OPC, q without the clipping"
@@ -184,34 +183,6 @@ def _other_length(runs: Runs) -> dict[str, float | None]:
 
 
 # ---- Figures of the start
-
-
-def weight_error(weights: np.ndarray, filtered: np.ndarray) -> np.ndarray:
-    """Return the error of each row of weights, as a share of the power of the anti-noise.
-
-    It is E[(x'^T (w - w_o))^2] / E[(x'^T w_o)^2], with the mean over the steady half as the algorithm's own solution w_o
-    and the autocorrelation of the filtered reference: of the anti-noise, the part that is still missing. The NSE would
-    compare an algorithm that settles at -6 dB with one that settles at -60 dB.
-    """
-    n_taps = weights.shape[1]
-    spectrum = np.abs(np.fft.rfft(filtered, 2 * filtered.size)) ** 2
-    correlation = toeplitz(np.fft.irfft(spectrum)[:n_taps])
-    own = weights[len(weights) // 2 :].mean(axis=0)
-    away = weights - own
-    return np.einsum("ni,ni->n", away @ correlation, away) / (own @ correlation @ own)
-
-
-def settled_after_s(curve: np.ndarray, level_db: float) -> float | None:
-    """Return the time after which a curve of weight errors stays below a level; None if not for the steady half."""
-    above = np.flatnonzero(~(curve <= 10 ** (level_db / 10)))
-    start = int(above[-1]) + 1 if above.size else 0
-    return start * WEIGHTS_EVERY / FS if start <= curve.size // 2 else None
-
-
-def first_below_s(curve: np.ndarray, level_db: float) -> float | None:
-    """Return the time at which a curve of weight errors first comes below a level; None if it does not."""
-    below = np.flatnonzero(curve <= 10 ** (level_db / 10))
-    return float(below[0] * WEIGHTS_EVERY / FS) if below.size else None
 
 
 def _starts(results: Sequence[SimulationResult]) -> dict[str, list[float]]:

@@ -11,8 +11,9 @@ import pytest
 from helpers.results import single_result
 
 from comparisons.studies import broadband
-from comparisons.studies.broadband import FS, KNOWING, UNAWARE, WEIGHTS_EVERY
+from comparisons.studies.broadband import FS, KNOWING, UNAWARE
 from comparisons.studies.report_parts import first_second_db
+from comparisons.studies.weight_errors import WEIGHTS_EVERY, first_below_s, settled_after_s, weight_error
 from kfopc_filterpy.bench import make_scene, with_clipping
 from kfopc_filterpy.signals import band_limited_noise
 
@@ -148,7 +149,7 @@ def test_weight_error_of_white_noise_is_the_squared_distance() -> None:
     x = np.random.default_rng(1).standard_normal(100_000)
     own = np.array([1.0, 2.0, -1.0])
     weights = np.vstack([np.zeros(3), own + np.array([0.0, 0.0, 0.3]), np.tile(own, (6, 1))])
-    curve = broadband.weight_error(weights, x)
+    curve = weight_error(weights, x)
     assert curve[:2] == pytest.approx([1.0, 0.3**2 / 6.0], rel=0.02)
     np.testing.assert_array_equal(curve[2:], 0.0)
 
@@ -158,7 +159,7 @@ def test_weight_error_is_the_missing_part_of_the_anti_noise() -> None:
     rng = np.random.default_rng(2)
     x = np.convolve(rng.standard_normal(50_000), [1.0, 0.8, 0.3])
     own, now = rng.standard_normal((2, 4))
-    curve = broadband.weight_error(np.vstack([now, *[own] * 3]), x)
+    curve = weight_error(np.vstack([now, *[own] * 3]), x)
     missing, whole = np.convolve(x, now - own), np.convolve(x, own)
     assert curve[0] == pytest.approx(np.sum(missing**2) / np.sum(whole**2), rel=1e-9)
 
@@ -167,15 +168,15 @@ def test_times_at_which_a_curve_settles() -> None:
     step = WEIGHTS_EVERY / FS
     curve = np.array([1.0, 0.011, 0.009, 0.011, 0.0099, 0.001])
     steady = np.full(8, 0.001)
-    assert broadband.settled_after_s(np.r_[curve, steady], -20.0) == 4 * step
-    assert broadband.settled_after_s(curve[:5], -20.0) is None  # there, but not for the second half of the run
-    assert broadband.settled_after_s(np.r_[np.ones(8), steady], -20.0) == 8 * step
-    assert broadband.settled_after_s(np.r_[np.ones(9), steady], -20.0) is None
-    assert broadband.first_below_s(curve, -20.0) == 2 * step
-    assert broadband.settled_after_s(curve[:4], -20.0) is None
-    assert broadband.settled_after_s(np.r_[curve, np.nan], -20.0) is None
-    assert broadband.settled_after_s(curve[4:], -20.0) == 0.0
-    assert broadband.first_below_s(curve[:2], -20.0) is None
+    assert settled_after_s(np.r_[curve, steady], -20.0) == 4 * step
+    assert settled_after_s(curve[:5], -20.0) is None  # there, but not for the second half of the run
+    assert settled_after_s(np.r_[np.ones(8), steady], -20.0) == 8 * step
+    assert settled_after_s(np.r_[np.ones(9), steady], -20.0) is None
+    assert first_below_s(curve, -20.0) == 2 * step
+    assert settled_after_s(curve[:4], -20.0) is None
+    assert settled_after_s(np.r_[curve, np.nan], -20.0) is None
+    assert settled_after_s(curve[4:], -20.0) == 0.0
+    assert first_below_s(curve[:2], -20.0) is None
 
 
 # ---- q with the clipping
