@@ -72,7 +72,6 @@ def main(runs: Runs) -> StudyReport:
     )
     return StudyReport(
         name="broadband",
-        conditions=("broadband noise", "band-pass paths"),
         title="Broadband noise and a linear amplifier",
         summary=(
             f"Noise from {BAND[0]:g} to {BAND[1]:g} Hz needs {POWER_MULTIPLE:g} times the rated power of "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from kfopc_filterpy import (
     power_constrained_wiener,
 )
 from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_scene, try_settings
-from kfopc_filterpy.bench.scene import reachable_weights
+from kfopc_filterpy.bench.scene import louder, reachable_weights
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.paths import duct_paths, path_taps
 from kfopc_filterpy.signals import (
@@ -184,19 +183,6 @@ def with_overdrive(scene: Scene, overdrive_db: float) -> Scene:
     return replace(scene, rated_power=scene.unconstrained_power / 10 ** (overdrive_db / 10))
 
 
-def louder(scene: Scene, gain: float) -> Scene:
-    """Return the scene with all signals times a gain, and the measurement noise with them."""
-    return replace(
-        scene,
-        references=[gain * x for x in scene.references],
-        disturbances=[gain * d for d in scene.disturbances],
-        sensor_noise_std=gain * scene.sensor_noise_std,
-        measurement_noise=gain**2 * scene.measurement_noise,
-        unconstrained_power=gain**2 * scene.unconstrained_power,
-        wiener_control_power=gain**2 * scene.wiener_control_power,
-    )
-
-
 def bound_of(scene: Scene, segment_s: float = 1.0) -> PowerConstrainedWiener:
     """Return the power-constrained Wiener solutions of a case, of weights that controllers reach."""
     ridge = scene.measurement_noise / (scene.settled[0].shape[-1] * scene.initial_variance)
@@ -243,11 +229,3 @@ def tune_all(runs: Runs, scene: Scene, settings: Mapping[str, Sequence[Setting]]
     """Return the best of the given settings of each algorithm; None if all of them diverge."""
     trials = try_settings(runs, scene, settings)
     return {name: best_setting(scene, name, own) for name, own in trials.items()}
-
-
-# ---- Measures that the package does not name
-
-
-def decibels(power: Any) -> Any:
-    """Return a power in dB, at least -300 dB."""
-    return 10 * np.log10(np.maximum(power, 1e-30))

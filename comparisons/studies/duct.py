@@ -125,7 +125,6 @@ def _study(
     bound = power_constrained_solution(*scene.settled, scene.secondary, scene.n_taps, RATED_POWER)
     return StudyReport(
         name=name,
-        conditions=("machine noise in a duct",),
         title=title,
         summary=(
             f"The noise needs {POWER_MULTIPLE:g} times the rated power of {RATED_POWER:g}, which a linear amplifier puts out. "

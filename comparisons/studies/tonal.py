@@ -74,7 +74,6 @@ def main(runs: Runs) -> StudyReport:
     crossings = crossings_db(OVERDRIVES_DB, sweep["KF-OPC"] - sweep["KF-ANC"])
     return StudyReport(
         name="tonal",
-        conditions=("a tone", "band-pass paths", "an amplifier that clips"),
         title="Tonal noise and a clipping amplifier",
         summary=(
             f"A {TONE_HZ:g} Hz tone needs {POWER_MULTIPLE:g} times the rated power. The amplifier clips at "

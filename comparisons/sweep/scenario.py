@@ -25,6 +25,7 @@ from kfopc_filterpy import (
 from kfopc_filterpy.bench import AllDivergedError, Scene, algorithms, make_controller, run_setting, tune
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import path_taps, perturbed_path
+from kfopc_filterpy.plot.style import decibels
 
 from ..studies.cases import (
     FS,
@@ -32,7 +33,6 @@ from ..studies.cases import (
     WINDOW_S,
     Pair,
     Setting,
-    decibels,
     made_noises,
     make_case,
     modelled_paths,

@@ -17,7 +17,7 @@ from kfopc_filterpy.paths import PathTolerance, path_taps, perturbed_path, read_
 from kfopc_filterpy.signals import band_limited_noise, has_dataset, load_measured_duct, read_recording
 
 from .registry import REGISTRY, make_controller
-from .scene import Scene, make_scene, reachable_weights, with_clipping
+from .scene import Scene, louder, make_scene, reachable_weights, with_clipping
 
 ALGORITHMS = ("KF-PB", "KF-OPC", "KF-ANC", "MOV-FxLMS", "FxLMS")
 N_TAPS = 128
@@ -361,7 +361,8 @@ def explore(setup: AcousticSetup, settings: ExploreSettings | None = None) -> Ex
     (True, True)
     """
     settings = settings or ExploreSettings()
-    scene = _at_level(_normalised_scene(setup, as_band(settings.band, setup.fs)), settings.level_db)
+    scene = _normalised_scene(setup, as_band(settings.band, setup.fs))
+    scene = louder(scene, float(np.sqrt(10 ** (settings.level_db / 10) / np.mean(scene.settled[1] ** 2))))
     full = float(scene.unconstrained_power)
     rated = 10 ** (settings.rating_db / 10) * (full if settings.rating_is_relative else 1.0)
     scene = replace(scene, rated_power=rated)
@@ -440,21 +441,6 @@ def _noise(setup: AcousticSetup, band: tuple[float, float]) -> np.ndarray:
     if np.linalg.norm(spectrum[inside]) <= ROUNDING * np.linalg.norm(spectrum):
         raise ValueError(f"the recording is silent from {band[0]:g} to {band[1]:g} Hz: choose a wider band")
     return np.fft.irfft(np.where(inside, spectrum, 0.0), setup.noise.size)
-
-
-def _at_level(scene: Scene, level_db: float) -> Scene:
-    """Return a scene whose disturbance has a power of `level_db` re 1 after switch-on; amplitudes scale, weights do not."""
-    power = 10 ** (level_db / 10) / float(np.mean(scene.settled[1] ** 2))
-    gain = np.sqrt(power)
-    return replace(
-        scene,
-        references=[gain * x for x in scene.references],
-        disturbances=[gain * d for d in scene.disturbances],
-        sensor_noise_std=gain * scene.sensor_noise_std,
-        measurement_noise=power * scene.measurement_noise,
-        unconstrained_power=power * scene.unconstrained_power,
-        wiener_control_power=power * scene.wiener_control_power,
-    )
 
 
 @lru_cache(maxsize=64)

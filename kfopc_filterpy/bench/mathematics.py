@@ -43,7 +43,6 @@ PARAMETERS = {
     "n_taps": (r"L", "taps of the control filter"),
     "nse_window_s": ("", "window of the normalised squared error (NSE) in s"),
     "penalty factor over G_s": (r"\beta / G_s", "penalty factor, without units"),
-    "phase_accuracy_deg": ("", "accuracy of the phase in degrees"),
     "power_memory_s": ("", "memory of the power estimates in s"),
     "primary_path": (r"P(z)", "primary path"),
     "r": (r"r", "variance of the state noise"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,30 +9,13 @@ import numpy as np
 
 from kfopc_filterpy.plot import curve_style
 
-from .study_report import OF_THE_PAPER, Claim, FigureItem, StudyReport, jsonable
+from .study_report import OF_THE_PAPER, FigureItem, StudyReport, jsonable
 
-# Words of a claim, and what a claim that has them is about.
-SUBJECTS = {
-    "output power": "the output power",
-    "rated power": "the output power",
-    "noise reduction": "the noise reduction",
-    "reduces the noise": "the noise reduction",
-    "converge": "the speed of convergence",
-    "harmonics": "distortion",
-    "saturation": "distortion",
-}
 GLANCE = "at-a-glance"
 
 
-# A claim, and the conditions of its study.
-_Stated = tuple[Claim, Sequence[str]]
-
-
 def claims_sentence(studies: Sequence[StudyReport]) -> str:
-    """Return how many claims hold, and what those that do not hold have in common, as a sentence.
-
-    The subjects of a claim are found by its words, its conditions are those of its study. A subject or condition is named
-    if all exceptions have it, else if most of them do; never if the claims that hold fail to set it apart.
+    """Return how many claims hold, and in which studies some do not, as a sentence.
 
     Parameters
     ----------
@@ -48,68 +30,32 @@ def claims_sentence(studies: Sequence[StudyReport]) -> str:
     Examples
     --------
     >>> from kfopc_filterpy.bench import StudyReport, Claim, claims_sentence
-    >>> def study(name, conditions, *claims):
-    ...     return StudyReport(name, name, "", 16000, 1.0, {}, {}, claims=claims, conditions=conditions)
-    >>> kept, fast = Claim("It keeps the rated power", True, ""), Claim("It converges faster", True, "")
-    >>> over = Claim("It keeps the rated power", False, "")
-    >>> claims_sentence([study("a", ["a tone"], kept, fast), study("b", ["noise"], over, fast, over)])
-    '3 of the 5 claims of the paper were reproduced; both exceptions concern the output power, with noise.'
+    >>> def study(name, *claims):
+    ...     return StudyReport(name, name, "", 16000, 1.0, {}, claims=claims)
+    >>> kept, over = Claim("It keeps the rated power", True, ""), Claim("It keeps the rated power", False, "")
+    >>> claims_sentence([study("a", kept, kept), study("b", over, kept, over)])
+    '3 of the 5 claims of the paper were reproduced; the others are of b (2).'
     """
-    kinds: dict[bool, list[_Stated]] = {True: [], False: []}
+    kinds: dict[bool, list[StudyReport]] = {True: [], False: []}
     for study in studies:
-        kinds[study.claims_heading == OF_THE_PAPER] += [(claim, study.conditions) for claim in study.claims]
-    return " ".join(_sentence(claims, of_paper) for of_paper, claims in kinds.items() if claims)
+        kinds[study.claims_heading == OF_THE_PAPER].append(study)
+    return " ".join(filter(None, (_sentence(own, of_paper) for of_paper, own in kinds.items())))
 
 
-def _sentence(claims: list[_Stated], of_paper: bool) -> str:
+def _sentence(studies: Sequence[StudyReport], of_paper: bool) -> str:
     what, done = ("claims of the paper", "reproduced") if of_paper else ("aims of the studies", "met")
-    exceptions = [claim for claim, _ in claims if not claim.holds]
-    if len(claims) == 1:
-        return f"The one {what.replace('s of', ' of', 1)} was {'not ' if exceptions else ''}{done}."
-    if not exceptions:
-        return f"All {len(claims)} {what} were {done}."
-    if len(exceptions) == len(claims):
-        return f"None of the {len(claims)} {what} was {done}."
-    held = len(claims) - len(exceptions)
-    return f"{held} of the {len(claims)} {what} {'was' if held == 1 else 'were'} {done}; {_exceptions(claims)}."
-
-
-def _exceptions(claims: list[_Stated]) -> str:
-    """Return what the exceptions, two at least, have in common; one is quoted."""
-    exceptions = [claim for claim, _ in claims if not claim.holds]
-    if len(exceptions) == 1:
-        return f"the exception is “{exceptions[0].text}”"
-    subjects = _in_common([(claim.holds, _subjects(claim)) for claim, _ in claims])
-    conditions = _in_common([(claim.holds, set(of_study)) for claim, of_study in claims])
-    if not subjects and not conditions:
-        return f"the {len(exceptions)} exceptions have neither a subject nor a condition in common"
-    most = max([*subjects.values(), *conditions.values()], key=len)  # the same exceptions for both
-    whom = f"{len(most)} of the {len(exceptions)} exceptions"
-    if len(most) == len(exceptions):
-        whom = "both exceptions" if len(most) == 2 else f"all {len(most)} exceptions"
-    about, under = (" and ".join(label for label in of if of[label] == most) for of in (subjects, conditions))
-    if not about:
-        return f"{whom} occurred with {under}"
-    return f"{whom} concern {about}" + (f", with {under}" if under else "")
-
-
-def _subjects(claim: Claim) -> set[str]:
-    words = claim.text.lower()
-    return {subject for word, subject in SUBJECTS.items() if word in words}
-
-
-def _in_common(claims: Sequence[tuple[bool, set[str]]]) -> dict[str, list[int]]:
-    """Return the labels that most exceptions have, and claims that hold have less often, with these exceptions."""
-    exceptions = [own for holds, own in claims if not holds]
-    having = {
-        label: [i for i, own in enumerate(exceptions) if label in own] for label in sorted(set().union(*exceptions))
-    }
-    everywhere = Counter(label for _, own in claims for label in own)
-    return {
-        label: those
-        for label, those in having.items()
-        if 2 * len(those) > len(exceptions) and len(those) * len(claims) > len(exceptions) * everywhere[label]
-    }
+    total = sum(len(study.claims) for study in studies)
+    missed = {study.name: sum(not claim.holds for claim in study.claims) for study in studies}
+    held = total - sum(missed.values())
+    if total <= 1:
+        return f"The one {what.replace('s of', ' of', 1)} was {'' if held else 'not '}{done}." if total else ""
+    if held == total:
+        return f"All {total} {what} were {done}."
+    if not held:
+        return f"None of the {total} {what} was {done}."
+    others = "the others are" if total - held > 1 else "the other is"
+    where = ", ".join(f"{name} ({count})" if total - held > 1 else name for name, count in missed.items() if count)
+    return f"{held} of the {total} {what} {'was' if held == 1 else 'were'} {done}; {others} of {where}."
 
 
 def glance(studies: Sequence[StudyReport]) -> FigureItem | None:

@@ -377,6 +377,19 @@ def with_clipping(scene: Scene) -> Scene:
     return replace(scene, amplifier=amplifier, measurement_noise=q)
 
 
+def louder(scene: Scene, gain: float) -> Scene:
+    """Return the scene with all signals times a gain, and the measurement noise with them."""
+    return replace(
+        scene,
+        references=[gain * x for x in scene.references],
+        disturbances=[gain * d for d in scene.disturbances],
+        sensor_noise_std=gain * scene.sensor_noise_std,
+        measurement_noise=gain**2 * scene.measurement_noise,
+        unconstrained_power=gain**2 * scene.unconstrained_power,
+        wiener_control_power=gain**2 * scene.wiener_control_power,
+    )
+
+
 def _as_rating(rated_power: Any, s: np.ndarray) -> Any:
     """Return a rated power, or one for each loudspeaker if several are given."""
     if s.ndim == 1 or np.ndim(rated_power) == 0:

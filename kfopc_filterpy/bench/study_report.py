@@ -220,7 +220,7 @@ class StudyReport:
         Rated output power, a mean square.
     parameters : dict of str to Parameter
         Every parameter by name.
-    algorithms : dict of str to dict
+    algorithms : dict of str to dict, optional
         Figures of merit by algorithm: keys out of `FIGURES_OF_MERIT`; None, NaN or left out if undefined.
     extra : dict of str to Any
         Further figures for results.json: numbers, text, arrays, lists and mappings of them.
@@ -239,9 +239,6 @@ class StudyReport:
         not.
     watt_per_power : float, optional
         Power in W of a mean square of 1, if it is known: page and terminal then show output powers in W.
-    conditions : sequence of str
-        Conditions that all its claims are under, in words that follow "with", such as "a tone". What the claims that do
-        not hold have in common is found among them.
 
     Raises
     ------
@@ -263,7 +260,6 @@ class StudyReport:
     notes: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     claims_heading: str = OF_THE_PAPER
-    conditions: Sequence[str] = ()
     watt_per_power: float | None = None
 
     def __post_init__(self) -> None:

@@ -267,7 +267,7 @@ def test_table_for_the_terminal():
         "  NOT REPRODUCED  it is faster",
         "                  no",
     ]
-    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the exception is")
+    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the other is of")
     assert max(map(len, lines)) <= 120
 
 
@@ -310,7 +310,7 @@ def test_a_table_for_the_terminal():
         "band-pass          diverged   1e+06",
         "duct                      7       3",
     ]
-    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the exception is")
+    assert lines[-1].startswith("1 of the 2 claims of the paper was reproduced; the other is of")
 
 
 def test_the_terminal_shows_one_table_beside_the_claims():
