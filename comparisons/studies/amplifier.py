@@ -290,11 +290,10 @@ def _ordering(rows: Sequence[AmplifierRow]) -> Claim:
 def _table(rows: Sequence[AmplifierRow]) -> Table:
     """Return what all runs together say of each algorithm."""
     lines: list[list[str | float]] = []
-    for known, name in product((UNKNOWN, KNOWN), ALGORITHMS):
-        if own := _of(rows, name, known=known):
-            went_on = [row for row in own if row.diverged_at_s is None]
-            spans = [span(column(went_on, figure)) for figure in ("power", "asked_power")]
-            lines.append([name, known, len(own), sum(row.overruns for row in own), len(own) - len(went_on), *spans])
+    for (known, name), own in grouped(rows, "known", "algorithm").items():
+        went_on = [row for row in own if row.diverged_at_s is None]
+        spans = [span(column(went_on, figure)) for figure in ("power", "asked_power")]
+        lines.append([name, known, len(own), sum(row.overruns for row in own), len(own) - len(went_on), *spans])
     return Table(
         "summary",
         "Runs that overrun and that diverge, output power before the amplifier over the rated power, and the power that the "

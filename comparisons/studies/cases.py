@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
 from kfopc_filterpy import (
+    SimulationResult,
     bandpass_path,
     power_constrained_wiener,
 )
-from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_scene, try_settings
+from kfopc_filterpy.bench import Runs, Scene, Tuned, algorithms, best_setting, make_controller, make_scene, try_settings
 from kfopc_filterpy.bench.scene import louder, reachable_weights
 from kfopc_filterpy.bounds import PowerConstrainedWiener
 from kfopc_filterpy.paths import duct_paths, path_taps
@@ -212,7 +214,16 @@ def bounds_db(scene: Scene, stationary: bool) -> tuple[float, float]:
     return reached["per_second"], reached["scaled_per_second"]
 
 
-# ---- Tuning
+# ---- Runs and tuning
+
+
+def run_each(runs: Runs, scene: Scene, settings: Mapping[str, Setting], **recorded: Any) -> dict[str, SimulationResult]:
+    """Return a run of each algorithm at its setting; what is recorded goes to `simulate`."""
+
+    def run(job: tuple[str, Setting]) -> SimulationResult:
+        return scene.run(make_controller(scene, *job), **recorded)
+
+    return dict(zip(settings, runs.map(run, settings.items()), strict=True))
 
 
 def grids(names: Iterable[str]) -> dict[str, list[Setting]]:

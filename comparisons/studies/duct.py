@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from kfopc_filterpy import SimulationResult, bench, noise_reduction_db, nse_db, output_power
-from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table, make_controller
+from kfopc_filterpy.bench import Claim, FigureItem, Parameter, Runs, Scene, StudyReport, Table
 from kfopc_filterpy.bounds import power_constrained_solution, wiener_solution
 from kfopc_filterpy.metrics import overshoot
 from kfopc_filterpy.paths import duct_paths, fir_path, secondary_path_gain
@@ -18,7 +18,7 @@ from kfopc_filterpy.plot import plot_constraint_factor, plot_error_spectra, plot
 from kfopc_filterpy.signals import DataUnavailableError, compressor_noise, load_measured_duct
 
 from . import report_parts as parts
-from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain
+from .cases import FS, PAPER, SEED, grid_runs, of_unit_gain, run_each
 from .duct_start import Start, faster_claim, start_under_constraint
 
 DURATION_S = 10.5
@@ -112,10 +112,7 @@ def _study(
     smaller = replace(scene, rated_power=scene.unconstrained_power / OTHER_MULTIPLE)
 
     def run_all(at: Scene, names: Sequence[str]) -> dict[str, SimulationResult]:
-        def run(algorithm: str) -> SimulationResult:
-            return at.run(make_controller(at, algorithm, tuned[algorithm].setting), record_powers=True)
-
-        return dict(zip(names, runs.map(run, names), strict=True))
+        return run_each(runs, at, {name: tuned[name].setting for name in names}, record_powers=True)
 
     results, of_smaller = run_all(scene, ALGORITHMS), run_all(smaller, RATED)
     figures = {algorithm: figures_of(result, RATED_POWER) for algorithm, result in results.items()}

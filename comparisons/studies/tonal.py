@@ -23,7 +23,7 @@ from kfopc_filterpy.metrics import harmonics_db, peak_control_signal
 from kfopc_filterpy.signals import tone
 
 from . import report_parts as parts
-from .cases import FS, PAPER, Setting, grid_runs
+from .cases import FS, PAPER, Setting, grid_runs, run_each
 
 KALMAN = ("KF-ANC", "KF-OPC")
 TONE_HZ = 400.0
@@ -58,11 +58,8 @@ def main(runs: Runs) -> StudyReport:
     scene = _scene(primary, secondary)
     tuned = bench.tune(runs, scene)
 
-    def run(job: tuple[str, Setting]) -> SimulationResult:
-        return scene.run(bench.make_controller(scene, *job), record_weights_every=WEIGHTS_EVERY)
-
     def run_all(settings: Mapping[str, Setting]) -> dict[str, SimulationResult]:
-        return dict(zip(settings, runs.map(run, settings.items()), strict=True))
+        return run_each(runs, scene, settings, record_weights_every=WEIGHTS_EVERY)
 
     results = run_all({name: best.setting for name, best in tuned.items()})
     forgetful, unforgetting = (run_all(dict.fromkeys(KALMAN, setting)) for setting in (FORGETFUL, UNFORGETTING))

@@ -13,7 +13,7 @@ from comparisons import __main__ as command
 from comparisons.studies import duct, duct_start
 from comparisons.studies.duct import Figures
 from comparisons.studies.duct_start import Start
-from kfopc_filterpy.bench import Claim, Runs, Tuned, make_scene
+from kfopc_filterpy.bench import Claim, Runs, Tuned, make_controller, make_scene
 from kfopc_filterpy.signals import band_limited_noise
 
 FS = duct.FS
@@ -224,7 +224,7 @@ def test_the_motor_is_run_only_if_it_is_named() -> None:
 def test_figures_are_over_the_rated_power() -> None:
     noise = band_limited_noise((200.0, 1000.0), 3.0, fs=FS, rng=1)
     made = make_scene({1: noise}, [0, 0, 0, 1.0], [0, 1.0], fs=FS, rated_power=0.5, power_multiple=4.0, n_taps=16)
-    result = made.run(duct.make_controller(made, "KF-OPC", 1e-6))
+    result = made.run(make_controller(made, "KF-OPC", 1e-6))
     once, twice = (duct.figures_of(result, power) for power in (0.5, 0.25))
     half = result.control_signal.size // 2
     assert once.power == pytest.approx(np.mean(result.control_signal[half:] ** 2) / 0.5, rel=1e-3)
