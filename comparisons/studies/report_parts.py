@@ -85,9 +85,9 @@ def common_parameters(scene: Scene, tuned: Mapping[str, Tuned]) -> dict[str, Par
         "rated_power": Parameter(scene.rated_power, "the paper's"),
         "n_taps": Parameter(scene.n_taps, "not stated in the paper; enough for the primary path's delay and length"),
         "wiener_control_power": Parameter(
-            scene.wiener_control_power,
+            scene.unconstrained_power,
             f"the reference is scaled so that the unconstrained Wiener control power is "
-            f"{scene.wiener_control_power / scene.rated_power:g} times the rated power: the constraint has to act",
+            f"{scene.unconstrained_power / scene.rated_power:g} times the rated power: the constraint has to act",
         ),
         "wiener_noise_reduction_db": Parameter(
             scene.wiener_noise_reduction_db, "batch least squares, unconstrained, without sensor noise"

@@ -147,7 +147,7 @@ def _overdrive_sweep(runs: Runs, scene: Scene, tuned: dict[str, Tuned]) -> dict[
 
     In decibels a louder noise is the same as a smaller amplifier, so all levels share the gains of one reference.
     """
-    powers = scene.wiener_control_power / 10 ** (np.array(OVERDRIVES_DB) / 10)
+    powers = scene.unconstrained_power / 10 ** (np.array(OVERDRIVES_DB) / 10)
     amplifiers = [HardClipAmplifier(float(np.sqrt(2 * power))) for power in powers]
 
     def reductions(name: str) -> list[float]:

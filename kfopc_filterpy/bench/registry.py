@@ -81,8 +81,8 @@ class Algorithm:
         Whether its disturbance estimate can know the amplifier.
     may_refuse : bool, default False
         Whether it may stop during a run because it cannot continue, which counts as divergence.
-    one_channel, several_channels : bool, default True, False
-        Whether the studies of one channel, or of several channels, compare it.
+    several_channels : bool, default False
+        Whether the studies of several channels compare it; those of one channel compare all.
     """
 
     make: Callable[..., Controller]
@@ -98,7 +98,6 @@ class Algorithm:
     shares_gains: bool = False
     knows_amplifier: bool = False
     may_refuse: bool = False
-    one_channel: bool = True
     several_channels: bool = False
 
     @property
@@ -262,8 +261,9 @@ def algorithms(*, several_channels: bool = False) -> Mapping[str, Algorithm]:
     >>> "FxRLS" in algorithms(), "FxRLS" in algorithms(several_channels=True)
     (True, False)
     """
-    wanted = "several_channels" if several_channels else "one_channel"
-    return MappingProxyType({name: own for name, own in REGISTRY.items() if getattr(own, wanted)})
+    return MappingProxyType(
+        {name: own for name, own in REGISTRY.items() if own.several_channels or not several_channels}
+    )
 
 
 def make_controller(

@@ -135,8 +135,6 @@ class Scene:
         P0 of the Kalman filters.
     unconstrained_power : float or ndarray, shape (J,)
         Output power that the noise would need without a constraint.
-    wiener_control_power : float or ndarray, shape (J,)
-        Output power of the unconstrained Wiener solution.
     wiener_noise_reduction_db : float
         Noise reduction of that solution in dB.
     seeds : list of int
@@ -166,7 +164,6 @@ class Scene:
     measurement_noise: float = 0.0
     initial_variance: float = 0.0
     unconstrained_power: Any = 1.0
-    wiener_control_power: Any = 0.0
     wiener_noise_reduction_db: float = 0.0
     seeds: list[int] = field(default_factory=list)
     secondary_estimate: np.ndarray | None = None
@@ -333,7 +330,6 @@ def make_scene(
         measurement_noise=_unexplained(scaled[0][settled], recorded, s, n_taps, fs),
         initial_variance=float(asked / (n_taps * power * np.size(share))),
         unconstrained_power=asked * share,
-        wiener_control_power=asked * share,
         wiener_noise_reduction_db=wiener.noise_reduction_db,
         seeds=list(references),
     )
@@ -386,7 +382,6 @@ def louder(scene: Scene, gain: float) -> Scene:
         sensor_noise_std=gain * scene.sensor_noise_std,
         measurement_noise=gain**2 * scene.measurement_noise,
         unconstrained_power=gain**2 * scene.unconstrained_power,
-        wiener_control_power=gain**2 * scene.wiener_control_power,
     )
 
 

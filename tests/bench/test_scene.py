@@ -38,8 +38,8 @@ def test_initial_variance_makes_weights_that_need_the_wiener_power(n_taps):
     weights = np.sqrt(scene.initial_variance) * np.random.default_rng(0).standard_normal((4000, n_taps))
     reference = scene.references[0]
     power = np.mean(np.sum(weights**2, axis=1)) * np.mean(reference**2)
-    assert power == pytest.approx(scene.wiener_control_power, rel=0.03)
-    assert scene.wiener_control_power == 4.0 * 0.5
+    assert power == pytest.approx(scene.unconstrained_power, rel=0.03)
+    assert scene.unconstrained_power == 4.0 * 0.5
 
 
 @pytest.mark.parametrize("name", KALMAN)
@@ -111,7 +111,7 @@ def channels() -> Scene:
 
 def test_level_of_several_channels_asks_for_a_multiple_of_all_ratings(channels):
     """Against a batch least-squares fit; 1e-3 for the ridge of 1e-6 of the filtered power."""
-    assert np.sum(channels.wiener_control_power) == pytest.approx(3.0 * 0.8, rel=1e-12)
+    assert np.sum(channels.unconstrained_power) == pytest.approx(3.0 * 0.8, rel=1e-12)
     x, d = channels.settled
     R, of_x, r = dense_systems(x, d, channels.secondary, 8, start=18)
     w = np.linalg.solve(R, r).reshape(2, -1)

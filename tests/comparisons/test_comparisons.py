@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from comparisons.studies import broadband, duct, tonal
 from comparisons.studies.cases import PAPER
 from kfopc_filterpy import bandpass_path, output_power
 from kfopc_filterpy.bench import Runs, Trial, algorithms, figures_of_merit, make_controller, make_scene, tune
+from kfopc_filterpy.bench.scene import louder
 from kfopc_filterpy.bench.tuning import _best
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.paths import path_taps
@@ -66,22 +66,8 @@ def test_each_noise_has_a_sensor_noise_of_its_own(scene):
     assert not set(scene.sensor_noise_seeds) & set(scene.seeds)
 
 
-def scaled(scene, wiener_control_power):
-    """The scene with all signals louder or softer, and another Wiener control power with them; same amplifier."""
-    ratio = wiener_control_power / scene.wiener_control_power
-    gain = float(np.sqrt(ratio))
-    return replace(
-        scene,
-        references=[gain * x for x in scene.references],
-        disturbances=[gain * d for d in scene.disturbances],
-        sensor_noise_std=gain * scene.sensor_noise_std,
-        measurement_noise=ratio * scene.measurement_noise,
-        wiener_control_power=wiener_control_power,
-    )
-
-
 def test_scaling_a_scene_scales_the_unconstrained_control_signal(scene):
-    quiet, loud = scene, scaled(scene, 4 * scene.wiener_control_power)
+    quiet, loud = scene, louder(scene, 2.0)
     assert loud.amplitude_limit == quiet.amplitude_limit
     results = [s.run(make_controller(s, "KF-ANC", 1e-6)) for s in (quiet, loud)]
     # Every quantity of the filter scales by a power of two: equal but for the sensor noise's rounding.

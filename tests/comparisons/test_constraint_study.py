@@ -358,7 +358,7 @@ def test_louder_scales_signals_powers_and_q_but_no_weights(scenes: Any) -> None:
     np.testing.assert_array_equal(loud.disturbances[0], 4.0 * scene.disturbances[0])
     assert loud.sensor_noise_std == 4.0 * scene.sensor_noise_std
     assert loud.measurement_noise == 16.0 * scene.measurement_noise
-    assert loud.wiener_control_power == 16.0 * scene.wiener_control_power
+    assert loud.unconstrained_power == 16.0 * scene.unconstrained_power
     assert (loud.initial_variance, loud.rated_power) == (scene.initial_variance, scene.rated_power)
     assert unconstrained_power(loud) == pytest.approx(16.0 * unconstrained_power(scene), rel=1e-9)
 
