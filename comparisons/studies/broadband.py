@@ -304,7 +304,7 @@ def _draw_weight_errors(ax: Any, curves: Mapping[str, np.ndarray]) -> None:
         ax.semilogx(time_ms[1:], 10 * np.log10(start[1:]), **parts.thin_style(name), label=name)
     ax.axhline(SETTLED_DB, color=parts.MARK, linestyle=":")
     ax.set(xlabel="Time (ms)", ylabel="Weight error (dB)")
-    ax.legend(), ax.grid(alpha=0.3)
+    ax.legend()
 
 
 def _figures_of(
