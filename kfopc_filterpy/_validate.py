@@ -74,7 +74,9 @@ def require_finite(array: Any, name: str) -> None:
     """Raise ValueError if `array` holds NaN or Inf; the message gives the index of the first one."""
     finite = np.isfinite(array)
     if not np.all(finite):
-        where = tuple(int(i) for i in np.argwhere(~np.atleast_1d(finite))[0])
+        if np.ndim(array) == 0:
+            raise ValueError(f"{name} must be finite, got {array}")
+        where = tuple(int(i) for i in np.argwhere(~finite)[0])
         at = where[0] if len(where) == 1 else where
         raise ValueError(f"{name} must be finite, but holds NaN or Inf (first at index {at})")
 

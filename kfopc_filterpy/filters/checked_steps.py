@@ -73,7 +73,9 @@ def run_or_undo(kf: KalmanFilter, step: Callable[..., None], arguments: tuple[An
     except BaseException as error:
         kf.__dict__.clear()
         kf.__dict__.update(before)
-        if not isinstance(error, ValueError | TypeError | RuntimeWarning):  # numpy's warnings may be errors
+        if not isinstance(
+            error, ValueError | TypeError | OverflowError | RuntimeWarning
+        ):  # numpy's warnings may be errors
             raise
         if checks is not None:
             checks(kf, *arguments)
@@ -92,18 +94,23 @@ def _is_plainly_sound(kf: KalmanFilter) -> bool:
     Finite sums imply finite elements. `vdot` is quick for many elements, and overflows without a warning.
     """
     x, P, n = kf.x, kf.P, kf.dim_x
-    if not (type(x) is type(P) is np.ndarray and x.size == n and P.shape == (n, n) and x.dtype == P.dtype == FLOAT):
+    if not (type(x) is type(P) is np.ndarray and x.dtype == P.dtype == FLOAT):
+        return False
+    if x.shape not in ((n, 1), (n,)) or P.shape != (n, n):
         return False
     return isfinite(np.vdot(P, P)) and isfinite(sum(x.ravel().tolist()))
 
 
 def _require_sound(kf: KalmanFilter) -> None:
-    """Raise ValueError unless x and P have their sizes and are finite."""
+    """Raise an error unless x and P have their shapes and are real and finite."""
     n = kf.dim_x
-    if np.size(kf.x) != n or np.shape(kf.P) not in ((), (n, n)):
+    if np.shape(kf.x) not in ((n, 1), (n,)) or np.shape(kf.P) not in ((), (n, n)):
         raise ValueError(f"x would become {np.shape(kf.x)} and P {np.shape(kf.P)}, for dim_x = {n}")
     for key in ("x", "P"):
-        if not np.all(np.isfinite(getattr(kf, key))):
+        value = np.asarray(getattr(kf, key))
+        if value.dtype.kind not in "biuf":
+            raise TypeError(f"{key} would become an array of {value.dtype}, but needs real numbers")
+        if not np.isfinite(value).all():
             raise ValueError(NOT_FINITE.format(key))
 
 
@@ -138,19 +145,23 @@ def checked_measurement(
     """Return z, R and H as filterpy handles them, or raise a clear error."""
     n = kf.dim_x
     given = kf.H if H is None else H
-    if H is not None or np.ndim(given) == 1:
-        H = np.asarray(given)
-        H = H.reshape(1, -1) if H.ndim == 1 else H
-        given = H
-    if np.ndim(given) != 2 or np.shape(given)[1] != n:
+    row = np.reshape(given, (1, -1)) if np.ndim(given) < 2 else np.asarray(given)
+    if row.ndim != 2 or row.shape[1] != n:
         raise ValueError(f"H must have shape ({n},) or (dim_z, {n}), got {np.shape(given)}")
-    require_finite(given, "H")
-    rows = np.shape(given)[0]
+    require_finite(as_real_array(row, "H"), "H")
+    if H is not None or np.ndim(given) < 2:
+        H = row
+    rows = len(row)
+    require_measurement(z, rows)
     noise = kf.R if R is None else R
+    size = kf.dim_z if np.isscalar(R) else len(np.atleast_1d(noise))  # filterpy makes a number that is passed a matrix
+    if size != rows and (np.isscalar(R) or np.ndim(noise)):
+        raise ValueError(
+            f"R must have shape ({rows}, {rows}), a row for each of H, got {noise!r} for dim_z = {kf.dim_z}"
+        )
     require_variance(noise, rows, "R")
     if np.shape(noise) == (1,):
         R = np.reshape(noise, (1, 1))
-    require_measurement(z, rows)
     shape = np.shape(z)
     # filterpy 2.0.0 does not reshape z if H is given: (rows,) against a column would broadcast
     wanted = (rows, 1) if np.ndim(kf.x) == 2 else (rows,)
@@ -177,21 +188,19 @@ def as_matrix(value: Any, name: str) -> Any:
     return as_real_array(value, name) if isinstance(value, list | tuple) else value
 
 
-def is_usual_prediction(kf: KalmanFilter, u: Any, F: Any, Q: Any) -> bool:
-    """Return whether u is left out, and F and Q are arrays of their sizes."""
+def is_usual_prediction(kf: KalmanFilter, F: Any, Q: Any) -> bool:
+    """Return whether F and Q are arrays of their sizes."""
     square, transition = (kf.dim_x, kf.dim_x), kf.F if F is None else F
     return (
-        u is None
-        and type(transition) is np.ndarray
-        and transition.shape == square
-        and is_variance(kf.Q if Q is None else Q, square)
+        type(transition) is np.ndarray and transition.shape == square and is_variance(kf.Q if Q is None else Q, square)
     )
 
 
 def require_control(kf: KalmanFilter, u: ArrayLike | None, B: ArrayLike | None) -> None:
-    """Raise ValueError if a control input u, or the B that it passes, holds NaN or Inf."""
-    for name, value in {"u": u, "B": None if u is None else kf.B if B is None else B}.items():
-        if value is not None:
+    """Raise an error if a control input u, or the B that it passes, is not real and finite. Without B, u is not used."""
+    passed = kf.B if B is None else B
+    if u is not None and passed is not None:
+        for name, value in {"u": u, "B": passed}.items():
             require_finite(as_real_array(value, name), name)
 
 
@@ -220,10 +229,15 @@ def without_masked(kf: KalmanFilter, z: np.ma.MaskedArray, R: Any, H: Any) -> tu
     return values, noise, row, missing
 
 
+def require_unmasked(z: ArrayLike) -> None:
+    """Raise ValueError if a component of z is masked: numpy would use the value behind the mask."""
+    if np.ma.is_masked(z):
+        raise ValueError("z must not be masked, except in update and batch_filter: pass None for a missed sample")
+
+
 def require_measurement(z: ArrayLike, rows: int) -> None:
     """Raise an error unless z holds finite numbers, one per row of H, in a shape that converts to (rows, 1)."""
-    if np.ma.is_masked(z):  # numpy would use the value behind the mask
-        raise ValueError("z must not be masked, except in update and batch_filter: pass None for a missed sample")
+    require_unmasked(z)
     values = np.asarray(z)
     if values.dtype.kind == "c":
         raise TypeError(f"z must be real, got complex numbers: {z!r}")

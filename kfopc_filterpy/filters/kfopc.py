@@ -26,6 +26,7 @@ from .checked_steps import (
     require_control,
     require_measurement,
     require_semidefinite,
+    require_unmasked,
     require_variance,
     restore,
     run_or_undo,
@@ -169,7 +170,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         self._unconstrained_factor = 1.0
         self._batch_references: BatchReferences | None = None
         dim_x, dim_z = as_count(dim_x, "dim_x"), as_count(dim_z, "dim_z")
-        super().__init__(dim_x, dim_z, as_count(dim_u, "dim_u", minimum=0))
+        super().__init__(dim_x, dim_z, dim_u)
         if constraint is not None:
             if rated_power is not None:
                 raise ValueError("give either rated_power= or constraint=, which has a rated power, not both")
@@ -336,14 +337,13 @@ class KFOPC(KalmanFilter, Checkpointed):
         Q: ArrayLike | None = None,
     ) -> None:
         """Run filterpy's `predict`; arguments that would corrupt the filter raise an error before anything changes."""
-        if not is_usual_prediction(self, u, F, Q):
+        if not is_usual_prediction(self, F, Q):
             u, B, F, Q = checked_prediction(self, u, B, F, Q)
         self._all_or_nothing(super().predict, checked_prediction, u, B, F, Q)
 
     def predict_steadystate(self, u: ArrayLike = 0, B: ArrayLike | None = None) -> None:
         """Run filterpy's `predict_steadystate`; arguments that would corrupt the filter raise an error first."""
-        require_control(self, u, B)
-        self._all_or_nothing(super().predict_steadystate, None, u, B)
+        self._all_or_nothing(super().predict_steadystate, require_control, u, B)
 
     def update(
         self,
@@ -520,11 +520,15 @@ class KFOPC(KalmanFilter, Checkpointed):
         samples = np.fromiter(zs, dtype=object, count=len(zs))
         before = self._snapshot()
         self._batch_references = batch
+        counting = CountingSaver(saver)
         try:
-            result = super().batch_filter(samples, Fs, Qs, Hs, Rs, Bs, us, update_first, saver)
-        except BaseException:
+            result = super().batch_filter(samples, Fs, Qs, Hs, Rs, Bs, us, update_first, counting)
+        except BaseException as error:
             restore(self, before)
-            raise
+            if not isinstance(error, ValueError | TypeError):
+                raise
+            kind = TypeError if isinstance(error, TypeError) else ValueError
+            raise kind(f"step {counting.steps} of the batch: {error}") from error
         self._batch_references = None
         return result
 
@@ -633,7 +637,7 @@ class KFOPC(KalmanFilter, Checkpointed):
         return samples
 
     def _presently_scaled(self, z: Any) -> Any:
-        require_measurement(z, self.dim_z)
+        require_unmasked(z)
         return self._scaled(z, self.constraint_factor)
 
     @staticmethod
@@ -695,3 +699,15 @@ class BatchReferences:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> None:
         return None
+
+
+class CountingSaver:
+    """Counts the steps of a batch, and saves each with the user's saver."""
+
+    def __init__(self, saver: Any) -> None:
+        self.saver, self.steps = saver, 0
+
+    def save(self) -> None:
+        if self.saver is not None:
+            self.saver.save()
+        self.steps += 1

@@ -187,8 +187,6 @@ def test_a_complex_z_is_refused(kind: str, z: Any) -> None:
         f.predict()
     with pytest.raises(TypeError, match="z must be real, got complex numbers"):
         kf.update(z, H=ROW, reference=1.0)
-    with pytest.raises(TypeError, match="z must be real, got complex numbers"):
-        kf.residual_of(z)
     require_same_course(kf, twin)
 
 
@@ -220,11 +218,11 @@ def test_the_refusal_of_NaN_says_how_to_mask_it(kind: str, z: Any) -> None:
 
 
 @pytest.mark.parametrize("bad", ["4", 4.0, None, [4], np.float64(4.0)])
-@pytest.mark.parametrize("name", ["dim_x", "dim_z", "dim_u"])
+@pytest.mark.parametrize("name", ["dim_x", "dim_z"])
 def test_dimensions_are_whole_numbers(name: str, bad: Any) -> None:
     with pytest.raises(TypeError, match=f"{name} must be a whole number, got "):
-        KFOPC(**{"dim_x": 4, "dim_z": 1, "dim_u": 0} | {name: bad})
-    assert KFOPC(**{"dim_x": 4, "dim_z": 1, "dim_u": 0} | {name: np.int64(2)}).x.any() == 0
+        KFOPC(**{"dim_x": 4, "dim_z": 1} | {name: bad})
+    assert KFOPC(**{"dim_x": 4, "dim_z": 1} | {name: np.int64(2)}).x.any() == 0
 
 
 # H
@@ -256,6 +254,7 @@ def test_an_H_that_was_assigned_or_written_into_is_used(kind: str) -> None:
 )
 def test_numbers_that_are_no_floats_are_refused(name, value, error):
     kf = KFOPC(3, 1)
+    kf.B = np.ones((3, 1))  # filterpy uses no u without it
     x, P = kf.x.copy(), kf.P.copy()
 
     def step():
