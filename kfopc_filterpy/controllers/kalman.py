@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import ArrayLike
 
 from .._types import PathModels, PerLoudspeaker, PerMicrophone
 from ..bounds.settings import SuggestedSettings
@@ -141,6 +142,15 @@ class KalmanController(CoreController):
             raise
         if powers is self._own_constraint:
             powers.advance(d, h[0, 0], x)
+
+    def process(
+        self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Process a block, see `BlockProcessing.process`; to the estimator, a sample that is not adapted to is missed."""
+        y = super().process(references, errors, adapt=adapt, out=out)
+        if not np.ravel(adapt)[-1]:
+            self.estimator.update(None)
+        return y
 
     def _listen(self, references: np.ndarray, errors: np.ndarray, adapting: np.ndarray) -> int:
         if self.constraint is self._own_constraint:

@@ -64,8 +64,8 @@ class KFOPC(KalmanFilter, Checkpointed):
     .. math:: \hat w(n|n) = \hat w(n|n-1) + K(n) [\alpha \hat d(n) - x'^T(n) \hat w(n|n-1)]
 
     With ``rated_power=None`` and ``constraint_factor`` left at 1 it is filterpy's filter bit for bit, except that
-    arguments that would corrupt that filter (NaN, Inf, a wrong shape, a negative variance) raise an error before
-    anything changes. So do a P that is not positive semidefinite and complex measurements.
+    arguments that would corrupt that filter (NaN, Inf, complex numbers, a wrong shape, a negative variance, a P that is
+    not positive semidefinite) raise an error before anything changes. The page "What differs from filterpy" lists all.
     `F` and `H` may be nested lists, which are stored as arrays.
 
     Parameters

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy.common import Q_discrete_white_noise, Saver, inv_diagonal, kinematic_kf
-from filterpy.kalman import IMMEstimator, MMAEFilterBank
+from filterpy.kalman import FixedLagSmoother, IMMEstimator, MMAEFilterBank
 from filterpy.kalman import KalmanFilter as FilterpyKalmanFilter
+from filterpy.kalman import kalman_filter as functions
+from helpers.pages import ROOT, table_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -358,9 +360,9 @@ def pairs_of_models(cls: type) -> list[KalmanFilter]:
     return filters
 
 
-def interacting_models(cls: type) -> list:
+def interacting_models(cls: type, estimator: type = IMMEstimator) -> list:
     filters = pairs_of_models(cls)
-    bank = IMMEstimator(filters, (0.5, 0.5), np.array([[0.97, 0.03], [0.03, 0.97]]))
+    bank = estimator(filters, (0.5, 0.5), np.array([[0.97, 0.03], [0.03, 0.97]]))
     saver, seen = Saver(bank, ignore=("filters",)), []
     for z in noisy_line(100):
         bank.predict()
@@ -395,6 +397,66 @@ def predictions(cls: type) -> list:
     return [*seen, kf.get_update(4.0), kf.get_update(), kf.x, kf.P, kf.y]
 
 
+def fixed_lag(cls: type) -> list:
+    """test_fls: the smoother has the filter's matrices, and smooths the same measurements."""
+    kf, smoother = constant_velocity(cls), FixedLagSmoother(dim_x=2, dim_z=1, N=5)
+    for name in ("x", "P", "F", "H", "Q", "R"):
+        setattr(smoother, name, getattr(kf, name))
+    for z in noisy_line(30):
+        kf.predict()
+        kf.update(z)
+        smoother.smooth(z)
+    assert len(smoother.xSmooth) == 30
+    return [kf.x, smoother.x, *smoother.xSmooth, *smoother.smooth_batch(noisy_line(30), N=5)]
+
+
+def corrected(cls: type, correct: Callable) -> list:
+    """Two positions, with correlated noises, by a way to correct."""
+    kf = constant_velocity(cls, dim=2)
+    kf.M = np.full((4, 2), 0.1)
+    for z in noisy_line(30):
+        kf.predict()
+        correct(kf, np.array([[z], [-z]]))
+    return [kf.x, kf.P, kf.K, kf.y, kf.z, kf.x_post, kf.P_post]
+
+
+def in_sequence(kf: KalmanFilter, z: np.ndarray) -> None:
+    if not FILTERPY_2:
+        pytest.skip("filterpy 1.4.5 has no update_sequential")
+    kf.update_sequential(0, z[0].item())
+    kf.update_sequential(1, z[1].item())
+
+
+def read_between_steps(cls: type) -> list:
+    kf, seen = constant_velocity(cls), []
+    for z in noisy_line(10):
+        kf.predict()
+        kf.update(z)
+        seen += [kf.residual_of(z + 1), kf.log_likelihood_of(z + 1), kf.measurement_of_state(kf.x)]
+        seen += [kf.log_likelihood, kf.likelihood, kf.mahalanobis]
+    kf.predict()
+    kf.update(None)
+    return [*seen, kf.log_likelihood, kf.likelihood]
+
+
+def procedural(cls: type) -> list:
+    """test_procedure_form: filterpy's functions, with a filter's arrays."""
+    kf = constant_velocity(cls)
+    kf.predict()
+    kf.update(3.0)
+    x, P = functions.predict(kf.x, kf.P, F=kf.F, Q=kf.Q)
+    x, P = functions.update(x, P, 4.0, kf.R, kf.H)
+    zs, n = noisy_line(20), 20
+    means, covariances, _, _ = functions.batch_filter(x, P, zs, [kf.F] * n, [kf.Q] * n, [kf.H] * n, [kf.R] * n)
+    return [x, P, means, covariances, *functions.rts_smoother(means, covariances, [kf.F] * n, [kf.Q] * n)]
+
+
+def fading(cls: type) -> list:
+    kf = constant_velocity(cls)
+    kf.alpha = 1.02
+    return [list(kf.batch_filter(noisy_line(30))), kf.alpha]
+
+
 def scalar_transition(cls: type) -> list:
     kf = cls(2, 1)
     kf.F, kf.H = np.float64(0.9), np.array([[1.0, 0.5]])
@@ -403,36 +465,62 @@ def scalar_transition(cls: type) -> list:
     return [kf.x, kf.P]
 
 
-SCENARIOS: dict[str, Callable[[type], list]] = {
-    "recursive, then batch": lambda cls: recursive_then_batch(cls, 2),
-    "recursive, then batch, 1-D x": lambda cls: recursive_then_batch(cls, 1),
-    "batch with None": batch,
-    "batch with None, update first": lambda cls: batch(cls, update_first=True),
-    "batch of lists": lambda cls: batch_of_lists(cls, False),
-    "batch of lists, update first": lambda cls: batch_of_lists(cls, True),
-    "rts_smoother": lambda cls: smoothed(cls, 2),
-    "rts_smoother, 1-D x": lambda cls: smoothed(cls, 1),
-    "Saver": saved,
-    "univariate": univariate,
-    "steady state": steady_state,
-    "defaults": defaults,
-    "inv = pinv": lambda cls: custom_inverse(cls, np.linalg.pinv),
-    "inv = inv_diagonal": lambda cls: custom_inverse(cls, inv_diagonal),
-    "copy": lambda cls: copied_mid_run(cls, copy.copy),
-    "deepcopy": lambda cls: copied_mid_run(cls, copy.deepcopy),
-    "pickle": lambda cls: copied_mid_run(cls, lambda kf: pickle.loads(pickle.dumps(kf))),
-    "IMM": interacting_models,
-    "MMAE": multiple_models,
-    "get_prediction, get_update": predictions,
-    "scalar F": scalar_transition,
+# The rows of the page's last table, and their scenarios.
+USES: dict[str, list[Callable[[type], list]]] = {
+    "`predict`, `update`": [
+        lambda cls: recursive_then_batch(cls, 2),
+        lambda cls: recursive_then_batch(cls, 1),
+        univariate,
+        defaults,
+        scalar_transition,
+    ],
+    "`batch_filter`": [
+        batch,
+        lambda cls: batch(cls, update_first=True),
+        lambda cls: batch_of_lists(cls, False),
+        lambda cls: batch_of_lists(cls, True),
+    ],
+    "`rts_smoother`": [lambda cls: smoothed(cls, 2), lambda cls: smoothed(cls, 1)],
+    "`FixedLagSmoother`": [fixed_lag],
+    "`Saver`": [saved],
+    "`IMMEstimator`": [interacting_models],
+    "`MMAEFilterBank`": [multiple_models],
+    "`predict_steadystate`, `update_steadystate`": [steady_state],
+    "`update_correlated`": [lambda cls: corrected(cls, lambda kf, z: kf.update_correlated(z))],
+    "`update_sequential`": [lambda cls: corrected(cls, in_sequence)],
+    "`get_prediction`, `get_update`": [predictions],
+    "`residual_of`, `log_likelihood_of`, `measurement_of_state`": [read_between_steps],
+    "`predict`, `update`, `batch_filter`, `rts_smoother` as functions": [procedural],
+    "`copy`, `deepcopy`, `pickle`": [
+        lambda cls: copied_mid_run(cls, copy.copy),
+        lambda cls: copied_mid_run(cls, copy.deepcopy),
+        lambda cls: copied_mid_run(cls, lambda kf: pickle.loads(pickle.dumps(kf))),
+    ],
+    "`inv`, `alpha`": [
+        lambda cls: custom_inverse(cls, np.linalg.pinv),
+        lambda cls: custom_inverse(cls, inv_diagonal),
+        fading,
+    ],
 }
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_a_filterpy_use_gives_the_same_bits(name: str) -> None:
-    expected, got = (SCENARIOS[name](cls) for cls in (KalmanFilter, KFOPC))
+@pytest.mark.parametrize(
+    "scenario", [pytest.param(one, id=f"{use} {k}") for use, several in USES.items() for k, one in enumerate(several)]
+)
+def test_a_filterpy_use_gives_the_same_bits(scenario: Callable[[type], list]) -> None:
+    expected, got = (scenario(cls) for cls in (KalmanFilter, KFOPC))
     assert same(expected, got)
     assert expected, "the scenario saw nothing"
+
+
+def test_the_page_lists_these_uses() -> None:
+    page = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
+    assert [row[0] for row in table_of(page, "What takes a filter, or stands beside one")] == list(USES)
+
+
+def test_the_imm_of_the_fork_runs_KFOPCs() -> None:
+    fork = pytest.importorskip("bayesian_filters.kalman", reason="needs bayesian-filters (the extra `test`)")
+    assert same(*(interacting_models(cls, fork.IMMEstimator) for cls in (fork.KalmanFilter, KFOPC)))
 
 
 # Shapes of z that filterpy's test_z_dim and test_z_checks accept and refuse.

@@ -59,6 +59,13 @@ class Page:
         return SimpleNamespace(**{name: value for name, value in self._variables.items() if not name.startswith("__")})
 
 
+def table_of(text: str, heading: str) -> list[list[str]]:
+    """Return the cells of the first table below a heading of a page, without its head."""
+    section = re.split(r"^## ", text.split(f"## {heading}\n", 1)[1], maxsplit=1, flags=re.M)[0]
+    rows = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows[2:]]
+
+
 def _run_in_shell(commands: str) -> None:
     """Run a cell of shell commands and print what they say; `kfopc` is this checkout's."""
     with tempfile.TemporaryDirectory() as folder:

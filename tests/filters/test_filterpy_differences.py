@@ -1,0 +1,139 @@
+"""The tables of docs/filterpy.md: each line of code runs with filterpy's filter and with KFOPC, and does what its row says."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import re
+import warnings
+from typing import Any
+
+import filterpy
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from helpers.pages import ROOT, table_of
+
+from kfopc_filterpy import KFOPC
+
+PAGE = (ROOT / "docs" / "filterpy.md").read_text(encoding="utf-8")
+CODE = re.compile(r"`([^`]+)`")
+STATE = ("x", "P", "y", "S", "K", "z", "x_post", "P_post")
+names: dict[str, Any] = {}
+exec(re.search(r"^```python\n(.*?)^```$", PAGE, re.M | re.S)[1], names)
+
+
+def state_of(kf: Any) -> list[np.ndarray]:
+    return [np.array(getattr(kf, name)) for name in STATE]
+
+
+def unchanged(before: list[np.ndarray], after: list[np.ndarray]) -> bool:
+    return all(a.shape == b.shape and repr(a.tolist()) == repr(b.tolist()) for a, b in zip(before, after, strict=True))
+
+
+def run(kind: type, code: str) -> tuple[Any, Any, Exception | None]:
+    """Return the filter after the code, the value of its last statement, or the error of the one that failed."""
+    scope, value = names | {"kind": kind, "kf": names["make"](kind)}, None
+    for statement in ast.parse(code).body:
+        before = copy.deepcopy(scope["kf"])
+        try:
+            if isinstance(statement, ast.Expr):
+                value = eval(ast.unparse(statement), scope)
+            else:
+                exec(ast.unparse(statement), scope)
+        except Exception as error:
+            kf = scope["kf"]
+            return kf, unchanged(state_of(before), state_of(kf)), error
+    return scope["kf"], value, None
+
+
+def outcome(kind: type, code: str) -> str:
+    """Return in the words of the page what a filter is after the code."""
+    kf, value, error = run(kind, code)
+    if error is not None and issubclass(kind, KFOPC):
+        assert value, f"{code} changed the filter before it was refused"
+        return f"`{type(error).__name__}`"
+    if error is not None:
+        return "an error" if value else "an error, half-way"
+    x, P = np.asarray(kf.x), np.asarray(kf.P)
+    if x.dtype.kind in "cO":
+        return {"c": "complex numbers in `x`", "O": "objects in `x`"}[x.dtype.kind]
+    if isinstance(kf.x, np.ma.MaskedArray):
+        return "`x` is a masked array"
+    if x.shape not in ((3, 1), (3,)):
+        return f"`x` of shape {x.shape}"
+    if not (np.isfinite(x).all() and np.isfinite(P).all()):
+        return "NaN or Inf"
+    if not np.allclose(P, P.T) or np.linalg.eigvalsh(P)[0] < -1e-6:
+        return "`P` is no covariance"
+    return "computes"
+
+
+def require_outcome(kind: type, code: str, cell: str) -> None:
+    """The code does with a filter of this kind what the cell says."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numpy's, of overflow and of imaginary parts that are dropped
+        if not cell.startswith("as `"):
+            assert outcome(kind, code) == cell, code
+            return
+        (like,) = CODE.findall(cell)
+        kf, _, error = run(kind, code)
+        other, _, failed = run(KalmanFilter, like)
+    assert error is None and failed is None, (code, error, failed)  # noqa: PT018
+    for name in ("x", "P"):  # to rounding: the same matrix may be an argument or a number, or have a row of zeros
+        np.testing.assert_allclose(getattr(kf, name), getattr(other, name), rtol=1e-14, atol=1e-15, err_msg=code)
+
+
+EXCEPTIONS = table_of(PAGE, "Exceptions")
+SAME = [code for row in table_of(PAGE, "As in filterpy, although it may surprise") for code in CODE.findall(row[0])]
+
+
+@pytest.mark.parametrize("row", EXCEPTIONS, ids=lambda row: CODE.findall(row[0])[0])
+def test_an_exception_is_as_the_page_says(row: list[str]) -> None:
+    codes, theirs, ours, why = CODE.findall(row[0]), *row[1:]
+    assert codes and why, "a row has code and a reason"  # noqa: PT018
+    theirs, _, version = theirs.partition(" in ") if re.search(r" in [12]\.\d\.\d$", theirs) else (theirs, "", "")
+    for code in codes:
+        require_outcome(KFOPC, code, ours)
+        if version in ("", filterpy.__version__):
+            require_outcome(KalmanFilter, code, theirs)
+
+
+@pytest.mark.parametrize("code", SAME)
+def test_what_may_surprise_is_as_in_filterpy(code: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        (kf, value, error), (ours, own_value, own_error) = run(KalmanFilter, code), run(KFOPC, code)
+    assert error is None and own_error is None, (error, own_error)  # noqa: PT018
+    for one, other in zip([*state_of(kf), *as_list(value)], [*state_of(ours), *as_list(own_value)], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def as_list(value: Any) -> list[Any]:
+    return [] if value is None else list(value) if isinstance(value, tuple) else [value]
+
+
+def test_a_number_assigned_to_R_fills_every_element() -> None:
+    kf = run(KFOPC, "kf.R = 5.0; kf.update([1.0, 2.0])")[0]
+    np.testing.assert_array_equal(kf.S - 2 * np.eye(2), np.full((2, 2), 5.0))  # H P H' = 2 I
+
+
+def test_a_batch_names_the_step_that_was_refused_and_saves_those_before() -> None:
+    class Counted:
+        saved = 0
+
+        def save(self) -> None:
+            self.saved += 1
+
+    kf, saver = names["make"](KFOPC), Counted()
+    zs = np.ones((4000, 2, 1))
+    zs[3210, 1] = np.nan
+    with pytest.raises(ValueError, match=r"step 3210 of the batch: z must be finite.* \(first at index \(1, 0\)\)"):
+        kf.batch_filter(zs, saver=saver)
+    assert saver.saved == 3210
+
+
+@pytest.mark.parametrize("R", [2.0, None, [[3.0]]])
+def test_an_R_that_does_not_fit_the_rows_of_H_is_named(R: Any) -> None:
+    with pytest.raises(ValueError, match=r"R must have shape \(2, 2\), a row for each of H, got .* for dim_z = 1"):
+        KFOPC(3, 1).update([1.0, 2.0], R=R, H=np.eye(2, 3))
