@@ -31,8 +31,8 @@ def unchanged(before: list[np.ndarray], after: list[np.ndarray]) -> bool:
     return all(a.shape == b.shape and repr(a.tolist()) == repr(b.tolist()) for a, b in zip(before, after, strict=True))
 
 
-def run(kind: type, code: str) -> tuple[Any, Any, Exception | None]:
-    """Return the filter after the code, the value of its last statement, or the error of the one that failed."""
+def run(kind: type, code: str) -> tuple[Any, Any, Any, Exception | None]:
+    """Return the filter after the code and before its last statement, what that returned, and the error that ended it."""
     scope, value = names | {"kind": kind, "kf": names["make"](kind)}, None
     for statement in ast.parse(code).body:
         before = copy.deepcopy(scope["kf"])
@@ -42,26 +42,26 @@ def run(kind: type, code: str) -> tuple[Any, Any, Exception | None]:
             else:
                 exec(ast.unparse(statement), scope)
         except Exception as error:
-            kf = scope["kf"]
-            return kf, unchanged(state_of(before), state_of(kf)), error
-    return scope["kf"], value, None
+            return scope["kf"], before, None, error
+    return scope["kf"], before, value, None
 
 
 def outcome(kind: type, code: str) -> str:
     """Return in the words of the page what a filter is after the code."""
-    kf, value, error = run(kind, code)
-    if error is not None and issubclass(kind, KFOPC):
-        assert value, f"{code} changed the filter before it was refused"
-        return f"`{type(error).__name__}`"
+    kf, before, _, error = run(kind, code)
     if error is not None:
-        return "an error" if value else "an error, half-way"
+        whole = unchanged(state_of(before), state_of(kf))
+        assert whole or not issubclass(kind, KFOPC), f"{code} changed the filter before it was refused"
+        name = f"`{type(error).__name__}`" if issubclass(kind, KFOPC) else "an error"
+        return name if whole else f"{name}, half-way"
     x, P = np.asarray(kf.x), np.asarray(kf.P)
     if x.dtype.kind in "cO":
         return {"c": "complex numbers in `x`", "O": "objects in `x`"}[x.dtype.kind]
     if isinstance(kf.x, np.ma.MaskedArray):
         return "`x` is a masked array"
-    if x.shape not in ((3, 1), (3,)):
-        return f"`x` of shape {x.shape}"
+    for name in ("x", "K"):
+        if np.shape(getattr(kf, name)) != np.shape(getattr(before, name)):
+            return f"`{name}` of shape {np.shape(getattr(kf, name))}"
     if not (np.isfinite(x).all() and np.isfinite(P).all()):
         return "NaN or Inf"
     if not np.allclose(P, P.T) or np.linalg.eigvalsh(P)[0] < -1e-6:
@@ -77,8 +77,8 @@ def require_outcome(kind: type, code: str, cell: str) -> None:
             assert outcome(kind, code) == cell, code
             return
         (like,) = CODE.findall(cell)
-        kf, _, error = run(kind, code)
-        other, _, failed = run(KalmanFilter, like)
+        kf, _, _, error = run(kind, code)
+        other, _, _, failed = run(KalmanFilter, like)
     assert error is None and failed is None, (code, error, failed)  # noqa: PT018
     for name in ("x", "P"):  # to rounding: the same matrix may be an argument or a number, or have a row of zeros
         np.testing.assert_allclose(getattr(kf, name), getattr(other, name), rtol=1e-14, atol=1e-15, err_msg=code)
@@ -103,7 +103,7 @@ def test_an_exception_is_as_the_page_says(row: list[str]) -> None:
 def test_what_may_surprise_is_as_in_filterpy(code: str) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        (kf, value, error), (ours, own_value, own_error) = run(KalmanFilter, code), run(KFOPC, code)
+        (kf, _, value, error), (ours, _, own_value, own_error) = run(KalmanFilter, code), run(KFOPC, code)
     assert error is None and own_error is None, (error, own_error)  # noqa: PT018
     for one, other in zip([*state_of(kf), *as_list(value)], [*state_of(ours), *as_list(own_value)], strict=True):
         np.testing.assert_array_equal(one, other)
