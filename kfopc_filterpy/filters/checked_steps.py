@@ -149,8 +149,6 @@ def checked_measurement(
     if row.ndim != 2 or row.shape[1] != n:
         raise ValueError(f"H must have shape ({n},) or (dim_z, {n}), got {np.shape(given)}")
     require_finite(as_real_array(row, "H"), "H")
-    if H is not None or np.ndim(given) < 2:
-        H = row
     rows = len(row)
     require_measurement(z, rows)
     noise = kf.R if R is None else R
@@ -162,12 +160,14 @@ def checked_measurement(
     require_variance(noise, rows, "R")
     if np.shape(noise) == (1,):
         R = np.reshape(noise, (1, 1))
+    if H is None and np.ndim(given) == 2:
+        return z, R, None
     shape = np.shape(z)
     # filterpy 2.0.0 does not reshape z if H is given: (rows,) against a column would broadcast
     wanted = (rows, 1) if np.ndim(kf.x) == 2 else (rows,)
-    if H is None or not shape or shape == wanted or (rows == 1 and len(wanted) == 2):
-        return z, R, H
-    return np.reshape(z, wanted), R, H
+    if H is not None and (not shape or shape == wanted or (rows == 1 and len(wanted) == 2)):
+        return z, R, row
+    return np.reshape(z, wanted), R, row
 
 
 def checked_prediction(kf: KalmanFilter, u: Any, B: Any, F: Any, Q: Any) -> tuple[Any, Any, Any, Any]:
