@@ -426,7 +426,6 @@ def faults_of_other_steps() -> dict[str, Fault]:
         "batch_filter: F NaN": (lambda f: batch(f, Fs=[np.eye(TAPS)] * 3 + [NAN * np.eye(TAPS)]), "F"),
         "batch_filter: reference NaN": (lambda f: batch(f, references=[1.0, NAN, 1.0, 1.0]), "references"),
         "batch_filter: silent": (lambda f: batch(f, Hs=[ROW, ROW, 0 * ROW, ROW], Rs=[1.0, 1.0, 0.0, 1.0]), "silent"),
-        "residual_of: z of another size": (lambda f: f.residual_of([1.0, 2.0]), "z"),
         "alpha NaN": (lambda f: setattr(f, "alpha", NAN), "alpha"),
         "alpha Inf": (lambda f: setattr(f, "alpha", INF), "alpha"),
         "alpha whose square overflows": (lambda f: setattr(f, "alpha", 1e200), "alpha"),
