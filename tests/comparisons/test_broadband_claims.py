@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.results import single_result
+from helpers.studies import smaller
 
 from comparisons.studies import broadband
 from comparisons.studies.broadband import FS, KNOWING, UNAWARE
@@ -21,14 +22,12 @@ from kfopc_filterpy.signals import band_limited_noise
 @pytest.mark.parametrize(
     ("powers", "held"),
     [
-        ([1.0, 1.0], True),
         ([1.004, 1.004], True),
         ([0.996, 0.996], True),
         ([1.006, 1.006], False),  # the mean
         ([0.994, 0.994], False),
         ([0.986, 1.014], True),
         ([0.984, 1.016], False),  # one of them
-        ([0.6, 1.4], False),
         ([1.0, np.nan], False),
     ],
 )
@@ -39,7 +38,6 @@ def test_power(powers: list[float], held: bool) -> None:
 @pytest.mark.parametrize(
     ("anc_db", "others_db", "power", "held"),
     [
-        (50.0, 6.0, 4.0, True),
         (6.1, 6.0, 1.51, True),
         (5.9, 6.0, 4.0, False),
         (50.0, 6.0, 1.49, False),
@@ -58,10 +56,8 @@ def test_best_reduction(anc_db: float, others_db: float, power: float, held: boo
 @pytest.mark.parametrize(
     ("opc", "anc", "held"),
     [
-        (6.9e-3, 6.8e-3, True),
         (1.09, 1.0, True),
         (1.11, 1.0, False),
-        (0.1, 1.0, True),
         (None, 1.0, False),
         (np.nan, 1.0, False),
         (1.0, None, True),  # KF-ANC does not settle, KF-OPC does
@@ -80,7 +76,6 @@ def test_not_slower(opc: float | None, anc: float | None, held: bool) -> None:
     [
         (1.0, 2.01, True),
         (1.0, 1.99, False),
-        (2.0, 1.0, False),
         (1.0, None, True),
         (None, 2.0, False),
         (None, None, False),
@@ -182,7 +177,7 @@ def test_times_at_which_a_curve_settles() -> None:
 # ---- q with the clipping
 
 
-def test_q_with_clipping_is_that_of_a_clipped_gaussian(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_q_with_clipping_is_that_of_a_clipped_gaussian() -> None:
     """Flat paths, white noise: y is Gaussian, so Price's theorem gives what is clipped off and proportional to y."""
     noise = np.random.default_rng(3).standard_normal(200_000)
     scene = make_scene({0: noise}, [0.0, 1.0], [1.0], fs=FS, rated_power=0.8, power_multiple=4.0, n_taps=4)
@@ -197,9 +192,8 @@ def test_q_with_clipping_is_that_of_a_clipped_gaussian(monkeypatch: pytest.Monke
     assert scene.amplifier is None
 
 
-def test_every_run_with_clipping_is_made_as_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_run_with_clipping_is_made_as_it_says() -> None:
     """All seeds; the q of the clipping for all algorithms but the two that show what another q does."""
-    monkeypatch.setattr(broadband, "SEEDS", (1, 2))
     noises = {k: band_limited_noise((200.0, 2000.0), 0.7, fs=FS, rng=k) for k in (1, 2)}
     scene = make_scene(noises, [0.0, 0.0, 1.0], [1.0], fs=FS, rated_power=0.8, power_multiple=4.0, n_taps=8)
     limited = with_clipping(scene)
@@ -209,9 +203,9 @@ def test_every_run_with_clipping_is_made_as_it_says(monkeypatch: pytest.MonkeyPa
         seen.append((own.measurement_noise, own.amplifier, own.known_amplifier, tuple(tuned)))
         return {name: [name] * 2 for name in tuned}
 
-    monkeypatch.setattr(broadband, "_run_all", run_all)
     tuned: Any = dict.fromkeys(("KF-ANC", "KF-OPC", "FxLMS", "MOV-FxLMS"))
-    results = broadband._run_clipped(None, scene, limited, tuned)
+    with smaller(broadband, _run_all=run_all):
+        results = broadband._run_clipped(None, scene, limited, tuned)
     low, high, amplifier = scene.measurement_noise, limited.measurement_noise, limited.amplifier
     assert seen == [
         (high, amplifier, None, tuple(tuned)),

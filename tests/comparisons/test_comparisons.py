@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
 from helpers import reports
+from helpers.studies import run_study, smaller
 
 from comparisons import __main__ as comparisons_command
-from comparisons.__main__ import STUDIES, main
+from comparisons.__main__ import FURTHER, STUDIES, main
 from comparisons.studies import broadband, duct, tonal
 from comparisons.studies.cases import PAPER
 from kfopc_filterpy import bandpass_path, output_power
-from kfopc_filterpy.bench import Runs, Trial, algorithms, figures_of_merit, make_controller, make_scene, tune
+from kfopc_filterpy.bench import (
+    Runs,
+    Trial,
+    algorithms,
+    best_setting,
+    figures_of_merit,
+    make_controller,
+    make_scene,
+    tune,
+)
 from kfopc_filterpy.bench.scene import louder
-from kfopc_filterpy.bench.tuning import _best
 from kfopc_filterpy.bounds import wiener_solution
 from kfopc_filterpy.paths import path_taps
 from kfopc_filterpy.signals import tone
@@ -83,19 +94,18 @@ def test_every_algorithm_runs_from_every_end_of_its_grid(scene):
             assert result.error.size == 12000 - 1600
 
 
-def test_tuning_takes_the_lowest_error_that_keeps_the_budget():
+def test_tuning_takes_the_lowest_error_that_keeps_the_budget(scene):
     trials = [
         Trial(1.0, -9.0, 9.0, 0.1),  # diverged
         Trial(2.0, -8.0, 0.52),  # over the budget
         Trial(3.0, -7.0, 0.505),
         Trial(4.0, -6.0, 0.5),
     ]
-    assert _best(trials, 0.5).setting == 3.0
-    assert _best(trials, np.inf).setting == 2.0
-    over = _best(trials[:2], 0.5)
+    assert best_setting(scene, "KF-OPC", trials).setting == 3.0
+    assert best_setting(scene, "KF-ANC", trials).setting == 2.0
+    over = best_setting(scene, "KF-OPC", trials[:2])
     assert (over.setting, over.within_budget) == (2.0, False)
-    assert _best(trials[:1], 0.5) is None
-    scene = tonal._scene(bandpass_path(128), bandpass_path(32))
+    assert best_setting(scene, "KF-OPC", trials[:1]) is None
     with pytest.raises(RuntimeError, match="KF-OPC diverged at every setting"):
         tune(Runs(), scene, ["KF-OPC"], trials={"KF-OPC": trials[:1]})
 
@@ -120,34 +130,28 @@ def test_overdrives_where_the_order_flips():
 
 
 def test_wiener_multiple_of_a_tone_is_its_overdrive():
-    scene = tonal._scene(bandpass_path(128), bandpass_path(32))
-    x = scene.references[0]
+    noise, fs = {0: tone(400, 10.5, fs=16000.0)}, 16000.0
+    paths = bandpass_path(128), bandpass_path(32)
+    scene = make_scene(noise, *paths, fs=fs, rated_power=0.5, power_multiple=4.0, n_taps=32)
     gain = abs(np.exp(-2j * np.pi * 400 / 16000 * np.arange(32)) @ path_taps(bandpass_path(32))) ** 2
     d = scene.disturbances[0][8000:]
     # A tone is cancelled by a control signal of power E[d^2] over the path's power gain at its frequency.
     assert np.mean(d**2) / gain == pytest.approx(2.0, rel=1e-3)
-    np.testing.assert_allclose(x / np.abs(x).max(), tone(400, 10.5, fs=16000.0), atol=1e-9)
 
 
-def test_measured_study_says_in_a_line_why_it_is_left_out(monkeypatch, tmp_path):
-    monkeypatch.setenv("KFOPC_DATA", str(tmp_path / "nowhere"))
+def test_measured_study_says_in_a_line_why_it_is_left_out(data_folder, tmp_path):
+    data_folder(tmp_path / "nowhere")
     line = duct.main_measured(Runs())
     assert isinstance(line, str)
     assert line.startswith("duct-measured is left out: set KFOPC_DATA to a folder with the measured data")
     assert "\n" not in line
 
 
-def test_studies_plan_the_runs_they_take(monkeypatch):
-    monkeypatch.setattr(broadband, "DURATION_S", 1.7)
-    monkeypatch.setattr(duct, "DURATION_S", 1.7)
-    monkeypatch.setattr(tonal, "DURATION_S", 0.7)
-    monkeypatch.setattr(tonal, "_figures_of", lambda *_: [])
-    monkeypatch.setattr(broadband, "_figures_of", lambda *_: [])
-    monkeypatch.setattr(duct, "_figures_of", lambda *_: [])
-    for study in (tonal, broadband, duct):
-        runs = Runs()
-        study.main(runs)
-        assert runs.done == study.planned_runs()
+def test_studies_plan_the_runs_they_take():
+    for study, duration_s in ((tonal, 0.7), (broadband, 1.7), (duct, 1.7)):
+        with smaller(study, DURATION_S=duration_s, _figures_of=lambda *_: []):
+            small = run_study(study)
+        assert small.done == small.planned
 
 
 def test_command_refuses_a_folder_it_cannot_write(tmp_path, capsys):
@@ -163,24 +167,28 @@ def test_command_refuses_an_unknown_study(capsys):
     assert "no study called tidal" in capsys.readouterr().err
 
 
-def test_a_study_that_is_left_out_is_noted_on_the_page(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(
-        comparisons_command,
-        "STUDIES",
-        {
-            "tonal": (lambda runs: reports.study(), lambda: 1),
-            "duct-measured": (lambda runs: "duct-measured is left out: set KFOPC_DATA", lambda: 1),
-        },
-    )
-    assert main(["--quiet", "--output", str(tmp_path)]) == 0
+def test_a_study_that_is_left_out_is_noted_on_the_page(tmp_path, capsys):
+    studies = {
+        "tonal": (lambda runs: reports.study(), lambda: 1),
+        "duct-measured": (lambda runs: "duct-measured is left out: set KFOPC_DATA", lambda: 1),
+    }
+    with smaller(comparisons_command, STUDIES=studies):
+        assert main(["--quiet", "--output", str(tmp_path)]) == 0
     assert "duct-measured is left out: set KFOPC_DATA" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_command_writes_report_and_results(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(tonal, "DURATION_S", 1.5)
-    monkeypatch.setattr(tonal, "OVERDRIVES_DB", np.array([0.0, 3.0, 10.0]))
+def test_the_command_finds_every_study_by_its_name():
     assert list(STUDIES) == ["tonal", "broadband", "duct", "duct-measured"]
-    assert main(["tonal", "--quiet", "--output", str(tmp_path / "out")]) == 0
+    assert not set(STUDIES) & set(FURTHER)
+    for name, functions in (STUDIES | FURTHER).items():
+        module = import_module(f"comparisons.studies.{name.partition('-')[0]}")
+        main_of_part = {"duct-measured": "main_measured", "duct-motor": "main_motor"}.get(name, "main")
+        assert functions == (getattr(module, main_of_part), module.planned_runs)
+
+
+def test_command_writes_report_and_results(tmp_path, capsys):
+    with smaller(tonal, DURATION_S=1.5, OVERDRIVES_DB=np.array([0.0, 3.0, 10.0])):
+        assert main(["tonal", "--quiet", "--output", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
     note = "The ceiling: within the rated power"  # notes go to the report
     assert note not in " ".join(printed.split())

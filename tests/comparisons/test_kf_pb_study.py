@@ -2,43 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from helpers.studies import Small, run_study, smaller
 
-from comparisons import __main__ as command
 from comparisons.studies import kf_pb as study
 from comparisons.studies import kf_pb_cases
-from comparisons.studies.cases import FS, measured_data
+from comparisons.studies.cases import FS
 from kfopc_filterpy import kf_pb, noise_reduction_db, simulate
-from kfopc_filterpy.bench import Runs, StudyReport
+from kfopc_filterpy.bench import StudyReport
 
 PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
-SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "SHARES": (0.25,)}
+SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "JUMP_S": 2.0, "SHARES": (0.25,)}
 
 
 @pytest.fixture(scope="module")
-def small() -> Any:
+def small() -> Iterator[Small]:
     """Few taps, short runs, one pair of short paths, one setting of MOV-FxLMS, no measured data."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KFOPC_DATA", "/no/such/folder")
-        measured_data.cache_clear()
-        kf_pb_cases.recordings.cache_clear()
-        for name, value in SMALL.items():
-            patch.setattr(kf_pb_cases, name, value)
-        patch.setattr(study, "JUMP_S", 2.0)
-        patch.setattr(kf_pb_cases, "JUMPS", {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)})
-        patch.setattr(study, "STEPS", np.array([0.01]))
-        patch.setattr(study, "PENALTIES", np.array([1.0]))
-        patch.setattr(kf_pb_cases, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
-        runs = Runs()
-        yield study.main(runs), runs.done, study.planned_runs()
-    measured_data.cache_clear()
-    kf_pb_cases.recordings.cache_clear()
+    settings = {"STEPS": np.array([0.01]), "PENALTIES": np.array([1.0])}
+    own = {
+        "JUMPS": {"12 dB louder from 3 s on": (12.0, 3.0, 5.0)},
+        "all_paths": lambda: {"short": (PRIMARY, SECONDARY)},
+    }
+    with smaller(kf_pb_cases, **SMALL, **own), smaller(study, JUMP_S=2.0, **settings):
+        yield run_study(study)
 
 
-def test_the_report_is_complete(small: Any) -> None:
+def test_the_report_is_complete(small: Small) -> None:
     report, done, planned = small
     assert isinstance(report, StudyReport)
     assert done == planned
@@ -48,11 +40,10 @@ def test_the_report_is_complete(small: Any) -> None:
     assert faults == expected | {(fault, "jump") for fault in study.PRIMARY}
     assert [table.stem for table in report.tables] == ["classes", "cases", "faults"]
     assert len(report.claims) == 8
-    assert command.FURTHER["kf_pb"] == (study.main, study.planned_runs)
 
 
-def test_a_row_is_what_a_run_of_ones_own_says(small: Any) -> None:
-    row = next(row for row in small[0].extra["rows"] if row["noise"] == "band noise")
+def test_a_row_is_what_a_run_of_ones_own_says(small: Small) -> None:
+    row = next(row for row in small.report.extra["rows"] if row["noise"] == "band noise")
     case = kf_pb_cases.make_rated((PRIMARY, SECONDARY), kf_pb_cases.noises()["band noise"][1](), 0.25)
     controller = kf_pb(16, SECONDARY, rated_power=case.rated_power, fs=FS)
     result = simulate(
@@ -64,8 +55,8 @@ def test_a_row_is_what_a_run_of_ones_own_says(small: Any) -> None:
     assert row["noise_reduction_db"] > 3.0
 
 
-def test_every_fault_is_overcome(small: Any) -> None:
+def test_every_fault_is_overcome(small: Small) -> None:
     """From two seconds after the fault on. A softer path needs more power, and a phase of five taps is another path."""
-    for row in small[0].extra["faults"]:
+    for row in small.report.extra["faults"]:
         if row["fault"] not in ("3 dB softer", "another phase"):
             assert row["lost_db"] < 1.0, row

@@ -2,45 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from helpers.studies import Small, run_study, smaller
 
-from comparisons import __main__ as command
 from comparisons.studies import kf_pb_cases, loss_map
-from comparisons.studies.cases import SENSOR_NOISE_DB, measured_data
+from comparisons.studies.cases import SENSOR_NOISE_DB
 from comparisons.studies.kf_pb_cases import Rated, make_rated, noises
-from kfopc_filterpy.bench import Runs, StudyReport
 
 TAPS, LONG = 12, 40
 PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
 
 
 @pytest.fixture(scope="module")
-def small() -> Any:
+def small() -> Iterator[Small]:
     """Few taps, one pair of short paths, no measured data."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KFOPC_DATA", "/no/such/folder")
-        measured_data.cache_clear()
-        kf_pb_cases.recordings.cache_clear()
-        patch.setattr(kf_pb_cases, "N_TAPS", TAPS)
-        patch.setattr(loss_map, "LONG", LONG)
-        patch.setattr(kf_pb_cases, "all_paths", lambda: {"short": (PRIMARY, SECONDARY)})
-        runs = Runs()
-        yield loss_map.main(runs), runs.done, loss_map.planned_runs()
-    measured_data.cache_clear()
-    kf_pb_cases.recordings.cache_clear()
+    paths = {"short": (PRIMARY, SECONDARY)}
+    with smaller(kf_pb_cases, N_TAPS=TAPS, all_paths=lambda: paths), smaller(loss_map, LONG=LONG):
+        yield run_study(loss_map)
 
 
-def test_planned_runs_are_those_taken(small: Any) -> None:
+def test_planned_runs_are_those_taken(small: Small) -> None:
     _, done, planned = small
     assert done == planned == len(loss_map.jobs()) > 0
-    assert command.FURTHER["loss_map"] == (loss_map.main, loss_map.planned_runs)
 
 
-def test_the_losses_lead_from_the_sensor_noise_to_what_is_left(small: Any) -> None:
-    report: StudyReport = small[0]
+def test_the_losses_lead_from_the_sensor_noise_to_what_is_left(small: Small) -> None:
+    report = small.report
     for line in report.tables[0].rows:
         losses, left = np.array(line[2:8]), line[8]
         assert -SENSOR_NOISE_DB - losses.sum() == pytest.approx(left)

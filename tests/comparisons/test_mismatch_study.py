@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.studies import run_study, short_duct, smaller
 
-from comparisons import __main__ as command
 from comparisons.studies import cases, mismatch
 from comparisons.studies.cases import Case
 from comparisons.studies.mismatch import EXACT, WRONG, MismatchRow, case_scene
 from kfopc_filterpy import FxLMS, noise_reduction_db, output_power, simulate
-from kfopc_filterpy.bench import Runs, StudyReport, make_controller
+from kfopc_filterpy.bench import Claim, StudyReport, make_controller
 from kfopc_filterpy.paths import path_taps, perturbed_path
 from kfopc_filterpy.signals import tone
 
@@ -25,23 +25,10 @@ AMOUNTS = {"phase": (0.0, 45.0, 120.0), "gain": (-6.0, 0.0), "delay": (0.0, 2.0)
 @pytest.fixture(scope="module")
 def small() -> Any:
     """Few taps, one second, one pair of paths cut short, no measured data."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KFOPC_DATA", "/no/such/folder")
-        cases.measured_data.cache_clear()
-        pairs = cases.ducts()
-        assert list(pairs) == ["duct"]
-        short = {"duct": tuple(path[:200] for path in pairs["duct"])}
-        patch.setattr(cases, "N_TAPS", TAPS)
-        patch.setattr(mismatch, "ducts", lambda: short)
-        patch.setattr(mismatch, "ALGORITHMS", STUDIED)
-        patch.setattr(mismatch, "AMOUNTS", AMOUNTS)
-        patch.setattr(mismatch, "DURATION_S", 1.0)
-        runs = Runs()
-        report = mismatch.main(runs)
-        planned = mismatch.planned_runs()
-        scene = case_scene(Case("duct", "tone"), short["duct"])
-    cases.measured_data.cache_clear()
-    return report, runs.done, planned, scene
+    short = short_duct()
+    constants = {"ALGORITHMS": STUDIED, "AMOUNTS": AMOUNTS, "DURATION_S": 1.0}
+    with smaller(cases, N_TAPS=TAPS), smaller(mismatch, ducts=lambda: short, **constants):
+        return *run_study(mismatch), case_scene(Case("duct", "tone"), short["duct"])
 
 
 def test_planned_runs_are_those_taken(small: Any) -> None:
@@ -154,114 +141,88 @@ def test_fxlms_of_a_tone_decays_below_90_degrees_and_grows_past_it(phase_deg: fl
 
 # ---- Claims from rows made by hand
 
-
-def _row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **more: Any) -> MismatchRow:
-    values = {
-        "path": "duct",
-        "noise": "band noise",
-        "tuned_with": WRONG,
-        "setting": 0.1,
-        "noise_reduction_db": 6.0,
-        "power": 1.0,
-        "diverged_at_s": None,
-    }
-    return MismatchRow(kind=kind, amount=amount, algorithm=algorithm, **{**values, **more})
+FXLMS_BELOW_90, KF_ANC_BELOW_90, GAIN, BOUNDED, POWER = range(5)  # the claims
 
 
-@pytest.mark.parametrize(
-    ("below_db", "above_db", "met"),
-    [(0.01, -0.01, True), (-0.01, -0.5, False), (0.5, 0.01, False), (0.5, np.nan, True)],
-)
-def test_the_bound_of_90_degrees_needs_both_sides(below_db: float, above_db: float, met: bool) -> None:
-    rows = [
-        _row(amount=0.0),
-        _row(amount=89.0, noise_reduction_db=below_db),
-        _row(amount=90.0, noise_reduction_db=-3.0),  # on the bound: says nothing
-        _row(amount=91.0, noise_reduction_db=above_db, diverged_at_s=1.0 if np.isnan(above_db) else None),
-        _row(amount=105.0, noise_reduction_db=20.0, noise="tone"),  # another noise
-        _row(amount=105.0, noise_reduction_db=20.0, tuned_with=EXACT),  # another tuning
-    ]
-    claim = mismatch._quarter_turn(rows, "FxLMS")
-    assert claim.holds == met
-    # The least of those below, and the best of those above.
-    assert claim.measured.startswith(
-        f"{1 + (below_db > 0.0)} of 2 runs below reduce it, the least by {below_db:.1f} dB"
-    )
-    assert "phase +89 degrees" in claim.measured
-    best = "-inf" if np.isnan(above_db) else f"{above_db:.1f}"
-    assert f"{int(above_db > 0.0)} of 1 above, the best of which is {best} dB" in claim.measured
+def row(kind: str = "phase", amount: float = 0.0, algorithm: str = "FxLMS", **more: Any) -> MismatchRow:
+    where = {"path": "duct", "noise": "band noise", "tuned_with": WRONG}
+    figures = {"noise_reduction_db": 6.0, "power": 1.0}
+    return MismatchRow(kind=kind, amount=amount, algorithm=algorithm, **where | figures | more)  # type: ignore[arg-type]
 
 
-def test_the_best_above_90_degrees_is_told() -> None:
-    rows = [_row(amount=0.0), *(_row(amount=a, noise_reduction_db=-a) for a in (120.0, 100.0, 150.0))]
-    assert "0 of 3 above, the best of which is -100.0 dB" in mismatch._quarter_turn(rows, "FxLMS").measured
-
-
-@pytest.mark.parametrize(("left_db", "met"), [(5.1, True), (5.0, True), (4.9, False), (np.nan, False)])
-def test_the_loss_to_a_wrong_gain_is_against_the_exact_path(left_db: float, met: bool) -> None:
-    rows = [
-        _row("gain", amount, name, tuned_with=EXACT)
-        for name in ("KF-ANC", "KF-PB", "FxLMS", "MOV-FxLMS")
+GOOD = [
+    *(row(amount=amount, algorithm=name) for amount in (0.0, 80.0) for name in ("FxLMS", "KF-ANC")),
+    *(row(amount=150.0, algorithm=name, noise_reduction_db=-9.0) for name in ("FxLMS", "KF-ANC")),
+    *(
+        row("gain", amount, name, tuned_with=EXACT, power=1.2 if name == "KF-OPC" else 1.0)
         for amount in (0.0, 6.0)
-    ]
-    rows.append(
-        _row(
-            "gain",
-            12.0,
-            "KF-PB",
-            tuned_with=EXACT,
-            noise_reduction_db=left_db,
-            diverged_at_s=0.1 if np.isnan(left_db) else None,
-        )
-    )
-    claim = mismatch._gain(rows)
-    assert claim.holds == met
-    lost = "diverges" if np.isnan(left_db) else f"{6.0 - left_db:.1f} dB"
-    assert claim.measured == f"largest loss: KF-ANC 0.0 dB, KF-PB {lost}, FxLMS 0.0 dB, MOV-FxLMS 0.0 dB"
-    assert claim.text.startswith("A gain up to 12 dB off")
+        for name in ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV-FxLMS")
+    ),
+]
 
 
-def test_one_divergence_is_one_too_many() -> None:
-    rows = [_row(algorithm=name) for name in mismatch.KEEPS_POWER] + [_row(algorithm="FxLMS", tuned_with=EXACT)]
-    assert mismatch._bounded(rows).holds
-    loud = mismatch._bounded([*rows, _row(algorithm="KF-PB", noise_reduction_db=-3.5)])
-    assert loud.holds  # louder, but bounded
-    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in loud.measured
-    assert not mismatch._bounded([*rows, _row(algorithm="KF-PB", diverged_at_s=2.0)]).holds
-    others = mismatch._bounded([*rows, _row(algorithm="FxLMS", tuned_with=EXACT, diverged_at_s=2.0)])
-    assert others.holds
-    assert others.measured.endswith("Of the unconstrained algorithms tuned with the exact path 1 of 2 diverged")
+def claim(which: int, *rows: MismatchRow) -> Claim:
+    """Return a claim on rows that meet all of them, and on these."""
+    return mismatch.claims([*GOOD, *rows])[which]
+
+
+def gain_row(algorithm: str, **more: Any) -> MismatchRow:
+    return row("gain", 12.0, algorithm, tuned_with=EXACT, **more)
+
+
+LOST = {"noise_reduction_db": np.nan, "diverged_at_s": 1.0}
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs", "met"),
+    ("which", "changed", "met"),
     [
-        (1.0, 1.2, True),
-        (1.02, 1.2, True),
-        (1.021, 1.2, False),
-        (0.97, 1.2, True),
-        (0.969, 1.2, False),
-        (1.0, 1.0, False),
-        (1.0, 1.02, False),
-        (1.0, 1.021, True),
-        (1.0, 0.97, False),
-        (1.0, 0.969, True),
+        (FXLMS_BELOW_90, row(amount=89.0, noise_reduction_db=0.01), True),
+        (FXLMS_BELOW_90, row(amount=89.0, noise_reduction_db=-0.01), False),
+        (FXLMS_BELOW_90, row(amount=91.0, noise_reduction_db=-0.01), True),
+        (FXLMS_BELOW_90, row(amount=91.0, noise_reduction_db=0.01), False),
+        (FXLMS_BELOW_90, row(amount=91.0, **LOST), True),
+        (FXLMS_BELOW_90, row(amount=90.0, noise_reduction_db=-3.0), True),  # on the bound: says nothing
+        (FXLMS_BELOW_90, row(amount=105.0, noise_reduction_db=20.0, noise="tone"), True),  # another noise
+        (FXLMS_BELOW_90, row(amount=105.0, noise_reduction_db=20.0, tuned_with=EXACT), True),  # another tuning
+        (FXLMS_BELOW_90, row(amount=105.0, algorithm="KF-ANC"), True),
+        (KF_ANC_BELOW_90, row(amount=105.0, algorithm="KF-ANC"), False),
+        (GAIN, gain_row("KF-PB", noise_reduction_db=5.0), True),  # 1 dB less than with the exact path
+        (GAIN, gain_row("KF-PB", noise_reduction_db=4.9), False),
+        (GAIN, gain_row("FxLMS", noise_reduction_db=4.9), True),
+        (BOUNDED, row(algorithm="KF-PB", noise_reduction_db=-3.5), True),  # louder, but bounded
+        (BOUNDED, row(algorithm="KF-PB", diverged_at_s=2.0), False),
+        (BOUNDED, row(tuned_with=EXACT, diverged_at_s=2.0), True),
+        *((POWER, gain_row("KF-PB", power=own), met) for own, met in ((1.02, True), (1.021, False), (0.97, True))),
+        (POWER, gain_row("KF-PB", power=0.969), False),
     ],
 )
-def test_power_under_a_wrong_gain(ours: float, theirs: float, met: bool) -> None:
-    rows = [
-        _row("gain", 6.0, name, tuned_with=EXACT, power=power)
-        for name, power in (("KF-PB", ours), ("KF-OPC", theirs), ("MOV-FxLMS", 1.0))
-    ]
-    assert mismatch._power(rows).holds == met
+def test_claims_on_both_sides_of_each_threshold(which: int, changed: MismatchRow, met: bool) -> None:
+    assert claim(which, changed).holds == met
+
+
+@pytest.mark.parametrize(("power", "met"), [(1.0, False), (1.02, False), (1.021, True), (0.97, False), (0.969, True)])
+def test_kf_opc_is_claimed_to_miss_its_power_under_a_wrong_gain(power: float, met: bool) -> None:
+    rows = [replace(one, power=power) if one.algorithm == "KF-OPC" else one for one in GOOD]
+    assert mismatch.claims(rows)[POWER].holds == met
+
+
+def test_claims_tell_the_worst_and_the_best() -> None:
+    rows = [row(amount=89.0, noise_reduction_db=0.5), row(amount=100.0, noise_reduction_db=-2.0)]
+    told = claim(FXLMS_BELOW_90, *rows).measured
+    assert told.startswith("3 of 3 runs below reduce it, the least by 0.5 dB")
+    assert "phase +89 degrees" in told
+    assert "0 of 2 above, the best of which is -2.0 dB" in told
+    for changes, lost in (({"noise_reduction_db": 4.9}, "1.1 dB"), (LOST, "diverges")):
+        found = claim(GAIN, gain_row("KF-PB", **changes))
+        assert found.measured == f"largest loss: KF-ANC 0.0 dB, KF-PB {lost}, FxLMS 0.0 dB, MOV-FxLMS 0.0 dB"
+        assert found.text.startswith("A gain up to 12 dB off")
+    rows = [row(algorithm="KF-PB", noise_reduction_db=-3.5), row(tuned_with=EXACT, diverged_at_s=2.0)]
+    told = claim(BOUNDED, *rows).measured
+    assert "the loudest left 3.5 dB more than the noise (KF-PB, duct" in told
+    assert told.endswith("Of the unconstrained algorithms tuned with the exact path 1 of 5 diverged")
 
 
 def test_unstable_is_diverged_or_louder() -> None:
-    assert _row(noise_reduction_db=0.0).unstable
-    assert _row(noise_reduction_db=np.nan, diverged_at_s=0.5).unstable
-    assert not _row(noise_reduction_db=0.1).unstable
-
-
-def test_the_command_knows_the_study() -> None:
-    assert command.FURTHER["mismatch"] == (mismatch.main, mismatch.planned_runs)
-    assert "mismatch" not in command.STUDIES
+    assert row(noise_reduction_db=0.0).unstable
+    assert row(**LOST).unstable
+    assert not row(noise_reduction_db=0.1).unstable

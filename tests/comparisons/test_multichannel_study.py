@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.studies import few_settings, run_study, smaller
 
-from comparisons.__main__ import FURTHER
 from comparisons.studies import multichannel
 from comparisons.studies import multichannel_rooms as rooms
 from comparisons.studies.multichannel import BOUND, EQUAL, KF_PB, SCALED, ChannelRow, claims
 from comparisons.studies.multichannel_rooms import MEASURED, Place, level_map_db
 from kfopc_filterpy import noise_reduction_db, output_power, power_constrained_wiener, simulate
 from kfopc_filterpy.bench import Runs, StudyReport, algorithms, make_controller, write_report
-from kfopc_filterpy.bench import registry as registered
 
 KEPT = ("KF-PB", "FxLMS", "MOV-FxLMS", "clipping FxLMS", "leaky FxLMS")
 
@@ -28,27 +27,15 @@ def through(paths: np.ndarray, x: np.ndarray) -> np.ndarray:
 def small() -> Any:
     """The 2 x 2 room of 16 taps and two noises of two seconds, five algorithms and few settings."""
     pytest.importorskip("pyroomacoustics")
-    with pytest.MonkeyPatch.context() as patch:
-        room = rooms.built_in_room(2)
-        noises = {name: own for name, own in rooms._noises(rooms.FS, rooms.BAND_HZ).items() if name != "tones"}
-        place = Place("2 x 2", rooms.FS, 16, room.primary[..., :100], room.secondary[..., :60], noises)
-        patch.setattr(multichannel, "places", lambda: {"2 x 2": place})
-        patch.setattr(multichannel, "DURATION_S", 2.0)
-        patch.setattr(multichannel, "SHOWN", ("2 x 2", "band noise"))
-        patch.setattr(rooms, "MAP_SPACING_M", 1.0)
-        for name, own in list(registered.REGISTRY.items()):
-            kept = replace(
-                own, first=own.first[1:8:3] or own.first, second=own.second[1:8:3], several_channels=name in KEPT
-            )
-            patch.setitem(registered.REGISTRY, name, kept)
-        runs = Runs()
-        report = multichannel.main(runs)
-        rooms._paths_to_plane.cache_clear()
-        yield report, runs.done, multichannel.planned_runs(), place
-
-
-def test_study_is_a_further_one() -> None:
-    assert FURTHER["multichannel"] == (multichannel.main, multichannel.planned_runs)
+    room = rooms.built_in_room(2)
+    with smaller(rooms, SIZES=(2,)):
+        noises = rooms.places()["2 x 2"].noises
+        rooms.places.cache_clear()
+    chosen = {name: noises[name] for name in ("band noise", "compressor")}
+    place = Place("2 x 2", rooms.FS, 16, room.primary[..., :100], room.secondary[..., :60], chosen)
+    constants = {"places": lambda: {"2 x 2": place}, "DURATION_S": 2.0, "SHOWN": ("2 x 2", "band noise")}
+    with few_settings(several_channels=KEPT), smaller(multichannel, **constants), smaller(rooms, MAP_SPACING_M=1.0):
+        return *run_study(multichannel), place
 
 
 def test_report_has_every_algorithm_in_every_place(small: Any, tmp_path: Any) -> None:
@@ -118,9 +105,7 @@ def test_bound_is_that_of_the_steady_half(small: Any) -> None:
 def test_level_map_is_the_sound_at_its_points() -> None:
     """Against paths to one point of the plane, computed and convolved on their own."""
     pytest.importorskip("pyroomacoustics")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rooms, "MAP_SPACING_M", 1.0)
-        rooms._paths_to_plane.cache_clear()
+    with smaller(rooms, MAP_SPACING_M=1.0):  # as above: the paths to the plane are kept
         rng = np.random.default_rng(0)
         x = rng.standard_normal((1, int(rooms.FS) + 600))
         y = 0.3 * rng.standard_normal((2, x.shape[1]))
@@ -128,7 +113,6 @@ def test_level_map_is_the_sound_at_its_points() -> None:
         result: Any = type("Run", (), {"control_signal": y})
         before, (along, across) = level_map_db(2, x, None)
         after, _ = level_map_db(2, x, result)
-        rooms._paths_to_plane.cache_clear()
     point = room.at([[along[4], across[1], rooms.HEIGHT_M]])
     n = int(rooms.FS)
     quiet = through(point.primary, x[0])[0]
@@ -138,9 +122,9 @@ def test_level_map_is_the_sound_at_its_points() -> None:
     assert 10 * np.log10(np.mean(10 ** (before / 10))) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_without_rooms_the_study_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(multichannel, "places", dict)
-    report = multichannel.main(Runs())
+def test_without_rooms_the_study_says_so() -> None:
+    with smaller(multichannel, places=dict):
+        report = multichannel.main(Runs())
     assert isinstance(report, str)
     assert "pyroomacoustics" in report
 
@@ -180,11 +164,9 @@ def held(**changes: float) -> list[bool]:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({}, [True, True, True, True, True]),
         ({"power": 0.96}, [False, True, True, True, True]),
         ({"power": 0.97}, [True, True, True, True, True]),
         ({"power": 1.02}, [True, True, True, True, True]),
-        ({"power": 1.05}, [False, True, True, True, True]),
         ({"power": 1.03}, [False, True, True, True, True]),
         ({"power": 1.06}, [False, True, False, True, True]),
         ({"loss_db": 0.6}, [True, False, True, True, True]),

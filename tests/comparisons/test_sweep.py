@@ -468,13 +468,12 @@ def test_command_names_the_scenario_that_failed(module, capsys):
         (["--scheduler", "tcp://127.0.0.1:1"], "not allowed with argument"),
     ],
 )
-def test_command_refuses(tmp_path, monkeypatch, capsys, arguments, message):
-    monkeypatch.chdir(tmp_path)
+def test_command_refuses(inside, capsys, arguments, message):
     with pytest.raises(SystemExit) as refused:
         main(["sweep", "--jobs", "1", "--quiet", *arguments])
     assert refused.value.code == 2
     assert message in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())  # nothing was begun
+    assert not list(inside.iterdir())  # nothing was begun
 
 
 def test_sweep_is_named_first(capsys):

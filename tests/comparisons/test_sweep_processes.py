@@ -14,8 +14,10 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from helpers.studies import smaller
 
 from comparisons.__main__ import main
+from comparisons.sweep import jobs
 from comparisons.sweep.run import run_sweep
 from comparisons.sweep.scenario import ScenarioError
 
@@ -214,10 +216,9 @@ def test_command_sends_a_module_that_the_workers_lack(cluster, tmp_path, monkeyp
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "own_far_module.py").write_text("def far(scenario):\n    return {'sum': scenario['a'] + 1}\n")
-    monkeypatch.chdir(elsewhere)
     monkeypatch.syspath_prepend(str(elsewhere))
     arguments = ["--scenario", "own_far_module:far", "--axis", "a=1,2", "--seeds", "2", "--scheduler", address]
-    assert main(["sweep", *arguments, "--output", "out", "--quiet"]) == 0
+    assert main(["sweep", *arguments, "--output", str(tmp_path / "out"), "--quiet"]) == 0
     assert "4 runs, 0 of them diverged, 2 cells" in capsys.readouterr().out
 
 
@@ -231,13 +232,15 @@ def test_job_that_no_worker_survives_ends_the_sweep(own, cluster, tmp_path):
 
 
 @dask
-def test_scheduler_that_is_not_there_is_refused(monkeypatch, own, tmp_path):
-    monkeypatch.setattr("comparisons.sweep.jobs.CONNECT_S", 1.0)
-    with pytest.raises(OSError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9: "):
+def test_scheduler_that_is_not_there_is_refused(own, tmp_path):
+    with (
+        smaller(jobs, CONNECT_S=1.0),
+        pytest.raises(OSError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9: "),
+    ):
         run_sweep(GRID, tmp_path, scenario=own.slow, scheduler="tcp://127.0.0.1:9", quiet=True)
 
 
-def test_cluster_without_its_extra_is_refused(monkeypatch, own, tmp_path):
-    monkeypatch.setitem(sys.modules, "distributed", None)
+def test_cluster_without_its_extra_is_refused(uninstall, own, tmp_path):
+    uninstall("distributed")
     with pytest.raises(ModuleNotFoundError, match=r'a scheduler needs the extra cluster: .*"\.\[cluster\]"'):
         run_sweep(GRID, tmp_path, scenario=own.slow, scheduler="tcp://127.0.0.1:9", quiet=True)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.studies import run_study, short_duct, smaller
 
-from comparisons import __main__ as command
 from comparisons.studies import cases, tracking
 from comparisons.studies import tracking_events as events
 from comparisons.studies.tracking import TrackingRow
@@ -21,7 +21,7 @@ from comparisons.studies.tracking_events import (
     sweep_scene,
 )
 from kfopc_filterpy import convergence_time_s, noise_reduction_db, simulate
-from kfopc_filterpy.bench import Runs, StudyReport, make_controller
+from kfopc_filterpy.bench import StudyReport, make_controller
 from kfopc_filterpy.metrics import overshoot
 
 FS = 16000.0
@@ -32,26 +32,13 @@ STUDIED = ("KF-ANC", "KF-OPC", "KF-PB", "FxLMS", "MOV-FxLMS")
 @pytest.fixture(scope="module")
 def small() -> Any:
     """Few taps, one pair of paths cut short, a jump, a change and a sweep, two seeds, short runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KFOPC_DATA", "/no/such/folder")
-        cases.measured_data.cache_clear()
-        short = {"duct": tuple(path[:200] for path in cases.ducts()["duct"])}
-        patch.setattr(cases, "N_TAPS", TAPS)
-        patch.setattr(tracking, "ducts", lambda: short)
-        patch.setattr(tracking, "ALGORITHMS", STUDIED)
-        patch.setattr(events, "SEEDS", (1, 2))
-        patch.setattr(events, "JUMP_S", (0.4, 0.8))
-        patch.setattr(events, "JUMP_RUN_S", 1.6)
-        patch.setattr(events, "CHANGE_S", 0.5)
-        patch.setattr(events, "CHANGE_RUN_S", 1.2)
-        chosen = [event for event in events.all_events() if event.name in ("20 dB louder", "sign", "one sweep")]
-        patch.setattr(events, "all_events", lambda: chosen)
-        runs = Runs()
-        report = tracking.main(runs)
-        planned = tracking.planned_runs()
-        scenes = events.scenes_of(chosen[1], short["duct"])
-    cases.measured_data.cache_clear()
-    return report, runs.done, planned, scenes
+    short, names = short_duct(), ("20 dB louder", "sign", "one sweep")
+    times = {"SEEDS": (1, 2), "JUMP_S": (0.4, 0.8), "JUMP_RUN_S": 1.6, "CHANGE_S": 0.5, "CHANGE_RUN_S": 1.2}
+    own = {"ducts": lambda: short, "ALGORITHMS": STUDIED}
+    with smaller(cases, N_TAPS=TAPS), smaller(events, **times), smaller(tracking, **own):
+        chosen = [event for event in events.all_events() if event.name in names]
+        with smaller(events, all_events=lambda: chosen):
+            return *run_study(tracking), events.scenes_of(chosen[1], short["duct"])
 
 
 def test_planned_runs_are_those_taken(small: Any) -> None:
@@ -176,67 +163,54 @@ def test_an_algorithm_without_a_setting_is_lost() -> None:
 
 # ---- Claims from rows made by hand
 
-
-def _row(event: str, algorithm: str, **more: Any) -> TrackingRow:
-    values: dict[str, Any] = {
-        "path": "duct",
-        "noise": "band noise",
-        "setting": 0.1,
-        "mean_nse_db": -5.0,
-        "noise_reduction_db": 5.0,
-        "power": 1.0,
-        "worst_window": 1.0,
-        "settled_s": {"changed": 0.1},
-        "diverged_at_s": None,
-    }
-    return TrackingRow(event=event, algorithm=algorithm, **{**values, **more})
+MEAN_NSE, SOONER, JUMP, BACK = range(4)  # the claims
 
 
-@pytest.mark.parametrize(("nse", "met"), [(-5.01, True), (-5.0, False), (-4.99, False), (np.nan, False)])
-def test_mean_nse_is_compared_event_by_event(nse: float, met: bool) -> None:
-    rows = [_row("sign", "KF-ANC", mean_nse_db=-9.0), _row("sign", "FxLMS")]
-    rows += [_row("delay", "KF-ANC", mean_nse_db=nse), _row("delay", "FxLMS")]
-    claim = tracking._mean_nse(rows)
-    assert claim.holds == met
-    if np.isfinite(nse):
-        assert (
-            claim.measured
-            == f"by {(4.0 - 5.0 - nse) / 2:.1f} dB on average, by {-5.0 - nse:.2f} dB at least (delay, duct)"
-        )
+def row(event: str, algorithm: str, **more: Any) -> TrackingRow:
+    figures: dict[str, Any] = {"mean_nse_db": -5.0, "worst_window": 30.0, "settled_s": {"changed": 0.1}}
+    return TrackingRow(path="duct", noise="band noise", event=event, algorithm=algorithm, **figures | more)
 
 
-@pytest.mark.parametrize(("time", "met"), [(0.099, True), (0.1, False), (None, False)])
-def test_sooner_needs_every_change(time: float | None, met: bool) -> None:
-    rows = [_row("sign", "KF-ANC", settled_s={"changed": time}), _row("sign", "FxLMS")]
-    rows += [_row("sweeps", "KF-ANC", settled_s={}), _row("sweeps", "FxLMS", settled_s={})]
-    assert tracking._sooner(rows).holds == met
+def louder(algorithm: str, back_s: float | None, **more: Any) -> TrackingRow:
+    return row("20 dB louder", algorithm, settled_s={"louder": 0.0, "back": back_s}, **more)
 
 
-@pytest.mark.parametrize(("worst", "met"), [(10.01, True), (10.0, False), (9.99, False)])
-def test_a_jump_breaks_every_constraint(worst: float, met: bool) -> None:
-    rows = [_row("20 dB louder", name, worst_window=30.0) for name in tracking.CONSTRAINED[1:]]
-    rows.append(_row("20 dB louder", tracking.CONSTRAINED[0], worst_window=worst))
-    assert tracking._jump(rows).holds == met
+def compared(event: str, **of_kf_anc: Any) -> list[TrackingRow]:
+    """KF-ANC, and FxLMS with a mean NSE of -5 dB that settles in 0.1 s."""
+    return [row(event, "KF-ANC", **of_kf_anc), row(event, "FxLMS")]
+
+
+GOOD = [
+    louder("KF-ANC", 0.1, mean_nse_db=-9.0),
+    louder("KF-OPC", 1.2),
+    *(louder(name, 0.1) for name in ("KF-PB", "FxLMS", "MOV-FxLMS")),
+]
 
 
 @pytest.mark.parametrize(
-    ("opc", "pb", "anc", "met"),
+    ("which", "rows", "met"),
     [
-        (1.01, 0.19, 0.19, True),
-        (0.99, 0.1, 0.1, False),
-        (1.3, 0.21, 0.1, False),
-        (1.2, 0.1, 0.21, False),
-        (None, 0.1, 0.1, True),
-        (1.2, 0.1, None, False),
-        (1.2, None, 0.1, False),
+        (MEAN_NSE, compared("delay", mean_nse_db=-5.01), True),
+        (MEAN_NSE, compared("delay", mean_nse_db=-5.0), False),
+        (MEAN_NSE, compared("delay", mean_nse_db=np.nan), False),
+        (SOONER, compared("sign", settled_s={"changed": 0.099}), True),
+        (SOONER, compared("sign", settled_s={"changed": 0.1}), False),
+        (SOONER, compared("sign", settled_s={"changed": None}), False),
+        (SOONER, compared("sweeps", settled_s={}), True),  # no change
+        (JUMP, [louder("KF-OPC", 1.2, worst_window=10.01)], True),
+        (JUMP, [louder("KF-OPC", 1.2, worst_window=10.0)], False),
+        (BACK, [louder("KF-OPC", 1.01)], True),
+        (BACK, [louder("KF-OPC", 0.99)], False),
+        (BACK, [louder("KF-OPC", None)], True),
+        *((BACK, [louder(name, 0.19)], True) for name in ("KF-PB", "KF-ANC")),
+        *((BACK, [louder(name, 0.21)], False) for name in ("KF-PB", "KF-ANC")),
+        *((BACK, [louder(name, None)], False) for name in ("KF-PB", "KF-ANC")),
     ],
 )
-def test_back_after_a_loud_noise(opc: float | None, pb: float | None, anc: float | None, met: bool) -> None:
-    times = {"KF-OPC": opc, "KF-PB": pb, "KF-ANC": anc}
-    rows = [_row("20 dB louder", name, settled_s={"louder": 0.0, "back": time}) for name, time in times.items()]
-    assert tracking._back(rows).holds == met
+def test_claims_on_both_sides_of_each_threshold(which: int, rows: list[TrackingRow], met: bool) -> None:
+    assert tracking.claims([*GOOD, *rows])[which].holds == met
 
 
-def test_the_command_knows_the_study() -> None:
-    assert command.FURTHER["tracking"] == (tracking.main, tracking.planned_runs)
-    assert "tracking" not in command.STUDIES
+def test_the_mean_nse_is_told_on_average_and_at_least() -> None:
+    told = tracking.claims([*GOOD, *compared("delay", mean_nse_db=-5.5)])[MEAN_NSE].measured
+    assert told == "by 2.2 dB on average, by 0.50 dB at least (delay, duct)"

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.studies import Small, run_study, smaller
 
-from comparisons import __main__ as command
-from comparisons.studies import cases, uncertain_path
+from comparisons.studies import uncertain_path
 from comparisons.studies.uncertain_path import (
     DEFAULT,
     ERRORS,
@@ -23,39 +23,30 @@ from comparisons.studies.uncertain_path import (
     stated,
 )
 from kfopc_filterpy import SimulationResult, simulate
-from kfopc_filterpy.bench import Runs, StudyReport
 from kfopc_filterpy.paths import PathTolerance
+
+PRIMARY, SECONDARY = np.array([0.0] * 8 + [0.8, 0.4]), np.array([0.0, 0.0, 0.0, 1.0, -0.6])
 
 
 @pytest.fixture(scope="module")
-def small() -> Any:
+def small() -> Small:
     """Few taps, two seconds, one pair of short paths, two noises, no measured data."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("KFOPC_DATA", "/no/such/folder")
-        cases.measured_data.cache_clear()
-        short = {"duct": (np.array([0.0] * 8 + [0.8, 0.4]), np.array([0.0, 0.0, 0.0, 1.0, -0.6]))}
+    with smaller(uncertain_path, paths=lambda: {"duct": (PRIMARY, SECONDARY)}, N_TAPS=16, DURATION_S=2.0):
         noises = uncertain_path.study_noises()
         assert list(noises) == ["compressor", "band noise", "wide band", "white", "high tone"]
-        patch.setattr(uncertain_path, "study_noises", lambda: {name: noises[name] for name in ("band noise", "white")})
-        patch.setattr(uncertain_path, "paths", lambda: short)
-        patch.setattr(uncertain_path, "N_TAPS", 16)
-        patch.setattr(uncertain_path, "DURATION_S", 2.0)
-        runs = Runs()
-        report = uncertain_path.main(runs)
-        planned = uncertain_path.planned_runs()
-    cases.measured_data.cache_clear()
-    return report, runs.done, planned
+        with smaller(uncertain_path, study_noises=lambda: {name: noises[name] for name in ("band noise", "white")}):
+            return run_study(uncertain_path)
 
 
-def test_planned_runs_are_those_taken(small: Any) -> None:
+def test_planned_runs_are_those_taken(small: Small) -> None:
     _, done, planned = small
     assert (
         planned == done == 2 * (1 + 2 + 3 * (1 + len(ERRORS)))
     )  # setting, the exact path, the others with 3 allowances
 
 
-def test_the_report_is_complete(small: Any) -> None:
-    report: StudyReport = small[0]
+def test_the_report_is_complete(small: Small) -> None:
+    report = small.report
     assert (report.name, report.claims_heading, len(report.claims)) == ("uncertain-path", "Findings", 5)
     assert [item.stem for item in report.figures] == ["worst-seconds"]
     assert report.notes[0] == "The measured duct was not at hand (KFOPC_DATA): it is left out."
@@ -69,9 +60,9 @@ def test_the_report_is_complete(small: Any) -> None:
         assert line[3:] == [own[NOTHING], own[DEFAULT], own[STATED]]
 
 
-def test_the_default_costs_little_and_the_rated_power_is_kept(small: Any) -> None:
+def test_the_default_costs_little_and_the_rated_power_is_kept(small: Small) -> None:
     rows = [
-        AllowanceRow(**row) for row in small[0].extra["rows"] if row["error"] == "exact" and row["noise"] == "white"
+        AllowanceRow(**row) for row in small.report.extra["rows"] if row["error"] == "exact" and row["noise"] == "white"
     ]
     bare, allowing = rows
     assert (bare.allowance, allowing.allowance) == (NOTHING, DEFAULT)
@@ -81,9 +72,8 @@ def test_the_default_costs_little_and_the_rated_power_is_kept(small: Any) -> Non
 
 
 def test_the_identified_path_is_near_the_true_one_and_within_its_uncertainty() -> None:
-    primary, secondary = np.array([0.0] * 8 + [0.8, 0.4]), np.array([0.0, 0.0, 0.0, 1.0, -0.6])
-    taps, uncertainty = uncertain_path.known_paths((primary, secondary))[IDENTIFIED]
-    true, found = np.fft.rfft([secondary, taps], 512)
+    taps, uncertainty = uncertain_path.known_paths((PRIMARY, SECONDARY))[IDENTIFIED]
+    true, found = np.fft.rfft([SECONDARY, taps], 512)
     assert 0.0 < np.max(np.abs(true / found - 1)) < 0.02
     assert np.all(np.abs(true / found - 1) < uncertainty)
 
@@ -167,7 +157,3 @@ def test_all_findings_hold_on_good_rows() -> None:
 )
 def test_each_finding_fails_alone(at: int, figures: dict[str, Any], finding: int) -> None:
     assert [n for n, claim in enumerate(claims(changed(at, **figures))) if not claim.holds] == [finding]
-
-
-def test_the_command_knows_the_study() -> None:
-    assert command.FURTHER["uncertain_path"] == (uncertain_path.main, uncertain_path.planned_runs)

@@ -1,0 +1,63 @@
+"""Studies beyond the paper on a small scale, away from the measured data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import pytest
+
+from comparisons.studies import cases, kf_pb
+from kfopc_filterpy.bench import Runs, StudyReport
+from kfopc_filterpy.bench.registry import REGISTRY
+
+
+class Small(NamedTuple):
+    """What a small study gave: its report, the runs that it took, and those that it had planned."""
+
+    report: StudyReport
+    done: int
+    planned: int
+
+
+@contextmanager
+def smaller(*studies: Any, **constants: Any) -> Iterator[None]:
+    """Give studies other constants, and take the measured data away, for a while."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("KFOPC_DATA", "/no/such/folder")
+        for study in studies:
+            for name, value in constants.items():
+                patch.setattr(study, name, value)
+        _forget_data()
+        yield
+    _forget_data()
+
+
+@contextmanager
+def few_settings(several_channels: Any = None) -> Iterator[None]:
+    """Leave three of each algorithm's settings; only the named algorithms run with several channels, if any are named."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, own in REGISTRY.items():
+            few = replace(own, first=own.first[1:8:3] or own.first, second=own.second[1:8:3])
+            if several_channels is not None:
+                few = replace(few, several_channels=name in several_channels)
+            patch.setitem(REGISTRY, name, few)
+        yield
+
+
+def run_study(study: Any) -> Small:
+    """Run a study as it is now."""
+    runs = Runs()
+    return Small(study.main(runs), runs.done, study.planned_runs())
+
+
+def short_duct() -> dict[str, cases.Pair]:
+    """Return the paths of the modelled duct, cut short."""
+    return {"duct": tuple(path[:200] for path in cases.modelled_paths()["duct"])}
+
+
+def _forget_data() -> None:
+    cases.measured_data.cache_clear()
+    kf_pb.recordings.cache_clear()
