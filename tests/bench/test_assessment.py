@@ -40,12 +40,22 @@ def heard(primary: np.ndarray, other_db: float) -> np.ndarray:
     return np.convolve(x, primary)[: x.size] + 10 ** (-other_db / 20) * noise(2)
 
 
+SECONDARY = arriving(6, length=16)
+
+
+def on(x=None, primary=None, secondary=SECONDARY, **options):
+    """The verdict on KF-PB alone, by default on a scene in which nothing is wrong."""
+    options = {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None} | options
+    if primary is None and "disturbance" not in options:
+        primary = arriving(20)
+    return assess(noise() if x is None else x, primary, secondary, **options)
+
+
 @functools.cache
 def verdict_on(case: str, better: bool):
     """The verdict on a scene with one fault, or without it."""
-    primary, secondary = arriving(20), arriving(6, length=16)
-    options: dict = {"rating": PLENTY, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
-    x = noise()
+    primary, secondary, x = arriving(20), SECONDARY, noise()
+    options: dict = {}
     if case == "coherence":
         options["disturbance"] = heard(primary, 15.0 if better else 2.0)
     if case == "causality":
@@ -59,7 +69,7 @@ def verdict_on(case: str, better: bool):
     if case == "adaptation":
         options |= {"disturbance": heard(primary, 12.0), "want_db": 10.0}
         options |= {"algorithm": "KF-OPC", "memory_s": 0.25 if better else 0.003}
-    return assess(x, primary, secondary, fs=FS, **options)
+    return on(x, primary, secondary, **options)
 
 
 @pytest.mark.parametrize("case", CAUSES)
@@ -90,13 +100,10 @@ def test_without_the_fault_the_same_scene_is_enough(case):
 
 def test_the_cause_is_the_amplifier_if_its_peaks_are_what_is_missing():
     """Noise within the mean power has peaks beyond a sine's: a fixed filter would do, the run does not, with more it does."""
-    x, primary, secondary = noise(), arriving(20), arriving(6, length=16)
-    options: dict = {"n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None, "want_db": 14.0, "fs": FS}
-    small = assess(x, primary, secondary, rating=AmplifierRating(ohm=1.0, sine_watt=0.75), **options)
+    small = on(rating=AmplifierRating(ohm=1.0, sine_watt=0.75), want_db=14.0)
     assert small.ceilings.power_db >= 14.0
     assert small.limited_by == "amplifier"
-    large = assess(x, primary, secondary, rating=AmplifierRating(ohm=1.0, sine_watt=8.0), **options)
-    assert large.enough
+    assert on(rating=AmplifierRating(ohm=1.0, sine_watt=8.0), want_db=14.0).enough
 
 
 def test_a_filter_that_ends_before_the_noise_arrives_is_advised_how_long_it_must_be():
@@ -124,27 +131,14 @@ def test_nothing_is_reported_as_minus_zero():
 
 
 def test_without_a_primary_path_a_short_filter_is_advised_to_be_longer():
-    x, primary = noise(), arriving(12, 30)
-    verdict = assess(
-        x,
-        None,
-        arriving(6, length=16),
-        disturbance=np.convolve(x, primary)[: x.size],
-        rating=PLENTY,
-        fs=FS,
-        n_taps=8,
-        beside=(),
-        secondary_path_uncertainty=None,
-    )
+    verdict = on(disturbance=np.convolve(noise(), arriving(12, 30))[: noise().size], n_taps=8)
     assert verdict.limited_by == "filter"
     assert verdict.response_s is None
     assert verdict.advice[0].startswith("Try a filter longer than 8 taps: 8 taps last 1 ms at 8000 Hz, more at a lower")
 
 
 def test_a_comparison_times_convergence_by_the_window_of_a_verdict_and_of_the_figure():
-    report = compare_recordings(
-        noise(), arriving(20), arriving(6, length=16), rating=PLENTY, fs=FS, names=["FxLMS"], n_taps=16
-    )
+    report = compare_recordings(noise(), arriving(20), SECONDARY, rating=PLENTY, fs=FS, names=["FxLMS"], n_taps=16)
     disturbance, error = (sound.signal for sound in report.sounds)
     time, of_5_ms = (convergence_time_s(error, disturbance, FS, window_s=window_s) for window_s in (0.1, 0.005))
     assert report.algorithms["FxLMS"]["convergence_time_s"] == time
@@ -155,9 +149,7 @@ def test_a_comparison_times_convergence_by_the_window_of_a_verdict_and_of_the_fi
 def test_a_tone_is_predicted_so_that_a_late_loudspeaker_does_not_limit():
     t = np.arange(round(SECONDS * FS)) / FS
     x = np.sin(2 * np.pi * 300 * t) + 0.01 * np.random.default_rng(0).standard_normal(t.size)
-    verdict = assess(
-        x, arriving(2), arriving(12, length=16), rating=PLENTY, fs=FS, n_taps=TAPS, beside=(), want_db=15.0
-    )
+    verdict = on(x, arriving(2), arriving(12, length=16), want_db=15.0)
     assert verdict.causality_margin_s < 0
     assert verdict.enough
 
@@ -188,8 +180,8 @@ class Bar:
 
 
 def test_the_bar_moves_while_fxlms_is_tuned_and_ends_at_its_total():
-    bar, options = Bar(), {"rating": PLENTY, "fs": FS, "n_taps": TAPS, "want_db": 0.0}
-    assess(noise(), arriving(20), arriving(6, length=16), algorithm="FxLMS", beside=("KF-PB",), bar=bar, **options)
+    bar = Bar()
+    on(algorithm="FxLMS", beside=("KF-PB",), bar=bar, want_db=0.0)
     after_switch_on = round(0.9 * SECONDS * FS)
     grid = len(algorithms()["FxLMS"].grid)
     assert bar.total == sum(bar.moved) == (2 + grid) * after_switch_on
@@ -203,26 +195,13 @@ def test_the_required_power_is_that_of_the_bound_and_the_estimate_is_not_below()
     assert verdict.unlimited_power == pytest.approx(1.0, rel=0.03)  # the record's own second half
     assert verdict.required_rated_power / verdict.unlimited_power == pytest.approx(wanted**2, rel=0.02)
     assert verdict.expected_rated_power >= verdict.required_rated_power
-    enough = assess(
-        noise(),
-        arriving(20),
-        arriving(6, length=16),
-        rating=1.1 * verdict.expected_rated_power,
-        fs=FS,
-        n_taps=TAPS,
-        beside=(),
-        secondary_path_uncertainty=None,
-    )
-    assert enough.enough
+    assert on(rating=1.1 * verdict.expected_rated_power).enough
 
 
 @pytest.mark.parametrize("rating", [PLENTY, AmplifierRating(ohm=1.0, sine_watt=PLENTY)], ids=["power", "amplifier"])
 def test_the_estimate_does_not_grow_with_a_rating_that_the_run_does_not_use(rating):
     more = 10 * PLENTY if rating is PLENTY else AmplifierRating(ohm=1.0, sine_watt=10 * PLENTY)
-    options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
-    large, larger = (
-        assess(noise(), arriving(20), arriving(6, length=16), rating=one, **options) for one in (rating, more)
-    )
+    large, larger = on(rating=rating), on(rating=more)
     assert large.expected_rated_power == pytest.approx(larger.expected_rated_power, rel=0.05)
     assert large.required_rated_power <= large.expected_rated_power < 10 * large.unlimited_power
 
@@ -230,38 +209,26 @@ def test_the_estimate_does_not_grow_with_a_rating_that_the_run_does_not_use(rati
 def test_the_advice_on_causality_is_a_delay_that_helps():
     verdict = verdict_on("causality", better=False)
     more = round(verdict.helpful_delay_s * FS)
-    helped = assess(
-        noise(high=3500.0),
-        arriving(2 + more),
-        arriving(12, length=16),
-        rating=PLENTY,
-        fs=FS,
-        n_taps=TAPS,
-        beside=(),
-        secondary_path_uncertainty=None,
-    )
+    helped = on(noise(high=3500.0), arriving(2 + more), arriving(12, length=16))
     assert helped.ceilings.filter_db >= verdict.want_db
     assert verdict.causality_margin_s == pytest.approx(-10 / FS)
 
 
 def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
-    x, primary, secondary = noise(), arriving(20), arriving(6, length=16)
     curve = (np.array([100.0, 300.0, 1500.0]), np.array([2.0, 1.0, 0.05]))
 
-    def on(x_max: float):
+    def with_excursion(x_max: float):
         loudspeaker = LoudspeakerRating(8.0, x_max_mm=x_max, displacement_mm_per_volt=curve)
-        rating = [AmplifierRating(ohm=8.0, sine_watt=0.1), loudspeaker]
-        options: dict = {"fs": FS, "n_taps": TAPS, "beside": (), "secondary_path_uncertainty": None}
-        return assess(x, primary, secondary, rating=rating, **options), loudspeaker
+        return on(rating=[AmplifierRating(ohm=8.0, sine_watt=0.1), loudspeaker]), loudspeaker
 
-    verdict, loudspeaker = on(0.5)
+    verdict, loudspeaker = with_excursion(0.5)
     assert verdict.limits.decided_by == "loudspeaker's excursion"
     assert verdict.limits.rated_power < 0.8
     y = verdict.runs["KF-PB"].control_signal
     moved = loudspeaker.displacement_mm(y[y.size // 2 :], FS)
     assert np.sqrt(np.mean(moved**2)) <= 0.5 / 2.0 * 1.02
     assert verdict.excursion_mm > 0
-    free, _ = on(50.0)
+    free, _ = with_excursion(50.0)
     assert free.limits.decided_by == "amplifier"
     assert free.limits.rated_power == pytest.approx(0.8)
 
@@ -272,15 +239,8 @@ def test_an_excursion_limit_lowers_the_rated_power_until_it_is_kept():
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("verdict") / "out"
-    verdict = assess(
-        noise(),
-        arriving(20),
-        arriving(6, length=16),
-        rating=AmplifierRating(ohm=8.0, sine_watt=2.0, volts_per_unit=10.0),
-        fs=FS,
-        n_taps=TAPS,
-        pascal_per_unit=1.0,
-    )
+    rating = AmplifierRating(ohm=8.0, sine_watt=2.0, volts_per_unit=10.0)
+    verdict = assess(noise(), arriving(20), SECONDARY, rating=rating, fs=FS, n_taps=TAPS, pascal_per_unit=1.0)
     return verdict, verdict.write(folder)
 
 
@@ -364,9 +324,6 @@ def test_the_levels_are_those_of_the_sounds(written):
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
 def test_bad_input_is_refused(change, message):
-    good = {"noise": noise()[:8000], "primary": arriving(20), "secondary": arriving(6, length=16), "rating": 1.0}
-    options = good | change
+    good = {"noise": noise()[:8000], "primary": arriving(20), "secondary": SECONDARY, "rating": 1.0, "n_taps": 16}
     with pytest.raises(ValueError, match=re.escape(message)):
-        assess(
-            options.pop("noise"), options.pop("primary"), options.pop("secondary"), fs=FS, **{"n_taps": 16, **options}
-        )
+        assess(fs=FS, **good | change)

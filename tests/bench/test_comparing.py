@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kfopc_filterpy.bench import compare_recordings
-from kfopc_filterpy.bench.comparing import _clipping, _edge
+from kfopc_filterpy.bench.comparing import _edge
 from kfopc_filterpy.power import AmplifierRating
 from kfopc_filterpy.signals import tone
 
@@ -36,9 +36,16 @@ def test_figures_say_when_the_control_is_switched_on(compared):
 
 def test_the_summary_says_whether_the_amplifier_clips(compared):
     assert compared.summary.endswith(f"The amplifier clips beyond ±{np.sqrt(2 * 10 * 8) / 4:.3g}.")
-    assert _clipping(None) == " The amplifier does not clip."
-    assert _clipping((None, None)) == " The amplifiers do not clip."
-    assert _clipping((None, 1.5)) == " The amplifiers clip beyond: never, ±1.5."
+
+    def summary(primary, secondary, rating):
+        options = {"rating": rating, "fs": FS, "names": ["FxLMS"], "n_taps": 8}
+        return compare_recordings(tone(400.0, 1.0, fs=FS), primary, secondary, **options).summary
+
+    assert " The amplifier does not clip." in summary(np.eye(32)[20], [0, 1.0], 1.0)
+    several = np.eye(32)[[20, 22]][:, np.newaxis], np.eye(2)[..., np.newaxis] * [0, 1.0]
+    assert " The amplifiers do not clip." in summary(*several, 1.0)
+    clips = AmplifierRating(8.0, sine_watt=9.0, volts_per_unit=8.0)  # beyond 12 V
+    assert " The amplifiers clip beyond: never, ±1.5." in summary(*several, [1.0, clips])
 
 
 def test_a_setting_at_the_edge_comes_with_advice():

@@ -35,21 +35,6 @@ FS = 16000
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_driven_by_hand_it_is_the_run(name):
-    made, driven = MAKERS[name](), MAKERS[name]()
-    assert isinstance(driven, Controller)
-    result = simulate(made, X, disturbance=D, secondary_path=S)
-    played = []
-    for n, (x, d) in enumerate(zip(X, D, strict=True)):
-        played.append(driven.control_signal(x))
-        error = d - sum(S[k] * played[n - k] for k in range(min(3, n + 1)))
-        driven.update(error)
-    # two orders of the sum over three taps, in a loop that contracts
-    np.testing.assert_allclose(played, result.control_signal, rtol=0, atol=1e-12)
-    assert driven.constraint_factor == pytest.approx(result.constraint_factor[-1], abs=1e-12)
-
-
-@pytest.mark.parametrize("name", MAKERS)
 def test_a_controller_goes_on_from_its_state(name):
     """The controller keeps all it has; the true paths start silent. With nothing in them, two parts are the whole."""
     memoryless = [0.9]
@@ -120,6 +105,7 @@ def test_the_estimator_may_keep_a_flat_state():
 
 def test_names_and_rated_powers():
     assert [MAKERS[name]().name for name in MAKERS] == list(MAKERS)
+    assert all(isinstance(make(), Controller) for make in MAKERS.values())
     assert [make().rated_power for make in MAKERS.values()] == [None, 0.2, None, 0.2]
     assert KalmanController(KalmanFilter(dim_x=2, dim_z=1), S).name == "KF-ANC"
     assert KalmanController(KFOPC(2, rated_power=1.0), S).name == "KF-OPC"

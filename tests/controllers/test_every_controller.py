@@ -12,11 +12,11 @@ import pytest
 from helpers.channels import random_paths
 from helpers.checkpoints import Room
 from helpers.comparing import assert_same_run, numbers_of
-from helpers.controllers import ALL, KALMAN, MAKERS, PATHS, SEVERAL, VARIANTS, I, J, K, made
-from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, S_HAT, noises, run
+from helpers.controllers import ALL, MAKERS, PATHS, SEVERAL, VARIANTS, I, J, K, made
+from helpers.loop import AMPLIFIERS, FEEDBACK, FS, N_TAPS, noises, run
 
 import kfopc_filterpy
-from kfopc_filterpy import HardClipAmplifier, OutputLimiter, kf_opc, simulate
+from kfopc_filterpy import HardClipAmplifier, simulate
 
 
 @pytest.mark.parametrize(("name", "variant"), VARIANTS)
@@ -102,14 +102,6 @@ def test_repr_names_the_algorithm_and_its_settings(name: str) -> None:
     expected = f"<{controller.name}: {N_TAPS} taps{rated}, constraint factor {controller.constraint_factor:.3g}"
     assert repr(controller) == f"{expected}>"
     assert repr(limited).endswith(", limiter of rated power 0.05>")
-
-
-def test_repr_of_kf_opc() -> None:
-    controller = kf_opc(128, S_HAT, rated_power=1.0, **KALMAN)
-    controller.constraint.factor = 0.70711
-    assert repr(controller) == "<KF-OPC: 128 taps, rated power 1, constraint factor 0.707>"
-    controller.limiter = OutputLimiter(2.5)
-    assert repr(controller) == "<KF-OPC: 128 taps, rated power 1, constraint factor 0.707, limiter of rated power 2.5>"
 
 
 def test_no_controller_is_left_out() -> None:

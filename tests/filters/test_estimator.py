@@ -369,7 +369,8 @@ def faults_of_updates() -> dict[str, Fault]:
     for method in UPDATES:
         for name, z in bad_z.items():
             if (method, name) not in (("update_sequential", "two"), ("update", "masked")):  # the latter is missing
-                found[f"{method}: z {name}"] = lambda f, m=method, z=z: correct(f, m, z, reference=1.0), r"\bz\b"
+                match = "z must be real, got complex numbers" if "complex" in name else r"\bz\b"
+                found[f"{method}: z {name}"] = lambda f, m=method, z=z: correct(f, m, z, reference=1.0), match
         for name, x in {"NaN": NAN, "Inf": -INF, "two": [1.0, 2.0], "text": "x"}.items():
             found[f"{method}: reference {name}"] = lambda f, m=method, x=x: correct(f, m, 1.0, reference=x), "reference"
     suffixes = {"update": "", "update_correlated": "", "update_sequential": "_i"}

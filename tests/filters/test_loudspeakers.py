@@ -96,17 +96,6 @@ def test_one_rated_power_for_several_measurements_is_one_loudspeaker() -> None:
     assert listed.rated_power.tolist() == [0.5]
 
 
-def test_a_list_of_one_rated_power_is_the_single_channel_bit_for_bit() -> None:
-    rng = np.random.default_rng(2)
-    one, listed = KFOPC(4, rated_power=0.2), KFOPC(4, rated_power=[0.2])
-    for row in rng.standard_normal((50, 4)):
-        for kf in (one, listed):
-            kf.predict()
-            kf.update(3.0 * row[1] + row[0], H=row, reference=row[2])
-    np.testing.assert_array_equal(one.x, listed.x)
-    assert one.constraint_factor == listed.constraint_factor < 1.0
-
-
 def test_a_loudspeaker_that_no_microphone_hears_is_left_out() -> None:
     z, rows, x = signals()
     unplugged = rows.reshape(-1, K, J, I, L).copy()

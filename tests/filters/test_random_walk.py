@@ -11,6 +11,7 @@ import copy
 import pickle
 from collections.abc import Callable
 from typing import Any
+from unittest.mock import patch
 
 import mpmath
 import numpy as np
@@ -280,17 +281,6 @@ def test_any_sequence_of_steps(names: list[str], n: int, seed: int) -> None:
     require_close(kf, ours)
 
 
-def test_two_measurements_in_a_row_read_late() -> None:
-    """P_prior stays that of the prediction, though the triangle is that of the second update."""
-    rng = np.random.default_rng(0)
-    kf, ours = filters = pair(4)
-    fast_step(filters, rng, 4)
-    for _ in range(3):
-        h, z = rng.normal(size=(1, 4)), rng.normal(size=(1, 1))
-        both(filters, lambda f, h=h, z=z: f.update(z, H=h))
-    require_close(kf, ours)
-
-
 # P, F, Q, R as a user meets them.
 
 
@@ -361,6 +351,10 @@ WRITES: dict[str, Callable[[np.ndarray], Any]] = {
     "fill_diagonal": lambda a: np.fill_diagonal(a, 3.0),
     "copyto": lambda a: np.copyto(a, 3.0),
     "a view of it": lambda a: a.T[0].__setitem__(0, 3.0),
+    "sort": lambda a: a.sort(),
+    "partition": lambda a: a.partition(0),
+    "put": lambda a: a.put(0, 2.0),
+    "flat": lambda a: a.flat.__setitem__(0, 2.0),
 }
 
 
@@ -461,45 +455,20 @@ def test_batch_filter_stays_fast_and_saves() -> None:
     n, steps, rng = 4, 50, np.random.default_rng(6)
     rows, zs = rng.normal(size=(steps, n)), [*rng.normal(size=steps - 1).tolist(), None]
     kf, ours = pair(n)
-    savers = Saver(ours), []
-    delegated: list[str] = []
-    original = type(ours)._all_or_nothing
-    try:
-        type(ours)._all_or_nothing = lambda self, step, *arguments: (
-            delegated.append(step.__name__),
-            original(self, step, *arguments),
-        )[1]
-        got = ours.batch_filter(zs, Hs=list(rows), saver=savers[0])
-    finally:
-        type(ours)._all_or_nothing = original
-    assert not delegated
+    saver = Saver(ours)
+    with patch.object(KalmanFilter, "predict"), patch.object(KalmanFilter, "update"):  # filterpy's would do nothing
+        got = ours.batch_filter(zs, Hs=list(rows), saver=saver)
     expected = kf.batch_filter(zs, Hs=[row.reshape(1, n) for row in rows])
     for a, b in zip(expected, got, strict=True):
         np.testing.assert_allclose(b, a, rtol=CLOSE, atol=CLOSE)
-    savers[0].to_array()
-    np.testing.assert_array_equal(savers[0].x, got[0])
-    np.testing.assert_array_equal(savers[0].P, got[1])
-    np.testing.assert_allclose(savers[0].P_prior, got[3], rtol=1e-13, atol=1e-14)  # another order of sums
-    assert savers[0].K.shape == (steps, n, 1)
+    saver.to_array()
+    np.testing.assert_array_equal(saver.x, got[0])
+    np.testing.assert_array_equal(saver.P, got[1])
+    np.testing.assert_allclose(saver.P_prior, got[3], rtol=1e-13, atol=1e-14)  # another order of sums
+    assert saver.K.shape == (steps, n, 1)
     smoothed = ours.rts_smoother(got[0], got[1]), kf.rts_smoother(*expected[:2])
     for a, b in zip(*smoothed, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-10)
-
-
-def test_a_saver_keeps_P_as_it_was_when_saved() -> None:
-    _, ours = pair(3)
-    saver = Saver(ours)
-    ours.predict()
-    ours.update(1.0, H=np.ones(3))
-    saver.save()
-    saved = saver.P[0].copy()
-    ours.P *= 10
-    saver.save()
-    ours.P[0, 0] = 99.0
-    saver.to_array()
-    np.testing.assert_array_equal(saver.P[0], saved)
-    np.testing.assert_array_equal(saver.P[1], 10 * saved)
-    assert ours.P[0, 0] == 99.0
 
 
 @pytest.mark.parametrize("cause", ["NaN", "silent", "square overflows", "S overflows", "no covariance"])
@@ -669,25 +638,6 @@ def test_weights_that_are_no_weights_are_refused_by_both_steps(x: list[float]) -
     with pytest.raises(ValueError, match="x must have 3 finite values"):
         kf.update(1.0, H=np.ones(3))
     assert np.array_equal(kf.P, P)
-
-
-@pytest.mark.parametrize("name", ["F", "Q", "R"])
-@pytest.mark.parametrize(
-    "write",
-    [
-        lambda a: a.sort(),
-        lambda a: a.partition(0),
-        lambda a: a.put(0, 2.0),
-        lambda a: a.flat.__setitem__(0, 2.0),
-    ],
-)
-def test_writes_through_methods_are_refused_too(name: str, write: Callable[[Any], Any]) -> None:
-    kf = KFOPC.random_walk(3, state_noise=0.5, measurement_noise=2.0)
-    before = np.array(getattr(kf, name))
-    with pytest.raises(ValueError, match="read-only"):
-        write(getattr(kf, name))
-    assert np.array_equal(getattr(kf, name), before)
-    assert list(getattr(kf, name).flat) == before.ravel().tolist()
 
 
 def test_an_inverse_of_ones_own_is_used() -> None:

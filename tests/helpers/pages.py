@@ -34,12 +34,12 @@ class Page:
     """
 
     def __init__(self, stem: str, without: str | None = None) -> None:
-        self.stem, self._variables = stem, {"__name__": "__main__"}
+        self.stem, self.variables = stem, {"__name__": "__main__"}
         text = (TUTORIALS / f"{stem}.md").read_text(encoding="utf-8")
         parts = list(_PART.finditer(text))
         assert sum(part["code"] is not None for part in parts) == text.count("```{code-cell}")  # none was overlooked
-        self._left = [part for part in parts if without is None or f"[{without}]" not in (part["options"] or "")]
-        assert without is None or len(self._left) < len(parts), f"{stem}.md has no cell tagged {without}"
+        self.left = [part for part in parts if without is None or f"[{without}]" not in (part["options"] or "")]
+        assert without is None or len(self.left) < len(parts), f"{stem}.md has no cell tagged {without}"
 
     def skip(self, to: str) -> None:
         """Leave out the cells before the heading `to`."""
@@ -48,15 +48,15 @@ class Page:
 
     def run(self, until: str | None = None) -> Any:
         """Run the cells before the heading `until`, by default all that are left; return the variables."""
-        while self._left and not (until and self._left[0]["heading"] == until):
-            part = self._left.pop(0)
+        while self.left and not (until and self.left[0]["heading"] == until):
+            part = self.left.pop(0)
             if part["code"] is not None and _SHELL.match(part["code"]):
                 _run_in_shell(_SHELL.sub("", part["code"]))
             elif part["code"] is not None:
-                exec(compile(part["code"], f"{self.stem}.md", "exec"), self._variables)
+                exec(compile(part["code"], f"{self.stem}.md", "exec"), self.variables)
                 plt.close("all")  # as a notebook does
-        assert self._left or until is None, f"{self.stem}.md has no heading {until!r} there"
-        return SimpleNamespace(**{name: value for name, value in self._variables.items() if not name.startswith("__")})
+        assert self.left or until is None, f"{self.stem}.md has no heading {until!r} there"
+        return SimpleNamespace(**{name: value for name, value in self.variables.items() if not name.startswith("__")})
 
 
 def table_of(text: str, heading: str) -> list[list[str]]:
