@@ -99,10 +99,3 @@ def test_a_step_that_would_be_too_large_is_left_out() -> None:
 def test_bad_variances_are_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):
         DiagonalKalman(L, PATH, **(NOISES | {name: value}))
-
-
-def test_a_bad_rated_power_is_refused() -> None:
-    with pytest.raises(ValueError, match="rated_power"):
-        DiagonalKalman(L, PATH, rated_power=0.0, **NOISES)
-    with pytest.raises(ValueError, match="give either rated_power= or constraint="):
-        DiagonalKalman(L, PATH, rated_power=1.0, constraint=OutputPowerConstraint(1.0), **NOISES)

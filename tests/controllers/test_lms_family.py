@@ -15,7 +15,6 @@ from kfopc_filterpy import (
     ClippingFxLMS,
     FxLMS,
     FxNLMS,
-    HardClipAmplifier,
     LeakyFxLMS,
     MOVFxLMS,
     OptimalLeakyFxLMS,
@@ -266,21 +265,3 @@ def test_settings_can_be_read() -> None:
     two = TwoGradientFxLMS(L, ESTIMATE, step_size=0.1, amplitude_limit=2.0)
     assert (two.step_size, two.output_step_size, two.amplitude_limit) == (0.1, 0.1, 2.0)
     assert MOVFxLMS(L, ESTIMATE, step_size=0.1, rated_power=1.0, modified=True).modified
-
-
-def test_a_known_amplifier_is_in_the_estimate_of_those_that_have_one() -> None:
-    """d^ = e + s^ * amplifier(y): with path and amplifier known exactly it is the disturbance itself."""
-    x, d = noise()
-    amplifier = HardClipAmplifier(0.2)
-    for kind in (MOVFxLMS, OptimalLeakyFxLMS):
-        long = OutputPowerConstraint(0.1, fs=1000, memory_s=1e3)
-        controller = kind(L, PATH, step_size=MU, constraint=long, amplifier=amplifier)
-        result = simulate(
-            controller, x, disturbance=d, secondary_path=PATH, amplifier=amplifier, fs=1000, record_powers=True
-        )
-        assert result.disturbance_power is not None
-        means = np.cumsum(d**2) / np.arange(1, d.size + 1)  # within the memory: plain means
-        np.testing.assert_allclose(result.disturbance_power, means, rtol=1e-12)
-
-
-# ---- As controllers

@@ -29,11 +29,6 @@ def test_noiseless_identification_is_exact(excitation):
     np.testing.assert_array_equal(path_taps(result.estimate), result.taps)
 
 
-def test_default_ridge_limits_the_accuracy_as_documented():
-    result = identify_secondary_path(PATH, n_taps=32, duration_s=1.0, rng=0)
-    assert result.misalignment_db == pytest.approx(-100, abs=1)
-
-
 def test_estimate_of_a_recording_is_dense_least_squares():
     rng = np.random.default_rng(3)
     sent = scipy.signal.lfilter([1.0], [1.0, -0.5], rng.standard_normal(2000))
