@@ -111,123 +111,90 @@ def test_ten_thousand_steps_as_filterpy(n: int, kind: str, P0: float, alpha: flo
 # What is mixed with fast steps: filterpy's own equations take over for a step, or an edit comes in.
 
 
-def _full_F(rng: np.random.Generator, n: int) -> Any:
-    F = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n))
-    return lambda f: f.predict(F=F)
+# Each is done to both filters with random numbers that start alike.
 
 
-def _assigned_F(rng: np.random.Generator, n: int) -> Any:
-    F = 0.9 * np.eye(n) + 0.05 * rng.normal(size=(n, n))
-
-    def action(f: KalmanFilter) -> None:
-        f.F = F.copy()
-        f.F[0, -1] = 0.02
-        f.predict()
-        f.update(0.3, R=0.4)
-        f.F = np.eye(n)
-
-    return action
+def full_F(f: KalmanFilter, rng: np.random.Generator) -> None:
+    f.predict(F=0.9 * np.eye(f.dim_x) + 0.05 * rng.normal(size=(f.dim_x, f.dim_x)))
 
 
-def _full_Q(rng: np.random.Generator, n: int) -> Any:
-    root = 0.1 * rng.normal(size=(n, n))
-    return lambda f: f.predict(Q=root @ root.T)
+def assigned_F(f: KalmanFilter, rng: np.random.Generator) -> None:
+    f.F = 0.9 * np.eye(f.dim_x) + 0.05 * rng.normal(size=(f.dim_x, f.dim_x))
+    f.F[0, -1] = 0.02
+    f.predict()
+    f.update(0.3, R=0.4)
+    f.F = np.eye(f.dim_x)
 
 
-def _assigned_Q(rng: np.random.Generator, n: int) -> Any:
-    Q = np.diag(rng.uniform(0, 0.1, size=n))
-
-    def action(f: KalmanFilter) -> None:
-        before = f.Q[0, 0]
-        f.Q = Q
-        f.predict()
-        f.predict()
-        f.Q = before * np.eye(n)
-
-    return action
+def full_Q(f: KalmanFilter, rng: np.random.Generator) -> None:
+    root = 0.1 * rng.normal(size=(f.dim_x, f.dim_x))
+    f.predict(Q=root @ root.T)
 
 
-def _control(rng: np.random.Generator, n: int) -> Any:
-    B, u = rng.normal(size=(n, 2)), rng.normal(size=(2, 1))
-    return lambda f: f.predict(u=u, B=B)
+def assigned_Q(f: KalmanFilter, rng: np.random.Generator) -> None:
+    before = f.Q[0, 0]
+    f.Q = np.diag(rng.uniform(0, 0.1, size=f.dim_x))
+    f.predict()
+    f.predict()
+    f.Q = before * np.eye(f.dim_x)
 
 
-def _own_control(rng: np.random.Generator, n: int) -> Any:
-    B = rng.normal(size=(n, 1))
-
-    def action(f: KalmanFilter) -> None:
-        f.B = B
-        f.predict(u=np.array([[0.3]]))
-        f.B = None
-
-    return action
+def control(f: KalmanFilter, rng: np.random.Generator) -> None:
+    f.predict(B=rng.normal(size=(f.dim_x, 2)), u=rng.normal(size=(2, 1)))
 
 
-def _steady(rng: np.random.Generator, n: int) -> Any:
-    z = rng.normal()
-
-    def action(f: KalmanFilter) -> None:
-        f.predict_steadystate()
-        f.update_steadystate(z)
-
-    return action
+def own_control(f: KalmanFilter, rng: np.random.Generator) -> None:
+    f.B = rng.normal(size=(f.dim_x, 1))
+    f.predict(u=np.array([[0.3]]))
+    f.B = None
 
 
-def _poked(rng: np.random.Generator, n: int) -> Any:
-    i = int(rng.integers(n))
-
-    def action(f: KalmanFilter) -> None:
-        f.P[i, i] += 0.7
-        f.x[i] += 0.2
-
-    return action
+def steady(f: KalmanFilter, rng: np.random.Generator) -> None:
+    f.predict_steadystate()
+    f.update_steadystate(rng.normal())
 
 
-def _replaced(rng: np.random.Generator, n: int) -> Any:
-    root = rng.normal(size=(n, n))
-
-    def action(f: KalmanFilter) -> None:
-        f.P = root @ root.T + np.eye(n)
-        f.P *= 0.5
-
-    return action
+def poked(f: KalmanFilter, rng: np.random.Generator) -> None:
+    i = int(rng.integers(f.dim_x))
+    f.P[i, i] += 0.7
+    f.x[i] += 0.2
 
 
-def _correlated(rng: np.random.Generator, n: int) -> Any:
-    z = rng.normal()
-    return lambda f: f.update_correlated(z)
+def replaced(f: KalmanFilter, rng: np.random.Generator) -> None:
+    root = rng.normal(size=(f.dim_x, f.dim_x))
+    f.P = root @ root.T + np.eye(f.dim_x)
+    f.P *= 0.5
 
 
-def _sequential(rng: np.random.Generator, n: int) -> Any:
-    z = rng.normal()
-    return lambda f: f.update_sequential(0, z)
+def two_rows(f: KalmanFilter, rng: np.random.Generator) -> None:
+    f.update(rng.normal(size=(2, 1)), R=np.diag([0.4, 0.6]), H=rng.normal(size=(2, f.dim_x)))
 
 
-def _two_rows(rng: np.random.Generator, n: int) -> Any:
-    H, z = rng.normal(size=(2, n)), rng.normal(size=(2, 1))
-    return lambda f: f.update(z, R=np.diag([0.4, 0.6]), H=H)
-
-
-ACTIONS: dict[str, Callable[[np.random.Generator, int], Callable[[KalmanFilter], Any]]] = {
-    "predict": lambda rng, n: lambda f: f.predict(),
-    "predict with a scalar Q": lambda rng, n: lambda f: f.predict(Q=0.05),
-    "missed sample": lambda rng, n: lambda f: f.update(None),
-    "F passed": _full_F,
-    "F assigned": _assigned_F,
-    "Q passed": _full_Q,
-    "Q assigned": _assigned_Q,
-    "u and B passed": _control,
-    "B assigned": _own_control,
-    "steady state": _steady,
-    "P poked in place": _poked,
-    "P replaced, then scaled": _replaced,
-    "fading": lambda rng, n: lambda f: setattr(f, "alpha", 1.01),
-    "update_correlated": _correlated,
-    "update_correlated, missed": lambda rng, n: lambda f: f.update_correlated(None),
+ACTIONS: dict[str, Callable[[KalmanFilter, np.random.Generator], Any]] = {
+    "predict": lambda f, rng: f.predict(),
+    "predict with a scalar Q": lambda f, rng: f.predict(Q=0.05),
+    "missed sample": lambda f, rng: f.update(None),
+    "F passed": full_F,
+    "F assigned": assigned_F,
+    "Q passed": full_Q,
+    "Q assigned": assigned_Q,
+    "u and B passed": control,
+    "B assigned": own_control,
+    "steady state": steady,
+    "P poked in place": poked,
+    "P replaced, then scaled": replaced,
+    "fading": lambda f, rng: setattr(f, "alpha", 1.01),
+    "update_correlated": lambda f, rng: f.update_correlated(rng.normal()),
+    "update_correlated, missed": lambda f, rng: f.update_correlated(None),
 }
 if HAS_SEQUENTIAL:
-    ACTIONS["update_sequential"] = _sequential
-    ACTIONS["H of two rows"] = _two_rows  # 1.4.5 wants dim_z values whatever the rows of H
+    ACTIONS["update_sequential"] = lambda f, rng: f.update_sequential(0, rng.normal())
+    ACTIONS["H of two rows"] = two_rows  # 1.4.5 wants dim_z values whatever the rows of H
+
+
+def act(filters: tuple, name: str, rng: np.random.Generator) -> None:
+    seed = rng.integers(2**32)
+    both(filters, lambda f: ACTIONS[name](f, np.random.default_rng(seed)))
 
 
 def fast_step(filters: tuple, rng: np.random.Generator, n: int) -> None:
@@ -247,7 +214,7 @@ def test_a_step_that_filterpy_takes_between_fast_ones(name: str, reading: str) -
             fast_step(filters, rng, n)
             if reading == "after each step":
                 require_close(kf, ours)
-        both(filters, ACTIONS[name](rng, n))
+        act(filters, name, rng)
         if reading == "after each step" and name != "H of two rows":  # K, S, y stay (n, 2), (2, 2), (2, 1) till then
             require_close(kf, ours, tuple(x for x in READ if x != "log_likelihood" or "steady" not in name))
     fast_step(filters, rng, n)
@@ -273,7 +240,7 @@ def test_any_sequence_of_steps(names: list[str], n: int, seed: int) -> None:
         else:
             if name == "update_sequential":  # it writes into z, K and y of one row
                 fast_step(filters, rng, n)
-            both(filters, ACTIONS[name](rng, n))
+            act(filters, name, rng)
             if name == "H of two rows":
                 fast_step(filters, rng, n)
     require_close(kf, ours, ("x", "P", "P_prior", "P_post", "K"))
