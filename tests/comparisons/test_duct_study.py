@@ -92,6 +92,8 @@ def start(time_s: float, equal_time_s: float) -> Start:
         (0.0199, 0.0099, True),
         (0.0199, 0.0101, False),
         (0.0201, 0.0099, False),
+        (0.0199, 0.0100, False),
+        (0.0200, 0.0099, False),
         (np.inf, 0.0099, False),
     ],
 )
@@ -116,6 +118,7 @@ def test_without_a_second_under_the_constraint_nothing_is_claimed() -> None:
         (1.25, 0.76, False),
         (0.74, 1.25, False),
         (0.76, 1.25, True),
+        (1.25, 0.75, False),
         (np.nan, 0.5, False),
     ],
 )

@@ -167,7 +167,7 @@ def held(**changes: float) -> list[bool]:
         ({"power": 0.96}, [False, True, True, True, True]),
         ({"power": 0.97}, [True, True, True, True, True]),
         ({"power": 1.02}, [True, True, True, True, True]),
-        ({"power": 1.03}, [False, True, True, True, True]),
+        ({"power": 1.05}, [False, True, True, True, True]),
         ({"power": 1.06}, [False, True, False, True, True]),
         ({"loss_db": 0.6}, [True, False, True, True, True]),
         ({"loss_db": 1.1}, [True, False, True, False, True]),
