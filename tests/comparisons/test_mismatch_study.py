@@ -182,6 +182,7 @@ LOST = {"noise_reduction_db": np.nan, "diverged_at_s": 1.0}
         (FXLMS_BELOW_90, row(amount=91.0, noise_reduction_db=0.01), False),
         (FXLMS_BELOW_90, row(amount=91.0, **LOST), True),
         (FXLMS_BELOW_90, row(amount=90.0, noise_reduction_db=-3.0), True),  # on the bound: says nothing
+        (FXLMS_BELOW_90, row(amount=90.0, noise_reduction_db=3.0), True),
         (FXLMS_BELOW_90, row(amount=105.0, noise_reduction_db=20.0, noise="tone"), True),  # another noise
         (FXLMS_BELOW_90, row(amount=105.0, noise_reduction_db=20.0, tuned_with=EXACT), True),  # another tuning
         (FXLMS_BELOW_90, row(amount=105.0, algorithm="KF-ANC"), True),
