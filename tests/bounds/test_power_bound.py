@@ -98,6 +98,7 @@ def test_record_and_segments_are_those_of_dense_least_squares(n, switch_on, edge
         assert (part.start_s, part.end_s) == pytest.approx(((start - switch_on) / FS, (stop - switch_on) / FS))
         assert (part.penalty == 0) == (part.control_power < rated * (1 - WELL))
     np.testing.assert_array_equal(found.disturbance, d[switch_on:])
+    np.testing.assert_array_equal(found.per_second.penalty, [part.penalty for part in parts[1:]])
 
 
 @st.composite
