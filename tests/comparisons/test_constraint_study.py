@@ -14,7 +14,7 @@ from comparisons import __main__ as command
 from comparisons.studies import cases, constraint
 from comparisons.studies.cases import Case, make_case
 from comparisons.studies.constraint import LIMITED, SHARES, TUNED, ClippedRow, ConstraintRow
-from comparisons.studies.report_parts import cell
+from comparisons.studies.rows import cell
 from kfopc_filterpy.bench import Scene, claims_sentence, results_table, write_report
 from kfopc_filterpy.paths import duct_paths, path_taps
 

@@ -15,7 +15,7 @@ from kfopc_filterpy import kf_pb, noise_reduction_db, simulate
 from kfopc_filterpy.bench import StudyReport
 
 PRIMARY, SECONDARY = np.array([0.0] * 6 + [1.0, 0.5, 0.25]), np.array([0.0, 0.0, 1.0, -0.6, 0.2])
-SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "JUMP_S": 2.0, "SHARES": (0.25,)}
+SMALL = {"N_TAPS": 16, "SILENT_S": 1.0, "DURATION_S": 5.0, "SHARES": (0.25,)}
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from comparisons.studies import cases, kf_pb
+from comparisons.studies import cases, kf_pb_cases
 from kfopc_filterpy.bench import Runs, StudyReport
 from kfopc_filterpy.bench.registry import REGISTRY
 
@@ -60,4 +60,4 @@ def short_duct() -> dict[str, cases.Pair]:
 
 def _forget_data() -> None:
     cases.measured_data.cache_clear()
-    kf_pb.recordings.cache_clear()
+    kf_pb_cases.recordings.cache_clear()
