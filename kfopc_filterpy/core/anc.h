@@ -134,6 +134,7 @@ ANC_PUBLIC void anc_limit_all(anc_limiter *limiter, anc_real *laps, const anc_re
  * covariance.h). */
 typedef struct {
     anc_real scale, diagonal, pending, largest, bound, floored; /* largest: at the start; bound: of all now */
+    anc_real usual;                                             /* variance along the rows */
 } anc_owed;
 ANC_PUBLIC size_t anc_covariance_size(int32_t n);
 ANC_PUBLIC void anc_covariance_describe(int32_t n, anc_visitor *visit, void *to);

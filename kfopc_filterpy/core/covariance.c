@@ -7,6 +7,10 @@ static const real CANCELLATION = 1000;
 /* Both in rounding errors of the largest variance. For an h of energy 1, an h'P h below BLUR is nothing but rounding.
  * From then on, and in float always, the state noise is at least LEAST_NOISE. See `blurred`. */
 static const real BLUR = 16, LEAST_NOISE = 2;
+/* P fades until its largest variance is WIDEST times the usual one along the rows. From then on, state noise of the same size
+ * along the rows takes the place of fading, so that the others hardly grow. The usual variance falls by e^FALL at most while a
+ * row passes, so that a bad sample does not count, and rises with RELEASE of the fading. */
+static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625;
 #ifdef ANC_FLOAT
 static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1, see two_product */
 #else
@@ -28,7 +32,7 @@ void layout_covariance(covariance *c, int32_t n, anc_layout *at)
 void start_covariance(covariance *c, real initial_variance)
 {
     for (int32_t i = 0; i < c->n; i++) row_of(c, i)[i] = initial_variance;
-    *c->owed = (anc_owed){.scale = 1, .largest = initial_variance, .bound = initial_variance, .floored = sizeof(real) < sizeof(double)};
+    *c->owed = (anc_owed){.scale = 1, .largest = initial_variance, .bound = initial_variance, .floored = sizeof(real) < sizeof(double), .usual = initial_variance};
 }
 
 static real largest_variance(const covariance *c)
@@ -54,8 +58,15 @@ int predictable(const covariance *c, real fading, real state_noise, real energy)
 
 void predict(covariance *c, real fading, real state_noise)
 {
-    c->owed->scale *= fading;
-    c->owed->diagonal = fading * c->owed->diagonal + state_noise;
+    anc_owed *owed = c->owed;
+    if (fading > 1) {
+        const real most = WIDEST * owed->usual;
+        owed->usual *= 1 + (fading - 1) * RELEASE;
+        if (owed->scale * owed->bound > most) owed->bound = largest_variance(c);
+        if (owed->scale * owed->bound > most) state_noise += (fading - 1) * owed->usual, fading = 1;
+    }
+    owed->scale *= fading;
+    owed->diagonal = fading * owed->diagonal + state_noise;
 }
 
 /* Set T to T - pending u u' + diagonal I and Ph to T h in one pass, two rows at a time; return h' T h. `pending` is 0
@@ -159,7 +170,8 @@ real project(covariance *c, real q)
     }
     owed->bound = owed->scale * owed->bound + owed->diagonal;
     if (owed->scale != 1) fade(c);
-    const real variance = pass(c, owed->pending, owed->diagonal), blur = BLUR * ROUNDING * dot(c->h, c->h, c->n);
+    const real variance = pass(c, owed->pending, owed->diagonal), energy = dot(c->h, c->h, c->n), blur = BLUR * ROUNDING * energy;
+    if (variance > 0 && energy > 0) owed->usual = held_value(owed->usual, variance / energy, 1 / (1 + FALL / (real)c->n), 1);
     owed->scale = 1, owed->diagonal = owed->pending = 0;
     return variance < blur * owed->bound ? blurred(c, variance, blur, q) : variance;
 }

@@ -20,7 +20,7 @@
 #include <string.h>
 
 typedef struct { /* of an array */
-    real root;    /* gamma^-1/2 */
+    real root;    /* gamma^-1/2; 0: rounding has corrupted the array */
     real energy;  /* squared norm of the gain column */
     real heard;   /* samples since the start */
     real trusted; /* samples at the start that leave the weights as they are */
@@ -81,7 +81,7 @@ static void begin(arrays *f, int32_t i, real initial, int32_t trusted)
     f->numbers[i] = (array_numbers){.root = 1, .trusted = (real)trusted};
 }
 
-/* Set the rotations for the present row; return 0 if they do not exist, because rounding has corrupted the array. */
+/* Set the rotations for the newest row; return 0 if they do not exist, because rounding has corrupted the array. */
 static int find_rotations(const arrays *f, int32_t i, real largest_stray, rotations *r)
 {
     const int32_t n = f->s.L + 1;
@@ -91,7 +91,7 @@ static int find_rotations(const arrays *f, int32_t i, real largest_stray, rotati
     const real ahead = dot(row, f->first + times(i, n), known), behind = dot(row, f->second + times(i, n), known);
     const real next = root(a->root * a->root + ahead * ahead), t = behind / next, cosine = root(1 - t * t);
     *r = (rotations){.root = next * cosine, .c = a->root / next, .s = ahead / next, .t = t, .h = 1 / cosine};
-    return last * last <= largest_stray * largest_stray * a->energy && cosine > 0 && isfinite(next);
+    return a->root > 0 && last * last <= largest_stray * largest_stray * a->energy && cosine > 0 && isfinite(next);
 }
 
 static void rotate(arrays *f, int32_t i, rotations r, real forgetting)
@@ -110,6 +110,14 @@ static void rotate(arrays *f, int32_t i, rotations r, real forgetting)
     f->numbers[i].root = r.root;
     f->numbers[i].energy = dot(gain, gain, n);
     f->numbers[i].heard += 1;
+}
+
+/* Follow the newest row. An array must hear every sample of the reference, whatever becomes of its error. */
+static void advance_array(arrays *f, int32_t i, real largest_stray, real forgetting)
+{
+    rotations r;
+    if (find_rotations(f, i, largest_stray, &r)) rotate(f, i, r, forgetting);
+    else f->numbers[i].root = 0;
 }
 
 static real *weights_in(const arrays *f, int32_t scenario, int32_t i) { return f->weights + times(scenario * f->n + i, f->s.L); }
@@ -147,22 +155,33 @@ static void start_growing(anc_view *view, const anc_plan *plan, const anc_settin
     f->second[f->s.L] *= root(fade);
 }
 
-static int adapt_growing(anc_view *view, const real *error)
+static void advance_growing(arrays *f) { advance_array(f, 0, UNUSABLE, *f->s.setting[FORGETTING]); }
+
+static int control_signal_growing(anc_view *view, const real *reference, real *control)
+{
+    const int refused = filtered_signal(view, reference, control);
+    if (!refused) advance_growing((arrays *)view);
+    return refused;
+}
+
+static int update_growing(anc_view *view, const real *error)
 {
     arrays *f = (arrays *)view;
-    signals *s = &f->s;
-    rotations r;
-    const int refused = error ? estimate(s, error) : ANC_DONE, held = find_rotations(f, 0, UNUSABLE, &r);
-    if (refused) return refused;
-    if (!held) return error ? ANC_LOST_ARRAY : ANC_DONE; /* reported with the next error */
-    rotate(f, 0, r, *s->setting[FORGETTING]);
-    if (!error) return ANC_DONE;
+    const int refused = error ? estimate(&f->s, error) : ANC_DONE;
+    if (!error || refused) return refused;
+    if (f->numbers->root == 0) return ANC_LOST_ARRAY;
     correct_array(f, 0);
-    commit(s);
+    commit(&f->s);
     return ANC_DONE;
 }
 
-const anc_algorithm anc_fast_array = {"fast-array KF", growing_settings, layout_growing, start_growing, filtered_signal, adapt_growing, adapt_growing};
+static int listen_growing(anc_view *view, const real *error)
+{
+    advance_growing((arrays *)view);
+    return update_growing(view, error);
+}
+
+const anc_algorithm anc_fast_array = {"fast-array KF", growing_settings, layout_growing, start_growing, control_signal_growing, update_growing, listen_growing};
 
 /* A finite memory of N samples: two growing ones without forgetting that take turns.
  *
@@ -201,15 +220,6 @@ static void restart(arrays *f, int32_t i, int mixed)
     begin(f, i, f->turns->initial, f->s.L - 1);
 }
 
-/* Rotate array i; return 0 if rounding has corrupted it. */
-static int advanced(arrays *f, int32_t i)
-{
-    rotations r;
-    const int held = find_rotations(f, i, ASTRAY, &r);
-    if (held) rotate(f, i, r, 1);
-    return held;
-}
-
 /* Correct both arrays, mix their weights, and let them take turns. */
 static void correct_pair(arrays *f)
 {
@@ -217,12 +227,12 @@ static void correct_pair(arrays *f)
     const int32_t elder = (int32_t)turn->elder, younger = 1 - elder, L = f->s.L;
     const real memory = *f->s.setting[MEMORY], largest = initial_variance(&f->s);
     if (turn->elder_lost == 0) {
-        if (advanced(f, elder)) correct_array(f, elder);
+        if (f->numbers[elder].root > 0) correct_array(f, elder);
         else if (turn->lost += 1, turn->paired != 0) turn->elder_lost = 1;
         else turn->initial *= LESS, restart(f, elder, 0);
     }
     if (turn->paired != 0) {
-        if (advanced(f, younger)) correct_array(f, younger);
+        if (f->numbers[younger].root > 0) correct_array(f, younger);
         else turn->lost += 1, turn->initial *= LESS, restart(f, younger, 0);
     }
     real share = turn->paired != 0 ? f->numbers[younger].heard / memory : 0;
@@ -242,18 +252,33 @@ static void correct_pair(arrays *f)
     }
 }
 
-static int adapt_finite(anc_view *view, const real *error)
+static void advance_pair(arrays *f)
+{
+    for (int32_t i = 0; i < 2; i++)
+        if (f->turns->paired != 0 || i == (int32_t)f->turns->elder) advance_array(f, i, ASTRAY, 1);
+}
+
+static int control_signal_finite(anc_view *view, const real *reference, real *control)
+{
+    const int refused = filtered_signal(view, reference, control);
+    if (!refused) advance_pair((arrays *)view);
+    return refused;
+}
+
+static int update_finite(anc_view *view, const real *error)
 {
     arrays *f = (arrays *)view;
     const int refused = error ? estimate(&f->s, error) : ANC_DONE;
-    if (refused) return refused;
-    if (!error) {
-        advanced(f, 0), advanced(f, 1);
-        return ANC_DONE;
-    }
+    if (!error || refused) return refused;
     correct_pair(f);
     commit(&f->s);
     return ANC_DONE;
 }
 
-const anc_algorithm anc_finite_memory = {"finite-memory fast-array KF", finite_settings, layout_finite, start_finite, filtered_signal, adapt_finite, adapt_finite};
+static int listen_finite(anc_view *view, const real *error)
+{
+    advance_pair((arrays *)view);
+    return update_finite(view, error);
+}
+
+const anc_algorithm anc_finite_memory = {"finite-memory fast-array KF", finite_settings, layout_finite, start_finite, control_signal_finite, update_finite, listen_finite};

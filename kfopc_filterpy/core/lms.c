@@ -3,6 +3,7 @@
 #include "signals.h"
 
 enum { STEP_SIZE }; /* the first setting of all */
+static real largest(real a, real b) { return b > a ? b : a; }
 
 /* FxLMS: w(n+1) = w(n) + mu e(n) x'(n). */
 
@@ -19,22 +20,39 @@ static int update_fxlms(anc_view *view, const real *error)
 
 const anc_algorithm anc_fxlms = {"FxLMS", fxlms, layout_plain, start_plain, filtered_signal, update_fxlms, NULL};
 
-/* FxNLMS: w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)), with the energy of all filtered references. */
+/* FxNLMS: w(n+1) = w(n) + mu e(n) x'(n) / (epsilon + x'(n)'x'(n)), with the energy of all filtered references. If epsilon is
+ * 0, the energy counts as QUIET of the usual one at least: in a quiet passage, the weights would follow the noise of the
+ * microphones. The usual energy follows a louder signal within a filter length, which a bad sample is not, and a softer one
+ * within HELD filter lengths. */
 
 enum { REGULARIZATION = STEP_SIZE + 1 };
+static const real QUIET = (real)1e-3, RISE = 4, HELD = 1000; /* e^RISE within a filter length */
+typedef struct { signals s; real *usual; } normalised;
 static const anc_setting fxnlms[] = {{"step_size", 0, 0, ANC_ONE}, {"regularization", 0, 0, ANC_ONE}, {0}};
+
+static void layout_fxnlms(anc_view *view, const anc_plan *plan, const anc_setting *settings, anc_layout *at)
+{
+    normalised *own = (normalised *)view;
+    layout_signals(&own->s, plan, settings, at);
+    own->usual = reals(at, "usual_energy", ANC_STATE, 1, 1, 1, 1);
+}
 
 static int update_fxnlms(anc_view *view, const real *error)
 {
-    signals *s = (signals *)view;
-    if (!error) return ANC_DONE;
-    const int refused = estimate(s, error);
-    const real all = *s->setting[REGULARIZATION] + energy_of(s, &s->filtered, 0, s->filtered.rows) + energy_of(s, &s->guarded, 0, s->guarded.rows);
-    for (int32_t sj = 0; sj < s->S * s->J; sj++) set_step(s, sj, 1, *s->setting[STEP_SIZE] / all, 0);
-    return refused ? refused : descend(s, error);
+    normalised *own = (normalised *)view;
+    signals *s = &own->s;
+    int refused = error ? estimate(s, error) : ANC_DONE;
+    if (!error || refused) return refused;
+    const real energy = energy_of(s, &s->filtered, 0, s->filtered.rows) + energy_of(s, &s->guarded, 0, s->guarded.rows);
+    const real epsilon = *s->setting[REGULARIZATION], usual = *own->usual > 0 ? *own->usual : energy, L = (real)s->L;
+    const real all = epsilon > 0 ? epsilon + energy : largest(energy, QUIET * usual);
+    for (int32_t sj = 0; sj < s->S * s->J; sj++) set_step(s, sj, 1, all > 0 ? *s->setting[STEP_SIZE] / all : 0, 0);
+    refused = descend(s, error);
+    if (!refused) *own->usual = held_value(usual, energy, 1 - 1 / (HELD * L), 1 + RISE / L);
+    return refused;
 }
 
-const anc_algorithm anc_fxnlms = {"FxNLMS", fxnlms, layout_plain, start_plain, filtered_signal, update_fxnlms, NULL};
+const anc_algorithm anc_fxnlms = {"FxNLMS", fxnlms, layout_fxnlms, start_plain, filtered_signal, update_fxnlms, NULL};
 
 /* Leaky FxLMS: w(n+1) = (1 - mu gamma) w(n) + mu e(n) x'(n). */
 
@@ -68,7 +86,7 @@ static int update_optimal_leaky(anc_view *view, const real *error)
     const int refused = estimate(s, error);
     const real mu = *s->setting[STEP_SIZE];
     for (int32_t sj = 0; sj < s->S * s->J; sj++)
-        set_step(s, sj, 1 - mu * (penalty_of_constraint(s->previewed + sj) * s->previewed[sj].mean[ANC_REFERENCE]), mu, 0);
+        set_step(s, sj, largest(1 - mu * (penalty_of_constraint(s->previewed + sj) * s->previewed[sj].mean[ANC_REFERENCE]), 0), mu, 0);
     return refused ? refused : descend(s, error);
 }
 

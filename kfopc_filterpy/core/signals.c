@@ -92,7 +92,7 @@ static void set_loudest(signals *s)
         if (sum > reach) reach = sum;
     }
     for (int32_t g = 0; g < s->G; g++) guard += (real)fabs(s->guard[g]);
-    *s->loudest = LOUDEST / reach / guard;
+    *s->loudest = LOUDEST_REFERENCE / reach / guard;
 }
 
 void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)
@@ -253,17 +253,38 @@ void set_step(signals *s, int32_t sj, real keep, real mu, real penalty)
     step[KEEP] = keep, step[MU] = mu, step[PENALTY] = penalty;
 }
 
+static real limited(real value, real most) { return value > most ? most : value < -most ? -most : value; }
+
+/* Bound large steps, which a bad sample causes: none corrects more than the whole error, or takes more than the whole control
+ * signal away. So the weights go back, however large they have become. Return whether all are short enough. */
+static int bound_steps(signals *s, const real *error)
+{
+    const real energy = energy_of(s, &s->filtered, 0, s->filtered.rows) + energy_of(s, &s->guarded, 0, s->guarded.rows);
+    const real x2 = energy_of(s, &s->x, 0, s->I), size = root(energy);
+    for (int32_t sj = 0; sj < s->S * s->J; sj++) {
+        real *step = s->step + STEPS * sj;
+        if (step[MU] * energy > 1) step[MU] = 1 / energy;
+        if (x2 > 0) step[PENALTY] = limited(step[PENALTY], (real)fabs(s->control[sj]) / x2);
+        for (int32_t sk = sj / s->J * s->K; sk < (sj / s->J + 1) * s->K; sk++)
+            if (!within(step[MU] * error[sk] * size, LARGEST) || !within(step[MU] * s->heard[sk] * size, LARGEST)) return 0;
+        if (!within(step[PENALTY] * root(x2), LARGEST)) return 0;
+    }
+    return 1;
+}
+
 int descend(signals *s, const real *error)
 {
+    int calm = 1;
     for (int32_t scenario = 0; scenario < s->S; scenario++)
         for (int32_t k = 0; k < s->K; k++) {
             const real e = error[scenario * s->K + k], heard = s->G ? heard_output(s, &s->guarded, scenario, k) : 0;
             s->heard[scenario * s->K + k] = heard;
             for (int32_t j = 0; j < s->J; j++) {
                 const real *step = s->step + STEPS * (scenario * s->J + j);
-                if (!within(step[MU] * e, LARGEST) || !within(step[MU] * heard, LARGEST) || !within(step[PENALTY], LARGEST)) return ANC_LOUD_STEP;
+                calm &= within(step[MU] * e, CALM) && within(step[MU] * heard, CALM) && within(step[PENALTY], CALM);
             }
         }
+    if (!calm && !bound_steps(s, error)) return ANC_LOUD_STEP;
     commit(s);
     for (int32_t scenario = 0; scenario < s->S; scenario++)
         for (int32_t j = 0; j < s->J; j++)

@@ -3,13 +3,14 @@
 #define SIGNALS_H
 #include "vectors.h"
 
-/* No signal may be louder than LOUDEST, and no factor of a step larger than LARGEST. So no square overflows, and no
- * weight or control signal can within 10^40 samples (10^5 in float). What exceeds these limits is refused before
- * anything changes. */
+/* No signal may be louder than LOUDEST, no reference than LOUDEST_REFERENCE, and no step of the weights longer than LARGEST.
+ * So no square overflows, and no weight or control signal can within 10^40 samples (10^5 in float). What exceeds these
+ * limits is refused before anything changes. Up to CALM, a factor of the reference in a step is not looked at: CALM times
+ * LOUDEST_REFERENCE is no long step. */
 #ifdef ANC_FLOAT
-static const real LOUDEST = 1e12f, LARGEST = 1e6f;
+static const real LOUDEST = 1e12f, LOUDEST_REFERENCE = 1e6f, LARGEST = 1e6f, CALM = 1;
 #else
-static const real LOUDEST = 1e100, LARGEST = 1e50;
+static const real LOUDEST = 1e100, LOUDEST_REFERENCE = 1e25, LARGEST = 1e50, CALM = 1e20;
 #endif
 
 /* The largest variance that a setting may have: neither it nor its sum over all samples overflows. */

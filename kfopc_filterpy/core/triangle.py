@@ -15,7 +15,7 @@ from .calls import covariance_update as covariance_update
 
 GROUP = 8  # rows of T that have one length, `PARTS` in vectors.h
 LINE = 64  # bytes in a cache line
-OWED = np.dtype([(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored")])
+OWED = np.dtype([(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored", "usual")])
 
 
 class Covariance(NamedTuple):
@@ -48,7 +48,7 @@ def new_covariance(P: np.ndarray) -> Covariance:
         rows[...] = full[group : group + GROUP, : group + GROUP]
     owed = owed_of(cov)
     owed["scale"], owed["largest"] = 1.0, np.max(np.diagonal(P))
-    owed["bound"] = owed["largest"]
+    owed["bound"] = owed["usual"] = owed["largest"]
     return cov
 
 

@@ -71,6 +71,12 @@ static inline real dot(const real *restrict a, const real *restrict b, int32_t n
     return total(part);
 }
 
+/* Return the next value, but at least `down` and at most `up` times the last one. */
+static inline real held_value(real last, real next, real down, real up)
+{
+    return next < last * down ? last * down : next > last * up ? last * up : next;
+}
+
 /* Set to = to + a from. */
 static inline void add_scaled(real *restrict to, real a, const real *restrict from, int32_t n)
 {
