@@ -33,7 +33,7 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
     """Return `value` as a float64 array of any shape, NaN and Inf included."""
     try:
         array = np.asarray(value)
-        real = array.astype(np.float64, copy=False) if array.dtype.kind not in "cSU" else None
+        real = array.astype(np.float64, copy=False) if _may_be_real(array) else None
         if real is not None and isinstance(value, np.ma.MaskedArray):
             real = np.where(np.ma.getmaskarray(value), np.nan, real)  # a masked value is a missing one
     except (TypeError, ValueError) as error:
@@ -41,10 +41,17 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
         raise TypeError(f"{name} must be a sequence of real numbers, got {type(value).__name__}{ragged}") from error
     except OverflowError as error:  # an integer of Python
         raise ValueError(f"{name} must be finite, but holds a number that is too large for a float") from error
-    if real is None:  # numpy would drop the imaginary part with only a warning, and read numbers from text
-        got = "complex ones" if array.dtype.kind == "c" else type(value).__name__
+    if real is None:
+        got = {"c": "complex ones", "O": "text or dates among them"}.get(array.dtype.kind, type(value).__name__)
         raise TypeError(f"{name} must be a sequence of real numbers, got {got}")
     return real
+
+
+def _may_be_real(array: np.ndarray) -> bool:
+    """Return False for what numpy would take: complex numbers without their imaginary part, text, dates and times."""
+    if array.dtype.kind != "O":
+        return array.dtype.kind not in "cSUMm"
+    return not any(isinstance(value, str | bytes | np.datetime64 | np.timedelta64) for value in array.flat)
 
 
 def as_channels(value: Any, name: str) -> np.ndarray:
@@ -89,13 +96,11 @@ def as_number(value: Any, name: str, *, unit: str = "") -> float:
     if isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}")
     try:
-        number = float(np.asarray(value).reshape(()))
-    except (TypeError, ValueError) as error:
+        number = float(as_real_array(value, name).reshape(()))
+    except TypeError as error:
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}") from error
-    except OverflowError as error:  # an integer of Python
-        raise ValueError(f"{name} must be finite, got a number that is too large for a float") from error
     if not math.isfinite(number):
-        raise ValueError(f"{name} must be finite, got {number}")
+        raise ValueError(f"{name} must be finite, got {'a masked value' if np.ma.is_masked(value) else number}")
     return number
 
 

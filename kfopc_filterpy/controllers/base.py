@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
 from copy import deepcopy
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -154,7 +153,6 @@ class Looped(NamedTuple):
     steps: Steps
     control_filter: np.ndarray  # (J, I, L) or (L,): the next control signal's
     recorded: dict[str, np.ndarray]  # constraint_factor and others, (J,) or (1,), as of the last sample
-    in_use: AbstractContextManager[Any] = nullcontext()
     owner: Any = None  # what must exist meanwhile
 
 

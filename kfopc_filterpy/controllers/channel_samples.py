@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from .._validate import as_real_array
 from ..power.amplifiers import Amplifiers, LinearAmplifier, amplifier_of_each
 
+LOUDEST = 1e50  # of the samples that can be learned from, see `plant.h`
+
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:
     """Return a sample of each channel, (size,), finite; `what` names the channels in an error."""
@@ -20,6 +22,12 @@ def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndar
     for channel in np.flatnonzero(~np.isfinite(sample)):
         raise ValueError(f"{name} must be finite, but that of {what[:-1]} {channel} is {sample[channel]}")
     return np.ascontiguousarray(sample)
+
+
+def require_moderate(signal: np.ndarray, name: str) -> None:
+    """Raise ValueError for samples from which a state could overflow."""
+    if np.any(np.abs(signal) > LOUDEST):
+        raise ValueError(f"{name} must not be louder than {LOUDEST:g}: scale the signals; nothing was changed")
 
 
 def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any] | None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from .._types import NumberOrArray, PathModels, PerLoudspeaker
 from .._validate import as_channels, as_count, as_number, as_positive, as_signal, per_channel, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..core.block import Algorithm, Block, Shape, reason_of
+from ..core.block import Algorithm, Block, InUse, Shape, reason_of
 from ..core.own import load_algorithm as load_algorithm
 from ..core.run_loop import REFUSED_REFERENCE, Steps, process
 from ..paths.path_matrix import is_path_matrix, secondary_paths, single_path
@@ -28,6 +28,7 @@ from .processing import (
     adapt_flags,
     block_signal,
     output_array,
+    require_apart,
     require_channels,
     require_one_length,
 )
@@ -57,7 +58,8 @@ class setting:
     def __set__(self, controller: Any, value: Any) -> None:
         if not self.assignable:
             raise AttributeError(f"{self.name} cannot be assigned: make a new controller")
-        controller._opened().fields[self.name][:] = controller._checked_setting(self.name, value)
+        with controller.in_use:
+            controller._opened().fields[self.name][:] = controller._checked_setting(self.name, value)
 
 
 class CoreController(BlockProcessing, Checkpointed):
@@ -319,7 +321,14 @@ class CoreController(BlockProcessing, Checkpointed):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for a copy or a file: the memory and the shape stand for the block."""
-        return {name: value for name, value in vars(self).items() if name != "_block"}
+        with self.in_use:
+            memory = self._opened().saved()
+            return {name: value for name, value in vars(self).items() if name != "_block"} | {"_memory": memory}
+
+    @property
+    def in_use(self) -> InUse:
+        """Context that refuses to be entered by a second thread: RuntimeError."""
+        return self._opened().in_use
 
     def _of_setting(self, name: str) -> Any:
         """Return a setting: a number, or with several channels (J,) or (K,) where each has its own."""
@@ -341,13 +350,16 @@ class CoreController(BlockProcessing, Checkpointed):
     @limiter.setter
     def limiter(self, value: Limiters) -> None:
         block = self._opened()
-        before, self._limiter = self._limiter, self._checked_limiter(value)
-        for limiter in self._each(before):
-            limiter.move_out()
-        guard = block.fields["guard"].ravel()
-        self._use_block(
-            block.remade(self._needed_shape(block.shape.path_taps, guard.size), guard if guard.size else None)
-        )
+        with block.in_use:
+            before, self._limiter = self._limiter, self._checked_limiter(value)
+            for limiter in self._each(before):
+                limiter.move_out()
+            for new, old in zip(self._each(self._limiter), self._each(before), strict=False):
+                new.follow(old)
+            guard = block.fields["guard"].ravel()
+            self._use_block(
+                block.remade(self._needed_shape(block.shape.path_taps, guard.size), guard if guard.size else None)
+            )
 
     @property
     def secondary_path(self) -> np.ndarray:
@@ -365,12 +377,13 @@ class CoreController(BlockProcessing, Checkpointed):
     def secondary_path(self, path: PathModels) -> None:
         before, after = self.secondary_path, self._checked_estimate(path)
         guard_filter(self._uncertainty, after)  # raises if none can be made, before anything changes
-        self._estimated_path()[:] = after
-        if self._uncertainty is None or not self.takes_guard:
-            self._filter_again()
-        else:  # measured paths, for example, have another distance from the new path
-            self.secondary_path_uncertainty = self._uncertainty
-        self._after_new_path(before)
+        with self.in_use:
+            self._estimated_path()[:] = after
+            if self._uncertainty is None or not self.takes_guard:
+                self._filter_again()
+            else:  # measured paths, for example, have another distance from the new path
+                self.secondary_path_uncertainty = self._uncertainty
+            self._after_new_path(before)
 
     def _filter_again(self) -> None:
         """Filter the stored references with the present estimate, and the results with the guard."""
@@ -407,8 +420,9 @@ class CoreController(BlockProcessing, Checkpointed):
                 "algorithm"
             )
         taps = guard_filter(value, self._estimated_path())
-        self._uncertainty = as_uncertainty(value)
-        self._use_block(self._opened().with_guard(taps))
+        with self.in_use:
+            self._uncertainty = as_uncertainty(value)
+            self._use_block(self._opened().with_guard(taps))
 
     @property
     def rated_power(self) -> NumberOrArray | None:
@@ -428,7 +442,8 @@ class CoreController(BlockProcessing, Checkpointed):
             value = per_loudspeaker(value, self.n_loudspeakers, "rated_power")
         else:
             value = as_positive(value, "rated_power")
-        self._take_rated_power(value)
+        with self.in_use:
+            self._take_rated_power(value)
 
     def _read_rated_power(self) -> Any:
         return self._of_constraint("rated_power", self._own_constraint) if self._constrained else None
@@ -506,18 +521,26 @@ class CoreController(BlockProcessing, Checkpointed):
 
         With several channels, x(n) is (I,) and y(n) is (J,).
         """
-        block = self._opened()
-        block.reference[:] = self._sample(reference, "reference", "references")
-        if answer := block.emit():
-            raise ValueError(f"{reason_of(answer)}; nothing was changed")
-        return self._shaped(block.control_signal)
+        block, x = self._opened(), self._sample(reference, "reference", "references")
+        block.enter()
+        try:
+            block.reference[:] = x
+            if answer := block.emit():
+                raise ValueError(f"{reason_of(answer)}; nothing was changed")
+            return self._shaped(block.control_signal)
+        finally:
+            block.leave()
 
     def update(self, error: NumberOrArray) -> None:
         """Adapt to the error e(n), with several channels (K,), that the last control signal left."""
-        block = self._opened()
-        block.error[:] = self._sample(error, "error", "microphones")
-        if answer := block.update():
-            raise ValueError(f"{reason_of(answer)}; nothing was changed")
+        block, e = self._opened(), self._sample(error, "error", "microphones")
+        block.enter()
+        try:
+            block.error[:] = e
+            if answer := block.update():
+                raise ValueError(f"{reason_of(answer)}; nothing was changed")
+        finally:
+            block.leave()
 
     def process(
         self, references: ArrayLike, errors: ArrayLike, *, adapt: bool | ArrayLike = True, out: np.ndarray | None = None
@@ -531,15 +554,16 @@ class CoreController(BlockProcessing, Checkpointed):
         require_one_length(x, e)
         n_samples = x.shape[-1]
         flags = adapt_flags(adapt, n_samples)
+        require_apart(out, x, e)
         y = output_array(out, (self.n_loudspeakers, n_samples) if self.multichannel else x.shape)
         rows = [np.atleast_2d(signal) for signal in (x, e, y)]
         done = 0
-        while done < n_samples:
-            end = min(done + LONGEST_CALL, n_samples)
-            with looped.in_use:
+        with self.in_use:
+            while done < n_samples:
+                end = min(done + LONGEST_CALL, n_samples)
                 status, done = process(looped.steps, rows[0], rows[1], rows[2], flags, done, end)
-            if done < end:
-                self._raise_refusal(x[..., done], e[..., done], done, status)
+                if done < end:
+                    self._raise_refusal(x[..., done], e[..., done], done, status)
         return y
 
     def _block_signal(self, value: Any, name: str, n_channels: int) -> np.ndarray:
@@ -609,7 +633,6 @@ class CoreController(BlockProcessing, Checkpointed):
             Steps(block.address, *block.algorithm.steps),
             self._by_channel("weights"),
             {name: constraint[field] for name, field in RECORDED.items()},
-            in_use=block.in_use,
             owner=block,
         )
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from .._types import PathModels
+from .._validate import as_nonnegative, as_positive
 from ..power.limiter import Limiters
 from .core_controller import CoreController, setting
 
@@ -10,14 +13,16 @@ from .core_controller import CoreController, setting
 class FxNLMS(CoreController):
     r"""Normalised FxLMS: the step is divided by the energy of the filtered reference, without a constraint.
 
-    .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{\epsilon + x'(n)^T x'(n)}
+    .. math:: w(n+1) = w(n) + \mu \frac{e(n)\, x'(n)}{x'(n)^T x'(n)}
 
-    One step size therefore suits soft and loud noise. With several channels, the steps of all filters are divided by
+    One step size therefore suits soft and loud noise. In a quiet passage, the energy counts as a thousandth of the usual
+    one at least; otherwise the weights would follow the noise of the microphones. The usual energy is that of the last
+    thousand filter lengths. With several channels, the steps of all filters are divided by
     the same energy, that of all filtered references together. So their direction remains that of the multiple-error
     LMS:
 
     .. math:: w_{ji}(n+1) = w_{ji}(n) + \mu \frac{\sum_k e_k(n)\, x'_{kji}(n)}
-       {\epsilon + \sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
+       {\sum_{k,j,i} x'_{kji}(n)^T x'_{kji}(n)}
 
     Parameters
     ----------
@@ -25,8 +30,8 @@ class FxNLMS(CoreController):
         As for `FxLMS`.
     step_size : float
         Step size mu, above zero; below 2 for secondary paths without delay, and smaller for longer paths.
-    regularization : float, default 1e-10
-        Energy epsilon, above zero, that keeps the quotient finite while the reference is silent.
+    regularization : float, optional
+        Energy epsilon, above zero, that is added to the energy instead; in the unit of the squared filtered reference.
 
     Raises
     ------
@@ -46,14 +51,14 @@ class FxNLMS(CoreController):
     >>> controller.control_signal(2.0)
     0.0
     >>> controller.update(4.0)
-    >>> round(float(controller.weights[0]), 9)  # 0.5 * 4 * 2 / 2^2
+    >>> float(controller.weights[0])  # 0.5 * 4 * 2 / 2^2
     1.0
     """
 
     name = "FxNLMS"
     algorithm = "fxnlms"
+    checks: ClassVar = {"regularization": as_nonnegative}
     step_size = setting("Step size mu.")
-    regularization = setting("Regularization epsilon.")
 
     def __init__(
         self,
@@ -61,9 +66,15 @@ class FxNLMS(CoreController):
         secondary_path: PathModels,
         *,
         step_size: float,
-        regularization: float = 1e-10,
+        regularization: float | None = None,
         n_references: int = 1,
         limiter: Limiters = None,
     ) -> None:
-        settings = {"step_size": step_size, "regularization": regularization}
+        epsilon = 0.0 if regularization is None else as_positive(regularization, "regularization")
+        settings = {"step_size": step_size, "regularization": epsilon}
         super().__init__(n_taps, secondary_path, settings=settings, n_references=n_references, limiter=limiter)
+
+    @property
+    def regularization(self) -> float | None:
+        """Regularization epsilon, or None."""
+        return self._of_setting("regularization") or None

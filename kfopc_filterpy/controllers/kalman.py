@@ -121,8 +121,14 @@ class KalmanController(CoreController):
 
     def control_signal(self, reference: float) -> float:
         """Return the control signal y(n) for the newest reference sample x(n), from the weights of the last sample."""
-        self._by_channel("weights")[:] = np.reshape(self.estimator.x, -1)
-        return super().control_signal(reference)
+        weights = self._by_channel("weights")
+        before = weights.copy()
+        weights[:] = np.reshape(self.estimator.x, -1)
+        try:
+            return super().control_signal(reference)
+        except BaseException:
+            weights[:] = before
+            raise
 
     def update(self, error: float) -> None:
         """Let the estimator predict and update (eq. 2-9) with the error e(n) that the last control signal left."""

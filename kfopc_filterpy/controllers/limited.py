@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from .._types import NumberOrArray
+from .._validate import as_real_array, require_finite
 from ..power.limiter import OutputLimiter
 from .base import Controller, WrappedController, listening
 from .core_controller import CoreController
@@ -42,6 +46,8 @@ class LimitedController(WrappedController):
     2.0
     """
 
+    _limiter: Any = None
+
     def __init__(self, controller: Controller, limiter: OutputLimiter) -> None:
         if isinstance(controller, CoreController):
             raise ValueError("this controller has a limiter of its own: set controller.limiter, or pass limiter=")
@@ -57,6 +63,8 @@ class LimitedController(WrappedController):
     def limiter(self, limiter: OutputLimiter) -> None:
         if not isinstance(limiter, OutputLimiter):
             raise TypeError(f"limiter must be an OutputLimiter, got {limiter!r}")
+        if self._limiter is not None:
+            limiter.follow(self._limiter)
         self._limiter = limiter
 
     def __repr__(self) -> str:
@@ -64,6 +72,7 @@ class LimitedController(WrappedController):
 
     def control_signal(self, reference: float) -> float:
         """Return the limited control signal y(n) for the newest reference sample x(n)."""
+        require_finite(as_real_array(reference, "reference"), "reference")
         y = self.controller.control_signal(reference)
         if not np.isfinite(y):  # a divergence: return it, so that the loop detects it
             return y
@@ -72,6 +81,11 @@ class LimitedController(WrappedController):
         if emitted is not None:
             emitted(y)
         return y
+
+    def update(self, error: NumberOrArray) -> None:
+        """Pass the error e(n) to the controller's `update`."""
+        require_finite(as_real_array(error, "error"), "error")
+        super().update(error)
 
     def _rates(self) -> dict[str, float | None]:
         return {"limiter": self.limiter.fs}

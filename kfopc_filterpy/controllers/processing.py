@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class BlockProcessing:
         adapt : bool or array_like, shape (n_samples,), default True
             Whether to adapt to a sample. Without, the control signal is computed with the present control filter.
         out : ndarray of float64, shape (n_samples,) or (J, n_samples), optional
-            Array for the control signals, C-contiguous. With it, nothing is allocated for them.
+            Array for the control signals, C-contiguous, in memory of its own. With it, nothing is allocated for them.
 
         Returns
         -------
@@ -60,7 +61,10 @@ class BlockProcessing:
         Raises
         ------
         ValueError
-            Signals of other shapes, without a sample, or with NaN or Inf: nothing was changed.
+            Signals of other shapes, without a sample, or with NaN or Inf; an `out` that overlaps with them: nothing was
+            changed.
+        RuntimeError
+            Another thread is using the controller: nothing was changed.
         RefusedUpdate
             An update that `update` refuses, for example because a square overflows.
 
@@ -90,22 +94,24 @@ def process_steps(
     x, e = block_signal(references, "references"), block_signal(errors, "errors")
     require_one_length(x, e)
     flags = adapt_flags(adapt, x.shape[-1])
+    require_apart(out, x, e)
     y: Any = out
     # The channels of others show in the first sample: of a user's controller, and of one with virtual microphones.
     if hasattr(controller, "multichannel") and not hasattr(controller, "physical"):
         require_channels(x, "references", controller.multichannel, controller.n_references)
         require_channels(e, "errors", controller.multichannel, controller.n_microphones)
         y = output_array(out, ((controller.n_loudspeakers,) if controller.multichannel else ()) + x.shape[-1:])
-    for n in range(x.shape[-1]):
-        sample = controller.control_signal(x[..., n])
-        if n == 0:
-            y = output_array(y, (*np.shape(sample), x.shape[-1]))
-        y[..., n] = sample
-        if flags[n]:
-            try:
-                controller.update(e[..., n])
-            except ValueError as error:
-                raise RefusedUpdate(str(error), n) from error
+    with getattr(controller, "in_use", nullcontext()):
+        for n in range(x.shape[-1]):
+            sample = controller.control_signal(x[..., n])
+            if n == 0:
+                y = output_array(y, (*np.shape(sample), x.shape[-1]))
+            y[..., n] = sample
+            if flags[n]:
+                try:
+                    controller.update(e[..., n])
+                except ValueError as error:
+                    raise RefusedUpdate(str(error), n) from error
     return y
 
 
@@ -147,6 +153,12 @@ def require_channels(signal: np.ndarray, name: str, multichannel: bool, n_channe
     wanted = "(n_samples,)" if not multichannel else f"({n_channels}, n_samples)"
     if signal.ndim != 1 + multichannel or (multichannel and len(signal) != n_channels):
         raise ValueError(f"{name} must be {wanted} for this controller, got shape {signal.shape}")
+
+
+def require_apart(out: np.ndarray | None, *signals: np.ndarray) -> None:
+    """Raise ValueError if control signals would be written over the signals that they are computed from."""
+    if isinstance(out, np.ndarray) and any(np.may_share_memory(out, signal) for signal in signals):
+        raise ValueError("out must not overlap with references or errors: give it memory of its own")
 
 
 def output_array(out: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

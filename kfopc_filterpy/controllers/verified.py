@@ -12,7 +12,7 @@ import numpy as np
 from .._validate import as_channels, as_number, as_positive
 from ..power.constraint import DEFAULT_FS
 from .base import Controller, WrappedController, listening
-from .channel_samples import amplified, amplifier_functions, channel_sample
+from .channel_samples import LOUDEST, amplified, amplifier_functions, channel_sample, require_moderate
 from .posterior import DEFAULT_UNCERTAINTY, LEAST_SPREAD, PathObserver, relative_spread
 
 AVERAGE_S = 0.1  # of the powers that are compared
@@ -25,7 +25,6 @@ LEARN_S = 2.0  # after the error was last so close to the disturbance
 LEAST_VOLUME, STEP_S = 0.05, 0.1  # of a new start, and the time until it is doubled
 FIRST_PAUSE_S, LONGEST_PAUSE_S, FORGIVEN_S = 0.5, 32.0, 60.0
 LEAST_CHANGE, LARGE_CHANGE = 1e-4, 0.25  # of the path's energy: less is not passed on; more is tried in silence first
-LOUDEST = 1e50  # of the samples that can be learned from, see `plant.h`
 
 
 @dataclass(frozen=True)
@@ -265,8 +264,8 @@ class VerifiedController(WrappedController):
     def listen(self, references: Any, errors: Any) -> None:
         """Follow `references` and `errors` before the control is switched on, with silent output."""
         x, e = (np.atleast_2d(as_channels(s, n)) for s, n in ((references, "references"), (errors, "errors")))
-        _require_moderate(x, "references")
-        _require_moderate(e, "errors")
+        require_moderate(x, "references")
+        require_moderate(e, "errors")
         listening(self.controller).listen(references, errors)
         if self._awaits_error:
             self._take(None)
@@ -282,7 +281,7 @@ class VerifiedController(WrappedController):
     def _channels(self, value: Any, count: int, name: str, what: str) -> np.ndarray:
         """Return a checked sample, of which the observer refuses none."""
         sample = channel_sample(value, count, name, what) if self.multichannel else np.array([as_number(value, name)])
-        _require_moderate(sample, name)
+        require_moderate(sample, name)
         return sample
 
     def _push(self, x: np.ndarray, y: np.ndarray, withheld: np.ndarray) -> None:
@@ -401,9 +400,3 @@ class VerifiedController(WrappedController):
 
     def _rates(self) -> dict[str, float | None]:
         return {"verification": self.fs}
-
-
-def _require_moderate(signal: np.ndarray, name: str) -> None:
-    """Raise ValueError for samples that the observer would refuse."""
-    if np.any(np.abs(signal) > LOUDEST):
-        raise ValueError(f"{name} must not be louder than {LOUDEST:g}: scale the signals; nothing was changed")

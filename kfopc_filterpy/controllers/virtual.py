@@ -15,7 +15,7 @@ from ..paths.observation import ObservationFilters
 from ..paths.path_matrix import secondary_paths
 from ..power.amplifiers import Amplifiers
 from .base import Controller, WrappedController, differing_counts, listening
-from .channel_samples import ChannelFilters, PlayedSound
+from .channel_samples import ChannelFilters, PlayedSound, require_moderate
 
 if TYPE_CHECKING:
     import control
@@ -268,7 +268,7 @@ class VirtualMicrophones(WrappedController):
         self.observer = self._checked_observer(observer)
         self._require_fitting_controller()
         self._sound = PlayedSound(secondary, amplifier)
-        self._virtual_error = np.zeros(self.virtual.size)
+        self._virtual_error, self._awaits_error = np.zeros(self.virtual.size), False
 
     def _indices(self, value: Any, name: str) -> np.ndarray:
         indices = np.array([as_count(index, name, minimum=0) for index in value])
@@ -323,7 +323,10 @@ class VirtualMicrophones(WrappedController):
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
         """Return the control signal y(n), (J,), for the newest reference sample x(n), (I,)."""
-        return self._sound.play(self.controller.control_signal(reference))
+        y = self.controller.control_signal(reference)
+        self._advance_unheard()
+        self._awaits_error = True
+        return self._sound.play(y)
 
     def update(self, error: NumberOrArray) -> None:
         """Let the controller adapt to the errors that the last control signal leaves at the virtual microphones.
@@ -337,10 +340,17 @@ class VirtualMicrophones(WrappedController):
             )
         for k in self.physical[~np.isfinite(heard[self.physical])]:
             raise ValueError(f"error must be finite, but that of microphone {k} is {heard[k]}")
+        require_moderate(heard[self.physical], "error")
         disturbance, virtual_error = self._estimate(heard)
         self.controller.update(virtual_error)
         self.observer.advance(disturbance)
-        self._virtual_error = virtual_error
+        self._virtual_error, self._awaits_error = virtual_error, False
+
+    def _advance_unheard(self) -> None:
+        """Keep the observer in time: a sample whose error was refused, or never came, counts as silence."""
+        if self._awaits_error:
+            self.observer.advance(np.zeros(self.physical.size))
+            self._awaits_error = False
 
     def _estimate(self, heard: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the disturbance at the physical and the error at the virtual microphones."""
@@ -372,7 +382,8 @@ class VirtualMicrophones(WrappedController):
             np.shape(errors)
         )  # what the virtual microphones hear is not used, so it may be anything
         heard[self.physical] = as_channels(np.asarray(errors)[self.physical], "errors")
-        before = self._sound.branched(), self._virtual_error, deepcopy(self.observer)
+        before = self._sound.branched(), self._virtual_error, deepcopy(self.observer), self._awaits_error
+        self._advance_unheard()
         virtual_errors = np.empty((self.virtual.size, heard.shape[1]))
         for n, sample in enumerate(heard.T):
             self._sound.push(np.zeros(self.n_loudspeakers))
@@ -382,7 +393,7 @@ class VirtualMicrophones(WrappedController):
         try:
             controller.listen(references, virtual_errors)
         except (ValueError, TypeError):
-            self._sound, self._virtual_error, self.observer = before
+            self._sound, self._virtual_error, self.observer, self._awaits_error = before
             raise
 
     def _rates(self) -> dict[str, float | None]:

@@ -140,7 +140,9 @@ ANC_PUBLIC size_t anc_covariance_size(int32_t n);
 ANC_PUBLIC void anc_covariance_describe(int32_t n, anc_visitor *visit, void *to);
 /* Eq. 5-9 for a row h: correct w by the measurement z with noise q. `result` gets the innovation and S. */
 ANC_PUBLIC int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real q, anc_real result[2]);
-/* Eq. 4 before that: P = fading P + r I. A row that carries no information, S = 0, corrects nothing. */
+/* Eq. 4: P = fading P + r I; see `predict` in covariance.h. */
+ANC_PUBLIC void anc_covariance_predict(void *memory, int32_t n, anc_real r, anc_real fading);
+/* Both: a row that carries no information, S = 0, corrects nothing. */
 ANC_PUBLIC int anc_covariance_step(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real r, anc_real q, anc_real fading, anc_real result[2]);
 
 /* The loop. */

@@ -25,7 +25,7 @@ _step = ctypes.PYFUNCTYPE  # keeps the interpreter's lock
 # What a step that was refused says: `anc_answer` in anc.h. Nothing was changed then.
 LOUD_REFERENCE, LOUD_ERROR, LOUD_ESTIMATE, LOUD_STEP, NO_SOLUTION, LOST_ARRAY = range(1, 7)
 REASONS = {
-    LOUD_REFERENCE: "the reference is too loud, above 1e100 over the gain of the secondary path: scale the signals",
+    LOUD_REFERENCE: "the reference is too loud, above 1e25 over the gain of the secondary path: scale the signals",
     LOUD_ERROR: "the error is too loud, above 1e100: scale the signals",
     LOUD_ESTIMATE: "the disturbance estimate e + s^ * y is too loud, above 1e100: scale the signals",
     LOUD_STEP: "the step of the weights is too large, above 1e50: use a smaller step size",
@@ -156,7 +156,7 @@ class InUse:
     """A context that refuses to be entered by a second thread."""
 
     def __init__(self) -> None:
-        lock = threading.Lock()
+        lock = threading.RLock()
         self._acquire, self.leave = lock.acquire, lock.release
 
     def enter(self) -> None:
@@ -211,7 +211,7 @@ class Block:
     ) -> None:
         self.algorithm, self.shape = algorithm, shape
         self.in_use = InUse()
-        self._enter, self._leave = self.in_use.enter, self.in_use.leave
+        self.enter, self.leave = self.in_use.enter, self.in_use.leave
         self._library: Any = load().held
         keep = self._plan_arrays(path, settings, guard)
         self._require_sizes(keep, memory is None)
@@ -242,6 +242,7 @@ class Block:
         if not opened:
             raise ValueError(f"a setting or a path of {algorithm.name} is out of its range: {settings}")
         self.fields: dict[str, NDArray[Any]] = {}
+        self._scratch: list[slice] = []  # their bytes
         self.states: list[str] = []
         self.scratch: list[str] = []
         self._library.anc_describe(ctypes.c_void_p(algorithm.pointer), of(plan), VISITOR(self._keep_field), None)
@@ -315,6 +316,14 @@ class Block:
             self.states.append(name.decode())
         elif role == _SCRATCH:
             self.scratch.append(name.decode())
+            self._scratch.append(slice(offset, offset + count * dtype.itemsize))
+
+    def saved(self) -> NDArray[np.uint8]:
+        """Return a copy of the memory, with zeros for what no next step needs: equal states have equal bytes."""
+        memory = self.memory.copy()
+        for part in self._scratch:
+            memory[part] = 0
+        return memory
 
     def latest(self, name: str) -> NDArray[np.float64]:
         """Return a field, or of delay lines the samples that they keep, newest first; a view."""
@@ -345,20 +354,12 @@ class Block:
         return other
 
     def emit(self) -> int:
-        """Take `reference`, set `control_signal`, and return the answer, 0 if all is well."""
-        self._enter()
-        try:
-            return self._control(*self._emitted)
-        finally:
-            self._leave()
+        """Take `reference`, set `control_signal`, and return the answer, 0 if all is well; enter `in_use` before."""
+        return self._control(*self._emitted)
 
     def update(self) -> int:
-        """Adapt to `error` and return the answer, 0 if all is well."""
-        self._enter()
-        try:
-            return self._update(*self._updated)
-        finally:
-            self._leave()
+        """Adapt to `error` and return the answer, 0 if all is well; enter `in_use` before."""
+        return self._update(*self._updated)
 
     def listen(
         self, references: NDArray[np.float64], errors: NDArray[np.float64], adapting: NDArray[np.bool_]
@@ -381,5 +382,4 @@ class Block:
 
     def refilter(self) -> None:
         """Filter the stored references again, after the path or the guard has changed."""
-        with self.in_use:
-            self._library.anc_refilter(self._view)
+        self._library.anc_refilter(self._view)

@@ -25,6 +25,7 @@ limit_all = _held("limit_all", None, *(ctypes.c_void_p,) * 4, ctypes.c_int64)
 limit = _held("limit", ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_double)
 amplify_all = _held("amplify_all", None, *(ctypes.c_void_p,) * 3, ctypes.c_int64)
 
+covariance_predict = _held("covariance_predict", None, ctypes.c_void_p, ctypes.c_int32, *(ctypes.c_double,) * 2)
 covariance_update = _held(
     "covariance_update",
     *(ctypes.c_int, ctypes.c_void_p, ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p),

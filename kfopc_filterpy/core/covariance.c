@@ -322,6 +322,12 @@ void anc_covariance_describe(int32_t n, anc_visitor *visit, void *to)
     layout_covariance(&c, n, &at);
 }
 
+void anc_covariance_predict(void *memory, int32_t n, anc_real r, anc_real fading)
+{
+    covariance c = in_memory(memory, n);
+    predict(&c, fading, r);
+}
+
 int anc_covariance_update(void *memory, int32_t n, anc_real *w, const anc_real *h, anc_real z, anc_real q, anc_real result[2])
 {
     covariance c = in_memory(memory, n);

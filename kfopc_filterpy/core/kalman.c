@@ -11,8 +11,8 @@ void layout_kalman(anc_view *view, const anc_plan *plan, const anc_setting *sett
     layout_signals(&f->s, plan, settings, at);
     layout_covariance(&f->c, states(&f->s), at);
     f->scaled = reals(at, "measurement", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
-    f->innovation = reals(at, "innovation", ANC_SCRATCH, 1, 1, f->s.S, f->s.K);
-    f->variance = reals(at, "innovation_variance", ANC_SCRATCH, 1, 1, 1, f->s.K);
+    f->innovation = reals(at, "innovation", ANC_STATE, 1, 1, f->s.S, f->s.K);
+    f->variance = reals(at, "innovation_variance", ANC_STATE, 1, 1, 1, f->s.K);
 }
 
 void start_kalman(anc_view *view, const anc_plan *plan, const anc_setting *settings)

@@ -92,7 +92,7 @@ static void set_loudest(signals *s)
         if (sum > reach) reach = sum;
     }
     for (int32_t g = 0; g < s->G; g++) guard += (real)fabs(s->guard[g]);
-    *s->loudest = LOUDEST_REFERENCE / reach / guard;
+    *s->loudest = s->filtered.rows ? LOUDEST_REFERENCE / reach / guard : LOUDEST;
 }
 
 void start_signals(signals *s, const anc_plan *p, const anc_setting *settings)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._validate import as_real_array, require_finite
+from ..core.calls import covariance_predict
 from ..core.triangle import Covariance, copy_covariance, covariance_at, new_covariance, owed_of
 from .checked_steps import INDEFINITE_LIMIT, require_semidefinite
 
@@ -102,14 +103,12 @@ class RandomWalkCovariance:
 
     def predict(self, alpha_sq: float, state_noise: float) -> None:
         """Record eq. 4, P(n|n-1) = alpha^2 P(n-1|n-1) + r I, as pending for the next pass over the triangle."""
-        owed = self.seen.owed
-        scale, diagonal, pending, *_ = owed.item()
+        scale, diagonal, *_ = self.seen.owed.item()
         if not alpha_sq * max(scale, diagonal) + state_noise < LARGEST:
             raise ValueError(f"P would overflow with Q = {state_noise:g}, alpha^2 = {alpha_sq:g}. Nothing was changed")
         self._shown = []
-        scale, diagonal = alpha_sq * scale, alpha_sq * diagonal + state_noise
-        owed["scale"], owed["diagonal"] = scale, diagonal
-        self.prior = scale, diagonal, -scale * pending
+        covariance_predict(*self.seen.places[:2], state_noise, alpha_sq)
+        self.prior = self.now
 
     def undoing(self) -> Callable[[], None]:
         """Return a function that takes back predictions from now on, unless a pass has applied them."""

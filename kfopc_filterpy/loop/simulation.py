@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -166,7 +167,8 @@ def simulate(
     looped = None
     if compiled and isinstance(controller, CoreController) and not any(functions):
         looped = controller.looped()
-    diverged, end = run.steps(x) if looped is None else run.loop(looped)
+    with getattr(controller, "in_use", nullcontext()):
+        diverged, end = run.steps(x) if looped is None else run.loop(looped)
     for signal in (*results, *recorded.values()):
         signal[:, end:] = np.nan
     weights[-(-end // (every or 1)) :] = np.nan
@@ -214,8 +216,7 @@ class _Run:
         status, begin, n_samples = RUNNING, 0, self.signals.error.shape[1]
         while begin < n_samples and status == RUNNING:
             end = min(begin + STRETCH, n_samples)
-            with looped.in_use:
-                status, done = self.plant.run(looped.steps, self.signals, records, begin, end)
+            status, done = self.plant.run(looped.steps, self.signals, records, begin, end)
             if self.progress:
                 self.progress(done - begin)
             begin = done

@@ -193,6 +193,48 @@ class OutputLimiter:
         """Go on in arrays of its own."""
         self._state = LimiterState(*(array.copy() for array in self._state))
 
+    def follow(self, other: OutputLimiter) -> None:
+        """Take over from another limiter of the same output: what that one has let through counts from now on.
+
+        A limiter that has let nothing through itself goes on as the other one if its settings are the same. Otherwise
+        the louder one of both counts in each sample, and if that exceeds the rated power, the output is zero until it
+        does not.
+
+        Parameters
+        ----------
+        other : OutputLimiter
+            Limiter that was in use so far; it stays as it is.
+
+        Raises
+        ------
+        TypeError
+            An object that is not an `OutputLimiter`.
+        """
+        if not isinstance(other, OutputLimiter):
+            raise TypeError(f"other must be an OutputLimiter, got {other!r}")
+        own, played = self._state, self._played(other)
+        if not np.any(played):
+            return
+        before = self._played(self)
+        settings = [[one.numbers[name] for name in _SETTINGS] for one in (own, other.state)]
+        if settings[0] == settings[1] and not np.any(before):
+            for array, theirs in zip(own, other.state, strict=True):
+                array[...] = theirs
+            return
+        # A complete lap of the louder ones; its sums, from each sample on, are those that `start_lap` in limiter.c makes.
+        squares = np.maximum(before, played)
+        own.laps[2, :-1] = squares
+        own.laps[:2, 1:-1] = np.cumsum(squares[::-1])[::-1][1:]
+        own.laps[:2, [0, -1]] = 0.0
+        own.numbers["position"] = own.numbers["spent"] = own.numbers["arrived"] = 0.0
+
+    def _played(self, other: OutputLimiter) -> np.ndarray:
+        """Return the energies that another limiter let through, (N,), the oldest first, in units of this one's budget."""
+        numbers, size = other.state.numbers, self._state.laps.shape[1] - 1
+        squares = np.roll(other.state.laps[2, :-1], -int(numbers["position"][0]))[-size:]
+        squares = squares * (self._state.numbers["scale"] / numbers["scale"]) ** 2
+        return np.pad(squares, (size - squares.size, 0))
+
     def reset(self) -> None:
         """Forget the past, as if only zeros had come in."""
         numbers = self._state.numbers

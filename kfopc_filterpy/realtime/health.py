@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from dataclasses import dataclass
 
+MOST_KINDS, OTHER = 1000, "other"  # of events, which an exception's words can make many; what the rest are
+LONGEST_TEXT = 200
 JOINED_S = 0.1  # events of a kind that are closer to each other are one
 
 
@@ -36,7 +38,8 @@ class Fault:
 class Health:
     """What a supervisor has noticed.
 
-    It stays small however long the run is: the newest events are kept, and the counts go on.
+    It stays small however long the run is, and whatever an exception says: the newest events are kept, and the counts go
+    on. Texts are cut to 200 characters, and after a thousand kinds of events a new kind counts as "other".
 
     Attributes
     ----------
@@ -84,6 +87,11 @@ class Health:
             Number of samples concerned.
         """
         until_s = time_s if until_s is None else until_s
+        what, channel = what[:LONGEST_TEXT], channel[:LONGEST_TEXT]
+        if what not in self.counts and len(self.counts) >= MOST_KINDS:
+            what = OTHER
+        if len(self._latest) >= MOST_KINDS:  # only forgets which events could go on
+            self._latest.clear()
         self.samples[what] += n_samples
         latest = self._latest.get((what, channel))
         if latest is not None and time_s - latest.until_s <= JOINED_S and until_s > time_s:

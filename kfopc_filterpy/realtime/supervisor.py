@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike
 from .._types import PerLoudspeaker
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..controllers.base import Controller
+from ..controllers.base import Controller, checked_controller
 from ..controllers.core_controller import CoreController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
 from ..power.constraint import DEFAULT_FS
+from ..power.limiter import OutputLimiter
 from .faults import GOOD, KINDS, REPEATED, Inspector, is_repeated
 from .health import Health
 
@@ -148,9 +149,7 @@ class Supervisor(Checkpointed):
         largest_gain: float = 1e6,
         blocks_can_repeat: bool = True,
     ) -> None:
-        if isinstance(controller, type) or not isinstance(controller, Controller):
-            raise TypeError(f"controller must have control_signal(reference) and update(error), got {controller!r}")
-        self.controller: Any = controller
+        self._controller: Any = checked_controller(controller)
         self.fs = as_positive(fs, "fs", unit="Hz")
         if hasattr(controller, "require_sample_rate"):
             controller.require_sample_rate(self.fs)
@@ -195,6 +194,26 @@ class Supervisor(Checkpointed):
         self._usual, self._usual_reference, self._normal_gain = np.nan, np.nan, np.inf
         self._windows, self._loud_windows = 0, 0
         self._begin_window()
+
+    @property
+    def controller(self) -> Any:
+        """Controller that is running now. What was played so far counts for the limiter of one that is assigned."""
+        return self._controller
+
+    @controller.setter
+    def controller(self, controller: Controller) -> None:
+        controller = checked_controller(controller)
+        for new, old in zip(_limiters(controller), _limiters(self._controller), strict=False):
+            if new is not old:
+                new.follow(old)
+        self._controller = controller
+
+    def _replace(self, state: Any) -> None:
+        """Go on with a copy of a controller; what that one played before it was copied does not count."""
+        other = deepcopy(state)
+        for limiter in _limiters(other):
+            limiter.reset()
+        self.controller = other
 
     @property
     def _target(self) -> float:
@@ -357,7 +376,8 @@ class Supervisor(Checkpointed):
     def _listen(self, x: np.ndarray, e: np.ndarray, usable: np.ndarray) -> None:
         """Let the controller follow the noise with silent loudspeakers, and count the pause."""
         if self._replacement_due:
-            self.controller, self._replacement_due = deepcopy(self._fresh), False
+            self._replace(self._fresh)
+            self._replacement_due = False
         signals = [self._shaped(block) for block in (x, e)]
         try:
             if isinstance(self.controller, CoreController):
@@ -409,6 +429,8 @@ class Supervisor(Checkpointed):
             held = y[:, first - 1] if first else self._last_y
             n = y.shape[1] - first
             y[:, first:] = held[:, np.newaxis] * np.clip(1.0 - np.arange(1, n + 1) / min(n, self._fade), 0.0, 1.0)
+            for faded, limiter in zip(y[:, first:], _limiters(self.controller), strict=False):
+                faded[:] = limiter.process(faded)
             self._stop("diverged: not finite", at_once=True)
         self._last_y = y[:, -1].copy()
         return y
@@ -495,11 +517,11 @@ class Supervisor(Checkpointed):
         self._note(why)
         if self.on_divergence == "freeze":
             self._note("frozen")
-            self.controller = deepcopy(self._good)
+            self._replace(self._good)
             self._frozen = self._pause
         elif self.on_divergence == "reset":
             self._note("reset")
-            self.controller = deepcopy(self._fresh)
+            self._replace(self._fresh)
         else:
             self._note("muted")
             self._waiting = self._pause
@@ -539,6 +561,13 @@ def _samples_since(bad: np.ndarray, before: int) -> tuple[np.ndarray, int]:
     last_bad = np.maximum.accumulate(np.where(bad, index, -1))
     since = np.where(last_bad < 0, before + index, index - last_bad - 1)
     return since, 0 if bad[-1] else int(since[-1]) + 1
+
+
+def _limiters(controller: Any) -> tuple[OutputLimiter, ...]:
+    """Return the limiters of a controller, one for each loudspeaker, or nothing."""
+    limiter = getattr(controller, "limiter", None)
+    limiters = limiter if isinstance(limiter, tuple) else (limiter,)
+    return tuple(one for one in limiters if isinstance(one, OutputLimiter))
 
 
 def _remembered(controller: Any) -> int:
