@@ -93,7 +93,7 @@ def as_number(value: Any, name: str, *, unit: str = "") -> float:
     if type(value) is float and math.isfinite(value):  # fast path: called for every sample
         return value
     unit = f" in {unit}" if unit else ""
-    if isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
+    if value is None or isinstance(value, str | bytes) or (np.ndim(value) != 0 and np.size(value) != 1):
         raise TypeError(f"{name} must be a single number{unit}, got {value!r}")
     try:
         number = float(as_real_array(value, name).reshape(()))

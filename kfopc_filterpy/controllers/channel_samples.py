@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .._validate import as_real_array
 from ..power.amplifiers import Amplifiers, LinearAmplifier, amplifier_of_each
 
-LOUDEST = 1e50  # of the samples that can be learned from, see `plant.h`
+LOUDEST = 1e20  # of the samples that can be learned from, see `plant.h`
 
 
 def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndarray:

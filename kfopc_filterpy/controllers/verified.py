@@ -39,7 +39,7 @@ class PathEvent:
         "alarm": the errors contradict the secondary path, which is learned anew; "full volume": the control signal is
         no longer turned down. The other events stop the control. "louder": the noise is louder than it would be without
         control; "another path": the secondary path has drifted far; "unstable": the adaptation diverges while the control
-        signal is turned down; "not finite": the control signal is NaN, Inf or above 1e50.
+        signal is turned down; "not finite": the control signal is NaN, Inf or above 1e20.
     """
 
     time_s: float

@@ -78,7 +78,7 @@ static inline real faded(real sum, real forget, real more)
 #ifdef ANC_FLOAT
 static const real LOUDEST_LEARNT = 1e6f, LOUDEST_PLAYED = 1e12f;
 #else
-static const real LOUDEST_LEARNT = 1e50, LOUDEST_PLAYED = 1e100;
+static const real LOUDEST_LEARNT = 1e20, LOUDEST_PLAYED = 1e100;
 #endif
 
 static inline int is_too_loud(const signals *s, const real *reference)
