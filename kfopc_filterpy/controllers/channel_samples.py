@@ -24,10 +24,10 @@ def channel_sample(value: ArrayLike, size: int, name: str, what: str) -> np.ndar
     return np.ascontiguousarray(sample)
 
 
-def require_moderate(signal: np.ndarray, name: str) -> None:
+def require_moderate(signal: np.ndarray, name: str, most: float = LOUDEST) -> None:
     """Raise ValueError for samples from which a state could overflow."""
-    if np.any(np.abs(signal) > LOUDEST):
-        raise ValueError(f"{name} must not be louder than {LOUDEST:g}: scale the signals; nothing was changed")
+    if np.any(np.abs(signal) > most):
+        raise ValueError(f"{name} must not be louder than {most:g}: scale the signals; nothing was changed")
 
 
 def amplifier_functions(amplifier: Amplifiers, n_loudspeakers: int) -> list[Any] | None:

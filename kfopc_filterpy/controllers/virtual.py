@@ -340,7 +340,7 @@ class VirtualMicrophones(WrappedController):
             )
         for k in self.physical[~np.isfinite(heard[self.physical])]:
             raise ValueError(f"error must be finite, but that of microphone {k} is {heard[k]}")
-        require_moderate(heard[self.physical], "error")
+        require_moderate(heard[self.physical], "error", 1e100)
         disturbance, virtual_error = self._estimate(heard)
         self.controller.update(virtual_error)
         self.observer.advance(disturbance)

@@ -3,7 +3,6 @@
 #include "signals.h"
 
 enum { STEP_SIZE }; /* the first setting of all */
-static real largest(real a, real b) { return b > a ? b : a; }
 
 /* FxLMS: w(n+1) = w(n) + mu e(n) x'(n). */
 
@@ -45,7 +44,7 @@ static int update_fxnlms(anc_view *view, const real *error)
     if (!error || refused) return refused;
     const real energy = energy_of(s, &s->filtered, 0, s->filtered.rows) + energy_of(s, &s->guarded, 0, s->guarded.rows);
     const real epsilon = *s->setting[REGULARIZATION], usual = *own->usual > 0 ? *own->usual : energy, L = (real)s->L;
-    const real all = epsilon > 0 ? epsilon + energy : largest(energy, QUIET * usual);
+    const real all = epsilon > 0 ? epsilon + energy : larger(energy, QUIET * usual);
     for (int32_t sj = 0; sj < s->S * s->J; sj++) set_step(s, sj, 1, all > 0 ? *s->setting[STEP_SIZE] / all : 0, 0);
     refused = descend(s, error);
     if (!refused) *own->usual = held_value(usual, energy, 1 - 1 / (HELD * L), 1 + RISE / L);
@@ -86,7 +85,7 @@ static int update_optimal_leaky(anc_view *view, const real *error)
     const int refused = estimate(s, error);
     const real mu = *s->setting[STEP_SIZE];
     for (int32_t sj = 0; sj < s->S * s->J; sj++)
-        set_step(s, sj, largest(1 - mu * (penalty_of_constraint(s->previewed + sj) * s->previewed[sj].mean[ANC_REFERENCE]), 0), mu, 0);
+        set_step(s, sj, larger(1 - mu * (penalty_of_constraint(s->previewed + sj) * s->previewed[sj].mean[ANC_REFERENCE]), 0), mu, 0);
     return refused ? refused : descend(s, error);
 }
 

@@ -88,7 +88,6 @@ static inline int is_too_loud(const signals *s, const real *reference)
     return 0;
 }
 
-static inline real larger(real a, real b) { return a > b ? a : b; }
 static inline real raised(real g, int32_t n) /* g^n */
 {
     real power = 1;

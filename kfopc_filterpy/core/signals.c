@@ -253,7 +253,7 @@ void set_step(signals *s, int32_t sj, real keep, real mu, real penalty)
     step[KEEP] = keep, step[MU] = mu, step[PENALTY] = penalty;
 }
 
-static real limited(real value, real most) { return value > most ? most : value < -most ? -most : value; }
+static real bounded(real value, real most) { return value > most ? most : value < -most ? -most : value; }
 
 /* Bound large steps, which a bad sample causes: none corrects more than the whole error, or takes more than the whole control
  * signal away. So the weights go back, however large they have become. Return whether all are short enough. */
@@ -264,7 +264,7 @@ static int bound_steps(signals *s, const real *error)
     for (int32_t sj = 0; sj < s->S * s->J; sj++) {
         real *step = s->step + STEPS * sj;
         if (step[MU] * energy > 1) step[MU] = 1 / energy;
-        if (x2 > 0) step[PENALTY] = limited(step[PENALTY], (real)fabs(s->control[sj]) / x2);
+        if (x2 > 0) step[PENALTY] = bounded(step[PENALTY], (real)fabs(s->control[sj]) / x2);
         for (int32_t sk = sj / s->J * s->K; sk < (sj / s->J + 1) * s->K; sk++)
             if (!within(step[MU] * error[sk] * size, LARGEST) || !within(step[MU] * s->heard[sk] * size, LARGEST)) return 0;
         if (!within(step[PENALTY] * root(x2), LARGEST)) return 0;

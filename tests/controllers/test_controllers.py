@@ -282,8 +282,8 @@ def test_listening_goes_on_where_nothing_may_be_put_out():
     x = np.random.default_rng(0).standard_normal(4000)
     held = kf_opc(8, [0.0, 0.8, 0.3], rated_power=1.0, state_noise=1e-6, measurement_noise=1e-3)
     held.constraint.factor = 0.0
-    tiny = MOVFxLMS(8, [0.0, 0.8, 0.3], rated_power=1e-300, step_size=0.1)
-    for controller, scale in ((held, 1.0), (tiny, 1e99)):
+    tiny = MOVFxLMS(8, [0.0, 0.8, 0.3], rated_power=1e-320, step_size=0.1)
+    for controller, scale in ((held, 1.0), (tiny, 1e24)):
         controller.listen(scale * x, scale * x)
         # half a second's memory over a quarter of one: nearly the plain mean
         assert controller.disturbance_power == pytest.approx(scale**2 * np.mean(x**2), rel=0.1)

@@ -260,7 +260,8 @@ def test_bad_factors_are_refused(value: float) -> None:
 
 
 def test_settings_can_be_read() -> None:
-    assert FxNLMS(L, ESTIMATE, step_size=0.1).regularization == 1e-10
+    assert FxNLMS(L, ESTIMATE, step_size=0.1).regularization is None
+    assert FxNLMS(L, ESTIMATE, step_size=0.1, regularization=0.5).regularization == 0.5
     assert LeakyFxLMS(L, ESTIMATE, step_size=0.1, leak=0.3).leak == 0.3
     two = TwoGradientFxLMS(L, ESTIMATE, step_size=0.1, amplitude_limit=2.0)
     assert (two.step_size, two.output_step_size, two.amplitude_limit) == (0.1, 0.1, 2.0)

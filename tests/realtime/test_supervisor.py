@@ -500,7 +500,7 @@ def test_an_integer_beyond_a_float_is_refused() -> None:
     supervisor = supervised(MAKERS["FxLMS"]())
     with pytest.raises(ValueError, match="references must be finite, but holds a number that is too large"):
         supervisor.process([10**400], [0.0])
-    with pytest.raises(ValueError, match="must be finite, got a number that is too large"):
+    with pytest.raises(ValueError, match="must be finite, but holds a number that is too large"):
         supervisor.controller.control_signal(10**400)
     with pytest.raises(ValueError, match="stuck_s must be a finite number of samples"):
         supervised(MAKERS["FxLMS"](), stuck_s=1e308)
