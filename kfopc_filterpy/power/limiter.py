@@ -203,7 +203,7 @@ class OutputLimiter:
         Parameters
         ----------
         other : OutputLimiter
-            Limiter that was in use so far; it stays as it is.
+            Limiter that was in use so far; it stays as it is. What it let through before its own window is not known.
 
         Raises
         ------

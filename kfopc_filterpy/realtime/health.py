@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from dataclasses import dataclass
 
-MOST_KINDS, OTHER = 1000, "other"  # of events, which an exception's words can make many; what the rest are
+MOST_KINDS, OTHER = 100, "other"  # of events, which an exception's words can make many; what the rest are
 LONGEST_TEXT = 200
 JOINED_S = 0.1  # events of a kind that are closer to each other are one
 
@@ -39,7 +39,7 @@ class Health:
     """What a supervisor has noticed.
 
     It stays small however long the run is, and whatever an exception says: the newest events are kept, and the counts go
-    on. Texts are cut to 200 characters, and after a thousand kinds of events a new kind counts as "other".
+    on. Texts are cut to 200 characters, and after a hundred kinds of events a new kind counts as "other".
 
     Attributes
     ----------

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from .._types import PerLoudspeaker
 from .._validate import as_choice, as_count, as_number, as_positive, as_real_array, as_sample_count, per_loudspeaker
 from ..checkpoint import Checkpointed
-from ..controllers.base import Controller, checked_controller
+from ..controllers.base import Controller, WrappedController, checked_controller
 from ..controllers.core_controller import CoreController
 from ..controllers.processing import RefusedUpdate, process_steps
 from ..paths.uncertainty import GUARD_TAPS
@@ -209,10 +209,12 @@ class Supervisor(Checkpointed):
         self._controller = controller
 
     def _replace(self, state: Any) -> None:
-        """Go on with a copy of a controller; what that one played before it was copied does not count."""
+        """Go on with a copy of a controller, and with the limiter in use: that knows what was played."""
         other = deepcopy(state)
-        for limiter in _limiters(other):
+        for limiter in _limiters(other):  # which knows what was played before the copy was made
             limiter.reset()
+        if _limiters(self.controller) and isinstance(other, CoreController | WrappedController):
+            other.limiter = self.controller.limiter
         self.controller = other
 
     @property
@@ -422,15 +424,15 @@ class Supervisor(Checkpointed):
         return y
 
     def _finite(self, y: np.ndarray) -> np.ndarray:
-        """Return the control signals; from a value that is not finite on, the last finite one fades out."""
+        """Return the control signals; from a value that is not finite on, the last finite one fades out, or 0."""
         finite = np.isfinite(y).all(axis=0)
         if not finite.all():
             first = int(finite.argmin())
             held = y[:, first - 1] if first else self._last_y
             n = y.shape[1] - first
+            if _limiters(self.controller):  # which would not know of a fade
+                held = np.zeros_like(held)
             y[:, first:] = held[:, np.newaxis] * np.clip(1.0 - np.arange(1, n + 1) / min(n, self._fade), 0.0, 1.0)
-            for faded, limiter in zip(y[:, first:], _limiters(self.controller), strict=False):
-                faded[:] = limiter.process(faded)
             self._stop("diverged: not finite", at_once=True)
         self._last_y = y[:, -1].copy()
         return y

@@ -9,7 +9,7 @@ import pytest
 from helpers.comparing import assert_same_run
 from helpers.simulation import MAKERS, D, Integrator, S, X, noises
 
-from kfopc_filterpy import FxLMS, HardClipAmplifier, KalmanController, SoftSaturationAmplifier, simulate
+from kfopc_filterpy import FxLMS, FxNLMS, HardClipAmplifier, KalmanController, SoftSaturationAmplifier, simulate
 from kfopc_filterpy.filters import RandomWalkKFOPC
 from kfopc_filterpy.paths import fir_path
 
