@@ -42,7 +42,9 @@ def as_real_array(value: Any, name: str) -> np.ndarray:
     except OverflowError as error:  # an integer of Python
         raise ValueError(f"{name} must be finite, but holds a number that is too large for a float") from error
     if real is None:
-        got = {"c": "complex ones", "O": "text, dates or masked values among them"}.get(array.dtype.kind, type(value).__name__)
+        got = {"c": "complex ones", "O": "text, dates or masked values among them"}.get(
+            array.dtype.kind, type(value).__name__
+        )
         raise TypeError(f"{name} must be a sequence of real numbers, got {got}")
     return real
 
@@ -51,7 +53,9 @@ def _may_be_real(array: np.ndarray) -> bool:
     """Return False for what numpy would take: complex numbers without their imaginary part, text, dates, masks."""
     if array.dtype.kind != "O":
         return array.dtype.kind not in "cSUMm"
-    return not any(isinstance(value, str | bytes | np.datetime64 | np.timedelta64 | np.ma.MaskedArray) for value in array.flat)
+    return not any(
+        isinstance(value, str | bytes | np.datetime64 | np.timedelta64 | np.ma.MaskedArray) for value in array.flat
+    )
 
 
 def as_channels(value: Any, name: str) -> np.ndarray:

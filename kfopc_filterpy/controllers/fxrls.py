@@ -50,9 +50,9 @@ def fx_rls(
 
     Notes
     -----
-    Band-limited noise and tones do not excite all directions of the control filter. In the others P grows by 1/lambda
-    per sample until rounding corrupts it, after some 23 time constants of the memory, and the control diverges. State
-    noise instead of forgetting (`kf_anc`) causes no such growth.
+    Band-limited noise and tones do not excite all directions of the control filter, and silence excites none. In the
+    others P grows by 1/lambda per sample, up to 10^4 times the usual variance along :math:`x'`. From then on, state noise
+    of the same size along :math:`x'` takes the place of forgetting: the filter follows changes, and P stays bounded.
 
     References
     ----------

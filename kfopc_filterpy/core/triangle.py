@@ -15,7 +15,9 @@ from .calls import covariance_update as covariance_update
 
 GROUP = 8  # rows of T that have one length, `PARTS` in vectors.h
 LINE = 64  # bytes in a cache line
-OWED = np.dtype([(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored", "usual")])
+OWED = np.dtype(
+    [(name, np.float64) for name in ("scale", "diagonal", "pending", "largest", "bound", "floored", "usual")]
+)
 
 
 class Covariance(NamedTuple):

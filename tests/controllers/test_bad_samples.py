@@ -19,7 +19,7 @@ from kfopc_filterpy import KFOPC, FxLMS, FxNLMS, OutputLimiter, fx_rls, simulate
 from kfopc_filterpy.signals import band_limited_noise, tone
 
 UNUSABLE = [np.nan, np.inf, -1e160, 1e308, "1.0", np.ma.masked, np.datetime64("2020-01-01")]
-HUGE = [1e12, -1e19, 1e24, 1e49]
+HUGE = [1e12, -1e24, 1e49]
 FS = 8000
 S = np.array([0.0, 0.0, 0.0, 0.8, 0.0, -0.2])
 P = np.zeros(40)

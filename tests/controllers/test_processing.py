@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 from helpers.channels import random_paths
+from helpers.checkpoints import contents
+from helpers.controllers import ALL
 from helpers.simulation import X
 
 from kfopc_filterpy import (
@@ -207,3 +209,27 @@ def test_the_interpreter_lock_is_released() -> None:
         time.sleep(0.005)
         ticks += 1
     assert ticks > 20  # with the lock held, only the last one or two
+
+
+@pytest.mark.parametrize("name", ["FxLMS plain", "LimitedController"])
+def test_an_output_that_overlaps_with_the_signals_is_refused_with_nothing_changed(name: str) -> None:
+    controller, room = ALL[name](), np.random.default_rng(0).standard_normal(60)
+    before = contents(controller)
+    for x, e, out in ((room[:20], room[30:50], room[30:50]), (room[:20], room[30:50], room[10:30])):
+        with pytest.raises(ValueError, match="out must not overlap"):
+            controller.process(x, e, out=out)
+    assert contents(controller) == before
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [["1.0", 2.0], [np.datetime64("2020-01-01"), 2.0], [np.timedelta64(3, "s"), 2.0], [np.ma.masked, 2.0]],
+    ids=["text", "date", "time", "masked"],
+)
+def test_what_is_no_number_in_an_array_of_objects_is_refused(signal: list[Any]) -> None:
+    controller = ALL["FxLMS plain"]()
+    with pytest.raises(TypeError, match="errors must be a sequence of real numbers"):
+        controller.process([1.0, 2.0], np.array(signal, dtype=object))
+    for call in (controller.update, OutputLimiter(1.0)):
+        with pytest.raises((TypeError, ValueError), match=r"a single number|finite, got a masked value"):
+            call(signal[0])

@@ -36,7 +36,9 @@ class Loud:
 
 MAKERS: dict[str, Any] = {
     "a user's": lambda: LimitedController(Loud(), limiter()),
-    "FxLMS": lambda: FxLMS(16, PATH, step_size=0.05, limiter=limiter()),  # it diverges, and is often beyond largest_gain
+    "FxLMS": lambda: FxLMS(
+        16, PATH, step_size=0.05, limiter=limiter()
+    ),  # it diverges, and is often beyond largest_gain
 }
 
 

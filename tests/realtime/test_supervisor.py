@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import pickle
 from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from kfopc_filterpy import KFOPC, FxLMS, KalmanController, OutputPowerConstraint, kf_anc, kf_opc
 from kfopc_filterpy.controllers import VerifiedController
-from kfopc_filterpy.realtime import SimulatedInterface, Supervisor
+from kfopc_filterpy.realtime import Health, SimulatedInterface, Supervisor
 
 FS = 8000.0
 BLOCK, LATENCY = 32, 64
@@ -504,3 +505,12 @@ def test_an_integer_beyond_a_float_is_refused() -> None:
         supervisor.controller.control_signal(10**400)
     with pytest.raises(ValueError, match="stuck_s must be a finite number of samples"):
         supervised(MAKERS["FxLMS"](), stuck_s=1e308)
+
+
+def test_the_health_record_stays_small_whatever_an_exception_says() -> None:
+    health = Health()
+    for n in range(500):
+        health.note(f"diverged: {n} {'x' * 10_000}", f"loudspeaker {n}", time_s=float(n))
+    assert len(pickle.dumps(health)) < 500_000  # 500 events of up to 200 letters
+    assert health.counts["other"] == 400
+    assert sum(health.counts.values()) == sum(health.samples.values()) == 500
