@@ -9,8 +9,9 @@ static const real CANCELLATION = 1000;
 static const real BLUR = 16, LEAST_NOISE = 2;
 /* P fades until its largest variance is WIDEST times the usual one along the rows. From then on, state noise of the same size
  * along the rows takes the place of fading, so that the others hardly grow. The usual variance falls by e^FALL at most while a
- * row passes, so that a bad sample does not count, and rises with RELEASE of the fading. */
-static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625;
+ * row passes, so that a bad sample does not count, and rises with RELEASE of the fading. It is known when h'P h first exceeds
+ * TELLING of q: before, the signal may be so soft that P must grow, up to UNKNOWN times the variance at the start. */
+static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625, TELLING = (real)1e-4, UNKNOWN = 1e20;
 #ifdef ANC_FLOAT
 static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1, see two_product */
 #else
@@ -32,7 +33,7 @@ void layout_covariance(covariance *c, int32_t n, anc_layout *at)
 void start_covariance(covariance *c, real initial_variance)
 {
     for (int32_t i = 0; i < c->n; i++) row_of(c, i)[i] = initial_variance;
-    *c->owed = (anc_owed){.scale = 1, .largest = initial_variance, .bound = initial_variance, .floored = sizeof(real) < sizeof(double), .usual = initial_variance};
+    *c->owed = (anc_owed){.scale = 1, .largest = initial_variance, .bound = initial_variance, .floored = sizeof(real) < sizeof(double)};
 }
 
 static real largest_variance(const covariance *c)
@@ -60,7 +61,7 @@ void predict(covariance *c, real fading, real state_noise)
 {
     anc_owed *owed = c->owed;
     if (fading > 1) {
-        const real most = WIDEST * owed->usual;
+        const real most = owed->usual > 0 ? WIDEST * owed->usual : UNKNOWN * owed->largest;
         owed->usual *= 1 + (fading - 1) * RELEASE;
         if (owed->scale * owed->bound > most) owed->bound = largest_variance(c);
         if (owed->scale * owed->bound > most) state_noise += (fading - 1) * owed->usual, fading = 1;
@@ -171,7 +172,10 @@ real project(covariance *c, real q)
     owed->bound = owed->scale * owed->bound + owed->diagonal;
     if (owed->scale != 1) fade(c);
     const real variance = pass(c, owed->pending, owed->diagonal), energy = dot(c->h, c->h, c->n), blur = BLUR * ROUNDING * energy;
-    if (variance > 0 && energy > 0) owed->usual = held_value(owed->usual, variance / energy, 1 / (1 + FALL / (real)c->n), 1);
+    if (energy > 0 && variance > TELLING * q) {
+        const real along = variance / energy;
+        owed->usual = owed->usual > 0 ? held_value(owed->usual, along, 1 / (1 + FALL / (real)c->n), 1) : along;
+    }
     owed->scale = 1, owed->diagonal = owed->pending = 0;
     return variance < blur * owed->bound ? blurred(c, variance, blur, q) : variance;
 }

@@ -50,7 +50,7 @@ def new_covariance(P: np.ndarray) -> Covariance:
         rows[...] = full[group : group + GROUP, : group + GROUP]
     owed = owed_of(cov)
     owed["scale"], owed["largest"] = 1.0, np.max(np.diagonal(P))
-    owed["bound"] = owed["usual"] = owed["largest"]
+    owed["bound"] = owed["largest"]
     return cov
 
 
