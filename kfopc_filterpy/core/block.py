@@ -16,7 +16,7 @@ from .library import Library, load
 
 ALIGNMENT = 64  # bytes; wide vectors are fastest there
 _STATE, _SETTING, _SCRATCH = range(3)
-_KINDS = (np.dtype(np.float64), np.dtype(np.int32))
+_PRECISIONS = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
 _VIEW_PLACES = 128
 SLACK = 64  # of delay lines, see signals.c
 _EACH = ("", "loudspeakers", "microphones")
@@ -89,6 +89,8 @@ class Algorithm:
         Name in C, without the prefix ``anc_``.
     path : str or Path, optional
         Library that has it, see `load_algorithm`; by default the core's.
+    real : {"double", "float"}
+        Type of the core's numbers.
 
     Raises
     ------
@@ -96,16 +98,19 @@ class Algorithm:
         If the library has no algorithm of that name.
     """
 
-    def __init__(self, name: str, path: str | Path | None = None) -> None:
-        self.name, self.path = name, None if path is None else str(path)
-        self._library: Library = load()
-        library = self._library.held if path is None else ctypes.PyDLL(str(path))
+    def __init__(self, name: str, path: str | Path | None = None, real: str = "double") -> None:
+        self.name, self.path, self.precision = name, None if path is None else str(path), _PRECISIONS[real]
+        self.library: Library = load(real)
+        library = self.library.held if path is None else ctypes.PyDLL(str(path))
         try:
             self._struct = _Algorithm.in_dll(library, f"anc_{name}")
         except ValueError:
             raise ValueError(f"{self.path or 'the core'} has no algorithm anc_{name}") from None
         self.pointer = ctypes.addressof(self._struct)
         self.settings: list[Setting] = []
+        if real == "float":  # whose table has floats in it, where `_Setting` has doubles
+            self.settings = Algorithm(name).settings
+            return
         while (name_of := self._struct.settings[len(self.settings)].name) is not None:
             self.settings.append(Setting(name_of.decode(), _EACH[self._struct.settings[len(self.settings)].each]))
 
@@ -124,7 +129,7 @@ class Algorithm:
         arrays = {name: np.array(getattr(shape, name), np.int32) for name in ("power_windows", "limiter_windows")}
         plan = _plan_of(shape, arrays)
         pointer = ctypes.c_void_p(self.pointer)
-        self._library.held.anc_describe(pointer, ctypes.byref(plan), VISITOR(keep), None)
+        self.library.held.anc_describe(pointer, ctypes.byref(plan), VISITOR(keep), None)
         return found
 
     def __reduce__(self) -> Any:
@@ -212,7 +217,7 @@ class Block:
         self.algorithm, self.shape = algorithm, shape
         self.in_use = InUse()
         self.enter, self.leave = self.in_use.enter, self.in_use.leave
-        self._library: Any = load().held
+        self._library: Any = algorithm.library.held
         keep = self._plan_arrays(path, settings, guard)
         self._require_sizes(keep, memory is None)
         if memory is not None:
@@ -246,8 +251,8 @@ class Block:
         self.states: list[str] = []
         self.scratch: list[str] = []
         self._library.anc_describe(ctypes.c_void_p(algorithm.pointer), of(plan), VISITOR(self._keep_field), None)
-        self.reference, self.control_signal = np.zeros(shape.references), np.zeros(shape.scenarios * shape.loudspeakers)
-        self.error = np.zeros(shape.scenarios * shape.microphones)
+        counts = (shape.references, shape.scenarios * shape.loudspeakers, shape.scenarios * shape.microphones)
+        self.reference, self.control_signal, self.error = (np.zeros(n, algorithm.precision) for n in counts)
         control, update = algorithm.steps
         pointers = (ctypes.c_void_p,) * 3
         self._control = _step(ctypes.c_int, *pointers)(control)
@@ -257,7 +262,7 @@ class Block:
 
     def _plan_arrays(self, path: Any, settings: Any, guard: Any) -> dict[str, np.ndarray]:
         """Return the arrays that a plan points to."""
-        shape, numbers = self.shape, dict(settings or {})
+        shape, numbers, real = self.shape, dict(settings or {}), self.algorithm.precision
         values = (
             [
                 np.broadcast_to(numbers.pop(name), getattr(shape, each) if each else 1)
@@ -271,26 +276,27 @@ class Block:
         return {
             "power_windows": np.array(shape.power_windows, np.int32),
             "limiter_windows": np.array(shape.limiter_windows, np.int32),
-            "path": np.array([] if path is None else path, np.float64, order="C"),
-            "guard": np.array([] if guard is None else guard, np.float64),
-            "settings": np.concatenate([*values, np.zeros(1)]) if settings else np.array([]),
+            "path": np.array([] if path is None else path, real, order="C"),
+            "guard": np.array([] if guard is None else guard, real),
+            "settings": np.concatenate([*values, np.zeros(1)]).astype(real) if settings else np.array([]),
         }
 
     def _settings_in(self, memory: NDArray[np.uint8], arrays: dict[str, np.ndarray]) -> np.ndarray:
         """Return the settings of a block, on which the size of the fields after them may depend."""
+        real = self.algorithm.precision
         found: dict[bytes, NDArray[np.uint8]] = {}
 
         def keep(_: Any, name: bytes, role: int, kind: int, offset: int, axes: Any) -> None:
             if role == _SETTING:
-                found[name] = memory[offset : offset + 8 * axes[3]]
+                found[name] = memory[offset : offset + real.itemsize * axes[3]]
 
         plan = _plan_of(self.shape, {**arrays, "settings": np.array([])})
         self._library.anc_describe(ctypes.c_void_p(self.algorithm.pointer), ctypes.byref(plan), VISITOR(keep), None)
         values = [found.get(name.encode(), memory[:0]) for name, _ in self.algorithm.settings]
-        expected = sum(8 * (getattr(self.shape, each) if each else 1) for _, each in self.algorithm.settings)
+        expected = sum(real.itemsize * (getattr(self.shape, each) if each else 1) for _, each in self.algorithm.settings)
         if sum(value.size for value in values) != expected:
             raise ValueError(f"the memory of {memory.size} bytes is not that of a controller of {self.shape}")
-        return np.concatenate([*(value.view(np.float64) for value in values), np.zeros(1)])
+        return np.concatenate([*(value.view(real) for value in values), np.zeros(1, real)])
 
     def _require_sizes(self, arrays: Mapping[str, np.ndarray], fresh: bool) -> None:
         """Raise ValueError if the core would see another shape, or read beyond an array."""
@@ -309,7 +315,7 @@ class Block:
                 raise ValueError(f"{name} of {arrays[name].size} numbers does not fit {shape}")
 
     def _keep_field(self, _: Any, name: bytes, role: int, kind: int, offset: int, shape: Any) -> None:
-        axes, dtype = tuple(shape[i] for i in range(4)), _KINDS[kind]
+        axes, dtype = tuple(shape[i] for i in range(4)), (self.algorithm.precision, np.dtype(np.int32))[kind]
         count = int(np.prod(axes))
         self.fields[name.decode()] = self.memory[offset : offset + count * dtype.itemsize].view(dtype).reshape(axes)
         if role == _STATE:

@@ -14,6 +14,7 @@ from numpy.typing import DTypeLike
 from ..controllers.base import calls_of
 from ..controllers.core_controller import CoreController
 from ..core.block import Block
+from .precision import REALS, in_precision
 from .source import Exported
 
 if TYPE_CHECKING:
@@ -138,8 +139,7 @@ def export_c(
     if path.suffix != ".c":
         raise ValueError(f"path must end in .c, got {str(path)!r}")
     name = _checked_name(path.stem if name is None else name)
-    block = _exportable(controller)
-    exported = Exported(block, controller.multichannel, name, precision)
+    exported = Exported(in_precision(_exportable(controller), precision), controller.multichannel, name)
     description = repr(controller)[1:-1].replace("*/", "* /")
     export = CExport(
         path, path.with_suffix(".h"), name, controller.name, controller.n_taps, precision.name, exported.n_bytes
@@ -170,7 +170,7 @@ def _precision(dtype: Any) -> np.dtype:
         precision = np.dtype(dtype)
     except TypeError as error:
         raise TypeError(f"dtype must be 'float64' or 'float32', got {dtype!r}") from error
-    if precision not in (np.float64, np.float32):
+    if precision not in REALS:
         raise ValueError(f"dtype must be 'float64' or 'float32', got {precision}")
     return precision
 

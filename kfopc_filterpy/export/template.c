@@ -2,7 +2,11 @@
  *
  * First the files of kfopc_filterpy's core (MIT licence, sources $stamp), in which only the includes were
  * resolved and everything made static. After them: the plan, the state of the export, the calls. */
-$defined
+#ifdef __cplusplus
+#error "compile this file as C99; C++ can include its header"
+#endif
+#undef I /* an earlier <complex.h> defines it, and the core has a member of this name */
+$defined#undef ANC_PUBLIC
 #define ANC_PUBLIC static
 #ifdef __GNUC__ /* not every export needs all of the core */
 #pragma GCC diagnostic ignored "-Wunused-function"
@@ -36,7 +40,6 @@ $stretches    {0},
 enum { SELF_TEST = $n_samples, COMPARED = $n_compared };
 static const real expected[COMPARED][$J] = {
 $expected};
-static const real tolerance = $tolerance;
 
 typedef char view_has_room[sizeof(anc_view) == sizeof(((${name}_state *)0)->view) ? 1 : -1];
 
@@ -49,9 +52,15 @@ static void fill(void *to, const char *name, anc_role role, anc_type type, size_
             memcpy((char *)to + offset + size * (size_t)s->first, s->values, size * (size_t)s->count);
 }
 
-/* Return the view of a state; a copy of a state gets its own when it is first used. */
+typedef struct { char before; ${name}_state state; } placed; /* a state where its type may stand */
+static const uint32_t mark = $mark; /* in every state of this export */
+
+static int usable(const void *state) { return state && (uintptr_t)state % offsetof(placed, state) == 0; }
+
+/* Return the view of a usable state; a copy of a state gets its own when it is first used. */
 static anc_view *view_of(${name}_state *state)
 {
+    if (state->mark != mark) ${name}_init(state);
     if (state->opened != state) anc_open(&ALGORITHM, &plan, (anc_view *)state->view, state->block, sizeof state->block, 0);
     state->opened = state;
     return (anc_view *)state->view;
@@ -61,6 +70,8 @@ static anc_view *view_of(${name}_state *state)
 static void take(${name}_state *state, const real *x, real *y)
 {
     static const real silence[$I];
+    for (int32_t j = 0; j < $J; j++) y[j] = 0;
+    if (!usable(state)) return;
     anc_view *view = view_of(state);
     state->fault = ALGORITHM.control_signal(view, x, y);
     if (state->fault) ALGORITHM.control_signal(view, silence, y);
@@ -71,6 +82,7 @@ static void take(${name}_state *state, const real *x, real *y)
 /* Time goes on after a refused sample, too: it is one that is not adapted to. */
 static int adapt(${name}_state *state, const real *e)
 {
+    if (!usable(state)) return ${NAME}_NO_STATE;
     anc_view *view = view_of(state);
     const int refused = state->fault ? state->fault : ALGORITHM.update(view, e);
     if (refused) ALGORITHM.update(view, NULL);
@@ -79,16 +91,18 @@ static int adapt(${name}_state *state, const real *e)
 
 void ${name}_init(${name}_state *state)
 {
+    if (!usable(state)) return;
     anc_open(&ALGORITHM, &plan, (anc_view *)state->view, state->block, sizeof state->block, 1);
     anc_describe(&ALGORITHM, &plan, fill, state->block);
     state->opened = state;
     state->fault = 0;
+    state->mark = mark;
 }
 
 $calls
 int ${name}_self_test(${name}_state *state)
 {
-    int differ = 0;
+    int differ = !usable(state);
     ${name}_init(state);
     for (int32_t n = 0; n < SELF_TEST; n++) {
         real x[$I], e[$K], y[$J];
@@ -96,10 +110,8 @@ int ${name}_self_test(${name}_state *state)
         for (int32_t k = 0; k < $K; k++) e[k] = (real)((5 * n + 2 * k) % 13 - 6) / 8;
         take(state, x, y);
         adapt(state, e);
-        for (int32_t j = 0; n >= SELF_TEST - COMPARED && j < $J; j++) {
-            const real difference = y[j] - expected[n - (SELF_TEST - COMPARED)][j];
-            if (!(difference <= tolerance && -difference <= tolerance)) differ = 1;
-        }
+        for (int32_t j = 0; n >= SELF_TEST - COMPARED && j < $J; j++)
+            if (!(y[j] == expected[n - (SELF_TEST - COMPARED)][j])) differ = 1;
     }
     ${name}_init(state);
     return differ;

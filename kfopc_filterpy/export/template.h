@@ -10,7 +10,7 @@
  *
  * The state has $n_bytes bytes where a pointer has 8. No heap is used, and there is no state elsewhere.
  *
- * Compile with these flags, and the result has the bits of kfopc_filterpy's core$if_compiled:
+ * Compile with these flags, and the result has the bits of kfopc_filterpy's core in $real, on every machine:
  *     $flags
  * -ffp-contract=off decides the bits, -fno-strict-aliasing is needed, the others are for speed. -ffast-math is refused.
  * Of the C library it uses memcpy, memmove, memset, strcmp and math.h.
@@ -20,6 +20,10 @@
  * that is too loud, a step of the weights that is too large, a covariance so large that the next one could overflow
  * (${NAME}_NO_SOLUTION), and a fast array that is lost to rounding. A refused update changes no weight. An output is
  * never NaN or infinite: if the weights have grown that much, it is 0.
+ *
+ * A state that was never initialised, zeroed or not, or that is of another export, is initialised by its first call. One
+ * that is NULL, or not aligned as its type must be, is left alone: the output is 0, and ${name}_update returns
+ * ${NAME}_NO_STATE. C++ can include this header; the source file is C.
  */
 #ifndef ${NAME}_EXPORTED_H
 #define ${NAME}_EXPORTED_H
@@ -43,6 +47,7 @@ typedef struct {
     void *view[$n_places];  /* where the fields stand in `block` */
     const void *opened; /* the state that they were found for */
     int32_t fault;      /* of this sample's reference */
+    uint32_t mark;      /* tells that the state is one of this export */
 } ${name}_state;
 
 /* Set the state to that of the export. */
@@ -54,7 +59,7 @@ $declared_control;
 /* Adapt to the error e(n) that this control signal left. Return ${NAME}_ADAPTED, or why the update was refused. */
 $declared_update;
 
-/* Run known samples from the state of the export, and compare with what Python computed for them$tolerated.
+/* Run known samples from the state of the export, and compare with what Python computed for them, bit for bit.
  * Return 0 if they agree. Afterwards the state is that of the export, as after ${name}_init. */
 int ${name}_self_test(${name}_state *state);
 
