@@ -10,7 +10,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from . import compare, data, explore, paths, run, verdict
+from . import compare, data, explore, export, paths, run, verdict
 from .options import WRONG_INPUT, Parser
 
 EXAMPLES = """examples:
@@ -18,6 +18,7 @@ EXAMPLES = """examples:
   kfopc paths identify sent.wav received.wav --taps 512 -o S.wav
   kfopc compare noise.wav --primary P.wav --secondary S.wav --rated-power 1.6 --algorithm KF-PB,FxLMS -o out
   kfopc run noise.wav --primary P.wav --secondary S.wav --rated-power 0.1 --seconds 20
+  kfopc export controller.toml -o firmware --dtype float32
   kfopc explore
   kfopc data list
 each command has its own --help"""
@@ -57,6 +58,6 @@ def _parser() -> Parser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for module in (verdict, compare, paths, run, explore, data):
+    for module in (verdict, compare, paths, run, export, explore, data):
         module.add_to(commands)
     return parser

@@ -16,7 +16,7 @@ from .library import Library, load
 
 ALIGNMENT = 64  # bytes; wide vectors are fastest there
 _STATE, _SETTING, _SCRATCH = range(3)
-_PRECISIONS = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
+_PRECISIONS: dict[str, np.dtype[Any]] = {"double": np.dtype(np.float64), "float": np.dtype(np.float32)}
 _VIEW_PLACES = 128
 SLACK = 64  # of delay lines, see signals.c
 _EACH = ("", "loudspeakers", "microphones")
@@ -293,7 +293,9 @@ class Block:
         plan = _plan_of(self.shape, {**arrays, "settings": np.array([])})
         self._library.anc_describe(ctypes.c_void_p(self.algorithm.pointer), ctypes.byref(plan), VISITOR(keep), None)
         values = [found.get(name.encode(), memory[:0]) for name, _ in self.algorithm.settings]
-        expected = sum(real.itemsize * (getattr(self.shape, each) if each else 1) for _, each in self.algorithm.settings)
+        expected = sum(
+            real.itemsize * (getattr(self.shape, each) if each else 1) for _, each in self.algorithm.settings
+        )
         if sum(value.size for value in values) != expected:
             raise ValueError(f"the memory of {memory.size} bytes is not that of a controller of {self.shape}")
         return np.concatenate([*(value.view(real) for value in values), np.zeros(1, real)])

@@ -51,22 +51,31 @@ class BuildError(RuntimeError):
     """There is no compiler, a flag is refused, or the compiler failed."""
 
 
-def compiler() -> list[str]:
+def compiler(target: str = "") -> list[str]:
     """Return the command of $CC, cc, gcc or clang, or else of the zig that is installed beside this Python.
+
+    For a target, a machine in zig's words, it is always a zig.
 
     Raises
     ------
     BuildError
         If there is none. The message says what to install.
     """
-    if own := machine_compiler():
+    own = machine_compiler()
+    if own and (not target or _is_zig(own)):
         return own
     if importlib.util.find_spec("ziglang"):
         return [sys.executable, "-m", "ziglang", "cc"]
+    if target:
+        raise BuildError(f"only zig builds for other machines, such as {target}: {_pip()} install ziglang")
     raise BuildError(
         "the core of kfopc_filterpy needs a C compiler: install gcc or clang (or name one by CC), "
-        f"or zig's as a wheel: {Path(sys.executable).name} -m pip install ziglang"
+        f"or zig's as a wheel: {_pip()} install ziglang"
     )
+
+
+def _pip() -> str:
+    return f"{Path(sys.executable).name} -m pip"
 
 
 def machine_compiler() -> list[str]:
@@ -165,7 +174,7 @@ def build(
     """
     if real not in REALS or level not in levels(target):
         raise ValueError(f"a library is for one of {REALS} and one of {levels(target)}, got {real!r} and {level!r}")
-    command, output = compiler(), Path(output)
+    command, output = compiler(target), Path(output)
     output.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=output.parent, prefix=".building-") as folder:
         library = Path(folder, output.name)
@@ -183,7 +192,7 @@ def build(
 
 def build_core(folder: Path, target: str = "") -> list[Path]:
     """Compile the libraries of the core into a folder, for each real and level, and return them."""
-    command = compiler()
+    command = compiler(target)
     known = [level for level in levels(target) if level == LEVELS[0] or _knows(command, level)]
     jobs = {folder / library_name(real, level, target): (real, level) for level in reversed(known) for real in REALS}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -210,8 +219,6 @@ def _machine_flags(command: list[str], level: str, target: str) -> list[str]:
     if _is_zig(command):
         chosen = [f"-mcpu={'baseline' if level == LEVELS[0] else level.replace('-', '_')}"]
         return [*chosen, "-target", target] if target else chosen
-    if target:
-        raise BuildError(f"only zig builds for other machines, such as {target}: set CC to 'python -m ziglang cc'")
     if len(levels()) == 1:
         return []
     return ["-march=x86-64" if level == LEVELS[0] else f"-march={level}"]

@@ -82,6 +82,8 @@ def export_c(
 ) -> CExport:
     """Write a controller as a C99 source file and its header, to continue from its present state.
 
+    In a folder, an example ``main.c`` and a ``README.md`` with the calls and the cost stand beside them.
+
     The files need only ``string.h`` and ``math.h``. They allocate nothing: a struct of fixed size holds the state.
     Several controllers, each exported under its own name, link into one program. The calls are
 
@@ -102,10 +104,11 @@ def export_c(
         `kf_anc`, `kf_opc`, `fx_rls` and `kf_opc_repaired` return, with whatever it has: several channels, limiters,
         amplifier models, an uncertain secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
-        Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Existing files are
-        replaced.
+        Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Or a folder, which is
+        made if its name has no dot. Existing files are replaced.
     name : str, optional
-        Prefix of all names, `anc` above; by default the name of the file.
+        Prefix of all names, `anc` above; by default the name of the file. In a folder it names the files too, and
+        `anc` is the default.
     dtype : {"float64", "float32"}, default "float64"
         Precision of the state and the arithmetic.
 
@@ -119,7 +122,7 @@ def export_c(
     TypeError
         A controller whose algorithm is not in the core, or a subclass with calls of its own. No file was written.
     ValueError
-        A path that does not end in ``.c``, a name that is no C identifier, a value that the precision cannot hold, a
+        A path with another ending, a name that is no C identifier, or `main` in a folder, a value that the precision cannot hold, a
         limiter's window too long for float32. No file was written.
 
     Examples
@@ -135,22 +138,36 @@ def export_c(
     >>> "double left_control_signal(left_state *state, double reference);" in header
     True
     """
-    path, precision = Path(path), _precision(dtype)
-    if path.suffix != ".c":
-        raise ValueError(f"path must end in .c, got {str(path)!r}")
-    name = _checked_name(path.stem if name is None else name)
-    exported = Exported(in_precision(_exportable(controller), precision), controller.multichannel, name)
+    path = Path(path)
+    in_folder = path.is_dir() or not path.suffix
+    if not in_folder and path.suffix != ".c":
+        raise ValueError(
+            f"path must end in .c, or be a folder; one with a dot in its name must exist, got {str(path)!r}"
+        )
+    name = checked_name(("anc" if in_folder else path.stem) if name is None else name)
+    if in_folder and name == "main":
+        raise ValueError("name must not be 'main', whose main.c is the example")
+    path = path / f"{name}.c" if in_folder else path
+    header = path.with_suffix(".h")
+    exported = exported_as(controller, name, header.name, dtype)
+    texts = exported.texts()
+    if in_folder:
+        texts |= exported.examples()
+        path.parent.mkdir(parents=True, exist_ok=True)
+    for file, text in texts.items():
+        (path.parent / file).write_text(text, encoding="utf-8", newline="\n")
+    precision = exported.block.algorithm.precision
+    return CExport(path, header, name, controller.name, controller.n_taps, precision.name, exported.n_bytes)
+
+
+def exported_as(controller: Any, name: str, header: str, dtype: DTypeLike) -> Exported:
+    """Return what the files of an export are made of, or raise the errors of `export_c`."""
+    block, precision = exportable(controller), _precision(dtype)
     description = repr(controller)[1:-1].replace("*/", "* /")
-    export = CExport(
-        path, path.with_suffix(".h"), name, controller.name, controller.n_taps, precision.name, exported.n_bytes
-    )
-    header, source = exported.texts(export.header_path.name, description)
-    export.header_path.write_text(header, encoding="utf-8", newline="\n")
-    export.path.write_text(source, encoding="utf-8", newline="\n")
-    return export
+    return Exported(in_precision(block, precision), controller.multichannel, name, header, description)
 
 
-def _exportable(controller: Any) -> Block:
+def exportable(controller: Any) -> Block:
     """Return a controller's block, or raise a TypeError that says why it cannot be exported."""
     kind = type(controller)
     if not isinstance(controller, CoreController):
@@ -175,7 +192,7 @@ def _precision(dtype: Any) -> np.dtype:
     return precision
 
 
-def _checked_name(name: Any) -> str:
+def checked_name(name: Any) -> str:
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier that begins with a letter, such as name='anc', got {name!r}")
     return name

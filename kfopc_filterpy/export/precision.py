@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..core.block import SLACK, Algorithm, Block
+from ..core.block import Algorithm, Block
 from ..power.limiter import NUMBERS, spans_of
 
 REALS = {np.dtype(np.float64): "double", np.dtype(np.float32): "float"}  # C's names
@@ -27,7 +27,10 @@ def in_precision(block: Block, precision: np.dtype) -> Block:
     """
     own = [one.name for one in block.algorithm.settings]
     fields = {name: block.fields[name].copy() for name in ("secondary_path", "guard", *own, *block.states, "amplifier")}
-    _tidy_lines(fields)
+    for name in [name.removesuffix("_at") for name in fields if name.endswith("_at")]:
+        line, newest = np.zeros_like(fields[name]), block.latest(name)
+        line[..., line.shape[-1] - newest.shape[-1] :] = newest
+        fields |= {name: line, f"{name}_at": np.full_like(fields[f"{name}_at"], line.shape[-1] - newest.shape[-1])}
     for limiter in fields["limiter"].reshape(-1, NUMBERS.itemsize // 8):
         _convert_limiter(limiter.view(NUMBERS), precision)
     fields = {name: _converted(field, name, precision) for name, field in fields.items()}
@@ -53,16 +56,6 @@ def _converted(field: NDArray[Any], name: str, precision: np.dtype) -> NDArray[A
     if lost.any():
         raise ValueError(f"{name} must be finite in {precision}, got {field[lost][0]:g}: scale the signals")
     return converted
-
-
-def _tidy_lines(fields: dict[str, NDArray[Any]]) -> None:
-    for name in [name.removesuffix("_at") for name in fields if name.endswith("_at")]:
-        line, at = fields[name], fields[f"{name}_at"]
-        taps = (line.shape[-1] - SLACK) // 4
-        newest = line[..., int(at.item()) :][..., :taps].copy()
-        line[...] = 0.0
-        line[..., -taps:] = newest
-        at[...] = line.shape[-1] - taps
 
 
 def _convert_limiter(numbers: np.ndarray, precision: np.dtype) -> None:

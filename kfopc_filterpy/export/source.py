@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,11 +16,12 @@ from numpy.typing import NDArray
 
 from ..core.block import _VIEW_PLACES, Block
 from ..core.building import FLAGS, FOLDER, stamp
+from .cost import operations, worst
 from .joined import joined, sources_of
 from .precision import REALS
 
 TEMPLATES = Path(__file__).parent
-NOT_OF_AN_EXPORT = ("-shared", "-fvisibility=hidden", "-Wno-psabi")
+FLAGS_OF_AN_EXPORT = " ".join(flag for flag in FLAGS if flag not in ("-shared", "-fvisibility=hidden", "-Wno-psabi"))
 COMPARED, MORE = 8, 16  # samples of the self-test that are compared; those that it takes beyond the secondary path
 APART = 8  # equal elements that end a stretch
 _POINTER = 8
@@ -30,11 +30,13 @@ WIDTH = 120
 
 @dataclass(frozen=True)
 class Exported:
-    """The block that an export begins with, and the name of the export."""
+    """The block that an export begins with, the prefix of its names, its header's file name, and its description."""
 
     block: Block
     multichannel: bool
     name: str
+    header: str
+    description: str
 
     @property
     def real(self) -> str:
@@ -46,18 +48,30 @@ class Exported:
         """Size of the state where a pointer has 8 bytes."""
         return self.block.memory.size + (_VIEW_PLACES + 2) * _POINTER
 
-    def texts(self, header: str, description: str) -> tuple[str, str]:
-        """Return the header, whose file name is given, and the source."""
-        s = self.block.shape
+    def filled(self, template: str, **values: Any) -> str:
+        """Return the text of a template; `state` is the address of a state in C, by default that of `state`."""
+        s, name, state = self.block.shape, self.name, values.pop("state", "&state")
         sizes = (s.microphones, s.loudspeakers, s.references, s.taps, s.path_taps, s.guard_taps)
         common: dict[str, Any] = {
             **dict(zip("KJILMG", sizes, strict=True)),
-            "description": description,
-            "header": header,
-            "name": self.name,
-            "NAME": self.name.upper(),
+            "description": self.description,
+            "source": f"{Path(self.header).stem}.c",
+            "header": self.header,
+            "name": name,
+            "NAME": name.upper(),
             "real": self.real,
+            "n_bytes": f"{self.n_bytes:,}",
+            "flags": FLAGS_OF_AN_EXPORT,
+            # The calls of a sample, whose signals are in arrays x, y and e.
+            "control": f"{name}_control_signal({state}, x, y);"
+            if self.multichannel
+            else f"y[0] = {name}_control_signal({state}, x[0]);",
+            "update": f"{name}_update({state}, {'e' if self.multichannel else 'e[0]'})",
         }
+        return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(common | values)
+
+    def texts(self) -> dict[str, str]:
+        """Return the source and its header, by the names of the files."""
         algorithm = self.block.algorithm.name
         own: dict[str, Any] = self._constants() | {
             "core": joined(sources_of(f"anc_{algorithm} anc_open")),
@@ -71,22 +85,32 @@ class Exported:
             "calls": self._calls(),
         }
         mark = f"0x{crc32(repr(own).encode()):08x}u"
-        return _filled("template.h", common, **self._header()), _filled("template.c", common, mark=mark, **own)
+        header = self.filled("template.h", **self._header())
+        return {self.header: header, f"{Path(self.header).stem}.c": self.filled("template.c", mark=mark, **own)}
+
+    def examples(self) -> dict[str, str]:
+        """Return an example of a program and a page about the export, by the names of the files."""
+        page = {
+            "operations": operations(self.block),
+            "worst": worst(self.block),
+            "dtype": self.block.algorithm.precision,
+        }
+        return {"main.c": self.filled("example.c"), "README.md": self.filled("example.md", **page)}
 
     def _header(self) -> dict[str, Any]:
         arrays, name = self.multichannel, self.name
         control, update = self._signatures()
         return {
-            "control": f"{name}_control_signal(&state, x, y);" if arrays else f"y = {name}_control_signal(&state, x);",
+            "statement": f"{name}_control_signal(&state, x, y);"
+            if arrays
+            else f"y = {name}_control_signal(&state, x);",
             "s": "s" if arrays else "",
             "returns": "Set `control` to" if arrays else "Return",
             "declared_control": control,
             "declared_update": update,
-            "n_bytes": f"{self.n_bytes:,}",
             "n_reals": self.block.memory.size // self.block.algorithm.precision.itemsize,
             "n_places": _VIEW_PLACES,
             "answers": "".join(f"#define {name.upper()}_{answer} {n}\n" for n, answer in enumerate(_answers())),
-            "flags": " ".join(flag for flag in FLAGS if flag not in NOT_OF_AN_EXPORT),
         }
 
     def _constants(self) -> dict[str, Any]:
@@ -179,10 +203,6 @@ def _answers() -> list[str]:
 
 def _bits(values: NDArray[Any]) -> NDArray[Any]:
     return np.ascontiguousarray(values).ravel().view(f"i{values.itemsize}")
-
-
-def _filled(template: str, common: dict[str, Any], **values: Any) -> str:
-    return Template((TEMPLATES / template).read_text(encoding="utf-8")).substitute(common, **values)
 
 
 def braces(numbers: Iterable[str], indent: str = "") -> str:

@@ -5,7 +5,7 @@
  *     static ${name}_state state;
  *     ${name}_init(&state);
  *     for each sample:
- *         $control    x(n) from the reference microphone$s, y(n) to the amplifier$s
+ *         $statement    x(n) from the reference microphone$s, y(n) to the amplifier$s
  *         ${name}_update(&state, e);    e(n) = d(n) - (s * y)(n) from the error microphone$s
  *
  * The state has $n_bytes bytes where a pointer has 8. No heap is used, and there is no state elsewhere.

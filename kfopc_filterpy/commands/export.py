@@ -1,0 +1,131 @@
+"""`kfopc export`: a controller as C99, or as an FMU, from a settings file or from what Python saved."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .._validate import as_choice
+from .inputs import Files
+from .options import DONE, Parser, add_command, add_reading
+
+EXAMPLES = """examples:
+  kfopc export controller.toml -o firmware --dtype float32
+  kfopc export trained.kfopc -o firmware --name left
+  kfopc export controller.toml -o simulation --fmu
+
+controller.toml, where every other key is a keyword argument of the algorithm in Python:
+  algorithm = "KF-OPC"         # a name that kfopc compare knows, or "fast-array KF"
+  n_taps = 64
+  secondary_path = "S.wav"     # or taps, or a list of files, one for each loudspeaker
+  fs = 16000                   # resample the path to this rate (default: the rate of the file)
+  rated_power = 0.5
+  state_noise = 1e-9
+  measurement_noise = 1e-3
+  [limiter]                    # OutputLimiter; [[limiter]] once for each of several loudspeakers
+  rated_power = 0.5
+  # likewise [constraint], [secondary_path_uncertainty] (PathTolerance) and [amplifier] (limit, sharpness)
+trained.kfopc is what controller.save wrote: the export goes on from its state"""
+
+
+def add_to(commands: argparse._SubParsersAction[Parser]) -> None:
+    """Add the subcommand."""
+    parser = add_command(commands, "export", export, "write a controller as C99 for a microcontroller", EXAMPLES)
+    parser.add_argument("controller", help="settings file, *.toml, or a controller that Python saved")
+    parser.add_argument("-o", "--output", metavar="FOLDER", required=True, help="folder for the files")
+    parser.add_argument("--name", default="anc", help="prefix of all names in C, and name of the files (default: anc)")
+    about = "precision of the arithmetic (default: float64)"
+    parser.add_argument("--dtype", choices=("float64", "float32"), default="float64", help=about)
+    about = "write an FMU (FMI 3.0, co-simulation) in place of the C files, with binaries for Linux and Windows"
+    parser.add_argument("--fmu", action="store_true", help=about)
+    add_reading(parser, "sample rate, in place of the settings file's")
+
+
+def export(options: argparse.Namespace) -> int:
+    """Write the files and print where they are."""
+    from ..checkpoint import Checkpointed
+    from ..export import export_c, export_fmu
+
+    path, fs = Path(options.controller), options.fs
+    if path.suffix == ".toml":
+        controller, fs = described(path, options)
+    else:
+        controller = Checkpointed.load(path)
+    folder = Path(options.output)
+    if not options.fmu:
+        print(f"{export_c(controller, folder, name=options.name, dtype=options.dtype)} in {folder}")
+        return DONE
+    if not fs:
+        raise ValueError("an FMU needs the sample rate: give --fs, or fs in the settings file")
+    folder.mkdir(parents=True, exist_ok=True)
+    print(export_fmu(controller, folder / f"{options.name}.fmu", fs=fs, dtype=options.dtype))
+    return DONE
+
+
+def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | None]:
+    """Return the controller that a settings file describes, and its sample rate, None if nothing states it."""
+    from .. import FastArrayKalman, OutputLimiter, OutputPowerConstraint
+    from ..bench import algorithms
+    from ..paths import PathTolerance
+
+    try:
+        settings = tomllib.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not TOML: {error}") from error
+    makers: dict[str, Any] = {name: own.make for name, own in algorithms().items()}
+    makers[FastArrayKalman.name] = FastArrayKalman
+    make = makers[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", makers)]
+    files = Files(argparse.Namespace(**vars(options) | {"fs": options.fs or settings.pop("fs", None)}))
+    if "secondary_path" in settings:
+        settings["secondary_path"] = _paths(settings["secondary_path"], path.parent, files)
+    fs = files.options.fs or files.fs or None
+    parts: dict[str, Any] = {
+        "limiter": OutputLimiter,
+        "constraint": OutputPowerConstraint,
+        "secondary_path_uncertainty": PathTolerance,
+        "amplifier": _amplifier,
+    }
+    for key in parts.keys() & settings.keys():
+        own, where = settings[key], f"{path}, [{key}]"
+        if isinstance(own, dict):
+            settings[key] = _made(parts[key], own, fs, where)
+        elif isinstance(own, list) and own and isinstance(own[0], dict):
+            settings[key] = [_made(parts[key], one, fs, where) for one in own]
+    assigned = {}
+    if "secondary_path_uncertainty" not in inspect.signature(make).parameters:
+        assigned = {key: settings.pop(key) for key in ("secondary_path_uncertainty",) if key in settings}
+    controller = _made(make, settings, fs, str(path))
+    for key, value in assigned.items():
+        setattr(controller, key, value)
+    return controller, fs
+
+
+def _paths(given: Any, folder: Path, files: Files) -> Any:
+    """Return secondary paths, (taps,) or (K, J, taps): as given, or from files beside the settings file."""
+    names = [given] if isinstance(given, str) else given
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return given
+    matrix = files.matrix([str(folder / name) for name in names], "secondary_path")
+    return matrix[0, 0] if matrix.shape[:2] == (1, 1) else matrix
+
+
+def _amplifier(*, limit: float, sharpness: float | None = None) -> Any:
+    from .. import HardClipAmplifier, SoftSaturationAmplifier
+
+    return HardClipAmplifier(limit) if sharpness is None else SoftSaturationAmplifier(limit, sharpness)
+
+
+def _made(make: Callable[..., Any], settings: dict[str, Any], fs: float | None, where: str) -> Any:
+    """Return what a function or class makes of settings, and of the sample rate if it takes one."""
+    known = inspect.signature(make).parameters
+    if unknown := ", ".join(settings.keys() - known.keys()):
+        raise ValueError(f"{where}: there is no setting {unknown}, but {', '.join(known)}")
+    rate = {"fs": fs} if fs and "fs" in known else {}
+    try:
+        return make(**rate | settings)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{where}: {error}") from error
