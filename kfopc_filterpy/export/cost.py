@@ -1,33 +1,45 @@
-"""What a sample of an exported controller costs, in words and numbers."""
+"""What a sample of an exported controller costs, for the README of the export."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..core.block import Block
+from ..core.run_loop import SOFT_SATURATION
 
 KALMAN = ("kalman", "repaired")
+OF_POWERS, OF_LIMITER, OF_SOFT_AMPLIFIER = 12, 43, 150  # multiplications for each loudspeaker
+# Multiplications per weight, beyond those of y: for each row of x' that a sample learns from, or in all.
+OF_EACH_ROW = {"diagonal": 8, "fast_array": 14, "finite_memory": 28}
+IN_ALL = {"leaky": 2, "optimal_leaky": 2, "mov": 2, "mov_fixed": 2}
 
 
 def operations(block: Block) -> str:
-    """Return how many multiplications a sample takes, for the README of an export."""
+    """Return how many multiplications a sample takes."""
     s, algorithm = block.shape, block.algorithm.name
-    K, J, M, G = s.microphones, s.loudspeakers, s.path_taps, s.guard_taps
-    n, observed = (
-        J * s.references * s.taps,
-        K * (2 if G else 1),
-    )  # weights; rows of x', or of x' and x'', that a sample learns from
-    signals = n + K * J * M * (s.references + 1) + K * J * s.references * G
+    K, J, M, guarded = s.microphones, s.loudspeakers, s.path_taps, s.guard_taps > 0
+    n = J * s.references * s.taps
     if algorithm == "power_budget":
-        return f"{signals:,} multiplications and as many additions, and the work of each block"
+        return f"{n:,} multiplications and as many additions, and once in a block the work of the block"
+    filtering = n + K * J * (M * (s.references + 1) + s.guard_taps * s.references)
+    filtering += J * (OF_POWERS + OF_LIMITER * bool(s.limiter_windows))
+    filtering += OF_SOFT_AMPLIFIER * int(np.count_nonzero(block.fields["amplifier"][..., 0] == SOFT_SATURATION))
+    rows = K * (1 + guarded)
     if algorithm in KALMAN:
-        learning = observed * (3 * n * n // 2 + 8 * n)
+        learning = rows * (3 * n * n // 2 + 12 * n)
+    elif algorithm in OF_EACH_ROW:
+        learning = rows * n * OF_EACH_ROW[algorithm]
     else:
-        of_each = {"diagonal": 8, "fast_array": 14, "finite_memory": 28}
-        learning = observed * n * of_each.get(algorithm, 2 if G else 1)
-    return f"{signals + learning:,} multiplications and as many additions"
+        learning = n * (K * (3 if guarded else 1) + IN_ALL.get(algorithm, 0))
+        if algorithm == "fxnlms":
+            learning += rows * n  # the energy of x', and below in MOV-MFxLMS
+        if algorithm in ("mov", "mov_fixed") and block.fields["modified"].item():
+            learning += K * n
+    return f"{filtering + learning:,} multiplications and as many additions"
 
 
 def worst(block: Block) -> str:
-    """Return which samples take longest, for the README of an export."""
+    """Return which samples take longest."""
     windows, algorithm = block.shape.limiter_windows, block.algorithm.name
     parts = ["one that moves the samples of the delay lines"]
     if windows:
