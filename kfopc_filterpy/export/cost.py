@@ -19,11 +19,11 @@ def operations(block: Block) -> str:
     s, algorithm = block.shape, block.algorithm.name
     K, J, M, guarded = s.microphones, s.loudspeakers, s.path_taps, s.guard_taps > 0
     n = J * s.references * s.taps
-    if algorithm == "power_budget":
-        return f"{n:,} multiplications and as many additions, and once in a block the work of the block"
-    filtering = n + K * J * (M * (s.references + 1) + s.guard_taps * s.references)
-    filtering += J * (OF_POWERS + OF_LIMITER * bool(s.limiter_windows))
+    filtering = n + OF_LIMITER * len(s.limiter_windows)
     filtering += OF_SOFT_AMPLIFIER * int(np.count_nonzero(block.fields["amplifier"][..., 0] == SOFT_SATURATION))
+    if algorithm == "power_budget":
+        return f"{filtering:,} multiplications and as many additions, and once in a block the work of the block"
+    filtering += K * J * (M * (s.references + 1) + s.guard_taps * s.references) + J * OF_POWERS
     rows = K * (1 + guarded)
     if algorithm in KALMAN:
         learning = rows * (3 * n * n // 2 + 12 * n)

@@ -528,13 +528,13 @@ __attribute__((destructor)) static void tell(void) { fprintf(stderr, "%ld", mult
 @pytest.mark.parametrize("everything", [False, True])
 @pytest.mark.parametrize("name", [*(name for name in ALGORITHMS if name != "FxRLS"), "KF-PB"])
 def test_the_readme_states_how_many_multiplications_a_sample_takes(name, everything, tmp_path):
-    """LLVM compiles for a machine that counts them: within 3 %, because small terms are left out.
+    """LLVM compiles for a machine that counts them: within 3 %, or 5 of them, because small terms are left out.
 
     FxRLS is left out: with this noise it updates P in twice the precision, as the README says of the worst sample.
     """
     clang, n, taps = compiler("clang"), 100, 64
     if name == "KF-PB":
-        controller = kf_pb(taps, S_TWO_HAT if everything else S_HAT, rated_power=RATED)
+        controller = kf_pb(taps, S_HAT, rated_power=RATED, limiter=limiter() if everything else None)
     elif everything:
         controller = with_everything(name, taps)
     else:
@@ -563,7 +563,7 @@ def test_the_readme_states_how_many_multiplications_a_sample_takes(name, everyth
 
     found = (counted(n) - counted(0)) / n
     print(f"{name}: {found:.0f} counted, {stated} stated")
-    assert abs(found - stated) <= 0.03 * found
+    assert abs(found - stated) <= max(5, 0.03 * found)
 
 
 # The files.
