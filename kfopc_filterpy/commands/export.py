@@ -70,6 +70,7 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
     """Return the controller that a settings file describes, and its sample rate, None if nothing states it."""
     from .. import FastArrayKalman, OutputLimiter, OutputPowerConstraint
     from ..bench import algorithms
+    from ..controllers.base import constraint_for
     from ..paths import PathTolerance
 
     try:
@@ -79,7 +80,8 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
     makers: dict[str, Any] = {name: own.make for name, own in algorithms().items()}
     makers[FastArrayKalman.name] = FastArrayKalman
     make = makers[as_choice(settings.pop("algorithm", None), f"algorithm in {path}", makers)]
-    files = Files(argparse.Namespace(**vars(options) | {"fs": options.fs or settings.pop("fs", None)}))
+    given_fs = settings.pop("fs", None)
+    files = Files(argparse.Namespace(**vars(options) | {"fs": options.fs or given_fs}))
     if "secondary_path" in settings:
         settings["secondary_path"] = _paths(settings["secondary_path"], path.parent, files)
     fs = files.options.fs or files.fs or None
@@ -95,12 +97,13 @@ def described(path: Path, options: argparse.Namespace) -> tuple[Any, float | Non
             settings[key] = _made(parts[key], own, fs, where)
         elif isinstance(own, list) and own and isinstance(own[0], dict):
             settings[key] = [_made(parts[key], one, fs, where) for one in own]
-    assigned = {}
-    if "secondary_path_uncertainty" not in inspect.signature(make).parameters:
-        assigned = {key: settings.pop(key) for key in ("secondary_path_uncertainty",) if key in settings}
+    known = inspect.signature(make).parameters
+    if fs and "rated_power" in settings and "constraint" in known:
+        settings["constraint"] = constraint_for(settings.pop("rated_power"), settings.get("constraint"), fs)
+    uncertainty = None if "secondary_path_uncertainty" in known else settings.pop("secondary_path_uncertainty", None)
     controller = _made(make, settings, fs, str(path))
-    for key, value in assigned.items():
-        setattr(controller, key, value)
+    if uncertainty is not None:
+        controller.secondary_path_uncertainty = uncertainty
     return controller, fs
 
 

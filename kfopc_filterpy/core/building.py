@@ -218,7 +218,7 @@ def _machine_flags(command: list[str], level: str, target: str) -> list[str]:
     """Return the flags that name the processor. Without one, zig builds for the machine at hand."""
     if _is_zig(command):
         chosen = [f"-mcpu={'baseline' if level == LEVELS[0] else level.replace('-', '_')}"]
-        return [*chosen, "-target", target] if target else chosen
+        return [*chosen, "-target", target, "-s"] if target else chosen  # without symbols for debuggers
     if len(levels()) == 1:
         return []
     return ["-march=x86-64" if level == LEVELS[0] else f"-march={level}"]

@@ -208,6 +208,9 @@ def test_zig_is_taken_where_the_machine_has_no_compiler(tmp_path: Path, no_flags
 
 def test_only_zig_builds_for_other_machines(tmp_path: Path, no_flags: pytest.MonkeyPatch) -> None:
     no_flags.setenv("CC", "gcc")
+    no_flags.setattr(building.importlib.util, "find_spec", lambda name: object())
+    assert building.compiler("aarch64-linux-musl") == [sys.executable, "-m", "ziglang", "cc"]
+    no_flags.setattr(building.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(building.BuildError, match="only zig builds for other machines"):
         building.build(building.core_sources(), tmp_path / "lib.so", target="aarch64-linux-musl")
 

@@ -1,0 +1,197 @@
+"""`kfopc export`: every algorithm from a settings file or a checkpoint, with the files that Python writes."""
+
+from __future__ import annotations
+
+import re
+import zipfile
+
+import numpy as np
+import pytest
+from helpers.commands import FS
+
+from kfopc_filterpy import (
+    FastArrayKalman,
+    FxLMS,
+    HardClipAmplifier,
+    OutputLimiter,
+    OutputPowerConstraint,
+    SoftSaturationAmplifier,
+    kf_opc,
+    kf_pb,
+    simulate,
+)
+from kfopc_filterpy.bench import algorithms
+from kfopc_filterpy.controllers import VerifiedController
+from kfopc_filterpy.export import export_c, export_fmu
+from kfopc_filterpy.paths import PathTolerance, read_path
+
+STEP, PEAK, NOISES = {"step_size": 1e-3}, {"amplitude_limit": 0.8}, {"state_noise": 1e-7, "measurement_noise": 1e-2}
+RATED, LEAK = {"rated_power": 0.5}, {"leak": 0.1}
+SETTINGS = {
+    "KF-ANC": NOISES,
+    "KF-OPC": NOISES | RATED,
+    "KF-OPC repaired": NOISES | RATED,
+    "KF-PB": RATED,
+    "diagonal KF": NOISES,
+    "diagonal KF-OPC": NOISES | RATED,
+    "FxRLS": {},
+    "FxLMS": STEP,
+    "FxNLMS": STEP,
+    "leaky FxLMS": STEP | LEAK,
+    "optimal leaky FxLMS": STEP | RATED,
+    "MOV-FxLMS fixed": STEP | RATED | {"penalty_factor": 0.2},
+    "MOV-FxLMS by variance": STEP | RATED | {"penalty_factor": 0.2},
+    "MOV-FxLMS": STEP | RATED,
+    "MOV-MFxLMS": STEP | RATED,
+    "two-gradient FxLMS": STEP | PEAK,
+    "re-scaling FxLMS": STEP | PEAK,
+    "clipping FxLMS": STEP | PEAK,
+    "fast-array KF": {"measurement_noise": 1.0},
+}
+
+
+def described(**settings):
+    """Return a settings file."""
+    return "\n".join(f"{name} = {str(value).lower() if value is True else value!r}" for name, value in settings.items())
+
+
+def same_as_of_python(controller, made, folder, dtype="float64"):
+    """Tell whether the files of the command are those that `export_c` writes of a controller."""
+    export_c(controller, folder / "python", dtype=dtype)
+    files = sorted(path.name for path in (folder / "python").iterdir())
+    assert files == ["README.md", "anc.c", "anc.h", "main.c"]
+    return all((folder / "python" / name).read_bytes() == (made / name).read_bytes() for name in files)
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_every_algorithm_can_be_described(name, command, folder, tmp_path):
+    assert set(SETTINGS) == {*algorithms(), FastArrayKalman.name}
+    path = [0.0, 0.8, 0.3]
+    (folder / "c.toml").write_text(described(algorithm=name, n_taps=8, secondary_path=path, **SETTINGS[name]))
+    code, out, err = command("export", "c.toml", "-o", tmp_path / "out")
+    assert (code, err) == (0, "")
+    assert out.startswith("<CExport anc.c: ")
+    make = FastArrayKalman if name == FastArrayKalman.name else algorithms()[name].make
+    assert same_as_of_python(make(8, path, **SETTINGS[name]), tmp_path / "out", tmp_path)
+
+
+def test_parts_rate_and_several_loudspeakers(command, folder, several, tmp_path):
+    _, _, paths = several
+    controller = kf_opc(
+        8,
+        paths,
+        constraint=[OutputPowerConstraint(power, fs=FS) for power in (0.5, 0.4)],
+        limiter=[OutputLimiter(power, fs=FS, window_s=0.05) for power in (0.5, 0.4)],
+        amplifier=[HardClipAmplifier(1.5), SoftSaturationAmplifier(1.2, 3.0)],
+        **NOISES,
+    )
+    controller.secondary_path_uncertainty = PathTolerance(phase_deg=10.0)
+    parts = """
+[[limiter]]
+rated_power = 0.5
+window_s = 0.05
+[[limiter]]
+rated_power = 0.4
+window_s = 0.05
+[[amplifier]]
+limit = 1.5
+[[amplifier]]
+limit = 1.2
+sharpness = 3.0
+[secondary_path_uncertainty]
+phase_deg = 10.0
+"""
+    own = {"algorithm": "KF-OPC", "n_taps": 8, "rated_power": [0.5, 0.4], **NOISES}
+    (folder / "c.toml").write_text(described(secondary_path=["S1.wav", "S2.wav"], **own) + parts)
+    code, _, err = command("export", "c.toml", "-o", tmp_path / "out", "--dtype", "float32")
+    assert (code, err) == (0, "")
+    assert same_as_of_python(controller, tmp_path / "out", tmp_path, "float32")
+
+
+@pytest.mark.parametrize(
+    ("file", "fs", "options"), [("S.wav", None, ()), ("S16.wav", FS, ()), ("S16.wav", 3 * FS, ("--fs", FS))]
+)
+def test_the_rate_is_that_of_the_option_the_settings_or_the_file(file, fs, options, command, folder, tmp_path):
+    settings = {"algorithm": "KF-PB", "n_taps": 8, "rated_power": 0.5, "secondary_path": file}
+    (folder / "c.toml").write_text(described(**settings | ({} if fs is None else {"fs": fs})))
+    code, _, err = command("export", "c.toml", "-o", tmp_path / "out", *options)
+    assert (code, err) == (0, "")
+    path = read_path(folder / file, fs=FS).samples
+    assert same_as_of_python(kf_pb(8, path, rated_power=0.5, fs=FS), tmp_path / "out", tmp_path)
+
+
+def test_a_controller_that_python_saved_goes_on(command, folder, tmp_path):
+    controller = FxLMS(8, [0.0, 1.0], step_size=0.01)
+    simulate(
+        controller, np.random.default_rng(0).standard_normal(500), primary_path=[0, 0, 1.0], secondary_path=[0, 1.0]
+    )
+    controller.save(folder / "trained.kfopc")
+    code, _, err = command("export", "trained.kfopc", "-o", tmp_path / "out", "--name", "anc")
+    assert (code, err) == (0, "")
+    assert same_as_of_python(controller, tmp_path / "out", tmp_path)
+
+
+def test_an_fmu_is_that_of_python(command, folder, tmp_path):
+    pytest.importorskip("ziglang", reason="zig compiles the libraries")
+    (folder / "c.toml").write_text(described(algorithm="FxLMS", n_taps=8, secondary_path="S.wav", step_size=0.01))
+    code, out, err = command("export", "c.toml", "-o", tmp_path / "out", "--fmu", "--name", "left")
+    assert (code, err) == (0, "")
+    assert out.rstrip() == str(tmp_path / "out" / "left.fmu")
+    controller = FxLMS(8, read_path(folder / "S.wav").samples, step_size=0.01)
+    expected = export_fmu(controller, tmp_path / "left.fmu", fs=FS)
+    assert (tmp_path / "out" / "left.fmu").read_bytes() == expected.read_bytes()
+    assert "binaries/x86_64-windows/left.dll" in zipfile.ZipFile(expected).namelist()
+
+
+GOOD = {"algorithm": "FxLMS", "n_taps": 8, "secondary_path": [0.0, 1.0], "step_size": 0.01}
+WRONG = {
+    "unknown algorithm": (
+        GOOD | {"algorithm": "FXLMS"},
+        "",
+        "algorithm in c.toml must be one of 'KF-ANC'.*got 'FXLMS'",
+    ),
+    "unknown setting": (
+        GOOD | {"step": 1.0},
+        "",
+        "c.toml: there is no setting step, but n_taps, secondary_path, step_size",
+    ),
+    "unknown setting of a part": (
+        GOOD,
+        "[limiter]\nwatt = 1",
+        r"c.toml, \[limiter\]: there is no setting watt, but rated_power",
+    ),
+    "bad setting": (GOOD | {"step_size": -1.0}, "", "c.toml: step_size must be greater than 0, got -1"),
+    "missing setting": ({"algorithm": "FxLMS", "n_taps": 8}, "", "c.toml: .*missing.*'secondary_path'"),
+    "no TOML": ({}, "algorithm: FxLMS", "c.toml is not TOML: "),
+    "missing file": (GOOD | {"secondary_path": "none.wav"}, "", "none.wav"),
+    "two budgets": (
+        {"algorithm": "KF-OPC", "n_taps": 8, "secondary_path": [1.0], "rated_power": 1.0, "fs": 8000} | NOISES,
+        "[constraint]\nrated_power = 1.0",
+        "give either rated_power= or constraint=",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_in_a_settings_file_is_said_in_one_line(case, command, folder, tmp_path):
+    settings, parts, message = WRONG[case]
+    (folder / "c.toml").write_text(f"{described(**settings)}\n{parts}")
+    code, _, err = command("export", "c.toml", "-o", tmp_path / "out")
+    assert code == 2
+    assert re.fullmatch(f"kfopc export: .*{message}.*\n", err)
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_wrong_input(command, folder, tmp_path):
+    VerifiedController(FxLMS(8, [0.0, 1.0], step_size=0.01)).save(folder / "wrapped.kfopc")
+    (folder / "c.toml").write_text(described(**GOOD))
+    for arguments, message in {
+        ("wrapped.kfopc",): r"FxLMS .* \(VerifiedController\) is not in the core and cannot be exported",
+        ("text.wav",): "text.wav",
+        ("c.toml", "--name", "main"): "name must not be 'main'",
+        ("c.toml", "--fmu"): "an FMU needs the sample rate: give --fs, or fs in the settings file",
+    }.items():
+        code, _, err = command("export", *arguments, "-o", tmp_path / "out")
+        assert code == 2
+        assert re.search(message, err)
+        assert not (tmp_path / "out").exists()
