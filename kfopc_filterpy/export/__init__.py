@@ -1,4 +1,4 @@
-"""A trained controller as plain C99, for a microcontroller or a signal processor."""
+"""A trained controller as plain C99, for a microcontroller or a signal processor, or as an FMU, for a simulator."""
 
 import lazy_loader
 

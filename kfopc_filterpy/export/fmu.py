@@ -8,6 +8,7 @@ import os
 import re
 import tempfile
 import zipfile
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
@@ -143,8 +144,7 @@ def _build_description(name: str) -> str:
 
 
 def _model_description(exported: Exported, fs: float, token: str) -> str:
-    from .. import __version__
-
+    version = import_module(str(__package__).partition(".")[0]).__version__
     name, number, step, shape = exported.name, NUMBERS[exported.real], repr(1.0 / fs), exported.block.shape
     time = f'<{number} name="time" valueReference="0" causality="independent" variability="continuous"/>'
     signals = {"reference": shape.references, "error": shape.microphones, "control_signal": shape.loudspeakers}
@@ -165,7 +165,7 @@ def _model_description(exported: Exported, fs: float, token: str) -> str:
     lines = "\n    "
     return f"""<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="3.0" modelName="{name}" instantiationToken="{token}"
-    description={quoteattr(exported.description)} generationTool="kfopc_filterpy {__version__}"
+    description={quoteattr(exported.description)} generationTool="kfopc_filterpy {version}"
     variableNamingConvention="structured">
   <CoSimulation modelIdentifier="{name}" canGetAndSetFMUState="true" canSerializeFMUState="true"
       fixedInternalStepSize="{step}"/>

@@ -58,14 +58,14 @@ class Float32Controller:
         self.name, self.rated_power = controller.name, controller.rated_power
 
     def control_signal(self, reference: NumberOrArray) -> NumberOrArray:
-        """Return y(n) for x(n), with several channels (I,) and (J,)."""
+        """Return the control signal y(n) for the newest reference sample x(n), with several channels (J,) and (I,)."""
         self._block.reference[:] = reference
         self._require(self._block.emit())
         y = self._block.control_signal
         return y.astype(np.float64) if self._multichannel else float(y[0])
 
     def update(self, error: NumberOrArray) -> None:
-        """Adapt to e(n), with several channels (K,)."""
+        """Adapt to the error e(n), with several channels (K,)."""
         self._block.error[:] = error
         self._require(self._block.update())
 
