@@ -176,7 +176,7 @@ class Guarded:
 
     def __init__(self, name: str, shape: Shape, path: np.ndarray, guard: np.ndarray, settings: dict[str, Any]) -> None:
         self.algorithm = Algorithm(name)
-        library = self.algorithm._library.held
+        library = self.algorithm.library.held
         # The plan as Block makes it, without Block's checks.
         block = Block.__new__(Block)
         block.algorithm, block.shape = self.algorithm, shape
