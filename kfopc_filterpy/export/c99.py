@@ -94,15 +94,15 @@ def export_c(
 
     With several channels, the numbers are arrays, and `anc_control_signal` sets its third argument, y(n).
 
-    The source contains the files of the package's own core: with the flags that the header states, float64 gives the
-    bits of Python.
+    The source contains the files of the package's own core: with the flags that the header states, it gives the bits of
+    Python, in float32 those of `Float32Controller`.
 
     Parameters
     ----------
     controller : CoreController
         One whose algorithm is in the core, such as the FxLMS family, `DiagonalKalman`, `FastArrayKalman`, or what
-        `kf_anc`, `kf_opc`, `fx_rls` and `kf_opc_repaired` return, with whatever it has: several channels, limiters,
-        amplifier models, an uncertain secondary path, sliding windows. It is not changed.
+        `kf_anc`, `kf_opc`, `kf_pb`, `fx_rls` and `kf_opc_repaired` return, with whatever it has: several channels,
+        limiters, amplifier models, an uncertain secondary path, sliding windows. It is not changed.
     path : str or pathlib.Path
         Source file to write, ending in ``.c``; its header, ending in ``.h``, is written beside it. Or a folder, which is
         made if its name has no dot. Existing files are replaced.
@@ -122,8 +122,8 @@ def export_c(
     TypeError
         A controller whose algorithm is not in the core, or a subclass with calls of its own. No file was written.
     ValueError
-        A path with another ending, a name that is no C identifier, or `main` in a folder, a value that the precision cannot hold, a
-        limiter's window too long for float32. No file was written.
+        A path with another ending, a name that is no C identifier, or `main` in a folder, a value that the
+        precision cannot hold, a limiter's window too long for float32. No file was written.
 
     Examples
     --------
@@ -193,6 +193,7 @@ def _precision(dtype: Any) -> np.dtype:
 
 
 def checked_name(name: Any) -> str:
+    """Return a name that can begin the names of an export in C, or raise ValueError."""
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ValueError(f"name must be a C identifier that begins with a letter, such as name='anc', got {name!r}")
     return name
