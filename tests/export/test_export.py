@@ -321,8 +321,8 @@ def test_what_float32_cannot_hold_is_refused(tmp_path):
         export_c(FxLMS(2, [1e39], step_size=0.1), tmp_path / "anc.c", dtype="float32")
     with pytest.raises(ValueError, match="initial_variance must be finite in float32"):
         export_c(kf_anc(2, [1.0], initial_variance=1e39, **NOISES), tmp_path / "anc.c", dtype="float32")
-    with pytest.raises(ValueError, match="a setting or a path of kalman is out of its range"):
-        export_c(kf_anc(2, [1.0], initial_variance=1e30, **NOISES), tmp_path / "anc.c", dtype="float32")
+    with pytest.raises(ValueError, match="a setting or a path of diagonal is out of its range"):
+        export_c(DiagonalKalman(2, [1.0], initial_variance=1e30, **NOISES), tmp_path / "anc.c", dtype="float32")
     assert list(tmp_path.iterdir()) == []
     assert export_c(long, tmp_path / "anc.c").n_bytes > 3 * 8 * 100_000
 
