@@ -11,7 +11,7 @@ static const real BLUR = 16, LEAST_NOISE = 2;
  * along the rows takes the place of fading, so that the others hardly grow. The usual variance falls by e^FALL at most while a
  * row passes, so that a bad sample does not count, and rises with RELEASE of the fading. It is known when h'P h first exceeds
  * TELLING of q: before, the signal may be so soft that P must grow, up to UNKNOWN times the variance at the start. */
-static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625, TELLING = (real)1e-4, UNKNOWN = 1e20;
+static const real WIDEST = 1e4, FALL = 4, RELEASE = (real)0.0625, TELLING = (real)1e-4, UNKNOWN = (real)1e20;
 #ifdef ANC_FLOAT
 static const real ROUNDING = FLT_EPSILON, MOST = 1e36f, CAREFULLY = 1e16f, SPLIT = 4097; /* 2^12 + 1, see two_product */
 #else
