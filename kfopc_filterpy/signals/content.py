@@ -89,11 +89,15 @@ def channels_first(array: np.ndarray) -> np.ndarray:
 
 
 def rate_of_step(step_s: float, path: str | os.PathLike[str]) -> float:
-    """Return the sampling rate for a sample interval, which a text rounds: a whole number of Hz within 1e-4 of it."""
+    """Return the sampling rate for a sample interval, which a text rounds: the roundest number of Hz within 1e-4 of it."""
     if not (math.isfinite(step_s) and step_s > 0):
         raise ValueError(f"{path} states a sample interval of {step_s:g} s, expected one above 0")
     rate = 1 / step_s
-    return float(round(rate)) if abs(rate - round(rate)) <= 1e-4 * rate else rate
+    for multiple, tolerance in ((1, 1e-9), (100, 1e-4), (25, 1e-4), (1, 1e-4)):
+        whole = multiple * round(rate / multiple)
+        if abs(rate - whole) <= tolerance * rate:
+            return float(whole)
+    return rate
 
 
 def chosen_variable(

@@ -1,4 +1,4 @@
-"""Text: columns of numbers, with or without a time column, and impulse responses exported by REW."""
+"""Text: columns of numbers, with or without a time column, LabVIEW's .lvm, and impulse responses exported by REW."""
 
 from __future__ import annotations
 
@@ -14,9 +14,24 @@ from .content import Content, rate_of_step
 
 _LONGEST_HEADER = 100  # lines
 _REW = "* Impulse Response data saved by REW"
+_LABVIEW, _END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
 _ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
 _NO_SIGNAL = 100  # rows: no signal rises for so long
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
+_SECONDS = {"s": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}  # by the first letter of the unit
+# The first column's name, if any, and its unit: "Time (ms)", "t/s", "(µs)"; "\ufffd" is µ in another encoding.
+_TIME_UNIT = re.compile(r"\W*?(?:\w+?[\s(\[/_]+)?(seconds?|sec|s|ms|msec|[uµμ\ufffd]s|usec|ns)(?!\w)")
+_FREQUENCY = re.compile(r"\W*(freq|hz\b|f\s*[(\[/]\s*hz)", re.IGNORECASE)
+_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
+_ONE_COMMA = re.compile(r"([+-]?\d+),(\d+)(e[+-]?\d+)?", re.IGNORECASE)  # two columns of whole numbers, or one number
+_QUOTED = re.compile(r'"\s*([^"]*)"')
+
+
+class Table(NamedTuple):
+    """Columns of numbers, (n_rows, n_columns), and the lines above them that are not blank."""
+
+    header: list[str]
+    columns: np.ndarray
 
 
 class _Layout(NamedTuple):
@@ -26,18 +41,36 @@ class _Layout(NamedTuple):
     delimiter: str | None
     has_decimal_comma: bool
 
+    def plain(self, line: str) -> str:
+        """Return a line without quotes, decimal commas and a separator at its end."""
+        line = _unquoted(line).rstrip()
+        line = _DECIMAL_COMMA.sub(".", line) if self.has_decimal_comma else line
+        return line.removesuffix(self.delimiter) if self.delimiter else line
+
 
 def read_text(path: str | os.PathLike[str]) -> Content:
     """Return the columns of a text file as channels; a first column of evenly rising times gives the rate."""
-    head = [line for _, line in zip(range(_LONGEST_HEADER), _lines(path), strict=False)]
+    head = list(islice(_lines(path), _LONGEST_HEADER))
     if head and head[0].startswith(_REW):
         return _read_rew(path, head)
+    if head and head[0].startswith(_LABVIEW):
+        return _read_labview(path, head)
+    return _without_time(path, read_table(path))
+
+
+def read_table(path: str | os.PathLike[str], *, n_least: int = 1) -> Table:
+    """Return the columns of a text file in any layout, of which there must be at least `n_least`."""
+    head = list(islice(_lines(path), _LONGEST_HEADER))
     layout = _layout(path, head)
-    lines: Iterator[str] = islice(_lines(path), layout.first, None)
-    if layout.has_decimal_comma:
-        lines = (line.replace(",", ".") for line in lines)
-    table = np.loadtxt(lines, delimiter=layout.delimiter, ndmin=2)
-    return _without_time(path, table)
+    header = [line for line in head[: layout.first] if line.strip()]
+    if n_least == 1 and layout.delimiter == "," and _ONE_COMMA.fullmatch(layout.plain(head[layout.first]).strip()):
+        names = header[-1].strip() if header else ""
+        if _is_decimal(path, names, islice(_lines(path), layout.first, None)):
+            layout = layout._replace(delimiter=None, has_decimal_comma=True)
+    columns = np.loadtxt(map(layout.plain, islice(_lines(path), layout.first, None)), delimiter=layout.delimiter, ndmin=2)
+    if columns.shape[1] < n_least:
+        raise ValueError(f"{path} must hold {n_least} columns, got {columns.shape[1]}")
+    return Table(header, columns)
 
 
 def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
@@ -48,45 +81,111 @@ def _lines(path: str | os.PathLike[str]) -> Iterator[str]:
         yield from text
 
 
+def _unquoted(line: str) -> str:
+    """Return a line without its quotes; a comma within them is a decimal comma."""
+    return _QUOTED.sub(lambda quoted: _DECIMAL_COMMA.sub(".", quoted[1]), line) if '"' in line else line
+
+
 def _layout(path: str | os.PathLike[str], head: list[str]) -> _Layout:
     for first, line in enumerate(head):
         for delimiter in (";", "\t", ",", None):
-            comma = delimiter != "," and "," in line
-            if (delimiter is None or delimiter in line) and _are_numbers(line, delimiter, comma):
-                return _Layout(first, delimiter, comma)
+            layout = _Layout(first, delimiter, delimiter != ",")
+            if (delimiter is None or delimiter in line) and _are_numbers(layout.plain(line), delimiter):
+                return layout
     shown = next((line.strip() for line in head if line.strip()), "")[:60]
+    gaps = [n for n, line in enumerate(head, 1) if re.search(r"\d\s*([,;\t])\s*\1\s*[-+.\d]", line)]
     raise ValueError(
         f"{path} is text that is no numbers: none in its first {len(head)} lines, which begin with {shown!r}; expected "
         "a column for each channel, at most 100 lines of header"
+        + (f"; line {gaps[0]} has an empty field: fill it, or leave out its column" if gaps else "")
     )
 
 
-def _are_numbers(line: str, delimiter: str | None, has_decimal_comma: bool) -> bool:
-    fields = (line.replace(",", ".") if has_decimal_comma else line).strip().split(delimiter)
+def _are_numbers(line: str, delimiter: str | None) -> bool:
     try:
-        return len([float(field) for field in fields]) > 0
+        return len([float(field) for field in line.strip().split(delimiter)]) > 0
     except ValueError:
         return False
 
 
-def _without_time(path: str | os.PathLike[str], table: np.ndarray) -> Content:
+def _is_decimal(path: str | os.PathLike[str], names: str, lines: Iterator[str]) -> bool:
+    """Return whether the only comma of each line is a decimal comma; it separates whole numbers otherwise."""
+    decimal = bool(names) and "," not in names and names[0] not in "#%*"  # a heading of one column
+    count, rises, before = 0, True, None
+    for line in lines:
+        if not line.strip():
+            continue
+        found = _ONE_COMMA.fullmatch(line.strip())
+        if found is None:  # a point, a sign, another comma
+            return False
+        whole, rest, exponent = found.groups()
+        decimal = decimal or whole.startswith("-0") or (rest[0] == "0" and len(rest) > 1) or exponent is not None
+        rises = rises and before in (None, int(whole) - 1)
+        count, before = count + 1, int(whole)
+    separated = "," in names or (rises and count > 2)
+    if decimal == separated:
+        raise ValueError(
+            f"{path} has a comma in each line that may separate two columns or be a decimal comma: write decimals with a "
+            "point or separate columns with a semicolon, and name the columns in the line above the numbers"
+        )
+    return decimal
+
+
+def _without_time(path: str | os.PathLike[str], table: Table) -> Content:
     """Return the channels (rows are samples); leave out a column that counts samples or time, which gives the rate."""
-    times = table[:, 0]
-    steps = np.diff(times)
-    if table.shape[1] < 2 or len(table) < 3 or not np.all(steps > 0):
-        return Content(table)
+    header, columns = table
+    if columns.shape[1] < 2:
+        return Content(columns)
+    if any(map(_FREQUENCY.match, header[-1:])) or any("frequency step" in line.lower() for line in header):
+        raise ValueError(
+            f"{path} is a frequency response, its first column is a frequency in Hz ({header[-1].strip()!r}): export the "
+            "impulse response (or the recording) instead"
+        )
+    times, steps = columns[:, 0], np.diff(columns[:, 0])
+    if header and header[-1].startswith(",") and np.all(steps == 1):  # an index, which has no name
+        return Content(columns[:, 1:])
+    if len(times) < 3 or not np.all(steps > 0):
+        return Content(columns)
     step = (times[-1] - times[0]) / (len(times) - 1)
     drift = np.max(np.abs(times - times[0] - step * np.arange(len(times))))
     if not (np.max(np.abs(steps - step)) <= _ROUNDED * step and drift <= step):
-        if len(table) >= _NO_SIGNAL:
+        if len(times) >= _NO_SIGNAL:
             raise ValueError(
                 f"{path} has a first column that rises in uneven steps, from {steps.min():g} to {steps.max():g}: export it "
                 "with a constant sampling rate, or without the times"
             )
-        return Content(table)
-    if step == 1:  # the number of each sample
-        return Content(table[:, 1:])
-    return Content(table[:, 1:], rate_of_step(step, path), start_s=float(times[0]))
+        return Content(columns)
+    units = [found[1] for found in map(_TIME_UNIT.match, reversed(header)) if found]
+    if step == 1 and not units:  # the number of each sample
+        return Content(columns[:, 1:])
+    unit_s = _SECONDS.get(units[0][0], 1e-6) if units else 1.0
+    return Content(columns[:, 1:], rate_of_step(step * unit_s, path), start_s=float(times[0] * unit_s))
+
+
+def _read_labview(path: str | os.PathLike[str], head: list[str]) -> Content:
+    """Return the channels of one segment of a LabVIEW measurement file, and the rate of its Delta_X."""
+    ends = [index for index, line in enumerate(head) if line.startswith(_END_OF_HEADER)]
+    n_segments = sum(line.startswith(_END_OF_HEADER) for line in _lines(path)) - 1
+    if len(ends) < 2 or n_segments != 1:
+        raise ValueError(f"{path} is a LabVIEW measurement of {n_segments} segments, expected one: export a file for each")
+    delimiter = "," if any(line.startswith("Separator,Comma") for line in head) else "\t"
+    names, *fields = (line.rstrip().split(delimiter) for line in (head[ends[1] + 1], *head[: ends[1]]))
+    values = {field[0]: field[1:] for field in fields}
+    has_decimal_comma = values.get("Decimal_Separator") == [","]
+
+    def plain(line: str) -> str:
+        return line.replace(",", ".") if has_decimal_comma else line
+
+    steps, starts = (
+        {float(plain(one)) for one in values.get(name, []) if one.strip()} for name in ("Delta_X", "X0")
+    )
+    if len(steps) > 1 or len(starts) > 1:
+        raise ValueError(f"{path} holds channels of different rates or starts (Delta_X, X0): export a file for each")
+    channels = [index for index, name in enumerate(names) if not name.startswith(("X_Value", "Comment"))]
+    lines = map(plain, islice(_lines(path), ends[1] + 2, None))
+    columns = np.loadtxt(lines, delimiter=delimiter, usecols=channels, comments=None, ndmin=2)
+    fs = rate_of_step(steps.pop(), path) if steps else None
+    return Content(columns, fs, start_s=starts.pop() if starts else 0.0)
 
 
 def _read_rew(path: str | os.PathLike[str], head: list[str]) -> Content:

@@ -175,7 +175,7 @@ def test_text_of_any_layout_is_read(tmp_path, text):
 
 
 def test_a_first_column_that_is_no_time_is_a_channel(tmp_path):
-    (tmp_path / "x.csv").write_text("0,1\n1,2\n3,3\n4,4\n")
+    (tmp_path / "x.csv").write_text("left,right\n0,1\n1,2\n3,3\n4,4\n")
     assert read_recording(tmp_path / "x.csv", fs=8).samples.tolist() == [[0.0, 1.0, 3.0, 4.0], [1.0, 2.0, 3.0, 4.0]]
 
 
