@@ -5,32 +5,53 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator
-from typing import BinaryIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import numpy as np
 
 from .content import Content, require_room
 
-# A size that a WAV file's header states if its writer could not know it (it wrote to a pipe), or in RF64.
-_SIZE_UNKNOWN = 0xFFFFFFFF
+# Sizes that a WAV file's header states if its writer could not know it (it wrote to a pipe: ffmpeg, SoX, arecord), or in RF64.
+_SIZES_UNKNOWN = (0xFFFFFFFF, 0x7FFFF000, 0x7FFFFFFF, 0x80000000)
 _FORMATS = ("WAV", "WAVEX", "RF64", "AIFF", "FLAC")
 _LOSSLESS = ("PCM_U8", "PCM_S8", "PCM_16", "PCM_24", "PCM_32", "FLOAT", "DOUBLE")  # codings of samples
+_BYTES = {"PCM_16": 2, "PCM_24": 3, "PCM_32": 4}
 _MOST_CHUNKS = 10_000
+_PCM = 1  # the tag of integers without loss
 _CONTAINERS = {b"RIFF": "<", b"RF64": "<", b"BW64": "<", b"RIFX": ">", b"FORM": ">"}  # and their byte order
+
+
+class _Bits(NamedTuple):
+    """Bits of a sample, and bytes of the samples of all channels at a time."""
+
+    bits: int
+    block: int
 
 
 def read_audio(path: str | os.PathLike[str]) -> Content:
     """Return the samples of an audio file, full scale 1, and its sampling rate."""
     import soundfile
 
-    _require_whole(path)
-    with soundfile.SoundFile(path) as file:
+    convert = f"convert it to WAV, for example with: ffmpeg -i {Path(path).name} {Path(path).stem}-pcm.wav"
+    bits = _require_whole(path)
+    try:
+        file = soundfile.SoundFile(path)
+    except soundfile.LibsndfileError as error:
+        raise ValueError(
+            f"{path} cannot be read as an audio file: {error.error_string} If other programs play it, {convert}"
+        ) from error
+    with file:
         if file.format not in _FORMATS or file.subtype not in _LOSSLESS:
             raise ValueError(
                 f"{path} is {file.format_info}, {file.subtype_info}, expected WAV, AIFF or FLAC without loss: record it "
-                "again in one of these, or convert it (MP3, Ogg, ADPCM and others have left out what an ear would not miss)"
+                f"again in one of these, or {convert} (MP3, Ogg, ADPCM and others have left out what an ear would not miss)"
             )
         # Before anything is read: soundfile makes room for as many frames as the header claims.
         require_room(path, float(file.frames) * file.channels)
         frames, claimed, fs = file.read(dtype="float64", always_2d=True), file.frames, file.samplerate
+        if bits is not None:
+            frames *= _justified(path, frames, bits, _BYTES.get(file.subtype, 0), file.channels)
     if len(frames) == 0:
         raise ValueError(f"{path} holds no samples (zero frames): record or export it again")
     if len(frames) < claimed:
@@ -38,23 +59,29 @@ def read_audio(path: str | os.PathLike[str]) -> Content:
     return Content(frames.T, float(fs))
 
 
-def _require_whole(path: str | os.PathLike[str]) -> None:
-    """Raise ValueError if a WAV or AIFF file is shorter than its header says: libsndfile would read what is left."""
+def _require_whole(path: str | os.PathLike[str]) -> _Bits | None:
+    """Raise ValueError if a WAV or AIFF file is shorter than its header says: libsndfile would read what is left.
+
+    Return the bits of a sample of a WAV file that has more room than they need, or None.
+    """
     with open(path, "rb") as file:
         held = file.seek(0, os.SEEK_END)
         file.seek(0)
         kind = file.read(4)
         if kind not in _CONTAINERS or held < 12:
-            return
-        claimed = _claimed_end(file, _CONTAINERS[kind], kind in (b"RF64", b"BW64"))
+            return None
+        order = _CONTAINERS[kind]
+        claimed = _claimed_end(file, order, kind in (b"RF64", b"BW64"))
+        spared = None if kind == b"FORM" else _spared(file, order)
     if claimed > held:
         raise ValueError(f"{path} is cut short: its header claims {claimed} bytes, {held} are there")
+    return spared
 
 
 def _claimed_end(file: BinaryIO, order: str, is_64_bit: bool) -> int:
     """Return where the file must end at the earliest by its header's sizes."""
     (size,) = struct.unpack(f"{order}I", file.read(4))
-    end = 8 + size if size != _SIZE_UNKNOWN else 0
+    end = 8 + size if size not in _SIZES_UNKNOWN else 0
     wide_data = None
     for name, start, size in _chunks(file, order):
         if is_64_bit and name == b"ds64" and size >= 16:
@@ -62,10 +89,37 @@ def _claimed_end(file: BinaryIO, order: str, is_64_bit: bool) -> int:
             wide, wide_data = struct.unpack("<QQ", file.read(16).ljust(16, b"\0"))
             end = max(end, 8 + wide)
         if name in (b"data", b"SSND"):
-            if size == _SIZE_UNKNOWN:
-                size = wide_data or 0
+            if size in _SIZES_UNKNOWN:  # the size of the whole is then none either
+                return 0 if wide_data is None else max(end, start + wide_data)
             return max(end, start + size)
     return end
+
+
+def _spared(file: BinaryIO, order: str) -> _Bits | None:
+    for name, start, size in _chunks(file, order):
+        if name == b"fmt " and size >= 16:
+            file.seek(start)
+            tag, channels, _, _, block, bits = struct.unpack(f"{order}HHIIHH", file.read(16).ljust(16, b"\0"))
+            return _Bits(bits, block) if tag == _PCM and bits > 8 and 8 * block != bits * channels else None
+    return None
+
+
+def _justified(path: str | os.PathLike[str], frames: np.ndarray, own: _Bits, n_bytes: int, n_channels: int) -> float:
+    """Return the factor of samples that have more room than bits: 1, or a power of 2 if they are in the low bits.
+
+    By the standard they are in the high bits and zeros follow; ALSA's S24_LE has them in the low ones.
+    """
+    spare = 8 * n_bytes - own.bits
+    if own.block == n_channels * n_bytes:
+        whole = frames * 2.0 ** (8 * n_bytes - 1)
+        if not np.any(whole % 2**spare):
+            return 1.0
+        if np.max(np.abs(whole)) <= 2.0 ** (own.bits - 1):
+            return float(2**spare)
+    raise ValueError(
+        f"{path} states {own.bits} bits in blocks of {own.block} bytes for {n_channels} channel(s), which its samples "
+        "do not fit: record it in 16, 24 (packed) or 32 bits"
+    )
 
 
 def _chunks(file: BinaryIO, order: str) -> Iterator[tuple[bytes, int, int]]:

@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 _LEAST_ROOM = 64 * 2**20  # bytes of float64 samples that any file may hold
+_ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
+_SAME_RATE = 1e-3  # share by which a rate may differ that is stated twice
 _LARGEST_EXPANSION = 100  # bytes of float64 samples for each byte of a larger file
+_STEP_NAMES = ("tinterval", "dt", "ts", "delta_t", "sample_interval", "sampling_interval")  # of a sample interval in s
+_TIME_NAMES = ("t", "time")  # of the times of all samples in s
 _RATE_NAMES = ("fs", "f_s", "sr", "samplerate", "sample_rate", "samplingrate", "sampling_rate", "sampling_frequency")
 
 
@@ -100,6 +104,14 @@ def rate_of_step(step_s: float, path: str | os.PathLike[str]) -> float:
     return rate
 
 
+def even_step(times: np.ndarray) -> float | None:
+    """Return the step of times that rise in even steps but for rounding, or None."""
+    steps, step = np.diff(times), (times[-1] - times[0]) / (len(times) - 1)
+    drift = np.max(np.abs(times - times[0] - step * np.arange(len(times))))
+    even = np.all(steps > 0) and np.max(np.abs(steps - step)) <= _ROUNDED * step and drift <= step
+    return float(step) if even else None
+
+
 def chosen_variable(
     path: str | os.PathLike[str],
     shapes: Mapping[str, tuple[int, ...]],
@@ -121,8 +133,45 @@ def chosen_variable(
         raise ValueError(f"{what} has shape {samples.shape}, but its header claims {shapes[name]}: the file is damaged")
     if samples.size == 0:
         raise ValueError(f"{what} is empty, shape {samples.shape}: expected at least one sample")
-    rates = [key for key, shape in shapes.items() if key.lower() in _RATE_NAMES and math.prod(shape) == 1]
-    return Content(samples, float(np.asarray(read(rates[0])).reshape(())) if len(rates) == 1 else None)
+    fs, start_s = _rate_and_start(path, name, shapes, read)
+    return Content(samples, fs, start_s=start_s)
+
+
+def _rate_and_start(
+    path: str | os.PathLike[str], name: str, shapes: Mapping[str, tuple[int, ...]], read: Callable[[str], np.ndarray]
+) -> tuple[float | None, float]:
+    """Return the sampling rate in Hz, if one is stored beside a variable, and the time of the first sample in s.
+
+    The fields of the variable's own struct come before variables outside.
+    """
+    folder = name.rpartition(".")[0]
+    for inside in dict.fromkeys((folder, "")):
+        numbers, times = {}, []
+        for key, shape in shapes.items():
+            place, _, own = key.rpartition(".")
+            if place == inside and math.prod(shape) == 1:
+                numbers.setdefault(own.lower(), []).append(float(np.asarray(read(key)).reshape(())))
+            elif place == inside and key != name and _are_times(key, shape, shapes[name]):
+                times.append(np.ravel(read(key)).astype(np.float64))
+        starts = [start for start in numbers.get("tstart", []) if math.isfinite(start)]
+        rates = [rate for own in _RATE_NAMES for rate in numbers.get(own, [])]
+        rates += [rate_of_step(step, path) for own in _STEP_NAMES for step in numbers.get(own, [])]
+        for one in times:
+            step = even_step(one)
+            if step is None:
+                raise ValueError(f"{path} has times in uneven steps: export it with a constant sampling rate")
+            rates.append(rate_of_step(step, path))
+            starts.append(float(one[0]))
+        if rates and max(rates) > (1 + _SAME_RATE) * min(rates):
+            raise ValueError(f"{path} states several sampling rates beside {name!r}, {sorted(rates)} Hz: leave only one")
+        if rates:
+            return rates[0], starts[0] if starts else 0.0
+    return None, 0.0
+
+
+def _are_times(name: str, shape: tuple[int, ...], signal: tuple[int, ...]) -> bool:
+    """Return whether a variable holds the times of a signal's samples, by its name and its shape."""
+    return name.rpartition(".")[2].lower() in _TIME_NAMES and math.prod(shape) == max(shape, default=0) == max(signal) > 2
 
 
 def _name_of(
@@ -133,13 +182,21 @@ def _name_of(
 ) -> str:
     there = ", ".join([f"{name} {shape}" for name, shape in sorted(shapes.items())]) or "no array of real numbers"
     if variable is None:
-        names = [name for name, shape in shapes.items() if math.prod(shape) > 1]
+        names = [
+            name
+            for name, shape in shapes.items()
+            if math.prod(shape) > 1
+            and not any(_are_times(name, shape, other) for key, other in shapes.items() if key != name)
+        ]
         if len(names) == 1:
             return names[0]
         if len(shapes) == 1:
             return next(iter(shapes))
         few = "several variables" if names else "no signal"
-        raise ValueError(f"{path} holds {few}: {there}; choose one with the option variable")
+        example = sorted(names or others or shapes)[0]
+        raise ValueError(
+            f"{path} holds {few}: {there}; choose one with the option variable (in a command also {Path(path).name}:{example})"
+        )
     if variable in others:
         raise ValueError(f"variable {variable!r} of {path} must hold real numbers, got {others[variable]}")
     if variable not in shapes:

@@ -17,6 +17,7 @@ NUMERIC_CLASSES = (
     "logical",
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
 )
+_STRUCT = "a struct"
 _DEFLATE, _SHUFFLE, _FLETCHER32 = 1, 2, 3  # filters of HDF5 that neither run foreign code nor expand twice
 
 
@@ -29,19 +30,25 @@ def read_mat73(path: str | os.PathLike[str], variable: str | None) -> Content:
     with _h5py(path).File(path, "r") as file:
         shapes: dict[str, tuple[int, ...]] = {}
         others: dict[str, str] = {}
-        for name in file:
-            if not name.startswith("#"):  # MATLAB's own
-                kind = _matlab_class(path, file, name)
-                if kind in NUMERIC_CLASSES and file[name].dtype.kind in "fiu":
-                    # HDF5 has the axes in C's order, MATLAB in Fortran's; of an empty variable it keeps the shape.
-                    empty = "MATLAB_empty" in file[name].attrs
-                    shapes[name] = (0,) if empty else file[name].shape[::-1]
-                else:
-                    others[name] = "complex numbers" if kind in NUMERIC_CLASSES else kind
+        names = [name for name in file if not name.startswith("#")]  # those are MATLAB's own
+        structs = set()
+        for name in names:
+            kind, place = _matlab_class(path, file, name), name.replace(".", "/")
+            if kind == _STRUCT:
+                if file[place] not in structs:  # which may hold itself
+                    names.extend(f"{name}.{field}" for field in file[place])
+                structs.add(file[place])
+                others[name] = kind
+            elif kind in NUMERIC_CLASSES and file[place].dtype.kind in "fiu":
+                # HDF5 has the axes in C's order, MATLAB in Fortran's; of an empty variable it keeps the shape.
+                empty = "MATLAB_empty" in file[place].attrs
+                shapes[name] = (0,) if empty else file[place].shape[::-1]
+            else:
+                others[name] = "complex numbers" if kind in NUMERIC_CLASSES else kind
         return chosen_variable(
             path,
             shapes,
-            lambda name: _read(path, file, name).T if shapes[name] != (0,) else np.empty(0),
+            lambda name: _read(path, file, name.replace(".", "/")).T if shapes[name] != (0,) else np.empty(0),
             variable,
             others,
         )
@@ -95,11 +102,11 @@ def _h5py(path: str | os.PathLike[str]) -> Any:
 
 
 def _matlab_class(path: str | os.PathLike[str], file: Any, name: str) -> str:
-    h5py = _h5py(path)
+    h5py, name = _h5py(path), name.replace(".", "/")
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
         return "a link to another file"
     if not isinstance(file[name], h5py.Dataset):
-        return "a struct or cell"
+        return _STRUCT
     return _text(file[name].attrs.get("MATLAB_class"))
 
 

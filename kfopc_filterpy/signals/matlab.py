@@ -9,7 +9,9 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from .content import Content, chosen_variable, require_room, room_of
 from .hdf5 import NUMERIC_CLASSES, read_mat73
@@ -17,6 +19,9 @@ from .hdf5 import NUMERIC_CLASSES, read_mat73
 _COMPRESSED, _MATRIX = 15, 14  # MATLAB's numbers for these elements
 _UINT32, _NUMBER_TYPES = 6, {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}  # of the numbers in an element
 _NUMBER_CLASSES, _COMPLEX = range(6, 16), 0x800  # of a variable: double to uint64, and the flag beside it
+_CELL, _CHAR, _WITH_FIELDS = 1, 4, {2: 3, 3: 4}  # classes: cell, text; of a struct and an object, where their names begin
+_WITH_ELEMENTS = (_CELL, _CHAR, *_WITH_FIELDS)
+_MOST_VARIABLES = 10_000  # in structs and cells: each takes a hundred bytes or more in memory
 _HEADER = 128  # bytes
 
 
@@ -40,7 +45,24 @@ def _from_scipy(path: str | os.PathLike[str], source: Any, variable: str | None)
     for name, shape in shapes.items():
         if math.prod(shape) > size:  # a value takes a byte or more
             raise ValueError(f"variable {name!r} of {path} is damaged: its header claims the shape {shape}")
-    return chosen_variable(path, shapes, lambda name: _load(source, name), variable, others)
+    fields: dict[str, np.ndarray] = {}
+    for name in [name for name, kind in others.items() if kind == "struct" and variable not in shapes]:
+        fields |= _fields(name, _load(source, name))
+    shapes |= {name: field.shape for name, field in fields.items() if field.dtype.kind in "fiub"}
+    others |= {name: str(field.dtype) for name, field in fields.items() if name not in shapes}
+    return chosen_variable(
+        path, shapes, lambda name: fields[name] if name in fields else _load(source, name), variable, others
+    )
+
+
+def _fields(name: str, value: Any) -> dict[str, np.ndarray]:
+    """Return the fields of a struct, and of the structs in it, by their names: "meas.ir"."""
+    found: dict[str, np.ndarray] = {}
+    for field in value.dtype.names if value.size == 1 else ():
+        inner = np.asarray(value[field].item())
+        own = f"{name}.{field}"
+        found |= _fields(own, inner) if inner.dtype.names else {own: inner}
+    return found
 
 
 def _load(source: Any, name: str) -> Any:
@@ -66,7 +88,7 @@ def _unpacked(path: str | os.PathLike[str]) -> io.BytesIO:
             body = _unzipped(path, body, room_of(path) - unpacked.tell())
         else:
             body = struct.pack(f"{order}II", kind, len(body)) + body
-        _require_honest_parts(path, body, order)
+        _require_honest_parts(path, memoryview(body), order)
         unpacked.write(body)
     unpacked.seek(0)
     return unpacked
@@ -95,11 +117,12 @@ def _elements(path: str | os.PathLike[str], content: Any, order: str) -> Iterato
         begin += 8 + size
 
 
-def _require_honest_parts(path: str | os.PathLike[str], body: bytes, order: str) -> None:
+def _require_honest_parts(path: str | os.PathLike[str], body: Any, order: str) -> int:
     """Raise ValueError if a part of a matrix claims more bytes than the matrix has, or if a variable lacks parts.
 
     scipy ends the process for numbers of a type that it does not know, which is the index into a table of its own. It
-    would also take the imaginary part of a variable that has none from what follows.
+    would also take the imaginary part of a variable that has none from what follows, and make room for the elements that
+    a struct or cell claims. Return the number of variables, with those in structs and cells.
     """
     if len(body) < 24:
         raise ValueError(f"{path} is damaged: a variable of {len(body)} bytes")
@@ -108,19 +131,44 @@ def _require_honest_parts(path: str | os.PathLike[str], body: bytes, order: str)
         raise ValueError(
             f"{path} is damaged: {len(body)} bytes claim to be type {kind} of {size} bytes, expected a variable"
         )
-    is_numeric = (flags & 0xFF) in _NUMBER_CLASSES
-    begin, end, types = 8, 8 + size, []
+    own_class = flags & 0xFF
+    is_numeric = own_class in _NUMBER_CLASSES
+    begin, end, parts, count = 8, 8 + size, [], 1
     while begin + 8 <= end:
         kind, part = struct.unpack_from(f"{order}II", body, begin)
+        at = begin + 8
         if kind >> 16:  # a part of up to four bytes, its size beside its type
-            kind, part = kind & 0xFFFF, 0
-        if begin + 8 + part > end:
+            kind, part, at = kind & 0xFFFF, kind >> 16, begin + 4
+        if at + part > end:
             raise ValueError(f"{path} is damaged: a part of {part} bytes in a variable of {size}")
-        types.append(kind)
-        begin += 8 + part + (-part) % 8
+        parts.append(_Part(kind, body[at : at + part]))
+        if kind == _MATRIX:
+            count += _require_honest_parts(path, body[begin : at + part], order) if part else 1
+            if count > _MOST_VARIABLES:
+                raise ValueError(f"{path} holds more than {_MOST_VARIABLES} variables in one: store arrays of numbers")
+        begin = at + part + (-part) % 8 if at == begin + 8 else begin + 8
     # Flags, dimensions and name; then, of numbers, the real part and the imaginary part.
     needed = 3 if not is_numeric else 5 if flags & _COMPLEX else 4
+    types = [part.kind for part in parts]
     if len(types) < needed or not set(types[:needed]) <= _NUMBER_TYPES:
         raise ValueError(
             f"{path} is damaged: a variable has parts of the types {types[:8]}, expected {needed} with numbers"
         )
+    if own_class in _WITH_ELEMENTS:
+        claimed = math.prod(parts[1].integers(order))
+        if own_class in _WITH_FIELDS:  # the length of a field's name, and the names, precede the fields
+            length, names = parts[_WITH_FIELDS[own_class] :][:2]
+            claimed *= len(names.content) // max(1, *length.integers(order))
+        if claimed > (size if own_class == _CHAR else count):
+            raise ValueError(f"{path} is damaged: a struct, cell or text of {size} bytes claims {claimed} elements")
+    return count
+
+
+class _Part(NamedTuple):
+    """Part of a variable: MATLAB's number for its type, and its bytes."""
+
+    kind: int
+    content: Any
+
+    def integers(self, order: str) -> tuple[int, ...]:
+        return struct.unpack(f"{order}{len(self.content) // 4}I", self.content[: len(self.content) // 4 * 4])

@@ -36,7 +36,9 @@ _UNNAMED = {
 }
 _SUFFIXES = {
     **dict.fromkeys((".wav", ".wave", ".bwf", ".rf64", ".flac", ".aif", ".aiff", ".aifc"), "an audio file"),
-    **dict.fromkeys((".txt", ".csv", ".tsv", ".dat", ".asc"), "text"),
+    # What is refused, with the remedy.
+    **dict.fromkeys((".m4a", ".aac", ".mp3", ".ogg", ".oga", ".opus", ".wma", ".w64", ".caf", ".au"), "an audio file"),
+    **dict.fromkeys((".txt", ".csv", ".tsv", ".dat", ".asc", ".lvm", ".frd", ".zma"), "text"),
     **dict.fromkeys((".uff", ".unv", ".uf", ".58"), "a UFF file"),
     ".mat": "a MAT file",
     ".npy": "a .npy file",
@@ -50,6 +52,7 @@ _BEGINNINGS = {
     b"MATLAB": "a MAT file",
     b"\x89HDF": "a SOFA file",
     **dict.fromkeys((b"RIFF", b"RIFX", b"RF64", b"BW64", b"FORM", b"fLaC"), "an audio file"),
+    **dict.fromkeys((b"OggS", b"ID3", b"\xff\xfb", b"riff", b"caff", b".snd"), "an audio file"),
 }
 
 
@@ -302,6 +305,12 @@ def read_content(path: str | os.PathLike[str], *, channel: int | None = None, va
         content = _NAMED[kind](path, variable) if kind in _NAMED else _UNNAMED[kind](path)
     if content.fs is not None and not (math.isfinite(content.fs) and content.fs > 0):
         raise ValueError(f"{path} states a sampling rate of {content.fs:g} Hz, expected one above 0")
+    if content.samples.ndim == 3 and kind != "a SOFA file" and max(content.samples.shape[:2]) >= content.samples.shape[2]:
+        raise ValueError(
+            f"{path} has the shape {content.samples.shape}, expected (microphones, loudspeakers, taps) with the taps last: "
+            "which axis is which? Store it in that order; (taps, microphones, loudspeakers) becomes it with MATLAB's "
+            "permute(S, [2 3 1]) or numpy.moveaxis(S, 0, 2)"
+        )
     samples = channels_first(content.samples)
     if channel is not None:
         samples = np.atleast_2d(samples)[as_channel(channel, np.atleast_2d(samples), path)]
@@ -325,6 +334,8 @@ def _kind_of(path: str | os.PathLike[str]) -> str:
     for beginning, kind in _BEGINNINGS.items():
         if head.startswith(beginning):
             return kind
+    if head[4:8] == b"ftyp":  # MPEG-4
+        return "an audio file"
     if head[512:516] == b"\x89HDF":
         return "a MAT file"
     lines = head.split(b"\n", 2)

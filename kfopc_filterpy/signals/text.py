@@ -10,12 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .content import Content, rate_of_step
+from .content import Content, even_step, rate_of_step
 
 _LONGEST_HEADER = 100  # lines
 _REW = "* Impulse Response data saved by REW"
 _LABVIEW, _END_OF_HEADER = "LabVIEW Measurement", "***End_of_Header***"
-_ROUNDED = 0.35  # share by which a step between times may differ: they are written with few digits
 _NO_SIGNAL = 100  # rows: no signal rises for so long
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _SECONDS = {"s": 1.0, "m": 1e-3, "u": 1e-6, "n": 1e-9}  # by the first letter of the unit
@@ -146,9 +145,8 @@ def _without_time(path: str | os.PathLike[str], table: Table) -> Content:
         return Content(columns[:, 1:])
     if len(times) < 3 or not np.all(steps > 0):
         return Content(columns)
-    step = (times[-1] - times[0]) / (len(times) - 1)
-    drift = np.max(np.abs(times - times[0] - step * np.arange(len(times))))
-    if not (np.max(np.abs(steps - step)) <= _ROUNDED * step and drift <= step):
+    step = even_step(times)
+    if step is None:
         if len(times) >= _NO_SIGNAL:
             raise ValueError(
                 f"{path} has a first column that rises in uneven steps, from {steps.min():g} to {steps.max():g}: export it "

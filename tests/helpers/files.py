@@ -45,6 +45,12 @@ def _mat4(path: Path) -> None:
     scipy.io.savemat(path, {"noise": signal()[:, None], "fs": float(FS)}, format="4")
 
 
+def _mat_struct(path: Path) -> None:
+    """Write a struct with a path and its rate, as a measurement is often kept."""
+    meas = {"ir": signal()[:, None], "fs": float(FS), "who": "me", "more": {"gain": 2.0}}
+    scipy.io.savemat(path, {"meas": meas, "words": np.array(["a", "b"], dtype=object)})
+
+
 def _mat73(path: Path) -> None:
     """Write what MATLAB's `save -v7.3` writes: HDF5 after 512 bytes of its own, axes swapped, the class as an attribute."""
     h5py = pytest.importorskip("h5py")
@@ -144,6 +150,7 @@ WRITERS: dict[str, Callable[[Path], None]] = {
     "plain.mat": _mat5_plain,
     "four.mat": _mat4,
     "new.mat": _mat73,
+    "struct.mat": _mat_struct,
     "x.csv": _text,
     "timed.csv": _timed,
     "rew.txt": _rew,

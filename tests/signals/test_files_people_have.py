@@ -126,3 +126,156 @@ def test_a_frequency_response_is_refused(tmp_path, read, header):
     (tmp_path / "x.txt").write_text(f"{header}\n{rows}")
     with pytest.raises(ValueError, match=r"x\.txt is a frequency response, .*: export the impulse response"):
         read(tmp_path / "x.txt", fs=16000)
+
+
+# ---- sound
+
+
+def wav(samples, bits: int, block: int, *, claimed: int | None = None) -> bytes:
+    """Return a WAV file of one channel with the bits and the block size that its header states."""
+    data = samples.tobytes() if isinstance(samples, np.ndarray) else samples
+    size = len(data) if claimed is None else claimed
+    riff = size if size == 0xFFFFFFFF else size + 36
+    form = struct.pack("<HHIIHH", 1, 1, FS, FS * block, block, bits)
+    return struct.pack("<4sI8sI", b"RIFF", riff, b"WAVEfmt ", 16) + form + struct.pack("<4sI", b"data", size) + data
+
+
+def low_bits(bits: int, n_bytes: int) -> np.ndarray:
+    """Return a sine of 0.1 as whole numbers in the low bits."""
+    whole = np.round(0.1 * np.sin(2 * np.pi * 440 * np.arange(FS) / FS) * 2 ** (bits - 1)).astype("<i4")
+    return whole.view(np.uint8).reshape(-1, 4)[:, :n_bytes]
+
+
+@pytest.mark.parametrize(("bits", "n_bytes"), [(24, 4), (20, 3), (12, 2)])
+@pytest.mark.parametrize("high", [False, True])
+def test_samples_with_more_room_than_bits_keep_their_level(tmp_path, bits, n_bytes, high):
+    samples = low_bits(bits, n_bytes)
+    if high:
+        whole = np.pad(samples, ((0, 0), (0, 4 - n_bytes))).copy().view("<i4") << (8 * n_bytes - bits)
+        samples = whole.view(np.uint8).reshape(-1, 4)[:, :n_bytes]
+    (tmp_path / "x.wav").write_bytes(wav(np.ascontiguousarray(samples), bits, n_bytes))
+    level = np.sqrt(np.mean(read_recording(tmp_path / "x.wav").samples ** 2))
+    assert level == pytest.approx(0.1 / np.sqrt(2), rel=1e-3)  # 12 bits: steps of 0.5 % of the sine
+
+
+def test_bits_that_do_not_fit_their_block_are_refused(tmp_path):
+    for samples, bits, block in ((low_bits(24, 4), 20, 4), (low_bits(30, 4), 24, 4)):
+        (tmp_path / "x.wav").write_bytes(wav(np.ascontiguousarray(samples), bits, block))
+        with pytest.raises(ValueError, match=rf"x\.wav states {bits} bits in blocks of {block} bytes"):
+            read_recording(tmp_path / "x.wav")
+
+
+@pytest.mark.parametrize("claimed", [0xFFFFFFFF, 0x7FFFF000, 0x7FFFFFFF, 0x80000000])
+def test_a_wav_from_a_pipe_is_read_to_its_end(tmp_path, claimed):
+    samples = (signal() * 2**15).astype("<i2")
+    (tmp_path / "x.wav").write_bytes(wav(samples, 16, 2, claimed=claimed))
+    np.testing.assert_array_equal(read_recording(tmp_path / "x.wav").samples, signal())
+
+
+@pytest.mark.parametrize("suffix", ["mp3", "ogg", "opus", "w64", "caf", "au", "m4a", "bin"])
+def test_other_sound_files_are_refused_with_the_remedy(tmp_path, suffix):
+    path = tmp_path / f"x.{suffix}"
+    kinds = {"opus": ("OGG", "OPUS"), "mp3": ("MP3", None), "ogg": ("OGG", None), "bin": ("CAF", "PCM_16")}
+    if suffix == "m4a":
+        path.write_bytes(b"\0\0\0\x20ftypM4A \0\0\0\0" + bytes(2000))
+    else:
+        kind, coding = kinds.get(suffix, (suffix.upper(), "PCM_16"))
+        soundfile.write(path, signal(1, 48000), 48000, format=kind, subtype=coding)
+    with pytest.raises(ValueError, match=rf"x\.{suffix} .*convert it to WAV, for example with: ffmpeg -i x\.{suffix} "):
+        read_recording(path)
+
+
+def test_a_chunk_that_is_wrong_is_refused_with_the_remedy(tmp_path):
+    soundfile.write(tmp_path / "x.wav", signal(2).T, FS, subtype="FLOAT")
+    content = (tmp_path / "x.wav").read_bytes()
+    at = content.index(b"PEAK") + 4  # of one channel, as if left over from before another was added
+    content = content[:at] + struct.pack("<I", 16) + content[at + 4 : at + 20] + content[at + 28 :]
+    (tmp_path / "x.wav").write_bytes(content[:4] + struct.pack("<I", len(content) - 8) + content[8:])
+    with pytest.raises(ValueError, match=r"x\.wav cannot be read .* 'PEAK' chunk.* convert it to WAV"):
+        read_recording(tmp_path / "x.wav")
+
+
+# ---- MATLAB
+
+
+SIGNAL = signal()[:, None]
+TIMES = np.arange(300)[:, None] / FS
+SCOPE_5 = {"Tstart": -10 / FS, "Tinterval": 1 / FS, "Length": 300.0, "A": SIGNAL.astype(np.float32)}
+
+
+@pytest.mark.parametrize(
+    ("content", "version"),
+    [
+        ({"p": SIGNAL, "Tinterval": 1 / FS}, "4"),
+        ({"p": SIGNAL, "t": TIMES}, "4"),
+        ({"p": SIGNAL, "t": TIMES.astype(np.float32) + 5}, "5"),
+        ({"p": SIGNAL, "dt": 1 / FS, "fs": float(FS)}, "5"),
+        (SCOPE_5, "5"),
+        ({"meas": {"p": SIGNAL, "Fs": float(FS)}, "fs": 1.0}, "5"),
+        ({"meas": {"p": SIGNAL}, "fs": float(FS)}, "5"),
+        ({"meas": {"p": SIGNAL, "time": TIMES}}, "5"),
+    ],
+)
+def test_matlab_files_have_their_own_rate(tmp_path, content, version):
+    scipy.io.savemat(tmp_path / "x.mat", content, format=version)
+    recording = read_recording(tmp_path / "x.mat")
+    np.testing.assert_array_equal(recording.samples, signal())
+    assert (recording.fs, recording.file_fs) == (FS, FS)
+    assert read_recording(tmp_path / "x.mat", fs=FS / 2).samples.shape == (150,)  # resampled, not relabelled
+
+
+def test_a_path_from_a_scope_begins_at_its_trigger(tmp_path):
+    taps = np.where(TIMES < 10 / FS, 0, SIGNAL)
+    scipy.io.savemat(tmp_path / "x.mat", SCOPE_5 | {"A": taps})
+    np.testing.assert_array_equal(read_path(tmp_path / "x.mat").samples, taps[10:, 0])
+
+
+@pytest.mark.parametrize(
+    ("beside", "message"),
+    [
+        ({"fs": 8000.0, "dt": 1e-4}, r"states several sampling rates beside 'p', \[8000\.0, 10000\.0\] Hz"),
+        ({"t": TIMES**2}, r"has times in uneven steps"),
+        ({"dt": 0.0}, r"states a sample interval of 0 s"),
+    ],
+)
+def test_rates_that_contradict_are_refused(tmp_path, beside, message):
+    scipy.io.savemat(tmp_path / "x.mat", {"p": SIGNAL, **beside})
+    with pytest.raises(ValueError, match=rf"x\.mat {message}"):
+        read_recording(tmp_path / "x.mat", fs=FS)
+
+
+def hdf5_struct(path, content):
+    """Write a struct as MATLAB's `save -v7.3` does: a group, its fields with swapped axes."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, fields in content.items():
+            group = file.create_group(name)
+            group.attrs["MATLAB_class"] = np.bytes_("struct")
+            for field, value in fields.items():
+                data = group.create_dataset(field, data=np.atleast_2d(value).T)
+                data.attrs["MATLAB_class"] = np.bytes_("double")
+        group["itself"] = group  # which only a damaged file has
+    with open(path, "r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+
+
+@pytest.mark.parametrize("write", [scipy.io.savemat, hdf5_struct])
+def test_the_fields_of_a_struct_are_named(tmp_path, write):
+    path = tmp_path / "x.mat"
+    write(path, {"P": {"ir": SIGNAL, "fs": 8000.0}, "S": {"ir": 2 * SIGNAL, "fs": float(FS)}})
+    with pytest.raises(ValueError, match=r"x\.mat holds several variables: P\.fs .*, P\.ir .*; choose one .* x\.mat:P\.ir\)"):
+        read_path(path)
+    chosen = read_path(path, variable="S.ir")
+    assert chosen.fs == FS
+    np.testing.assert_array_equal(chosen.samples, 2 * signal())
+    with pytest.raises(ValueError, match=r"variable 'S' of .*x\.mat must hold real numbers, got (a )?struct"):
+        read_path(path, variable="S")
+
+
+@pytest.mark.parametrize("shape", [(32, 4, 4), (4, 32, 4), (4, 4, 4)])
+@pytest.mark.parametrize("suffix", ["mat", "npy"])
+def test_a_matrix_of_paths_whose_taps_are_not_last_is_asked_for_its_axes(tmp_path, shape, suffix):
+    path, taps = tmp_path / f"x.{suffix}", np.ones(shape)
+    scipy.io.savemat(path, {"S": taps}) if suffix == "mat" else np.save(path, taps)
+    with pytest.raises(ValueError, match=rf"x\.{suffix} .*\({shape[0]}, {shape[1]}, 4\).*microphones, loudspeakers, taps"):
+        read_path(path, fs=FS)
