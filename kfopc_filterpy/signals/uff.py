@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,12 +13,24 @@ import numpy as np
 from .content import Content, optional_module, rate_of_step
 
 _IN_TIME = {0: "general", 1: "time response", 25: "FIR filter"}  # function types whose samples may be in time
+_PADDED = re.compile(rb"^((?: *[-+]?\d\.\d+[eE][-+]\d+)+) +(?=\r?$)", re.MULTILINE)  # a row of numbers, then blanks
+_BINARY = re.compile(rb"^    58b", re.MULTILINE)
 
 
 def read_uff(path: str | os.PathLike[str]) -> Content:
     """Return the time signals of a UFF file, one channel for each data set 58, and their rate and unit."""
     pyuff = optional_module("pyuff", path, "a UFF file")
-    file = pyuff.UFF(os.fspath(path))
+    content = Path(path).read_bytes()
+    if _PADDED.search(content) is None or _BINARY.search(content):
+        return _from_pyuff(path, pyuff.UFF(os.fspath(path)))
+    # pyuff takes the blanks after the last number for numbers, and reads only files.
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "unpadded.uff"
+        copy.write_bytes(_PADDED.sub(rb"\1", content))
+        return _from_pyuff(path, pyuff.UFF(str(copy)))
+
+
+def _from_pyuff(path: str | os.PathLike[str], file: Any) -> Content:
     wanted = [index for index, kind in enumerate(file.get_set_types()) if kind == 58]
     if not wanted:
         raise ValueError(f"{path} has no whole data set 58: it is cut short, or holds something else than signals")

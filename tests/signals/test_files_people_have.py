@@ -279,3 +279,16 @@ def test_a_matrix_of_paths_whose_taps_are_not_last_is_asked_for_its_axes(tmp_pat
     scipy.io.savemat(path, {"S": taps}) if suffix == "mat" else np.save(path, taps)
     with pytest.raises(ValueError, match=rf"x\.{suffix} .*\({shape[0]}, {shape[1]}, 4\).*microphones, loudspeakers, taps"):
         read_path(path, fs=FS)
+
+
+# ---- UFF
+
+
+@pytest.mark.parametrize("n_samples", [61, 62, 64])
+@pytest.mark.parametrize("end", [b"\n", b"\r\n"])
+def test_a_uff_whose_last_row_is_padded_with_blanks_is_read(tmp_path, n_samples, end):
+    path = tmp_path / "x.uff"
+    write_uff(path, signal(2)[:, :n_samples])
+    lines = path.read_bytes().splitlines()
+    path.write_bytes(end.join(line.ljust(80) if line.strip() != b"-1" else line for line in lines) + end)
+    np.testing.assert_allclose(read_recording(path).samples, signal(2)[:, :n_samples], rtol=0, atol=1e-11)  # 13 digits
